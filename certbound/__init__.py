@@ -1,0 +1,63 @@
+"""certbound: certified probabilities that a noisy nonlinear system leaves its safe set.
+
+Every name below is loaded when it is first used, so that reading a certificate imports neither CasADi nor cvxpy.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from typing import Any
+
+from certbound._version import __version__
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())
+
+_HOME = {
+    "ContinuousSystem": "problem.systems",
+    "DiscreteSystem": "problem.systems",
+    "linear_system": "problem.systems",
+    "Gaussian": "problem.noise",
+    "Uniform": "problem.noise",
+    "Rademacher": "problem.noise",
+    "Bounded": "problem.noise",
+    "SubGaussian": "problem.noise",
+    "Box": "problem.sets",
+    "Ball": "problem.sets",
+    "Ellipsoid": "problem.sets",
+    "HalfSpace": "problem.sets",
+    "Polytope": "problem.sets",
+    "Inside": "problem.sets",
+    "Outside": "problem.sets",
+    "Problem": "problem.problem",
+    "load": "problem.files",
+    "save": "problem.files",
+    "Constants": "tubes.constants",
+    "tune_tube": "tubes.tuning",
+    "bound_exit_probability": "tubes.tuning",
+    "simulate_exits": "simulation.montecarlo",
+    "sample_paths": "simulation.paths",
+    "bound_constants": "constants.bounds",
+    "bound_metrics": "constants.metrics",
+    "bound_reach": "reach",
+    "verify_safety": "safety.verification",
+    "CertboundError": "errors",
+    "CertificateError": "errors",
+    "EnclosureError": "errors",
+    "InfeasibleError": "errors",
+    "SolverError": "errors",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,116 @@
+"""A traced model as plain data: a straight-line program over scalars.
+
+A tape is read by the interval enclosures, by the simulation kernels, by the optimal-control transcription and by
+the certificate checker; each reader brings its own arithmetic. Reading a tape needs nothing but this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
+
+__all__ = ["BINARY", "JUMPS", "UNARY", "Node", "Tape"]
+
+T = TypeVar("T")
+
+UNARY = frozenset(
+    "neg sq sqrt exp log sin cos tan asin acos atan sinh cosh tanh abs sign floor not".split()
+)
+"""Operations of one argument (``sq`` is the square). ``pow`` has one argument too, and a constant exponent."""
+
+BINARY = frozenset("add sub mul div atan2 hypot min max lt le eq ne and or if_else_zero".split())
+"""Operations of two arguments. ``if_else_zero(c, y)`` is y where c holds and 0 elsewhere; comparisons are 0 or 1."""
+
+JUMPS = frozenset("sign floor not lt le eq ne and or if_else_zero".split())
+"""Operations that can jump (``atan2`` jumps too, across its cut): a reader that differentiates must decide them."""
+
+
+class Node(NamedTuple):
+    """One operation: ``args`` are indices of earlier nodes.
+
+    ``value`` is the number of a ``const`` node and the exponent of a ``pow`` node; an ``input`` node has its slot
+    as its only argument.
+    """
+
+    op: str
+    args: tuple[int, ...] = ()
+    value: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Tape:
+    """A vector- or matrix-valued function of named scalars.
+
+    Parameters
+    ----------
+    inputs : tuple of str
+        Names of the scalar inputs, in slot order; for a system's dynamics: ``t``, states, inputs, disturbances.
+    nodes : tuple of Node
+        Operations in topological order.
+    outputs : tuple of int
+        Node of each output, in row-major order.
+    shape : tuple of int
+        Shape of the output, ``(n,)`` or ``(rows, columns)``.
+    """
+
+    inputs: tuple[str, ...]
+    nodes: tuple[Node, ...]
+    outputs: tuple[int, ...]
+    shape: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        for index, node in enumerate(self.nodes):
+            limit = len(self.inputs) if node.op == "input" else index
+            if any(not 0 <= arg < limit for arg in node.args):
+                raise ValueError(f"`nodes` must refer to earlier nodes only; node {index} is {node}.")
+            arity = {"const": 0, "input": 1, "pow": 1}.get(node.op, 1 if node.op in UNARY else 2)
+            if node.op not in UNARY | BINARY | {"const", "input", "pow"} or len(node.args) != arity:
+                raise ValueError(f"`nodes` holds an unknown operation or a wrong arity: node {index} is {node}.")
+        if any(not 0 <= output < len(self.nodes) for output in self.outputs):
+            raise ValueError("`outputs` must be indices of nodes.")
+
+    def evaluate(self, arithmetic: Mapping[str, Callable[..., Any]], inputs: Sequence[Any]) -> list[Any]:
+        """Values of the outputs, computed in the given arithmetic.
+
+        Parameters
+        ----------
+        arithmetic : mapping
+            Operation name to function; ``const`` maps a float, ``pow`` maps (base, exponent as float).
+        inputs : sequence
+            One value per input slot, of whatever type the arithmetic works on.
+        """
+        if len(inputs) != len(self.inputs):
+            raise ValueError(f"`inputs` must hold {len(self.inputs)} values, got {len(inputs)}.")
+        values: list[Any] = []
+        for node in self.nodes:
+            if node.op == "input":
+                values.append(inputs[node.args[0]])
+            elif node.op == "const":
+                values.append(arithmetic["const"](node.value))
+            elif node.op == "pow":
+                values.append(arithmetic["pow"](values[node.args[0]], node.value))
+            else:
+                values.append(arithmetic[node.op](*(values[arg] for arg in node.args)))
+        return [values[output] for output in self.outputs]
+
+    def describe(self, index: int) -> str:
+        """The expression that node ``index`` stands for, for error messages (cut after 120 characters)."""
+        text = self._expression(index, depth=6)
+        return text if len(text) <= 120 else text[:117] + "..."
+
+    def _expression(self, index: int, depth: int) -> str:
+        node = self.nodes[index]
+        if node.op == "input":
+            return self.inputs[node.args[0]]
+        if node.op == "const":
+            return f"{node.value:g}"
+        if depth == 0:
+            return "..."
+        parts = [self._expression(arg, depth - 1) for arg in node.args]
+        infix = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
+        if node.op in infix:
+            return f"({parts[0]} {infix[node.op]} {parts[1]})"
+        if node.op in ("pow", "sq"):
+            return f"{parts[0]}**{2 if node.op == 'sq' else node.value:g}"
+        return f"-{parts[0]}" if node.op == "neg" else f"{node.op}({', '.join(parts)})"

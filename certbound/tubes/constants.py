@@ -1,0 +1,164 @@
+"""The record of constants that every tube formula reads (symbols: c, L, sigma, nu, P of docs/theory.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["Constants", "Proof"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Proof:
+    """What the rigorous recheck established; built by ``certbound.constants`` alone, never by a user.
+
+    Parameters
+    ----------
+    sampled : float
+        Largest value of the bounded quantity that sampling found: no valid constant lies below it.
+    boxes : int
+        Number of boxes that the branch and bound proved.
+    status : str
+        What proposed the metric: ``closed form`` or the status of the solver.
+    domain : str
+        Where the constants hold, in words.
+    """
+
+    sampled: float
+    boxes: int
+    status: str
+    domain: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Constants:
+    """Bounds on a system's contraction and noise: mu_P(D_x f) <= rate (CT) or ||D_x f||_P <= gain (DT).
+
+    Constants that a user states are an assumption: ``certified`` is False on them, and every verdict built on
+    them says so.
+
+    Parameters
+    ----------
+    rate, gain : float or array_like, optional
+        Exactly one: matrix measure bound c in 1/s (continuous time) or Lipschitz bound L > 0 per step (discrete
+        time); an array holds one value per piece of ``times``.
+    sigma : float or array_like
+        Noise level in the metric: g g^T <= sigma^2 P^-1 (CT), variance proxy of the noise (DT, measured in the
+        metric of the next step).
+    dimension : int
+        State dimension n.
+    effective_dimension : float, optional
+        nu with tr(P g g^T) <= nu sigma^2 at every time and state; ``dimension`` when omitted.
+    metric : array_like, shape (n, n), optional
+        P of the norm sqrt(x^T P x); the identity when omitted.
+    isotropic : bool
+        Asserts P^{1/2} g = sigma I (CT), Gaussian noise with covariance sigma^2 P^-1 (DT), exactly.
+    gaussian : bool
+        Asserts that the noise of a discrete-time system is Gaussian (implied by ``isotropic``; a Wiener process
+        always is).
+    times : array_like, optional
+        Piece ends, one entry more than the per-piece values, which hold on [times[k], times[k+1]).
+
+    Source: Assumptions 1-3 (paper), with E4 and Sec. 7.2-7.3 of docs/theory.md.
+    """
+
+    sigma: float | Array
+    dimension: int
+    rate: float | Array | None = None
+    gain: float | Array | None = None
+    effective_dimension: float | None = None
+    metric: Array | None = None
+    isotropic: bool = False
+    gaussian: bool = False
+    times: Array | None = None
+    proof: Proof | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if (self.rate is None) == (self.gain is None):
+            raise ValueError("give exactly one of `rate` (continuous time) and `gain` (discrete time).")
+        if int(self.dimension) != self.dimension or self.dimension < 1:
+            raise ValueError(f"`dimension` must be a positive integer, got {self.dimension}.")
+        name = "rate" if self.gain is None else "gain"
+        times = None if self.times is None else np.asarray(self.times, dtype=float)
+        for field_name in (name, "sigma"):
+            value = _values(field_name, getattr(self, field_name), times)
+            object.__setattr__(self, field_name, value)
+        if np.any(np.asarray(self.sigma) < 0):
+            raise ValueError(f"`sigma` must not be negative, got {self.sigma}.")
+        if self.gain is not None and np.any(np.asarray(self.gain) <= 0):
+            raise ValueError(f"`gain` must be positive (replace 0 by any small positive bound), got {self.gain}.")
+        if times is not None:
+            if times.ndim != 1 or len(times) < 2 or times[0] != 0 or np.any(np.diff(times) <= 0):
+                raise ValueError("`times` must rise strictly from 0 and have at least two entries.")
+            object.__setattr__(self, "times", _frozen(times))
+        nu = float(self.dimension) if self.effective_dimension is None else float(self.effective_dimension)
+        if not 0 < nu <= self.dimension:
+            raise ValueError(f"`effective_dimension` must lie in (0, {self.dimension}], got {nu}.")
+        object.__setattr__(self, "effective_dimension", nu)
+        if self.metric is not None:
+            object.__setattr__(self, "metric", _frozen(_checked_metric(self.metric, self.dimension)))
+        if self.isotropic:
+            object.__setattr__(self, "gaussian", True)
+            if nu != self.dimension:
+                raise ValueError(f"`isotropic` noise has effective dimension {self.dimension}, got {nu}.")
+
+    @property
+    def continuous(self) -> bool:
+        """True for a rate (continuous time), False for a gain (discrete time)."""
+        return self.rate is not None
+
+    @property
+    def nu(self) -> float:
+        """Effective dimension as a float."""
+        assert self.effective_dimension is not None
+        return self.effective_dimension
+
+    @property
+    def certified(self) -> bool:
+        """True only for constants that the rigorous recheck returned."""
+        return self.proof is not None
+
+    @property
+    def gap(self) -> float | None:
+        """Certified minus sampled value of the rate or gain; None for stated constants."""
+        if self.proof is None:
+            return None
+        value = self.rate if self.rate is not None else self.gain
+        return float(np.max(np.asarray(value)) - self.proof.sampled)
+
+
+def _frozen(array: Array) -> Array:
+    array = np.array(array, dtype=float)
+    array.setflags(write=False)
+    return array
+
+
+def _values(name: str, value: ArrayLike | None, times: Array | None) -> float | Array:
+    array = np.asarray(value, dtype=float)
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"`{name}` must be finite, got {value}.")
+    if array.ndim == 0:
+        return float(array)
+    if times is None or array.ndim != 1 or len(array) != len(times) - 1:
+        expected = "a number, or an array together with `times`" if times is None else f"{len(times) - 1} values"
+        raise ValueError(f"`{name}` must be {expected}, got shape {array.shape}.")
+    return _frozen(array)
+
+
+def _checked_metric(metric: ArrayLike, dimension: int) -> Array:
+    matrix = np.asarray(metric, dtype=float)
+    if matrix.shape != (dimension, dimension):
+        raise ValueError(f"`metric` must have shape ({dimension}, {dimension}), got {matrix.shape}.")
+    if not np.all(np.isfinite(matrix)):
+        raise ValueError("`metric` must be finite.")
+    if not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0):
+        raise ValueError("`metric` must be symmetric; use (P + P.T) / 2.")
+    matrix = (matrix + matrix.T) / 2
+    smallest = float(np.linalg.eigvalsh(matrix)[0])
+    if smallest <= 0:
+        raise ValueError(f"`metric` must be positive definite, its smallest eigenvalue is {smallest:.3g}.")
+    return matrix
