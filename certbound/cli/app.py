@@ -1,0 +1,87 @@
+"""The application: global options, the commands, and the one place where errors become messages."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from certbound._version import __version__
+from certbound.cli import derive, doctor, new, problems, tune, verify
+from certbound.cli.messages import BAD_INPUT, INTERRUPTED, explain, write_error
+from certbound.cli.output import SETTINGS, start_logging
+
+__all__ = ["app", "run"]
+
+_ClickException = typer.BadParameter.__mro__[2]  # whichever click typer brings: vendored or its own
+_log = logging.getLogger(__name__)
+
+app = typer.Typer(
+    name="certbound",
+    help="Certified probabilities that a noisy nonlinear system leaves its safe set.",
+    epilog="Exit codes: 0 done or SAFE, 1 UNKNOWN, unsafe or refuted, 2 bad input, 3 failed, 130 interrupted.",
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback(invoke_without_command=True)
+def _global_options(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Log the work to standard error.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print the answer's first line only.")] = False,
+) -> None:
+    if version:
+        sys.stdout.write(f"certbound {__version__}\n")
+        raise typer.Exit(0)
+    if context.invoked_subcommand is None:
+        sys.stdout.write(context.get_help() + "\n")
+        raise typer.Exit(BAD_INPUT)
+
+
+for _command in (verify, derive, tune, problems, new, doctor):
+    _command.register(app)
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; ``--verbose`` and ``--quiet`` may stand anywhere."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    SETTINGS.verbose, SETTINGS.quiet = "--verbose" in words, "--quiet" in words
+    words = [word for word in words if word not in ("--verbose", "--quiet")]
+    if SETTINGS.verbose:
+        start_logging()
+    command = next((word for word in words if not word.startswith("-")), "")
+    try:
+        code = app(args=words, prog_name="certbound", standalone_mode=False)
+        sys.stdout.flush()
+        return code if isinstance(code, int) else 0
+    except (KeyboardInterrupt, typer.Abort):
+        sys.stderr.write("certbound: interrupted; nothing was written\n")
+        return INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    except Exception as error:  # noqa: BLE001  (the outermost frame: whatever happened, three lines)
+        _log.debug("the command ended with an error", exc_info=True)
+        return _report(error, command)
+
+
+def _report(error: Exception, command: str) -> int:
+    if isinstance(error, _ClickException):
+        message = error.format_message().rstrip(".")  # type: ignore[attr-defined]
+        write_error(
+            "the command line was not understood",
+            message,
+            f"see `certbound {command} --help`".replace("  ", " "),
+        )
+        return BAD_INPUT
+    code, why, cure = explain(error, command)
+    write_error(
+        f"{command or 'the command'} {'refused its input' if code == BAD_INPUT else 'failed'}", why, cure
+    )
+    return code

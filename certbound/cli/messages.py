@@ -1,0 +1,124 @@
+"""Three lines for everything that goes wrong: what, why, what to do."""
+
+from __future__ import annotations
+
+import linecache
+import re
+import sys
+from types import TracebackType
+
+from certbound.errors import (
+    CertboundError,
+    CertificateError,
+    EnclosureError,
+    InfeasibleError,
+    SolverError,
+)
+
+__all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "InputError", "explain", "split_cure", "write_error"]
+
+BAD_INPUT = 2
+FAILED = 3
+INTERRUPTED = 130
+
+
+class InputError(ValueError):
+    """What the user asked for cannot be understood; carries the second and third line of the message."""
+
+    def __init__(self, why: str, cure: str) -> None:
+        super().__init__(f"{why}; {cure}")
+        self.why = why
+        self.cure = cure
+
+
+def explain(error: Exception, command: str) -> tuple[int, str, str]:
+    """Exit code, reason and cure for an error that ended a command.
+
+    Input is at fault where certbound itself refused it (a ``raise`` in its own source), where a file could
+    not be read or written, or where an extra is missing; all else is a failure of a solver or of certbound.
+    """
+    help_line = f"see `certbound {command} --help`" if command else "see `certbound --help`"
+    if isinstance(error, InputError):
+        return BAD_INPUT, error.why, error.cure
+    if isinstance(error, (SolverError, InfeasibleError)):
+        why, cure = split_cure(str(error))
+        return FAILED, why, cure or "try another --method or a smaller problem; --verbose shows the details"
+    if isinstance(error, (EnclosureError, CertificateError)):
+        why, cure = split_cure(str(error))
+        return BAD_INPUT, why, cure or help_line
+    if isinstance(error, OSError):
+        subject = f"`{error.filename}`: " if error.filename else ""
+        why = f"{subject}{error.strerror or error}"
+        return BAD_INPUT, why, "check the path and its permissions"
+    if isinstance(error, ModuleNotFoundError):
+        return BAD_INPUT, f"the module `{error.name}` is not installed", _install_hint(error.name or "")
+    if isinstance(error, (ValueError, TypeError)) and _refused(error):
+        why, cure = split_cure(str(error))
+        return BAD_INPUT, why, cure or help_line
+    if isinstance(error, CertboundError):
+        why, cure = split_cure(str(error))
+        return FAILED, why, cure or "run again with --verbose for the details"
+    return (
+        FAILED,
+        f"certbound failed: {type(error).__name__}: {_one_line(str(error))}",
+        "this is a defect; run again with --verbose and report what it prints",
+    )
+
+
+def split_cure(message: str) -> tuple[str, str]:
+    """A library message split into its reason and its cure (empty where it names none).
+
+    Examples
+    --------
+    >>> split_cure("`delta` must lie in (0, 1), got 1.5; give a probability.")
+    ('`delta` must lie in (0, 1), got 1.5', 'give a probability')
+    """
+    text = _one_line(message)
+    depth = 0
+    for position, letter in enumerate(text):
+        depth += (letter in "([{") - (letter in ")]}")
+        if depth <= 0 and text.startswith("; ", position):
+            return text[:position], text[position + 2 :].rstrip(".")
+    match = re.search(r"(?<=[\w`)\]])\. (?=[A-Z`])", text)
+    if match:
+        return text[: match.start()], text[match.end() :].rstrip(".")
+    return text.rstrip("."), ""
+
+
+def write_error(what: str, why: str, cure: str) -> None:
+    """Three lines on standard error."""
+    sys.stderr.write(f"certbound: {what}\n  why: {why}\n  try: {cure}\n")
+    sys.stderr.flush()
+
+
+def _install_hint(module: str) -> str:
+    extra = {
+        "dask": "cluster",
+        "distributed": "cluster",
+        "sklearn": "learn",
+        "jax": "compare",
+        "immrax": "compare",
+    }
+    name = extra.get(module.split(".")[0])
+    return (
+        f'pip install "certbound[{name}]"'
+        if name
+        else f"install it, or check the spelling: pip install {module}"
+    )
+
+
+def _one_line(message: str) -> str:
+    return " ".join(message.split())
+
+
+def _refused(error: Exception) -> bool:
+    """True where the innermost frame is a ``raise`` statement of certbound's own source."""
+    trace: TracebackType | None = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    if trace is None:
+        return False
+    frame = trace.tb_frame
+    line = linecache.getline(frame.f_code.co_filename, trace.tb_lineno)
+    module = str(frame.f_globals.get("__name__", ""))
+    return module.split(".")[0] == "certbound" and line.lstrip().startswith("raise ")

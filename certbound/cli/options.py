@@ -1,0 +1,158 @@
+"""Arguments and options that several commands share, and how a problem is loaded from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certbound.cli.messages import InputError, split_cure
+
+if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
+
+__all__ = [
+    "JsonOption",
+    "ProblemArgument",
+    "SetOption",
+    "check_writable",
+    "integer",
+    "load_problem",
+    "number",
+    "settings_of",
+]
+
+
+def number(text: str) -> float:
+    """A finite number from the command line; ``1e6`` is one, ``nan`` is not.
+
+    Examples
+    --------
+    >>> number("1e6")
+    1000000.0
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        raise typer.BadParameter(f"must be a number such as 0.5 or 1e6, got `{text}`") from None
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"must be a finite number, got `{text}`")
+    return value
+
+
+def integer(text: str) -> int:
+    """A whole number from the command line, also written as ``1e6``."""
+    value = number(text)
+    if value != int(value):
+        raise typer.BadParameter(f"must be a whole number, got `{text}`")
+    return int(value)
+
+
+def complete_problem(incomplete: str) -> list[str]:
+    """Names of bundled problems for the shell's completion."""
+    from certbound.problem.models import MODELS
+
+    return sorted(name for name in MODELS if name.startswith(incomplete))
+
+
+ProblemArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="PROBLEM",
+        help="A bundled problem's name, a TOML file, or module:name.",
+        autocompletion=complete_problem,
+        show_default=False,
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change a parameter of the problem; repeat for more.",
+        show_default=False,
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+HorizonOption = Annotated[
+    float | None,
+    typer.Option("--horizon", parser=number, metavar="T", help="Seconds, or steps.", show_default=False),
+]
+DeltaOption = Annotated[
+    float | None,
+    typer.Option("--delta", parser=number, metavar="D", help="Allowed exit probability.", show_default=False),
+]
+
+
+def settings_of(pairs: Sequence[str] | None) -> dict[str, float]:
+    """The ``--set key=value`` pairs as a mapping.
+
+    Examples
+    --------
+    >>> settings_of(["sigma=2e-2", "v = 1"])
+    {'sigma': 0.02, 'v': 1.0}
+    """
+    found: dict[str, float] = {}
+    for pair in pairs or ():
+        key, sign, value = (part.strip() for part in pair.partition("="))
+        if not sign or not key or not value:
+            raise InputError(f"`--set` takes key=value, got `{pair}`", "write for example --set sigma=0.02")
+        if key in found:
+            raise InputError(f"`--set {key}` is given twice", "give each key once")
+        try:
+            found[key] = number(value)
+        except typer.BadParameter as error:
+            raise InputError(
+                f"the value of `--set {key}` {error}", f"write for example --set {key}=0.02"
+            ) from None
+    return found
+
+
+def load_problem(
+    source: str, pairs: Sequence[str] | None, *, horizon: float | None = None, delta: float | None = None
+) -> Problem:
+    """The problem that the arguments name, with its parameters, horizon and delta changed as asked."""
+    from certbound.problem.files import load
+
+    parameters: dict[str, Any] = dict(settings_of(pairs))
+    try:
+        problem = load(source, **parameters)
+        changes: dict[str, Any] = {}
+        if horizon is not None:
+            changes["horizon"] = _whole(horizon) if problem.system.time == "discrete" else horizon
+        if delta is not None:
+            changes["delta"] = delta
+        return problem.replace(**changes) if changes else problem
+    except (ValueError, TypeError, ArithmeticError) as error:
+        if isinstance(error, InputError):
+            raise
+        why, cure = split_cure(str(error))
+        raise InputError(
+            why, cure or "run `certbound problems` for the bundled problems and their keys"
+        ) from error
+
+
+def check_writable(*paths: Path | None) -> None:
+    """Refuse, before any work, to write where no file can be written."""
+    for path in paths:
+        if path is None:
+            continue
+        if path.is_dir():
+            raise InputError(f"`{path}` is a directory", "name a file")
+        if not path.parent.is_dir():
+            raise InputError(f"the directory `{path.parent}` does not exist", f"run mkdir -p {path.parent}")
+        import os
+
+        if not os.access(path if path.exists() else path.parent, os.W_OK):
+            raise InputError(f"`{path}` cannot be written", "choose another place, or change the permissions")
+
+
+def _whole(horizon: float) -> int:
+    if horizon != int(horizon):
+        raise InputError(
+            f"`--horizon` counts steps here and must be whole, got {horizon:g}", "give whole steps"
+        )
+    return int(horizon)

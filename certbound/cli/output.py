@@ -1,0 +1,99 @@
+"""What the commands print: JSON for programs, short tables for people, a spinner on a terminal only."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = ["SETTINGS", "Settings", "console", "plain", "print_json", "spinner", "write_file"]
+
+
+class Settings:
+    """The global options of this run."""
+
+    verbose: bool = False
+    quiet: bool = False
+
+
+SETTINGS = Settings()
+
+
+def console() -> Console:
+    """Standard output for people: colours and box drawing on a terminal only."""
+    from rich.console import Console
+
+    terminal = sys.stdout.isatty()
+    width = None if terminal else max(100, int(os.environ.get("COLUMNS") or 100))
+    return Console(file=sys.stdout, highlight=False, soft_wrap=not terminal, width=width)
+
+
+def print_json(value: Mapping[str, Any]) -> None:
+    """One JSON object on standard output, on one line; nothing else is printed there."""
+    sys.stdout.write(json.dumps(plain(value), allow_nan=False) + "\n")
+    sys.stdout.flush()
+
+
+def plain(value: Any) -> Any:
+    """JSON types: arrays become lists, numpy scalars numbers, what is not finite null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (bool, str, int)) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    raise TypeError(f"`value` must be made of JSON types and arrays, got {type(value).__name__}.")
+
+
+@contextlib.contextmanager
+def spinner(text: str) -> Iterator[None]:
+    """A spinner with the elapsed time on standard error while the work runs, on a terminal only."""
+    if SETTINGS.quiet or SETTINGS.verbose or not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        progress.add_task(text, total=None)
+        yield
+
+
+def start_logging() -> None:
+    """Send the library's log to standard error (with --verbose)."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(relativeCreated)8.0f ms  %(name)s: %(message)s"))
+    logger = logging.getLogger("certbound")
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG)
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file whole or not at all: an interrupted run leaves the old file as it was."""
+    data = content.encode() if isinstance(content, str) else content
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
