@@ -15,14 +15,18 @@ __all__ = ["BINARY", "JUMPS", "UNARY", "Node", "Tape"]
 T = TypeVar("T")
 
 UNARY = frozenset(
-    "neg sq sqrt exp log sin cos tan asin acos atan sinh cosh tanh abs sign floor not".split()
+    ["neg", "sq", "sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "abs", "kink", "sign", "floor", "not"]
 )
-"""Operations of one argument (``sq`` is the square). ``pow`` has one argument too, and a constant exponent."""
+"""Operations of one argument (``sq`` is the square). ``pow`` has one argument too, and a constant exponent.
 
-BINARY = frozenset("add sub mul div atan2 hypot min max lt le eq ne and or if_else_zero".split())
+``kink`` is the generalised derivative of abs: -1 left of 0, 1 right of it, and **all of [-1, 1]** at 0 (so that an
+interval reader encloses it by [-1, 1] on a box that contains 0, and refuses nothing). It occurs in derivatives only.
+"""
+
+BINARY = frozenset(["add", "sub", "mul", "div", "atan2", "hypot", "min", "max", "lt", "le", "eq", "ne", "and", "or", "if_else_zero"])
 """Operations of two arguments. ``if_else_zero(c, y)`` is y where c holds and 0 elsewhere; comparisons are 0 or 1."""
 
-JUMPS = frozenset("sign floor not lt le eq ne and or if_else_zero".split())
+JUMPS = frozenset(["sign", "floor", "not", "lt", "le", "eq", "ne", "and", "or", "if_else_zero"])
 """Operations that can jump (``atan2`` jumps too, across its cut): a reader that differentiates must decide them."""
 
 
