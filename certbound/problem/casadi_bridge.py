@@ -50,11 +50,12 @@ def _entries(ca: Any, value: Any) -> list[Any]:
 def _casadi_arithmetic() -> dict[str, Callable[..., Any]]:
     ca = casadi_module()
     names = {
-        "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "tan": "tan", "asin": "asin",
-        "acos": "acos", "atan": "atan", "sinh": "sinh", "cosh": "cosh", "tanh": "tanh", "abs": "fabs", "sign": "sign",
-        "kink": "sign", "floor": "floor", "not": "logic_not", "atan2": "atan2", "hypot": "hypot", "min": "fmin",
-        "max": "fmax", "lt": "lt", "le": "le", "eq": "eq", "ne": "ne", "and": "logic_and", "or": "logic_or",
-        "add": "plus", "sub": "minus", "mul": "times", "div": "rdivide",
+        "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "tan": "tan",
+        "asin": "asin", "acos": "acos", "atan": "atan", "sinh": "sinh", "cosh": "cosh", "tanh": "tanh",
+        "abs": "fabs", "sign": "sign", "kink": "sign", "floor": "floor", "not": "logic_not",
+        "atan2": "atan2", "hypot": "hypot", "min": "fmin", "max": "fmax", "lt": "lt", "le": "le",
+        "eq": "eq", "ne": "ne", "and": "logic_and", "or": "logic_or", "add": "plus", "sub": "minus",
+        "mul": "times", "div": "rdivide",
     }  # fmt: skip
     table: dict[str, Callable[..., Any]] = {op: getattr(ca, name) for op, name in names.items()}
     return table | {
@@ -83,8 +84,8 @@ def from_casadi(expression: Any, inputs: Sequence[Any], names: Sequence[str], sh
     Raises
     ------
     ValueError
-        If the expression uses an operation that a tape cannot hold (erf, calls of other functions), or the sizes
-        disagree.
+        If the expression uses an operation that a tape cannot hold (erf, calls of other functions), or the
+        sizes disagree.
     """
     ca = casadi_module()
     columns = ca.densify(ca.vec(ca.SX(expression).T))
@@ -129,11 +130,12 @@ def _readers(ca: Any, graph: Graph) -> dict[int, Callable[..., int]]:
 
     one = graph.const(1.0)
     names = {
-        "ADD": "add", "SUB": "sub", "MUL": "mul", "DIV": "div", "NEG": "neg", "EXP": "exp", "LOG": "log", "SQRT": "sqrt",
-        "SQ": "sq", "SIN": "sin", "COS": "cos", "TAN": "tan", "ASIN": "asin", "ACOS": "acos", "ATAN": "atan",
-        "LT": "lt", "LE": "le", "EQ": "eq", "NE": "ne", "NOT": "not", "AND": "and", "OR": "or", "FLOOR": "floor",
-        "FABS": "abs", "SIGN": "sign", "IF_ELSE_ZERO": "if_else_zero", "FMIN": "min", "FMAX": "max", "SINH": "sinh",
-        "COSH": "cosh", "TANH": "tanh", "ATAN2": "atan2", "HYPOT": "hypot",
+        "ADD": "add", "SUB": "sub", "MUL": "mul", "DIV": "div", "NEG": "neg", "EXP": "exp", "LOG": "log",
+        "SQRT": "sqrt", "SQ": "sq", "SIN": "sin", "COS": "cos", "TAN": "tan", "ASIN": "asin",
+        "ACOS": "acos", "ATAN": "atan", "LT": "lt", "LE": "le", "EQ": "eq", "NE": "ne", "NOT": "not",
+        "AND": "and", "OR": "or", "FLOOR": "floor", "FABS": "abs", "SIGN": "sign",
+        "IF_ELSE_ZERO": "if_else_zero", "FMIN": "min", "FMAX": "max", "SINH": "sinh", "COSH": "cosh",
+        "TANH": "tanh", "ATAN2": "atan2", "HYPOT": "hypot",
     }  # fmt: skip
     table: dict[int, Callable[..., int]] = {
         getattr(ca, f"OP_{name}"): simple(op) for name, op in names.items()

@@ -14,9 +14,9 @@ __all__ = ["jacobian"]
 def jacobian(tape: Tape, columns: Sequence[int] | None = None) -> Tape:
     """Derivative of every output with respect to the given inputs.
 
-    The derivative is exact: where a constant of it is no floating-point number, the tape holds the operations that
-    define it. Kinks (abs, min, max) get their generalised derivative, the operation ``kink``; jumps get the
-    derivative that holds beside the jump.
+    The derivative is exact: where a constant of it is no floating-point number, the tape holds the operations
+    that define it. Kinks (abs, min, max) get their generalised derivative, the operation ``kink``; jumps get
+    the derivative that holds beside the jump.
 
     Parameters
     ----------
@@ -28,10 +28,11 @@ def jacobian(tape: Tape, columns: Sequence[int] | None = None) -> Tape:
     Returns
     -------
     Tape
-        Shape ``(len(tape.outputs), len(columns))``, over the same inputs. **Its nodes begin with the nodes of the
-        function itself, index for index**, whether the derivative needs them or not: a reader that refuses undecided
-        jumps sees those of the function too (x' = sign(x) has derivative 0 beside its jump). Differentiating a
-        derivative turns its kinks into jumps (operation ``sign``), since the slope of |x| jumps at 0.
+        Shape ``(len(tape.outputs), len(columns))``, over the same inputs. **Its nodes begin with the nodes of
+        the function itself, index for index**, whether the derivative needs them or not: a reader that
+        refuses undecided jumps sees those of the function too (x' = sign(x) has derivative 0 beside its
+        jump). Differentiating a derivative turns its kinks into jumps (operation ``sign``), since the slope
+        of |x| jumps at 0.
 
     Raises
     ------

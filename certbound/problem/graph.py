@@ -1,8 +1,8 @@
-"""A tape under construction: nodes are shared, and only rewritings that are exact in real arithmetic are made.
+"""A tape under construction: nodes are shared, and only rewritings that are exact over the reals are made.
 
-Constants are folded only where the floating-point result is the exact one: a tape that says ``0.1 * 0.3`` keeps
-both factors, so that a rigorous reader encloses the product that the user wrote, and a derivative taken on the
-tape is the exact derivative of the tape.
+Constants are folded only where the floating-point result is the exact one: a tape that says ``0.1 * 0.3``
+keeps both factors, so that a rigorous reader encloses the product that the user wrote, and a derivative taken
+on the tape is the exact derivative of the tape.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Graph:
         return graph
 
     def tape(self, outputs: Sequence[int], shape: tuple[int, ...], keep: int = 0) -> Tape:
-        """The finished tape, without the nodes that no output needs (the first ``keep`` nodes always stay)."""
+        """The finished tape, less the nodes that no output needs (the first ``keep`` nodes always stay)."""
         needed = [index < keep for index in range(len(self.nodes))]
         for output in outputs:
             needed[output] = True
@@ -100,7 +100,7 @@ class Graph:
         return node.value if node.op == "const" else None
 
     def apply(self, op: str, *args: int) -> int:
-        """The node of ``op`` applied to earlier nodes (see ``tape.UNARY`` and ``tape.BINARY``), simplified."""
+        """The node of ``op`` (see ``tape.UNARY``, ``tape.BINARY``) applied to earlier nodes, simplified."""
         if len(args) == 1 and op in UNARY:
             simple = self._simple_unary(op, args[0])
         elif len(args) == 2 and op in BINARY:
@@ -114,7 +114,7 @@ class Graph:
         return self._intern(Node(op, args))
 
     def pow(self, base: int, exponent: float) -> int:
-        """``base ** exponent`` with a constant exponent; squares, roots and reciprocals get their own nodes."""
+        """``base ** exponent``, exponent constant; squares, roots and reciprocals get their own nodes."""
         exponent = float(exponent)
         if not math.isfinite(exponent):
             raise ValueError(f"an exponent must be finite, got {exponent}.")

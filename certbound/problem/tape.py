@@ -1,7 +1,8 @@
 """A traced model as plain data: a straight-line program over scalars.
 
-A tape is read by the interval enclosures, by the simulation kernels, by the optimal-control transcription and by
-the certificate checker; each reader brings its own arithmetic. Reading a tape needs nothing but this module.
+A tape is read by the interval enclosures, by the simulation kernels, by the optimal-control transcription and
+by the certificate checker; each reader brings its own arithmetic. Reading a tape needs nothing but this
+module.
 """
 
 from __future__ import annotations
@@ -15,26 +16,31 @@ __all__ = ["BINARY", "JUMPS", "UNARY", "Node", "Tape"]
 T = TypeVar("T")
 
 UNARY = frozenset(
-    ["neg", "sq", "sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "abs", "kink", "sign", "floor", "not"]
+    "neg sq sqrt exp log sin cos tan asin acos atan sinh cosh tanh abs kink sign floor not".split()  # noqa: SIM905
 )
 """Operations of one argument (``sq`` is the square). ``pow`` has one argument too, and a constant exponent.
 
-``kink`` is the generalised derivative of abs: -1 left of 0, 1 right of it, and **all of [-1, 1]** at 0 (so that an
-interval reader encloses it by [-1, 1] on a box that contains 0, and refuses nothing). It occurs in derivatives only.
+``kink`` is the generalised derivative of abs: -1 left of 0, 1 right of it, and **all of [-1, 1]** at 0 (so
+that an interval reader encloses it by [-1, 1] on a box that contains 0, and refuses nothing). It occurs in
+derivatives only.
 """
 
-BINARY = frozenset(["add", "sub", "mul", "div", "atan2", "hypot", "min", "max", "lt", "le", "eq", "ne", "and", "or", "if_else_zero"])
-"""Operations of two arguments. ``if_else_zero(c, y)`` is y where c holds and 0 elsewhere; comparisons are 0 or 1."""
+BINARY = frozenset(
+    "add sub mul div atan2 hypot min max lt le eq ne and or if_else_zero".split()  # noqa: SIM905
+)
+"""Operations of two arguments. ``if_else_zero(c, y)`` is y where c holds, else 0; comparisons are 0 or 1."""
 
-JUMPS = frozenset(["sign", "floor", "not", "lt", "le", "eq", "ne", "and", "or", "if_else_zero"])
-"""Operations that can jump (``atan2`` jumps too, across its cut): a reader that differentiates must decide them."""
+JUMPS = frozenset(
+    "sign floor not lt le eq ne and or if_else_zero".split()  # noqa: SIM905
+)
+"""Operations that jump (``atan2`` too, across its cut): a reader that differentiates must decide them."""
 
 
 class Node(NamedTuple):
     """One operation: ``args`` are indices of earlier nodes.
 
-    ``value`` is the number of a ``const`` node and the exponent of a ``pow`` node; an ``input`` node has its slot
-    as its only argument.
+    ``value`` is the number of a ``const`` node and the exponent of a ``pow`` node; an ``input`` node has its
+    slot as its only argument.
     """
 
     op: str
@@ -49,7 +55,8 @@ class Tape:
     Parameters
     ----------
     inputs : tuple of str
-        Names of the scalar inputs, in slot order; for a system's dynamics: ``t``, states, inputs, disturbances.
+        Names of the scalar inputs, in slot order; for a system's dynamics: ``t``, states, inputs,
+        disturbances.
     nodes : tuple of Node
         Operations in topological order.
     outputs : tuple of int
@@ -70,7 +77,7 @@ class Tape:
                 raise ValueError(f"`nodes` must refer to earlier nodes only; node {index} is {node}.")
             arity = {"const": 0, "input": 1, "pow": 1}.get(node.op, 1 if node.op in UNARY else 2)
             if node.op not in UNARY | BINARY | {"const", "input", "pow"} or len(node.args) != arity:
-                raise ValueError(f"`nodes` holds an unknown operation or a wrong arity: node {index} is {node}.")
+                raise ValueError(f"`nodes` holds an unknown operation or arity: node {index} is {node}.")
         if any(not 0 <= output < len(self.nodes) for output in self.outputs):
             raise ValueError("`outputs` must be indices of nodes.")
 
@@ -112,7 +119,7 @@ class Tape:
         if depth == 0:
             return "..."
         parts = [self._expression(arg, depth - 1) for arg in node.args]
-        infix = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
+        infix = dict(add="+", sub="-", mul="*", div="/", lt="<", le="<=", eq="==", ne="!=")  # noqa: C408
         if node.op in infix:
             return f"({parts[0]} {infix[node.op]} {parts[1]})"
         if node.op in ("pow", "sq"):

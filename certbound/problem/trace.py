@@ -23,22 +23,24 @@ __all__ = ["casadi_module", "compile_numpy", "from_casadi", "jacobian", "substit
 def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) -> Tape:
     """Record a NumPy-style function as a tape.
 
-    The function is called once, with traced values. It may use Python's operators, indexing, loops over a fixed
-    range, ``@`` with constant matrices, and NumPy's elementary functions (np.sin, np.where, np.maximum,
+    The function is called once, with traced values. It may use Python's operators, indexing, loops over a
+    fixed range, ``@`` with constant matrices, and NumPy's elementary functions (np.sin, np.where, np.maximum,
     np.linalg.norm, ...).
 
     Parameters
     ----------
     function : callable
-        Takes any of the arguments, by name. Parameters that have a default and are not among ``arguments`` keep it.
+        Takes any of the arguments, by name. Parameters that have a default and are not among ``arguments``
+        keep it.
     arguments : mapping
-        Argument name to the names of its scalar entries. ``t`` is passed as a scalar, everything else as an array
-        of one dimension. The order fixes the input slots.
+        Argument name to the names of its scalar entries. ``t`` is passed as a scalar, everything else as an
+        array of one dimension. The order fixes the input slots.
 
     Returns
     -------
     Tape
-        With inputs in the order of ``arguments`` and the shape of what the function returned (``(1,)`` for a scalar).
+        With inputs in the order of ``arguments`` and the shape of what the function returned (``(1,)`` for a
+        scalar).
 
     Raises
     ------

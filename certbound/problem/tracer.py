@@ -1,8 +1,8 @@
 """Scalars and arrays that record what a NumPy-style function does to them.
 
-A function is called once with a ``Traced`` array of ``Scalar`` entries. NumPy's operators and functions reach them
-through its two dispatch protocols; what cannot be recorded (``if``, ``float()``, ``math.sin``) is refused with the
-cure.
+A function is called once with a ``Traced`` array of ``Scalar`` entries. NumPy's operators and functions reach
+them through its two dispatch protocols; what cannot be recorded (``if``, ``float()``, ``math.sin``) is
+refused with the cure.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ class UntraceableError(TypeError):
 
 
 _BRANCH = (
-    "a traced value has no truth value, so `if`, `while`, `and`, `or`, `not`, max() and min() cannot act on it (nor "
-    "can a comparison of arrays made by np.array); use np.where(x[0] > 0, a, b), np.maximum, np.minimum, or `&`, `|`, `~`"
+    "a traced value has no truth value, so `if`, `while`, `and`, `or`, `not`, max() and min() cannot act on "
+    "it, nor can a comparison of arrays made by np.array; use np.where(x[0] > 0, a, b), np.maximum, "
+    "np.minimum, or `&`, `|`, `~`"
 )
 _FLOAT = (
-    "a traced value is not a number: math.sin(x), float(x), int(x), round(x) and writing it into a float array "
-    "cannot work; use np.sin (and np.* throughout), and collect entries with np.array([...])"
+    "a traced value is not a number: math.sin(x), float(x), int(x), round(x) and writing it into a float "
+    "array cannot work; use np.sin (and np.* throughout), and collect entries with np.array([...])"
 )
 
 
@@ -332,8 +333,8 @@ def _install() -> None:
     """Give Scalar Python's operators, and the methods by which NumPy reaches the entries of object arrays."""
     unary = {"__neg__": "negative", "__pos__": "positive", "__abs__": "absolute", "__invert__": "invert"}
     binary = {
-        "add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power", "mod": "remainder",
-        "floordiv": "floor_divide", "and": "logical_and", "or": "logical_or",
+        "add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power",
+        "mod": "remainder", "floordiv": "floor_divide", "and": "logical_and", "or": "logical_or",
     }  # fmt: skip
     comparisons = {
         "lt": "less",
