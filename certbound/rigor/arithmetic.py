@@ -251,8 +251,9 @@ def _outward(lo: Array, hi: Array, a: Interval, b: Interval) -> Interval:
     exact = bool(np.all(lo)) and bool(np.all(hi))
     lo, hi = lower(lo, tiny=TINY), upper(hi, tiny=TINY)
     if not exact:
-        same = ((a.lo >= 0) & (b.lo >= 0)) | ((a.hi <= 0) & (b.hi <= 0))
-        opposite = ((a.lo >= 0) & (b.hi <= 0)) | ((a.hi <= 0) & (b.lo >= 0))
+        zero = ((a.lo == 0) & (a.hi == 0)) | ((b.lo == 0) & (b.hi == 0))
+        same = ((a.lo >= 0) & (b.lo >= 0)) | ((a.hi <= 0) & (b.hi <= 0)) | zero
+        opposite = ((a.lo >= 0) & (b.hi <= 0)) | ((a.hi <= 0) & (b.lo >= 0)) | zero
         lo = np.where(same, np.maximum(lo, 0.0), lo)
         hi = np.where(opposite, np.minimum(hi, 0.0), hi)
     return Interval._raw(lo, hi)

@@ -38,6 +38,6 @@ from certbound.rigor.rounding import down, matmul_error, up
 
 __all__ = [
     "ARITHMETIC", "UNDEFINED", "Interval", "IntervalLike", "abs_", "acos", "asin", "atan", "atan2",
-    "concatenate", "cos", "cosh", "down", "exp", "hypot", "log", "matmul", "matmul_error", "maximum", "minimum",
-    "pow_", "sin", "sinh", "sq", "sqrt", "stack", "tan", "tanh", "up",
+    "concatenate", "cos", "cosh", "down", "exp", "hypot", "log", "matmul", "matmul_error", "maximum",
+    "minimum", "pow_", "sin", "sinh", "sq", "sqrt", "stack", "tan", "tanh", "up",
 ]  # fmt: skip

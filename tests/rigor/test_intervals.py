@@ -17,20 +17,22 @@ UNARY_BALLS = {
     "neg": lambda x: -x, "sq": lambda x: x * x, "sqrt": lambda x: x.sqrt(), "exp": lambda x: x.exp(),
     "log": lambda x: x.log(), "sin": lambda x: x.sin(), "cos": lambda x: x.cos(), "tan": lambda x: x.tan(),
     "asin": lambda x: x.asin(), "acos": lambda x: x.acos(), "atan": lambda x: x.atan(),
-    "sinh": lambda x: x.sinh(), "cosh": lambda x: x.cosh(), "tanh": lambda x: x.tanh(), "abs": lambda x: abs(x),
+    "sinh": lambda x: x.sinh(), "cosh": lambda x: x.cosh(), "tanh": lambda x: x.tanh(),
+    "abs": lambda x: abs(x),
 }  # fmt: skip
 BINARY_BALLS = {
-    "add": lambda x, y: x + y, "sub": lambda x, y: x - y, "mul": lambda x, y: x * y, "div": lambda x, y: x / y,
+    "add": lambda x, y: x + y, "sub": lambda x, y: x - y, "mul": lambda x, y: x * y,
+    "div": lambda x, y: x / y,
     "atan2": lambda y, x: flint.arb.atan2(y, x), "hypot": lambda x, y: (x * x + y * y).sqrt(),
     "min": lambda x, y: x.min(y), "max": lambda x, y: x.max(y),
 }  # fmt: skip
-POWERS = {2: lambda x: x**2, 3: lambda x: x**3, 7: lambda x: x**7, -1: lambda x: 1 / x, -4: lambda x: 1 / x**4}
-REAL_POWERS = {0.5: 0, 1.5: 0, -0.3: 0}
+POWERS = {2: lambda x: x**2, 3: lambda x: x**3, 7: lambda x: x**7, -1: lambda x: 1 / x, -4: lambda x: x**-4}
+REAL_POWERS = [0.5, 1.5, -0.3]
 COUNT = 3300  # times 31 primitives: 1e5 intervals
 
 
 def random_intervals(rng: np.random.Generator, count: int) -> Interval:
-    """Moderate, tiny (down to subnormal), huge, half-infinite, infinite, zero-touching and point intervals."""
+    """Moderate, tiny (down to subnormal), huge, unbounded, zero-touching and point intervals."""
     scale = 10.0 ** rng.choice([0, 0, 0, 1, 3, 7, -5, -200, -310, 150, 300], count)
     centre = rng.normal(size=count) * scale
     width = np.abs(rng.normal(size=count)) * 10.0 ** rng.uniform(-16, 1, count) * np.minimum(scale, 1e300)
@@ -112,7 +114,9 @@ def test_every_operation_of_a_tape_has_an_interval_version():
     assert set(iv.ARITHMETIC) == UNARY | BINARY | {"const", "pow"}
 
 
-@pytest.mark.parametrize("op", ["sin", "cos", "tan", "exp", "log", "tanh", "atan", "sinh", "cosh", "asin", "acos"])
+@pytest.mark.parametrize(
+    "op", ["sin", "cos", "tan", "exp", "log", "tanh", "atan", "sinh", "cosh", "asin", "acos"]
+)
 def test_library_functions_stay_within_half_of_the_granted_margin(op):
     rng = np.random.default_rng(1)
     x = np.concatenate([rng.uniform(-1, 1, 4000), rng.uniform(-20, 20, 4000), rng.uniform(-1e5, 1e5, 4000)])
@@ -124,12 +128,8 @@ def test_library_functions_stay_within_half_of_the_granted_margin(op):
     flint.ctx.prec = 128
     for value, point in zip(found.tolist(), x.tolist(), strict=True):
         exact = UNARY_BALLS[op](flint.arb(point))
-        error = abs(exact - flint.arb(value))
-        assert error <= flint.arb(max(abs(value), 5e-324) * 2.0**-52 * (iv_margin() / 2)), (op, point)
-
-
-def iv_margin() -> float:
-    return elementary.LIBRARY_ULPS
+        granted = max(abs(value), 5e-324) * 2.0**-52 * elementary.LIBRARY_ULPS
+        assert abs(exact - flint.arb(value)) <= flint.arb(granted / 2), (op, point)
 
 
 def test_zero_times_unbounded_is_zero_and_unbounded_differences_are_everything():
