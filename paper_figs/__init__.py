@@ -1,0 +1,1 @@
+"""The paper's figures and certbound's own, drawn from what ``experiments`` computed."""
