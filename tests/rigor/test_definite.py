@@ -1,0 +1,170 @@
+"""Eigenvalue, norm and exponential bounds hold for every member, are tight, and refuse what they must."""
+
+from __future__ import annotations
+
+import flint
+import numpy as np
+import pytest
+
+from certbound.rigor import definite
+from certbound.rigor.definite import (
+    eigenvalue_lower,
+    eigenvalue_upper,
+    is_positive_definite,
+    matrix_exponential,
+    norm_upper,
+)
+from certbound.rigor.intervals import Interval
+
+
+def symmetric(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    a = rng.normal(size=shape)
+    return (a + np.swapaxes(a, -1, -2)) / 2
+
+
+def exceeds(matrix: np.ndarray, bound: float) -> bool:
+    """Whether lambda_max(matrix) > bound for certain: bound I - matrix is indefinite in ball arithmetic."""
+    flint.ctx.prec = 200
+    n = len(matrix)
+    shifted = flint.arb_mat((-matrix).tolist()) + flint.arb_mat(np.eye(n).tolist()) * flint.arb(float(bound))
+    for k in range(1, n + 1):
+        leading = flint.arb_mat([[shifted[i, j] for j in range(k)] for i in range(k)])
+        if leading.det() < 0:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 12])
+def test_eigenvalue_bounds_of_point_matrices_are_rigorous_and_tight(n):
+    rng = np.random.default_rng(n)
+    a = symmetric(rng, 40, n, n) * 10.0 ** rng.uniform(-6, 6, (40, 1, 1))
+    a[:3] = np.eye(n) * 0.1
+    up, low = eigenvalue_upper(a), eigenvalue_lower(a)
+    size = np.abs(np.linalg.eigvalsh(a)).max(axis=-1)
+    assert np.all(up - np.linalg.eigvalsh(a)[:, -1] <= 1e-13 * n * size)
+    assert np.all(np.linalg.eigvalsh(a)[:, 0] - low <= 1e-13 * n * size)
+    for k in range(40):
+        assert not exceeds(a[k], up[k])
+        assert not exceeds(-a[k], -low[k])
+        assert exceeds(a[k], up[k] - 1e-12 * n * size[k])
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 8])
+def test_eigenvalue_bounds_hold_for_members_and_are_tight_to_first_order(n):
+    rng = np.random.default_rng(10 + n)
+    middle, radius = symmetric(rng, n, n), np.abs(symmetric(rng, n, n)) * 1e-6
+    bound = eigenvalue_upper(Interval.around(middle, radius))
+    signs = np.sign(np.outer(v := np.linalg.eigh(middle)[1][:, -1], v))
+    worst = np.linalg.eigvalsh(middle + radius * signs)[-1]
+    assert worst <= bound <= worst + 1e-4 * radius.max() * n
+    noise = rng.uniform(-1, 1, (2000, n, n))
+    noise = np.triu(noise) + np.swapaxes(np.triu(noise, 1), -1, -2)
+    for size in (1.0, 1e6):
+        values = np.linalg.eigvalsh(middle + size * radius * noise)
+        wide = Interval.around(middle, size * radius)
+        assert values.max() <= eigenvalue_upper(wide)
+        assert values.min() >= eigenvalue_lower(wide)
+
+
+def test_wide_interval_matrices_of_order_two_get_the_exact_largest_eigenvalue():
+    a = Interval([[-5.0, -2.0], [-1.0, -np.inf]], [[1.0, 1.0], [1.0, 3.0]])
+    exact = np.linalg.eigvalsh(np.array([[1.0, 1.0], [1.0, 3.0]]))[-1]
+    assert exact <= eigenvalue_upper(a) <= exact + 1e-14
+
+
+def test_unbounded_entries_give_infinite_bounds_only_where_they_matter():
+    lo, hi = -np.ones((4, 3, 3)), np.ones((4, 3, 3))
+    lo[0, 1, 1] = -np.inf
+    hi[1, 1, 1] = np.inf
+    lo[2, 0, 1] = lo[2, 1, 0] = -np.inf
+    bound = eigenvalue_upper(Interval(lo, hi))
+    assert np.isfinite(bound).tolist() == [True, False, False, True]
+    assert np.isinf(norm_upper(Interval(lo, hi))).tolist() == [True, True, True, False]
+    assert np.isinf(eigenvalue_upper(Interval(lo[2, :2, :2], hi[2, :2, :2])))
+
+
+def test_tiny_and_huge_matrices_are_bounded_soundly():
+    for scale in (1e-170, 1e-300, 1e150):
+        a = np.array([[1.0, 2.0], [2.0, -1.0]]) * scale
+        assert eigenvalue_upper(a) >= np.sqrt(5.0) * scale * (1 - 1e-15)
+        assert norm_upper(a) >= np.sqrt(5.0) * scale * (1 - 1e-15)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 1), (2, 2), (3, 5), (5, 3), (12, 12)])
+def test_norm_bounds_hold_and_are_tight(shape):
+    rng = np.random.default_rng(sum(shape))
+    a = rng.normal(size=(30, *shape))
+    exact = np.linalg.norm(a, 2, axis=(-2, -1))
+    bound = norm_upper(a)
+    assert np.all(bound >= exact * (1 - 1e-15))
+    assert np.all(bound <= exact * (1 + 1e-12))
+    radius = 1e-6 * np.abs(rng.normal(size=shape))
+    wide = norm_upper(Interval.around(a[0], radius))
+    u, _, vt = np.linalg.svd(a[0])
+    worst = np.linalg.norm(a[0] + radius * np.sign(np.outer(u[:, 0], vt[0])), 2)
+    assert worst <= wide <= worst + 1e-4 * radius.max() * sum(shape)
+
+
+def test_norm_of_a_singular_and_of_a_zero_matrix():
+    assert norm_upper(np.zeros((3, 3))) <= 1e-150
+    assert 1.0 <= norm_upper(np.outer([0.6, 0.8, 0.0], [0.0, 1.0, 0.0])) <= 1 + 1e-13
+
+
+def test_positive_definiteness_is_decided_on_both_sides_of_the_edge():
+    hilbert = 1.0 / (np.arange(6)[:, None] + np.arange(6) + 1.0)
+    assert is_positive_definite(hilbert)
+    assert not is_positive_definite(-hilbert)
+    edge = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    assert not is_positive_definite(edge)
+    assert is_positive_definite(edge + 1e-13 * np.eye(3))
+    assert not is_positive_definite(Interval.around(edge + 1e-3 * np.eye(3), 1.1e-3))
+    badly_scaled = np.diag([1e-200, 1.0, 1e200]) + 0.0
+    badly_scaled[0, 1] = badly_scaled[1, 0] = 5e-101
+    assert is_positive_definite(np.stack([badly_scaled, edge])).tolist() == [True, False]
+    assert not is_positive_definite(np.diag([0.0, 1.0]))
+
+
+@pytest.mark.parametrize(("n", "scale"), [(1, 0.3), (2, 3.0), (3, 40.0), (6, 5.0)])
+def test_matrix_exponential_contains_the_ball_arithmetic_value(n, scale):
+    rng = np.random.default_rng(n)
+    a = rng.normal(size=(5, n, n)) * scale / n
+    found = matrix_exponential(a, 0.7)
+    flint.ctx.prec = 300
+    for k in range(5):
+        exact = (flint.arb_mat(a[k].tolist()) * flint.arb(0.7)).exp()
+        for i in range(n):
+            for j in range(n):
+                assert flint.arb(found.lo[k, i, j]) <= exact[i, j] <= flint.arb(found.hi[k, i, j])
+    size = np.abs(found.mid).max(axis=(-1, -2), keepdims=True)
+    assert np.all(found.width <= 1e-11 * size * max(1.0, scale))
+
+
+def test_matrix_exponential_of_an_interval_covers_its_members_and_times():
+    rng = np.random.default_rng(0)
+    middle = rng.normal(size=(3, 3))
+    wide = matrix_exponential(Interval.around(middle, 0.05), Interval(0.1, 0.2))
+    import scipy.linalg
+
+    for _ in range(200):
+        member = (middle + rng.uniform(-0.05, 0.05, (3, 3))) * rng.uniform(0.1, 0.2)
+        assert wide.contains(scipy.linalg.expm(member)).all()
+    batch = matrix_exponential(np.stack([middle, middle]), np.array([0.1, 0.2]))
+    assert batch.shape == (2, 3, 3)
+
+
+def test_a_missing_remainder_would_be_noticed(monkeypatch):
+    monkeypatch.setattr(definite, "DEGREE", 4)
+    flint.ctx.prec = 200
+    assert matrix_exponential(np.array([[0.5]])).contains(np.exp(0.5)).all()
+    assert matrix_exponential(np.array([[0.5]])).width[0, 0] > 1e-5
+
+
+def test_malformed_matrices_are_refused():
+    with pytest.raises(ValueError, match="`A` must be a batch of square matrices"):
+        eigenvalue_upper(np.ones((2, 3)))
+    with pytest.raises(ValueError, match="symmetric"):
+        eigenvalue_upper(np.array([[1.0, 2.0], [0.0, 1.0]]))
+    with pytest.raises(ValueError, match="batch of matrices"):
+        norm_upper(np.ones(3))
+    with pytest.raises(ValueError, match="at most 1000"):
+        matrix_exponential(np.eye(2) * 1e4)
