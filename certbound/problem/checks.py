@@ -1,0 +1,130 @@
+"""Checks of user input: each returns a clean read-only value, or says which argument broke which rule."""
+
+from __future__ import annotations
+
+import difflib
+import keyword
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "frozen",
+    "matrix",
+    "names",
+    "nearest",
+    "number",
+    "pick",
+    "positive_definite",
+    "symmetric",
+    "vector",
+]
+
+Array = NDArray[np.float64]
+
+
+def frozen(value: Any) -> Array:
+    """A read-only copy as floats (-0.0 becomes 0.0)."""
+    array = np.array(value, dtype=float) + 0.0
+    array.setflags(write=False)
+    return array
+
+
+def _floats(name: str, value: Any) -> Array:
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`{name}` must hold numbers, got {value!r}.") from error
+    if np.any(np.isnan(array)):
+        raise ValueError(f"`{name}` must not contain nan, got {value!r}.")
+    return array
+
+
+def number(name: str, value: Any, *, infinite: bool = False) -> float:
+    """One real number."""
+    if isinstance(value, bool):
+        raise TypeError(f"`{name}` must be a number, got {value!r}.")
+    array = _floats(name, value)
+    if array.size != 1 or array.ndim > 1:
+        raise ValueError(f"`{name}` must be one number, got {value!r}.")
+    result = float(array.reshape(()))
+    if not infinite and not np.isfinite(result):
+        raise ValueError(f"`{name}` must be finite, got {result}.")
+    return result
+
+
+def vector(name: str, value: Any, length: int | None = None, *, infinite: bool = False) -> Array:
+    """A vector; a number counts as a vector of one entry."""
+    array = np.atleast_1d(_floats(name, value))
+    if array.ndim != 1 or array.size == 0:
+        raise ValueError(f"`{name}` must be a vector, got shape {array.shape}.")
+    if length is not None and len(array) != length:
+        raise ValueError(f"`{name}` must have {length} entries, got {len(array)}.")
+    if not infinite and not np.all(np.isfinite(array)):
+        raise ValueError(f"`{name}` must be finite, got {array.tolist()}.")
+    return frozen(array)
+
+
+def matrix(name: str, value: Any, rows: int | None = None, columns: int | None = None) -> Array:
+    """A finite matrix of the given size (None: any)."""
+    array = _floats(name, value)
+    if array.ndim != 2 or array.size == 0:
+        raise ValueError(f"`{name}` must be a matrix, got shape {array.shape}.")
+    wanted = (array.shape[0] if rows is None else rows, array.shape[1] if columns is None else columns)
+    if array.shape != wanted:
+        raise ValueError(f"`{name}` must have shape {wanted}, got {array.shape}.")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"`{name}` must be finite.")
+    return frozen(array)
+
+
+def symmetric(name: str, value: Any, size: int | None = None) -> Array:
+    """A symmetric matrix (asymmetry of rounding size is averaged away)."""
+    array = matrix(name, value, size, size)
+    if array.shape[0] != array.shape[1]:
+        raise ValueError(f"`{name}` must be square, got shape {array.shape}.")
+    if not np.allclose(array, array.T, rtol=1e-12, atol=1e-14 * float(np.max(np.abs(array)))):
+        raise ValueError(f"`{name}` must be symmetric; use (M + M.T) / 2.")
+    return frozen((array + array.T) / 2)
+
+
+def positive_definite(name: str, value: Any, size: int | None = None, *, strict: bool = True) -> Array:
+    """A symmetric matrix with positive (``strict=False``: nonnegative) eigenvalues, up to rounding."""
+    array = symmetric(name, value, size)
+    smallest, largest = (float(x) for x in np.linalg.eigvalsh(array)[[0, -1]])
+    if smallest <= 0 if strict else smallest < -1e-12 * max(largest, 1e-300):
+        rule = "positive definite" if strict else "positive semidefinite"
+        raise ValueError(f"`{name}` must be {rule}, its smallest eigenvalue is {smallest:.3g}.")
+    return array
+
+
+def names(name: str, value: Sequence[str], reserved: Iterable[str] = ()) -> tuple[str, ...]:
+    """Distinct identifiers."""
+    result = tuple(value)
+    for entry in result:
+        if not isinstance(entry, str) or not entry.isidentifier() or keyword.iskeyword(entry):
+            raise ValueError(f"`{name}` must be identifiers (letters, digits, _), got {entry!r}.")
+        if entry in set(reserved) | {"t"}:
+            raise ValueError(f"`{name}` must not use the name {entry!r}, which is taken; choose another.")
+    if len(set(result)) != len(result):
+        raise ValueError(f"`{name}` must be distinct, got {list(result)}.")
+    return result
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """``; did you mean 'x'?`` with the nearest known word, or the list of known words."""
+    known = sorted(known)
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(known) or 'none'}."
+
+
+def pick(coordinates: Any, dimension: int) -> tuple[int, ...] | None:
+    """Distinct state indices, as many as the set has dimensions."""
+    if coordinates is None:
+        return None
+    result = tuple(int(index) for index in coordinates)
+    if len(result) != dimension or len(set(result)) != len(result) or any(index < 0 for index in result):
+        raise ValueError(f"`coordinates` must be {dimension} distinct state indices, got {coordinates!r}.")
+    return result
