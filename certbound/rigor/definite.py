@@ -208,10 +208,16 @@ def _perron(n: Array) -> Array:
     size = np.max(np.abs(n), axis=(-1, -2))
     loose = np.isfinite(bound) & (bound - floor > 1e-13 * size)
     if loose.any():
-        rough = n[loose]
-        symmetric = 0.5 * (rough + rough.swapaxes(-1, -2))
-        vector = np.abs(np.linalg.eigh(symmetric)[1][..., -1])
-        better = _quotient(np.maximum(rough, rough.swapaxes(-1, -2)), np.maximum(vector, 1e-8))
+        rough = np.maximum(n[loose], n[loose].swapaxes(-1, -2))
+        values, vectors = np.linalg.eigh(rough)
+        vector = np.maximum(np.abs(vectors[..., -1]), 1e-8)
+        better = _quotient(rough, vector)
+        # one sweep of Jacobi gives the small components of the eigenvector their relative accuracy
+        inner = np.diagonal(rough, axis1=-2, axis2=-1)
+        rest = np.maximum(np.einsum("...ij,...j->...i", rough, vector) - inner * vector, TINY)
+        sweep = rest / np.maximum(values[..., -1:] - inner, 1e-300)
+        largest = np.max(vector, axis=-1, keepdims=True)
+        better = np.minimum(better, _quotient(rough, np.where(vector == largest, vector, sweep)))
         bound = np.array(bound)
         bound[loose] = np.minimum(bound[loose], better)
     return bound
