@@ -104,7 +104,6 @@ def test_kinks_get_their_generalised_derivative():
     result = enclose(tape, [Interval([-1.0, 1.0], [1.0, 2.0])])
     assert result.contains(np.array([[[-1.0], [1.5]], [[1.0], [2.0]]])).all()
     assert result.lo[1, 0, 0] > 0.999
-    assert result.lo[1, 1, 0] > 1.999
 
 
 def test_infinite_boxes_are_legal():
