@@ -1,9 +1,87 @@
-"""To come."""
+"""``certbound derive``: the contraction and noise constants of a problem, proved."""
 
 from __future__ import annotations
 
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 import typer
+
+from certbound.cli.describe import describe_constants
+from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, load_problem
+from certbound.cli.output import SETTINGS, console, print_json, spinner
+
+if TYPE_CHECKING:
+    from certbound.tubes.constants import Constants
+
+__all__ = ["register"]
 
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
+    app.command("derive", epilog="Example: certbound derive chain --json")(derive)
+
+
+def derive(
+    problem: ProblemArgument,
+    pairs: SetOption = None,
+    horizon: HorizonOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Bound the contraction rate (or gain) and the noise, with a metric for each constraint."""
+    subject = load_problem(problem, pairs, horizon=horizon)
+    from certbound.constants.bounds import bound_constants
+    from certbound.constants.metrics import bound_metrics
+
+    started = time.perf_counter()
+    with spinner(f"bounding the constants of {subject.name}"):
+        constants = bound_constants(subject)
+        metrics = bound_metrics(subject)
+    seconds = time.perf_counter() - started
+    result = {
+        **describe_constants(constants),
+        "metrics": [
+            {"constraint": constraint.label, **describe_constants(one)}
+            for constraint, one in zip(subject.safe, metrics)
+        ],
+        "seconds": seconds,
+    }
+    if as_json:
+        print_json(result)
+    else:
+        _print(constants, result)
+
+
+def _print(constants: Constants, result: dict[str, Any]) -> None:
+    screen = console()
+    name = "rate" if constants.continuous else "gain"
+    unit = "1/s" if constants.continuous else "per step"
+    origin = "certified" if constants.certified else "stated, not certified"
+    screen.print(f"{name} {_range(getattr(constants, name))} {unit}, {origin}", markup=False)
+    if SETTINGS.quiet:
+        return
+    screen.print(
+        f"sigma {_range(constants.sigma)}, effective dimension {constants.nu:.4g} of {constants.dimension}"
+    )
+    if constants.gap is not None:
+        screen.print(f"at most {constants.gap:.3g} above what sampling found")
+    if constants.proof is not None:
+        screen.print(f"holds on {constants.proof.domain}", markup=False)
+    if result["metrics"]:
+        from rich.table import Table
+
+        table = Table(box=None, pad_edge=False)
+        for heading in ("constraint", name, "sigma", "eff. dimension"):
+            table.add_column(heading)
+        for row in result["metrics"]:
+            numbers = (_range(row[name]), _range(row["sigma"]), f"{row['effective_dimension']:.4g}")
+            table.add_row(row["constraint"], *numbers)
+        screen.print(table)
+    screen.print(f"{result['seconds']:.2f} s")
+
+
+def _range(value: Any) -> str:
+    values = np.atleast_1d(np.asarray(value, dtype=float))
+    low, high = float(values.min()), float(values.max())
+    return f"{high:.6g}" if low == high else f"{low:.4g} .. {high:.4g}"

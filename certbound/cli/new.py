@@ -32,7 +32,7 @@ sigma = 0.05
 [disturbances]             # bounded, unknown, may depend on the past: name = [low, high]
 push = [-0.02, 0.02]
 
-[dynamics]                 # d(state)/dt: t, + - * / **, sin cos tan tanh exp log sqrt abs min max hypot ..., pi
+[dynamics]                 # d(state)/dt: t + - * / **, sin cos tan tanh exp log sqrt abs min max ..., pi
 angle = "speed"
 speed = "-gravity/length*sin(angle) - damping*speed + push"
 

@@ -1,9 +1,110 @@
-"""To come."""
+"""``certbound tune``: every valid tube of a problem, side by side."""
 
 from __future__ import annotations
 
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 import typer
+
+from certbound.cli.describe import describe_parameters
+from certbound.cli.options import (
+    DeltaOption,
+    HorizonOption,
+    JsonOption,
+    ProblemArgument,
+    SetOption,
+    load_problem,
+)
+from certbound.cli.output import SETTINGS, console, print_json, spinner
+
+if TYPE_CHECKING:
+    from certbound.tubes.constants import Constants
+    from certbound.tubes.tube import Tube
+
+__all__ = ["register"]
+
+SAMPLES = 513
 
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
+    app.command("tune", epilog="Example: certbound tune ou --json")(tune)
+
+
+def tune(
+    problem: ProblemArgument,
+    pairs: SetOption = None,
+    horizon: HorizonOption = None,
+    delta: DeltaOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compute the probabilistic tube by every method that applies, and say which is smallest."""
+    subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
+    from certbound.constants.bounds import bound_constants
+
+    with spinner(f"bounding the constants of {subject.name}"):
+        constants = bound_constants(subject)
+    rows = _rows(constants, subject.horizon, subject.delta)
+    valid = [
+        row for row in rows if row["level"] == "trajectory" and not row["method"].endswith("_as_printed")
+    ]
+    best = min(valid, key=lambda row: row["maximum"])["method"]
+    if as_json:
+        print_json({"method": best, "rows": rows})
+    else:
+        _print(best, rows)
+
+
+def _rows(constants: Constants, horizon: float, delta: float) -> list[dict[str, Any]]:
+    from certbound.tubes.tuning import applicable_methods, tune_tube
+
+    rows = []
+    for method in applicable_methods(constants):
+        started = time.perf_counter()
+        with spinner(f"tuning {method}"):
+            tube = tune_tube(constants, horizon=horizon, delta=delta, method=method, thorough=True)
+        rows.append(_row(tube, method, horizon, time.perf_counter() - started, constants.continuous))
+    return rows
+
+
+def _row(tube: Tube, method: str, horizon: float, seconds: float, continuous: bool) -> dict[str, Any]:
+    times = np.linspace(0.0, horizon, SAMPLES) if continuous else np.arange(int(horizon) + 1.0)
+    radii = np.asarray(tube.radius(times))
+    mean = float(np.trapezoid(radii, times) / horizon) if continuous else float(radii[1:].mean())
+    return {
+        "method": method,
+        "level": tube.level,
+        "final": float(radii[-1]),
+        "maximum": float(max(tube.bound(0.0, horizon), radii.max())),
+        "mean": mean,
+        "parameters": describe_parameters(tube),
+        "seconds": seconds,
+    }
+
+
+def _print(best: str, rows: list[dict[str, Any]]) -> None:
+    screen = console()
+    if SETTINGS.quiet:
+        screen.print(best)
+        return
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    table.add_column("method")
+    table.add_column("level")
+    for heading in ("largest", "final", "mean"):
+        table.add_column(heading, justify="right")
+    table.add_column("parameters", overflow="fold")
+    for row in sorted(rows, key=lambda row: row["maximum"]):
+        name = f"[bold]{row['method']}[/]" if row["method"] == best else row["method"]
+        numbers = (f"{row[key]:.4f}" for key in ("maximum", "final", "mean"))
+        parameters = ", ".join(f"{key} {_short(value)}" for key, value in row["parameters"].items())
+        table.add_row(name, row["level"], *numbers, parameters)
+    screen.print(table)
+    screen.print(f"smallest trajectory-level tube: {best}")
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, (int, float)) else str(value)

@@ -1,0 +1,49 @@
+"""Results as plain dictionaries: what --json prints of constants, tubes and verdicts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from certbound.tubes.constants import Constants
+    from certbound.tubes.tube import Tube
+
+__all__ = ["describe_constants", "describe_parameters", "log10_text"]
+
+
+def describe_constants(constants: Constants) -> dict[str, Any]:
+    """``rate`` or ``gain``, ``sigma``, ``effective_dimension``, ``metric``, and what they rest on."""
+    name = "rate" if constants.continuous else "gain"
+    return {
+        name: getattr(constants, name),
+        "sigma": constants.sigma,
+        "effective_dimension": constants.nu,
+        "metric": constants.metric,
+        "isotropic": constants.isotropic,
+        "times": constants.times,
+        "certified": constants.certified,
+        "gap": constants.gap,
+        "domain": None if constants.proof is None else constants.proof.domain,
+    }
+
+
+def describe_parameters(tube: Tube) -> dict[str, Any]:
+    """The free parameters that the tuning settled on."""
+    return {key: np.asarray(value).tolist() for key, value in dict(tube.parameters).items()}
+
+
+def log10_text(log10: float) -> str:
+    """A probability given by its decimal logarithm, also where no float could hold it.
+
+    Examples
+    --------
+    >>> log10_text(-3.0), log10_text(-49718.25), log10_text(0.0)
+    ('1e-3', '5.6e-49719', '1')
+    """
+    if log10 >= 0:
+        return "1"
+    exponent = int(np.floor(log10 + 1e-12))
+    mantissa = f"{10 ** (log10 - exponent):.2g}"
+    return f"1e{exponent + 1}" if mantissa == "10" else f"{mantissa}e{exponent}"
