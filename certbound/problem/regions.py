@@ -1,6 +1,6 @@
 """Sets of states.
 
-A set may live in some of the coordinates only (``coordinates``), and its centre may move: ``center`` is then a
+A set may live in some of the coordinates only (``coordinates``); its centre may move: ``center`` is then a
 tape over ``("t",)``, made from a function of t. What a set says at time t, it says about its shape moved to
 ``center(t)``.
 """
@@ -51,7 +51,8 @@ class Region:
         array = np.asarray(x, dtype=float)
         if self.coordinates is not None:
             if array.ndim == 0 or array.shape[-1] <= max(self.coordinates):
-                raise ValueError(f"`x` must have over {max(self.coordinates)} entries, got shape {array.shape}.")
+                least = max(self.coordinates) + 1
+                raise ValueError(f"`x` must have {least} or more entries, got shape {array.shape}.")
             return np.asarray(array[..., list(self.coordinates)])
         if array.ndim == 0 or array.shape[-1] != self.dimension:
             raise ValueError(f"`x` must end in an axis of {self.dimension}, got shape {array.shape}.")
@@ -374,4 +375,4 @@ def _linear_maximum(faces: Array, bounds: Array, direction: Array) -> float | No
     result = linprog(-direction, A_ub=faces, b_ub=bounds, bounds=(None, None), method="highs")
     if result.status == 2:
         return None
-    return -float(result.fun) if result.status == 0 else np.inf
+    return -float(result.fun or 0.0) if result.status == 0 else np.inf

@@ -1,0 +1,300 @@
+"""A safety problem: a system, where it starts, what it must respect, for how long, and how surely."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.checks import frozen, nearest, number, positive_definite, vector
+from certbound.problem.initial import check_start
+from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, Inside
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
+from certbound.problem.tape import Tape
+from certbound.problem.trace import substitute, trace
+
+__all__ = ["GaussianStart", "Problem"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Does the state satisfy every constraint over the horizon, but for a probability delta?
+
+    Parameters
+    ----------
+    system : ContinuousSystem or DiscreteSystem
+        The model.
+    initial : Box, Ball, Ellipsoid, GaussianStart or array_like of shape (n,)
+        Every start in a set counts (also one chosen by an adversary); a point is stored as a degenerate box.
+    safe : sequence of Inside and Outside
+        Constraints, each over its own window.
+    horizon : float or int
+        Seconds (CT) or steps (DT); positive.
+    delta : float
+        Accepted probability of leaving the safe set, in (0, 1).
+    plan : array_like of shape (K, m), function u(t, x), or Tape, optional
+        Inputs: one row a step (DT; rows beyond the horizon are ignored), constant on K equal pieces of the
+        horizon (CT), or a feedback law. A system with inputs may go without, for synthesis.
+    cost : (Q, R), optional
+        Weights of x' Q x + u' R u: matrices, or vectors of their diagonals.
+    domain : Box, optional
+        Where the model is meant; leaving it is never counted as safe (see ``constraints``).
+    name : str
+        For humans.
+    parameters : mapping, optional
+        Parameters that the problem was built with, for the record.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If sizes disagree, numbers are out of range, or the start violates a constraint that is due at time 0;
+        the message names the argument, the rule and the cure.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from certbound.problem.sets import Box
+    >>> system = ContinuousSystem(lambda x: -x, states=2, diffusion=0.1 * np.eye(2))
+    >>> problem = Problem(system, initial=[0, 0], safe=[Inside(Box([-1, -1], [1, 1]))], horizon=5)
+    >>> problem.safe[0].label
+    '-1 <= x1 <= 1, -1 <= x2 <= 1'
+    """
+
+    system: ContinuousSystem | DiscreteSystem
+    initial: Any = field(kw_only=True)
+    safe: Any = field(kw_only=True)
+    horizon: Any = field(kw_only=True)
+    delta: Any = field(default=1e-3, kw_only=True)
+    plan: Any = field(default=None, kw_only=True)
+    cost: Any = field(default=None, kw_only=True)
+    domain: Any = field(default=None, kw_only=True)
+    name: str = field(default="problem", kw_only=True)
+    parameters: Any = field(default=None, kw_only=True)
+    source: Any = field(default=None, kw_only=True, repr=False)
+    """The content of the problem file it came from, for saving it as written; dropped by ``replace``."""
+    _closed_loop: Tape | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.system, System):
+            raise TypeError(f"`system` must be a ContinuousSystem or DiscreteSystem, got {self.system!r}.")
+        if not isinstance(self.name, str):
+            raise TypeError(f"`name` must be text, got {self.name!r}.")
+        discrete = self.system.time == "discrete"
+        self._set("horizon", _horizon(self.horizon, discrete))
+        self._set("delta", _delta(self.delta))
+        self._set("safe", self._constraints())
+        self._set("domain", self._domain())
+        self._set("initial", _start(self.initial, self.system.dimension))
+        self._set("parameters", MappingProxyType(dict(self.parameters or {})))
+        self._set("plan", self._checked_plan())
+        self._set("cost", self._cost())
+        check_start(self.initial, self.constraints)
+        if self.plan is not None or self.system.inputs is None:
+            self._set("_closed_loop", self._closed())
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    @property
+    def constraints(self) -> tuple[Inside, ...]:
+        """Everything that a safe path respects: ``safe``, and staying in the domain where there is one."""
+        if self.domain is None:
+            return tuple(self.safe)
+        return (*self.safe, Inside(self.domain, label="the model's domain"))
+
+    @property
+    def closed_loop(self) -> Tape:
+        """The dynamics under the plan, shape (n,).
+
+        Over ``("t", *states, *disturbance_names)``; the inputs' names stand before the disturbances' when the
+        plan is an array, which ``input_sequence`` holds.
+
+        Raises
+        ------
+        ValueError
+            If the system has inputs and no plan.
+        """
+        if self._closed_loop is None:
+            names = ", ".join(self.system.input_names)
+            raise ValueError(
+                f"the system has inputs ({names}) and no plan; give `plan=` ([plan] in a problem file), "
+                "or use synthesize."
+            )
+        return self._closed_loop
+
+    @property
+    def input_sequence(self) -> Array | None:
+        """The plan's rows, shape (K, m), where the plan is an array."""
+        return self.plan if isinstance(self.plan, np.ndarray) else None
+
+    @property
+    def fixed_start(self) -> bool:
+        """True when the initial set is a single point."""
+        return isinstance(self.initial, Box) and bool(np.all(self.initial.low == self.initial.high))
+
+    def replace(self, **changes: Any) -> Problem:
+        """The same problem with other values of some arguments; everything is checked again.
+
+        Raises
+        ------
+        TypeError
+            If a name is not an argument of ``Problem``.
+        ValueError
+            If only the horizon of a continuous-time problem with an array plan changes: its pieces would
+            change too.
+        """
+        known = {entry.name for entry in dataclasses.fields(self) if entry.init} - {"source"}
+        for name in changes:
+            if name not in known:
+                raise TypeError(f"`{name}` is no argument of Problem{nearest(name, known)}")
+        stretched = isinstance(self.plan, np.ndarray) and self.system.time == "continuous"
+        if stretched and changes.get("horizon", self.horizon) != self.horizon and "plan" not in changes:
+            raise ValueError(
+                "`horizon` must not change alone when the plan is an array over it; give `plan=` as well."
+            )
+        values = {name: getattr(self, name) for name in known}
+        if "system" in changes and "cost" not in changes and changes["system"].inputs is None:
+            values["cost"] = None
+        return Problem(**(values | changes))
+
+    def _constraints(self) -> tuple[Inside, ...]:
+        safe = [self.safe] if isinstance(self.safe, Inside) else self.safe
+        if not isinstance(safe, Sequence):
+            raise TypeError(f"`safe` must be a list of cb.Inside and cb.Outside, got {safe!r}.")
+        result = []
+        for place, constraint in enumerate(safe):
+            if not isinstance(constraint, Inside):
+                raise TypeError(f"`safe[{place}]` must be cb.Inside or cb.Outside, got {constraint!r}.")
+            _check_dimension(f"safe[{place}]", constraint.region, self.system.dimension)
+            if constraint.during is not None:
+                self._check_window(place, constraint.during)
+            result.append(constraint.named(self.system.states))
+        return tuple(result)
+
+    def _check_window(self, place: int, window: tuple[float, float]) -> None:
+        if window[1] > self.horizon:
+            raise ValueError(
+                f"`safe[{place}]` must have `during` within [0, {self.horizon:g}], got {list(window)}."
+            )
+        if self.system.time == "discrete" and any(end != int(end) for end in window):
+            raise ValueError(f"`safe[{place}]` must have whole steps in `during`, got {list(window)}.")
+
+    def _domain(self) -> Box | None:
+        if self.domain is None:
+            return None
+        if not isinstance(self.domain, Box) or self.domain.moving or self.domain.coordinates is not None:
+            raise TypeError(f"`domain` must be a fixed Box over all states, got {self.domain!r}.")
+        _check_dimension("domain", self.domain, self.system.dimension)
+        return self.domain
+
+    def _checked_plan(self) -> Array | Tape | None:
+        system, plan = self.system, self.plan
+        if plan is None:
+            return None
+        if system.inputs is None:
+            raise ValueError("`plan` must be omitted for a system without inputs; give the system `inputs=`.")
+        count = len(system.input_names)
+        if callable(plan) or isinstance(plan, Tape):
+            tape = plan if isinstance(plan, Tape) else trace(plan, {"t": ["t"], "x": system.states})
+            if tape.inputs != ("t", *system.states) or tape.shape != (count,):
+                raise ValueError(
+                    f"`plan` must return {count} values ({', '.join(system.input_names)}) from t and x, "
+                    f"got shape {tape.shape} over {tape.inputs}."
+                )
+            return tape
+        return self._array_plan(plan, system.inputs, count)
+
+    def _array_plan(self, plan: Any, box: Box, count: int) -> Array:
+        rows = np.asarray(plan, dtype=float)
+        rows = rows[:, None] if rows.ndim == 1 and count == 1 else rows
+        if rows.ndim != 2 or rows.shape[1] != count or not len(rows) or not np.all(np.isfinite(rows)):
+            raise ValueError(f"`plan` must be a finite array (steps, {count}), got shape {rows.shape}.")
+        if self.system.time == "discrete":
+            if len(rows) < self.horizon:
+                raise ValueError(f"`plan` must have {self.horizon} rows, one a step, got {len(rows)}.")
+            rows = rows[: self.horizon]
+        slack = 1e-9 * (1.0 + np.abs(rows))
+        outside = (rows < box.low - slack) | (rows > box.high + slack)
+        if np.any(outside):
+            row, column = (int(k) for k in np.argwhere(outside)[0])
+            name, value = self.system.input_names[column], rows[row, column]
+            raise ValueError(
+                f"`plan` must stay in the input bounds, got {name} = {value:g} in row {row}, outside "
+                f"[{box.low[column]:g}, {box.high[column]:g}]."
+            )
+        return frozen(np.clip(rows, box.low, box.high))
+
+    def _cost(self) -> tuple[Array, Array] | None:
+        if self.cost is None:
+            return None
+        if self.system.inputs is None:
+            raise ValueError("`cost` must be omitted for a system without inputs.")
+        if not isinstance(self.cost, Sequence) or len(self.cost) != 2:
+            raise ValueError(f"`cost` must be the pair (Q, R), got {self.cost!r}.")
+        state = _weight("Q", self.cost[0], self.system.dimension, strict=False)
+        return state, _weight("R", self.cost[1], len(self.system.input_names), strict=True)
+
+    def _closed(self) -> Tape:
+        system = self.system
+        if not isinstance(self.plan, Tape):
+            return system.dynamics
+        inputs = ("t", *system.states, *system.disturbance_names)
+        law = {name: (self.plan, place) for place, name in enumerate(system.input_names)}
+        return substitute(system.dynamics, inputs, law)
+
+
+def _horizon(value: Any, discrete: bool) -> float | int:
+    horizon = number("horizon", value)
+    if horizon <= 0:
+        raise ValueError(f"`horizon` must be positive, got {horizon:g}.")
+    if discrete:
+        if horizon != int(horizon):
+            raise ValueError(f"`horizon` must be a whole number of steps in discrete time, got {horizon:g}.")
+        return int(horizon)
+    return horizon
+
+
+def _delta(value: Any) -> float:
+    delta = number("delta", value)
+    if not 0 < delta < 1:
+        raise ValueError(f"`delta` must lie in (0, 1), got {delta:g}.")
+    return delta
+
+
+def _check_dimension(name: str, region: Any, dimension: int) -> None:
+    if region.coordinates is not None:
+        if max(region.coordinates) >= dimension:
+            raise ValueError(
+                f"`{name}` must use state indices below {dimension}, got coordinates {region.coordinates}."
+            )
+    elif region.dimension != dimension:
+        raise ValueError(f"`{name}` must have dimension {dimension} (the states), got {region.dimension}.")
+
+
+def _start(value: Any, dimension: int) -> Box | Ball | Ellipsoid | GaussianStart:
+    if not isinstance(value, (Box, Ball, Ellipsoid, GaussianStart)):
+        if isinstance(value, (Mapping, str)) or hasattr(value, "halfspaces"):
+            kinds = "point, Box, Ball, Ellipsoid or GaussianStart"
+            raise TypeError(f"`initial` must be a {kinds}, got {value!r}.")
+        point = vector("initial", value, dimension)
+        return Box(point, point)
+    if not isinstance(value, GaussianStart):
+        if value.moving or value.coordinates is not None:
+            raise ValueError("`initial` must be a fixed set over all states, without `coordinates`.")
+        if isinstance(value, Box) and not value.bounded:
+            raise ValueError("`initial` must be bounded, got a box with infinite sides.")
+    if value.dimension != dimension:
+        raise ValueError(f"`initial` must have dimension {dimension} (the states), got {value.dimension}.")
+    return value
+
+
+def _weight(name: str, value: Any, size: int, *, strict: bool) -> Array:
+    matrix = np.diag(vector(name, value, size)) if np.ndim(value) == 1 else value
+    return positive_definite(name, matrix, size, strict=strict)

@@ -1,0 +1,397 @@
+"""Stochastic systems: dynamics traced to a tape, with noise, inputs and disturbances.
+
+CT: dX = f(t, X, u, d) dt + g(t, X) dW in the Ito sense, W a Wiener process. DT: X+ = f(t, X, u, d) + G w,
+with t the number of the step and w drawn anew at every step. The disturbance d is bounded, unknown, and may
+react to the past and the state; it never sees coming noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.problem.checks import frozen, matrix, names, number, vector
+from certbound.problem.io_systems import import_control, is_control_system
+from certbound.problem.noise import Gaussian, Law
+from certbound.problem.sets import Box
+from certbound.problem.tape import Tape
+from certbound.problem.trace import compile_numpy, trace
+
+__all__ = ["ContinuousSystem", "DiscreteSystem", "System", "from_control", "linear_system"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class System:
+    """What continuous and discrete time share.
+
+    Parameters
+    ----------
+    states : tuple of str
+        Names of the states.
+    inputs, disturbance : Box or None
+        Where u and d live.
+    input_names, disturbance_names : tuple of str
+        Their names.
+    dynamics : Tape
+        f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,).
+    """
+
+    states: tuple[str, ...]
+    inputs: Box | None
+    input_names: tuple[str, ...]
+    disturbance: Box | None
+    disturbance_names: tuple[str, ...]
+    dynamics: Tape
+
+    time: ClassVar[str]
+
+    @property
+    def dimension(self) -> int:
+        """Number of states n."""
+        return len(self.states)
+
+    @property
+    def noise_dimension(self) -> int:
+        """Number of noise entries m."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        parts = [f"{type(self).__name__}: states {', '.join(self.states)}"]
+        parts += [f"inputs {', '.join(self.input_names)}"] if self.inputs else []
+        parts += [f"disturbance {', '.join(self.disturbance_names)}"] if self.disturbance else []
+        return "<" + "; ".join(parts) + ">"
+
+    def _common(self, f: Any, states: Any, options: dict[str, Any]) -> None:
+        imported = import_control(f, self.time) if is_control_system(f) else None
+        if imported is not None:
+            f, states = imported.function, imported.states if states is None else states
+            options = imported.options(options)
+        if states is None:
+            raise TypeError("`states` must be given: a number, or the states' names.")
+        self._set("states", _state_names(states))
+        self._set("inputs", _signal_box("inputs", options["inputs"], "u"))
+        self._set("disturbance", _signal_box("disturbance", options["disturbance"], "d"))
+        if self.disturbance is not None and not self.disturbance.bounded:
+            raise ValueError("`disturbance` must be a bounded box, got infinite sides.")
+        input_names = _signal_names("input_names", options["input_names"], self.inputs, "u", self.states)
+        self._set("input_names", input_names)
+        taken = (*self.states, *input_names)
+        given = options["disturbance_names"]
+        disturbance_names = _signal_names("disturbance_names", given, self.disturbance, "d", taken)
+        self._set("disturbance_names", disturbance_names)
+        self._set("dynamics", self._traced(f))
+
+    def _traced(self, f: Any) -> Tape:
+        arguments: dict[str, Sequence[str]] = {"t": ["t"], "x": self.states}
+        arguments |= {"u": self.input_names} if self.inputs is not None else {}
+        arguments |= {"d": self.disturbance_names} if self.disturbance is not None else {}
+        inputs = tuple(name for entries in arguments.values() for name in entries)
+        tape = f if isinstance(f, Tape) else trace(f, arguments)
+        if tape.inputs != inputs:
+            raise ValueError(f"`dynamics` must be a tape over {inputs}, got {tape.inputs}.")
+        if tape.shape not in ((self.dimension,), (self.dimension, 1)):
+            raise ValueError(
+                f"`dynamics` must return {self.dimension} values, one per state ({', '.join(self.states)}), "
+                f"got shape {tape.shape}."
+            )
+        return Tape(inputs=inputs, nodes=tape.nodes, outputs=tape.outputs, shape=(self.dimension,))
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class ContinuousSystem(System):
+    """dX = f(t, X, u, d) dt + g(t, X) dW, in the Ito sense.
+
+    Parameters
+    ----------
+    f : function, Tape, or python-control system
+        Takes any of t, x, u, d by name and returns n values: NumPy-style, traced once.
+    states : int or sequence of str
+        Number of states (named x1, x2, ...) or their names.
+    inputs : Box, optional
+        Bounds of the inputs u (infinite sides allowed); without it the system has none.
+    disturbance : Box, optional
+        Bounded set of the unknown signal d; without it there is none.
+    diffusion : array_like of shape (n, m), or function g(t, x), optional
+        G or g; no noise when omitted. For n = 1 a number will do.
+    input_names, disturbance_names : sequence of str, optional
+        Names; u1, u2, ... and d1, d2, ... when omitted (u and d alone).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If f cannot be traced, sizes disagree, or the diffusion is a scalar where a matrix is meant.
+
+    Examples
+    --------
+    >>> system = ContinuousSystem(lambda x: -np.sin(x), states=["angle"], diffusion=0.1)
+    >>> system.dynamics.inputs, system.diffusion
+    (('t', 'angle'), array([[0.1]]))
+    """
+
+    diffusion: Array | Tape
+
+    time: ClassVar[str] = "continuous"
+
+    def __init__(
+        self,
+        f: Any,
+        *,
+        states: int | Sequence[str] | None = None,
+        inputs: Box | None = None,
+        disturbance: Box | None = None,
+        diffusion: Any = None,
+        input_names: Sequence[str] | None = None,
+        disturbance_names: Sequence[str] | None = None,
+    ) -> None:
+        options = {
+            "inputs": inputs,
+            "disturbance": disturbance,
+            "input_names": input_names,
+            "disturbance_names": disturbance_names,
+        }
+        self._common(f, states, options)
+        self._set("diffusion", _diffusion(diffusion, self.states))
+
+    @property
+    def noise_dimension(self) -> int:
+        return int(self.diffusion.shape[1])
+
+
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class DiscreteSystem(System):
+    """X+ = f(t, X, u, d) + G w, with w drawn anew at every step.
+
+    Parameters
+    ----------
+    f : function, Tape, or python-control system
+        Takes any of t, x, u, d by name and returns the n next values; t is the number of the step.
+    states : int or sequence of str
+        Number of states (named x1, x2, ...) or their names.
+    inputs : Box, optional
+        Bounds of the inputs u (infinite sides allowed); without it the system has none.
+    disturbance : Box, optional
+        Bounded set of the unknown signal d; without it there is none.
+    noise : Gaussian, Uniform, Rademacher, Bounded or SubGaussian, optional
+        Law of w; no noise when omitted.
+    noise_matrix : array_like, shape (n, m), optional
+        G; the identity when omitted.
+    input_names, disturbance_names : sequence of str, optional
+        Names; u1, u2, ... and d1, d2, ... when omitted (u and d alone).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If f cannot be traced, sizes disagree, or the noise is a bare number.
+
+    Examples
+    --------
+    >>> from certbound.problem.noise import Gaussian
+    >>> system = DiscreteSystem(lambda x: 0.5 * x, states=2, noise=Gaussian(std=0.1))
+    >>> system.states, system.noise.proxy.diagonal()
+    (('x1', 'x2'), array([0.01, 0.01]))
+    """
+
+    noise: Law
+    noise_matrix: Array
+
+    time: ClassVar[str] = "discrete"
+
+    def __init__(
+        self,
+        f: Any,
+        *,
+        states: int | Sequence[str] | None = None,
+        inputs: Box | None = None,
+        disturbance: Box | None = None,
+        noise: Law | None = None,
+        noise_matrix: ArrayLike | None = None,
+        input_names: Sequence[str] | None = None,
+        disturbance_names: Sequence[str] | None = None,
+    ) -> None:
+        options = {
+            "inputs": inputs,
+            "disturbance": disturbance,
+            "input_names": input_names,
+            "disturbance_names": disturbance_names,
+        }
+        self._common(f, states, options)
+        law = Gaussian(std=0.0) if noise is None else noise
+        if not isinstance(law, Law):
+            raise TypeError(
+                f"`noise` must be a law, got {noise!r}; a bare number does not say what it is: use "
+                "cb.Gaussian(std=...), cb.Gaussian(variance=...), cb.Gaussian(covariance=...), "
+                "cb.Uniform(halfwidth=...), cb.Rademacher(scale=...), cb.Bounded(halfwidth=...) or "
+                "cb.SubGaussian(proxy_std=...)."
+            )
+        matrix_value = np.eye(self.dimension) if noise_matrix is None else noise_matrix
+        gain = _noise_matrix("noise_matrix", matrix_value, self.states)
+        self._set("noise_matrix", gain)
+        self._set("noise", law.resolve(gain.shape[1]))
+
+    @property
+    def noise_dimension(self) -> int:
+        return int(self.noise_matrix.shape[1])
+
+
+def linear_system(
+    A: ArrayLike,
+    B: ArrayLike | None = None,
+    b: ArrayLike | None = None,
+    *,
+    E: ArrayLike | None = None,
+    time: str | None = None,
+    states: int | Sequence[str] | None = None,
+    inputs: Box | None = None,
+    **options: Any,
+) -> ContinuousSystem | DiscreteSystem:
+    """dX = (A X + B u + E d + b) dt + G dW, or X+ = A X + B u + E d + b + G w.
+
+    Parameters
+    ----------
+    A : array_like, shape (n, n)
+        System matrix.
+    B : array_like, shape (n, k), optional
+        Input matrix; the inputs are unbounded when ``inputs`` is omitted.
+    b : array_like, shape (n,), optional
+        Constant term.
+    E : array_like, shape (n, l), optional
+        Disturbance matrix; needs ``disturbance``.
+    time : "continuous" or "discrete", optional
+        When omitted: discrete if ``noise`` or ``noise_matrix`` is given, continuous otherwise.
+    states, inputs, **options
+        As for ``ContinuousSystem`` and ``DiscreteSystem``.
+
+    Examples
+    --------
+    >>> linear_system([[0, 1], [-1, -1]], diffusion=[[0], [0.5]]).time
+    'continuous'
+    """
+    a = matrix("A", A)
+    a = matrix("A", A, len(a), len(a))
+    n = len(a)
+    gain = None if B is None else matrix("B", B, rows=n)
+    push = None if E is None else matrix("E", E, rows=n)
+    offset = np.zeros(n) if b is None else vector("b", b, n)
+    if (push is None) != (options.get("disturbance") is None):
+        raise ValueError("`E` and `disturbance` must be given together.")
+    if gain is None and inputs is not None:
+        raise ValueError("`inputs` must come with a matrix `B`.")
+    if gain is not None and inputs is None:
+        inputs = Box([-np.inf] * gain.shape[1], [np.inf] * gain.shape[1])
+    for name, mat, box in (("B", gain, inputs), ("E", push, options.get("disturbance"))):
+        if mat is not None and isinstance(box, Box) and box.dimension != mat.shape[1]:
+            raise ValueError(f"`{name}` must have {box.dimension} columns, got {mat.shape[1]}.")
+    if time is None:
+        time = "discrete" if {"noise", "noise_matrix"} & set(options) else "continuous"
+    if time not in ("continuous", "discrete"):
+        raise ValueError(f"`time` must be 'continuous' or 'discrete', got {time!r}.")
+    build = ContinuousSystem if time == "continuous" else DiscreteSystem
+    terms: dict[str, Callable[..., Any]] = {
+        "": lambda x: a @ x + offset,
+        "u": lambda x, u: a @ x + gain @ u + offset,
+        "d": lambda x, d: a @ x + push @ d + offset,
+        "ud": lambda x, u, d: a @ x + gain @ u + push @ d + offset,
+    }
+    f = terms[("" if gain is None else "u") + ("" if push is None else "d")]
+    return build(f, states=n if states is None else states, inputs=inputs, **options)
+
+
+def from_control(system: Any, **options: Any) -> ContinuousSystem | DiscreteSystem:
+    """A python-control ``StateSpace`` or ``NonlinearIOSystem`` (its outputs are not used).
+
+    A system with a sampling time becomes a ``DiscreteSystem``. Names of states and inputs are kept as far as
+    they are identifiers; inputs are unbounded unless ``inputs`` says otherwise.
+
+    Parameters
+    ----------
+    system : control.StateSpace or control.NonlinearIOSystem
+        A state-space model.
+    **options
+        As for ``ContinuousSystem`` and ``DiscreteSystem``.
+    """
+    if not is_control_system(system):
+        raise TypeError(f"`system` must be a python-control system with states, got {system!r}.")
+    build = DiscreteSystem if system.isdtime(strict=True) else ContinuousSystem
+    return build(system, **options)
+
+
+def _state_names(states: Any) -> tuple[str, ...]:
+    if isinstance(states, (int, np.integer)) and not isinstance(states, bool):
+        if states < 1:
+            raise ValueError(f"`states` must be at least 1, got {states}.")
+        return tuple(f"x{k}" for k in range(1, states + 1))
+    if isinstance(states, str) or not isinstance(states, Sequence) or not states:
+        raise TypeError(f"`states` must be a number or a list of names, got {states!r}.")
+    return names("states", states)
+
+
+def _signal_box(name: str, value: Any, symbol: str) -> Box | None:
+    if value is None or (isinstance(value, Box) and value.coordinates is None and not value.moving):
+        return value
+    raise TypeError(f"`{name}` must be a Box that bounds {symbol}, got {value!r}; use cb.Box(low, high).")
+
+
+def _signal_names(
+    name: str, given: Sequence[str] | None, box: Box | None, symbol: str, taken: Sequence[str]
+) -> tuple[str, ...]:
+    if box is None:
+        if given:
+            raise ValueError(f"`{name}` must come with bounds, got {list(given)} alone.")
+        return ()
+    if given is not None:
+        if len(given) != box.dimension:
+            raise ValueError(f"`{name}` must hold {box.dimension} names, got {list(given)}.")
+        return names(name, given, taken)
+    while any(entry.startswith(symbol) for entry in taken):
+        symbol = f"{symbol}_"
+    count = box.dimension
+    return (symbol,) if count == 1 else tuple(f"{symbol}{k}" for k in range(1, count + 1))
+
+
+def _noise_matrix(name: str, value: Any, states: Sequence[str]) -> Array:
+    n = len(states)
+    array = np.asarray(value, dtype=float) if not isinstance(value, (int, float)) else np.array(float(value))
+    if array.ndim < 2 and n == 1:
+        array = array.reshape(1, -1)
+    if array.ndim == 0:
+        raise ValueError(
+            f"`{name}` must be a matrix with {n} rows (one per state), got the scalar "
+            f"{number(name, value):g}; write {float(value):g} * np.eye({n}) for independent noise."
+        )
+    if array.ndim == 1:
+        raise ValueError(
+            f"`{name}` must be a matrix with {n} rows (one per state), got a vector; write np.diag([...]) "
+            "for independent noise on every state, or a column [[...], [...]] for one common noise."
+        )
+    return matrix(name, array, rows=n)
+
+
+def _diffusion(value: Any, states: Sequence[str]) -> Array | Tape:
+    n = len(states)
+    if value is None:
+        return frozen(np.zeros((n, 1)))
+    if not callable(value) and not isinstance(value, Tape):
+        return _noise_matrix("diffusion", value, states)
+    tape = value if isinstance(value, Tape) else trace(value, {"t": ["t"], "x": states})
+    if tape.inputs != ("t", *states):
+        raise ValueError(f"`diffusion` must be a tape over {('t', *states)}, got {tape.inputs}.")
+    shape = tape.shape if len(tape.shape) == 2 else (1, *tape.shape)
+    if len(tape.shape) == 1 and n > 1:
+        raise ValueError(
+            f"`diffusion` must return a matrix with {n} rows (one per state), got shape {tape.shape}; write "
+            "np.diag([...]) for independent noise on every state, or a column [[...], [...]]."
+        )
+    if shape[0] != n:
+        raise ValueError(f"`diffusion` must return {n} rows (one per state), got shape {shape}.")
+    if all(node.op != "input" for node in tape.nodes):
+        return frozen(compile_numpy(tape)(*np.zeros(n + 1)).reshape(shape))
+    return Tape(inputs=tape.inputs, nodes=tape.nodes, outputs=tape.outputs, shape=shape)
