@@ -1,12 +1,13 @@
 """Taylor coefficients of a traced function along a curve, in interval arithmetic.
 
-A series [x_0, x_1, ..., x_m] stands for x(s) = x_0 + x_1 s + x_2 s^2 + ...; coefficients left out are 0. Evaluated
-at one point of time the coefficients are thin; evaluated with coefficients that hold at every time of a piece they
-enclose x^(j)(s)/j! over the piece, which is what Lagrange's remainder asks for (`taylor_bounds`).
+A series [x_0, x_1, ..., x_m] stands for x(s) = x_0 + x_1 s + x_2 s^2 + ...; coefficients left out are 0.
+Evaluated at one point of time the coefficients are thin; evaluated with coefficients that hold at every
+time of a piece they enclose x^(j)(s)/j! over the piece, which is what Lagrange's remainder asks for
+(`taylor_bounds`).
 
-The recurrences are those of automatic differentiation: y = F(x) satisfies a linear relation between y' and x'.
-Where a kink (abs, min, max) is undecided the first coefficient is that of the generalised derivative and all later
-ones are unbounded; where a jump is undecided everything is unbounded.
+The recurrences are those of automatic differentiation: y = F(x) satisfies a linear relation between y' and
+x'. Where a kink (abs, min, max) is undecided the first coefficient is that of the generalised derivative
+and all later ones are unbounded; where a jump is undecided everything is unbounded.
 """
 
 from __future__ import annotations
@@ -170,9 +171,7 @@ def series_arithmetic(order: int) -> dict[str, Callable[..., Any]]:
         """y with y_0 = first and weight y' = numerator."""
         result = [first]
         for k in range(1, order + 1):
-            terms = [
-                result[j] * weight[k - j] * float(j) for j in range(max(1, k - len(weight) + 1), k)
-            ]
+            terms = [result[j] * weight[k - j] * float(j) for j in range(max(1, k - len(weight) + 1), k)]
             head = numerator[k - 1] if k - 1 < len(numerator) else ZERO
             result.append((head - _sum(terms)) / (weight[0] * float(k)))
         return result
@@ -299,6 +298,13 @@ def series_arithmetic(order: int) -> dict[str, Callable[..., Any]]:
 
         return function
 
+    def kink(x: Series) -> Series:
+        value = base["kink"](x[0])
+        decided = value.lo == value.hi
+        if np.all(decided):
+            return [value]
+        return [value, *[_where(decided, ZERO, _unbounded(value.shape))] * order]
+
     def if_else_zero(condition: Series, x: Series) -> Series:
         flag = condition[0]
         result = []
@@ -348,6 +354,7 @@ def series_arithmetic(order: int) -> dict[str, Callable[..., Any]]:
     for name in ("sign", "floor", "not", "lt", "le", "eq", "ne", "and", "or"):
         table[name] = jump(name)
     table["if_else_zero"] = if_else_zero
+    table["kink"] = kink
     table["pow"] = power
     table["const"] = lambda value: [Interval.point(value)]
     return table
