@@ -1,0 +1,214 @@
+"""Running blocks on threads, processes or a cluster, with progress and a checkpoint."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from certbound.errors import SolverError
+from certbound.simulation.blocks import BLOCK, Tally, Work, run_blocks
+from certbound.simulation.checkpoint import Checkpoint
+
+__all__ = ["Outcome", "Progress", "connect", "run_work"]
+
+logger = logging.getLogger(__name__)
+
+_STEPS_PER_CHUNK = 4e7  # about a quarter of a second
+_FEWEST_CHUNKS = 64
+_SAVE_EVERY = 2.0  # seconds between two checkpoints
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Progress:
+    """Where a run stands.
+
+    Parameters
+    ----------
+    paths, total : int
+        Paths done, and asked for.
+    rate : float
+        Path-steps per second, of this run.
+    remaining : float
+        Estimated seconds left.
+    """
+
+    paths: int
+    total: int
+    rate: float
+    remaining: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Outcome:
+    """A finished run: what was counted, in how many seconds (compilation aside), at how many path-steps each."""
+
+    tally: Tally
+    seconds: float
+    rate: float
+
+
+def run_work(
+    work: Work,
+    executor: Any = None,
+    checkpoint: str | Path | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Outcome:
+    """Run all blocks of a piece of work.
+
+    Parameters
+    ----------
+    work : Work
+    executor : concurrent.futures.Executor or dask Client, optional
+        Threads of this process when omitted. The answer is the same on any.
+    checkpoint : path, optional
+        File that keeps finished chunks; an existing one is continued.
+    progress : callable, optional
+        Called with a `Progress` after each chunk.
+
+    Raises
+    ------
+    SolverError
+        If the executor breaks down; finished chunks are in the checkpoint.
+    """
+    work.compile()
+    chunk = _chunk(work)
+    record = (
+        Checkpoint.open(checkpoint, work, chunk) if checkpoint is not None else Checkpoint.fresh(work, chunk)
+    )
+    begin = time.perf_counter()
+    steps_before, saved = record.tally.steps, begin
+    todo = record.missing()
+    with _pool(executor) as (pool, width):
+        try:
+            for number, tally in _completed(pool, width, work, chunk, todo):
+                record.add(number, tally)
+                now = time.perf_counter()
+                if progress is not None:
+                    progress(_progress(record, work, now - begin, steps_before))
+                if now - saved > _SAVE_EVERY:
+                    record.save()
+                    saved = now
+        except (BrokenExecutor, CancelledError, OSError, TimeoutError) as error:
+            raise SolverError(
+                f"the executor broke down after {record.tally.paths} of {work.paths} paths "
+                f"({type(error).__name__}: {error}); "
+                + (
+                    f"run again with the checkpoint {checkpoint} to go on."
+                    if checkpoint
+                    else "give `checkpoint=` to keep what is finished."
+                )
+            ) from error
+        finally:
+            record.save()
+    seconds = time.perf_counter() - begin
+    return Outcome(
+        tally=record.tally, seconds=seconds, rate=(record.tally.steps - steps_before) / max(seconds, 1e-9)
+    )
+
+
+def _chunk(work: Work) -> int:
+    """Blocks per chunk: it depends on the work alone, so that any executor can go on with a checkpoint."""
+    by_time = int(_STEPS_PER_CHUNK // (BLOCK * work.steps))
+    return max(1, min(by_time, work.blocks // _FEWEST_CHUNKS))
+
+
+def _progress(record: Checkpoint, work: Work, seconds: float, steps_before: int) -> Progress:
+    done = record.tally.paths
+    fresh = max(done - record.paths_before, 1)
+    return Progress(
+        paths=done,
+        total=work.paths,
+        rate=(record.tally.steps - steps_before) / max(seconds, 1e-9),
+        remaining=seconds / fresh * (work.paths - done),
+    )
+
+
+def _completed(
+    pool: Executor, width: int, work: Work, chunk: int, todo: list[int]
+) -> Iterator[tuple[int, Tally]]:
+    """Chunks as they finish, with a bounded number in flight."""
+    waiting: dict[Future[Tally], int] = {}
+    queue = iter(todo)
+    try:
+        while True:
+            for number in queue:
+                waiting[_submit(pool, work, number, chunk)] = number
+                if len(waiting) >= 2 * width + 1:
+                    break
+            if not waiting:
+                return
+            finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
+            for future in finished:
+                number = waiting.pop(future)
+                yield number, future.result()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def _submit(pool: Executor, work: Work, number: int, chunk: int) -> Future[Tally]:
+    return pool.submit(run_blocks, work, number * chunk, min((number + 1) * chunk, work.blocks))
+
+
+@contextmanager
+def _pool(executor: Any) -> Iterator[tuple[Executor, int]]:
+    """The executor to use and how many chunks it runs at a time."""
+    if executor is None:
+        width = _cores()
+        pool = ThreadPoolExecutor(width, thread_name_prefix="certbound")
+        try:
+            yield pool, width
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+    elif hasattr(executor, "get_executor"):  # a dask Client
+        with executor.get_executor(pure=False, retries=10) as pool:
+            yield pool, sum(executor.ncores().values()) or 1
+    elif hasattr(executor, "submit"):
+        yield executor, int(getattr(executor, "_max_workers", 8))
+    else:
+        raise TypeError(
+            f"`executor` must be a concurrent.futures.Executor or a dask Client, got {type(executor).__name__}."
+        )
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def connect(address: str, timeout: float = 10.0) -> Any:
+    """A dask Client for a scheduler's address, such as ``tcp://host:8786``.
+
+    Raises
+    ------
+    ValueError
+        If dask is not installed, or no scheduler answers there.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ValueError(
+            "a cluster needs dask; install it with: pip install 'certbound[cluster]'."
+        ) from error
+    try:
+        return Client(address, timeout=timeout)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ValueError(
+            f"`cluster` must be the address of a running dask scheduler, got {address!r} ({error})."
+        ) from error

@@ -1,0 +1,72 @@
+"""The exact transition of a linear stochastic system over one step."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["exact_transition"]
+
+Array = NDArray[np.float64]
+
+
+def exact_transition(
+    matrix: Array, offset: Array, diffusion: Array, step: float
+) -> tuple[Array, Array, Array]:
+    """The law of x(h) for dx = (A x + B v + b) dt + G dW with v constant: N(F x + E v + e, L L').
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (n, n + k)
+        [A, B].
+    offset : ndarray, shape (n,)
+        b.
+    diffusion : ndarray, shape (n, m)
+        G.
+    step : float
+        h in seconds.
+
+    Returns
+    -------
+    tuple of ndarray
+        [F, E] of shape (n, n + k), e of shape (n,), and L of shape (n, r) with r the rank of the covariance.
+
+    Notes
+    -----
+    The covariance is Van Loan's block exponential (1978) over h/2^j with ‖A‖ h/2^j <= 1/2, doubled j times by
+    S(2h) = S(h) + F(h) S(h) F(h)'.
+
+    Examples
+    --------
+    >>> move, shift, factor = exact_transition(np.array([[-1.0]]), np.array([1.0]), np.array([[1.0]]), 0.5)
+    >>> bool(np.isclose(move[0, 0], np.exp(-0.5))), bool(np.isclose(factor[0, 0] ** 2, (1 - np.exp(-1)) / 2))
+    (True, True)
+    """
+    from scipy.linalg import expm
+
+    n, width = matrix.shape
+    block = np.zeros((width + 1, width + 1))
+    block[:n, :width], block[:n, width] = matrix, offset
+    move = expm(block * step)[:n]
+    halvings = max(int(np.ceil(np.log2(max(np.linalg.norm(matrix[:, :n], 2) * step, 1e-300)))) + 1, 0)
+    short = step / 2**halvings
+    pair = np.block([[-matrix[:, :n], diffusion @ diffusion.T], [np.zeros((n, n)), matrix[:, :n].T]])
+    exponential = expm(pair * short)
+    flow = exponential[n:, n:].T
+    covariance = flow @ exponential[:n, n:]
+    for _ in range(halvings):
+        covariance = covariance + flow @ covariance @ flow.T
+        flow = flow @ flow
+    return move[:, :width], move[:, width], _factor((covariance + covariance.T) / 2)
+
+
+def _factor(covariance: Array) -> Array:
+    """L with L L' = covariance: Cholesky's, or one without the directions that get no noise."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
+    correlation = covariance * np.outer(inverse, inverse)
+    values, vectors = np.linalg.eigh(correlation)
+    if values[0] > 1e-10:
+        return np.asarray(scale[:, None] * np.linalg.cholesky(correlation))
+    kept = values > 1e-12
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))

@@ -1,0 +1,281 @@
+"""One step of a problem's system, as numbers and tapes: what a kernel is written from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.problem.noise import Gaussian, Uniform
+from certbound.problem.tape import Node, Tape
+from certbound.problem.trace import compile_numpy, jacobian, trace
+from certbound.simulation.expressions import live_nodes
+from certbound.simulation.linear import exact_transition
+
+__all__ = ["Scenario", "StepModel", "step_model"]
+
+Array = NDArray[np.float64]
+
+_LARGEST_EXACT = 16
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scenario:
+    """How paths are drawn: what the problem leaves open.
+
+    Parameters
+    ----------
+    scheme : {"auto", "exact", "milstein", "euler"}
+        Continuous time only. ``auto`` takes the exact transition of a linear system of up to 16 states,
+        Milstein's scheme where the diffusion is diagonal and entry i depends on state i alone, and
+        Euler-Maruyama otherwise.
+    bridge : bool
+        Continuous time only: look for exits between two steps with a Brownian bridge.
+    initial : array_like, shape (n,), optional
+        One start for all paths; otherwise X_0 is uniform in the problem's initial set (or drawn from its
+        law).
+    disturbance : {"constant", "switching"}, array_like or callable
+        ``constant``: each path draws one value, uniform in the box. ``switching``: jumps between vertices of
+        the box at random times (ten times per horizon on average). An array of shape (q,) or (pieces, q): the
+        same signal for all paths, constant on equal pieces of the horizon. A function d(t, x) reacts to the
+        state of the path (and is cut off at the box).
+
+    Examples
+    --------
+    >>> Scenario(scheme="euler", disturbance=[0.1]).bridge
+    True
+    """
+
+    scheme: Literal["auto", "exact", "milstein", "euler"] = "auto"
+    bridge: bool = True
+    initial: ArrayLike | None = None
+    disturbance: str | ArrayLike | Callable[..., Any] = "constant"
+
+    def __post_init__(self) -> None:
+        if self.scheme not in ("auto", "exact", "milstein", "euler"):
+            raise ValueError(f"`scheme` must be auto, exact, milstein or euler, got {self.scheme!r}.")
+        if isinstance(self.disturbance, str) and self.disturbance not in ("constant", "switching"):
+            raise ValueError(
+                f"`disturbance` must be 'constant', 'switching', an array or a function d(t, x), "
+                f"got {self.disturbance!r}."
+            )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StepModel:
+    """One step of a system, as numbers and tapes.
+
+    Parameters
+    ----------
+    drift : Tape
+        Inputs (t, states, inputs, disturbances). With ``step`` > 0 the state moves by ``step`` times it;
+        otherwise it is the next state.
+    dimension, input_count, disturbance_count : int
+        n, and the numbers of inputs and disturbances among the tape's inputs.
+    step : float
+        Step h of Euler's scheme in seconds; 0 when ``drift`` gives the next state.
+    interval : float
+        Time between two states (h, or 1 in discrete time).
+    variate : str
+        Law of the m independent unit variates z: ``normal``, ``uniform`` on (-1, 1), ``sign``.
+    noise : ndarray, shape (n, m), or Tape
+        What multiplies z. A tape (inputs t, states; shape (n, m)) is multiplied by sqrt(step) too.
+    correction : Tape, optional
+        Diagonal of d g_ii/d x_i, for Milstein's scheme.
+    spread : ndarray, shape (n, m), optional
+        g sqrt(h) of the bridge between two steps; None in discrete time, and where ``noise`` is a tape.
+    bridge : bool
+        Whether exits between steps are looked for.
+    signal : Tape, optional
+        Disturbance as a function of (t, states).
+    low, high : ndarray, shape (disturbance_count,)
+        The disturbance's box.
+    switching : float
+        Mean number of steps between two jumps of a switching disturbance; 0: constant.
+    table : ndarray, shape (steps, input_count + disturbances given as an array)
+        Inputs that all paths share, one row a step.
+    scheme : str
+        What was chosen: ``exact``, ``milstein``, ``euler`` or ``discrete``.
+    """
+
+    drift: Tape
+    dimension: int
+    input_count: int = 0
+    disturbance_count: int = 0
+    step: float = 0.0
+    interval: float = 1.0
+    variate: Literal["normal", "uniform", "sign"] = "normal"
+    noise: Array | Tape
+    correction: Tape | None = None
+    spread: Array | None = None
+    bridge: bool = False
+    signal: Tape | None = None
+    low: Array = field(default_factory=lambda: np.zeros(0))
+    high: Array = field(default_factory=lambda: np.zeros(0))
+    switching: float = 0.0
+    table: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    scheme: str = "discrete"
+
+    @property
+    def noise_count(self) -> int:
+        """Number m of variates that a step needs."""
+        return int(self.noise.shape[1])
+
+    @property
+    def own_disturbance(self) -> bool:
+        """Whether the disturbance differs from path to path."""
+        return self.disturbance_count > 0
+
+
+def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
+    """The step of a problem on a grid of ``steps`` equal pieces of its horizon (discrete time: of its steps).
+
+    Raises
+    ------
+    ValueError
+        If the noise has no law, or the scheme does not fit the system.
+    """
+    system = problem.system
+    tape: Tape = problem.closed_loop
+    sequence = problem.input_sequence
+    inputs = 0 if sequence is None else sequence.shape[1]
+    disturbances = len(tape.inputs) - 1 - system.dimension - inputs
+    rows = [] if sequence is None else [_table(sequence, steps)]
+    fields: dict[str, Any] = {"dimension": system.dimension}
+    fields |= _disturbance(system, disturbances, steps, scenario)
+    if "row" in fields:
+        rows.append(_table(fields.pop("row"), steps))
+        inputs, disturbances = inputs + disturbances, 0
+    fields |= {"input_count": inputs, "disturbance_count": disturbances}
+    fields["table"] = np.hstack(rows) if rows else np.zeros((0, 0))
+    if system.time == "discrete":
+        variate, factor = _unit_variates(system.noise)
+        noise = np.asarray(system.noise_matrix) @ factor
+        return StepModel(drift=tape, variate=variate, noise=noise, **fields)
+    step = float(problem.horizon) / steps
+    return _continuous(tape, system.diffusion, step, scenario, fields)
+
+
+def _table(rows: Array, steps: int) -> Array:
+    """Rows of equal duration, spread over the steps."""
+    pieces = len(rows)
+    return np.asarray(rows, dtype=float)[(np.arange(steps) * pieces) // steps]
+
+
+def _unit_variates(law: Any) -> tuple[Literal["normal", "uniform", "sign"], Array]:
+    if isinstance(law, Gaussian):
+        return "normal", law.factor
+    law.sample(np.random.default_rng(0), 1)  # refuses noise without a law
+    return ("uniform" if isinstance(law, Uniform) else "sign"), np.diag(law.bound)
+
+
+def _disturbance(system: Any, count: int, steps: int, scenario: Scenario) -> dict[str, Any]:
+    choice = scenario.disturbance
+    if count == 0:
+        if not isinstance(choice, str):
+            raise ValueError("`disturbance` must be left out: this system has none.")
+        return {}
+    box = system.disturbance
+    fields: dict[str, Any] = {"low": np.asarray(box.low), "high": np.asarray(box.high)}
+    if isinstance(choice, str):
+        return fields | {"switching": steps / 10.0 if choice == "switching" else 0.0}
+    if callable(choice):
+        signal = trace(choice, {"t": ["t"], "x": list(system.states)})
+        if signal.shape != (count,):
+            raise ValueError(f"`disturbance` must return {count} values, got shape {signal.shape}.")
+        return fields | {"signal": signal}
+    rows = np.atleast_2d(np.asarray(choice, dtype=float))
+    if rows.ndim != 2 or rows.shape[1] != count or not np.all(np.isfinite(rows)):
+        raise ValueError(f"`disturbance` must hold {count} finite values a row, got shape {rows.shape}.")
+    if not np.all((box.low <= rows) & (rows <= box.high)):
+        raise ValueError("`disturbance` must lie in the system's disturbance box; clip it.")
+    return {"row": rows}
+
+
+def _continuous(
+    tape: Tape, diffusion: Array | Tape, step: float, scenario: Scenario, fields: dict[str, Any]
+) -> StepModel:
+    n = fields["dimension"]
+    fields |= {"interval": step, "bridge": scenario.bridge}
+    wanted = scenario.scheme
+    if isinstance(diffusion, Tape):
+        correction = _milstein(diffusion, n) if wanted in ("auto", "milstein") else None
+        if wanted == "exact" or (wanted == "milstein" and correction is None):
+            raise ValueError(
+                f"`scheme` {wanted!r} does not fit this diffusion, which depends on the state"
+                + ("" if wanted == "exact" else " in another way than entry i on state i alone")
+                + "; use 'auto'."
+            )
+        name = "euler" if correction is None else "milstein"
+        return StepModel(drift=tape, step=step, noise=diffusion, correction=correction, scheme=name, **fields)
+    spread = np.asarray(diffusion) * np.sqrt(step)
+    linear = _affine(tape, n) if wanted in ("auto", "exact") else None
+    if linear is not None and (n <= _LARGEST_EXACT or wanted == "exact"):
+        transition, offset, factor = exact_transition(*linear, np.asarray(diffusion), step)
+        drift = _affine_tape(tape.inputs, np.hstack([np.zeros((n, 1)), transition]), offset)
+        return StepModel(drift=drift, noise=factor, spread=spread, scheme="exact", **fields)
+    if wanted in ("exact", "milstein"):
+        need = (
+            "a linear system with constant coefficients"
+            if wanted == "exact"
+            else "a state-dependent diffusion"
+        )
+        raise ValueError(f"`scheme` {wanted!r} needs {need}; use 'auto'.")
+    return StepModel(drift=tape, step=step, noise=spread, spread=spread, scheme="euler", **fields)
+
+
+def _constant(tape: Tape) -> bool:
+    return not any(tape.nodes[index].op == "input" for index in live_nodes(tape))
+
+
+def _affine(tape: Tape, n: int) -> tuple[Array, Array] | None:
+    """(matrix of all inputs but t, offset) of an affine map with constant coefficients, else None."""
+    if any(tape.nodes[index] == Node("input", (0,)) for index in live_nodes(tape)):
+        return None
+    derivative = jacobian(tape, tuple(range(1, len(tape.inputs))))
+    if not _constant(derivative):
+        return None
+    zeros = [0.0] * len(tape.inputs)
+    return compile_numpy(derivative)(*zeros), compile_numpy(tape)(*zeros)
+
+
+def _affine_tape(inputs: tuple[str, ...], matrix: Array, offset: Array) -> Tape:
+    """Tape of offset + matrix (x, u, d), with zero entries left out."""
+    nodes = [Node("input", (slot,)) for slot in range(len(inputs))]
+    outputs = []
+    for row, start in zip(matrix, offset):
+        total = -1
+        if start != 0.0 or not np.any(row):
+            nodes.append(Node("const", (), float(start)))
+            total = len(nodes) - 1
+        for slot in np.flatnonzero(row):
+            nodes.append(Node("const", (), float(row[slot])))
+            nodes.append(Node("mul", (len(nodes) - 1, int(slot))))
+            if total >= 0:
+                nodes.append(Node("add", (total, len(nodes) - 1)))
+            total = len(nodes) - 1
+        outputs.append(total)
+    return Tape(inputs=inputs, nodes=tuple(nodes), outputs=tuple(outputs), shape=(len(outputs),))
+
+
+def _milstein(diffusion: Tape, n: int) -> Tape | None:
+    """The derivatives d g_ii/d x_i if g is diagonal and g_ii depends on t and x_i alone, else None."""
+    if diffusion.shape != (n, n):
+        return None
+    derivative = jacobian(diffusion, tuple(range(1, n + 1)))
+    zero = [
+        derivative.nodes[o].op == "const" and derivative.nodes[o].value == 0.0 for o in derivative.outputs
+    ]
+    entry = np.array(zero).reshape(n, n, n)
+    for i in range(n):
+        for j in range(n):
+            node = diffusion.nodes[diffusion.outputs[i * n + j]]
+            if i != j and not (node.op == "const" and node.value == 0.0):
+                return None
+        if not all(entry[i, i, k] for k in range(n) if k != i):
+            return None
+    outputs = tuple(derivative.outputs[(i * n + i) * n + i] for i in range(n))
+    return Tape(inputs=derivative.inputs, nodes=derivative.nodes, outputs=outputs, shape=(n,))

@@ -1,0 +1,195 @@
+"""What a kernel counts: source lines that watch a path.
+
+Every function returns four lists of lines: before the first step, within a step (old state x_i, new state
+y_i), at the end of a step, and after the last one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.simulation.barriers import EXPONENT, Barrier, Bridge, barrier_source
+from certbound.simulation.expressions import Parameters, linear_form
+
+__all__ = ["LOWEST", "Lines", "Task", "task_source"]
+
+Array = NDArray[np.float64]
+Lines = tuple[list[str], list[str], list[str], list[str]]
+
+LOWEST = -40
+"""Deviations below 2**LOWEST fall into the histograms' first bin."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Task:
+    """What a kernel does with the paths.
+
+    Parameters
+    ----------
+    kind : str
+        ``exits`` (stop at the first exit, count it by constraint and time), ``deviation`` (histograms of the
+        largest distance to the associated noise-free path) or ``record`` (store states).
+    barriers : sequence of Barrier
+        Constraints of an ``exits`` task.
+    norm : ndarray, shape (rows, n), optional
+        The deviation s is measured by ‖norm s‖ ...
+    directions : ndarray, shape (rows, n), optional
+        ... or by the value of each directions . s (with one histogram each).
+    own_nominal : bool
+        Whether each path has a noise-free path of its own (which shares its start and disturbance); otherwise
+        all share one. In a ``record`` task: whether to store the deviation instead of the state.
+    smallest_scale : float
+        Smallest value of the profile that deviations are divided by; 0: no profile.
+    densities : tuple of float
+        Bins per factor of two of the histograms of suprema, and of those at the marked times.
+    """
+
+    kind: Literal["exits", "deviation", "record"]
+    barriers: Sequence[Barrier] = ()
+    norm: Array | None = None
+    directions: Array | None = None
+    own_nominal: bool = True
+    smallest_scale: float = 0.0
+    densities: tuple[float, float] = (1.0, 1.0)
+
+
+def task_source(
+    task: Task, dimension: int, bridge: Bridge | None, nominal_step: list[str], p: Parameters
+) -> Lines:
+    """Lines of a task; ``nominal_step`` advances the noise-free path from a_i to b_i."""
+    if task.kind == "exits":
+        return _exits(task, bridge, p)
+    states = range(dimension)
+    begin, within, end = [], [], []
+    if task.own_nominal:
+        begin, within, end = (
+            [f"a_{i} = x_{i}" for i in states],
+            nominal_step,
+            [f"a_{i} = b_{i}" for i in states],
+        )
+    elif task.kind == "deviation":
+        within = [f"b_{i} = nominal[k + 1, {i}]" for i in states]
+    watch = _record if task.kind == "record" else _deviation
+    lines = watch(task, dimension, bridge, p)
+    return begin + lines[0], within + lines[1], end + lines[2], lines[3]
+
+
+def _exits(task: Task, bridge: Bridge | None, p: Parameters) -> Lines:
+    begin, within, end = ["left = -1"], [], []
+    column = 0
+    for number, barrier in enumerate(task.barriers):
+        before, during, after = barrier_source(number, barrier, bridge, p, column)
+        begin, within, end = begin + before, within + during, end + after
+        column += len(barrier.matrix) if barrier.moving else 0
+    begin += ["if left >= 0:", "    counts[left, 0] += 1", "    continue"]
+    within += ["if left >= 0:", "    counts[left, 1 + k * (counts.shape[1] - 1) // steps] += 1", "    break"]
+    return begin, within, end, []
+
+
+def _record(task: Task, dimension: int, bridge: Bridge | None, p: Parameters) -> Lines:
+    def store(place: str, value: str) -> list[str]:
+        return [f"    out[path, {place}, {i}] = {value.format(i)}" for i in range(dimension)]
+
+    begin = [
+        "mark = 0",
+        "if marks[0] == 0:",
+        *store("0", "0.0" if task.own_nominal else "x_{0}"),
+        "    mark = 1",
+    ]
+    value = "y_{0} - b_{0}" if task.own_nominal else "y_{0}"
+    within = ["if mark < marks.shape[0] and marks[mark] == k + 1:", *store("mark", value), "    mark += 1"]
+    return begin, within, [], []
+
+
+def _deviation(task: Task, dimension: int, bridge: Bridge | None, p: Parameters) -> Lines:
+    within = [f"s_{i} = y_{i} - b_{i}" for i in range(dimension)]
+    if task.smallest_scale > 0.0:
+        within += ["scale = profile[k + 1]", *[f"s_{i} = s_{i} / scale" for i in range(dimension)]]
+    if task.norm is not None:
+        value, count = "math.sqrt(new_{0})", 1
+        within += _norm_supremum(task, task.norm, dimension, bridge, p)
+    else:
+        rows = task.directions if task.directions is not None else np.eye(dimension)
+        value, count = "new_{0}", len(rows)
+        within += _direction_suprema(task, rows, dimension, bridge, p)
+    lowest = "0.0" if task.norm is not None else "-math.inf"
+    begin = [f"old_{j} = top_{j} = 0.0" for j in range(count)] + [
+        f"limit_{j} = {lowest}" for j in range(count)
+    ]
+    end = [f"old_{j} = new_{j}" for j in range(count)]
+    sup, marginal = (p.add(density) for density in task.densities)
+    if task.norm is not None and bridge is None:
+        finish = ["top_0 = math.sqrt(limit_0)"]
+        top = "math.sqrt(limit_{0})"
+    else:
+        finish, top = [], "top_{0}"
+    within += ["if mark < marks.shape[0] and marks[mark] == k + 1:"]
+    for j in range(count):
+        for kind, text in enumerate((value, top)):
+            bin_of = f"bin_of({text.format(j)}, {marginal}, marginals.shape[3])"
+            within += [f"    marginals[{kind}, mark, {j}, {bin_of}] += 1"]
+    within += ["    mark += 1"]
+    finish += [f"counts[{j}, bin_of(top_{j}, {sup}, counts.shape[1])] += 1" for j in range(count)]
+    return ["mark = 0", *begin], within, end, finish
+
+
+def _norm_supremum(task: Task, norm: Array, n: int, bridge: Bridge | None, p: Parameters) -> list[str]:
+    """The largest ‖norm s‖: squares are compared, and roots and bridges evaluated near the record only."""
+    legs = [f"e_{i}" for i in range(len(norm))]
+    deviation = [f"s_{i}" for i in range(n)]
+    lines = [f"{leg} = {linear_form(row.tolist(), deviation, p)}" for leg, row in zip(legs, norm)]
+    lines += [f"new_0 = {' + '.join(f'{leg} * {leg}' for leg in legs)}"]
+    if bridge is None:
+        return [*lines, "if new_0 > limit_0:", "    limit_0 = new_0"]
+    near = ["after = math.sqrt(new_0)", "top_0 = max(top_0, after)"]
+    near += [f"w_{i} = {linear_form(norm[:, i].tolist(), legs, p)}" for i in range(n)]
+    variance = bridge.moving_variance([f"w_{i}" for i in range(n)], p)
+    shrink = " / (scale * scale)" if task.smallest_scale > 0.0 else ""
+    near += [f"spread = ({variance}) / new_0{shrink} if new_0 > 0.0 else 0.0"]
+    near += _bridge_top("0", "math.sqrt(old_0)", "spread")
+    if bridge.spread is not None:
+        band = _band(norm @ bridge.spread, task)
+        near += [f"limit_0 = max(top_0 - {p.add(band)}, 0.0) ** 2"]
+    return [*lines, "if new_0 > limit_0 or old_0 > limit_0:", *[f"    {line}" for line in near]]
+
+
+def _direction_suprema(task: Task, rows: Array, n: int, bridge: Bridge | None, p: Parameters) -> list[str]:
+    """The largest value of each row . s."""
+    lines = []
+    for j, row in enumerate(rows):
+        lines += [f"new_{j} = {linear_form(row.tolist(), [f's_{i}' for i in range(n)], p)}"]
+        if bridge is None:
+            lines += [f"top_{j} = max(top_{j}, new_{j})"]
+            continue
+        shrink = " / (scale * scale)" if task.smallest_scale > 0.0 else ""
+        near = [f"after = new_{j}", f"top_{j} = max(top_{j}, after)"]
+        near += [f"spread = ({bridge.variance(row.tolist(), p)}){shrink}"]
+        near += _bridge_top(str(j), f"old_{j}", "spread")
+        start = [f"if new_{j} > limit_{j} or old_{j} > limit_{j}:"]
+        if bridge.spread is not None:
+            near += [f"limit_{j} = top_{j} - {p.add(_band(row[None] @ bridge.spread, task))}"]
+        else:
+            start = ["if True:"]
+        lines += [*start, *[f"    {line}" for line in near]]
+    return lines
+
+
+def _bridge_top(j: str, old: str, spread: str) -> list[str]:
+    """Draw the largest value of the bridge from ``old`` to ``after`` where it can exceed the record."""
+    return [
+        f"before = {old}",
+        f"if 2.0 * (top_{j} - before) * (top_{j} - after) < {EXPONENT} * {spread}:",
+        f"    rise = math.sqrt((after - before) ** 2 - 2.0 * {spread} * math.log(uniform(stream)))",
+        f"    top_{j} = max(top_{j}, 0.5 * (before + after + rise))",
+    ]
+
+
+def _band(spread: Array, task: Task) -> float:
+    """Distance from the record beyond which no bridge matters (2 u^2 > EXPONENT v)."""
+    largest = float(np.linalg.norm(spread, 2)) / (task.smallest_scale or 1.0)
+    return float(np.sqrt(0.5 * EXPONENT)) * largest
