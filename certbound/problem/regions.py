@@ -95,8 +95,8 @@ def _center(name: str, value: Any, length: int | None) -> Center:
         return vector(name, value, length)
     if length is not None and tape.shape != (length,):
         raise ValueError(f"`{name}` must have {length} entries, got shape {tape.shape}.")
-    if all(tape.nodes[output].op == "const" for output in tape.outputs):
-        return frozen([tape.nodes[output].value for output in tape.outputs])
+    if all(node.op != "input" for node in tape.nodes):
+        return frozen(compile_numpy(tape)(0.0))
     return tape
 
 

@@ -87,6 +87,7 @@ def _describe(constraint: Inside, states: tuple[str, ...]) -> str:
     region = constraint.region
     used = states if region.coordinates is None else tuple(states[index] for index in region.coordinates)
     center = "a moving centre" if region.moving else _listed(region.center_at())
+    among = "" if region.coordinates is None else f" in ({', '.join(used)})"
     if isinstance(region, Box):
         ends = zip(used, region.low, region.high)
         text = ", ".join(_interval(*end) for end in ends if np.isfinite(end[1:]).any()) or "everywhere"
@@ -96,9 +97,9 @@ def _describe(constraint: Inside, states: tuple[str, ...]) -> str:
         sign = "<=" if constraint.word == "inside" else ">"
         return f"{_linear(region.normal, used)} {sign} {region.bound:g}"
     if isinstance(region, Ball):
-        text = f"the ball of radius {region.radius:g} around {center} in ({', '.join(used)})"
+        text = f"the ball of radius {region.radius:g} around {center}{among}"
     elif isinstance(region, Ellipsoid):
-        text = f"the ellipsoid around {center} in ({', '.join(used)})"
+        text = f"the ellipsoid around {center}{among}"
     else:
         text = f"a polytope of {len(region.halfspaces()[1])} faces"
     return f"{constraint.word} {text}"
