@@ -97,9 +97,9 @@ class _Parser:
         self.depth = 0
 
     def fail(self, message: str, place: int | None = None) -> ValueError:
-        at = "" if place is None else f" at position {place + 1}"
+        at = "" if place is None else f" (position {place + 1})"
         shown = self.text if len(self.text) <= 80 else self.text[:77] + "..."
-        return ValueError(f"`{self.where}` must be an expression, got {shown!r}: {message}{at}")
+        return ValueError(f"`{self.where}` must be an expression, got {shown!r}{at}: {message}")
 
     def result(self) -> int:
         node = self.expression(0)
