@@ -1,0 +1,12 @@
+"""Pictures of problems and verdicts: sets, nominal, tubes, sample paths.
+
+Figures are made without pyplot, so that nothing global changes and no window opens. Colours are those of
+Okabe and Ito; what matters is told apart by dash pattern and hatching as well, so that grey prints and
+colour-blind readers lose nothing. Everything drawn here is a rendering of sets that were proved elsewhere.
+"""
+
+from __future__ import annotations
+
+from certbound.plotting.scene import Scene, draw_scene
+
+__all__ = ["Scene", "draw_scene"]

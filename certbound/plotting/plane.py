@@ -1,0 +1,151 @@
+"""Two states in their plane: obstacles with their eroded bands, tubes, nominal, sample paths."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.plotting.scene import GREY, INK, RIM, VERMILION, YELLOW, Scene, instants
+from certbound.problem.sets import Ball, Box, Ellipsoid, Inside, Outside
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from certbound.problem.problem import Problem
+    from certbound.reach.tube import ReachTube
+
+__all__ = ["draw_plane", "outlines", "plane_of", "supports"]
+
+Array = NDArray[np.float64]
+Plane = tuple[int, int]
+
+DIRECTIONS = 32
+OUTLINES = 160
+
+
+def plane_of(problem: Problem) -> Plane | None:
+    """The two states that a constraint lives in, or the only two states of a planar system."""
+    for constraint in problem.safe:
+        coordinates = constraint.region.coordinates
+        if coordinates is not None and len(coordinates) == 2:
+            return int(coordinates[0]), int(coordinates[1])
+    return (0, 1) if problem.system.dimension == 2 else None
+
+
+def draw_plane(axes: Axes, scene: Scene, plane: Plane) -> None:
+    """Everything that shows in the plane of two states."""
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    for order, (tube, color) in enumerate(scene.tubes):
+        shapes = PolyCollection(
+            list(outlines(tube, plane)), facecolors=color, edgecolors=color, linewidths=0.3
+        )
+        shapes.set_zorder(1 + order)
+        axes.add_collection(shapes)
+    if scene.paths is not None:
+        segments = list(scene.paths[..., list(plane)])
+        axes.add_collection(LineCollection(segments, colors=GREY, linewidths=0.4, alpha=0.5, zorder=3))
+    nominal = np.array([scene.reach.center(float(t))[list(plane)] for t in instants(scene.reach)])
+    axes.plot(*nominal.T, color=INK, linewidth=1.2, zorder=5)
+    axes.autoscale_view()
+    limits = _limits(scene.problem, plane, (*axes.get_xlim(), *axes.get_ylim()))
+    for constraint in scene.problem.safe:
+        if _lives_in(constraint.region, plane):
+            _draw_set(axes, constraint, limits, _band(scene, constraint, plane))
+    names = scene.problem.system.states
+    axes.set(xlim=limits[:2], ylim=limits[2:], xlabel=names[plane[0]], ylabel=names[plane[1]])
+    if any(isinstance(c.region, Ball) and _lives_in(c.region, plane) for c in scene.problem.safe):
+        axes.set_aspect("equal", adjustable="box")
+
+
+def supports(tube: ReachTube, direction: Array) -> Array:
+    """max a.x over the tube on each piece, over all cells: shape (K,)."""
+    from certbound.reach.series import polynomial_range
+    from certbound.rigor.intervals import Interval
+
+    coefficients = tube.curve.coefficients
+    along = [Interval.point(coefficients[:, :, j] @ direction) for j in range(coefficients.shape[2])]
+    centre = polynomial_range(along, tube.curve.span)
+    return np.asarray(np.max(np.asarray(centre.hi) + tube.spread(direction), axis=0))
+
+
+def outlines(tube: ReachTube, plane: Plane) -> Array:
+    """Polygons around the tube's projections on a plane, shape (pieces, corners, 2)."""
+    angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    heights = np.stack([supports(tube, _row(tube, plane, angle)) for angle in angles])
+    chosen = np.unique(np.linspace(0, tube.curve.pieces - 1, OUTLINES).astype(int))
+    here, following = heights[:, chosen], np.roll(heights, -1, axis=0)[:, chosen]
+    turn = 2 * np.pi / DIRECTIONS
+    along = (following - here * np.cos(turn)) / np.sin(turn)
+    c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
+    return np.swapaxes(np.stack([here * c - along * s, here * s + along * c], axis=-1), 0, 1)
+
+
+def _row(tube: ReachTube, plane: Plane, angle: float) -> Array:
+    row = np.zeros(tube.curve.dimension)
+    row[plane[0]], row[plane[1]] = np.cos(angle), np.sin(angle)
+    return row
+
+
+def _lives_in(region: Any, plane: Plane) -> bool:
+    coordinates = range(region.dimension) if region.coordinates is None else region.coordinates
+    return set(coordinates) == set(plane) or (isinstance(region, Box) and bool(set(coordinates) & set(plane)))
+
+
+def _limits(problem: Problem, plane: Plane, limits: tuple[float, ...]) -> tuple[float, ...]:
+    """The picture's frame, grown so that every round obstacle is in it."""
+    left, right, bottom, top = limits
+    for constraint in problem.safe:
+        region = constraint.region
+        if isinstance(constraint, Outside) and isinstance(region, Ball) and _lives_in(region, plane):
+            x, y = region.center_at(0.0)
+            grown = 1.25 * region.radius
+            left, right = min(left, x - grown), max(right, x + grown)
+            bottom, top = min(bottom, y - grown), max(top, y + grown)
+    return left, right, bottom, top
+
+
+def _draw_set(axes: Axes, constraint: Inside, limits: tuple[float, ...], band: float) -> None:
+    """An obstacle with the band that the noise adds to it, or the border of where the state must stay."""
+    from matplotlib.patches import Circle, Polygon
+
+    region, obstacle = constraint.region, isinstance(constraint, Outside)
+    solid = {"facecolor": VERMILION, "edgecolor": RIM, "hatch": "////", "linewidth": 0.6, "zorder": 0.5}
+    border = {"fill": False, "edgecolor": VERMILION, "linestyle": (0, (5, 2)), "linewidth": 1.2, "zorder": 6}
+    style: dict[str, Any] = solid if obstacle else border
+    if isinstance(region, Ball):
+        centre = tuple(region.center_at(constraint.during[0] if constraint.during else 0.0))
+        axes.add_patch(Circle(centre, region.radius, **style))
+        if band > 0:
+            radius = region.radius + (band if obstacle else -band)
+            axes.add_patch(Circle(centre, radius, facecolor=YELLOW, alpha=0.6, zorder=0.2, fill=obstacle))
+        return
+    corners = _corners(region, limits)
+    if corners is not None:
+        axes.add_patch(Polygon(corners, closed=True, **style))
+
+
+def _corners(region: Any, limits: tuple[float, ...]) -> Array | None:
+    """Outline of an ellipsoid or a box, cut to the picture."""
+    if isinstance(region, Ellipsoid):
+        angles = np.linspace(0, 2 * np.pi, 90)
+        circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        return np.asarray(region.center_at() + circle @ np.linalg.cholesky(region.shape).T)
+    if not isinstance(region, Box):
+        return None
+    left, right, bottom, top = limits
+    width, height = right - left, top - bottom
+    low = np.maximum(region.low[:2] + region.center_at()[:2], [left - width, bottom - height])
+    high = np.minimum(region.high[:2] + region.center_at()[:2], [right + width, top + height])
+    return np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+
+
+def _band(scene: Scene, constraint: Inside, plane: Plane) -> float:
+    """The largest stochastic deviation in the plane: how far a round obstacle is grown in the picture."""
+    if scene.tube is None or not isinstance(constraint.region, Ball):
+        return 0.0
+    rows = [_row(scene.reach, plane, angle) for angle in np.linspace(0, 2 * np.pi, 16, endpoint=False)]
+    width = max(float(np.max(supports(scene.tube, row) - supports(scene.reach, row))) for row in rows)
+    return max(width, 0.0)
