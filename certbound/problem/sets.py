@@ -90,7 +90,8 @@ def _describe(constraint: Inside, states: tuple[str, ...]) -> str:
     among = "" if region.coordinates is None else f" in ({', '.join(used)})"
     if isinstance(region, Box):
         ends = zip(used, region.low, region.high)
-        text = ", ".join(_interval(*end) for end in ends if np.isfinite(end[1:]).any()) or "everywhere"
+        parts = [_interval(*end) for end in ends if np.isfinite(end[1:]).any()] or ["everywhere"]
+        text = ", ".join(parts if len(parts) <= 4 else [*parts[:2], f"... ({len(parts)} intervals)"])
         text += " (moving)" if region.moving else ""
         return text if constraint.word == "inside" else f"outside {text}"
     if isinstance(region, HalfSpace):
