@@ -93,6 +93,15 @@ class Bridge:
             ]
         )
 
+    def even_variance(self, matrix: Array) -> float:
+        """|u . matrix . G|^2 h where it is the same for all unit vectors u, else 0."""
+        if self.spread is None:
+            return 0.0
+        image = matrix @ self.spread
+        square = image @ image.T
+        even = np.allclose(square, square[0, 0] * np.eye(len(square)), rtol=1e-12, atol=1e-14 * square[0, 0])
+        return float(square[0, 0]) if even else 0.0
+
     @staticmethod
     def squares(terms: Sequence[str]) -> str:
         return " + ".join(f"({term}) ** 2" for term in terms if term != "0.0") or "0.0"
@@ -116,7 +125,7 @@ def barriers_of(problem: Any, times: Array) -> list[Barrier]:
         if region.coordinates is not None:
             embed = embed[list(region.coordinates)]
         centers = np.array([region.center_at(t) for t in times]) if region.moving else region.center_at()
-        fields = _round_region(region, embed, centers) if region.kind in _ROUND else None
+        fields = _round_fields(region, embed, centers) if region.kind in _ROUND else None
         if fields is None:
             faces, bounds = region.halfspaces()
             if len(bounds) == 0:
@@ -132,11 +141,18 @@ def barriers_of(problem: Any, times: Array) -> list[Barrier]:
 _ROUND = ("ball", "ellipsoid")
 
 
-def _round_region(region: Any, embed: Array, centers: Array) -> dict[str, Any]:
+def _round_fields(region: Any, embed: Array, centers: Array) -> dict[str, Any]:
+    """A ball or ellipsoid as ‖matrix x - offset‖ <= radius; an interval, in one dimension, as two faces."""
+    whiten, radius = np.eye(region.dimension), 1.0
     if region.kind == "ball":
-        return {"round": True, "matrix": embed, "offset": centers, "radius": float(region.radius)}
-    whiten = np.linalg.inv(np.linalg.cholesky(region.shape))
-    return {"round": True, "matrix": whiten @ embed, "offset": centers @ whiten.T, "radius": 1.0}
+        radius = float(region.radius)
+    else:
+        whiten = np.linalg.inv(np.linalg.cholesky(region.shape))
+    matrix, offset = whiten @ embed, centers @ whiten.T
+    if region.dimension == 1:
+        both = np.concatenate([radius + offset, radius - offset], axis=-1)
+        return {"round": False, "matrix": np.vstack([matrix, -matrix]), "offset": both}
+    return {"round": True, "matrix": matrix, "offset": offset, "radius": radius}
 
 
 def barrier_source(
@@ -162,58 +178,77 @@ def _names(letter: str, count: int) -> list[str]:
     return [f"{letter}_{i}" for i in range(count)]
 
 
+def _touch(exponent: str, number: int) -> list[str]:
+    """Leave with probability exp(-e), which is below 1/(1 + e + e^2/2): that saves most exponentials."""
+    return [
+        f"exponent = {exponent}",
+        "chance = uniform(stream)",
+        "if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0 and chance < math.exp(-exponent):",
+        f"    left = {number}",
+    ]
+
+
+def _indent(lines: Sequence[str], levels: int = 1) -> list[str]:
+    return ["    " * levels + line for line in lines]
+
+
 def _faces(
     number: int, barrier: Barrier, bridge: Bridge | None, p: Parameters, column: int
 ) -> tuple[list[str], list[str], list[str]]:
     rows, dimension = barrier.matrix.shape
-    faces = range(rows)
-    old, new = [f"g_{number}_{f}" for f in faces], [f"n_{number}_{f}" for f in faces]
-    sign = 1.0 if barrier.stay else -1.0
+    old, new = _names(f"g_{number}", rows), _names(f"n_{number}", rows)
 
     def gaps(targets: list[str], state: str, step: str) -> list[str]:
         lines = []
-        for f in faces:
+        for f, target in enumerate(targets):
             bound = f"moving[{step}, {column + f}]" if barrier.moving else p.add(float(barrier.offset[f]))
             value = linear_form(barrier.matrix[f].tolist(), _names(state, dimension), p)
-            lines.append(
-                f"{targets[f]} = {bound} - ({value})" if sign > 0 else f"{targets[f]} = ({value}) - {bound}"
-            )
+            lines.append(f"{target} = " + (f"{bound} - ({value})" if barrier.stay else f"{value} - {bound}"))
         return lines
 
-    start = gaps(old, "x", "0")
-    out = " or ".join(f"{g} < 0.0" for g in old) if barrier.stay else " and ".join(f"{g} < 0.0" for g in old)
-    start += [f"if windows[{number}, 0] == 0 and ({out}):", f"    left = {number}"]
-    step = gaps(new, "y", "k + 1")
-    end = [f"{g} = {n}" for g, n in zip(old, new)]
-    out = out.replace("g_", "n_")
-    step += [f"if ({out}) and {_active(number, old=False)}:", f"    left = {number}"]
-    if bridge is None:
-        return start, step, end
-    variances = [bridge.variance(barrier.matrix[f].tolist(), p) for f in faces]
-    if barrier.stay:
-        for f in faces:
-            if variances[f] != "0.0" and p_value(p, variances[f]) != 0.0:
-                near = f"0.0 <= {old[f]} and 2.0 * {old[f]} * {new[f]} < {EXPONENT} * ({variances[f]})"
-                step += [f"if left < 0 and {near} and {_active(number, old=True)}:"]
-                step += [f"    if uniform(stream) < math.exp(-2.0 * {old[f]} * {new[f]} / ({variances[f]})):"]
-                step += [f"        left = {number}"]
-        return start, step, end
-    step += [f"if left < 0 and {_active(number, old=True)}:", "    exponent = -1.0"]
-    for f in faces:
-        step += [f"    if {old[f]} > 0.0 and {new[f]} > 0.0:"]
-        step += [f"        exponent = max(exponent, 2.0 * {old[f]} * {new[f]} / ({variances[f]}))"]
-    step += [f"    if 0.0 <= exponent < {EXPONENT} and uniform(stream) < math.exp(-exponent):"]
-    step += [f"        left = {number}"]
+    def out(names: list[str]) -> str:
+        return (" or " if barrier.stay else " and ").join(f"{name} < 0.0" for name in names)
+
+    start = [*gaps(old, "x", "0"), f"if windows[{number}, 0] == 0 and ({out(old)}):", f"    left = {number}"]
+    step = [
+        *gaps(new, "y", "k + 1"),
+        f"if ({out(new)}) and {_active(number, old=False)}:",
+        f"    left = {number}",
+    ]
+    end: list[str] = []
+    if bridge is not None:
+        end = [f"{g} = {n}" for g, n in zip(old, new)]
+        spreads = [bridge.variance(row.tolist(), p) for row in barrier.matrix]
+        step += (_bridge_stay if barrier.stay else _bridge_avoid)(number, old, new, spreads, p)
     return start, step, end
 
 
-def p_value(p: Parameters, expression: str) -> float:
-    """The number behind ``p[i]``, nan for any other expression."""
-    return (
-        p.values[int(expression[2:-1])]
-        if expression.startswith("p[") and expression.endswith("]")
-        else np.nan
+def _bridge_stay(number: int, old: list[str], new: list[str], spreads: list[str], p: Parameters) -> list[str]:
+    """Each face may be touched."""
+    lines = []
+    for g, n, spread in zip(old, new, spreads):
+        if not p.is_zero(spread):
+            near = f"0.0 <= {g} and 2.0 * {g} * {n} < {EXPONENT} * ({spread})"
+            lines += [f"if left < 0 and {near} and {_active(number, old=True)}:"]
+            lines += _indent(_touch(f"2.0 * {g} * {n} / ({spread})", number))
+    return lines
+
+
+def _bridge_avoid(
+    number: int, old: list[str], new: list[str], spreads: list[str], p: Parameters
+) -> list[str]:
+    """All faces must be crossed: the least likely one decides; without one, the straight line does."""
+    near = " and ".join(
+        f"({n} < 0.0 or 2.0 * {g} * {n} < {EXPONENT} * ({spread}))" for g, n, spread in zip(old, new, spreads)
     )
+    lines = ["worst, enter, leave = -1.0, 0.0, 1.0"]
+    for g, n, spread in zip(old, new, spreads):
+        lines += [f"if {g} > 0.0 and {n} > 0.0:", f"    worst = max(worst, 2.0 * {g} * {n} / ({spread}))"]
+        lines += [f"elif {g} > 0.0:", f"    enter = max(enter, {g} / ({g} - {n}))"]
+        lines += [f"elif {n} > 0.0:", f"    leave = min(leave, {g} / ({g} - {n}))"]
+    lines += ["if worst >= 0.0:", *_indent(_touch("worst", number))]
+    lines += ["elif enter < leave:", f"    left = {number}"]
+    return [f"if left < 0 and {near} and {_active(number, old=True)}:", *_indent(lines)]
 
 
 def _round(
@@ -222,52 +257,41 @@ def _round(
     rows, dimension = barrier.matrix.shape
     old, new = f"q_{number}", f"r_{number}"
     radius = p.add(barrier.radius)
-    legs = [f"e_{number}_{i}" for i in range(rows)]
+    legs = _names(f"e_{number}", rows)
 
     def distance(target: str, state: str, step: str) -> list[str]:
         lines = []
-        for i in range(rows):
-            centre = f"moving[{step}, {column + i}]" if barrier.moving else p.add(float(barrier.offset[i]))
-            lines.append(
-                f"{legs[i]} = {linear_form(barrier.matrix[i].tolist(), _names(state, dimension), p)} - {centre}"
-            )
+        for i, leg in enumerate(legs):
+            center = f"moving[{step}, {column + i}]" if barrier.moving else p.add(float(barrier.offset[i]))
+            value = linear_form(barrier.matrix[i].tolist(), _names(state, dimension), p)
+            lines += [f"{leg} = {value} - {center}"]
         return [*lines, f"{target} = {' + '.join(f'{leg} * {leg}' for leg in legs)}"]
 
-    beyond = ">" if barrier.stay else "<"
+    beyond = f"{'>' if barrier.stay else '<'} {radius} * {radius}"
     start = distance(old, "x", "0")
-    start += [f"if windows[{number}, 0] == 0 and {old} {beyond} {radius} * {radius}:", f"    left = {number}"]
+    start += [f"if windows[{number}, 0] == 0 and {old} {beyond}:", f"    left = {number}"]
     step = distance(new, "y", "k + 1")
-    step += [
-        f"if {new} {beyond} {radius} * {radius} and {_active(number, old=False)}:",
-        f"    left = {number}",
-    ]
+    step += [f"if {new} {beyond} and {_active(number, old=False)}:", f"    left = {number}"]
     end = [f"{old} = {new}"]
     if bridge is None:
-        return start, step, end
-    near = _near_radius(barrier, bridge, p)
-    if near:
-        worst = "max" if barrier.stay else "min"
-        step += [f"elif {worst}({old}, {new}) {beyond} {near} and {_active(number, old=True)}:"]
-    else:
-        step += [f"elif {_active(number, old=True)}:"]
+        return start, step, []
+    near = _near(barrier, bridge, old, new, p)
     gap = f"{radius} - math.sqrt({{0}})" if barrier.stay else f"math.sqrt({{0}}) - {radius}"
-    step += [f"    before, after = {gap.format(old)}, {gap.format(new)}"]
-    gradient = []
-    for i in range(dimension):
-        weights = barrier.matrix[:, i].tolist()
-        step += [f"    w_{i} = {linear_form(weights, legs, p)}"]
-        gradient.append(f"w_{i}")
-    step += [f"    spread = ({bridge.moving_variance(gradient, p)}) / {new} if {new} > 0.0 else 0.0"]
-    step += [f"    if before >= 0.0 and 2.0 * before * after < {EXPONENT} * spread:"]
-    step += ["        if uniform(stream) < math.exp(-2.0 * before * after / spread):"]
-    step += [f"            left = {number}"]
-    return start, step, end
+    lines = [f"before, after = {gap.format(old)}, {gap.format(new)}"]
+    weights = [linear_form(column_.tolist(), legs, p) for column_ in barrier.matrix.T]
+    lines += [f"w_{i} = {weight}" for i, weight in enumerate(weights)]
+    spread = bridge.moving_variance(_names("w", dimension), p)
+    lines += [f"spread = ({spread}) / {new} if {new} > 0.0 else 0.0"]
+    lines += [f"if before >= 0.0 and 2.0 * before * after < {EXPONENT} * spread:"]
+    lines += _indent(_touch("2.0 * before * after / spread", number))
+    return start, [*step, f"elif {near}{_active(number, old=True)}:", *_indent(lines)], end
 
 
-def _near_radius(barrier: Barrier, bridge: Bridge, p: Parameters) -> str:
-    """Squared radius beyond which a bridge can matter; empty where the noise depends on the state."""
+def _near(barrier: Barrier, bridge: Bridge, old: str, new: str, p: Parameters) -> str:
+    """Test, on squared radii, whether a bridge can matter; none where the noise depends on the state."""
     if bridge.spread is None:
         return ""
     band = np.sqrt(0.5 * EXPONENT) * np.linalg.norm(barrier.matrix @ bridge.spread, 2)
     near = max(barrier.radius - band, 0.0) if barrier.stay else barrier.radius + band
-    return p.add(float(near**2))
+    limit = p.add(float(near**2))
+    return f"max({old}, {new}) > {limit} and " if barrier.stay else f"min({old}, {new}) < {limit} and "

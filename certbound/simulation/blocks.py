@@ -26,11 +26,12 @@ MEMORY_LIMIT = 512 * 2**20
 
 def check_count(name: str, value: Any) -> int:
     """A positive whole number (3e6 is one)."""
-    if isinstance(value, (bool, str)) or not np.isscalar(value):
+    if not isinstance(value, (int, float, np.integer, np.floating)) or isinstance(value, bool):
         raise TypeError(f"`{name}` must be a positive whole number, got {value!r}.")
-    if not np.isfinite(value) or value != int(value) or value <= 0:
+    number = float(value)
+    if not np.isfinite(number) or number != int(number) or number <= 0:
         raise ValueError(f"`{name}` must be a positive whole number, got {value!r}.")
-    return int(value)
+    return int(number)
 
 
 def entropy_of(rng: np.random.Generator | int | None) -> int:
@@ -157,9 +158,9 @@ class Work:
         if done < 0:
             state = ", ".join(f"{value:.6g}" for value in notes[2:])
             raise ValueError(
-                f"the model gave a state that is not finite in the step after time {notes[1] * self.interval:.6g} "
-                f"on path {block * BLOCK + int(notes[0])}, from state ({state}); use more steps, or set `domain` to "
-                "where the model is meant."
+                "the model gave a state that is not finite in the step after time "
+                f"{notes[1] * self.interval:.6g} on path {block * BLOCK + int(notes[0])}, from state "
+                f"({state}); use more steps, or set `domain` to where the model is meant."
             )
         return int(done)
 

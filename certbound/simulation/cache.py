@@ -128,7 +128,7 @@ def load_kernel(source: str) -> Callable[..., Any]:
 
 
 def _store(path: Path, content: bytes) -> Path:
-    """Keep the source beside its compiled form (numba compares its time and size), and drop the oldest ones."""
+    """Keep the source beside its compiled form (numba compares time and size); drop the oldest ones."""
     if not path.exists() or path.read_bytes() != content:
         write_atomically(path, content)
         sources = sorted(path.parent.glob("kernel_*.py"), key=lambda file: file.stat().st_mtime)

@@ -55,7 +55,7 @@ class Progress:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Outcome:
-    """A finished run: what was counted, in how many seconds (compilation aside), at how many path-steps each."""
+    """A finished run: what was counted, in how many seconds, at how many path-steps each."""
 
     tally: Tally
     seconds: float

@@ -27,7 +27,7 @@ _UNARY = {
     "atan": "math.atan({0})",
     "sinh": "math.sinh({0})",
     "cosh": "math.cosh({0})",
-    "tanh": "math.tanh({0})",
+    "tanh": "tanh({0})",
     "abs": "abs({0})",
     "floor": "np.floor({0})",
     "sign": "(1.0 if {0} > 0.0 else -1.0 if {0} < 0.0 else {0})",
@@ -63,6 +63,11 @@ class Parameters:
         """Append a number; returns the expression that reads it."""
         self.values.append(float(value))
         return f"p[{len(self.values) - 1}]"
+
+    def is_zero(self, expression: str) -> bool:
+        """Whether an expression is known to be 0."""
+        known = expression[2:-1].isdigit() and expression.startswith("p[")
+        return expression == "0.0" or (known and self.values[int(expression[2:-1])] == 0.0)
 
 
 def live_nodes(tape: Tape) -> list[int]:

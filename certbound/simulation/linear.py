@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,7 +50,8 @@ def exact_transition(
     block = np.zeros((width + 1, width + 1))
     block[:n, :width], block[:n, width] = matrix, offset
     move = expm(block * step)[:n]
-    halvings = max(int(np.ceil(np.log2(max(np.linalg.norm(matrix[:, :n], 2) * step, 1e-300)))) + 1, 0)
+    stiffness = float(np.linalg.norm(matrix[:, :n], 2)) * step
+    halvings = max(math.ceil(math.log2(max(stiffness, 1e-300))) + 1, 0)
     short = step / 2**halvings
     pair = np.block([[-matrix[:, :n], diffusion @ diffusion.T], [np.zeros((n, n)), matrix[:, :n].T]])
     exponential = expm(pair * short)

@@ -71,8 +71,8 @@ def sample_paths(
     per_path = 8 * n * (points + 1)
     if paths * per_path > MEMORY_LIMIT:
         raise ValueError(
-            f"`paths` must be at most {MEMORY_LIMIT // per_path} with {points + 1} stored times of {n} states "
-            f"({MEMORY_LIMIT // 2**20} MiB), got {paths}; lower `paths` or `points`."
+            f"`paths` must be at most {MEMORY_LIMIT // per_path} with {points + 1} stored times of {n} "
+            f"states ({MEMORY_LIMIT // 2**20} MiB), got {paths}; lower `paths` or `points`."
         )
     source, p = kernel_source(setting.model, Task(kind="record", own_nominal=deviation))
     marks = np.arange(points + 1, dtype=np.int64) * (setting.steps // points)

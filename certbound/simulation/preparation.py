@@ -95,8 +95,8 @@ def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = 
     fit = MEMORY_LIMIT // (8 * columns)
     if count > fit:
         raise ValueError(
-            f"`steps` must be at most {fit} for this problem, got {count}: its tables over time would take more than "
-            f"{MEMORY_LIMIT // 2**20} MiB."
+            f"`steps` must be at most {fit} for this problem, got {count}: its tables over time would take "
+            f"more than {MEMORY_LIMIT // 2**20} MiB."
         )
     times = np.linspace(0.0, float(problem.horizon), count + 1)
     start, fixed = _start(problem, scenario)

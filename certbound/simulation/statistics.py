@@ -70,8 +70,7 @@ def order_ranks(level: float, trials: int, confidence: float) -> tuple[int, int]
     spread = 10.0 * np.sqrt(trials * level * (1.0 - level)) + 50.0
     low, high = max(int(trials * level - spread), 0), min(int(trials * level + spread), trials)
     ranks = np.arange(low, high + 1)
-    below = bdtr(ranks, trials, level)  # P(number below <= rank)
-    lower = int(ranks[np.searchsorted(below, tail)]) - 1 if below[-1] > tail else high
-    reached = np.searchsorted(below, 1.0 - tail)
-    upper = int(ranks[min(reached, len(ranks) - 1)])
+    below = bdtr(ranks.astype(float), trials, level)  # P(number below <= rank)
+    lower = low + int(np.searchsorted(below, tail)) - 1
+    upper = low + min(int(np.searchsorted(below, 1.0 - tail)), high - low)
     return lower, upper

@@ -65,7 +65,9 @@ def task_source(
     if task.kind == "exits":
         return _exits(task, bridge, p)
     states = range(dimension)
-    begin, within, end = [], [], []
+    begin: list[str] = []
+    within: list[str] = []
+    end: list[str] = []
     if task.own_nominal:
         begin, within, end = (
             [f"a_{i} = x_{i}" for i in states],
@@ -80,8 +82,7 @@ def task_source(
 
 
 def _exits(task: Task, bridge: Bridge | None, p: Parameters) -> Lines:
-    begin, within, end = ["left = -1"], [], []
-    column = 0
+    begin, within, end, column = ["left = -1"], list[str](), list[str](), 0
     for number, barrier in enumerate(task.barriers):
         before, during, after = barrier_source(number, barrier, bridge, p, column)
         begin, within, end = begin + before, within + during, end + after
@@ -110,24 +111,20 @@ def _deviation(task: Task, dimension: int, bridge: Bridge | None, p: Parameters)
     within = [f"s_{i} = y_{i} - b_{i}" for i in range(dimension)]
     if task.smallest_scale > 0.0:
         within += ["scale = profile[k + 1]", *[f"s_{i} = s_{i} / scale" for i in range(dimension)]]
-    if task.norm is not None:
-        value, count = "math.sqrt(new_{0})", 1
-        within += _norm_supremum(task, task.norm, dimension, bridge, p)
-    else:
-        rows = task.directions if task.directions is not None else np.eye(dimension)
-        value, count = "new_{0}", len(rows)
-        within += _direction_suprema(task, rows, dimension, bridge, p)
-    lowest = "0.0" if task.norm is not None else "-math.inf"
-    begin = [f"old_{j} = top_{j} = 0.0" for j in range(count)] + [
-        f"limit_{j} = {lowest}" for j in range(count)
-    ]
+    rows = task.norm if task.norm is not None else task.directions
+    rows = np.eye(dimension) if rows is None else rows
+    radial = task.norm is not None and len(rows) > 1
+    count = 1 if radial else len(rows)
+    watch = _norm_supremum if radial else _scalar_suprema
+    within += watch(task, rows, dimension, bridge, p)
+    begin = [f"old_{j} = top_{j} = limit_{j} = 0.0" for j in range(count)]
     end = [f"old_{j} = new_{j}" for j in range(count)]
     sup, marginal = (p.add(density) for density in task.densities)
-    if task.norm is not None and bridge is None:
-        finish = ["top_0 = math.sqrt(limit_0)"]
-        top = "math.sqrt(limit_{0})"
-    else:
-        finish, top = [], "top_{0}"
+    value, top, finish = "new_{0}", "top_{0}", []
+    if radial:
+        value = "math.sqrt(new_{0})"
+        if bridge is None:
+            finish, top = ["top_0 = math.sqrt(limit_0)"], "math.sqrt(limit_{0})"
     within += ["if mark < marks.shape[0] and marks[mark] == k + 1:"]
     for j in range(count):
         for kind, text in enumerate((value, top)):
@@ -146,46 +143,60 @@ def _norm_supremum(task: Task, norm: Array, n: int, bridge: Bridge | None, p: Pa
     lines += [f"new_0 = {' + '.join(f'{leg} * {leg}' for leg in legs)}"]
     if bridge is None:
         return [*lines, "if new_0 > limit_0:", "    limit_0 = new_0"]
-    near = ["after = math.sqrt(new_0)", "top_0 = max(top_0, after)"]
-    near += [f"w_{i} = {linear_form(norm[:, i].tolist(), legs, p)}" for i in range(n)]
-    variance = bridge.moving_variance([f"w_{i}" for i in range(n)], p)
+    near = ["before = math.sqrt(old_0)", "after = math.sqrt(new_0)", "top_0 = max(top_0, after)"]
     shrink = " / (scale * scale)" if task.smallest_scale > 0.0 else ""
-    near += [f"spread = ({variance}) / new_0{shrink} if new_0 > 0.0 else 0.0"]
-    near += _bridge_top("0", "math.sqrt(old_0)", "spread")
+    even = bridge.even_variance(norm)
+    if even > 0.0 and not shrink:
+        spread = p.add(even)
+    else:
+        near += [f"w_{i} = {linear_form(norm[:, i].tolist(), legs, p)}" for i in range(n)]
+        variance = bridge.moving_variance([f"w_{i}" for i in range(n)], p)
+        near += [f"spread = ({variance}) / new_0{shrink} if new_0 > 0.0 else 0.0"]
+        spread = "spread"
+    near += _bridge_top("0", "before", "after", spread)
     if bridge.spread is not None:
         band = _band(norm @ bridge.spread, task)
         near += [f"limit_0 = max(top_0 - {p.add(band)}, 0.0) ** 2"]
-    return [*lines, "if new_0 > limit_0 or old_0 > limit_0:", *[f"    {line}" for line in near]]
+    return [*lines, "if new_0 > limit_0 or old_0 > limit_0:", *_indent(near)]
 
 
-def _direction_suprema(task: Task, rows: Array, n: int, bridge: Bridge | None, p: Parameters) -> list[str]:
-    """The largest value of each row . s."""
+def _scalar_suprema(task: Task, rows: Array, n: int, bridge: Bridge | None, p: Parameters) -> list[str]:
+    """The largest value of each row . s, or of |row . s| in a norm of one row."""
     lines = []
+    shrink = " / (scale * scale)" if task.smallest_scale > 0.0 else ""
     for j, row in enumerate(rows):
-        lines += [f"new_{j} = {linear_form(row.tolist(), [f's_{i}' for i in range(n)], p)}"]
+        value = linear_form(row.tolist(), [f"s_{i}" for i in range(n)], p)
+        lines += [f"new_{j} = {value}" if task.norm is None else f"new_{j} = abs({value})"]
         if bridge is None:
             lines += [f"top_{j} = max(top_{j}, new_{j})"]
             continue
-        shrink = " / (scale * scale)" if task.smallest_scale > 0.0 else ""
-        near = [f"after = new_{j}", f"top_{j} = max(top_{j}, after)"]
-        near += [f"spread = ({bridge.variance(row.tolist(), p)}){shrink}"]
-        near += _bridge_top(str(j), f"old_{j}", "spread")
-        start = [f"if new_{j} > limit_{j} or old_{j} > limit_{j}:"]
-        if bridge.spread is not None:
-            near += [f"limit_{j} = top_{j} - {p.add(_band(row[None] @ bridge.spread, task))}"]
-        else:
-            start = ["if True:"]
-        lines += [*start, *[f"    {line}" for line in near]]
+        spread = bridge.variance(row.tolist(), p)
+        if shrink or bridge.spread is None:
+            lines += [f"spread = ({spread}){shrink}"]
+            spread = "spread"
+        half = f"{0.5 * EXPONENT} * {spread}"
+        near = [f"top_{j} = max(top_{j}, new_{j})", *_bridge_top(str(j), f"old_{j}", f"new_{j}", spread)]
+        lines += [f"if (top_{j} - old_{j}) * (top_{j} - new_{j}) < {half}:", *_indent(near)]
     return lines
 
 
-def _bridge_top(j: str, old: str, spread: str) -> list[str]:
-    """Draw the largest value of the bridge from ``old`` to ``after`` where it can exceed the record."""
+def _indent(lines: Sequence[str]) -> list[str]:
+    return [f"    {line}" for line in lines]
+
+
+def _bridge_top(j: str, before: str, after: str, spread: str) -> list[str]:
+    """Draw the largest value of the bridge between two values where it can exceed the record.
+
+    It does so when the variate is below exp(-e), and e^-e < 1/(1 + e + e^2/2) saves most logarithms.
+    """
     return [
-        f"before = {old}",
-        f"if 2.0 * (top_{j} - before) * (top_{j} - after) < {EXPONENT} * {spread}:",
-        f"    rise = math.sqrt((after - before) ** 2 - 2.0 * {spread} * math.log(uniform(stream)))",
-        f"    top_{j} = max(top_{j}, 0.5 * (before + after + rise))",
+        f"exponent = math.inf if {spread} <= 0.0 else "
+        f"2.0 * (top_{j} - {before}) * (top_{j} - {after}) / {spread}",
+        f"if exponent < {EXPONENT}:",
+        "    chance = uniform(stream)",
+        "    if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0:",
+        f"        rise = math.sqrt(({after} - {before}) ** 2 - 2.0 * {spread} * math.log(chance))",
+        f"        top_{j} = max(top_{j}, 0.5 * ({before} + {after} + rise))",
     ]
 
 
