@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from certbound.plotting.plane import supports
 from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene, instants
-from certbound.problem.clearance import clearance
+from certbound.problem.distances import clearance
 from certbound.problem.sets import Ball, Ellipsoid, Inside, Outside
 
 if TYPE_CHECKING:
