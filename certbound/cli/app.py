@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
 import sys
 from collections.abc import Sequence
@@ -72,16 +73,20 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 def _report(error: Exception, command: str) -> int:
+    known = [entry.name for entry in app.registered_commands if entry.name]
     if isinstance(error, _ClickException):
-        message = error.format_message().rstrip(".")  # type: ignore[attr-defined]
-        write_error(
-            "the command line was not understood",
-            message,
-            f"see `certbound {command} --help`".replace("  ", " "),
-        )
+        why = error.format_message().rstrip(".")  # type: ignore[attr-defined]
+        write_error("the command line was not understood", why, _usage_hint(command, known))
         return BAD_INPUT
     code, why, cure = explain(error, command)
     write_error(
         f"{command or 'the command'} {'refused its input' if code == BAD_INPUT else 'failed'}", why, cure
     )
     return code
+
+
+def _usage_hint(command: str, known: list[str]) -> str:
+    if command in known:
+        return f"see `certbound {command} --help`"
+    near = difflib.get_close_matches(command, known, n=1)
+    return f"did you mean `certbound {near[0]}`?" if near else "see `certbound --help` for the commands"

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from certbound.safety.verification import Verdict
     from certbound.tubes.constants import Constants
     from certbound.tubes.tube import Tube
 
-__all__ = ["describe_constants", "describe_parameters", "log10_text"]
+__all__ = ["describe_constants", "describe_deviation", "describe_parameters", "log10_text"]
 
 
 def describe_constants(constants: Constants) -> dict[str, Any]:
@@ -47,3 +48,15 @@ def log10_text(log10: float) -> str:
     exponent = int(np.floor(log10 + 1e-12))
     mantissa = f"{10 ** (log10 - exponent):.2g}"
     return f"1e{exponent + 1}" if mantissa == "10" else f"{mantissa}e{exponent}"
+
+
+def describe_deviation(verdict: Verdict) -> dict[str, Any] | None:
+    """``times``, and per piece an upper bound on the size of X - x and on its half-width in each state.
+
+    Piece k is [times[k], times[k+1]] with both ends; in discrete time it covers the steps k and k + 1. None where
+    no tube could be certified.
+    """
+    deviation = verdict.deviation
+    if deviation is None:
+        return None
+    return {"times": deviation.times, "radius": deviation.radius, "extent": deviation.extent}

@@ -1,9 +1,184 @@
-"""To come."""
+"""``certbound verify``: the verdict on a problem, with its certificate, report and picture."""
 
 from __future__ import annotations
 
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
+
+from certbound.cli.describe import describe_constants, describe_deviation, log10_text
+from certbound.cli.options import (
+    DeltaOption,
+    HorizonOption,
+    JsonOption,
+    ProblemArgument,
+    SetOption,
+    check_writable,
+    integer,
+    load_problem,
+)
+from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
+
+if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
+    from certbound.safety.verification import Verdict
+
+__all__ = ["register"]
+
+MethodOption = Annotated[
+    str, typer.Option("--method", metavar="M", help="auto, linear, or a tube method such as kummer or thm3.")
+]
+CellsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--cells", parser=integer, metavar="K", help="Cells per side of the initial set.", show_default=False
+    ),
+]
+CertificateOption = Annotated[
+    Path | None,
+    typer.Option("--certificate", metavar="FILE", help="Write the certificate.", show_default=False),
+]
+ReportOption = Annotated[
+    Path | None, typer.Option("--report", metavar="FILE", help="Write one HTML page.", show_default=False)
+]
+PlotOption = Annotated[
+    Path | None,
+    typer.Option("--plot", metavar="FILE", help="Draw tube, sets and sample paths.", show_default=False),
+]
+ExplainOption = Annotated[bool, typer.Option("--explain", help="Show what each engine found.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
+    app.command("verify", epilog="Example: certbound verify unicycle --horizon 2 --plot tube.png")(verify)
+
+
+def verify(
+    problem: ProblemArgument,
+    pairs: SetOption = None,
+    delta: DeltaOption = None,
+    horizon: HorizonOption = None,
+    method: MethodOption = "auto",
+    cells: CellsOption = None,
+    certificate: CertificateOption = None,
+    report: ReportOption = None,
+    plot: PlotOption = None,
+    explain: ExplainOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Decide whether the system stays safe but for a probability of delta, and prove it."""
+    check_writable(certificate, report, plot)
+    subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
+    from certbound.safety.verification import verify_safety
+
+    started = time.perf_counter()
+    with spinner(f"verifying {subject.name}"):
+        verdict = verify_safety(subject, method=method, cells=cells)
+    seconds = time.perf_counter() - started
+    result = _result(subject, verdict, seconds)
+    if explain:
+        result["engines"] = _engines(subject, verdict, cells)
+    _write(subject, verdict, certificate=certificate, report=report, plot=plot)
+    if as_json:
+        print_json(result)
+    else:
+        _print(subject, result)
+    raise typer.Exit(0 if verdict.status == "SAFE" else 1)
+
+
+def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any]:
+    return {
+        "status": verdict.status,
+        "log10_delta": verdict.log10_delta,
+        "delta": problem.delta,
+        "margin": verdict.margin,
+        "time": verdict.time,
+        "constraint": verdict.constraint,
+        "reason": verdict.reason,
+        "method": verdict.method,
+        "constants": None if verdict.constants is None else describe_constants(verdict.constants),
+        "tube": describe_deviation(verdict),
+        "seconds": seconds,
+    }
+
+
+def _engines(problem: Problem, verdict: Verdict, cells: int | None) -> list[dict[str, Any]]:
+    """What each engine says on its own (the one that gave the verdict is not run again)."""
+    from certbound.safety.verification import verify_safety
+
+    rows = []
+    for name in ("linear", "kummer"):
+        started = time.perf_counter()
+        try:
+            with spinner(f"trying {name}"):
+                one = verdict if verdict.method == name else verify_safety(problem, method=name, cells=cells)
+        except (ValueError, ArithmeticError) as error:
+            found = {"status": "UNKNOWN", "log10_delta": 0.0, "margin": None, "reason": str(error)}
+        else:
+            found = {key: getattr(one, key) for key in ("status", "log10_delta", "margin", "reason")}
+        rows.append({"engine": name, **found, "seconds": time.perf_counter() - started})
+    return rows
+
+
+def _write(
+    problem: Problem, verdict: Verdict, *, certificate: Path | None, report: Path | None, plot: Path | None
+) -> None:
+    if certificate is not None:
+        write_file(certificate, verdict.certificate_text(problem))
+    if plot is not None:
+        with spinner("drawing"):
+            write_file(plot, picture(problem, verdict, plot.suffix.lstrip(".") or "png"))
+    if report is not None:
+        from certbound.report import report_page
+
+        with spinner("writing the report"):
+            write_file(report, report_page(problem, verdict))
+
+
+def picture(problem: Problem, verdict: Verdict, suffix: str) -> bytes:
+    """The picture of a verdict, with 100 sample paths where the noise has a law to sample from."""
+    from io import BytesIO
+
+    import numpy as np
+
+    from certbound.plotting import Scene, draw_scene
+    from certbound.simulation.paths import sample_paths
+
+    times = paths = None
+    title = f"{problem.name}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
+    scene = Scene(problem=problem, reach=verdict.reach, tube=None, times=times, paths=paths, title=title)
+    stream = BytesIO()
+    draw_scene(scene).savefig(stream, format=suffix, dpi=150)
+    return stream.getvalue()
+
+
+def _print(problem: Problem, result: dict[str, Any]) -> None:
+    screen = console()
+    colors = {"SAFE": "bold green", "UNSAFE_NOMINAL": "bold red", "UNKNOWN": "bold yellow"}
+    unit = "s" if problem.system.time == "continuous" else "steps"
+    color = colors[result["status"]]
+    screen.print(f"[{color}]{result['status']}[/]  {problem.name}", end="")
+    screen.print(
+        f": P(leaving within {problem.horizon:g} {unit}) <= {log10_text(result['log10_delta'])}"
+        f", asked {result['delta']:g}",
+        markup=False,
+    )
+    if SETTINGS.quiet:
+        return
+    if result["margin"] is not None and result["constraint"]:
+        when = (
+            "" if result["time"] is None else f" at {'t' if unit == 's' else 'step'} = {result['time']:.4g}"
+        )
+        screen.print(f"margin {result['margin']:.4g}{when}, constraint: {result['constraint']}", markup=False)
+    if result["reason"]:
+        screen.print(result["reason"], markup=False)
+    tube = result["tube"]
+    if tube is not None:
+        largest = max(tube["radius"])
+        screen.print(f"stochastic deviation: at most {largest:.4g} with that probability", markup=False)
+    screen.print(f"method {result['method']}, {result['seconds']:.1f} s", markup=False)
+    for row in result.get("engines", ()):
+        bound = log10_text(row["log10_delta"])
+        screen.print(f"  {row['engine']:<8} {row['status']:<8} <= {bound}: {row['reason']}", markup=False)
