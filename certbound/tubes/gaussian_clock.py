@@ -1,0 +1,250 @@
+"""Slepian's comparison of a rough Gaussian process with an Ornstein-Uhlenbeck process in a clock of its own.
+
+Let x_t = xi_t/s_t (unit variance) and psi(s, t) = -log corr(xi_s, xi_t). If a nondecreasing clock satisfies
+clock(t) - clock(s) >= psi(s, t) for **all** s < t of a block, then P(exists t in the block: x_t > q_t) is
+at most the probability that the stationary Ornstein-Uhlenbeck process exceeds q in that clock (Slepian's
+inequality).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.rigor.rounding import quiet
+from certbound.tubes.gaussian_crossing import log_polygon_crossing
+from certbound.tubes.gaussian_normal import EPS, log_between
+from certbound.tubes.gaussian_pair import total
+
+__all__ = ["Clock", "Windows", "clock_crossing", "cut_windows", "group_windows", "markov_clock"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_WEIGHT = 2.5  # window clock times the square of the least level: near the optimum for levels of 3 to 6
+_MOST_WINDOWS = 600
+_LEAST_CLOCK = 1e-8  # a block of less clock is given this much
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Clock:
+    """A clock on K pieces, linear in time on each: clock(t) - clock(s) >= -log corr within every block.
+
+    Parameters
+    ----------
+    increments : ndarray, shape (K,)
+        Clock of each piece.
+    starts : ndarray of int
+        First piece of each block, beginning with 0.
+    """
+
+    increments: Array
+    starts: Index
+
+
+def markov_clock(durations: ArrayLike, rates: ArrayLike, *, limit: float = 3.0) -> Clock:
+    """The least clock that rates of decorrelation allow, by a forward maximum over the nodes.
+
+    Proves: clock(t) - clock(s) >= psi(s, t) = -log corr(xi_s, xi_t) for all s < t in one block, given
+    ``rates[i, j]`` >= d psi(s, t)/dt for all s in piece i and t in piece j with s < t (almost every t;
+    psi(., s) is absolutely continuous and psi(s, s) = 0). For s in piece i and t in piece j the integral of
+    the rates is at most rates[i, i] (t_{i+1} - s) + sum_{i<l<j} rates[i, l] h_l + rates[i, j] (t - t_j),
+    which is linear in t on piece j: a clock of slope >= rates[i, i] on each piece i that satisfies the
+    inequality at the nodes t_{j+1}, from every t_{i+1}, satisfies it throughout. Such is the smallest one
+    found going forward.
+
+    For xi_t = a_t^T Z_t with dZ = J Z dt + g dW, V the covariance, w = Phi(t, s) V_s a_s and
+    e = da/dt + J^T a: d psi/dt = e^T (V_t a_t/s_t^2 - w/(a_t^T w)) + |a_t^T g|^2/(2 s_t^2), valid where
+    a_t^T w > 0; +inf otherwise.
+
+    Parameters
+    ----------
+    durations : array_like, shape (K,)
+        Lengths h of the pieces, > 0.
+    rates : array_like, shape (K, K) or (K,)
+        Upper bounds as above (entries below the diagonal are not read); +inf allowed off the diagonal. One
+        row of K means bounds that hold for every earlier s.
+    limit : float
+        A new block begins at the piece at whose end psi may exceed it.
+
+    Returns
+    -------
+    Clock
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, a duration is not positive, or a diagonal rate is not finite.
+
+    Examples
+    --------
+    >>> markov_clock([0.5, 0.5], [2.0, 2.0]).increments.round(9).tolist()
+    [1.0, 1.0]
+    """
+    h = np.atleast_1d(np.asarray(durations, dtype=np.float64))
+    rate = np.asarray(rates, dtype=np.float64)
+    count = len(h)
+    if h.ndim != 1 or not np.all((h > 0) & (h < np.inf)):
+        raise ValueError("`durations` must be a row of positive numbers.")
+    if rate.shape not in ((count,), (count, count)):
+        raise ValueError(f"`rates` must have shape ({count},) or ({count}, {count}), got {rate.shape}.")
+    own = rate if rate.ndim == 1 else np.diagonal(rate)
+    if np.any(np.isnan(rate)) or not np.all(own < np.inf):
+        raise ValueError("`rates` must not be NaN, and finite on the diagonal; split the first pieces.")
+    slope = np.maximum(own, 0.0)
+    if rate.ndim == 1:
+        return Clock(increments=_frozen(slope * h * (1 + 2 * EPS)), starts=np.zeros(1, dtype=np.intp))
+    increments = slope * h * (1 + 2 * EPS)
+    starts, block = [0], 0
+    clock = np.zeros(count + 1)
+    debt = np.zeros(count)  # debt[i]: bound of psi(s, t_j) - rates[i, i] (t_{i+1} - s)
+    for j in range(count):
+        before = slice(block, j)
+        step = rate[before, j] * h[j]
+        debt[before] = debt[before] + step + 4 * EPS * (np.abs(debt[before]) + np.abs(step))
+        if j > block and not np.all(debt[before] <= limit):
+            starts.append(j)
+            block = j
+        needed = clock[block + 1 : j + 1] + debt[block:j]
+        ahead = float(np.max(needed)) - clock[j] if j > block else 0.0
+        increments[j] = max(increments[j], ahead + 8 * EPS * (1 + abs(clock[j])))
+        clock[j + 1] = clock[j] + increments[j]
+    return Clock(increments=_frozen(increments), starts=np.asarray(starts, dtype=np.intp))
+
+
+def _frozen(array: Array) -> Array:
+    array = np.array(array, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Windows:
+    """Lines below a boundary: clocks and end levels per window."""
+
+    spans: Array
+    starts: Array
+    stops: Array
+
+
+@quiet
+def group_windows(clock: Array, left: Array, right: Array, first: Index) -> Windows:
+    """Windows from node ``first[k]`` to ``first[k + 1]`` (at last to the last node), one line below each.
+
+    Proves: each line, a chord in Brownian coordinates, lies below the boundary that on piece l runs at or
+    above the chord from ``left[l]`` to ``right[l]``: the chord between the window's ends, lowered by its
+    largest excess over the nodes inside (and 1e-12 relative for rounding).
+    """
+    count = len(left)
+    last = np.append(first[1:], count)
+    window = np.repeat(np.arange(len(first)), last - first)
+    origin = clock[first]
+    spans = clock[last] - origin
+    growth = np.expm1(2 * spans)
+    low, high = left[first], right[last - 1] * np.exp(spans)
+    slope = (high - low) / growth
+    excess = np.zeros(len(first))
+    for node, level in ((np.arange(count), left), (np.arange(1, count + 1), right)):
+        offset = clock[node] - origin[window]
+        line = low[window] + slope[window] * np.expm1(2 * offset)
+        over = line - level * np.exp(offset)
+        excess = np.maximum(excess, np.maximum.reduceat(over, first))
+    excess = excess + 1e-12 * (low + high)
+    stops = (high - excess) * np.exp(-spans)
+    return Windows(spans=spans, starts=low - excess, stops=stops - 32 * EPS * np.abs(stops))
+
+
+@quiet
+def clock_crossing(
+    clock: Clock, levels: ArrayLike, *, continuous: ArrayLike = True, weight: float = _WEIGHT
+) -> float:
+    """Upper bound of log10 P(exists t: xi_t > z_t) for a process compared with an OU process by its `Clock`.
+
+    Proves: with A_k the exceedance in block k and x continuous at the block's start, P <= P(A_0) + sum_k
+    [P(A_k) - P(A_k, x > q at the end of block k - 1)], and P(A_k) by Slepian and the window sums of
+    `log_polygon_crossing`; a boundary linear in the clock and >= 0 is concave in Brownian coordinates,
+    hence above its chords.
+
+    Parameters
+    ----------
+    clock : Clock
+        From `markov_clock`.
+    levels : array_like, shape (K,) or (K, 2)
+        Lower bounds of z_t/s_t on each piece: one number, or its two ends when z_t/s_t is at least the
+        linear interpolation (in t) between them. +inf allowed.
+    continuous : array_like of bool
+        Per block start after the first (or one for all): xi is the same process across it. Where False,
+        nothing is subtracted.
+    weight : float
+        Clock of a window times the square of the least level.
+
+    Returns
+    -------
+    float
+        0.0 (probability 1) where a level is negative.
+
+    Examples
+    --------
+    >>> clock = markov_clock([0.5] * 10, [1.0] * 10)
+    >>> round(clock_crossing(clock, [4.0] * 10), 3)
+    -2.554
+    """
+    d = np.asarray(clock.increments, dtype=np.float64)
+    q = np.asarray(levels, dtype=np.float64)
+    if q.ndim == 1:
+        q = np.stack([q, q], axis=-1)
+    if q.shape != (len(d), 2) or np.any(np.isnan(q)):
+        raise ValueError(f"`levels` must have shape ({len(d)},) or ({len(d)}, 2) without NaN, got {q.shape}.")
+    least = float(np.min(q))
+    if least < 0:
+        return 0.0
+    if least == np.inf:
+        return -np.inf
+    q = np.minimum(q, 3 * least + 40)
+    span = max(weight / max(least, 0.5) ** 2, float(np.sum(d)) / _MOST_WINDOWS)
+    bounds = np.append(clock.starts, len(d))
+    linked = np.broadcast_to(np.asarray(continuous, dtype=bool), (len(clock.starts) - 1,))
+    logs: list[Array] = []
+    end = np.inf
+    for k in range(len(clock.starts)):
+        piece = slice(bounds[k], bounds[k + 1])
+        terms = _block_terms(d[piece], q[piece], span)
+        if k and linked[k - 1]:
+            terms[0] = log_between(terms_start := float(q[bounds[k], 0]), max(end, terms_start))
+        logs.append(terms)
+        end = float(q[bounds[k + 1] - 1, 1])
+    return float(total(np.concatenate(logs)))
+
+
+def _block_terms(d: Array, q: Array, span: float) -> Array:
+    """Terms of one block: pieces cut to at most a third of ``span``, grouped, one line per window."""
+    parts = np.maximum(np.ceil(3 * d / span), 1).astype(np.intp)
+    piece = np.repeat(np.arange(len(d)), parts)
+    index = np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts)
+    share = 1.0 / parts[piece]
+    base, rise = q[piece, 0], (q[:, 1] - q[:, 0])[piece]
+    guard = 32 * EPS * (q[piece, 0] + q[piece, 1])
+    left = np.where(index == 0, base, base + rise * index * share - guard)
+    right = np.where(index + 1 == parts[piece], q[piece, 1], base + rise * (index + 1) * share - guard)
+    steps = (d / parts)[piece] * (1 + 8 * EPS)
+    steps = steps + 8 * EPS * (float(np.sum(steps)) + 1e-3)
+    steps = steps + max(_LEAST_CLOCK - float(np.sum(steps)), 0.0) / len(steps)
+    clock = np.concatenate([[0.0], np.cumsum(steps)])
+    lines = group_windows(clock, left, right, cut_windows(clock, left, right, span))
+    return log_polygon_crossing(lines.spans, lines.starts, lines.stops)
+
+
+def cut_windows(clock: Array, left: Array, right: Array, span: float) -> Index:
+    """First pieces of windows of about ``span``, or shorter where the level jumps, never below a tenth."""
+    jump = (np.abs(left[1:] - right[:-1]) > 0.05 * np.abs(left[1:])).tolist()
+    nodes, first, start = clock.tolist(), [0], 0.0
+    for k in range(1, len(left)):
+        gone = nodes[k] - start
+        if gone >= (1 - 1e-9) * span or (jump[k - 1] and gone > 0.1 * span):
+            first.append(k)
+            start = nodes[k]
+    if len(first) > 1 and nodes[-1] - start < 0.1 * span:
+        first.pop()
+    return np.asarray(first, dtype=np.intp)
