@@ -17,7 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.rigor.arithmetic import Interval, IntervalLike, matmul
 from certbound.rigor.rounding import STEP, TINY, lower, product_error, quiet, upper
 
-__all__ = ["eigenvalue_lower", "eigenvalue_upper", "is_positive_definite", "matrix_exponential", "norm_upper"]
+__all__ = [
+    "eigenvalue_lower", "eigenvalue_upper", "is_positive_definite", "matrix_exponential", "norm_upper",
+    "perron_upper",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 DEGREE = 14  # of the Taylor polynomial
@@ -198,11 +201,20 @@ def _collatz(t: Interval) -> Array:
     n = t.mag
     diagonal = np.arange(n.shape[-1])
     n[..., diagonal, diagonal] = t.hi[..., diagonal, diagonal]
-    return _perron(n)
+    return perron_upper(n)
 
 
-def _perron(n: Array) -> Array:
-    """Upper bounds of lambda_max for symmetric n with nonnegative off-diagonal entries."""
+def perron_upper(n: Array) -> Array:
+    """Upper bounds of lambda_max over symmetric matrices whose entries ``n`` bounds.
+
+    Proves: lambda_max(S) <= result whenever S_ii <= n_ii and |S_ij| <= n_ij, from the quotients of the vector
+    of ones and of the computed dominant eigenvector; +inf where an entry is unbounded.
+
+    Parameters
+    ----------
+    n : ndarray, shape (..., n, n)
+        Nonnegative off the diagonal.
+    """
     bound = _quotient(n, np.ones(n.shape[:-1]))
     floor = np.max(np.diagonal(n, axis1=-2, axis2=-1), axis=-1)
     size = np.max(np.abs(n), axis=(-1, -2))
@@ -226,7 +238,7 @@ def _perron(n: Array) -> Array:
 def _nonnegative_norm(n: Array) -> Array:
     """Upper bounds of the spectral norm of nonnegative matrices: ||N||^2 = lambda_max(N^T N)."""
     gram = matmul(n.swapaxes(-1, -2), n).hi
-    return _up_sqrt(np.maximum(_perron(np.maximum(gram, gram.swapaxes(-1, -2))), 0.0))
+    return _up_sqrt(np.maximum(perron_upper(np.maximum(gram, gram.swapaxes(-1, -2))), 0.0))
 
 
 @quiet
