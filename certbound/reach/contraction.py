@@ -19,8 +19,9 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.errors import EnclosureError
 from certbound.problem.problem import Problem
-from certbound.reach.cells import Cells, initial_cells
+from certbound.reach.cells import initial_cells
 from certbound.reach.curve import Curve
 from certbound.reach.flow import Flow
 from certbound.reach.nominal import bound_defect, bound_disturbance_slope, nominal_curve
@@ -30,7 +31,15 @@ from certbound.rigor import intervals as iv
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants
 
-__all__ = ["bound_forcing", "contraction_tube", "growth", "integrate_radius", "values_on_pieces"]
+__all__ = [
+    "bound_forcing",
+    "contraction_tube",
+    "first_infinite",
+    "growth",
+    "integrate_radius",
+    "jump_sizes",
+    "values_on_pieces",
+]
 
 Array = NDArray[np.float64]
 
@@ -66,11 +75,14 @@ def contraction_tube(
     Returns
     -------
     ReachTube
+        It may end before the horizon (see ``ReachTube.end``), where the closed loop has no enclosure.
 
     Raises
     ------
     ValueError
         If rate and time do not fit, or the nominal trajectory cannot be followed.
+    EnclosureError
+        If the closed loop has no enclosure on the first piece already.
     """
     flow = problem if isinstance(problem, Flow) else Flow(problem)
     if constants.continuous != flow.continuous:
@@ -83,9 +95,26 @@ def contraction_tube(
     eta = bound_forcing(flow, curve, norm) if forcing is None else forcing
     slope = constants.rate if constants.rate is not None else constants.gain
     slopes = values_on_pieces(slope, constants.times, curve)
-    radius = integrate_radius(curve, norm, parts, slopes, eta)
-    assumption = "" if constants.certified else "the stated constants"
-    return ReachTube(curve=curve, radius=radius, metric=constants.metric, assumption=assumption)
+    rho = parts.radii(norm, curve.initial())
+    radius, _ = integrate_radius(curve, jump_sizes(curve, norm), rho, slopes, eta)
+    proved = first_infinite(radius)
+    if proved == 0:
+        raise EnclosureError(
+            "the closed loop has no enclosure on the first piece of the nominal curve; check where the model is "
+            "defined."
+        )
+    return ReachTube(
+        curve=curve.until(proved),
+        radius=radius[:, :proved],
+        metric=constants.metric,
+        assumption="" if constants.certified else "the stated constants",
+    )
+
+
+def first_infinite(radius: Array) -> int:
+    """Number of pieces before the first unbounded one."""
+    finite = np.all(np.isfinite(radius), axis=0)
+    return len(finite) if finite.all() else int(np.argmin(finite))
 
 
 def bound_forcing(flow: Flow, curve: Curve, norm: Norm) -> Array:
@@ -125,27 +154,39 @@ def _largest_image(norm: Norm, slope: Interval, width: Interval) -> Array:
     return best
 
 
-def integrate_radius(curve: Curve, norm: Norm, cells: Cells, slopes: Array, eta: Array) -> Array:
-    """rho over each piece, shape (B, K), rounded up, for slopes c or L and forcing eta per piece.
+def integrate_radius(curve: Curve, gaps: Array, rho: Array, slopes: Array, eta: Array) -> tuple[Array, Array]:
+    """rho over each piece, shape (B, K), and after the last one, shape (B,), rounded up.
 
-    ``slopes`` has shape (K,) or (B, K). Once a radius is infinite it stays so.
+    Parameters
+    ----------
+    curve : Curve
+        Of K pieces (or steps).
+    gaps : ndarray, shape (B, K)
+        Size of the curve's jump after each piece, see `jump_sizes`.
+    rho : ndarray, shape (B,)
+        Radius at the start of the first piece.
+    slopes, eta : ndarray, shapes broadcastable to (B, K)
+        c (CT) or L (DT), and the forcing. Once a radius is infinite it stays so.
     """
     slopes = np.broadcast_to(slopes, eta.shape)
     radius = np.empty(eta.shape)
-    rho = cells.radii(norm, curve.initial())
-    if not curve.continuous:
-        for k in range(curve.pieces):
-            radius[:, k] = rho
-            rho = _step(slopes[:, k], rho, np.ones(len(rho)), eta[:, k])
-        return radius
-    factor, integral = growth(slopes, curve)
-    gaps = norm.length(curve.jumps())
+    if curve.continuous:
+        factor, integral = growth(slopes, curve)
+    else:
+        factor, integral = slopes, np.ones(slopes.shape)
     for k in range(curve.pieces):
         after = _step(factor[:, k], rho, integral[:, k], eta[:, k])
-        radius[:, k] = np.maximum(rho, after)
-        if k + 1 < curve.pieces:
-            rho = np.nextafter(after + gaps[:, k], np.inf)
-    return radius
+        radius[:, k] = np.maximum(rho, after) if curve.continuous else rho
+        rho = np.nextafter(after + gaps[:, k], np.inf)
+    return radius, rho
+
+
+def jump_sizes(curve: Curve, norm: Norm) -> Array:
+    """Upper bounds of the curve's jump after each piece, shape (B, K); 0 after the last and in discrete time."""
+    gaps = np.zeros((curve.cells, curve.pieces))
+    if curve.continuous and curve.pieces > 1:
+        gaps[:, :-1] = norm.length(curve.jumps())
+    return gaps
 
 
 def _step(factor: Array, rho: Array, integral: Array, eta: Array) -> Array:
@@ -174,8 +215,9 @@ def growth(rates: Array, curve: Curve) -> tuple[Array, Array]:
     for j in range(16, 1, -1):
         total = total * small / float(j) + 1.0
     total = total + Interval(-1e-17, 1e-17)
-    phi = np.maximum(np.where(large, quotient.hi, total.hi), 0.0)
+    phi = np.clip(np.where(large, quotient.hi, total.hi), 0.0, 1e300)
     integral = (Interval.point(phi) * h).hi
+    finite &= phi < 1e300
     return np.where(finite, factor.hi, np.inf), np.where(finite, integral, np.inf)
 
 

@@ -147,11 +147,15 @@ class Curve:
             total = total * offsets + chosen[..., j, :]
         return total.reshape(self.cells, *times.shape, self.dimension)
 
-    def until(self, pieces: int) -> Curve:
-        """The first ``pieces`` pieces."""
+    def section(self, first: int, last: int) -> Curve:
+        """Pieces ``first`` up to, but without, ``last``."""
         return Curve(
             continuous=self.continuous,
-            starts=self.starts[:pieces],
-            ends=self.ends[:pieces],
-            coefficients=self.coefficients[:, :pieces],
+            starts=self.starts[first:last],
+            ends=self.ends[first:last],
+            coefficients=self.coefficients[:, first:last],
         )
+
+    def until(self, pieces: int) -> Curve:
+        """The first ``pieces`` pieces."""
+        return self.section(0, pieces)

@@ -19,7 +19,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian
 from certbound.reach.series import Series, expand
-from certbound.rigor.intervals import Interval
+from certbound.rigor.intervals import Interval, stack
 
 __all__ = ["Flow"]
 
@@ -125,12 +125,19 @@ class Flow:
         disturbance : Interval, shape (..., q), optional
             The whole set D when omitted.
         """
+        slots = self.slots(times, states, rows, disturbance)
+        return enclose(tape, [slots[..., i] for i in range(slots.shape[-1])], undefined="infinite")
+
+    def slots(
+        self, times: Interval, states: Interval, rows: Array, disturbance: Interval | None = None
+    ) -> Interval:
+        """Boxes of all input slots, shape (..., K, slots), from the parts that `bounds` takes."""
         d = self.disturbance if disturbance is None else disturbance
-        slots = [times, *(states[..., i] for i in range(self.dimension))]
-        slots += [Interval.point(rows[..., i]) for i in range(rows.shape[-1])]
-        slots += [d[..., i] for i in range(d.shape[-1])]
-        batch = np.broadcast_shapes(*(slot.shape for slot in slots))
-        return enclose(tape, [slot.broadcast_to(batch) for slot in slots], undefined="infinite")
+        parts = [times, *(states[..., i] for i in range(self.dimension))]
+        parts += [Interval.point(rows[..., i]) for i in range(rows.shape[-1])]
+        parts += [d[..., i] for i in range(d.shape[-1])]
+        batch = np.broadcast_shapes(*(part.shape for part in parts))
+        return stack([part.broadcast_to(batch) for part in parts], axis=-1)
 
     def expand(self, times: Series, states: Sequence[Series], rows: Array, order: int) -> list[Series]:
         """Series of f at d0 along series of time and states."""
