@@ -53,8 +53,8 @@ def log10_text(log10: float) -> str:
 def describe_deviation(verdict: Verdict) -> dict[str, Any] | None:
     """``times``, and per piece an upper bound on the size of X - x and on its half-width in each state.
 
-    Piece k is [times[k], times[k+1]] with both ends; in discrete time it covers the steps k and k + 1. None where
-    no tube could be certified.
+    Piece k is [times[k], times[k+1]] with both ends; in discrete time it covers the steps k and k + 1. None
+    where no tube could be certified.
     """
     deviation = verdict.deviation
     if deviation is None:

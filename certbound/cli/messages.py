@@ -50,7 +50,7 @@ def explain(error: Exception, command: str) -> tuple[int, str, str]:
         subject = f"`{error.filename}`: " if error.filename else ""
         why = f"{subject}{error.strerror or error}"
         return BAD_INPUT, why, "check the path and its permissions"
-    if isinstance(error, ModuleNotFoundError):
+    if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("certbound."):
         return BAD_INPUT, f"the module `{error.name}` is not installed", _install_hint(error.name or "")
     if isinstance(error, (ValueError, TypeError)) and _refused(error):
         why, cure = split_cure(str(error))

@@ -141,10 +141,7 @@ def picture(problem: Problem, verdict: Verdict, suffix: str) -> bytes:
     """The picture of a verdict, with 100 sample paths where the noise has a law to sample from."""
     from io import BytesIO
 
-    import numpy as np
-
     from certbound.plotting import Scene, draw_scene
-    from certbound.simulation.paths import sample_paths
 
     times = paths = None
     title = f"{problem.name}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
