@@ -7,6 +7,7 @@ paper).
 
 from __future__ import annotations
 
+import functools
 import importlib
 from typing import Any
 
@@ -28,6 +29,8 @@ __all__ = ["bound_constants", "constants_along"]
 
 Array = NDArray[np.float64]
 
+FIRST_BUDGET = 4000
+"""Boxes before the affine structure of the Jacobian is looked for."""
 SMALLEST_GAIN = 1e-12
 """Stands for L = 0, which the tubes exclude."""
 
@@ -156,14 +159,17 @@ def _supremum(
             result[defined] = sampled(matrices[defined])
         return result
 
-    return bound_supremum(
-        bound,
-        value,
-        jacobian.box,
-        tolerance=tolerance * _scale(jacobian, norm),
-        budget=budget,
-        ceiling=_structural_bound(model, jacobian, norm),
-    )
+    limit = tolerance * _scale(jacobian, norm)
+    starts = jacobian.starts()
+    search = functools.partial(bound_supremum, bound, value, jacobian.box, tolerance=limit, starts=starts)
+    found = search(budget=min(budget, FIRST_BUDGET))
+    if found.upper - found.sampled <= limit or not np.isfinite(found.sampled):
+        return found
+    many = len(jacobian.active) > 3 or not (np.isfinite(jacobian.box.lo) & np.isfinite(jacobian.box.hi)).all()
+    ceiling = _structural_bound(model, jacobian, norm) if many else np.inf
+    if np.isinf(found.upper) and np.isinf(ceiling):
+        return found
+    return search(budget=budget, ceiling=ceiling)
 
 
 def _structural_bound(model: Model, jacobian: StateJacobian, norm: Metric) -> float:

@@ -51,6 +51,7 @@ def bound_supremum(
     tolerance: float,
     budget: int = 60_000,
     ceiling: float = np.inf,
+    starts: Interval | None = None,
 ) -> Supremum:
     """Bound sup value over a box, best boxes first.
 
@@ -72,18 +73,20 @@ def bound_supremum(
         Stop after about so many boxes; the result is certified all the same.
     ceiling : float
         An upper bound known beforehand.
+    starts : Interval, shape (N, k), optional
+        Boxes that together hold the supremum; the box itself when omitted.
     """
     if not tolerance > 0:
         raise ValueError(f"`tolerance` must be positive, got {tolerance}.")
     rng = np.random.default_rng(0)
-    boxes = box.reshape(1, -1)
+    boxes = box.reshape(1, -1) if starts is None else starts
     point = _centres(boxes)[0]
     sampled, point = _sample(value, [_centres(boxes), random_points(rng, box, 2048)], -np.inf, point)
     sampled, point = _climb(value, rng, box, sampled, point)
     uppers, weights = bound(boxes, -np.inf)
     uppers = np.minimum(uppers, ceiling)
     retired, retired_box = -np.inf, box
-    count, rounds_unbounded = 1, 0
+    count, rounds_unbounded = len(boxes), 0
     while len(boxes):
         done = uppers <= sampled + tolerance
         done |= ~np.any(boxes.lo < boxes.hi, axis=1)

@@ -55,6 +55,21 @@ class StateJacobian:
         if self.active and size <= SLOPE_LIMIT:
             self._slopes = jacobian(self.tape, self.active)
 
+    def starts(self, limit: int = 256) -> Interval:
+        """Boxes (N, k) over which the supremum of a convex function of J equals that over the whole box.
+
+        Where J is affine in one coordinate with the others fixed, a convex function of J (a measure, a norm)
+        is largest at an end of that coordinate: only the ends are kept, while there are at most ``limit``.
+        """
+        lo, hi = self.box.lo[None], self.box.hi[None]
+        for column, slot in enumerate(self.active):
+            a, b = float(self.box.lo[column]), float(self.box.hi[column])
+            if 2 * len(lo) <= limit and a < b and np.isfinite(b - a) and _is_affine(self.tape, slot):
+                lo, hi = np.concatenate([lo, lo]), np.concatenate([hi, hi])
+                ends = np.repeat([a, b], len(lo) // 2)
+                lo[:, column], hi[:, column] = ends, ends
+        return Interval(lo, hi)
+
     @property
     def dimension(self) -> int:
         """State dimension n."""
@@ -118,6 +133,20 @@ class StateJacobian:
         elif inputs:
             inputs[0] = inputs[0].broadcast_to((len(boxes),))
         return inputs
+
+
+def _is_affine(tape: Tape, slot: int) -> bool:
+    """Whether the outputs are affine in one slot, and nothing that may be undefined or jump depends on it."""
+    depends: list[bool] = []
+    for node in tape.nodes:
+        if node.op == "input":
+            depends.append(node.args[0] == slot)
+            continue
+        inner = [depends[arg] for arg in node.args]
+        depends.append(any(inner))
+        if (node.op in JUMPS or node.op in UNDEFINED) and (inner[-1] if node.op == "div" else any(inner)):
+            return False
+    return slot not in _dependencies(jacobian(tape, [slot]))
 
 
 def _dependencies(tape: Tape) -> tuple[int, ...]:

@@ -98,9 +98,9 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
 
     if pieces is not None:
         squares, traces = levels(pieces[:, :slots])
-        unbounded = np.flatnonzero(~np.isfinite(squares))
-        if len(unbounded):
-            _refuse(tape, pieces[int(unbounded[0]), :slots], True)
+        bounded = np.asarray(np.isfinite(squares))
+        if not bounded.all():
+            _refuse(tape, pieces[:, :slots][int(np.argmin(bounded))], True)
         roots = np.array([_root(entry) for entry in squares])
         nu = _effective(traces, roots, model.dimension)
         return NoiseBound(sigma=roots, effective_dimension=nu, isotropic=False, gaussian=True)
