@@ -173,7 +173,10 @@ class Metric:
 def _half_sum(x: Interval) -> Interval:
     """Symmetric part, entry by entry."""
     total = x + x.T
-    return Interval._raw(0.5 * total.lo - TINY, 0.5 * total.hi + TINY)  # halving is exact but for underflow
+    large = 4 * TINY  # from there on halving is exact
+    lo = np.where(np.abs(total.lo) >= large, 0.5 * total.lo, np.minimum(total.lo, 0.0))
+    hi = np.where(np.abs(total.hi) >= large, 0.5 * total.hi, np.maximum(total.hi, 0.0))
+    return Interval._raw(lo, hi)
 
 
 def _bounded(x: Interval) -> tuple[Interval, NDArray[np.bool_]]:

@@ -60,13 +60,17 @@ def bound_noise(model: Model, norm: Metric, pieces: Interval | None = None) -> N
         assert isinstance(system.diffusion, np.ndarray)
         gain, proxy, gaussian = system.diffusion, np.eye(system.noise_dimension), True
         exact = _product(_fractions(gain), _fractions(np.eye(gain.shape[1])))
+    if not (gain.any() and proxy.any()):
+        silent: Any = 0.0 if pieces is None else np.zeros(len(pieces))
+        nu = float(model.dimension)
+        return NoiseBound(sigma=silent, effective_dimension=nu, isotropic=False, gaussian=gaussian)
     covariance = matmul(matmul(gain, proxy), np.swapaxes(gain, 0, 1))
     square, trace = _level(norm, Interval(covariance.lo[None], covariance.hi[None]))
     isotropic = exact is not None and _is_isotropic(norm, exact)
     sigma = _root(square[0])
     if isotropic and norm.matrix is None:
         sigma = _exact_sigma(exact, sigma)
-    nu = _effective(trace, np.array([sigma]), model.dimension)
+    nu = _effective(trace, np.array([sigma]), min(gain.shape))
     value = sigma if pieces is None else np.full(len(pieces), sigma)
     nu = float(model.dimension) if isotropic else nu
     return NoiseBound(sigma=value, effective_dimension=nu, isotropic=isotropic, gaussian=gaussian)
@@ -102,7 +106,7 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
         if not bounded.all():
             _refuse(tape, pieces[:, :slots][int(np.argmin(bounded))], True)
         roots = np.array([_root(entry) for entry in squares])
-        nu = _effective(traces, roots, model.dimension)
+        nu = _effective(traces, roots, min(tape.shape))
         return NoiseBound(sigma=roots, effective_dimension=nu, isotropic=False, gaussian=True)
     function = compile_numpy(tape)
 
@@ -112,7 +116,7 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
         matrix = g @ np.swapaxes(g, -1, -2)
         if norm.matrix is not None:
             matrix = norm.transform(matrix @ norm.matrix)
-        defined = np.isfinite(matrix).all(axis=(-1, -2))
+        defined = np.asarray(np.isfinite(matrix).all(axis=(-1, -2)))
         safe = np.where(defined[:, None, None], matrix, 0.0)
         found = np.linalg.norm(safe, 2, axis=(-2, -1)) if which == 0 else np.trace(safe, axis1=-2, axis2=-1)
         return np.where(defined, found, np.nan)
@@ -132,7 +136,7 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
             _refuse(tape, found.worst, model.bounded_by_user)
         results.append(found.upper)
     sigma = _root(results[0])
-    nu = _effective(np.array([results[1]]), np.array([sigma]), model.dimension)
+    nu = _effective(np.array([results[1]]), np.array([sigma]), min(tape.shape))
     return NoiseBound(sigma=sigma, effective_dimension=nu, isotropic=False, gaussian=True)
 
 
@@ -163,13 +167,13 @@ def _root(square: float) -> float:
     return root
 
 
-def _effective(trace: Array, sigma: Array, dimension: int) -> float:
-    """nu with trace <= nu sigma^2 on every piece."""
+def _effective(trace: Array, sigma: Array, rank: int) -> float:
+    """nu with trace <= nu sigma^2 on every piece; never above the rank that g g^T can have."""
     with np.errstate(all="ignore"):
         ratio = upper(trace / lower(sigma * sigma, tiny=TINY), tiny=TINY)
     useful = ratio[np.isfinite(ratio) & (sigma > 0)]
     largest = float(np.max(useful, initial=0.0))
-    return min(float(dimension), largest) if largest > 0 else float(dimension)
+    return min(float(rank), largest) if largest > 0 else float(rank)
 
 
 Rational = list[list[Fraction]]
