@@ -85,14 +85,11 @@ class Region:
 
 def _center(name: str, value: Any, length: int | None) -> Center:
     """A fixed centre, or the tape of a moving one."""
-    if isinstance(value, Tape):
-        if value.inputs != ("t",) or len(value.shape) != 1:
-            raise ValueError(f"`{name}` must be a vector over ('t',), got {value.shape} over {value.inputs}.")
-        tape = value
-    elif callable(value):
-        tape = trace(value, {"t": ["t"]})
-    else:
+    if not isinstance(value, Tape) and not callable(value):
         return vector(name, value, length)
+    tape = value if isinstance(value, Tape) else trace(value, {"t": ["t"]})
+    if tape.inputs != ("t",) or len(tape.shape) != 1:
+        raise ValueError(f"`{name}` must be a vector over ('t',), got shape {tape.shape} over {tape.inputs}.")
     if length is not None and tape.shape != (length,):
         raise ValueError(f"`{name}` must have {length} entries, got shape {tape.shape}.")
     if all(node.op != "input" for node in tape.nodes):
