@@ -1,0 +1,299 @@
+"""Probabilities that the Gaussian response ever exceeds given levels along given rows (scalar events of Thm K7).
+
+Discrete time: the first exceedance, P(xi_0 > z_0) + sum_t P(xi_t <= z_t, xi_{t+1} > z_{t+1}).
+
+Continuous time, in windows [t_a, t_e]: M_s = Phi(t_e, s) Z_s is a Gaussian martingale, so that
+P(r . M_{t_a} <= z, sup r . M > z) = 2 P(r . M_{t_a} <= z, r . M_{t_e} > z) by reflection. A row w at time s reads
+w . Z_s = b . M_s with b = w Phi(s, t_e); if |M_i| <= z_i for every coordinate, then w . Z_s <= r . M_s +
+sum_i |b - r|_i z_i. The event that some coordinate exceeds z_i is paid once, for all rows together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.reach.response import LinearResponse
+from certbound.tubes.gaussian_normal import log_below_above, log_tail
+
+__all__ = ["StepEvents", "WindowEvents", "logsumexp"]
+
+Array = NDArray[np.float64]
+Nodes = NDArray[np.int64]
+
+_ROUND = 1 + 1e-14
+
+
+def logsumexp(values: Array) -> float:
+    """Upper bound of log sum exp(values)."""
+    values = np.asarray(values, dtype=float).ravel()
+    top = float(values.max(initial=-np.inf))
+    if not np.isfinite(top):
+        return top
+    total = np.log(np.exp(values - top).sum() * (1 + 1e-13 + 2e-16 * len(values))) + top
+    return float(total + 4e-16 * (abs(top) + 1))
+
+
+def _ratio_down(level: Array, variance_hi: Array) -> Array:
+    """level / standard deviation, rounded down; +inf for a variance of 0 and a level that is not negative."""
+    sd = np.sqrt(np.maximum(variance_hi, 0.0)) * _ROUND
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        value = level / sd
+    value = np.where(sd > 0, value - np.abs(value) * 4e-16, np.where(level >= 0, np.inf, -np.inf))
+    return np.where(level == np.inf, np.inf, value)
+
+
+def _ratio_up(level: Array, variance_lo: Array) -> Array:
+    """level / standard deviation, rounded up."""
+    sd = np.sqrt(np.maximum(variance_lo, 0.0)) / _ROUND
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        value = level / sd
+    value = np.where(sd > 0, value + np.abs(value) * 4e-16, np.inf)
+    return np.where(level == np.inf, np.inf, value)
+
+
+def _spread(difference_hi: Array, scale: Array) -> Array:
+    """Upper bound of sqrt((1 - rho)/(1 + rho)) from 1 - rho <= difference_hi / scale."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gap = np.where(scale > 0, difference_hi / scale, 2.0) * _ROUND
+        gap = np.clip(gap, 0.0, 2.0)
+        return np.sqrt(gap / np.maximum(2.0 - gap, 0.0)) * _ROUND
+
+
+def _numbers(count: int) -> Nodes:
+    return np.arange(count, dtype=np.int64)
+
+
+def _product_rounding(n: int) -> float:
+    """Relative rounding error of a sum of n products."""
+    return 1.02 * (n + 2) * 2.0**-53
+
+
+def _size(response: LinearResponse, nodes: Nodes) -> Array:
+    """Bound of the standard deviation along any row with entries in [-1, 1], at ``nodes``."""
+    total = np.abs(response.covariance[0, nodes]).sum(axis=(1, 2)) + np.abs(
+        response.covariance_error[0, nodes]).sum(axis=(1, 2))
+    return np.asarray(np.sqrt(total) * (1 + 1e-12))
+
+
+class StepEvents:
+    """Discrete time. ``gaussian`` noise: first exceedances; any other sub-Gaussian law: the union bound."""
+
+    def __init__(self, response: LinearResponse, cell: int, gaussian: bool) -> None:
+        self.response, self.cell, self.gaussian = _one(response, cell), cell, gaussian
+        self.shared_log = -np.inf
+
+    def standard_deviation(self, rows: Array) -> Array:
+        """Standard deviation along ``rows`` (nodes, n): an estimate to shape levels with."""
+        nodes = _numbers(len(rows))
+        _, high = self.response.variance(rows[None], nodes)
+        return np.asarray(np.sqrt(np.maximum(high[0], 0.0)))
+
+    def log_exceedance(self, rows: Array, levels: Array) -> float:
+        """Upper bound of log P(exists t: rows[t] . Z_t > levels[t])."""
+        nodes = _numbers(len(rows))
+        if np.any(levels < 0):
+            return 0.0
+        low, high = (v[0] for v in self.response.variance(rows[None], nodes))
+        above = _ratio_down(levels, high)
+        if not self.gaussian:
+            with np.errstate(over="ignore"):
+                exponent = -0.5 * np.minimum(above, 1e150) ** 2
+            return min(logsumexp(np.where(above == np.inf, -np.inf, exponent * (1 - 1e-15))), 0.0)
+        single = log_tail(above)
+        below = _ratio_up(levels, low)[:-1]
+        following = np.einsum("ti,tij->tj", rows[1:], self.response.transition[0, : len(rows) - 1])
+        # the row at t + 1 seen from t is w F up to the rounding of this product
+        cross_lo, _ = self.response.covariance_of(following[None], rows[None, :-1], nodes[:-1])
+        scale = np.sqrt(np.maximum(high[:-1], 0) * np.maximum(high[1:], 0)) * _ROUND
+        low_scale = np.sqrt(np.maximum(low[:-1], 0) * np.maximum(low[1:], 0)) / _ROUND
+        size = np.einsum("ti,tij->t", np.abs(rows[1:]), np.abs(self.response.transition[0, : len(rows) - 1]))
+        loss = size * _product_rounding(rows.shape[1]) * _size(self.response, nodes[:-1])
+        cross = cross_lo[0] - loss * np.sqrt(np.maximum(high[:-1], 0)) * _ROUND
+        with np.errstate(divide="ignore", invalid="ignore"):
+            correlation = np.where(cross >= 0, cross / scale, cross / low_scale)
+        correlation = np.where(np.isfinite(correlation), np.clip(correlation - 1e-14, -1.0, 1.0), -1.0)
+        joint = log_below_above(below, above[1:], correlation)
+        return min(logsumexp(np.concatenate([single[:1], np.minimum(joint, single[1:])])), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class WindowEvents:
+    """Continuous time: reflection in windows of ``length`` pieces.
+
+    Parameters
+    ----------
+    response : LinearResponse
+    cell : int
+    length : int
+        Pieces per window.
+    shared_log : float
+        Log probability granted to the event that some coordinate of M leaves its level in some window.
+    """
+
+    response: LinearResponse
+    cell: int
+    length: int
+    shared_log: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "response", _one(self.response, self.cell))
+
+    @cached_property
+    def bounds(self) -> Nodes:
+        """Window borders: node numbers from 0 to N."""
+        return np.append(np.arange(0, self.response.pieces, self.length, dtype=np.int64), self.response.pieces)
+
+    @cached_property
+    def back(self) -> tuple[Array, Array]:
+        """Phi(t_{k+1}, t_e)^{-1 of the forward map}: G_k of the row b = w G_k, and an entrywise error bound.
+
+        G_k approximates Phi(t_e, t_{k+1})^{-1}; the error also covers the motion inside piece k.
+        """
+        n = self.response.slope.shape[-1]
+        pieces = self.response.pieces
+        f, phi = self.response.transition[0], self.response.transition_error[0]
+        g = np.zeros((pieces, n, n))
+        error = np.zeros((pieces, n, n))
+        for start, end in zip(self.bounds[:-1], self.bounds[1:], strict=True):
+            forward, slack = np.eye(n), 0.0
+            for k in range(end - 1, start - 1, -1):
+                inverse = np.linalg.inv(forward)
+                size = float(np.abs(inverse).sum(1).max())
+                norm = float(np.abs(forward).sum(1).max())
+                residual = float(np.abs(np.eye(n) - inverse @ forward).sum(1).max())
+                residual += size * (n * slack + (n + 2) * 4e-16 * norm)
+                if residual >= 0.5:
+                    raise ValueError("`length` of a window is too large for this system; take shorter windows.")
+                offset = 2 * residual * size
+                deviation = self.response.deviation[0, k]
+                g[k] = inverse
+                error[k] = (deviation @ (np.abs(inverse) + offset) + offset) * (1 + 1e-13)
+                forward, slack = _longer(forward, slack, f[k], float(phi[k]))
+        return g, error
+
+    @cached_property
+    def starts(self) -> tuple[Array, Array]:
+        """Phi(t_e, t_a) of every window in floats, and an entrywise error bound (one number a window)."""
+        f, phi = self.response.transition[0], self.response.transition_error[0]
+        n = f.shape[-1]
+        result, errors = [], []
+        for start, end in zip(self.bounds[:-1], self.bounds[1:], strict=True):
+            forward, slack = np.eye(n), 0.0
+            for k in range(end - 1, start - 1, -1):
+                forward, slack = _longer(forward, slack, f[k], float(phi[k]))
+            result.append(forward)
+            errors.append(slack)
+        return np.array(result), np.array(errors)
+
+    def standard_deviation(self, rows: Array) -> Array:
+        """Standard deviation along ``rows`` (pieces, n), the larger of both ends: an estimate."""
+        nodes = _numbers(self.response.pieces)
+        ends = [self.response.variance(rows[None], nodes + shift)[1][0] for shift in (0, 1)]
+        return np.asarray(np.sqrt(np.maximum(np.maximum(*ends), 0.0)))
+
+    @cached_property
+    def coordinate_levels(self) -> Array:
+        """z_i of every window: the levels of |M_i| that together cost exp(shared_log)."""
+        n = self.response.slope.shape[-1]
+        variance = np.stack([
+            self.response.variance(np.broadcast_to(np.eye(n)[i], (1, len(self.bounds) - 1, n)), self.bounds[1:])[1][0]
+            for i in range(n)
+        ], axis=1)
+        sd = np.sqrt(np.maximum(variance, 0.0)) * _ROUND
+        active = [i for i in range(n) if sd[:, i].max() > 0]
+        low, high = 1.0, 60.0
+        rows = np.broadcast_to(np.eye(n)[:, None, :], (n, len(self.bounds) - 1, n))
+        for _ in range(24):
+            factor = (low + high) / 2
+            total = logsumexp(np.array([self._windows(rows[i], factor * sd[:, i]) + np.log(2.0) for i in active]))
+            low, high = (low, factor) if total <= self.shared_log else (factor, high)
+        return np.asarray(high * sd)
+
+    def log_exceedance(self, rows: Array, levels: Array) -> float:
+        """Upper bound of log P(exists t: rows[k] . Z_t > levels[k] on piece k, no coordinate above its level)."""
+        g, error = self.back
+        exact = np.einsum("ki,kij->kj", rows, g)
+        slack = np.einsum("ki,kij->kj", np.abs(rows), error) + 1e-14 * np.abs(exact)
+        count = len(self.bounds) - 1
+        window = np.repeat(np.arange(count), np.diff(self.bounds))
+        asked = levels < np.inf
+        directions = np.zeros((count, rows.shape[1]))
+        room = np.full(count, np.inf)
+        for index in range(count):
+            inside = (window == index) & asked
+            if not inside.any():
+                continue
+            chosen = exact[inside]
+            directions[index] = (chosen.max(axis=0) + chosen.min(axis=0)) / 2
+            off = np.abs(chosen - directions[index]) + slack[inside]
+            cost = (off @ self.coordinate_levels[index]) * (1 + 1e-13)
+            room[index] = np.min(levels[inside] - cost)
+        if np.any(room < 0):
+            return 0.0
+        return min(self._windows(directions, room), 0.0)
+
+    def _windows(self, directions: Array, levels: Array) -> float:
+        """Log of the bound on P(some window's martingale direction . M exceeds its level)."""
+        forward, slack = self.starts
+        first = np.einsum("wi,wij->wj", directions, forward)
+        ends, begins = self.bounds[1:], self.bounds[:-1]
+        end_low, end_high = (v[0] for v in self.response.variance(directions[None], ends))
+        begin_low, begin_high = (v[0] for v in self.response.variance(first[None], begins))
+        # the row at the window's start is known up to its rounding: r V r moves by 2 sqrt(r V r) e + e^2
+        norms = np.abs(directions).sum(axis=1)
+        loss = norms * (slack + 2 * len(first[0]) * 2.0**-53 * np.abs(forward).max(axis=(1, 2)))
+        loss = loss * _size(self.response, begins) * (1 + 1e-12)
+        change = 2 * np.sqrt(np.maximum(begin_high, 0)) * loss + loss**2
+        begin_low = np.maximum(begin_low - change * _ROUND, 0.0)
+        begin_high = np.minimum(begin_high + change * _ROUND, end_high)
+        above = _ratio_down(levels, end_high)
+        below = _ratio_up(levels, begin_low)
+        roots = (np.sqrt(begin_low) + np.sqrt(np.maximum(end_low, 0))) / _ROUND
+        with np.errstate(divide="ignore", invalid="ignore"):
+            spread = np.sqrt(np.maximum(end_high - begin_low, 0.0)) / roots * _ROUND
+        spread = np.where(roots > 0, spread, 1.0)
+        inside = log_below_above(below, above, spread=spread) + np.log(2.0)
+        # at a window's start: the previous window kept its own direction below its level
+        start = log_tail(_ratio_down(levels, begin_high))
+        previous, own = directions[:-1], first[1:]
+        p_low, p_high = (v[0] for v in self.response.variance(previous[None], begins[1:]))
+        own_low, own_high = begin_low[1:], begin_high[1:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            unit = previous / np.sqrt(p_high)[:, None] - own / np.sqrt(own_high)[:, None]
+            scale = 2 * np.sqrt(np.maximum(p_low / p_high, 0) * np.maximum(own_low / own_high, 0))
+        usable = np.isfinite(unit).all(axis=1) & (scale > 0)
+        unit = np.where(usable[:, None], unit, 0.0)
+        _, gap = (v[0] for v in self.response.variance(unit[None], begins[1:]))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = np.where(usable, loss[1:] / np.sqrt(own_high), 0.0) + 1e-14
+        gap = (np.sqrt(np.maximum(gap, 0)) + relative * (1 + 1e-12)) ** 2
+        tau = np.where(usable, _spread(gap, np.where(usable, scale, 1.0)), 1e6)
+        joint = log_below_above(
+            _ratio_up(levels[:-1], p_low), _ratio_down(levels[1:], own_high), spread=tau
+        )
+        start[1:] = np.minimum(start[1:], joint)
+        return logsumexp(np.concatenate([inside, start]))
+
+
+def _longer(forward: Array, slack: float, transition: Array, error: float) -> tuple[Array, float]:
+    """The product with one more transition matrix, and its entrywise error bound."""
+    n = len(forward)
+    norm, size = float(np.abs(forward).sum(1).max()), float(np.abs(transition).max())
+    column = float(np.abs(transition).sum(0).max())
+    slack = slack * (column + n * error) + norm * error + (n + 2) * 4e-16 * norm * size
+    return forward @ transition, slack * (1 + 1e-13)
+
+
+def _one(response: LinearResponse, cell: int) -> LinearResponse:
+    """The response of a single cell."""
+    chosen = slice(cell, cell + 1)
+    return LinearResponse(
+        step=response.step, slope=response.slope[chosen], drift=response.drift[chosen],
+        transition=response.transition[chosen], transition_error=response.transition_error[chosen],
+        deviation=response.deviation[chosen], covariance=response.covariance[chosen],
+        covariance_error=response.covariance_error[chosen],
+    )

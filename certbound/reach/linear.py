@@ -1,0 +1,237 @@
+"""The linear-response engine (Thm K7): nominal + zonotope + exact Gaussian response + proved remainder.
+
+X = p + y + Z + R: y answers the initial set and the disturbance linearly, Z is Gaussian, and R gathers what the
+linearisation leaves over. The event that Z stays within levels along the coordinates that enter nonlinearly costs
+delta_N; on it R obeys an inclusion that `LinearRun.include` guesses and proves. What each constraint then leaves
+to Z is a scalar event, so that P(unsafe) <= delta_N + sum_j P_j (Thm K7').
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.systems import ContinuousSystem
+from certbound.reach.directions import Requirement, requirements
+from certbound.reach.events import StepEvents, WindowEvents, logsumexp
+from certbound.reach.inclusion import Supports
+from certbound.reach.linearisation import Linearisation
+
+__all__ = ["LinearRun", "Outcome", "level_scale"]
+
+Array = NDArray[np.float64]
+Events = StepEvents | WindowEvents
+_LOG = logging.getLogger(__name__)
+
+_GUESSES = 30
+_PICARD = 12
+_HUGE = 1e6
+_WINDOW = 0.05
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Outcome:
+    """What one run proved.
+
+    Parameters
+    ----------
+    log_probability : float
+        Natural logarithm of a bound on P(unsafe); 0 when nothing was proved.
+    log_nonlinear : float
+        Logarithm of delta_N.
+    bounds : (ndarray, ndarray), shape (B, N, n), or None
+        The proved enclosure of the remainder beta, None when it fed itself.
+    requirement : Requirement or None
+        The one that costs most.
+    margin : float
+        Its least room after the deterministic parts, in its own unit; -inf when nothing was proved.
+    piece : int
+        Where that is (or where the remainder began to feed itself).
+    """
+
+    log_probability: float
+    log_nonlinear: float
+    bounds: tuple[Array, Array] | None
+    requirement: Requirement | None
+    margin: float
+    piece: int
+    costs: tuple[tuple[str, float], ...] = ()
+
+
+class LinearRun:
+    """One evaluation of the engine: supports of all cells, the inclusion for the remainder, the events."""
+
+    def __init__(self, engine: Linearisation) -> None:
+        self.engine = engine
+        self.rows, self.extra = engine.directions()
+        cells = range(len(engine.centres))
+        self.requirements = [requirements(engine.problem, engine.nominal(cell)) for cell in cells]
+        self.supports: list[Supports] = []
+        for cell in cells:
+            asked = np.stack([r.rows for r in self.requirements[cell]], axis=1)
+            inner = self.rows[cell]
+            if not engine.continuous:
+                inner = np.concatenate([inner, np.zeros((1, *inner.shape[1:]))])
+            self.supports.append(Supports(
+                engine.response, engine.gathering.of_cell(cell), cell, np.concatenate([inner, asked], axis=1),
+                np.diag(engine.radii[cell])[engine.radii[cell] > 0], continuous=engine.continuous,
+            ))
+        self.inner = self.rows.shape[2]
+
+    def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+        """Bounds of s = y + Z + R along the inner rows over all pieces: (B N, D)."""
+        n = self.engine.pieces
+        lows, highs = [], []
+        for support, level, (r_lo, r_hi) in zip(self.supports, levels, remainder, strict=True):
+            y = support.y[:n, : self.inner]
+            lows.append(-y - level + r_lo[:n, : self.inner])
+            highs.append(y + level + r_hi[:n, : self.inner])
+        low, high = np.concatenate(lows), np.concatenate(highs)
+        slack = 4e-16 * (np.abs(low) + np.abs(high))
+        return low - slack, high + slack
+
+    def include(self, levels: Array, effort: int) -> tuple[Array, Array] | None:
+        """beta's bounds (B, N, n) that prove themselves, or None (``failed_at`` then names a piece)."""
+        engine = self.engine
+        shape = (len(engine.centres), engine.pieces, engine.n)
+        extra = self.extra.reshape(shape[0] * shape[1], *self.extra.shape[2:])
+        self.failed_at = engine.pieces - 1
+        below = above = np.full(shape, 1e-12)  # what the proof needs beyond the sampled range
+        low, high = np.zeros(shape), np.zeros(shape)
+        for attempt in range(_PICARD):
+            # a guess: the fixed point of the sampled range, widened by what the last proof needed
+            share = 0.15 if attempt == 0 else 0.02
+            for _ in range(_GUESSES):
+                polytope = self._deviations(levels, low, high)
+                if polytope is None:
+                    return None
+                old = low, high
+                sample = [b.reshape(shape) for b in engine.model.estimate(engine.frame, *polytope, extra)]
+                pad = share * (sample[1] - sample[0])
+                low, high = sample[0] - below - pad, sample[1] + above + pad
+                if not self._all_finite(low, high):
+                    return None
+                change = max(float(np.max(old[0] - low)), float(np.max(high - old[1])))
+                if change <= 1e-3 * float(np.max(high - low)):
+                    break
+            # the proof: beta over what the guess implies must lie in the guess
+            polytope = self._deviations(levels, low, high)
+            if polytope is None:
+                return None
+            b_low, b_high = (b.reshape(shape) for b in engine.model.bound(engine.frame, *polytope, extra, effort))
+            if not self._all_finite(b_low, b_high):
+                return None
+            if np.all((b_low >= low) & (b_high <= high)):
+                return b_low, b_high
+            _LOG.debug("inclusion %d: widths %s, beyond the guess by %.3g", attempt, (b_high - b_low).max(
+                axis=(0, 2))[:: max(1, engine.pieces // 8)].round(4), max(np.max(low - b_low), np.max(b_high - high)))
+            sample = [b.reshape(shape) for b in engine.model.estimate(engine.frame, *polytope, extra)]
+            below = np.maximum(1.02 * (sample[0] - b_low), 0.0) + 1e-12
+            above = np.maximum(1.02 * (b_high - sample[1]), 0.0) + 1e-12
+        return None
+
+    def _all_finite(self, low: Array, high: Array) -> bool:
+        """Whether all bounds are finite; if not, ``failed_at`` names the first piece."""
+        finite = np.isfinite(low) & np.isfinite(high)
+        if not finite.all():
+            self.failed_at = int(np.argmax((~finite).any(axis=(0, 2))))
+        return bool(finite.all())
+
+    def _deviations(self, levels: Array, low: Array, high: Array) -> tuple[Array, Array] | None:
+        """The polytope that bounds on beta imply, or None where it is beyond all use."""
+        reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(self.supports, low, high, strict=True)]
+        p_low, p_high = self.polytope(levels, reach)
+        beyond = ~(np.isfinite(p_low) & np.isfinite(p_high)) | (p_high - p_low > _HUGE)
+        if beyond.any():
+            self.failed_at = int(np.argmax(beyond.any(axis=1).reshape(len(low), -1).any(axis=0)))
+            return None
+        return p_low, p_high
+
+    # ---- probabilities -----------------------------------------------------------------------------------
+
+    def events(self, cell: int, shared_log: float) -> StepEvents | WindowEvents:
+        """Scalar events of one cell; ``shared_log`` is the log probability that they may share."""
+        engine = self.engine
+        if isinstance(engine.system, ContinuousSystem):
+            return WindowEvents(engine.response, cell, max(1, round(_WINDOW / engine.step)), shared_log)
+        return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
+
+    def levels(self, log_nonlinear: float) -> tuple[Array, list[Events]]:
+        """Levels of |Z| along the inner rows that together cost exp(log_nonlinear): (B, N, D)."""
+        engine = self.engine
+        cells, pieces, count = self.rows.shape[:3]
+        result = np.zeros((cells, pieces, count))
+        share = log_nonlinear + np.log(0.9 / (2 * max(count, 1)))
+        found = []
+        for cell in range(cells):
+            events = self.events(cell, log_nonlinear + np.log(0.1 if count else 1.0))
+            found.append(events)
+            for d in range(count):
+                rows = self.rows[cell, :, d]
+                deviation = events.standard_deviation(rows)
+                if deviation.max() <= 0:
+                    continue
+                shape = deviation
+                if engine.continuous:
+                    early = max(1, pieces // 5)
+                    shape = np.maximum(deviation, np.where(np.arange(pieces) < early, deviation[early - 1], 0.0))
+                result[cell, :, d] = level_scale(events, rows, shape, share) * shape
+        return result, found
+
+    def probability(self, log_nonlinear: float, effort: int = 2) -> Outcome:
+        """Thm K7' with delta_N = exp(log_nonlinear): the outcome of the worst cell."""
+        levels, events = self.levels(log_nonlinear)
+        bounds = self.include(levels, effort)
+        if bounds is None:
+            return Outcome(
+                log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None, requirement=None,
+                margin=-np.inf, piece=self.failed_at,
+            )
+        outcomes = [self._cell(cell, bounds, events[cell], log_nonlinear) for cell in range(len(self.supports))]
+        return max(outcomes, key=lambda outcome: (outcome.log_probability, -outcome.margin))
+
+    def rooms(self, cell: int, bounds: tuple[Array, Array]) -> Array:
+        """Room that each requirement leaves to Z on each piece: (pieces, requirements), rounded down."""
+        support = self.supports[cell]
+        _, high, _ = support.remainder(bounds[0][cell], bounds[1][cell])
+        used = support.y[:, self.inner :] + high[:, self.inner :]
+        room = np.stack([r.room for r in self.requirements[cell]], axis=1)
+        left = room - used
+        return np.asarray(np.where(np.isinf(room), np.inf, left - 4e-16 * (np.abs(room) + np.abs(used))))
+
+    def _cell(self, cell: int, bounds: tuple[Array, Array], events: Events, log_nonlinear: float) -> Outcome:
+        rooms, asked = self.rooms(cell, bounds), self.requirements[cell]
+        logs = [events.log_exceedance(r.rows, rooms[:, index]) for index, r in enumerate(asked)]
+        shared = log_nonlinear if len(self.engine.model.active) else events.shared_log
+        total = min(logsumexp(np.array([shared, *logs])), 0.0)
+        # the margin is what is left at the problem's own delta, shared among the requirements
+        target = np.log(self.engine.problem.delta / max(len(asked), 1))
+        left = np.empty_like(rooms)
+        for index, requirement in enumerate(asked):
+            shape = events.standard_deviation(requirement.rows)
+            factor = level_scale(events, requirement.rows, shape, target) if shape.max() > 0 else 0.0
+            left[:, index] = rooms[:, index] - factor * shape
+        tightest = np.unravel_index(int(np.argmin(left)), left.shape) if left.size else (0, 0)
+        return Outcome(
+            log_probability=total, log_nonlinear=log_nonlinear, bounds=bounds,
+            requirement=asked[tightest[1]] if asked else None, piece=int(tightest[0]),
+            margin=float(left[tightest]) if left.size else np.inf,
+            costs=tuple((r.label, log) for r, log in zip(asked, logs, strict=True)),
+        )
+
+
+def level_scale(events: Events, rows: Array, shape: Array, target: float) -> float:
+    """Least factor q (nearly) with P(exists t: row . Z > q shape) <= exp(target)."""
+    low, high = 0.5, 2.0 + np.sqrt(2 * max(-target, 0.0) + 20)
+    while events.log_exceedance(rows, high * shape) > target and high < 1e6:
+        low, high = high, 2 * high
+    for _ in range(12):
+        middle = (low + high) / 2
+        if events.log_exceedance(rows, middle * shape) > target:
+            low = middle
+        else:
+            high = middle
+    return float(high)

@@ -1,0 +1,318 @@
+"""A problem linearised along nominal curves: the data of Thm K7, for a batch of cells of the initial set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.problem import Problem
+from certbound.problem.sets import GaussianStart
+from certbound.problem.systems import ContinuousSystem
+from certbound.problem.trace import compile_numpy
+from certbound.reach.cells import initial_cells
+from certbound.reach.directions import NominalPieces
+from certbound.reach.inclusion import Gathering
+from certbound.reach.remainder import Frame, Remainder
+from certbound.reach.response import LinearResponse, continuous_response, discrete_response
+from certbound.rigor.intervals import Interval
+
+__all__ = ["Linearisation"]
+
+Array = NDArray[np.float64]
+
+_PIECE = 0.02
+_MOST_PIECES = 4000
+_ROUND = 1 + 1e-13
+
+
+class Linearisation:
+    """Thm K7 for one problem, on a grid of pieces, for a batch of cells of the initial set.
+
+    Parameters
+    ----------
+    problem : Problem
+        Additive noise (a constant diffusion matrix, or any discrete-time law).
+    cells : int, optional
+        Cells along each side of the initial set.
+    pieces : int, optional
+        Pieces of the horizon (continuous time).
+    noise : bool
+        False: the noise-free reachable set.
+    """
+
+    def __init__(
+        self, problem: Problem, *, cells: int | None = None, pieces: int | None = None, noise: bool = True,
+    ) -> None:
+        self.problem, self.noise = problem, noise
+        self.system = problem.system
+        self.continuous = self.system.time == "continuous"
+        self.n = self.system.dimension
+        self.model = Remainder(problem)
+        self.pieces = self._pieces(pieces)
+        self.step = float(problem.horizon) / self.pieces if self.continuous else 1.0
+        split = initial_cells(problem, cells)
+        self.centres = np.asarray(split.centres)
+        self.radii = np.asarray((split.boxes - self.centres).mag)
+        random = noise and isinstance(problem.initial, GaussianStart)
+        self.start_covariance = (
+            np.asarray(problem.initial.covariance) if random else np.zeros((self.n, self.n))
+        )
+        low, high = (
+            (self.system.disturbance.low, self.system.disturbance.high)
+            if self.system.disturbance is not None else (np.zeros(0), np.zeros(0))
+        )
+        self.d_low, self.d_high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+        self.d_middle = (self.d_low + self.d_high) / 2
+        self.d_radius = np.maximum(self.d_high - self.d_middle, self.d_middle - self.d_low) * (1 + 1e-15)
+
+    def _pieces(self, pieces: int | None) -> int:
+        if not self.continuous:
+            return int(self.problem.horizon)
+        count = pieces or min(max(100, int(np.ceil(self.problem.horizon / _PIECE))), _MOST_PIECES)
+        if self.problem.input_sequence is not None:
+            rows = len(self.problem.input_sequence)
+            count = rows * int(np.ceil(count / rows))
+        return count
+
+    # ---- nominal data ------------------------------------------------------------------------------------
+
+    @cached_property
+    def inputs(self) -> Array:
+        """Input of every piece: shape (N, m)."""
+        sequence = self.problem.input_sequence
+        if sequence is None:
+            return np.zeros((self.pieces, 0))
+        return np.repeat(sequence, self.pieces // len(sequence), axis=0)
+
+    @cached_property
+    def times(self) -> Array:
+        """Nodes."""
+        return np.asarray(np.arange(self.pieces + 1) * self.step, dtype=float)
+
+    def _evaluate(self, k: int, time: float, state: Array) -> Array:
+        values = [time, *state.T, *self.inputs[k], *self.d_middle]
+        count = len(state)
+        return np.asarray(self._compiled(*(np.broadcast_to(np.asarray(v, dtype=float), (count,)) for v in values)))
+
+    @cached_property
+    def _compiled(self) -> Callable[..., Array]:
+        return compile_numpy(self.problem.closed_loop)
+
+    @cached_property
+    def nodes(self) -> Array:
+        """Nominal states at the nodes: shape (B, N + 1, n)."""
+        x = np.array(self.centres)
+        states = [x]
+        with np.errstate(all="ignore"):
+            for k in range(self.pieces):
+                x = self._advance(k, x) if self.continuous else self._evaluate(k, float(k), x)
+                states.append(x)
+        return np.stack(states, axis=1)
+
+    def _advance(self, k: int, x: Array) -> Array:
+        """Two steps of the classical Runge-Kutta method."""
+        h = self.step / 2
+        for half in range(2):
+            t = self.times[k] + half * h
+            k1 = self._evaluate(k, t, x)
+            k2 = self._evaluate(k, t + h / 2, x + h / 2 * k1)
+            k3 = self._evaluate(k, t + h / 2, x + h / 2 * k2)
+            k4 = self._evaluate(k, t + h, x + h * k3)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return x
+
+    @cached_property
+    def controls(self) -> Array:
+        """Bezier points of the nominal curve (CT, shape (B, N, 4, n)) or its nodes (DT, (B, N + 1, 1, n))."""
+        x = self.nodes
+        if not self.continuous:
+            return x[:, :, None, :]
+        slopes = np.empty((x.shape[0], self.pieces, 2, self.n))
+        for k in range(self.pieces):
+            slopes[:, k, 0] = self._evaluate(k, self.times[k], x[:, k])
+            slopes[:, k, 1] = self._evaluate(k, self.times[k + 1], x[:, k + 1])
+        third = self.step / 3
+        return np.stack([
+            x[:, :-1], x[:, :-1] + third * slopes[:, :, 0], x[:, 1:] - third * slopes[:, :, 1], x[:, 1:],
+        ], axis=2)
+
+    def nominal(self, cell: int) -> NominalPieces:
+        """The nominal curve of one cell."""
+        return NominalPieces(times=self.times, controls=self.controls[cell], continuous=self.continuous)
+
+    @cached_property
+    def slopes(self) -> tuple[Array, Array, Array]:
+        """A, K and E of every piece: shapes (B, N, n, n), (B, N, n, n), (B, N, n, q)."""
+        cells = len(self.centres)
+        x = self.nodes
+        inputs = np.broadcast_to(self.inputs, (cells, *self.inputs.shape))
+
+        def at(nodes: Array, times: Array) -> Array:
+            shape = nodes.shape[:2]
+            value = self.model.reference_slope(
+                np.broadcast_to(times, shape).ravel(), nodes.reshape(-1, self.n),
+                inputs.reshape(cells * self.pieces, -1), self.d_middle,
+            )
+            return value.reshape(*shape, self.n, self.n)
+
+        first = at(x[:, :-1], self.times[:-1])
+        gain = self.model.reference_gain(
+            np.broadcast_to(self.times[:-1], (cells, self.pieces)).ravel(), x[:, :-1].reshape(-1, self.n),
+            inputs.reshape(cells * self.pieces, -1), self.d_middle,
+        ).reshape(cells, self.pieces, self.n, len(self.d_middle))
+        if not self.continuous:
+            return first, np.zeros_like(first), gain
+        last = at(x[:, 1:], self.times[1:])
+        return first, (last - first) / self.step, gain
+
+    @property
+    def slope_error(self) -> float:
+        """Entrywise bound of |Jhat - its floats|: the model's constant entries need not be floats."""
+        return float(self.model.constant_slope.rad.max(initial=0.0))
+
+    @cached_property
+    def response(self) -> LinearResponse:
+        """Linear data of all cells."""
+        slope, drift, _ = self.slopes
+        start = self.start_covariance
+        if isinstance(self.system, ContinuousSystem):
+            g = np.asarray(self.system.diffusion, dtype=float)
+            return continuous_response(slope, drift, self.step, g if self.noise else 0 * g, start,
+                                       slope_error=self.slope_error)
+        g = np.asarray(self.system.noise_matrix, dtype=float)
+        proxy = np.asarray(self.system.noise.proxy, dtype=float) * (1.0 if self.noise else 0.0)
+        covariance = g @ proxy @ g.T
+        covariance = (covariance + covariance.T) / 2
+        bound = 8 * (len(proxy) + 2) * 2.0**-53 * float((np.abs(g) @ np.abs(proxy) @ np.abs(g).T).max(initial=0.0))
+        return discrete_response(slope, covariance, bound, start, slope_error=self.slope_error)
+
+    @property
+    def _slope_slack(self) -> Interval:
+        return self.model.constant_slope - self.model.constant_slope.mid
+
+    @cached_property
+    def frame(self) -> Frame:
+        """Enclosures of the nominal data, cells and pieces in one batch (piece index fastest)."""
+        slope, drift, gain = self.slopes
+        cells, pieces, n = len(self.centres), self.pieces, self.n
+
+        def flat(a: Array) -> Array:
+            return a.reshape(cells * pieces, *a.shape[2:])
+
+        if self.continuous:
+            c = [Interval.point(flat(self.controls[:, :, i])) for i in range(4)]
+            h = Interval(np.nextafter(self.step, 0), np.nextafter(self.step, np.inf))
+            middle = (c[0] + 3.0 * (c[1] + c[2]) + c[3]) / 8.0
+            spread = np.max([(p - middle).mag for p in c], axis=0)
+            velocities = [3.0 * (c[i + 1] - c[i]) / h for i in range(3)]
+            accelerations = [6.0 * (c[i + 2] - 2.0 * c[i + 1] + c[i]) / (h * h) for i in range(2)]
+            jerk = 6.0 * (c[3] - c[0] + 3.0 * (c[1] - c[2])) / (h * h * h)
+            velocity = velocities[0].hull(velocities[1]).hull(velocities[2])
+            middle_velocity = (velocities[0] + 2.0 * velocities[1] + velocities[2]) / 4.0
+            acceleration = accelerations[0].hull(accelerations[1])
+            middle_acceleration = (accelerations[0] + accelerations[1]) / 2.0
+            half = float(np.nextafter(h.hi / 2, np.inf))
+            middle_slope = Interval.point(flat(slope)) + (h * 0.5) * flat(drift) + self._slope_slack
+            slip = 8e-16 * float(self.problem.horizon)
+            time = Interval.around(np.tile((self.times[:-1] + self.times[1:]) / 2, cells), np.full(cells * pieces, slip))
+            span = Interval(time.lo - half - slip, time.hi + half + slip)
+        else:
+            zero = np.zeros((cells * pieces, n))
+            middle = Interval.point(flat(self.nodes[:, :-1]))
+            middle_velocity = Interval.point(flat(self.nodes[:, 1:]))
+            velocity = acceleration = middle_acceleration = jerk = Interval.point(zero)
+            spread, half = zero, 0.0
+            middle_slope = Interval.point(flat(slope)) + self._slope_slack
+            time = span = Interval.point(np.tile(self.times[:-1], cells))
+        return Frame(
+            half=half, middle_time=time, span=span, middle=middle, spread=spread, middle_velocity=middle_velocity,
+            velocity=velocity, middle_acceleration=middle_acceleration, acceleration=acceleration, jerk=jerk,
+            slope=middle_slope, drift=flat(drift), input_gain=flat(gain),
+            inputs=np.tile(self.inputs, (cells, 1)), disturbance_middle=self.d_middle,
+            disturbance_low=self.d_low, disturbance_high=self.d_high,
+        )
+
+    # ---- supports ----------------------------------------------------------------------------------------
+
+    @cached_property
+    def gathering(self) -> Gathering:
+        """How a disturbance and a remainder on one piece reach its end."""
+        slope, _, gain = self.slopes
+        response, h, n = self.response, self.step, self.n
+        size_e = np.abs(gain) @ self.d_radius
+        if not self.continuous:
+            generators = gain * self.d_radius
+            loss = np.abs(generators).sum(-1) * 4 * 2.0**-53
+            zero = np.zeros((*slope.shape[:2], n, n))
+            return Gathering(centre=zero + np.eye(n), second=zero, first=zero, curve=zero,
+                             generators=np.swapaxes(generators, -1, -2), box=loss, size=size_e)
+        identity = np.eye(n)
+        middle = identity + (h / 2) * slope
+        second = np.maximum(response.deviation - h * np.abs(slope), 0.0) + 4e-16 * response.deviation
+        box = (h * h / 4 * np.abs(slope) + h * second) @ size_e[..., None]
+        generators = h * (middle @ gain) * self.d_radius
+        rounding = 16 * (n + 4) * 2.0**-53 * h * (np.abs(middle) @ size_e[..., None])
+        bend = np.abs(response.drift) + _square(np.abs(slope) + h * np.abs(response.drift))
+        return Gathering(
+            centre=h * middle, second=h * second, first=response.deviation,
+            curve=h * h / 8 * (bend @ (identity + response.deviation)) * _ROUND,
+            generators=np.swapaxes(generators, -1, -2), box=(box + rounding)[..., 0] * _ROUND, size=size_e * _ROUND,
+        )
+
+    def directions(self) -> tuple[Array, Array]:
+        """Rows along which the remainder needs bounds: (B, N, D, n), and the extra ones over active coordinates."""
+        active, cells = self.model.active, len(self.centres)
+        unit = np.zeros((len(active), self.n))
+        unit[np.arange(len(active)), active] = 1.0
+        rows = np.broadcast_to(unit, (cells, self.pieces, *unit.shape))
+        extra = self._curved_directions()
+        full = np.zeros((cells, self.pieces, extra.shape[2], self.n))
+        full[..., active] = extra
+        return np.concatenate([rows, full], axis=2), extra
+
+    def _curved_directions(self) -> Array:
+        """Extreme eigen-directions of the Hessians in the metric of the deviation's spread (any rows are valid)."""
+        active, cells = self.model.active, len(self.centres)
+        count = len(active)
+        nothing = np.zeros((cells, self.pieces, 0, count))
+        if not 2 <= count <= 6 or len(self.model.blocks) != 1 or len(self.model.blocks[0]) != 1:
+            return nothing
+        hessians = self.model.reference_hessians(self.frame).reshape(cells, self.pieces, -1, count, count)
+        if not hessians.shape[2]:
+            return nothing
+        node = slice(1, None) if self.continuous else slice(0, -1)
+        spread = 16 * self.response.covariance[:, node] + self._spread()[:, node]
+        spread = spread[..., active, :][..., active]
+        trace = np.trace(spread, axis1=-2, axis2=-1)[..., None, None]
+        spread = spread + (1e-9 * trace + 1e-30) * np.eye(count)
+        root = np.linalg.cholesky(spread)
+        inverse = np.linalg.inv(root)
+        _, vectors = np.linalg.eigh(np.swapaxes(root, -1, -2)[:, :, None] @ hessians @ root[:, :, None])
+        chosen = np.swapaxes(vectors, -1, -2)[..., [0, -1], :] @ inverse[:, :, None]
+        rows = chosen.reshape(cells, self.pieces, -1, count)
+        # the sign of an eigenvector is free: keep it from flipping between neighbours
+        flips = np.einsum("bkda,bkac,bkdc->bkd", rows[:, 1:], spread[:, 1:], rows[:, :-1])
+        sign = np.cumprod(np.where(flips < 0, -1.0, 1.0), axis=1)
+        rows[:, 1:] *= sign[..., None]
+        return rows
+
+    def _spread(self) -> Array:
+        """Rough second moment of y at the nodes (floats; it only shapes directions)."""
+        cells, n = self.centres.shape
+        gram = np.zeros((cells, self.pieces + 1, n, n))
+        own = 2 * self.radii[:, :, None] ** 2 * np.eye(n)
+        drift = np.zeros((cells, n, len(self.d_radius)))
+        gram[:, 0] = own
+        for k in range(self.pieces):
+            f = self.response.transition[:, k]
+            own = f @ own @ np.swapaxes(f, -1, -2)
+            drift = f @ drift + np.swapaxes(self.gathering.generators[:, k], -1, -2)
+            gram[:, k + 1] = own + drift @ np.swapaxes(drift, -1, -2)
+        return gram
+
+
+def _square(a: Array) -> Array:
+    return np.asarray(a @ a * (1 + 1e-13))

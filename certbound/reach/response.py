@@ -1,0 +1,274 @@
+"""Linear response along a nominal curve: the exact part of Thm K7, with every rounding error bounded.
+
+On piece k of length h the slope is Jhat(tau) = A + tau K with float matrices A, K taken as exact, so that the
+transition matrix F = Phi(t_{k+1}, t_k) is a convergent power series. Float values of F and of the covariance V
+stand beside proved error bounds. Supports of the linear responses are computed by adjoint rows r_j = r_{j+1} F_j;
+the residual of that float product meets the state of step j, whose size is known, so errors never wrap.
+
+Discrete time is the case K = 0, F = A, h = 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["LinearResponse", "RowResponse", "discrete_response", "continuous_response"]
+
+Array = NDArray[np.float64]
+Nodes = NDArray[np.int64]
+
+_UNIT = 2.0**-53
+_TINY = 1e-300
+_TERMS = 24
+
+
+def _gamma(count: int) -> float:
+    """Bound of the relative rounding error of a sum of ``count`` products (any order of summation)."""
+    return 1.01 * (count + 2) * _UNIT
+
+
+def _absmul(a: Array, b: Array) -> Array:
+    """Upper bound of |a| |b| for nonnegative results, rounded up."""
+    return np.asarray((np.abs(a) @ np.abs(b)) * (1 + 2 * _gamma(a.shape[-1])) + _TINY)
+
+
+def _transposed(a: Array) -> Array:
+    return np.swapaxes(a, -1, -2)
+
+
+def _norm(a: Array) -> Array:
+    """Upper bound of the maximum row sum."""
+    return np.asarray(np.abs(a).sum(-1).max(-1) * (1 + _gamma(a.shape[-1])))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LinearResponse:
+    """Linear data of a batch of nominal curves (axis 0: cells of X0; axis 1: pieces or steps).
+
+    Parameters
+    ----------
+    step : float
+        Length h of a piece (1 in discrete time); the exact length is h up to one rounding.
+    slope, drift : ndarray, shape (B, N, n, n)
+        A and K of Jhat(tau) = A + tau K.
+    transition : ndarray, shape (B, N, n, n)
+        F; the exact transition matrix differs by at most ``transition_error`` in every entry.
+    transition_error : ndarray, shape (B, N)
+    deviation : ndarray, shape (B, N, n, n)
+        Entrywise bound of |Phi(t, s) - I| for s <= t in one piece (0 in discrete time).
+    covariance, covariance_error : ndarray, shape (B, N + 1, n, n)
+        V and W with -W <= V_exact - V <= W as quadratic forms.
+    """
+
+    step: float
+    slope: Array
+    drift: Array
+    transition: Array
+    transition_error: Array
+    deviation: Array
+    covariance: Array
+    covariance_error: Array
+
+    @property
+    def pieces(self) -> int:
+        """Number of pieces N."""
+        return int(self.slope.shape[1])
+
+    def variance(self, rows: Array, nodes: Nodes) -> tuple[Array, Array]:
+        """Lower and upper bounds of the variances r V r^T of ``rows`` (B, M, n) at ``nodes`` (M,)."""
+        return self.covariance_of(rows, rows, nodes)
+
+    def covariance_of(self, first: Array, second: Array, nodes: Nodes) -> tuple[Array, Array]:
+        """Bounds of cov(first Z, second Z) at ``nodes``; rows (B, M, n)."""
+        v = self.covariance[:, nodes]
+        w = self.covariance_error[:, nodes]
+        value = np.einsum("bmi,bmij,bmj->bm", first, v, second)
+        n = first.shape[-1]
+        rounding = 2 * _gamma(n * n) * np.einsum("bmi,bmij,bmj->bm", abs(first), abs(v), abs(second))
+        own = [np.einsum("bmi,bmij,bmj->bm", r, w, r) + _gamma(n * n) * 2 * np.einsum(
+            "bmi,bmij,bmj->bm", abs(r), abs(w), abs(r)) for r in (first, second)]
+        error = np.sqrt(np.maximum(own[0], 0) * np.maximum(own[1], 0)) * (1 + 1e-12) + rounding + _TINY
+        return value - error, value + error
+
+
+def _transition(slope: Array, drift: Array, step: float, slope_error: float) -> tuple[Array, Array, Array]:
+    """F, an entrywise error bound, and a bound of |Phi(t, s) - I| on the piece."""
+    n = slope.shape[-1]
+    a, k = slope * step, drift * step**2
+    alpha, kappa = _norm(a) * (1 + 1e-14), _norm(k) * (1 + 1e-14)
+    size = np.broadcast_to(np.eye(n), a.shape)
+    terms, total = [np.zeros_like(a), size.copy()], size.copy()
+    majorant = [np.zeros_like(alpha), np.ones_like(alpha)]
+    for i in range(_TERMS):
+        terms.append((a @ terms[-1] + k @ terms[-2]) / (i + 1))
+        majorant.append((alpha * majorant[-1] + kappa * majorant[-2]) / (i + 1))
+        total = total + terms[-1]
+    # beyond the last term the majorant falls by this ratio at least every second term
+    ratio = (alpha + kappa) / _TERMS
+    if np.any(ratio > 0.5):
+        raise ValueError(
+            f"`pieces` must be larger: ||J|| h = {float((alpha + kappa).max()):.3g} is beyond {_TERMS / 2:g}."
+        )
+    tail = 4.1 * (majorant[-1] + majorant[-2]) * np.maximum(ratio, _TINY)
+    growth = np.exp(alpha + kappa) * (1 + 1e-13)
+    error = tail + _TERMS * (3 * n + 12) * 2 * _UNIT * growth + 2 * n * step * slope_error * growth
+    size_ = (np.abs(a) + np.abs(k)) * (1 + 1e-14)
+    square = _absmul(size_, size_)
+    mass = np.expm1(_norm(size_)) * (1 + 1e-13)
+    deviation = size_ + 0.5 * (square + _absmul(square, np.broadcast_to(mass[..., None, None], a.shape)))
+    return total, error, np.asarray(deviation * (1 + 1e-14))
+
+
+def _noise_covariance(slope: Array, drift: Array, step: float, gram: Array) -> tuple[Array, Array]:
+    """Covariance Q gathered on a piece from g g^T = ``gram``, and an entrywise error bound."""
+    n = slope.shape[-1]
+    a, k = slope * step, drift * step**2
+    start = np.broadcast_to(gram * step, a.shape)
+    older, newer = np.zeros_like(a), start.copy()
+    total = start.copy()
+    alpha = (_norm(a) + _norm(_transposed(a))) * (1 + 1e-14)
+    kappa = (_norm(k) + _norm(_transposed(k))) * (1 + 1e-14)
+    small, big = np.zeros_like(alpha), np.ones_like(alpha)
+    for i in range(1, _TERMS):
+        product = a @ newer + k @ older
+        older, newer = newer, (product + _transposed(product)) / (i + 1)
+        small, big = big, (alpha * big + kappa * small) / (i + 1)
+        total = total + newer
+    ratio = (alpha + kappa) / _TERMS
+    if np.any(ratio > 0.5):
+        raise ValueError(f"`pieces` must be larger: 2 ||J|| h = {float((alpha + kappa).max()):.3g}.")
+    scale = _norm(gram) * step
+    error = (4.1 * (big + small) * np.maximum(ratio, _TINY)
+             + _TERMS * (3 * n + 12) * 4 * _UNIT * np.exp(alpha + kappa)) * scale
+    return total, np.asarray(error + _TINY)
+
+
+def _propagate(
+    transition: Array, transition_error: Array, noise: Array, noise_error: Array, start: Array
+) -> tuple[Array, Array]:
+    """V_{k+1} = F V_k F^T + Q_k in floats, and W with |V_exact - V| <= W as quadratic forms."""
+    cells, pieces, n, _ = transition.shape
+    v = np.zeros((cells, pieces + 1, n, n))
+    w = np.zeros_like(v)
+    v[:, 0] = start
+    w[:, 0] = np.eye(n) * (2 * n * _UNIT * float(np.abs(start).max(initial=0.0)))
+    eye = np.eye(n)
+    for k in range(pieces):
+        f, phi = transition[:, k], transition_error[:, k]
+        product = f @ v[:, k] @ _transposed(f) + noise[:, k]
+        v[:, k + 1] = (product + _transposed(product)) / 2
+        size_f, size_v, size_w = _norm(f), _norm(v[:, k]), _norm(w[:, k])
+        columns = _norm(_transposed(f))
+        spread = n * phi * (size_f + columns + n * phi)
+        rounding = 2 * _gamma(2 * n + 4) * (size_f * columns * (size_v + size_w) + _norm(v[:, k + 1]))
+        residual = n * (rounding + noise_error[:, k]) + n * spread * (size_v + size_w)
+        grown = f @ w[:, k] @ _transposed(f)
+        w[:, k + 1] = (grown + _transposed(grown)) / 2 + (residual * (1 + 1e-10) + _TINY)[:, None, None] * eye
+    return v, w
+
+
+def continuous_response(
+    slope: Array, drift: Array, step: float, diffusion: Array, start: Array, *, slope_error: float = 0.0
+) -> LinearResponse:
+    """Linear data in continuous time: dZ = (A + tau K) Z dt + g dW on every piece.
+
+    ``slope_error`` bounds entrywise how far the exact slope (the model's constants) is from its floats.
+    """
+    transition, error, deviation = _transition(slope, drift, step, slope_error)
+    gram = diffusion @ diffusion.T
+    noise, noise_error = _noise_covariance(slope, drift, step, gram)
+    noise_error = noise_error + 4 * slope.shape[-1] * step * slope_error * np.abs(noise).sum(axis=(-1, -2))
+    noise_error = noise_error + _gamma(diffusion.shape[1]) * 4 * step * float(
+        (np.abs(diffusion) @ np.abs(diffusion).T).max(initial=0.0)
+    )
+    v, w = _propagate(transition, error, noise, noise_error, start)
+    return LinearResponse(
+        step=step, slope=slope, drift=drift, transition=transition, transition_error=error,
+        deviation=deviation, covariance=v, covariance_error=w,
+    )
+
+
+def discrete_response(
+    slope: Array, covariance: Array, covariance_bound: float, start: Array, *, slope_error: float = 0.0
+) -> LinearResponse:
+    """Linear data in discrete time: Z+ = A Z + w with Cov(w) (or its proxy) given up to an entrywise bound."""
+    cells, steps = slope.shape[:2]
+    noise = np.broadcast_to(covariance, slope.shape)
+    none = np.full((cells, steps), slope_error)
+    v, w = _propagate(slope, none, noise, np.zeros_like(none) + covariance_bound, start)
+    zero = np.zeros_like(slope)
+    return LinearResponse(
+        step=1.0, slope=slope, drift=zero, transition=slope, transition_error=none,
+        deviation=zero, covariance=v, covariance_error=w,
+    )
+
+
+class RowResponse:
+    """Supports, along chosen rows, of states driven through the response of one cell.
+
+    The state obeys s_{j+1} = F_j s_j + b_j. For rows r at nodes k the class gives bounds of r . s_k from the sets
+    of s_0 and b_j, by the adjoint rows of every earlier step.
+
+    Parameters
+    ----------
+    response : LinearResponse
+    cell : int
+    rows : ndarray, shape (M, D, n)
+        Rows at nodes 0 .. M - 1 (M <= N + 1).
+    """
+
+    def __init__(self, response: LinearResponse, cell: int, rows: Array) -> None:
+        self.nodes, self.count, self.dimension = rows.shape
+        n = self.dimension
+        f = response.transition[cell]
+        loss = _gamma(n) * 2 * np.abs(f) + response.transition_error[cell][:, None, None]
+        current = np.array(rows)
+        self.coefficients: list[Array] = [np.empty(0)] * (self.nodes - 1)
+        self.losses: list[Array] = [np.empty(0)] * (self.nodes - 1)
+        for j in range(self.nodes - 2, -1, -1):
+            later = current[j + 1 :].reshape(-1, n).copy()
+            self.coefficients[j] = later
+            self.losses[j] = np.abs(later) @ loss[j] * (1 + 1e-12) + _TINY
+            current[j + 1 :] = (later @ f[j]).reshape(-1, self.count, n)
+        self.initial = current
+
+    def _gather(self, parts: list[Array]) -> Array:
+        """Sum over j of the contributions of step j to all later nodes: shape (M, D)."""
+        total = np.zeros((self.nodes, self.count))
+        for j, part in enumerate(parts):
+            total[j + 1 :] += part.reshape(-1, self.count)
+        return total
+
+    def errors(self, sizes: Array) -> Array:
+        """Effect of the rounded adjoint rows for states with |s_j| <= ``sizes`` (N + 1, n): shape (M, D)."""
+        return self._gather([loss @ sizes[j] for j, loss in enumerate(self.losses)]) * (1 + 1e-12)
+
+    def start(self, generators: Array) -> Array:
+        """Support of the zonotope of ``generators`` (G, n) at node 0, carried to every node: shape (M, D)."""
+        if not len(generators):
+            return np.zeros((self.nodes, self.count))
+        value = np.abs(self.initial @ generators.T).sum(-1)
+        slack = _gamma(self.dimension + len(generators)) * 2
+        return np.asarray(value + slack * (np.abs(self.initial) @ np.abs(generators.T)).sum(-1) + _TINY)
+
+    def boxes(self, radii: Array) -> Array:
+        """Support of the sum of the boxes |b_j| <= ``radii`` (N, n): shape (M, D)."""
+        total = self._gather([np.abs(c) @ radii[j] for j, c in enumerate(self.coefficients)])
+        return np.asarray(total * (1 + _gamma(2 * self.nodes + self.dimension) * 2))
+
+    def centres(self, values: Array) -> tuple[Array, Array]:
+        """The response to b_j = ``values`` (N, n), and a bound of its rounding error."""
+        total = self._gather([c @ values[j] for j, c in enumerate(self.coefficients)])
+        size = self._gather([np.abs(c) @ np.abs(values[j]) for j, c in enumerate(self.coefficients)])
+        return total, size * _gamma(2 * self.nodes + self.dimension) * 2 + _TINY
+
+    def segments(self, generators: Array) -> Array:
+        """Support of the sum over j of the zonotopes of ``generators`` (N, G, n): shape (M, D)."""
+        parts = []
+        for j, c in enumerate(self.coefficients):
+            size = np.abs(c) @ np.abs(generators[j]).sum(0) * _gamma(self.dimension) * 2
+            parts.append(np.abs(c @ generators[j].T).sum(-1) + size)
+        return self._gather(parts) * (1 + _gamma(2 * self.nodes + generators.shape[1]) * 2)

@@ -1,0 +1,290 @@
+"""Answers of the linear-response engine: the least probability found, its reach tube and its deviation tube."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.problem.problem import Problem
+from certbound.problem.systems import ContinuousSystem
+from certbound.problem.tape import Tape
+from certbound.reach.curve import Curve
+from certbound.reach.events import logsumexp
+from certbound.reach.inclusion import Supports
+from certbound.reach.linear import LinearRun, Outcome, level_scale
+from certbound.reach.linearisation import Linearisation
+from certbound.reach.tube import ReachTube
+from certbound.rigor.intervals import Interval
+
+__all__ = ["DeviationTube", "LinearAnswer", "linear_answer", "linear_reach", "refusal"]
+
+Array = NDArray[np.float64]
+
+_SHARES = ((0.1, 1), (0.3, 2), (0.8, 3))
+_REFINEMENTS = 3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeviationTube:
+    """Bounds, coordinate by coordinate, of the deviation X - x from every associated trajectory.
+
+    Proves: with probability at least 1 - 10**log10_delta, |X_t - x_t|_i <= ``half_widths[k, i]`` for every state i
+    and every t in [times[k], times[k + 1]), whatever the start and the disturbance. Source: Thm K7.
+
+    Parameters
+    ----------
+    times : ndarray, shape (K + 1,)
+    half_widths : ndarray, shape (K, n)
+    log10_delta : float
+    """
+
+    times: Array
+    half_widths: Array
+    log10_delta: float
+    method: str = "linear"
+    level: str = "trajectory"
+    certified: bool = True
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def horizon(self) -> float:
+        """Last time that the tube covers."""
+        return float(self.times[-1])
+
+    @cached_property
+    def radii(self) -> Array:
+        """Euclidean bound of the deviation on each piece."""
+        return np.asarray(np.linalg.norm(self.half_widths, axis=1) * (1 + 1e-14))
+
+    def _piece(self, t: ArrayLike) -> NDArray[np.intp]:
+        index = np.searchsorted(self.times, np.asarray(t, dtype=float), side="right") - 1
+        return np.clip(index, 0, len(self.half_widths) - 1)
+
+    def radius(self, t: ArrayLike) -> Any:
+        """Euclidean bound of the deviation at times ``t``."""
+        value = self.radii[self._piece(t)]
+        return float(value) if np.ndim(t) == 0 else value
+
+    def bound(self, t0: float, t1: float) -> float:
+        """Supremum of the radius over [t0, t1]."""
+        return float(self.radii[int(self._piece(t0)) : int(self._piece(t1)) + 1].max())
+
+    def extent(self, directions: ArrayLike, t: ArrayLike) -> Any:
+        """Bound of a . (X_t - x_t) for directions a of shape (..., n)."""
+        value = np.abs(np.asarray(directions, dtype=float)) @ self.half_widths[self._piece(t)].T * (1 + 1e-14)
+        return float(value) if np.ndim(value) == 0 else value
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LinearAnswer:
+    """Best certified probability of the engine, and what stands in the way of a smaller one."""
+
+    run: LinearRun
+    outcome: Outcome
+
+    @property
+    def log10_delta(self) -> float:
+        """log10 of a bound on the probability of leaving the safe set: finite, at most 0."""
+        value = self.outcome.log_probability / np.log(10.0)
+        return float(min(max(value + 1e-15 * abs(value), -1e15), 0.0))
+
+    @property
+    def margin(self) -> float:
+        """Room left at the problem's delta, in the units of the tightest constraint."""
+        return self.outcome.margin
+
+    @property
+    def time(self) -> float | None:
+        """Where the room is least, or where the remainder begins to feed itself."""
+        engine = self.run.engine
+        return float(self.outcome.piece * engine.step)
+
+    @property
+    def constraint(self) -> str | None:
+        """The tightest requirement."""
+        return None if self.outcome.requirement is None else self.outcome.requirement.label
+
+    @property
+    def reason(self) -> str:
+        """Why nothing smaller was proved, in words."""
+        if self.outcome.bounds is None:
+            return (
+                f"the remainder of the linearisation feeds itself from t = {self.time:.4g} on; split the initial set "
+                "(cells), shorten the horizon or lower the noise"
+            )
+        return f"the room of '{self.constraint}' at t = {self.time:.4g} is {self.margin:.4g}"
+
+    @cached_property
+    def tube(self) -> DeviationTube | None:
+        """Deviation tube at the problem's delta (None when nothing was proved)."""
+        bounds = self.outcome.bounds
+        return None if bounds is None else _deviation_tube(self.run, self.outcome, bounds)
+
+    @cached_property
+    def reach(self) -> ReachTube | None:
+        """Sets that contain the state with probability at least 1 - delta (None when nothing was proved)."""
+        bounds, tube = self.outcome.bounds, self.tube
+        if bounds is None or tube is None:
+            return None
+        return _reach_tube(self.run, bounds, tube.log10_delta, _levels_of_coordinates(self.run, self.outcome)[0])
+
+
+def refusal(problem: Problem) -> str | None:
+    """Why the engine does not apply to ``problem``; None where it does."""
+    if isinstance(problem.system, ContinuousSystem) and isinstance(problem.system.diffusion, Tape):
+        return "the linear-response engine needs a constant diffusion matrix"
+    return None
+
+
+def linear_answer(problem: Problem, *, cells: int | None = None) -> LinearAnswer:
+    """Bound the probability of leaving the safe set by the linear response (Thm K7').
+
+    Parameters
+    ----------
+    problem : Problem
+    cells : int, optional
+        Cells along each side of the initial set.
+    """
+    run = LinearRun(Linearisation(problem, cells=cells))
+    target = float(np.log(problem.delta))
+    best: Outcome | None = None
+    effort = 1
+    for share, effort in _SHARES:
+        outcome = run.probability(target + np.log(share), effort)
+        best = outcome if best is None or outcome.log_probability < best.log_probability else best
+        if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
+            break
+    assert best is not None
+    if best.log_probability <= target and best.log_probability > best.log_nonlinear - 3.0:
+        for _ in range(_REFINEMENTS):
+            outcome = run.probability(2 * best.log_nonlinear, effort)
+            if outcome.log_probability >= best.log_probability:
+                break
+            best = outcome
+    return LinearAnswer(run=run, outcome=best)
+
+
+def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = None) -> ReachTube:
+    """Reach tube of the linear-response engine; with ``noise=False`` of the associated trajectories.
+
+    Raises
+    ------
+    ArithmeticError
+        If the remainder feeds itself before the horizon ends.
+    """
+    run = LinearRun(Linearisation(problem, cells=cells, noise=noise))
+    outcome = run.probability(float(np.log(problem.delta / 2)))
+    if outcome.bounds is None:
+        raise ArithmeticError(LinearAnswer(run=run, outcome=outcome).reason)
+    if noise:
+        reach = LinearAnswer(run=run, outcome=outcome).reach
+        assert reach is not None
+        return reach
+    return _reach_tube(run, outcome.bounds, -np.inf, None)
+
+
+def _coordinates(run: LinearRun, cell: int) -> Supports:
+    """Supports along the coordinates over every piece."""
+    engine = run.engine
+    count = engine.pieces if engine.continuous else engine.pieces + 1
+    rows = np.broadcast_to(np.eye(engine.n), (count, engine.n, engine.n))
+    radii = engine.radii[cell]
+    return Supports(
+        engine.response, engine.gathering.of_cell(cell), cell, rows, np.diag(radii)[radii > 0],
+        continuous=engine.continuous,
+    )
+
+
+def _levels_of_coordinates(run: LinearRun, outcome: Outcome) -> tuple[list[Array], float]:
+    """Levels of |Z_i| over every piece, one array (K, n) a cell, and the log probability of the whole event."""
+    engine = run.engine
+    n, cells = engine.n, len(engine.centres)
+    count = engine.pieces if engine.continuous else engine.pieces + 1
+    active = [int(state) for state in engine.model.active]
+    log_nonlinear = outcome.log_nonlinear if active else float(np.log(engine.problem.delta / 10))
+    levels, events = run.levels(log_nonlinear)
+    rest = [i for i in range(n) if i not in active]
+    share = float(np.log(engine.problem.delta * 0.5 / (2 * max(len(rest), 1))))
+    result, worst = [], -np.inf
+    for cell in range(cells):
+        values, logs = np.zeros((count, n)), [log_nonlinear]
+        for i in range(n):
+            rows = np.broadcast_to(np.eye(n)[i], (count, n))
+            shape = events[cell].standard_deviation(rows)
+            if i in active:
+                kept = levels[cell, :, active.index(i)]
+                if len(kept) < count:  # the last step does not enter the dynamics: an event of its own
+                    values[:-1, i] = kept
+                    last = np.where(np.arange(count) == count - 1, 0.0, np.inf)
+                    factor = level_scale(events[cell], rows, np.where(np.isinf(last), np.inf, shape), share)
+                    values[-1, i] = factor * shape[-1]
+                    logs.append(share + np.log(2.0))
+                else:
+                    values[:, i] = kept
+            elif shape.max() > 0:
+                values[:, i] = level_scale(events[cell], rows, shape, share) * shape
+                logs.append(share + np.log(2.0))
+        result.append(values * (1 + 1e-15))
+        worst = max(worst, logsumexp(np.array(logs)))
+    return result, worst
+
+
+def _deviation_tube(run: LinearRun, outcome: Outcome, bounds: tuple[Array, Array]) -> DeviationTube:
+    """|X - x|_i <= level of |Z_i| plus the width of R's set, which holds both remainders."""
+    engine = run.engine
+    levels, log_probability = _levels_of_coordinates(run, outcome)
+    half = np.zeros_like(levels[0])
+    for cell, level in enumerate(levels):
+        low, high, _ = _coordinates(run, cell).remainder(bounds[0][cell], bounds[1][cell])
+        half = np.maximum(half, level + np.maximum(high - low, 0.0) * (1 + 1e-15))
+    count = len(half)
+    times = engine.times if engine.continuous else np.arange(count + 1.0)
+    log10 = min(log_probability / np.log(10.0) * (1 - 1e-15), 0.0)
+    return DeviationTube(times=times, half_widths=half, log10_delta=float(log10))
+
+
+def _reach_tube(
+    run: LinearRun, bounds: tuple[Array, Array], log10_delta: float, levels: list[Array] | None
+) -> ReachTube:
+    """Nominal curve plus a box around it on every piece."""
+    engine = run.engine
+    cells, n = engine.centres.shape
+    boxes = []
+    for cell in range(cells):
+        support = _coordinates(run, cell)
+        low, high, _ = support.remainder(bounds[0][cell], bounds[1][cell])
+        level = 0.0 if levels is None else levels[cell]
+        boxes.append((low - support.y - level, high + support.y + level))
+    if engine.continuous:
+        c = engine.controls
+        h = engine.step
+        exact = [Interval.point(c[:, :, i]) for i in range(4)]
+        # Bezier points about the middle of the piece, s in [-h/2, h/2]
+        powers = [
+            (exact[0] + 3.0 * (exact[1] + exact[2]) + exact[3]) / 8.0,
+            0.75 * (exact[3] + exact[2] - exact[1] - exact[0]) / h,
+            1.5 * (exact[0] - exact[1] - exact[2] + exact[3]) / (h * h),
+            (exact[3] - exact[0] + 3.0 * (exact[1] - exact[2])) / (h * h * h),
+        ]
+        coefficients = np.stack([p.mid for p in powers], axis=2)
+        slack = sum(p.rad * (0.6 * h) ** j for j, p in enumerate(powers))
+        # the pieces' ends are floats within a rounding of k h
+        speed = np.abs(coefficients[:, :, 1]) + h * np.abs(coefficients[:, :, 2]) * 2 + np.abs(coefficients[:, :, 3]) * h * h
+        slack = np.asarray(slack) * (1 + 1e-12) + speed * 4e-15 * (1 + engine.times[-1])
+        starts, ends = engine.times[:-1], engine.times[1:]
+    else:
+        coefficients = engine.nodes[:, :, None, :]
+        slack = np.zeros((cells, engine.pieces + 1, n))
+        starts = ends = np.arange(engine.pieces + 1.0)
+    low = np.stack([b[0] for b in boxes]) - slack
+    high = np.stack([b[1] for b in boxes]) + slack
+    curve = Curve(continuous=engine.continuous, starts=starts, ends=ends, coefficients=coefficients)
+    return ReachTube(
+        curve=curve, box=Interval(np.nextafter(low, -np.inf), np.nextafter(high, np.inf)),
+        noise=levels is not None, log10_delta=log10_delta, method="linear",
+    )
