@@ -1,0 +1,86 @@
+"""Fig. 1: (a) the eroded aisle with the nominal inside, (b) tubes at three levels with sample paths."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from paper_figs.style import BLACK, COLUMN, GREY, Data, main, panels
+
+WALL, BAND = "#7f7f7f", "#8fc1e3"
+TUBES = ("#e3eff8", "#b3d3ec", "#6fa8d6")
+
+
+def draw(data: Data) -> Figure:
+    """Two panels, one above the other, on the same axes."""
+    figure, axes = panels(COLUMN, 3.9, 2, 1, sharex=True)
+    _erosion(axes[0, 0], data)
+    _tubes(axes[1, 0], data)
+    for panel, title in zip(axes.flat, ("(a) set erosion", "(b) probabilistic tubes")):
+        panel.set_title(title, loc="left", pad=3)
+        panel.set(xlim=(data["x"][0], data["x"][-1]), ylim=(data["y"][0], data["y"][-1]), ylabel="$p_y$")
+        panel.set_aspect("equal", adjustable="box")
+        panel.grid(False)
+        panel.fill_between(data["x"], data["high"], data["y"][-1], color=WALL, linewidth=0, zorder=3)
+        panel.fill_between(data["x"], data["y"][0], data["low"], color=WALL, linewidth=0, zorder=3)
+    axes[1, 0].set_xlabel("$p_x$")
+    return figure
+
+
+def _erosion(axes: Axes, data: Data) -> None:
+    radius = data.claims["radius"]
+    distance = data["distance"]
+    axes.contourf(data["x"], data["y"], distance, levels=[-0.5, radius], colors=[BAND], zorder=1)
+    axes.contour(
+        data["x"], data["y"], distance, levels=[radius], colors=["#1f5f8b"], linewidths=0.7, zorder=2
+    )
+    axes.plot(*data["nominal"].T, color=BLACK, linewidth=1.5, zorder=5)
+    handles = [
+        Patch(facecolor=WALL, label="unsafe"),
+        Patch(facecolor=BAND, label=rf"eroded by $r_\delta={radius:.2f}$, $\delta=10^{{-3}}$"),
+        Line2D([], [], color=BLACK, linewidth=1.5, label="noise-free trajectory"),
+    ]
+    axes.legend(
+        handles=handles,
+        loc="lower left",
+        ncols=3,
+        columnspacing=0.9,
+        handlelength=1.4,
+        bbox_to_anchor=(0, 1.09),
+    )
+
+
+def _tubes(axes: Axes, data: Data) -> None:
+    angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    handles = [
+        Line2D([], [], color=BLACK, linewidth=1.5, label="$x_t$"),
+        Line2D([], [], color=GREY, linewidth=0.7, label="$X_t$"),
+    ]
+    order = np.argsort(data["levels"])
+    for place, index in enumerate(order):
+        discs = data["nominal"][:, None] + data["radii"][index][:, None, None] * circle
+        axes.add_collection(
+            PolyCollection(list(discs), facecolors=TUBES[place], edgecolors="none", zorder=1 + 0.1 * place)
+        )
+        exponent = round(np.log10(data["levels"][index]))
+        handles.append(Patch(facecolor=TUBES[place], label=rf"$\delta=10^{{{exponent}}}$"))
+    for path in data["paths"]:
+        axes.plot(*path.T, color=GREY, linewidth=0.35, alpha=0.7, zorder=4)
+    axes.plot(*data["nominal"].T, color=BLACK, linewidth=1.5, zorder=5)
+    axes.legend(
+        handles=handles,
+        loc="lower left",
+        ncols=5,
+        columnspacing=0.9,
+        handlelength=1.4,
+        bbox_to_anchor=(0, 1.09),
+    )
+
+
+if __name__ == "__main__":
+    main("fig1", draw)
