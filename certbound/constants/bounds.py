@@ -162,14 +162,15 @@ def _supremum(
     limit = tolerance * _scale(jacobian, norm)
     starts = jacobian.starts()
     search = functools.partial(bound_supremum, bound, value, jacobian.box, tolerance=limit, starts=starts)
+    unbounded = not (np.isfinite(jacobian.box.lo) & np.isfinite(jacobian.box.hi)).all()
+    many = len(jacobian.active) > 3
+    if many and unbounded:
+        return search(budget=budget, ceiling=_structural_bound(model, jacobian, norm))
     found = search(budget=min(budget, FIRST_BUDGET))
     if found.upper - found.sampled <= limit or not np.isfinite(found.sampled):
         return found
-    many = len(jacobian.active) > 3 or not (np.isfinite(jacobian.box.lo) & np.isfinite(jacobian.box.hi)).all()
-    ceiling = _structural_bound(model, jacobian, norm) if many else np.inf
-    if np.isinf(found.upper) and np.isinf(ceiling):
-        return found
-    return search(budget=budget, ceiling=ceiling)
+    ceiling = _structural_bound(model, jacobian, norm) if many or unbounded else np.inf
+    return found if np.isinf(found.upper) and np.isinf(ceiling) else search(budget=budget, ceiling=ceiling)
 
 
 def _structural_bound(model: Model, jacobian: StateJacobian, norm: Metric) -> float:

@@ -188,7 +188,8 @@ def _sample(
     value: Callable[[Array], Array], groups: list[Array], sampled: float, point: Array
 ) -> tuple[float, Array]:
     points = np.concatenate(groups)
-    found = value(points)
+    with np.errstate(all="ignore"):
+        found = value(points)
     found = np.where(np.isfinite(found), found, -np.inf)
     first = int(np.argmax(found))
     if found[first] > sampled:
