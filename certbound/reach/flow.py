@@ -75,10 +75,7 @@ class Flow:
         times = np.asarray(starts, dtype=float)
         if sequence is None:
             return np.zeros((len(times), 0))
-        if self.continuous:
-            index = np.searchsorted(self.breaks, times, side="right") - 1
-        else:
-            index = times.astype(int)
+        index = np.searchsorted(self.breaks, times, side="right") - 1 if self.continuous else times.astype(int)
         rows: Array = np.asarray(sequence, dtype=float)[np.clip(index, 0, len(sequence) - 1)]
         return rows
 

@@ -11,7 +11,7 @@ Source: Thms K4, K5 (theory).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from certbound.errors import EnclosureError
 from certbound.problem.problem import Problem
@@ -36,7 +36,7 @@ INFLATION = 1.03
 def local_contraction_tube(
     problem: Problem | Flow,
     *,
-    metric: ArrayLike | None = None,
+    metric: Array | None = None,
     cells: int | None = None,
     curve: Curve | None = None,
 ) -> ReachTube:

@@ -48,6 +48,8 @@ def polyhedral_weights(points: Array, faces: Array, bounds: Array, matrix: Array
     Two proposals: the single best face, and the direction to the nearest point by Hildreth's dual coordinate
     ascent on max_{lam >= 0} lam.(faces q - bounds) - lam^T G lam / 2, G = faces Q faces^T.
     """
+    if len(faces) == 0:
+        return []
     excess = points @ faces.T - bounds
     gram = faces @ matrix @ faces.T
     diagonal = np.maximum(np.diag(gram), 1e-300)

@@ -63,15 +63,14 @@ class LocalSlopes:
         return np.where(finite, values.reshape(radius.shape), np.inf)
 
     def _branch(self, slots: Interval, centres: Interval, radius: Array) -> Array:
-        """One bound per row of ``slots`` (N, all slots), over the part within ``radius`` of ``centres`` (N, n)."""
+        """One bound per row of ``slots`` (N, all), over what lies within ``radius`` of ``centres`` (N, n)."""
         active = list(self.jacobian.active)
         boxes, owners = slots[:, active], np.arange(len(slots))
-        settled = np.full(len(boxes), -np.inf)
+        settled, floor = np.full(len(boxes), -np.inf), np.full(len(boxes), -np.inf)
         values, weights = self._evaluate(boxes)
+        bounds = values
         for _ in range(ROUNDS if active else 0):
-            floor = np.full(len(settled), -np.inf)
             np.maximum.at(floor, owners, self._sampled(boxes))
-            np.maximum(floor, settled, out=floor)
             open_ = values > floor[owners] + TOLERANCE * (1e-2 + np.abs(floor[owners]))
             open_ &= np.any(boxes.lo < boxes.hi, axis=1)
             np.maximum.at(settled, owners[~open_], values[~open_])
@@ -85,6 +84,10 @@ class LocalSlopes:
             boxes, owners, parents = boxes[near], owners[near], parents[near]
             values, weights = self._evaluate(boxes)
             values = np.minimum(values, parents)
+            before, bounds = bounds, settled.copy()
+            np.maximum.at(bounds, owners, values)
+            if not _worthwhile(before, bounds, floor):
+                break
         np.maximum.at(settled, owners, values)
         return settled
 
@@ -116,3 +119,12 @@ class LocalSlopes:
         usable = np.all(np.isfinite(jacobians), axis=(-1, -2))
         sample = self.frame.sample_measure if self.flow.continuous else self.frame.sample_norm
         return np.where(usable, sample(np.where(usable[:, None, None], jacobians, 0.0)), -np.inf)
+
+
+def _worthwhile(before: Array, after: Array, floor: Array) -> bool:
+    """Whether a round of halving closed a tenth of the gaps, on the whole."""
+    gap, left = before - floor, after - floor
+    usable = np.isfinite(gap) & np.isfinite(left)
+    if not usable.all():
+        return True
+    return bool(np.sum(left) < 0.9 * np.sum(gap))

@@ -127,16 +127,16 @@ class ReachTube:
         eye = np.eye(self.curve.dimension)
         dual = Interval.point(self.norm.dual(eye))
         grown = Interval.point(np.asarray(extra, dtype=float))[..., None] * dual
-        width = np.stack([self.spread(row) for row in eye], axis=-1)
-        low = np.stack([self.spread(-row) for row in eye], axis=-1)
+        above, below = (np.moveaxis(self.spread(rows[:, None, None]), 0, -1) for rows in (eye, -eye))
         centre = self.curve.range()
-        upper = centre + Interval.point(width) + grown
-        return Interval((centre - Interval.point(low) - grown).lo, upper.hi)
+        upper = centre + Interval.point(above) + grown
+        return Interval((centre - Interval.point(below) - grown).lo, upper.hi)
 
     def spread(self, directions: ArrayLike | Interval) -> Array:
-        """Upper bounds of a . (x - p(t)) over the sets: directions (..., n) against (B, K) -> (B, K).
+        """Upper bounds of a . (x - p(t)) over the sets: directions (..., n) against (B, K) -> (..., B, K).
 
-        A direction may differ from piece to piece, shape (K, n), and from cell to cell, shape (B, K, n).
+        A direction may differ from piece to piece, shape (K, n), and from cell to cell, shape (B, K, n); more
+        axes come first.
         """
         a = directions if isinstance(directions, Interval) else Interval.point(directions)
         total = Interval.point(self.radius) * Interval.point(self.norm.dual(a))
@@ -146,22 +146,19 @@ class ReachTube:
             total = total + Interval.point(shares.mag).sum(axis=-1)
         if self.box is not None:
             total = total + Interval.point((a * self.box).hi).sum(axis=-1)
-        return np.asarray(np.broadcast_to(total.hi, self.radius.shape))
+        return np.asarray(np.broadcast_to(total.hi, np.broadcast_shapes(total.shape, self.radius.shape)))
 
     def support(self, directions: ArrayLike, piece: int) -> Array:
         """Upper bounds of max a . x over the set of ``piece``, shape (..., n) -> (...)."""
         a = np.asarray(directions, dtype=float)
-        rows = a.reshape(-1, a.shape[-1])
-        span = self.curve.span[piece]
-        values = []
-        for row in rows:
-            along = [
-                (Interval.point(self.curve.coefficients[:, piece, j]) * row).sum(axis=-1)
-                for j in range(self.curve.coefficients.shape[2])
-            ]
-            centre = polynomial_range(along, span)
-            values.append(float(np.max((centre + Interval.point(self.spread(row)[:, piece])).hi)))
-        return np.array(values).reshape(a.shape[:-1])
+        rows = a.reshape(-1, 1, 1, a.shape[-1])
+        part = self.section(piece, piece + 1)
+        along = [
+            (Interval.point(part.curve.coefficients[..., j, :]) * rows).sum(axis=-1)
+            for j in range(part.curve.coefficients.shape[2])
+        ]
+        total = polynomial_range(along, part.curve.span) + Interval.point(part.spread(rows))
+        return np.asarray(total.hi.max(axis=(1, 2)).reshape(a.shape[:-1]))
 
     def center(self, t: float) -> Array:
         """Mean of the cells' nominal states at time t, shape (n,)."""
@@ -172,9 +169,8 @@ class ReachTube:
         a = np.asarray(directions, dtype=float)
         piece = self.curve.piece_of(float(t))
         centres = self.curve.value(t)
-        rows = a.reshape(-1, a.shape[-1])
-        offsets = rows @ (centres - centres.mean(axis=0)).T
-        spreads = np.stack([self.spread(row)[:, piece] for row in rows])
+        offsets = a.reshape(-1, a.shape[-1]) @ (centres - centres.mean(axis=0)).T
+        spreads = self.section(piece, piece + 1).spread(a.reshape(-1, 1, 1, a.shape[-1]))[..., 0]
         return np.asarray(np.max(offsets + spreads, axis=-1).reshape(a.shape[:-1]))
 
     def contains(self, t: float, x: ArrayLike, *, tolerance: float = 1e-9) -> bool:
@@ -228,14 +224,18 @@ class ReachTube:
         room = constraint_clearance(self, constraint, Norm(self.curve.dimension))
         return float(np.min(room.radius, initial=np.inf))
 
+    def section(self, first: int, last: int) -> ReachTube:
+        """Pieces ``first`` up to, but without, ``last``."""
+        return self.altered(
+            curve=self.curve.section(first, last),
+            radius=self.radius[:, first:last],
+            generators=None if self.generators is None else self.generators[:, first:last],
+            box=None if self.box is None else self.box[:, first:last],
+        )
+
     def until(self, pieces: int) -> ReachTube:
         """The first ``pieces`` pieces."""
-        return self.altered(
-            curve=self.curve.until(pieces),
-            radius=self.radius[:, :pieces],
-            generators=None if self.generators is None else self.generators[:, :pieces],
-            box=None if self.box is None else self.box[:, :pieces],
-        )
+        return self.section(0, pieces)
 
     def grown(self, extra: ArrayLike, *, log10_delta: float, method: str) -> ReachTube:
         """The tube with a stochastic deviation of ``extra`` (shape (K,)) in the metric added."""

@@ -11,8 +11,7 @@ from certbound.reach.series import expand, polynomial_range, series_product, tay
 from certbound.rigor.intervals import Interval
 
 
-
-@pytest.fixture()
+@pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(7)
 
@@ -48,7 +47,7 @@ BINARY = {
 
 def tape(op: str, arity: int, value: float = 0.0) -> Tape:
     names = ("x", "y")[:arity]
-    nodes = tuple(Node("input", (k,)) for k in range(arity)) + (Node(op, tuple(range(arity)), value),)
+    nodes = (*(Node("input", (k,)) for k in range(arity)), Node(op, tuple(range(arity)), value))
     return Tape(inputs=names, nodes=nodes, outputs=(arity,), shape=(1,))
 
 
