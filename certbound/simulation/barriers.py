@@ -77,9 +77,7 @@ class Bridge:
         """Expression of |row . G|^2 h for a fixed row."""
         if self.spread is not None:
             return parameters.add(float(np.sum((np.asarray(row) @ self.spread) ** 2)))
-        return self.squares(
-            [linear_form(row, column, parameters) for column in zip(*self.entries, strict=True)]
-        )
+        return self.squares([linear_form(row, column, parameters) for column in zip(*self.entries, strict=True)])
 
     def moving_variance(self, names: Sequence[str], parameters: Parameters) -> str:
         """Expression of |w . G|^2 h for a row w of variables."""
@@ -87,10 +85,7 @@ class Bridge:
             return self.squares([linear_form(column, names, parameters) for column in self.spread.T])
         columns = zip(*self.entries, strict=True)
         return self.squares(
-            [
-                " + ".join(f"{n} * {e}" for n, e in zip(names, column) if e != "0.0") or "0.0"
-                for column in columns
-            ]
+            [" + ".join(f"{n} * {e}" for n, e in zip(names, column) if e != "0.0") or "0.0" for column in columns]
         )
 
     def even_variance(self, matrix: Array) -> float:
@@ -234,9 +229,7 @@ def _bridge_stay(number: int, old: list[str], new: list[str], spreads: list[str]
     return lines
 
 
-def _bridge_avoid(
-    number: int, old: list[str], new: list[str], spreads: list[str], p: Parameters
-) -> list[str]:
+def _bridge_avoid(number: int, old: list[str], new: list[str], spreads: list[str], p: Parameters) -> list[str]:
     """All faces must be crossed: the least likely one decides; without one, the straight line does."""
     near = " and ".join(
         f"({n} < 0.0 or 2.0 * {g} * {n} < {EXPONENT} * ({spread}))" for g, n, spread in zip(old, new, spreads)

@@ -37,9 +37,7 @@ def check_count(name: str, value: Any) -> int:
 def entropy_of(rng: np.random.Generator | int | None) -> int:
     """128 random bits that name all streams of a run; drawn from ``rng``, so that the next run differs."""
     if rng is not None and not isinstance(rng, (np.random.Generator, int, np.integer)):
-        raise TypeError(
-            f"`rng` must be a numpy.random.Generator, got {rng!r}; use np.random.default_rng(seed)."
-        )
+        raise TypeError(f"`rng` must be a numpy.random.Generator, got {rng!r}; use np.random.default_rng(seed).")
     return int.from_bytes(np.random.default_rng(rng).bytes(16), "little")
 
 
@@ -87,6 +85,8 @@ class Work:
     counts_shape, marginals_shape : tuple of int
     paths : int
     entropy : int
+    block : int
+        Paths per block.
     """
 
     source: str
@@ -107,11 +107,12 @@ class Work:
     marginals_shape: tuple[int, int, int, int] = (2, 0, 1, 1)
     paths: int
     entropy: int
+    block: int = BLOCK
 
     @property
     def blocks(self) -> int:
         """Number of blocks."""
-        return -(-self.paths // BLOCK)
+        return -(-self.paths // self.block)
 
     def tally(self) -> Tally:
         """An empty tally."""
@@ -126,7 +127,7 @@ class Work:
         arrays = (self.p, starts, self.low, self.high, self.inputs, self.moving, self.nominal, self.windows)
         for array in (*arrays, self.profile, self.marks):
             state.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-        state.update(f"{self.source} {self.steps} {self.interval!r} {self.counts_shape} {BLOCK}".encode())
+        state.update(f"{self.source} {self.steps} {self.interval!r} {self.counts_shape} {self.block}".encode())
         return state.hexdigest()
 
     def compile(self) -> None:
@@ -138,9 +139,9 @@ class Work:
         from certbound.simulation.streams import start_generator
 
         generator = start_generator(self.entropy, block)
-        count = min(BLOCK, self.paths - block * BLOCK)
-        starts = np.ascontiguousarray(self.sample_start(generator, BLOCK)[:count], dtype=float)
-        signals = generator.uniform(self.low, self.high, (BLOCK, len(self.low)))[:count]
+        count = min(self.block, self.paths - block * self.block)
+        starts = np.ascontiguousarray(self.sample_start(generator, self.block)[:count], dtype=float)
+        signals = generator.uniform(self.low, self.high, (self.block, len(self.low)))[:count]
         return self._call(starts, signals, block, tally, out)
 
     def _call(self, starts: Array, signals: Array, block: int, tally: Tally, out: Array | None) -> int:
@@ -159,7 +160,7 @@ class Work:
             state = ", ".join(f"{value:.6g}" for value in notes[2:])
             raise ValueError(
                 "the model gave a state that is not finite in the step after time "
-                f"{notes[1] * self.interval:.6g} on path {block * BLOCK + int(notes[0])}, from state "
+                f"{notes[1] * self.interval:.6g} on path {block * self.block + int(notes[0])}, from state "
                 f"({state}); use more steps, or set `domain` to where the model is meant."
             )
         return int(done)
@@ -173,5 +174,5 @@ def run_blocks(work: Work, first: int, last: int) -> Tally:
     """Run blocks ``first`` .. ``last - 1``: what an executor calls."""
     tally = work.tally()
     steps = sum(work.run_block(block, tally) for block in range(first, last))
-    paths = min(last * BLOCK, work.paths) - first * BLOCK
+    paths = min(last * work.block, work.paths) - first * work.block
     return Tally(counts=tally.counts, marginals=tally.marginals, steps=steps, paths=paths)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from certbound.errors import SolverError
-from certbound.simulation.blocks import BLOCK, Tally, Work, run_blocks
+from certbound.simulation.blocks import Tally, Work, run_blocks
 from certbound.simulation.checkpoint import Checkpoint
 
 __all__ = ["Outcome", "Progress", "connect", "run_work"]
@@ -87,9 +87,7 @@ def run_work(
     """
     work.compile()
     chunk = _chunk(work)
-    record = (
-        Checkpoint.open(checkpoint, work, chunk) if checkpoint is not None else Checkpoint.fresh(work, chunk)
-    )
+    record = Checkpoint.open(checkpoint, work, chunk) if checkpoint is not None else Checkpoint.fresh(work, chunk)
     begin = time.perf_counter()
     steps_before, saved = record.tally.steps, begin
     todo = record.missing()
@@ -116,14 +114,12 @@ def run_work(
         finally:
             record.save()
     seconds = time.perf_counter() - begin
-    return Outcome(
-        tally=record.tally, seconds=seconds, rate=(record.tally.steps - steps_before) / max(seconds, 1e-9)
-    )
+    return Outcome(tally=record.tally, seconds=seconds, rate=(record.tally.steps - steps_before) / max(seconds, 1e-9))
 
 
 def _chunk(work: Work) -> int:
     """Blocks per chunk: it depends on the work alone, so that any executor can go on with a checkpoint."""
-    by_time = int(_STEPS_PER_CHUNK // (BLOCK * work.steps))
+    by_time = int(_STEPS_PER_CHUNK // (work.block * work.steps))
     return max(1, min(by_time, work.blocks // _FEWEST_CHUNKS))
 
 
@@ -138,9 +134,7 @@ def _progress(record: Checkpoint, work: Work, seconds: float, steps_before: int)
     )
 
 
-def _completed(
-    pool: Executor, width: int, work: Work, chunk: int, todo: list[int]
-) -> Iterator[tuple[int, Tally]]:
+def _completed(pool: Executor, width: int, work: Work, chunk: int, todo: list[int]) -> Iterator[tuple[int, Tally]]:
     """Chunks as they finish, with a bounded number in flight."""
     waiting: dict[Future[Tally], int] = {}
     queue = iter(todo)
@@ -181,9 +175,8 @@ def _pool(executor: Any) -> Iterator[tuple[Executor, int]]:
     elif hasattr(executor, "submit"):
         yield executor, int(getattr(executor, "_max_workers", 8))
     else:
-        raise TypeError(
-            f"`executor` must be a concurrent.futures.Executor or a dask Client, got {type(executor).__name__}."
-        )
+        kind = type(executor).__name__
+        raise TypeError(f"`executor` must be a concurrent.futures.Executor or a dask Client, got a {kind}.")
 
 
 def _cores() -> int:
@@ -203,9 +196,7 @@ def connect(address: str, timeout: float = 10.0) -> Any:
     try:
         from distributed import Client
     except ImportError as error:
-        raise ValueError(
-            "a cluster needs dask; install it with: pip install 'certbound[cluster]'."
-        ) from error
+        raise ValueError("a cluster needs dask; install it with: pip install 'certbound[cluster]'.") from error
     try:
         return Client(address, timeout=timeout)
     except (OSError, TimeoutError, ValueError) as error:

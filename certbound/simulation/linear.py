@@ -12,9 +12,7 @@ __all__ = ["exact_transition"]
 Array = NDArray[np.float64]
 
 
-def exact_transition(
-    matrix: Array, offset: Array, diffusion: Array, step: float
-) -> tuple[Array, Array, Array]:
+def exact_transition(matrix: Array, offset: Array, diffusion: Array, step: float) -> tuple[Array, Array, Array]:
     """The law of x(h) for dx = (A x + B v + b) dt + G dW with v constant: N(F x + E v + e, L L').
 
     Parameters

@@ -76,9 +76,7 @@ def sample_paths(
         )
     source, p = kernel_source(setting.model, Task(kind="record", own_nominal=deviation))
     marks = np.arange(points + 1, dtype=np.int64) * (setting.steps // points)
-    work = setting.work(
-        source=source, p=p, marks=marks, counts_shape=(1, 1), paths=paths, entropy=entropy_of(rng)
-    )
+    work = setting.work(source=source, p=p, marks=marks, counts_shape=(1, 1), paths=paths, entropy=entropy_of(rng))
     out = np.empty((paths, points + 1, n))
     for block in range(work.blocks):
         work.run_block(block, work.tally(), out[block * BLOCK : (block + 1) * BLOCK])

@@ -56,7 +56,7 @@ class Setting:
         """Whether all paths have the same noise-free path."""
         return self.fixed is not None and not self.model.own_disturbance
 
-    def work(self, **fields: Any) -> Work:
+    def work(self, kind: type[Work] = Work, **fields: Any) -> Work:
         """A piece of work on this setting; ``fields`` are those that differ from task to task."""
         model = self.model
         drawn = model.signal is None and model.switching == 0.0
@@ -75,7 +75,7 @@ class Setting:
             "interval": model.interval,
             "dimension": model.dimension,
         }
-        return Work(**(defaults | fields))
+        return kind(**(defaults | fields))
 
 
 def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = None) -> Setting:
@@ -100,18 +100,14 @@ def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = 
         )
     times = np.linspace(0.0, float(problem.horizon), count + 1)
     start, fixed = _start(problem, scenario)
-    return Setting(
-        model=step_model(problem, count, scenario), steps=count, times=times, start=start, fixed=fixed
-    )
+    return Setting(model=step_model(problem, count, scenario), steps=count, times=times, start=start, fixed=fixed)
 
 
 def _steps(problem: Any, steps: int | None) -> int:
     if problem.system.time == "discrete":
         horizon = int(problem.horizon)
         if steps is not None and check_count("steps", steps) != horizon:
-            raise ValueError(
-                f"`steps` must be {horizon}, the horizon of this discrete-time problem, or left out."
-            )
+            raise ValueError(f"`steps` must be {horizon}, the horizon of this discrete-time problem, or left out.")
         return horizon
     if steps is not None:
         return check_count("steps", steps)
@@ -119,9 +115,7 @@ def _steps(problem: Any, steps: int | None) -> int:
     return -(-_DEFAULT_STEPS // pieces) * pieces
 
 
-def _start(
-    problem: Any, scenario: Scenario
-) -> tuple[Callable[[np.random.Generator, int], Array], Array | None]:
+def _start(problem: Any, scenario: Scenario) -> tuple[Callable[[np.random.Generator, int], Array], Array | None]:
     initial, n = problem.initial, problem.system.dimension
     if scenario.initial is not None:
         point = np.asarray(scenario.initial, dtype=float)

@@ -154,7 +154,7 @@ def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
     if system.time == "discrete":
         variate, factor = _unit_variates(system.noise)
         noise = np.asarray(system.noise_matrix) @ factor
-        return StepModel(drift=tape, variate=variate, noise=noise, **fields)
+        return StepModel(drift=tape, variate=variate, noise=_without_zeros(noise), **fields)
     step = float(problem.horizon) / steps
     return _continuous(tape, system.diffusion, step, scenario, fields)
 
@@ -211,20 +211,21 @@ def _continuous(
             )
         name = "euler" if correction is None else "milstein"
         return StepModel(drift=tape, step=step, noise=diffusion, correction=correction, scheme=name, **fields)
-    spread = np.asarray(diffusion) * np.sqrt(step)
+    spread = _without_zeros(np.asarray(diffusion)) * np.sqrt(step)
     linear = _affine(tape, n) if wanted in ("auto", "exact") else None
     if linear is not None and (n <= _LARGEST_EXACT or wanted == "exact"):
         transition, offset, factor = exact_transition(*linear, np.asarray(diffusion), step)
         drift = _affine_tape(tape.inputs, np.hstack([np.zeros((n, 1)), transition]), offset)
         return StepModel(drift=drift, noise=factor, spread=spread, scheme="exact", **fields)
     if wanted in ("exact", "milstein"):
-        need = (
-            "a linear system with constant coefficients"
-            if wanted == "exact"
-            else "a state-dependent diffusion"
-        )
+        need = "a linear system with constant coefficients" if wanted == "exact" else "a state-dependent diffusion"
         raise ValueError(f"`scheme` {wanted!r} needs {need}; use 'auto'.")
     return StepModel(drift=tape, step=step, noise=spread, spread=spread, scheme="euler", **fields)
+
+
+def _without_zeros(noise: Array) -> Array:
+    """Columns that are all 0 need no variates."""
+    return np.ascontiguousarray(noise[:, np.any(noise != 0.0, axis=0)])
 
 
 def _constant(tape: Tape) -> bool:
@@ -266,9 +267,7 @@ def _milstein(diffusion: Tape, n: int) -> Tape | None:
     if diffusion.shape != (n, n):
         return None
     derivative = jacobian(diffusion, tuple(range(1, n + 1)))
-    zero = [
-        derivative.nodes[o].op == "const" and derivative.nodes[o].value == 0.0 for o in derivative.outputs
-    ]
+    zero = [derivative.nodes[o].op == "const" and derivative.nodes[o].value == 0.0 for o in derivative.outputs]
     entry = np.array(zero).reshape(n, n, n)
     for i in range(n):
         for j in range(n):

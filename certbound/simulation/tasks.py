@@ -58,9 +58,7 @@ class Task:
     densities: tuple[float, float] = (1.0, 1.0)
 
 
-def task_source(
-    task: Task, dimension: int, bridge: Bridge | None, nominal_step: list[str], p: Parameters
-) -> Lines:
+def task_source(task: Task, dimension: int, bridge: Bridge | None, nominal_step: list[str], p: Parameters) -> Lines:
     """Lines of a task; ``nominal_step`` advances the noise-free path from a_i to b_i."""
     if task.kind == "exits":
         return _exits(task, bridge, p)
@@ -190,8 +188,7 @@ def _bridge_top(j: str, before: str, after: str, spread: str) -> list[str]:
     It does so when the variate is below exp(-e), and e^-e < 1/(1 + e + e^2/2) saves most logarithms.
     """
     return [
-        f"exponent = math.inf if {spread} <= 0.0 else "
-        f"2.0 * (top_{j} - {before}) * (top_{j} - {after}) / {spread}",
+        f"exponent = math.inf if {spread} <= 0.0 else 2.0 * (top_{j} - {before}) * (top_{j} - {after}) / {spread}",
         f"if exponent < {EXPONENT}:",
         "    chance = uniform(stream)",
         "    if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0:",
