@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 
 FIRST_BUDGET = 4000
 """Boxes before the affine structure of the Jacobian is looked for."""
+MOST_SIDES = 8
+"""Coordinates above which bisection is left out where the affine structure gives a bound."""
 SMALLEST_GAIN = 1e-12
 """Stands for L = 0, which the tubes exclude."""
 
@@ -164,8 +166,11 @@ def _supremum(
     search = functools.partial(bound_supremum, bound, value, jacobian.box, tolerance=limit, starts=starts)
     unbounded = not (np.isfinite(jacobian.box.lo) & np.isfinite(jacobian.box.hi)).all()
     many = len(jacobian.active) > 3
+    budget = max(1, int(budget * min(1.0, (6 / model.dimension) ** 2)))  # a box costs the more, the larger n
     if many and unbounded:
-        return search(budget=budget, ceiling=_structural_bound(model, jacobian, norm))
+        ceiling = _structural_bound(model, jacobian, norm)
+        hopeless = len(jacobian.active) > MOST_SIDES and np.isfinite(ceiling)
+        return search(budget=1 if hopeless else budget, ceiling=ceiling)
     found = search(budget=min(budget, FIRST_BUDGET))
     if found.upper - found.sampled <= limit or not np.isfinite(found.sampled):
         return found

@@ -176,6 +176,8 @@ def _half_sum(x: Interval) -> Interval:
     large = 4 * TINY  # from there on halving is exact
     lo = np.where(np.abs(total.lo) >= large, 0.5 * total.lo, np.minimum(total.lo, 0.0))
     hi = np.where(np.abs(total.hi) >= large, 0.5 * total.hi, np.maximum(total.hi, 0.0))
+    index = np.arange(x.shape[-1])
+    lo[..., index, index], hi[..., index, index] = x.lo[..., index, index], x.hi[..., index, index]
     return Interval._raw(lo, hi)
 
 

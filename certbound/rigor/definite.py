@@ -165,7 +165,8 @@ def _largest_of_two(a: Array, d: Array, b: Array) -> Array:
     denominator = lower(np.maximum(lower(np.sqrt(square)), b) + half)
     excess = upper(b * (b / denominator) * (1 + 4 * STEP), tiny=TINY)
     excess = np.where(b == 0, 0.0, np.minimum(excess, b))
-    return np.where(np.isfinite(largest) & np.isfinite(b), upper(largest + excess), np.inf)
+    total = np.where(excess == 0, largest, upper(largest + excess))
+    return np.where(np.isfinite(largest) & np.isfinite(b), total, np.inf)
 
 
 def _up_sqrt(x: Array) -> Array:
