@@ -13,7 +13,10 @@ FUNCTIONS = {
     "inverses": lambda x: [np.arcsin(x[0]), np.arccos(x[1]), np.arctan(x[2]), np.arctan2(x[0], x[1])],
     "exponentials": lambda x: [np.exp(x[0]), np.log(x[1]), np.sqrt(x[2]), np.hypot(x[0], x[1])],
     "kinks and jumps": lambda x: [abs(x[0] - 0.5), np.maximum(x[0], x[1]), np.minimum(x[1], 0.5), np.floor(9 * x[2])],
-    "branches": lambda x: [np.where((x[0] > 0.5) & ~(x[1] <= x[2]), 1.0, np.sign(x[0] - x[1])), (x[0] == x[1]) | (x[1] != x[2])],
+    "branches": lambda x: [
+        np.where((x[0] > 0.5) & ~(x[1] <= x[2]), 1.0, np.sign(x[0] - x[1])),
+        (x[0] == x[1]) | (x[1] != x[2]),
+    ],
     "matrix": lambda x: np.outer(x, [1.0, 2.0]),
 }
 STATES = {"t": ["t"], "x": ["a", "b", "c"], "u": ["u"]}
@@ -66,6 +69,8 @@ def test_an_operation_that_a_tape_cannot_hold_is_named():
 
 def test_functions_of_the_library_are_rewritten():
     x = ca.SX.sym("x")
-    expression = ca.vertcat(ca.log1p(x), ca.expm1(x), ca.ceil(x), ca.asinh(x), 2 * x, 1 / x, x**ca.SX(1.5), 3**x)
+    expression = ca.vertcat(ca.log1p(x), ca.expm1(x), ca.ceil(x), ca.asinh(x), 2 * x, 1 / x, x ** ca.SX(1.5), 3**x)
     result = compile_numpy(from_casadi(expression, [x], ["x"], (8,)))(1.25)
-    np.testing.assert_allclose(result, [np.log1p(1.25), np.expm1(1.25), 2, np.arcsinh(1.25), 2.5, 0.8, 1.25**1.5, 3**1.25])
+    np.testing.assert_allclose(
+        result, [np.log1p(1.25), np.expm1(1.25), 2, np.arcsinh(1.25), 2.5, 0.8, 1.25**1.5, 3**1.25]
+    )

@@ -145,7 +145,10 @@ def test_awkward_labels_become_identifiers():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: ContinuousSystem(lambda x: -x, states=3, diffusion=0.1), r"got the scalar 0\.1; write 0\.1 \* np\.eye\(3\)"),
+        (
+            lambda: ContinuousSystem(lambda x: -x, states=3, diffusion=0.1),
+            r"got the scalar 0\.1; write 0\.1 \* np\.eye\(3\)",
+        ),
         (lambda: ContinuousSystem(lambda x: -x, states=3, diffusion=[0.1, 0.2, 0.3]), r"got a vector; write np\.diag"),
         (lambda: ContinuousSystem(lambda x: -x, states=3, diffusion=np.eye(2)), r"must have shape \(3, 2\)"),
         (lambda: ContinuousSystem(lambda x: -x, states=3, diffusion=lambda x: 0.1), "must return a matrix with 3 rows"),
@@ -190,7 +193,10 @@ def test_sizes_and_names_are_checked(build, message):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: DiscreteSystem(lambda x: x, states=2, noise=0.1), r"`noise` must be a law, got 0\.1; .*cb\.Gaussian\(std="),
+        (
+            lambda: DiscreteSystem(lambda x: x, states=2, noise=0.1),
+            r"`noise` must be a law, got 0\.1; .*cb\.Gaussian\(std=",
+        ),
         (lambda: ContinuousSystem(lambda x: x), "`states` must be given"),
         (lambda: ContinuousSystem(lambda x: x, states="abc"), "`states` must be a number or a list of names"),
         (lambda: ContinuousSystem(lambda x: x, states=True), "`states` must be a number or a list of names"),

@@ -28,7 +28,9 @@ FUNCTIONS = {
     "masks": lambda x: [np.where((x[0] > 0) & ~(x[1] > 0), 1.0, 2.0), np.where((x[0] < 0) | (x[1] != x[1]), 3.0, 4.0)],
     "select": lambda x: [np.select([x[0] > 1, x[0] > 0], [x[1], x[2]], 7.0)],
     "steps": lambda x: [np.sign(x[0]), np.floor(x[1]), np.ceil(x[1]), np.heaviside(x[2], 0.5), x[0] % 2, x[1] // 2],
-    "matrices": lambda x: np.array([[0, 1.5, 0], [2, 0, 1], [0, 0, 3]]) @ x + np.dot(np.eye(3), x) - x @ np.ones((3, 3)),
+    "matrices": lambda x: (
+        np.array([[0, 1.5, 0], [2, 0, 1], [0, 0, 3]]) @ x + np.dot(np.eye(3), x) - x @ np.ones((3, 3))
+    ),
     "reductions": lambda x: [x.sum(), np.sum(x**2), np.prod(x), np.mean(x), x @ x],
     "shapes": lambda x: np.concatenate([np.diff(x), np.cross(x, [1.0, 2.0, 3.0]), np.stack([x[0], x[1]])]),
     "outer product": lambda x: np.outer(x, [1.0, 2.0]),

@@ -50,7 +50,7 @@ def chain(**parameters: float) -> Problem:
     Parameters
     ----------
     masses : int
-        Number of masses m.
+        Number of masses m, at least 3 (fewer start beyond the constraints).
     reaction : 0 or 1
         Whether a spring also pulls at its other end.
     mass, stiffness, B1, B2, eta : float
@@ -62,8 +62,8 @@ def chain(**parameters: float) -> Problem:
 
     Source: Sec. VIII-B of the paper, with ">= 1.2" read as ">= -1.2".
     """
-    values = merged("chain", DEFAULTS, parameters)
-    positions, velocities = _descent(whole("masses", values["masses"]), values["eta"])
+    values = _checked("chain", parameters)
+    positions, velocities = _descent(whole("masses", values["masses"], 3), values["eta"])
     plan = _inverse(positions, velocities, values)
     start = np.concatenate([positions[0], velocities[0]])
     return _problem("chain", values, start, plan)
@@ -72,18 +72,25 @@ def chain(**parameters: float) -> Problem:
 def chain_rest(**parameters: float) -> Problem:
     """The same chain, left at the origin with zero inputs: does the noise alone drive it out?
 
-    Parameters are those of ``chain``.
+    Parameters are those of ``chain``; any number of masses will do.
     """
-    values = merged("chain_rest", DEFAULTS, parameters)
+    values = _checked("chain_rest", parameters)
     masses = whole("masses", values["masses"])
     return _problem("chain_rest", values, np.zeros(2 * masses), np.zeros((HORIZON, masses)))
 
 
-def _problem(name: str, values: dict[str, float], start: Array, plan: Array) -> Problem:
-    masses, eta = whole("masses", values["masses"]), values["eta"]
+def _checked(name: str, parameters: dict[str, float]) -> dict[str, float]:
+    values = merged(name, DEFAULTS, parameters)
     for key in ("mass", "eta", "input_bound"):
         if values[key] <= 0:
             raise ValueError(f"`{key}` must be positive, got {values[key]:g}.")
+    if values["reaction"] not in (0, 1):
+        raise ValueError(f"`reaction` must be 0 or 1, got {values['reaction']:g}.")
+    return values
+
+
+def _problem(name: str, values: dict[str, float], start: Array, plan: Array) -> Problem:
+    masses, eta = whole("masses", values["masses"]), values["eta"]
 
     def step(x: Any, u: Any) -> list[Any]:
         p, v = x[:masses], x[masses:]
