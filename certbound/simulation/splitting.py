@@ -54,6 +54,8 @@ class RareExits:
     confidence : float
     paths : int
         Particles in all replicas.
+    exits : int
+        Particles that had left in the end, in all replicas.
     replicas : int
     steps : int
     scheme : str
@@ -69,6 +71,7 @@ class RareExits:
     upper: float
     confidence: float
     paths: int
+    exits: int
     replicas: int
     steps: int
     scheme: str
@@ -147,7 +150,7 @@ def simulate_rare_exits(
         nominal=np.zeros((0, 0)) if shared is None else nominal_path(setting, shared),
         moving=np.hstack(moving) if moving else np.zeros((0, 0)),
         windows=np.array([[b.first, b.last] for b in barriers], dtype=np.int64).reshape(-1, 2),
-        counts_shape=(replicas, 1),
+        counts_shape=(replicas, 2),
         paths=replicas * particles,
         block=particles,
         entropy=entropy_of(rng) if entropy is None else entropy,
@@ -162,6 +165,7 @@ def simulate_rare_exits(
         upper=upper,
         confidence=confidence,
         paths=replicas * particles,
+        exits=int(outcome.tally.counts[:, 1].sum()),
         replicas=replicas,
         steps=setting.steps,
         scheme=model.scheme,
@@ -185,12 +189,16 @@ def _summary(estimates: Array, paths: int, confidence: float) -> tuple[float, fl
 
 
 class RareWork(Work):
-    """One replica a block. A tally's row holds the bits of a replica's estimate, so that sums join the rows."""
+    """One replica a block.
+
+    A tally's row holds the bits of a replica's estimate, and its exits: adding tallies joins their rows.
+    """
 
     def run_block(self, block: int, tally: Tally, out: Array | None = None) -> int:
-        result = np.zeros((1, 1, 1))
+        result = np.zeros((1, 1, 2))
         done = super().run_block(block, tally, result)
         tally.counts[block, 0] = result[0, 0].view(np.int64)[0]
+        tally.counts[block, 1] = int(result[0, 0, 1])
         return done
 
 
@@ -272,6 +280,7 @@ def run(
             left += 1
     if count > 0:
         out[0, 0, 0] = weight * left / count
+        out[0, 0, 1] = left
     return done
 """
 

@@ -1,0 +1,230 @@
+"""``certbound simulate``: exit probabilities by Monte Carlo, beside what was certified."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certbound.cli.messages import InputError
+from certbound.cli.options import (
+    HorizonOption,
+    JsonOption,
+    ProblemArgument,
+    SetOption,
+    check_writable,
+    integer,
+    load_problem,
+    number,
+)
+from certbound.cli.output import SETTINGS, console, print_json
+
+if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
+    from certbound.simulation.executors import Progress
+
+__all__ = ["register"]
+
+PathsOption = Annotated[
+    int, typer.Option("--paths", parser=integer, metavar="N", help="Paths to simulate, such as 3e6.")
+]
+SeedOption = Annotated[
+    int | None,
+    typer.Option(
+        "--seed", parser=integer, metavar="S", help="The same seed gives the same counts.", show_default=False
+    ),
+]
+StepOption = Annotated[
+    float | None,
+    typer.Option(
+        "--step", parser=number, metavar="H", help="Time step in seconds; T/1000 if left out.", show_default=False
+    ),
+]
+ConfidenceOption = Annotated[float, typer.Option("--confidence", parser=number, metavar="C", help="Of the limits.")]
+RareOption = Annotated[bool, typer.Option("--rare", help="Importance splitting, for rare exits.")]
+CheckpointOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--checkpoint", metavar="FILE", help="Keep finished work here, and go on from it.", show_default=False
+    ),
+]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option("--cluster", metavar="ADDRESS", help="A dask scheduler, tcp://host:port.", show_default=False),
+]
+AgainstOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--against", metavar="CERT", help="Does the simulation contradict this certificate?", show_default=False
+    ),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command("simulate", epilog="Example: certbound simulate ou --paths 1e6 --seed 1")(simulate)
+
+
+def simulate(
+    problem: ProblemArgument,
+    paths: PathsOption,
+    pairs: SetOption = None,
+    horizon: HorizonOption = None,
+    seed: SeedOption = None,
+    step: StepOption = None,
+    confidence: ConfidenceOption = 0.99,
+    rare: RareOption = False,
+    checkpoint: CheckpointOption = None,
+    cluster: ClusterOption = None,
+    against: AgainstOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Count how many random paths leave the safe set or the domain, with confidence limits."""
+    check_writable(checkpoint)
+    if seed is not None and seed < 0:
+        raise InputError(f"`--seed` must not be negative, got {seed}", "give a whole number such as 1")
+    subject = load_problem(problem, pairs, horizon=horizon)
+    claim = None if against is None else _claimed(against)
+    options: dict[str, Any] = {"paths": paths, "steps": _steps(subject, step), "confidence": confidence}
+    if seed is not None or checkpoint is None:
+        import numpy as np
+
+        options["rng"] = np.random.default_rng(seed)
+    with _executor(cluster) as executor, _progress_bar(paths) as progress:
+        options |= {"executor": executor, "progress": progress, "checkpoint": checkpoint}
+        result = _rare(subject, options) if rare else _plain(subject, options)
+    if claim is not None:
+        contradicted = result["lower"] > 10.0**claim
+        result["against"] = {"certificate": str(against), "log10_delta": claim, "contradicted": contradicted}
+    if as_json:
+        print_json(result)
+    else:
+        _print(result)
+    raise typer.Exit(1 if claim is not None and result["against"]["contradicted"] else 0)
+
+
+def _steps(problem: Problem, step: float | None) -> int | None:
+    """Number of steps that a time step means; None for the default."""
+    if step is None:
+        return None
+    if problem.system.time == "discrete":
+        raise InputError("`--step` has no meaning in discrete time", "leave it out")
+    if not 0.0 < step <= problem.horizon:
+        raise InputError(
+            f"`--step` must lie in (0, {problem.horizon:g}], got {step:g}", f"try --step {problem.horizon / 1000:g}"
+        )
+    return math.ceil(float(problem.horizon) / step * (1.0 - 1e-12))
+
+
+def _plain(problem: Problem, options: dict[str, Any]) -> dict[str, Any]:
+    from certbound.simulation.montecarlo import simulate_exits
+
+    found = simulate_exits(problem, **options)
+    return {
+        "paths": found.paths,
+        "exits": found.exits,
+        "probability": found.probability,
+        "lower": found.lower,
+        "upper": found.upper,
+        "confidence": found.confidence,
+        "by_constraint": found.by_constraint,
+        "steps": found.steps,
+        "scheme": found.scheme,
+        "path_steps_per_second": found.path_steps_per_second,
+        "seconds": found.seconds,
+    }
+
+
+def _rare(problem: Problem, options: dict[str, Any]) -> dict[str, Any]:
+    from certbound.simulation.splitting import simulate_rare_exits
+
+    found = simulate_rare_exits(problem, **options)
+    return {
+        "paths": found.paths,
+        "exits": found.exits,
+        "probability": found.probability,
+        "standard_error": found.standard_error,
+        "lower": found.lower,
+        "upper": found.upper,
+        "confidence": found.confidence,
+        "replicas": found.replicas,
+        "steps": found.steps,
+        "scheme": found.scheme,
+        "path_steps_per_second": found.path_steps_per_second,
+        "seconds": found.seconds,
+    }
+
+
+def _claimed(path: Path) -> float:
+    """log10 of the probability that a certificate claims."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"`{path}` is no certificate: {error}", "give the file of verify --certificate") from error
+    for part in (content, content.get("claim") if isinstance(content, dict) else None):
+        value = part.get("log10_delta") if isinstance(part, dict) else None
+        if isinstance(value, str):
+            with contextlib.suppress(ValueError):
+                value = float.fromhex(value)
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and value <= 0:
+            return float(value)
+    raise InputError(f"`{path}` claims no probability (`log10_delta`)", "give the file of verify --certificate")
+
+
+@contextlib.contextmanager
+def _executor(address: str | None) -> Iterator[Any]:
+    """A dask client for the address, closed again; None for threads."""
+    if address is None:
+        yield None
+        return
+    from certbound.simulation.executors import connect
+
+    client = connect(address)
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+@contextlib.contextmanager
+def _progress_bar(paths: int) -> Iterator[Callable[[Progress], None] | None]:
+    """A bar with rate and time left on standard error, on a terminal only."""
+    if SETTINGS.quiet or SETTINGS.verbose or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"))
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("compiling", total=paths)
+
+        def update(state: Progress) -> None:
+            text = f"{state.rate:.3g} path-steps/s, {state.remaining:.0f} s left"
+            bar.update(task, description=text, completed=state.paths, total=state.total)
+
+        yield update
+
+
+def _print(result: dict[str, Any]) -> None:
+    screen = console()
+    low, high = result["lower"], result["upper"]
+    sure = f"{100 * result['confidence']:g} %"
+    screen.print(f"exit probability {result['probability']:.4g}  ({sure} limits {low:.4g} ... {high:.4g})")
+    if SETTINGS.quiet:
+        return
+    screen.print(f"{result['exits']} of {result['paths']} paths left, in steps of the {result['scheme']} scheme")
+    for label, count in result.get("by_constraint", {}).items():
+        screen.print(f"  {count:>9}  {label}", markup=False)
+    screen.print(f"a claim of less than {low:.4g} is refuted; the smallest delta supported is {high:.4g}")
+    if "against" in result:
+        word = "contradicts" if result["against"]["contradicted"] else "does not contradict"
+        screen.print(f"the simulation {word} the certificate (10^{result['against']['log10_delta']:.6g})")
+    screen.print(f"{result['seconds']:.2f} s, {result['path_steps_per_second']:.3g} path-steps per second")
