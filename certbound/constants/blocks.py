@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from certbound.constants.affine import AffineSet, SectorSet
 from certbound.constants.jacobians import IntervalMatrixSet, JacobianSet, UnionSet, VertexPolytope
 
-__all__ = ["VERTEX_LIMIT", "Sector", "centred", "contraction_value", "lmi_blocks"]
+__all__ = ["VERTEX_LIMIT", "Sector", "centred", "contraction_value", "lmi_blocks", "transformed"]
 
 Array = NDArray[np.float64]
 
@@ -26,6 +26,7 @@ class Sector:
     B: Array
     C: Array
     groups: tuple[int, ...]
+    scale: Array
 
 
 def lmi_blocks(jacobians: JacobianSet, *, form: str = "auto") -> list[Array | Sector]:
@@ -62,7 +63,15 @@ def centred(sector: SectorSet) -> Sector:
     scale = np.sqrt(np.linalg.norm(C, axis=1) / np.maximum(np.linalg.norm(B, axis=0), 1e-300))
     scale = np.where(scale > 0, scale, 1.0)
     assert sector.groups is not None
-    return Sector(A=A, B=B * scale, C=C / scale[:, None], groups=tuple(sector.groups[i] for i in wide))
+    groups = tuple(sector.groups[i] for i in wide)
+    return Sector(A=A, B=B * scale, C=C / scale[:, None], groups=groups, scale=scale)
+
+
+def transformed(block: Array | Sector, root: Array, inverse: Array) -> Array | Sector:
+    """The block in coordinates y = root x."""
+    if isinstance(block, Sector):
+        return replace(block, A=root @ block.A @ inverse, B=root @ block.B, C=block.C @ inverse)
+    return np.asarray(root @ block @ inverse)
 
 
 def contraction_value(metric: Array, matrices: Array, *, continuous: bool) -> float:

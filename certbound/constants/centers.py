@@ -6,7 +6,7 @@ numbers and one Cholesky factor of size n(n+1)/2. That is what makes n = 60 a ma
 proposes P and Lambda; ``recheck`` proves. With P given, the multipliers alone are found (k + 1 unknowns).
 
 Symbols: F = v E'PE - H'PH - Chat'Lam Chat + Qhat'Lam Qhat in discrete time (v = L^2), with 2v E'PE - E'PH -
-H'PE in place of the first two terms in continuous time (v = c); E = [I 0], H = [A B], Chat = [C 0], Qhat = [0 I].
+H'PE for the first two terms in continuous time (v = c); E = [I 0], H = [A B], Chat = [C 0], Qhat = [0 I].
 Source: Boyd and El Ghaoui, "Method of centers for minimizing generalized eigenvalues" (1993); Sec. 6.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh, solve_continuous_lyapunov, solve_discrete_lyapunov
 
-from certbound.constants.blocks import Sector
+from certbound.constants.blocks import Sector, transformed
 from certbound.constants.matrices import frozen
 
 __all__ = ["Center", "center_metric", "center_multipliers", "lyapunov_metric"]
@@ -137,20 +137,14 @@ def center_metric(
         Limit on Newton steps.
     """
     root = _start(blocks, continuous=continuous)
-    inverse: Array = np.linalg.inv(root)
-    work = [_Block(_transformed(block, root, inverse), continuous=continuous) for block in blocks]
+    inverse = np.asarray(np.linalg.inv(root), dtype=float)
+    work = [_Block(transformed(block, root, inverse), continuous=continuous) for block in blocks]
     n = work[0].n
     P = np.eye(n) / 2
     multipliers = [_first_multipliers(block, P) for block in work]
     value = max(block.smallest_value(P, lam) for block, lam in zip(work, multipliers))
     center = _descend(work, P, multipliers, value, lower, tolerance, max_steps, _Pairs(n))
     return replace(center, metric=frozen(root.T @ center.metric @ root))
-
-
-def _transformed(block: Array | Sector, root: Array, inverse: Array) -> Array | Sector:
-    if isinstance(block, Sector):
-        return replace(block, A=root @ block.A @ inverse, B=root @ block.B, C=block.C @ inverse)
-    return np.asarray(root @ block @ inverse)
 
 
 def _start(blocks: Sequence[Array | Sector], *, continuous: bool) -> Array:
@@ -225,9 +219,7 @@ def _descend(
         if value <= lower + tolerance or target - reached <= tolerance or (steps > 20 and gain <= tolerance):
             break
         target = reached + _SHRINK * (target - reached)
-    return Center(
-        metric=frozen(P), multipliers=tuple(frozen(lam) for lam in multipliers), value=value, steps=steps
-    )
+    return Center(metric=frozen(P), multipliers=tuple(frozen(lam) for lam in multipliers), value=value, steps=steps)
 
 
 def _recenter(
@@ -274,7 +266,8 @@ def _barrier(blocks: Sequence[_Block], P: Array, multipliers: list[Array], value
     total = 0.0
     for matrix in (P, np.eye(len(P)) - P, *matrices):
         try:
-            total -= 2 * float(np.sum(np.log(np.diagonal(np.linalg.cholesky(matrix)))))
+            diagonal: Array = np.diagonal(np.linalg.cholesky(matrix))
+            total -= 2 * float(np.sum(np.log(diagonal)))
         except np.linalg.LinAlgError:
             return float(np.inf)
     return total
@@ -295,10 +288,7 @@ def _search(
     slope = float(gradient @ direction)
     length = 1.0
     while length > safe:
-        if (
-            _barrier(blocks, *_moved(P, multipliers, pairs, direction, length), value)
-            <= here + 0.1 * length * slope
-        ):
+        if _barrier(blocks, *_moved(P, multipliers, pairs, direction, length), value) <= here + 0.1 * length * slope:
             return length
         length *= 0.6
     return safe

@@ -6,7 +6,8 @@ bound from the proposal in rigorous arithmetic. Symbols of docs/theory.md, Sec. 
 with multipliers; G noise matrix; a_j directions; w the largest a_j^T P^-1 a_j / clearance_j^2.
 
 A status other than ``optimal`` is never read as infeasibility: the margin of a rate program is free, so that
-it has a solution for every value, and a stall is answered by another setting, another solver, ``SolverError``.
+it has a solution for every value, and a stall is answered by another setting, another solver, or
+``SolverError``.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.constants.blocks import Sector, contraction_value, lmi_blocks
+from certbound.constants.blocks import Sector, contraction_value, lmi_blocks, transformed
 from certbound.constants.jacobians import JacobianSet
 from certbound.constants.matrices import frozen
 from certbound.errors import InfeasibleError, SolverError
@@ -66,8 +67,7 @@ def solve(problem: Any) -> str:
         if problem.status == cp.OPTIMAL or (name == "SCS" and problem.status == cp.OPTIMAL_INACCURATE):
             return str(problem.status)
     raise SolverError(
-        f"no semidefinite solver finished ({'; '.join(statuses)}); scale the states to like sizes, "
-        "or give a metric."
+        f"no semidefinite solver finished ({'; '.join(statuses)}); scale the states to like sizes, or give a metric."
     )
 
 
@@ -88,9 +88,7 @@ def _contraction(
             corner = np.zeros((k, k)) if continuous else -(block.B.T @ P @ block.B)
             Q, S, R, extra = _multipliers(block.groups, full=full)
             lift = np.block([[block.C, np.zeros((k, k))], [np.zeros((k, n)), np.eye(k)]])
-            block_matrix = (
-                cp.bmat([[base, cross], [cross.T, corner]]) - lift.T @ cp.bmat([[Q, S], [S.T, R]]) @ lift
-            )
+            block_matrix = cp.bmat([[base, cross], [cross.T, corner]]) - lift.T @ cp.bmat([[Q, S], [S.T, R]]) @ lift
             constraints += [*extra, (block_matrix + block_matrix.T) / 2 >> margin * np.eye(n + k)]
         else:
             drift = block.T @ P + P @ block if continuous else block.T @ P @ block
@@ -205,6 +203,8 @@ class ErosionProgram:
         One (n,) normal or (n, r) matrix per constraint; the erosion is r sqrt(lambda_max(a^T P^-1 a)).
     noise : sequence of array_like
         Noise matrices G (n, m), all of which the metric must serve.
+    start : array_like, shape (n, n)
+        A metric of the right order of magnitude: the program is solved in its coordinates, where P is near I.
     continuous : bool
     """
 
@@ -213,29 +213,33 @@ class ErosionProgram:
         jacobians: JacobianSet,
         directions: Sequence[ArrayLike],
         noise: Sequence[ArrayLike],
+        start: ArrayLike,
         *,
         continuous: bool,
         form: str = "auto",
     ) -> None:
         cp = _cvxpy()
-
         n = jacobians.dimension
-        normals = [np.asarray(a, dtype=float).reshape(n, -1) for a in directions]
+        self._root = np.linalg.cholesky(np.asarray(start, dtype=float)).T
+        inverse = np.linalg.inv(self._root)
+        blocks = [transformed(block, self._root, inverse) for block in lmi_blocks(jacobians, form=form)]
+        normals = [inverse.T @ np.asarray(a, dtype=float).reshape(n, -1) for a in directions]
+        factors = [self._root @ np.asarray(G, dtype=float).reshape(n, -1) for G in noise]
+        self._sizes = np.array([max(float(np.linalg.norm(a, 2)), 1e-300) for a in normals])
+        unit = max([float(np.linalg.norm(G, 2)) for G in factors] + [1e-300])
         self._metric = cp.Variable((n, n), symmetric=True)
         self._value = cp.Parameter()
         self._alpha, self._beta = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)
         self._weights = cp.Parameter(len(normals), nonneg=True)
         top, worst = cp.Variable(), cp.Variable()
-        constraints = _contraction(
-            self._metric, self._value, lmi_blocks(jacobians, form=form), 0.0, continuous=continuous
-        )
-        for matrix in noise:
-            G = np.asarray(matrix, dtype=float).reshape(n, -1)
-            G = G[:, G.any(axis=0)]
+        constraints = _contraction(self._metric, self._value, blocks, 0.0, continuous=continuous)
+        for matrix in factors:
+            G = matrix[:, matrix.any(axis=0)] / unit
             inner = G.T @ self._metric @ G
             constraints += [top * np.eye(G.shape[1]) - inner >> 0]
             constraints += [self._alpha * top + self._beta * cp.trace(inner) <= 1]
         for j, a in enumerate(normals):
+            a = a / self._sizes[j]
             corner = (worst * self._weights[j]) * np.eye(a.shape[1])
             constraints.append(cp.bmat([[self._metric, a], [a.T, corner]]) >> 0)
         self._problem = cp.Problem(cp.Minimize(worst), constraints)
@@ -243,11 +247,11 @@ class ErosionProgram:
 
     def propose(self, value: float, alpha: float, beta: float, clearances: ArrayLike) -> Array:
         """The metric of least max_j a_j^T P^-1 a_j / clearance_j^2."""
-        weights = np.asarray(clearances, dtype=float) ** 2
+        weights = (np.asarray(clearances, dtype=float) / self._sizes) ** 2
         self._value.value, self._alpha.value, self._beta.value = float(value), float(alpha), float(beta)
-        self._weights.value = weights
+        self._weights.value = weights / weights.max()
         self.status = solve(self._problem)
-        return _symmetric(self._metric.value)
+        return _symmetric(self._root.T @ self._metric.value @ self._root)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -324,9 +328,7 @@ def design_feedback(
         if continuous:
             constraints.append(2 * value * X - closed - closed.T >> margin * identity)
         else:
-            constraints.append(
-                cp.bmat([[value * X, closed.T], [closed, value * X]]) >> margin * np.eye(2 * n)
-            )
+            constraints.append(cp.bmat([[value * X, closed.T], [closed, value * X]]) >> margin * np.eye(2 * n))
     problem = cp.Problem(cp.Maximize(margin), constraints)
     spread = float(np.max(np.linalg.norm(jacobians.vertices(), ord=2, axis=(1, 2))))
     best = FeedbackDesign(feedback=frozen(np.zeros((m, n))), metric=frozen(identity), value=spread)
@@ -341,9 +343,7 @@ def design_feedback(
             feedback: Array = np.asarray(Y.value, dtype=float) @ metric
             reached = contraction_value(metric, jacobians.vertices() + B @ feedback, continuous=continuous)
             if reached < best.value:
-                best = FeedbackDesign(
-                    feedback=frozen(feedback), metric=frozen(_symmetric(metric)), value=reached
-                )
+                best = FeedbackDesign(feedback=frozen(feedback), metric=frozen(_symmetric(metric)), value=reached)
             high = min(middle, max(reached, low))
         else:
             low = middle
