@@ -15,17 +15,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.rigor.rounding import quiet
 from certbound.tubes.gaussian_crossing import log_polygon_crossing
-from certbound.tubes.gaussian_normal import EPS, log_between
+from certbound.tubes.gaussian_normal import EPS, log_tail
 from certbound.tubes.gaussian_pair import total
 
-__all__ = ["Clock", "Windows", "clock_crossing", "cut_windows", "group_windows", "markov_clock"]
+__all__ = ["Clock", "Windows", "clock_crossing", "group_windows", "markov_clock"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _WEIGHT = 2.5  # window clock times the square of the least level: near the optimum for levels of 3 to 6
 _MOST_WINDOWS = 600
-_LEAST_CLOCK = 1e-8  # a block of less clock is given this much
+_LEAST_CLOCK = 1e-9  # a piece of less clock is given this much
+_MISFIT, _FAR_BELOW, _SPLITS = 0.1, 0.5, 6  # a chord may pass a node this much above or below, times the level
+_FAR_ABOVE = 20.0  # levels with (z/s)^2 this much above the least do not matter
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -44,7 +46,7 @@ class Clock:
     starts: Index
 
 
-def markov_clock(durations: ArrayLike, rates: ArrayLike, *, limit: float = 3.0) -> Clock:
+def markov_clock(durations: ArrayLike, rates: ArrayLike, *, limit: float = 0.5) -> Clock:
     """The least clock that rates of decorrelation allow, by a forward maximum over the nodes.
 
     Proves: clock(t) - clock(s) >= psi(s, t) = -log corr(xi_s, xi_t) for all s < t in one block, given
@@ -67,7 +69,8 @@ def markov_clock(durations: ArrayLike, rates: ArrayLike, *, limit: float = 3.0) 
         Upper bounds as above (entries below the diagonal are not read); +inf allowed off the diagonal. One
         row of K means bounds that hold for every earlier s.
     limit : float
-        A new block begins at the piece at whose end psi may exceed it.
+        A new block begins at the piece at whose end psi may exceed it: short blocks have a slower clock and
+        sum more probabilities.
 
     Returns
     -------
@@ -120,40 +123,93 @@ def _frozen(array: Array) -> Array:
     return array
 
 
+NO_CUTS: Index = np.zeros(1, dtype=np.intp)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Windows:
-    """Lines below a boundary: clocks and end levels per window."""
+    """Lines below a boundary: first piece, clock and end levels of each window."""
 
+    first: Index
     spans: Array
     starts: Array
     stops: Array
 
 
 @quiet
-def group_windows(clock: Array, left: Array, right: Array, first: Index) -> Windows:
-    """Windows from node ``first[k]`` to ``first[k + 1]`` (at last to the last node), one line below each.
+def group_windows(
+    clock: Array, left: Array, right: Array, span: float, forced: Index = NO_CUTS
+) -> Windows:
+    """Windows of about ``span`` over the nodes of ``clock``, cut at ``forced``, split where a line fits badly.
 
     Proves: each line, a chord in Brownian coordinates, lies below the boundary that on piece l runs at or
-    above the chord from ``left[l]`` to ``right[l]``: the chord between the window's ends, lowered by its
-    largest excess over the nodes inside (and 1e-12 relative for rounding).
+    above the chord from ``left[l]`` to ``right[l]`` (see `_lines`).
+    """
+    first = _cut(clock, span, forced)
+    cap = np.sqrt(min(float(np.min(left)), float(np.min(right))) ** 2 + _FAR_ABOVE)
+    lines, line = _lines(clock, left, right, first)
+    for _ in range(_SPLITS):
+        last = np.append(first[1:], len(left))
+        room = np.minimum(np.minimum(left[1:], right[:-1]), cap) - line  # at the nodes inside
+        inside = np.ones(len(room), dtype=bool)
+        inside[first[1:] - 1] = False
+        misfit = np.where(inside, np.abs(room) * np.maximum(cap, line), 0.0)
+        misfit = np.where(room > 0, misfit / _FAR_BELOW, misfit / _MISFIT)
+        window = np.repeat(np.arange(len(first)), last - first)[1:]
+        worst = np.zeros(len(first))
+        np.maximum.at(worst, window, misfit)
+        bad = (worst > 1) & (lines.spans > _LEAST_CLOCK)
+        if not np.any(bad):
+            break
+        more = [int(i) + 1 + int(np.argmax(misfit[i : j - 1])) for i, j in zip(first[bad], last[bad])]
+        first = np.unique(np.concatenate([first, np.asarray(more, dtype=np.intp)]))
+        lines, line = _lines(clock, left, right, first)
+    return lines
+
+
+def _lines(clock: Array, left: Array, right: Array, first: Index) -> tuple[Windows, Array]:
+    """One line per window from node ``first[k]`` to the next; the levels of the chords at the inner nodes.
+
+    The chord between the window's ends is lowered by its largest excess over the nodes inside, and by 1e-12
+    relative for rounding.
     """
     count = len(left)
     last = np.append(first[1:], count)
     window = np.repeat(np.arange(len(first)), last - first)
     origin = clock[first]
     spans = clock[last] - origin
-    growth = np.expm1(2 * spans)
     low, high = left[first], right[last - 1] * np.exp(spans)
-    slope = (high - low) / growth
+    slope = (high - low) / np.expm1(2 * spans)
     excess = np.zeros(len(first))
     for node, level in ((np.arange(count), left), (np.arange(1, count + 1), right)):
         offset = clock[node] - origin[window]
-        line = low[window] + slope[window] * np.expm1(2 * offset)
-        over = line - level * np.exp(offset)
-        excess = np.maximum(excess, np.maximum.reduceat(over, first))
+        chord = low[window] + slope[window] * np.expm1(2 * offset)
+        if level is left:
+            line = (chord * np.exp(-offset))[1:]
+        excess = np.maximum(excess, np.maximum.reduceat(chord - level * np.exp(offset), first))
     excess = excess + 1e-12 * (low + high)
     stops = (high - excess) * np.exp(-spans)
-    return Windows(spans=spans, starts=low - excess, stops=stops - 32 * EPS * np.abs(stops))
+    stops = stops - 32 * EPS * np.abs(stops)
+    return Windows(first=first, spans=spans, starts=low - excess, stops=stops), line
+
+
+def _cut(clock: Array, span: float, forced: Index) -> Index:
+    """First pieces of windows of about ``span`` between forced cuts, none but whole blocks below a tenth."""
+    nodes, first, start = clock.tolist(), [0], 0.0
+    blocks = {*forced.tolist(), len(nodes) - 1}
+    fresh = True
+    for k in range(1, len(nodes)):
+        if k in blocks:
+            if not fresh and nodes[k] - start < 0.1 * span:
+                first.pop()
+            fresh = True
+        elif nodes[k] - start >= (1 - 1e-9) * span:
+            fresh = False
+        else:
+            continue
+        first.append(k)
+        start = nodes[k]
+    return np.asarray(first[:-1], dtype=np.intp)
 
 
 @quiet
@@ -204,23 +260,24 @@ def clock_crossing(
         return -np.inf
     q = np.minimum(q, 3 * least + 40)
     span = max(weight / max(least, 0.5) ** 2, float(np.sum(d)) / _MOST_WINDOWS)
-    bounds = np.append(clock.starts, len(d))
     linked = np.broadcast_to(np.asarray(continuous, dtype=bool), (len(clock.starts) - 1,))
-    logs: list[Array] = []
-    end = np.inf
-    for k in range(len(clock.starts)):
-        piece = slice(bounds[k], bounds[k + 1])
-        terms = _block_terms(d[piece], q[piece], span)
-        if k and linked[k - 1]:
-            terms[0] = log_between(terms_start := float(q[bounds[k], 0]), max(end, terms_start))
-        logs.append(terms)
-        end = float(q[bounds[k + 1] - 1, 1])
-    return float(total(np.concatenate(logs)))
-
-
-def _block_terms(d: Array, q: Array, span: float) -> Array:
-    """Terms of one block: pieces cut to at most a third of ``span``, grouped, one line per window."""
     parts = np.maximum(np.ceil(3 * d / span), 1).astype(np.intp)
+    nodes, left, right = _subdivide(d, q, parts)
+    forced = (np.cumsum(parts) - parts)[clock.starts]
+    lines = group_windows(nodes, left, right, span, forced)
+    fresh = np.isin(lines.first, forced)
+    logs = log_polygon_crossing(lines.spans, lines.starts, lines.stops, fresh=fresh)
+    restart = np.searchsorted(lines.first, forced[1:][~linked])
+    apart = np.logaddexp(logs[1 + restart], log_tail(lines.starts[restart]))
+    logs[1 + restart] = apart + 8 * EPS * (1 + np.abs(apart))
+    return float(total(logs))
+
+
+def _subdivide(d: Array, q: Array, parts: Index) -> tuple[Array, Array, Array]:
+    """Each piece cut into equal parts: the clock at the nodes, and levels at the two ends of each part.
+
+    The clock grows by at least d/parts on each part, whatever the rounding of its sum.
+    """
     piece = np.repeat(np.arange(len(d)), parts)
     index = np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts)
     share = 1.0 / parts[piece]
@@ -228,23 +285,6 @@ def _block_terms(d: Array, q: Array, span: float) -> Array:
     guard = 32 * EPS * (q[piece, 0] + q[piece, 1])
     left = np.where(index == 0, base, base + rise * index * share - guard)
     right = np.where(index + 1 == parts[piece], q[piece, 1], base + rise * (index + 1) * share - guard)
-    steps = (d / parts)[piece] * (1 + 8 * EPS)
-    steps = steps + 8 * EPS * (float(np.sum(steps)) + 1e-3)
-    steps = steps + max(_LEAST_CLOCK - float(np.sum(steps)), 0.0) / len(steps)
-    clock = np.concatenate([[0.0], np.cumsum(steps)])
-    lines = group_windows(clock, left, right, cut_windows(clock, left, right, span))
-    return log_polygon_crossing(lines.spans, lines.starts, lines.stops)
-
-
-def cut_windows(clock: Array, left: Array, right: Array, span: float) -> Index:
-    """First pieces of windows of about ``span``, or shorter where the level jumps, never below a tenth."""
-    jump = (np.abs(left[1:] - right[:-1]) > 0.05 * np.abs(left[1:])).tolist()
-    nodes, first, start = clock.tolist(), [0], 0.0
-    for k in range(1, len(left)):
-        gone = nodes[k] - start
-        if gone >= (1 - 1e-9) * span or (jump[k - 1] and gone > 0.1 * span):
-            first.append(k)
-            start = nodes[k]
-    if len(first) > 1 and nodes[-1] - start < 0.1 * span:
-        first.pop()
-    return np.asarray(first, dtype=np.intp)
+    steps = np.maximum((d / parts)[piece] * (1 + 8 * EPS), _LEAST_CLOCK)
+    steps = steps + 8 * EPS * float(np.sum(steps))
+    return np.concatenate([[0.0], np.cumsum(steps)]), left, right

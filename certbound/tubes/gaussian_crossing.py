@@ -152,7 +152,12 @@ def _ellipse_error(
 
 @quiet
 def log_polygon_crossing(
-    spans: ArrayLike, starts: ArrayLike, stops: ArrayLike, *, origin: tuple[float, float] | None = None
+    spans: ArrayLike,
+    starts: ArrayLike,
+    stops: ArrayLike,
+    *,
+    origin: tuple[float, float] | None = None,
+    fresh: ArrayLike = False,
 ) -> Array:
     """Natural logarithms of terms whose sum bounds P(U exceeds a polygon), one line per window.
 
@@ -172,12 +177,20 @@ def log_polygon_crossing(
         ``origin[0]`` at u = 0 to ``origin[1]`` at the start u_1 of the first window, both in units of
         sqrt(u_1).
 
+    fresh : array_like of bool, shape (K,)
+        Windows whose past is not that of the same process (blocks of a comparison): only U at their start is
+        known to be below the line before.
+
     Returns
     -------
     ndarray, shape (K + 1,)
         The first entry is P(U > starts[0]), or the passage over the line from the origin.
     """
     d, q0, q1 = (np.atleast_1d(np.asarray(v, dtype=np.float64)) for v in (spans, starts, stops))
+    if len(d) == 0:
+        if origin is None:
+            raise ValueError("`spans` must hold at least one window unless `origin` is given.")
+        return np.asarray([_log_from_origin(float(origin[0]), float(origin[1]))])
     single = log_line_crossing(q0, q1, d)
     length = np.expm1(2 * d)
     forward, backward = (np.exp(d) * q1 - q0) / length, (np.exp(d) * q0 - q1) / length
@@ -193,7 +206,11 @@ def log_polygon_crossing(
     linked = single[len(single) - len(before[0]) :]
     jump = log_between(after[0], before[0])
     closed = np.logaddexp(linked, jump) + 8 * EPS * (1 + np.abs(linked))
-    linked[:] = np.minimum(closed, _log_excluding(before, after)) if len(linked) else linked
+    own = ~np.broadcast_to(np.asarray(fresh, dtype=bool), single.shape)[len(single) - len(linked) :]
+    if np.any(own):
+        refined = _log_excluding((before[0][own], *(x[own] for x in before[1:])), tuple(x[own] for x in after))
+        closed[own] = np.minimum(closed[own], refined)
+    linked[:] = closed
     return np.concatenate([np.atleast_1d(first), single])
 
 

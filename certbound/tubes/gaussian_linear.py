@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.rigor.rounding import quiet
-from certbound.tubes.gaussian_clock import cut_windows, group_windows
+from certbound.tubes.gaussian_clock import group_windows
 from certbound.tubes.gaussian_crossing import log_polygon_crossing
-from certbound.tubes.gaussian_normal import EPS
+from certbound.tubes.gaussian_normal import EPS, log_between
 from certbound.tubes.gaussian_pair import double, total
 from certbound.tubes.gaussian_scale import least_scale
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 _WEIGHT = 2.5
 _MOST_WINDOWS = 400
 _RANGE = 24.0  # how far back in log u windows may begin
-_EARLY = 8.0  # the window from 0 ends where (z/s)^2 exceeds its least value by this much
+_EARLY = 8.0  # the window from 0 keeps (z/s)^2 above its least value by this much
 
 
 @quiet
@@ -60,23 +60,46 @@ def linear_exceedance(durations: ArrayLike, rates: ArrayLike, sigmas: ArrayLike,
     guard = max(1e-10, 16 * EPS * (len(h) + 16) * (1 + exponent))
     exponents = np.concatenate([[0.0], np.cumsum(c * h)])
     log_u, log_b = _refine(h, c, sigma, exponents, level)
-    q = np.exp(log_b - 0.5 * log_u)
-    if not np.any(np.isfinite(log_u)):
+    if not np.isfinite(log_u[-1]):
         return -np.inf
-    least = float(np.min(q))
-    late = np.flatnonzero(q * q < least * least + _EARLY)
-    first = max(int(late[0]) - 1, int(np.flatnonzero(np.isfinite(log_u))[0]))
-    share = np.exp(log_u[: first + 1] - log_u[first])
-    height = np.exp(log_b[: first + 1] - 0.5 * log_u[first])
-    excess = float(np.max(height[0] + (height[-1] - height[0]) * share - height))
-    excess += 4 * guard * float(np.max(height))
-    origin = (float(height[0]) - excess, float(height[-1]) - excess)
-    steps = np.maximum(0.5 * np.diff(log_u[first:]), 0.0) * (1 + guard) + guard
+    # one node per value of u: b on arrival, on leaving, and the least while u stands still (sigma = 0)
+    begin = np.flatnonzero(np.concatenate([[True], np.diff(log_u) > 0]))
+    final = np.append(begin[1:], len(log_u)) - 1
+    low = np.minimum.reduceat(log_b, begin)
+    arrive, leave = log_b[begin], log_b[final]
+    leave = np.where(low < np.minimum(arrive, leave), low, leave)
+    log_u = log_u[begin]
+    q_low = np.exp(low - 0.5 * log_u)
+    least = float(np.min(q_low))
+    first, origin = _first_window(log_u, low, math.sqrt(least * least + _EARLY), guard)
+    steps = 0.5 * np.diff(log_u[first:]) * (1 + guard) + guard
     clock = np.concatenate([[0.0], np.cumsum(steps)])
-    left, right = q[first:-1] * (1 - 4 * guard), q[first + 1 :] * (1 - 4 * guard)
-    span = max(_span(least), float(clock[-1]) / _MOST_WINDOWS)
-    lines = group_windows(clock, left, right, cut_windows(clock, left, right, span))
-    return float(total(log_polygon_crossing(lines.spans, lines.starts, lines.stops, origin=origin)))
+    left = np.exp(leave - 0.5 * log_u)[first:-1] * (1 - 4 * guard)
+    right = np.exp(arrive - 0.5 * log_u)[first + 1 :] * (1 - 4 * guard)
+    if len(steps) == 0:
+        logs, end = log_polygon_crossing([], [], [], origin=origin), origin[1]
+    else:
+        span = max(_span(least), float(clock[-1]) / _MOST_WINDOWS)
+        lines = group_windows(clock, left, right, span)
+        logs = log_polygon_crossing(lines.spans, lines.starts, lines.stops, origin=origin)
+        end = float(lines.stops[-1])
+    last = log_between(float(q_low[-1]) * (1 - 4 * guard), end)
+    return float(total(np.append(logs, last)))
+
+
+def _first_window(log_u: Array, log_b: Array, clear: float, guard: float) -> tuple[int, tuple[float, float]]:
+    """The last node that a line from u = 0 reaches below all nodes and ``clear`` of 0 in units of s; that line."""
+    top = float(np.max(log_b))
+    b = np.exp(log_b - top)
+    share = np.exp(np.minimum(log_u[None, 1:] - log_u[1:, None], 0.0))
+    over = b[0] + (b[1:, None] - b[0]) * share - b[None, 1:]
+    excess = np.max(np.tril(over), axis=1) + 4 * guard * np.maximum(b[0], b[1:])
+    unit = np.exp(top - 0.5 * log_u[1:])
+    base, end = (b[0] - excess) * unit, (b[1:] - excess) * unit
+    nearest = np.where(end <= 2 * base, end, 2 * np.sqrt(np.maximum(base * (end - base), 0.0)))
+    fine = np.flatnonzero(nearest >= clear)
+    k = int(fine[-1]) if len(fine) else int(np.argmax(nearest))
+    return k + 1, (float(base[k]), float(end[k]))
 
 
 def _span(least: float) -> float:

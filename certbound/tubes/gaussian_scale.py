@@ -91,7 +91,7 @@ def _next_trial(
     count: int,
     tolerance: float,
 ) -> float:
-    """The logarithm of a Gaussian tail is nearly linear in q^2: extrapolate, then interpolate, safeguarded."""
+    """The log of a Gaussian tail is nearly linear in q^2: extrapolate, then interpolate, safeguarded."""
     (low, high), (at_low, at_high) = bracket, values
     if low == 0.0 or not math.isfinite(high):
         level = value + target
