@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from certbound.problem.tape import JUMPS
+from certbound.problem.graph import Graph
+from certbound.problem.tape import BINARY, JUMPS, UNARY
 from certbound.problem.trace import compile_numpy, jacobian, trace
 
 SMOOTH = {
@@ -41,6 +42,28 @@ def test_a_jacobian_agrees_with_finite_differences(name, point):
     tape = trace(SMOOTH[name], {"x": ["a", "b", "c"]})
     expected = differences(compile_numpy(tape), point)
     np.testing.assert_allclose(compile_numpy(jacobian(tape))(*point), expected, rtol=2e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("op", sorted(UNARY | BINARY))
+def test_every_operation_is_differentiated(op):
+    graph = Graph(["a", "b"])
+    a, b = graph.input(0), graph.input(1)
+    node = graph.apply(op, a, b) if op in BINARY else graph.apply(op, a)
+    tape = graph.tape([node], (1,))
+    for point in ([0.3, 0.7], [0.8, 0.4], [0.45, 0.55]):
+        expected = differences(compile_numpy(tape), np.array(point))
+        np.testing.assert_allclose(compile_numpy(jacobian(tape))(*point), expected, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("exponent", [3.0, 4.0, 7.0, 1.5, 2.5, 0.3, -0.7, 100.0])
+def test_every_power_is_differentiated(exponent):
+    graph = Graph(["a"])
+    tape = graph.tape([graph.pow(graph.input(0), exponent)], (1,))
+    expected = exponent * 0.8 ** (exponent - 1)
+    assert compile_numpy(jacobian(tape))(0.8)[0, 0] == pytest.approx(expected, rel=1e-13)
+    if exponent == int(exponent):
+        expected = exponent * (-0.8) ** (exponent - 1)
+        assert compile_numpy(jacobian(tape))(-0.8)[0, 0] == pytest.approx(expected, rel=1e-13)
 
 
 def test_second_derivatives_come_from_the_jacobian_of_the_jacobian():

@@ -41,6 +41,19 @@ def test_default_names_do_not_clash_with_states():
     assert system.input_names == ("u_",)
 
 
+def test_a_disturbance_must_not_have_an_inputs_name():
+    box = Box([-1], [1])
+    with pytest.raises(ValueError, match="`disturbance_names` must not use the name 'p'"):
+        ContinuousSystem(
+            lambda x, u, d: x,
+            states=1,
+            inputs=box,
+            input_names=["p"],
+            disturbance=box,
+            disturbance_names=["p"],
+        )
+
+
 def test_diffusion_may_be_a_matrix_a_function_or_a_number_for_one_state():
     constant = ContinuousSystem(lambda x: -x, states=2, diffusion=[[0], [0.5]])
     np.testing.assert_array_equal(constant.diffusion, [[0], [0.5]])
