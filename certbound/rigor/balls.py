@@ -2,13 +2,14 @@
 
 Symbols: F_a(z) = 1F1(a; b; z), excess E_a(z) = (F_a(z) - 1)/a with the limit sum_k z^k/(k (b)_k) at a = 0
 (item 7.13 of docs/theory.md), 0F1(; b; x), and the normal tail Q(x) = P(N(0, 1) > x). All the Taylor coefficients
-of F_a, E_a and 0F1 are positive for a >= 0, b > 0, so that a partial sum is a lower bound.
+of E_a and 0F1 are positive for a >= 0, b > 0.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 from flint import arb, ctx
 
@@ -31,12 +32,13 @@ __all__ = [
 PRECISION = 96
 """Working precision in bits: enough that rounding to a float costs the last place only."""
 
-_SERIES_LIMIT = 2_000_000
+_SERIES_LIMIT = 200_000
 
 
-def precision(bits: int = PRECISION) -> object:
+def precision(bits: int = PRECISION) -> AbstractContextManager[object]:
     """Context manager that sets the working precision of ball arithmetic."""
-    return ctx.workprec(bits)
+    manager: AbstractContextManager[object] = ctx.workprec(bits)
+    return manager
 
 
 def ball(value: float | int) -> arb:
@@ -60,29 +62,33 @@ def lower(value: arb) -> float:
     return -upper(-value)
 
 
-def _series(a: arb, b: arb, z: arb, shift: int) -> arb:
-    """Sum over k >= 1 of (a + shift)_(k-1) z^k / ((b)_k k!) (shift 1), with 0F1's terms for shift = -1."""
+def _series(a: arb | None, b: arb, z: arb) -> arb:
+    """Sum over k >= 1 of (a + 1)_(k-1) z^k / ((b)_k k!), or of z^k / ((b)_k k!) without a."""
     term = z / b
     total = term
     bits = int(ctx.prec) + 8
-    peak = math.sqrt(upper(z)) if shift < 0 else upper(z)
+    peak = math.sqrt(upper(z)) if a is None else upper(z)
+    if peak > _SERIES_LIMIT:
+        return arb.nan()
     for k in range(1, _SERIES_LIMIT):
         ratio = z / ((b + k) * (k + 1))
-        if shift >= 0:
+        if a is not None:
             ratio = ratio * (a + k)
         term = term * ratio
         total += term
         if k > peak and k % 16 == 0:
             # later ratios only shrink: (a + j)/(b + j) is monotone with limit 1, z/(j + 1) falls
-            bound = ratio if shift < 0 else z / (k + 1) * arb.max((a + k) / (b + k), arb(1))
+            bound = ratio if a is None else z / (k + 1) * arb.max((a + k) / (b + k), arb(1))
             if bound < arb(0.5) and term < total * arb(2) ** (-bits):
                 tail = term * bound / (1 - bound)
                 return total + tail.union(arb(0))
-    raise ArithmeticError(f"the series needs more than {_SERIES_LIMIT} terms at z = {z.str(5)}.")
+    return arb.nan()
 
 
 def kummer_excess(a: arb, b: arb, z: arb) -> arb:
     """Ball of E_a(z) = (1F1(a; b; z) - 1)/a for a >= 0 (limit at a = 0), b > 0, z >= 0.
+
+    Indeterminate where neither the library nor the series reaches.
 
     Examples
     --------
@@ -92,32 +98,35 @@ def kummer_excess(a: arb, b: arb, z: arb) -> arb:
     """
     if z.is_zero():
         return arb(0)
-    size = a * z / b
-    lost = 0 if a.is_zero() else max(0, -int(math.floor(lower(size.log()) / math.log(2)))) if size > 0 else 10**6
-    if not a.is_zero() and lost < 400:
-        with precision(int(ctx.prec) + lost + 8):
-            value = (z.hypgeom_1f1(a, b) - 1) / a
-        if _accurate(value):
+    if not a.is_zero():
+        value = _sharpened(lambda: (z.hypgeom_1f1(a, b) - 1) / a, a * z / b)
+        if value is not None:
             return value
-    return _series(a, b, z, 1)
+    return _series(a, b, z)
 
 
 def bessel_excess(b: arb, x: arb) -> arb:
-    """Ball of 0F1(; b; x) - 1 for b > 0, x >= 0."""
+    """Ball of 0F1(; b; x) - 1 for b > 0, x >= 0 (indeterminate beyond reach)."""
     if x.is_zero():
         return arb(0)
-    size = x / b
-    lost = max(0, -int(math.floor(lower(size.log()) / math.log(2)))) if size > 0 else 10**6
-    if lost < 400:
-        with precision(int(ctx.prec) + lost + 8):
-            value = x.hypgeom_0f1(b) - 1
-        if _accurate(value):
+    value = _sharpened(lambda: x.hypgeom_0f1(b) - 1, x / b)
+    return _series(None, b, x) if value is None else value
+
+
+def _sharpened(evaluate: Callable[[], arb], size: arb) -> arb | None:
+    """The library's value at enough precision; None where the subtraction of 1 or the size defeats it."""
+    if not size > 0:
+        return None
+    lost = max(0, -math.floor(lower(size.log()) / math.log(2)))
+    if lost > 400:
+        return None
+    bits = int(ctx.prec)
+    for extra in (8, 72):
+        with precision(bits + lost + extra):
+            value = evaluate()
+        if value.is_finite() and value > 0 and value.rel_accuracy_bits() >= min(bits, 56):
             return value
-    return _series(arb(0), b, x, -1)
-
-
-def _accurate(value: arb) -> bool:
-    return bool(value.is_finite()) and value > 0 and value.rel_accuracy_bits() >= int(ctx.prec) // 2
+    return None
 
 
 def log_expm1(x: arb) -> arb:
@@ -136,7 +145,7 @@ def log_kummer(a: float, b: float, z: float) -> tuple[float, float]:
     """
     _check(a=a, b=b, z=z)
     with precision():
-        value = (1 + arb(a) * kummer_excess(arb(a), arb(b), arb(z))).log()
+        value = (arb(a) * kummer_excess(arb(a), arb(b), arb(z))).log1p()
         return lower(value), upper(value)
 
 
@@ -151,7 +160,7 @@ def log_bessel0f1(b: float, z: float) -> tuple[float, float]:
     """
     _check(b=b, z=z)
     with precision():
-        value = (1 + bessel_excess(arb(b), arb(z))).log()
+        value = bessel_excess(arb(b), arb(z)).log1p()
         return lower(value), upper(value)
 
 
@@ -195,7 +204,7 @@ def log_q_bounds(x: float) -> tuple[float, float]:
     with precision():
         value = ((arb(x) / arb(2).sqrt()).erfc() / 2).log()
         if not value.is_finite():  # Mills: x phi/(1 + x^2) < Q < phi/x
-            density = -arb(x) ** 2 / 2 - (2 * arb.pi()).log() / 2
+            density = -(arb(x) ** 2) / 2 - (2 * arb.pi()).log() / 2
             return lower(density + (arb(x) / (1 + arb(x) ** 2)).log()), upper(density - arb(x).log())
         return lower(value), upper(value)
 

@@ -132,15 +132,15 @@ class Constants:
 
 
 def _frozen(array: Array) -> Array:
-    array = np.array(array, dtype=float)
-    array.setflags(write=False)
-    return array
+    copy: Array = np.array(array, dtype=float)
+    copy.setflags(write=False)
+    return copy
 
 
 def _values(name: str, value: ArrayLike | None, times: Array | None) -> float | Array:
     array = np.asarray(value, dtype=float)
     if not np.all(np.isfinite(array)):
-        raise ValueError(f"`{name}` must be finite, got {value}.")
+        raise ValueError(f"`{name}` must be finite, got {value!r}.")
     if array.ndim == 0:
         return float(array)
     if times is None or array.ndim != 1 or len(array) != len(times) - 1:
@@ -150,7 +150,7 @@ def _values(name: str, value: ArrayLike | None, times: Array | None) -> float | 
 
 
 def _checked_metric(metric: ArrayLike, dimension: int) -> Array:
-    matrix = np.asarray(metric, dtype=float)
+    matrix: Array = np.asarray(metric, dtype=float)
     if matrix.shape != (dimension, dimension):
         raise ValueError(f"`metric` must have shape ({dimension}, {dimension}), got {matrix.shape}.")
     if not np.all(np.isfinite(matrix)):

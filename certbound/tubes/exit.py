@@ -1,0 +1,104 @@
+"""Thm K2 in ball arithmetic: the probability of given clearances, proved between the nodes."""
+
+from __future__ import annotations
+
+import math
+
+from flint import arb
+
+from certbound.rigor.balls import lower, precision, upper
+from certbound.tubes.ballpath import ball_path
+from certbound.tubes.kummer import Start, excess_function, initial_ball, phi_ball
+from certbound.tubes.objective import Clearance
+from certbound.tubes.schedule import Schedule
+
+__all__ = ["exit_level"]
+
+
+def exit_level(
+    schedule: Schedule, clearance: Clearance, *, a: float, v0: float, bessel: bool = False, start: Start | None = None
+) -> float:
+    """log10 of X / min_t [phi(I_t) + e^{a I_t} E_a(r_t^2/(2 v_t))], rounded up, at most 0.
+
+    The schedule must be cut at the ends of the clearance. On a piece I_t falls and v_t is monotone, so that the
+    minimum over [s, e] is at least the value with I_e and max(v_s, v_e); pieces where v falls are halved until the
+    minimum is found within 1 %.
+
+    Source: Thm K2, item 7.5 of docs/theory.md.
+    """
+    start = start or Start()
+    with precision():
+        gain = _Gain(schedule, clearance, a=a, v0=v0, bessel=bessel, start=start)
+        if not gain.initial.is_finite():
+            return 0.0
+        if gain.initial.is_zero():
+            return -1e12
+        least = gain.least()
+        if not least.is_finite():
+            return -1e12 if least > 0 else 0.0
+        return min(0.0, upper((gain.initial / least).log() / arb(10).log()))
+
+
+class _Gain:
+    """phi(I_t) + e^{a I_t} E_a(r_t^2/(2 v_t)) along a schedule."""
+
+    def __init__(
+        self, schedule: Schedule, clearance: Clearance, *, a: float, v0: float, bessel: bool, start: Start
+    ) -> None:
+        self.schedule, self.path = schedule, ball_path(schedule, v0, bessel=bessel)
+        self.radii = clearance.at(schedule.times[:-1]).tolist()
+        self.power, self.unit = arb(a), arb(schedule.unit)
+        self.excess = excess_function(a, schedule.nu / 2, bessel)
+        self.initial = initial_ball(self.path, a, start)
+        self.first = 0.0 if schedule.continuous or start.sigma > 0 else 1.0
+
+    def stretch(self, piece: int, s: float, e: float) -> tuple[arb, arb, arb]:
+        """(I_e, least z on [s, e], z_e)."""
+        radius = self.radii[piece]
+        v_end, info = self.path.at(piece, e)
+        square = (arb(radius) / self.unit) ** 2 / 2
+        v_start = self.path.at(piece, s)[0] if s < e else v_end
+        return info, square / arb.max(v_start, v_end), square / v_end
+
+    def value(self, info: arb, z: arb) -> arb:
+        """The gain at a given I and z."""
+        return phi_ball(self.power, info) + (self.power * info).exp() * self.excess(z)
+
+    def steps(self, piece: int) -> tuple[float, float] | None:
+        """Ends of a piece; in DT the whole steps whose clearance is this piece's."""
+        times, last = self.schedule.times, len(self.schedule.lengths) - 1
+        s, e = max(float(times[piece]), self.first), float(times[piece + 1])
+        if not self.schedule.continuous and piece < last:
+            e -= 1
+        return (s, e) if s <= e else None
+
+    def least(self, gap: float = 0.01, budget: int = 64) -> arb:
+        """Lower bound of the minimum over the horizon, within ``gap`` where it is cheap."""
+        items: list[tuple[float, int, float, float, arb]] = []
+        attained = smallest = math.inf
+
+        def push(piece: int, s: float, e: float) -> None:
+            nonlocal attained, smallest
+            info, z, z_end = self.stretch(piece, s, e)
+            smallest = min(smallest, upper(z))
+            bound = self.value(info, z)
+            value = bound if s == e else self.value(info, z_end)
+            attained = min(attained, upper(value.log()))
+            items.append((lower(bound.log()), piece, s, e, bound))
+
+        for piece in range(len(self.schedule.lengths) - 1, -1, -1):
+            ends = self.steps(piece)
+            if ends is None or not math.isfinite(self.radii[piece]):
+                continue
+            # I falls with time: a later stretch with a smaller z has the smaller gain
+            if lower(self.stretch(piece, *ends)[1]) < smallest:
+                push(piece, *ends)
+        while items:
+            low, piece, s, e, bound = min(items, key=lambda item: item[0])
+            middle = (s + e) / 2 if self.schedule.continuous else math.floor((s + e) / 2)
+            if low >= attained - gap or len(items) > budget + len(self.radii) or not s <= middle < e:
+                return bound
+            items.remove((low, piece, s, e, bound))
+            push(piece, s, middle)
+            push(piece, middle if self.schedule.continuous else middle + 1, e)
+        return arb.pos_inf()

@@ -1,0 +1,214 @@
+"""Piecewise-constant data over a horizon, and the two scalars that every tube formula reads.
+
+Symbols (docs/theory.md, Sec. 4): v' = 2 c_t v + sigma_t^2 (CT) or v+ = L_t^2 v + sigma_t^2 (DT), and the information
+I_t = int_t^T sigma^2/v (CT) or sum_{k >= t} log(v_{k+1}/(L_k^2 v_k)) (DT). Both are closed forms on a piece; in DT
+the same ones hold at whole steps with c = log L and sigma^2 2c/(e^{2c} - 1). v is linear in its start:
+v_t = gain_t v_0 + variance_t. The Bessel form takes v' = 2 c_t v instead. Variances are in units of ``unit``^2,
+the largest sigma, so that no sigma overflows or underflows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.tubes.constants import Constants
+
+__all__ = ["Schedule", "make_schedule", "spread"]
+
+Array = NDArray[np.float64]
+
+
+def integral(rate: Array, length: Array) -> Array:
+    """int_0^length e^{rate s} ds, without cancellation at rate -> 0."""
+    x = np.asarray(rate * length)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        return np.where(np.abs(x) < 1e-300, length, length * np.expm1(x) / np.where(x == 0, 1.0, x))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Schedule:
+    """Constants cut to a horizon: K pieces, values constant on [times[k], times[k+1]).
+
+    Parameters
+    ----------
+    continuous : bool
+        CT or DT.
+    times : ndarray (K + 1,)
+        From 0 to the horizon; whole numbers in DT.
+    slopes : ndarray (K,)
+        rate (CT) or gain (DT) per piece, as stated.
+    sigmas : ndarray (K,)
+        Noise level per piece, as stated.
+    nu : float
+        Effective dimension.
+    any_power : bool
+        Whether every Kummer parameter a > 0 is valid (CT, Gaussian noise or isotropic proxy; Thm K1).
+    """
+
+    continuous: bool
+    times: Array
+    slopes: Array
+    sigmas: Array
+    nu: float
+    any_power: bool
+
+    def __getstate__(self) -> dict[str, Any]:
+        names = ("continuous", "times", "slopes", "sigmas", "nu", "any_power")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def horizon(self) -> float:
+        """End of the last piece."""
+        return float(self.times[-1])
+
+    @cached_property
+    def unit(self) -> float:
+        """Largest sigma (1 when there is no noise)."""
+        return float(np.max(self.sigmas)) or 1.0
+
+    @cached_property
+    def rates(self) -> Array:
+        """c per piece; log L in DT."""
+        return self.slopes if self.continuous else np.log(self.slopes)
+
+    @cached_property
+    def lengths(self) -> Array:
+        """Length of each piece."""
+        return np.diff(self.times)
+
+    @cached_property
+    def noise(self) -> Array:
+        """sigma^2/unit^2 per piece, in DT times 2c/(e^{2c} - 1)."""
+        relative = (self.sigmas / self.unit) ** 2
+        return relative if self.continuous else relative / integral(2 * self.rates, np.ones_like(self.rates))
+
+    @cached_property
+    def nodes(self) -> tuple[Array, Array]:
+        """(gain, variance) at the times: v = gain v_0 + variance."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            growth = np.exp(2 * self.rates * self.lengths)
+            forward = self.noise * integral(2 * self.rates, self.lengths)
+            gain, variance = np.ones(len(self.times)), np.zeros(len(self.times))
+            for k in range(len(self.lengths)):
+                gain[k + 1] = gain[k] * growth[k]
+                variance[k + 1] = variance[k] * growth[k] + forward[k]
+        return gain, np.nan_to_num(variance, nan=np.inf, posinf=np.inf)
+
+    def refined(self, times: Array) -> Schedule:
+        """The same data on a finer grid: the union of ``times`` (inside the horizon) and the old ones."""
+        inside = times[(times > 0) & (times < self.horizon)]
+        merged = np.union1d(self.times, inside)
+        piece = np.searchsorted(self.times, merged[:-1], side="right") - 1
+        return Schedule(
+            continuous=self.continuous, times=merged, slopes=self.slopes[piece], sigmas=self.sigmas[piece],
+            nu=self.nu, any_power=self.any_power,
+        )  # fmt: skip
+
+    def graded(self, count: int = 32) -> Schedule:
+        """Refined inside the pieces, more densely after their starts, to about ``count`` pieces or more."""
+        each = max(1, -(-count // len(self.lengths)))
+        if each == 1:
+            return self
+        fraction = (np.arange(1, each) / each) ** 2
+        extra = (self.times[:-1, None] + self.lengths[:, None] * fraction).ravel()
+        return self.refined(extra if self.continuous else np.unique(np.append(np.ceil(extra), 1.0)))
+
+    def locate(self, t: Array) -> NDArray[np.intp]:
+        """Piece that holds each time."""
+        last = len(self.lengths) - 1
+        return np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, last)
+
+    def state(self, t: Array) -> tuple[Array, Array]:
+        """(gain, variance) at any times inside the horizon, shape of ``t``."""
+        gain, variance = self.nodes
+        k = self.locate(t)
+        h = t - self.times[k]
+        with np.errstate(over="ignore", invalid="ignore"):
+            growth = np.exp(2 * self.rates[k] * h)
+            forward = self.noise[k] * integral(2 * self.rates[k], h)
+            return gain[k] * growth, variance[k] * growth + forward
+
+    @cached_property
+    def backward(self) -> tuple[Array, Array]:
+        """(sigma^2 int e^{-2 c s}, 2 c h) per piece."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self.noise * integral(-2 * self.rates, self.lengths), 2 * self.rates * self.lengths
+
+    def path(self, start: Array, *, bessel: bool = False) -> tuple[Array, Array]:
+        """v and I at the times for each v_0 in ``start``: two arrays of shape (*start.shape, K + 1)."""
+        gain, variance = self.nodes
+        backward, drift = self.backward
+        start = np.asarray(start, dtype=float)[..., None]
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            v = gain * start if bessel else gain * start + variance
+            part = backward / v[..., :-1]
+            if not bessel:
+                part = np.where(part < 1, np.log1p(part), np.log(v[..., 1:] / v[..., :-1]) - drift)
+        info = np.zeros_like(v)
+        info[..., :-1] = np.cumsum(part[..., ::-1], axis=-1)[..., ::-1]
+        return v, info
+
+    def path_at(self, start: float, t: Array, *, bessel: bool = False) -> tuple[Array, Array]:
+        """v and I at any times for one v_0: two arrays of the shape of ``t``."""
+        gain, variance = self.state(t)
+        k = self.locate(t)
+        _, info = self.path(np.asarray(start), bessel=bessel)
+        with np.errstate(over="ignore", invalid="ignore"):
+            v = gain * start + (0.0 if bessel else variance)
+            rest = self._information(v, self.rates[k], self.noise[k], self.times[k + 1] - t, bessel)
+        return v, info[k + 1] + rest
+
+    @staticmethod
+    def _information(v: Array, rate: Array, noise: Array, length: Array, bessel: bool) -> Array:
+        """int sigma^2/v over a stretch of one piece that starts at v."""
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            x = noise * integral(-2 * rate, length) / v
+            if bessel:
+                return x
+            end = v * np.exp(2 * rate * length) + noise * integral(2 * rate, length)
+            return np.where(x < 1, np.log1p(x), np.log(end / v) - 2 * rate * length)
+
+
+def make_schedule(constants: Constants, horizon: float) -> Schedule:
+    """Cut constants to a horizon, after checking it.
+
+    Raises
+    ------
+    ValueError
+        If ``horizon`` is not positive and finite, not a whole number of steps (DT), or beyond ``times``.
+    """
+    horizon = float(horizon)
+    if not (np.isfinite(horizon) and horizon > 0):
+        raise ValueError(f"`horizon` must be positive and finite, got {horizon}.")
+    if not constants.continuous and horizon != int(horizon):
+        raise ValueError(f"`horizon` must be a whole number of steps in discrete time, got {horizon}.")
+    slope = constants.rate if constants.rate is not None else constants.gain
+    slopes, sigmas = np.atleast_1d(np.asarray(slope, float)), np.atleast_1d(np.asarray(constants.sigma, float))
+    if constants.times is None:
+        times = np.array([0.0, horizon])
+    else:
+        times = constants.times
+        if not constants.continuous and np.any(times != np.round(times)):
+            raise ValueError("`times` must be whole numbers of steps in discrete time.")
+        if horizon > times[-1]:
+            raise ValueError(f"`horizon` must not exceed the last entry of `times`, {times[-1]}, got {horizon}.")
+        pieces = len(times) - 1
+        slopes, sigmas = spread(slopes, pieces), spread(sigmas, pieces)
+        kept = int(np.searchsorted(times, horizon, side="left"))
+        times = np.append(times[:kept], horizon)
+        slopes, sigmas = slopes[:kept], sigmas[:kept]
+    nu = constants.nu
+    any_power = constants.continuous or constants.gaussian or nu == constants.dimension
+    return Schedule(
+        continuous=constants.continuous, times=times, slopes=slopes, sigmas=sigmas, nu=nu, any_power=any_power
+    )
+
+
+def spread(values: Array, count: int) -> Array:
+    """A single value repeated, or the values as they are."""
+    return np.full(count, values[0]) if len(values) == 1 else values

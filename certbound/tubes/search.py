@@ -1,0 +1,286 @@
+"""Floating-point search for the Kummer parameters (a, v_0): it proposes, ball arithmetic certifies.
+
+The unknowns are x = log(1 + a) and y = log v_0 (Bessel form: log a alone). A coarse grid gives the start, the
+simplex method of Nelder and Mead the end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.tubes.kummer import Start, log_initial, log_target
+from certbound.tubes.schedule import Schedule
+from certbound.tubes.series import (
+    log_excess,
+    log_excess_one,
+    log_phi,
+    log_phi_one,
+    solve_excess,
+    solve_excess_one,
+)
+
+__all__ = ["Search", "simplex"]
+
+Array = NDArray[np.float64]
+
+_POWERS = np.array([0.0, 0.2, 1.0, 6.0, 60.0])
+_SPREADS = np.log(10.0) * np.array([-3.0, -1.8, -0.9, -0.3, 0.0, 0.5, 1.5])
+_FEW = 16
+_DIGITS = 1e-11
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Search:
+    """One tuning problem on the nodes of a (graded) schedule.
+
+    Parameters
+    ----------
+    schedule : Schedule
+        Data; its piece ends are the nodes.
+    kind : str
+        ``"scale"`` (least s with r_t <= s clearance_t), ``"final"``, ``"mean"``, or ``"probability"`` (Thm K2).
+    weights : ndarray (K + 1,)
+        Clearance at the nodes (infinite where nothing is asked); ones for the largest radius.
+    log_delta : float
+        Level of the tube (unused for ``"probability"``).
+    bessel : bool
+        Search the Bessel form.
+    start : Start
+        Deviation at time 0.
+    """
+
+    schedule: Schedule
+    kind: str
+    weights: Array
+    log_delta: float = 0.0
+    bessel: bool = False
+    start: Start = field(default_factory=Start)
+
+    @cached_property
+    def reference(self) -> float:
+        """Scale of v_0: the largest variance, in the moving coordinates where it grows."""
+        gain, variance = self.schedule.nodes
+        finite = np.isfinite(variance) & np.isfinite(gain)
+        top = float(np.max(np.where(finite, variance / np.maximum(gain, 1.0), 0.0)))
+        return max(top, 1e-290)
+
+    @cached_property
+    def cap(self) -> float:
+        """Largest x = log(1 + a) that Thm K1 allows."""
+        return math.log(1e4) if self.schedule.any_power else math.log1p(self.schedule.nu / 2 * (1 - 1e-9))
+
+    @cached_property
+    def half(self) -> float:
+        """nu/2."""
+        return self.schedule.nu / 2
+
+    @cached_property
+    def _squares(self) -> Array:
+        return (self.weights / self.schedule.unit) ** 2
+
+    def solve(self) -> tuple[float, float, float]:
+        """(a, v_0, objective): the objective is a radius, a scale, or log P."""
+        if self.kind == "probability":
+            value, point = self._minimise(self._point, self._at(1.0), 0.5, 1e-4)
+            return *self._parameters(point), value
+        point, step = self._point, 0.5
+        if self.kind != "mean":
+            # the best parameters for a scale s are those that make P least there: alternate, s falls
+            for tolerance in (1e-2, 1e-6):
+                scale = self.scale(*self._parameters(point))
+                if not math.isfinite(scale):
+                    break
+                point = self._minimise(point, self._at(scale), step, tolerance)[1]
+                step = 0.05
+            return *self._parameters(point), self.scale(*self._parameters(point))
+        value, point = self._minimise(point, self.scale, step, 1e-9)
+        return *self._parameters(point), value
+
+    def first_look(self) -> float:
+        """Objective at the best point of the grid."""
+        return self.scale(*self._parameters(self._point))
+
+    def _at(self, scale: float) -> Callable[[float, float], float]:
+        return lambda a, v0: self.log_probability(a, v0, scale)
+
+    def _minimise(
+        self, point: Array, function: Callable[[float, float], float], step: float, tolerance: float
+    ) -> tuple[float, Array]:
+        def objective(p: Array) -> float:
+            outside = p[0] > self.cap or abs(p[-1]) > 660
+            return math.inf if outside else function(*self._parameters(p))
+
+        return simplex(objective, point, step, tolerance=tolerance)
+
+    def _parameters(self, point: Array) -> tuple[float, float]:
+        """(a, v_0) of a point of the search: the Bessel form has one free parameter."""
+        if self.bessel:
+            return math.exp(float(point[0])), self.reference
+        return math.expm1(max(float(point[0]), 0.0)), math.exp(float(point[1]))
+
+    def log_probability(self, a: float, v0: float, scale: float) -> float:
+        """Logarithm of Thm K2's bound for the clearance ``scale`` times ``weights``."""
+        if len(self._pieces) <= _FEW:
+            return self._short(a, v0, scale)
+        v, info = self.schedule.path(np.asarray(v0), bessel=self.bessel)
+        log_x = log_initial(self.schedule, a, v0, float(info[0]), self.start, self.bessel)
+        if not math.isfinite(log_x):
+            return math.inf
+        active = self._active(v)
+        z, left = scale**2 * self._squares[active] / (2 * v[active]), info[active]
+        if len(active) <= _FEW:
+            return log_x - min(self._log_gain(a, i, x) for i, x in zip(left.tolist(), z.tolist()))
+        with np.errstate(divide="ignore"):
+            base = np.log(left) + log_phi(a * left)
+        excess = log_excess(np.asarray(a), self.half, z, bessel=self.bessel)[0] + a * left
+        return log_x - float(np.min(np.logaddexp(base, excess)))
+
+    @cached_property
+    def _pieces(self) -> list[tuple[float, float, float, float, float]]:
+        """(gain, variance, square at the end; backward, drift) per piece, the last one first."""
+        gain, variance = self.schedule.nodes
+        backward, drift = self.schedule.backward
+        weights = self._squares[1:].copy()
+        if self.kind == "final":
+            weights[:-1] = np.inf
+        columns = (gain[1:], variance[1:], weights, backward, drift)
+        return list(zip(*(column[::-1].tolist() for column in columns)))
+
+    def _short(self, a: float, v0: float, scale: float) -> float:
+        """The same for few pieces: plain numbers are quicker than short arrays."""
+        info, record, least = 0.0, 0.0, math.inf
+        moving = 0.0 if self.bessel else 1.0
+        pieces = self._pieces
+        last = len(pieces) - 1
+        for j, (gain, variance, square, backward, drift) in enumerate(pieces):
+            v = gain * v0 + moving * variance
+            if v > record * square:
+                record = v / square
+                least = min(least, self._log_gain(a, info, scale * scale / (2 * record)))
+            before = v0 if j == last else pieces[j + 1][0] * v0 + moving * pieces[j + 1][1]
+            if not (before > 0 and v < math.inf):
+                return math.inf
+            part = backward / before
+            info += part if self.bessel else (math.log1p(part) if part < 1 else math.log(v / before) - drift)
+        first = self._squares[0]
+        if (self.schedule.continuous or self.start.sigma > 0) and self.kind != "final" and v0 > record * first:
+            least = min(least, self._log_gain(a, info, scale * scale * float(first) / (2 * v0)))
+        log_x = log_initial(self.schedule, a, v0, info, self.start, self.bessel)
+        return log_x - least if math.isfinite(log_x) else math.inf
+
+    def _log_gain(self, a: float, info: float, z: float) -> float:
+        """log of phi(I) + e^{a I} E_a(z)."""
+        if not z > 0:
+            return -math.inf if info <= 0 else math.log(info) + log_phi_one(a * info)
+        excess = log_excess_one(a, self.half, z, bessel=self.bessel, digits=_DIGITS)[0] + a * info
+        return excess if info <= 0 else _log_add(math.log(info) + log_phi_one(a * info), excess)
+
+    def scale(self, a: float, v0: float) -> float:
+        """Least scale (or mean radius) of Thm K1's tube for stated parameters."""
+        v, info = self.schedule.path(np.asarray(v0), bessel=self.bessel)
+        log_x = log_initial(self.schedule, a, v0, float(info[0]), self.start, self.bessel)
+        if not math.isfinite(log_x):
+            return math.inf
+        chosen = np.arange(len(v)) if self.kind == "mean" else self._active(v)
+        target = log_target(a, info[chosen], log_x, self.log_delta)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if len(chosen) == 1:
+                z = np.array([solve_excess_one(a, self.half, float(target[0]), bessel=self.bessel)])
+            else:
+                z = solve_excess(np.asarray(a), self.half, target, bessel=self.bessel)
+            size = np.sqrt(2 * v[chosen] * z)
+            if self.kind == "mean":
+                return self._mean(size * self.schedule.unit)
+            return float(np.max(size / np.sqrt(self._squares[chosen])))
+
+    def _mean(self, radius: Array) -> float:
+        times = self.schedule.times
+        if self.schedule.continuous:
+            return float(np.trapezoid(radius, times) / times[-1])
+        steps = np.arange(1.0, times[-1] + 1)
+        return float(np.mean(np.interp(steps, times, radius)))
+
+    def _active(self, v: Array) -> NDArray[np.intp]:
+        """Nodes that no later node dominates: z_t rises in t, so only records of v/clearance^2 from the end count."""
+        if self.kind == "final":
+            return np.array([len(v) - 1])
+        first = 0 if self.schedule.continuous or self.start.sigma > 0 else 1
+        ratio = (v / self._squares)[first:]
+        later = np.maximum.accumulate(ratio[::-1])[::-1]
+        keep = np.append(ratio[:-1] > later[1:], True)
+        return np.flatnonzero(keep & (ratio > 0)) + first
+
+    @cached_property
+    def _point(self) -> Array:
+        """Best point of a coarse grid, judged by Thm K2 at a typical scale."""
+        if self.bessel:
+            points = np.linspace(-3.0, 7.0, 9)[:, None]
+        else:
+            powers = np.unique(np.minimum(np.log1p(_POWERS), self.cap - 1e-3))
+            points = np.array([(x, y) for x in powers for y in math.log(self.reference) + _SPREADS])
+        scale = 1.0 if self.kind == "probability" else self._typical()
+        scores = [self.log_probability(*self._parameters(point), scale) for point in points]
+        return np.asarray(points[int(np.argmin(np.nan_to_num(scores, nan=np.inf)))])
+
+    def _typical(self) -> float:
+        """A scale of the right size: Gaussian tail at the node of the largest variance."""
+        _, variance = self.schedule.nodes
+        size = np.sqrt(np.nanmax(np.where(np.isfinite(variance), variance, 0.0) / self._squares))
+        tail = max(1e-3, -self.log_delta)
+        return float(size * math.sqrt(2 * self.half + 2 * math.sqrt(2 * self.half * tail) + 2 * tail))
+
+
+def _log_add(x: float, y: float) -> float:
+    top, low = (x, y) if x > y else (y, x)
+    return top + math.log1p(math.exp(low - top)) if top > -math.inf else top
+
+
+def simplex(
+    function: Callable[[Array], float], start: Array, step: float, *, tolerance: float, budget: int = 160
+) -> tuple[float, Array]:
+    """Least value found and its place (Nelder-Mead; the objectives are smooth near their minimum)."""
+    size = len(start)
+    points = [np.array(start, dtype=float)]
+    for i in range(size):
+        other = points[0].copy()
+        other[i] += step
+        points.append(other)
+    pairs = sorted(((function(p), p) for p in points), key=lambda pair: pair[0])
+    used = size + 1
+    while used < budget:
+        low, high = pairs[0][0], pairs[-1][0]
+        if not math.isfinite(low):
+            break
+        spread = max(float(np.max(np.abs(p - pairs[0][1]))) for _, p in pairs[1:])
+        if (high - low <= tolerance and spread < 0.05) or spread < 1e-7:
+            break
+        centre = sum((p for _, p in pairs[:-1]), np.zeros(size)) / size
+        worst = pairs[-1][1]
+        reflected = centre + (centre - worst)
+        value = function(reflected)
+        used += 1
+        if value < low:
+            expanded = centre + 2 * (centre - worst)
+            trial = function(expanded)
+            used += 1
+            pairs[-1] = (trial, expanded) if trial < value else (value, reflected)
+        elif value < pairs[-2][0]:
+            pairs[-1] = (value, reflected)
+        else:
+            inside = centre + (0.5 if value < high else -0.5) * (centre - worst)
+            trial = function(inside)
+            used += 1
+            if trial < min(value, high):
+                pairs[-1] = (trial, inside)
+            else:
+                best = pairs[0][1]
+                pairs[1:] = [(function(q), q) for q in (best + 0.5 * (p - best) for _, p in pairs[1:])]
+                used += size
+        pairs.sort(key=lambda pair: pair[0])
+    return pairs[0]
