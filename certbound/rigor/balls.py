@@ -93,7 +93,7 @@ def kummer_excess(a: arb, b: arb, z: arb) -> arb:
     Examples
     --------
     >>> from flint import arb
-    >>> bool(abs(kummer_excess(arb(0.5), arb(0.5), arb(1)) - 2 * (arb(1).exp() - 1)) < 1e-15)
+    >>> bool(abs(kummer_excess(arb(0.5), arb(0.5), arb(1)) - 2 * (arb(1).exp() - 1)) < 1e-13)
     True
     """
     if z.is_zero():

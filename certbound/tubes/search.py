@@ -98,9 +98,21 @@ class Search:
                     break
                 point = self._minimise(point, self._at(scale), step, tolerance)[1]
                 step = 0.05
-            return *self._parameters(point), self.scale(*self._parameters(point))
+            return self._snapped(*self._parameters(point))
         value, point = self._minimise(point, self.scale, step, 1e-9)
         return *self._parameters(point), value
+
+    def _snapped(self, a: float, v0: float) -> tuple[float, float, float]:
+        """The corners where the objective has kinks are tried as well: a = 0 and the constant v."""
+        rate, noise = float(self.schedule.rates[0]), float(self.schedule.noise[0])
+        pairs = [(a, v0)]
+        if not self.bessel:
+            pairs.append((0.0, v0))
+            if rate < 0 and noise > 0 and np.all(self.schedule.rates == rate) and np.all(self.schedule.noise == noise):
+                pairs += [(a, noise / (-2 * rate)), (0.0, noise / (-2 * rate))]
+        values = [self.scale(*pair) for pair in pairs]
+        best = int(np.argmin(np.nan_to_num(values, nan=np.inf)))
+        return *pairs[best], values[best]
 
     def first_look(self) -> float:
         """Objective at the best point of the grid."""
