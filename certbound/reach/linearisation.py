@@ -23,8 +23,8 @@ __all__ = ["Linearisation"]
 
 Array = NDArray[np.float64]
 
-_PIECE = 0.02
-_MOST_PIECES = 4000
+_FEWEST_PIECES, _MOST_PIECES = 50, 2000
+_STEP = 0.1  # ||J|| h of a piece
 _ROUND = 1 + 1e-13
 
 
@@ -71,11 +71,21 @@ class Linearisation:
     def _pieces(self, pieces: int | None) -> int:
         if not self.continuous:
             return int(self.problem.horizon)
-        count = pieces or min(max(100, int(np.ceil(self.problem.horizon / _PIECE))), _MOST_PIECES)
+        count = _FEWEST_PIECES if pieces is None else pieces
         if self.problem.input_sequence is not None:
             rows = len(self.problem.input_sequence)
             count = rows * int(np.ceil(count / rows))
         return count
+
+    @classmethod
+    def of(cls, problem: Problem, *, cells: int | None = None, noise: bool = True) -> Linearisation:
+        """The linearisation on a grid that resolves the nominal Jacobians: ||J|| h at most 0.1."""
+        if problem.system.time == "discrete":
+            return cls(problem, cells=cells, noise=noise)
+        trial = cls(problem, noise=noise)
+        size = float(np.linalg.norm(np.nan_to_num(trial.slopes[0]), axis=(-2, -1)).max())
+        pieces = int(np.clip(np.ceil(problem.horizon * size / _STEP), _FEWEST_PIECES, _MOST_PIECES))
+        return cls(problem, cells=cells, pieces=pieces, noise=noise)
 
     # ---- nominal data ------------------------------------------------------------------------------------
 

@@ -82,10 +82,14 @@ class DeviationTube:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearAnswer:
-    """Best certified probability of the engine, and what stands in the way of a smaller one."""
+    """Best certified probability of the engine, and what stands in the way of a smaller one.
+
+    ``outcome`` holds the least probability found; ``shown`` the run whose tube fits the problem's own delta.
+    """
 
     run: LinearRun
     outcome: Outcome
+    shown: Outcome
 
     @property
     def log10_delta(self) -> float:
@@ -96,18 +100,17 @@ class LinearAnswer:
     @property
     def margin(self) -> float:
         """Room left at the problem's delta, in the units of the tightest constraint."""
-        return self.outcome.margin
+        return self.shown.margin
 
     @property
-    def time(self) -> float | None:
+    def time(self) -> float:
         """Where the room is least, or where the remainder begins to feed itself."""
-        engine = self.run.engine
-        return float(self.outcome.piece * engine.step)
+        return float(self.shown.piece * self.run.engine.step)
 
     @property
     def constraint(self) -> str | None:
         """The tightest requirement."""
-        return None if self.outcome.requirement is None else self.outcome.requirement.label
+        return None if self.shown.requirement is None else self.shown.requirement.label
 
     @property
     def reason(self) -> str:
@@ -122,16 +125,16 @@ class LinearAnswer:
     @cached_property
     def tube(self) -> DeviationTube | None:
         """Deviation tube at the problem's delta (None when nothing was proved)."""
-        bounds = self.outcome.bounds
-        return None if bounds is None else _deviation_tube(self.run, self.outcome, bounds)
+        bounds = self.shown.bounds
+        return None if bounds is None else _deviation_tube(self.run, self.shown, bounds)
 
     @cached_property
     def reach(self) -> ReachTube | None:
         """Sets that contain the state with probability at least 1 - delta (None when nothing was proved)."""
-        bounds, tube = self.outcome.bounds, self.tube
+        bounds, tube = self.shown.bounds, self.tube
         if bounds is None or tube is None:
             return None
-        return _reach_tube(self.run, bounds, tube.log10_delta, _levels_of_coordinates(self.run, self.outcome)[0])
+        return _reach_tube(self.run, bounds, tube.log10_delta, _levels_of_coordinates(self.run, self.shown)[0])
 
 
 def refusal(problem: Problem) -> str | None:
@@ -150,7 +153,7 @@ def linear_answer(problem: Problem, *, cells: int | None = None) -> LinearAnswer
     cells : int, optional
         Cells along each side of the initial set.
     """
-    run = LinearRun(Linearisation(problem, cells=cells))
+    run = LinearRun(Linearisation.of(problem, cells=cells))
     target = float(np.log(problem.delta))
     best: Outcome | None = None
     effort = 1
@@ -160,13 +163,15 @@ def linear_answer(problem: Problem, *, cells: int | None = None) -> LinearAnswer
         if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
             break
     assert best is not None
+    shown = best
     if best.log_probability <= target and best.log_probability > best.log_nonlinear - 3.0:
-        for _ in range(_REFINEMENTS):
+        coupled = max((len(group[0]) for group in run.engine.model.blocks), default=1) > 1
+        for _ in range(0 if coupled else _REFINEMENTS):
             outcome = run.probability(2 * best.log_nonlinear, effort)
             if outcome.log_probability >= best.log_probability:
                 break
             best = outcome
-    return LinearAnswer(run=run, outcome=best)
+    return LinearAnswer(run=run, outcome=best, shown=shown)
 
 
 def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = None) -> ReachTube:
@@ -177,12 +182,12 @@ def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = No
     ArithmeticError
         If the remainder feeds itself before the horizon ends.
     """
-    run = LinearRun(Linearisation(problem, cells=cells, noise=noise))
+    run = LinearRun(Linearisation.of(problem, cells=cells, noise=noise))
     outcome = run.probability(float(np.log(problem.delta / 2)))
     if outcome.bounds is None:
-        raise ArithmeticError(LinearAnswer(run=run, outcome=outcome).reason)
+        raise ArithmeticError(LinearAnswer(run=run, outcome=outcome, shown=outcome).reason)
     if noise:
-        reach = LinearAnswer(run=run, outcome=outcome).reach
+        reach = LinearAnswer(run=run, outcome=outcome, shown=outcome).reach
         assert reach is not None
         return reach
     return _reach_tube(run, outcome.bounds, -np.inf, None)
