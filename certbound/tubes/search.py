@@ -107,12 +107,15 @@ class Search:
         rate, noise = float(self.schedule.rates[0]), float(self.schedule.noise[0])
         pairs = [(a, v0)]
         if not self.bessel:
-            pairs.append((0.0, v0))
+            pairs.insert(0, (0.0, v0))
             if rate < 0 and noise > 0 and np.all(self.schedule.rates == rate) and np.all(self.schedule.noise == noise):
-                pairs += [(a, noise / (-2 * rate)), (0.0, noise / (-2 * rate))]
+                pairs = [(0.0, noise / (-2 * rate)), (a, noise / (-2 * rate)), *pairs]
         values = [self.scale(*pair) for pair in pairs]
-        best = int(np.argmin(np.nan_to_num(values, nan=np.inf)))
-        return *pairs[best], values[best]
+        # between nodes a falling v costs more than the nodes show: a corner wins a near tie
+        least = min((value for value in values if value == value), default=math.inf)
+        return next(
+            ((*pair, value) for pair, value in zip(pairs, values) if value <= least * (1 + 1e-5)), (a, v0, least)
+        )
 
     def first_look(self) -> float:
         """Objective at the best point of the grid."""
