@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from certbound.tubes.tube import Tube
 
 import certbound as cb
+from certbound.tubes.tube import Tube
 from experiments.harness import Arrays, Claims, main
 
 HORIZON, DELTA = 2000, 0.01

@@ -10,9 +10,9 @@ import math
 from typing import Any
 
 import numpy as np
-from certbound.tubes.tube import Tube
 
 import certbound as cb
+from certbound.tubes.tube import Tube
 
 __all__ = ["DELTA", "SIGMA", "largest_deviations", "paths", "tube"]
 

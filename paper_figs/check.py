@@ -56,9 +56,7 @@ def compare(expectation: Mapping[str, Any], found: Any) -> bool:
     return bool(expectation.get("at_least", found) <= found <= expectation.get("at_most", found))
 
 
-def check(
-    expected: Sequence[Mapping[str, Any]], claims: Mapping[str, Mapping[str, Any]], mode: str
-) -> list[Row]:
+def check(expected: Sequence[Mapping[str, Any]], claims: Mapping[str, Mapping[str, Any]], mode: str) -> list[Row]:
     """One row for each expectation that applies to the mode; a claim that is missing has failed."""
     rows = []
     for entry in expected:
@@ -98,9 +96,7 @@ def table(rows: Sequence[Row]) -> str:
 def _goal(entry: Mapping[str, Any]) -> Any:
     if "value" in entry:
         return entry["value"]
-    return ", ".join(
-        f"{word} {entry[key]}" for key, word in (("at_least", ">="), ("at_most", "<=")) if key in entry
-    )
+    return ", ".join(f"{word} {entry[key]}" for key, word in (("at_least", ">="), ("at_most", "<=")) if key in entry)
 
 
 def _show(value: Any) -> str:

@@ -9,15 +9,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from paper_figs.style import BLACK, COLUMN, GREY, Data, main, panels
+from paper_figs.style import BLACK, COLUMN, Data, main, panels
 
-WALL, BAND = "#7f7f7f", "#8fc1e3"
-TUBES = ("#e3eff8", "#b3d3ec", "#6fa8d6")
+WALL, BAND, DARK = "#9a9a9a", "#8fc1e3", "#3a3a3a"
+TUBES = ("#d7e8f5", "#a3cae8", "#5f9fd3")
 
 
 def draw(data: Data) -> Figure:
     """Two panels, one above the other, on the same axes."""
-    figure, axes = panels(COLUMN, 3.9, 2, 1, sharex=True)
+    figure, axes = panels(COLUMN, 4.1, 2, 1, sharex=True)
     _erosion(axes[0, 0], data)
     _tubes(axes[1, 0], data)
     for panel, title in zip(axes.flat, ("(a) set erosion", "(b) probabilistic tubes")):
@@ -35,14 +35,12 @@ def _erosion(axes: Axes, data: Data) -> None:
     radius = data.claims["radius"]
     distance = data["distance"]
     axes.contourf(data["x"], data["y"], distance, levels=[-0.5, radius], colors=[BAND], zorder=1)
-    axes.contour(
-        data["x"], data["y"], distance, levels=[radius], colors=["#1f5f8b"], linewidths=0.7, zorder=2
-    )
+    axes.contour(data["x"], data["y"], distance, levels=[radius], colors=["#1f5f8b"], linewidths=0.7, zorder=2)
     axes.plot(*data["nominal"].T, color=BLACK, linewidth=1.5, zorder=5)
     handles = [
         Patch(facecolor=WALL, label="unsafe"),
-        Patch(facecolor=BAND, label=rf"eroded by $r_\delta={radius:.2f}$, $\delta=10^{{-3}}$"),
-        Line2D([], [], color=BLACK, linewidth=1.5, label="noise-free trajectory"),
+        Patch(facecolor=BAND, label=rf"eroded by $r_\delta={radius:.2f}$"),
+        Line2D([], [], color=BLACK, linewidth=1.5, label="noise-free $x_t$"),
     ]
     axes.legend(
         handles=handles,
@@ -50,7 +48,9 @@ def _erosion(axes: Axes, data: Data) -> None:
         ncols=3,
         columnspacing=0.9,
         handlelength=1.4,
-        bbox_to_anchor=(0, 1.09),
+        bbox_to_anchor=(-0.02, 1.1),
+        borderaxespad=0.0,
+        handletextpad=0.5,
     )
 
 
@@ -59,7 +59,7 @@ def _tubes(axes: Axes, data: Data) -> None:
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     handles = [
         Line2D([], [], color=BLACK, linewidth=1.5, label="$x_t$"),
-        Line2D([], [], color=GREY, linewidth=0.7, label="$X_t$"),
+        Line2D([], [], color=DARK, linewidth=0.7, label="$X_t$"),
     ]
     order = np.argsort(data["levels"])
     for place, index in enumerate(order):
@@ -70,7 +70,7 @@ def _tubes(axes: Axes, data: Data) -> None:
         exponent = round(np.log10(data["levels"][index]))
         handles.append(Patch(facecolor=TUBES[place], label=rf"$\delta=10^{{{exponent}}}$"))
     for path in data["paths"]:
-        axes.plot(*path.T, color=GREY, linewidth=0.35, alpha=0.7, zorder=4)
+        axes.plot(*path.T, color=DARK, linewidth=0.3, alpha=0.8, zorder=4)
     axes.plot(*data["nominal"].T, color=BLACK, linewidth=1.5, zorder=5)
     axes.legend(
         handles=handles,
@@ -78,7 +78,9 @@ def _tubes(axes: Axes, data: Data) -> None:
         ncols=5,
         columnspacing=0.9,
         handlelength=1.4,
-        bbox_to_anchor=(0, 1.09),
+        bbox_to_anchor=(-0.02, 1.1),
+        borderaxespad=0.0,
+        handletextpad=0.5,
     )
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from paper_figs.style import BLACK, COLUMN, LINES, Data, main, paths, shared_legend
+from paper_figs.style import COLUMN, LINES, Data, draw_strip, main, paths, shared_legend, with_strip
 
 PANELS = {"a": "$c=1$, $T=2$", "b": "$c=0$, $T=2$", "c": "$c=-1$, $T=2$", "d": "$c=-1$, $T=0.02$"}
 
@@ -18,9 +17,10 @@ def draw(data: Data) -> Figure:
     grid = figure.subfigures(2, 2, hspace=0.03)
     lower = []
     for place, (name, title) in zip(grid.flat, PANELS.items()):
-        strip, panel = place.subplots(2, 1, sharex=True, height_ratios=[1, 3.2])
+        strip, panel = with_strip(place)
         _panel(panel, data, name)
-        _strip(strip, data, name, f"({name}) {title}")
+        line = {"label": r"Thm 2, $\varepsilon=1/16$ as printed", **LINES["printed"]}
+        draw_strip(strip, data[f"{name}_times"], data[f"{name}_printed"], f"({name}) {title}", **line)
         lower.append((strip, panel))
     for index, (_, panel) in enumerate(lower):
         if index >= 2:
@@ -40,31 +40,7 @@ def _panel(axes: Axes, data: Data, name: str) -> None:
     top = 1.12 * max(data[f"{name}_paper"].max(), data[f"{name}_exact"].max(), data[f"{name}_paths"].max())
     axes.set(xlim=(0, times[-1]), ylim=(0, top))
     axes.locator_params(axis="both", nbins=4)
-
-
-def _strip(axes: Axes, data: Data, name: str, title: str) -> None:
-    times, printed = data[f"{name}_times"], data[f"{name}_printed"]
-    axes.plot(times, printed, label=r"Thm 2, $\varepsilon=1/16$ as printed", **LINES["printed"])
-    low, high = float(printed.min()), float(printed.max())
-    margin = 0.15 * high
-    axes.set(ylim=(max(0.0, low - margin), high + margin))
-    axes.set_yticks(sorted({_round(low), _round(high)}))
-    axes.spines["bottom"].set_visible(False)
-    axes.tick_params(bottom=False, labelbottom=False)
-    axes.set_title(title, loc="left", pad=2)
-    marks = {
-        "marker": [(-1, -0.7), (1, 0.7)],
-        "markersize": 5,
-        "linestyle": "none",
-        "color": BLACK,
-        "clip_on": False,
-    }
-    axes.plot([0], [0], transform=axes.transAxes, **marks)
-
-
-def _round(value: float) -> float:
-    digits = 2 - int(np.floor(np.log10(value)))
-    return round(value, digits - 1)
+    axes.margins(x=0)
 
 
 if __name__ == "__main__":

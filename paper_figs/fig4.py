@@ -5,37 +5,35 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from paper_figs.style import COLUMN, LINES, Data, letter, main, panels, paths, shared_legend
+from paper_figs.style import COLUMN, LINES, Data, draw_strip, main, paths, shared_legend, with_strip
+
+PANELS = {"thm2": "(a) Theorem 2", "thm3": r"(b) Theorem 3, $\Delta t=0.05$"}
 
 
 def draw(data: Data) -> Figure:
-    """Two panels on one scale; the printed epsilon, far above it, is named with its largest radius."""
-    figure, axes = panels(COLUMN, 2.6, 1, 2, sharey=True)
-    for panel, key, name in zip(axes.flat, ("thm2", "thm3"), ("Thm 2", r"Thm 3, $\Delta t=0.05$")):
-        _panel(panel, data, key, name)
-    axes[0, 0].set_ylabel("deviation $|X_t-x_t|$")
-    letter(axes.flat, ["Theorem 2", "Theorem 3"])
-    shared_legend(figure, axes.flat, columns=2)
+    """Two panels, each on its own scale, with the printed epsilon in a strip above."""
+    figure = Figure(figsize=(COLUMN, 2.9), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.015, hspace=0.0, wspace=0.04)
+    every = []
+    for place, (key, title) in zip(figure.subfigures(1, 2), PANELS.items()):
+        strip, panel = with_strip(place)
+        _panel(panel, data, key)
+        line = {"label": r"paper, $\varepsilon=1/16$ as printed", **LINES["printed"]}
+        draw_strip(strip, data["times"], data[f"{key}_printed"], title, **line)
+        every += [strip, panel]
+    every[1].set_ylabel("deviation $|X_t-x_t|$")
+    shared_legend(figure, every, columns=2)
     return figure
 
 
-def _panel(axes: Axes, data: Data, key: str, name: str) -> None:
+def _panel(axes: Axes, data: Data, key: str) -> None:
     times = data["times"]
     paths(axes, times, data["paths"])
-    style = {**LINES["paper"], "linestyle": (0, (4, 1.5)) if key == "thm2" else (0, (7, 1.5))}
-    axes.plot(times, data[key], label=rf"{name}, $\varepsilon=15/16$", **style)
+    axes.plot(times, data[key], label=r"paper, $\varepsilon=15/16$", **LINES["paper"])
     axes.plot(times, data["kummer"], label="Kummer tube (certbound)", **LINES["kummer"])
     axes.plot(times, data["exact"], label="exact constant radius", **LINES["exact"])
-    axes.set(xlim=(0, times[-1]), ylim=(0, 1.05 * data["thm2"].max()), xlabel="time $t$ (s)")
-    printed = data[f"{key}_printed"]
-    axes.annotate(
-        r"$\varepsilon=1/16$ as printed:" + f"\n{printed.min():.0f} to {printed.max():.0f}, off this scale",
-        xy=(0.97, 0.97),
-        xycoords="axes fraction",
-        ha="right",
-        va="top",
-        fontsize=6,
-    )
+    axes.set(xlim=(0, times[-1]), ylim=(0, 1.08 * data[key].max()), xlabel="time $t$ (s)")
+    axes.locator_params(axis="both", nbins=5)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ DASHES = ((0, (1, 1)), (0, (3, 1)), (0, (6, 1.5)), (0, (5, 1, 1, 1)))
 
 def draw(data: Data) -> Figure:
     """Two panels, legends inside."""
-    figure, axes = panels(COLUMN, 2.5, 1, 2)
+    figure, axes = panels(COLUMN, 2.6, 1, 2)
     _over_time(axes[0, 0], data)
     _over_window(axes[0, 1], data)
     letter(axes.flat, ["over time", "over the window"])
@@ -28,7 +28,7 @@ def _over_time(axes: Axes, data: Data) -> None:
     axes.plot(times, data["kummer"], label="Kummer", **LINES["kummer"])
     axes.plot(times, data["exact"], label="exact", **LINES["exact"])
     axes.set(xlim=(0, times[-1]), ylim=(0, None), xlabel="time $t$ (s)", ylabel="radius $r_t$")
-    axes.legend(loc="lower right", ncols=2, columnspacing=0.8, handlelength=2.0)
+    axes.legend(loc="lower right", handlelength=2.2, labelspacing=0.25, borderaxespad=0.1)
 
 
 def _over_window(axes: Axes, data: Data) -> None:
@@ -41,7 +41,7 @@ def _over_window(axes: Axes, data: Data) -> None:
         axes.plot(steps[best], printed[best], "v", color=color, markersize=3.5)
     axes.axhline(data["kummer_instants"][-1], color=BLUE, linewidth=1.4, label="Kummer, $t=5$")
     axes.set(xlim=(steps[0], steps[-1]), ylim=(0, None), xlabel=r"window $\Delta t$ (s)")
-    axes.legend(loc="lower right", ncols=2, columnspacing=0.8, handlelength=2.0)
+    axes.legend(loc="lower right", handlelength=2.2, labelspacing=0.25, borderaxespad=0.1)
 
 
 if __name__ == "__main__":

@@ -34,9 +34,7 @@ def _panel(axes: Axes, data: Data, side: str, reading: str) -> None:
     printed, proved = data[f"{side}_{reading}_real"], data[f"{side}_{reading}_whole"]
     for index, (instant, color, dash) in enumerate(zip(data["instants"], COLORS, DASHES)):
         axes.plot(steps, proved[index], color=color, linewidth=0.5, alpha=0.5)
-        axes.plot(
-            steps, printed[index], color=color, linestyle=dash, linewidth=1.2, label=f"Thm 5, $t={instant:g}$"
-        )
+        axes.plot(steps, printed[index], color=color, linestyle=dash, linewidth=1.2, label=f"Thm 5, $t={instant:g}$")
     best = int(np.argmin(printed[-1]))
     axes.plot(steps[best], printed[-1, best], "v", color=VERMILION, markersize=4)
     axes.annotate(

@@ -19,7 +19,7 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 HERE = Path(__file__).resolve().parent
 DATA = HERE.parent / "experiments" / "out"
@@ -127,9 +127,7 @@ def _replace(path: Path, content: bytes) -> None:
     temporary.replace(path)
 
 
-def panels(
-    width: float, height: float, rows: int = 1, columns: int = 1, **options: Any
-) -> tuple[Figure, np.ndarray]:
+def panels(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, np.ndarray]:
     """A figure with a grid of axes, laid out without overlaps."""
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0.03, hspace=0.03)
@@ -137,16 +135,12 @@ def panels(
     return figure, axes
 
 
-def paths(
-    axes: Axes, times: np.ndarray, values: np.ndarray, *, color: str = GREY, alpha: float | None = None
-) -> None:
+def paths(axes: Axes, times: np.ndarray, values: np.ndarray, *, color: str = GREY, alpha: float | None = None) -> None:
     """Sample paths (path, time) as thin lines, drawn as pixels so that the PDF stays small."""
     segments = np.stack(np.broadcast_arrays(times[None, :], values), axis=-1)
     if alpha is None:
         alpha = float(np.clip(25.0 / len(values), 0.03, 0.5))
-    lines = LineCollection(
-        list(segments), colors=color, linewidths=0.4, alpha=alpha, rasterized=True, zorder=1
-    )
+    lines = LineCollection(list(segments), colors=color, linewidths=0.4, alpha=alpha, rasterized=True, zorder=1)
     axes.add_collection(lines)
     axes.autoscale_view()
 
@@ -163,6 +157,25 @@ def shared_legend(figure: Figure, axes: Sequence[Axes], columns: int = 2) -> Non
     for panel in axes:
         for handle, label in zip(*panel.get_legend_handles_labels()):
             entries.setdefault(label, handle)
-    figure.legend(
-        entries.values(), entries.keys(), loc="outside upper center", ncols=columns, columnspacing=1.2
-    )
+    figure.legend(entries.values(), entries.keys(), loc="outside upper center", ncols=columns, columnspacing=1.2)
+
+
+def with_strip(place: SubFigure, ratio: float = 3.2) -> tuple[Axes, Axes]:
+    """Two axes, one above the other on the same times: a strip for what is far off the scale, and the panel."""
+    strip, panel = place.subplots(2, 1, sharex=True, height_ratios=[1, ratio])
+    return strip, panel
+
+
+def draw_strip(axes: Axes, times: np.ndarray, values: np.ndarray, title: str, **line: Any) -> None:
+    """A curve on a scale of its own, broken off from the panel below."""
+    axes.plot(times, values, **line)
+    low, high = float(values.min()), float(values.max())
+    margin = max(0.2 * (high - low), 0.08 * high)
+    axes.set_ylim(low - margin, high + margin)
+    ends = [high] if high - low < 0.2 * high else [low, high]
+    axes.set_yticks(ends, [f"{end:.3g}" for end in ends])
+    axes.spines["bottom"].set_visible(False)
+    axes.tick_params(bottom=False, labelbottom=False)
+    axes.set_title(title, loc="left", pad=2)
+    mark = {"marker": [(-1, -0.7), (1, 0.7)], "markersize": 5, "linestyle": "none", "color": BLACK, "clip_on": False}
+    axes.plot([0], [0], transform=axes.transAxes, **mark)

@@ -119,7 +119,8 @@ def _steps(problem: Problem, step: float | None) -> int | None:
         raise InputError(
             f"`--step` must lie in (0, {problem.horizon:g}], got {step:g}", f"try --step {problem.horizon / 1000:g}"
         )
-    return math.ceil(float(problem.horizon) / step * (1.0 - 1e-12))
+    count = float(problem.horizon) / step
+    return round(count) if math.isclose(count, round(count), rel_tol=1e-9) else math.ceil(count)
 
 
 def _plain(problem: Problem, options: dict[str, Any]) -> dict[str, Any]:
@@ -220,7 +221,12 @@ def _print(result: dict[str, Any]) -> None:
     screen.print(f"exit probability {result['probability']:.4g}  ({sure} limits {low:.4g} ... {high:.4g})")
     if SETTINGS.quiet:
         return
-    screen.print(f"{result['exits']} of {result['paths']} paths left, in steps of the {result['scheme']} scheme")
+    steps = f"{result['steps']} steps of the {result['scheme']} scheme"
+    if "standard_error" in result:
+        error, replicas = result["standard_error"], result["replicas"]
+        screen.print(f"standard error {error:.2g}, from {replicas} runs of importance splitting, {steps}")
+    else:
+        screen.print(f"{result['exits']} of {result['paths']} paths left, {steps}")
     for label, count in result.get("by_constraint", {}).items():
         screen.print(f"  {count:>9}  {label}", markup=False)
     screen.print(f"a claim of less than {low:.4g} is refuted; the smallest delta supported is {high:.4g}")
