@@ -34,9 +34,12 @@ def frozen(value: Any) -> Array:
 
 def _floats(name: str, value: Any) -> Array:
     try:
-        array = np.asarray(value, dtype=float)
+        raw = np.asarray(value)
+        array = np.asarray(raw, dtype=float) if raw.dtype.kind in "biufO" else None
     except (TypeError, ValueError) as error:
         raise TypeError(f"`{name}` must hold numbers, got {value!r}.") from error
+    if array is None:
+        raise TypeError(f"`{name}` must hold numbers, got {value!r}.")
     if np.any(np.isnan(array)):
         raise ValueError(f"`{name}` must not contain nan, got {value!r}.")
     return array

@@ -27,7 +27,7 @@ CONSTANTS: Mapping[str, float] = {"pi": math.pi}
 
 _LONGEST, _DEEPEST = 20_000, 60
 _TOKEN = re.compile(
-    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_][A-Za-z_0-9]*)"
+    r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)|(?P<name>[^\W\d]\w*)"
     r"|(?P<symbol>\*\*|[-+*/(),]))"
 )
 _CURES = {
@@ -88,9 +88,7 @@ def parse(text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]],
 
 
 class _Parser:
-    def __init__(
-        self, text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str
-    ) -> None:
+    def __init__(self, text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str) -> None:
         self.text, self.graph, self.names, self.where = text, graph, names, where
         self.tokens = self._split()
         self.next = 0

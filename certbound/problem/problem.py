@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -92,7 +91,7 @@ class Problem:
         self._set("safe", self._constraints())
         self._set("domain", self._domain())
         self._set("initial", _start(self.initial, self.system.dimension))
-        self._set("parameters", MappingProxyType(dict(self.parameters or {})))
+        self._set("parameters", dict(self.parameters or {}))
         self._set("plan", self._checked_plan())
         self._set("cost", self._cost())
         check_start(self.initial, self.constraints)

@@ -518,3 +518,13 @@ def test_problems_are_found_in_modules(tmp_path, monkeypatch):
         load("no_such_module_of_ours:build")
     with pytest.raises(ValueError, match=r"must be package.module:name"):
         load(":build")
+
+
+def test_states_may_have_greek_names(tmp_path):
+    text = STEPS.replace("x", "\u03b8").replace("m\u03b8", "mx").replace("matri\u03b8", "matrix")
+    text = text.replace('"y"', '"\u03c9"').replace("*y", "*\u03c9").replace('["\u03b8"', '["\u03b8"')
+    text = changed(text, "-0.1*\u03b8", "-0.1*\u03b8 - \u03c9")
+    problem = loads(text)
+    assert problem.system.states == ("\u03b8", "\u03c9")
+    save(problem.replace(name="again"), tmp_path / "greek.toml")
+    assert same(problem.replace(name="again"), load(tmp_path / "greek.toml"))

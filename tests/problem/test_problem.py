@@ -1,5 +1,7 @@
 """A problem checks everything it is given, and offers the closed loop that all engines read."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -250,3 +252,19 @@ def test_moving_obstacles_are_met_at_time_0():
     assert problem(safe=[rock]).safe[0].region.moving
     with pytest.raises(ValueError, match="violates"):
         problem(safe=[rock], initial=[2.0, 0.0])
+
+
+def test_a_problem_travels_to_another_process():
+    base = problem(
+        driven(noise=Gaussian(std=0.1)),
+        plan=lambda t, x: [t - x[0]],
+        safe=[SQUARE, Outside(Ball(lambda t: [9 - t, 0.0], 1.0))],
+        parameters={"k": 1.0},
+    )
+    copy = pickle.loads(pickle.dumps(base))
+    assert dict(copy.parameters) == {"k": 1.0}
+    assert [constraint.label for constraint in copy.safe] == [constraint.label for constraint in base.safe]
+    np.testing.assert_array_equal(copy.safe[1].region.center_at(2.0), [7.0, 0.0])
+    np.testing.assert_array_equal(copy.system.noise.proxy, base.system.noise.proxy)
+    point = (1.0, 2.0, 3.0)
+    np.testing.assert_array_equal(compile_numpy(copy.closed_loop)(*point), compile_numpy(base.closed_loop)(*point))

@@ -159,7 +159,14 @@ def test_bad_sets_are_refused(build, message):
         build()
 
 
+def test_a_complex_number_is_refused():
+    with pytest.raises(TypeError, match="`low` must hold numbers"):
+        Box([1j], [2])
+
+
 def test_text_is_no_number():
+    with pytest.raises(TypeError, match="`low` must hold numbers"):
+        Box(["1"], ["2"])
     with pytest.raises(TypeError, match="`low` must hold numbers"):
         Box(["a"], ["b"])
 
