@@ -10,10 +10,13 @@ Source: Thms K4, K5 (theory).
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
-from certbound.errors import EnclosureError
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.constants.bounds import constants_along
+from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.reach.cells import initial_cells
 from certbound.reach.contraction import bound_forcing, integrate_radius, jump_sizes
@@ -23,14 +26,20 @@ from certbound.reach.nominal import nominal_curve
 from certbound.reach.norms import Norm
 from certbound.reach.slopes import LocalSlopes
 from certbound.reach.tube import ReachTube
+from certbound.rigor.intervals import Interval
+from certbound.tubes.constants import Constants
+from certbound.tubes.tube import Tube
+from certbound.tubes.tuning import tune_tube
 
-__all__ = ["local_contraction_tube"]
+__all__ = ["local_constants", "local_contraction_tube", "local_tube", "radius_over_pieces"]
 
 Array = NDArray[np.float64]
 
 BLOCK = 16
 ITERATIONS = 12
 INFLATION = 1.03
+GUESSES = 12
+TUBE_INFLATION = 1.1
 
 
 def local_contraction_tube(
@@ -76,9 +85,7 @@ def local_contraction_tube(
             "the noise-free reach tube could not be proved on its first piece; use more cells of the initial set, "
             "a smaller disturbance, or check where the model is defined."
         )
-    return ReachTube(
-        curve=curve.until(proved), radius=radius, metric=metric, method="contraction (local rates)"
-    )
+    return ReachTube(curve=curve.until(proved), radius=radius, metric=metric, method="contraction (local rates)")
 
 
 class _March:
@@ -126,3 +133,74 @@ class _March:
             guess = np.where(radius < guess, guess, INFLATION * radius + 1e-12)
             slopes = self.slopes.bound(part, guess)
         return None
+
+
+def local_constants(problem: Problem, reach: ReachTube, extra: ArrayLike = 0.0, *, refine: int = 16) -> Constants:
+    """Constants per piece that hold on reach + {||y||_P <= extra}, in the metric of ``reach`` (Thm K4).
+
+    Parameters
+    ----------
+    problem : Problem
+    reach : ReachTube
+        Noise-free tube over the whole horizon.
+    extra : array_like, shape (K,) or ()
+        Room for the stochastic deviation on each piece.
+    refine : int
+        Sub-boxes per piece.
+
+    Raises
+    ------
+    ValueError, EnclosureError
+        If the Jacobian is unbounded or undefined there.
+    """
+    hull = reach.boxes(extra)
+    boxes = Interval(hull.lo.min(axis=0), hull.hi.max(axis=0))
+    curve = reach.curve
+    if curve.continuous:
+        times = np.append(curve.starts, curve.ends[-1])
+    else:
+        times, boxes = curve.starts, boxes[:-1]
+    return constants_along(problem, times, boxes, metric=reach.metric, refine=refine)
+
+
+def local_tube(
+    problem: Problem, reach: ReachTube, *, delta: float, method: str = "auto", objective: Any = "max"
+) -> tuple[Tube, Array]:
+    """A tube whose constants hold on reach + tube only, and its radius over each piece of ``reach`` (Thm K4).
+
+    Proves: P(||X_t - x_t||_P <= radius over the piece of t, for all t) >= 1 - delta for every associated trajectory
+    x in ``reach``. A guess r is accepted when the tube computed from the constants of reach + r is nowhere larger.
+
+    Raises
+    ------
+    InfeasibleError
+        If no guess confirmed itself.
+    ValueError
+        If the method's level is one time: such a bound must not be combined with local constants (7.7).
+    """
+    guess = np.zeros(reach.curve.pieces)
+    for _ in range(GUESSES):
+        try:
+            constants = local_constants(problem, reach, guess)
+        except (ValueError, EnclosureError) as error:
+            raise InfeasibleError(
+                f"no local tube at delta = {delta:g}: with {np.max(guess):.3g} of room, {error} "
+                "Use more cells, less noise, or a larger delta."
+            ) from error
+        tube = tune_tube(constants, horizon=reach.end, delta=delta, method=method, objective=objective)
+        if tube.level != "trajectory":
+            raise ValueError(f"`method` must be of trajectory level with local constants, got {method!r}.")
+        radius = radius_over_pieces(tube, reach.curve)
+        if np.all(radius <= guess):
+            return tube, radius
+        guess = np.maximum(guess, TUBE_INFLATION * radius)
+    raise InfeasibleError(
+        f"no local tube at delta = {delta:g}: no radius up to {np.max(guess):.3g} confirmed itself; "
+        "use more cells, less noise, or a larger delta."
+    )
+
+
+def radius_over_pieces(tube: Tube, curve: Curve) -> Array:
+    """Upper bounds of a tube's radius over each piece of a curve, shape (K,); 0 at step 0 of discrete time."""
+    radius = np.asarray(tube.bound(curve.starts, curve.ends), dtype=float)
+    return radius if curve.continuous else np.concatenate([[0.0], radius[1:]])

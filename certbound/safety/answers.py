@@ -1,0 +1,111 @@
+"""What an engine answers, before a verdict is made of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from flint import arb
+from numpy.typing import NDArray
+
+from certbound.reach.norms import Norm
+from certbound.reach.tube import ReachTube
+from certbound.rigor.balls import lower, precision
+from certbound.tubes.constants import Constants
+
+__all__ = ["Deviation", "EngineAnswer", "is_at_most", "settled"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Deviation:
+    """Upper bounds on the stochastic deviation S = X - x at the target probability, piece by piece.
+
+    Parameters
+    ----------
+    times : ndarray, shape (K + 1,)
+        Piece k is [times[k], times[k + 1]] with both ends; in discrete time the steps k and k + 1.
+    radius : ndarray, shape (K,)
+        Of the Euclidean size of S.
+    extent : ndarray, shape (K, n)
+        Of |S_i| for every state.
+    """
+
+    times: Array
+    radius: Array
+    extent: Array
+
+    @classmethod
+    def of_ball(cls, times: Array, radius: Array, norm: Norm) -> Deviation:
+        """From radii in the norm of a metric."""
+        eye = np.eye(norm.dimension)
+        size = np.nextafter(radius * norm.section(eye), np.inf)
+        extent = np.nextafter(radius[:, None] * norm.dual(eye), np.inf)
+        return cls(times=times, radius=size, extent=extent)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EngineAnswer:
+    """The best that one engine could prove.
+
+    Parameters
+    ----------
+    log10_delta : float
+        log10 of an upper bound of the probability that a constraint is broken: finite, at most 0 (0: nothing).
+    margin : float or None
+        Least Euclidean room left at the target probability, negative when it does not fit; None if unknown.
+    time, constraint
+        Where that is, and for which constraint (None if nothing could be evaluated).
+    reason : str
+        One or two sentences for humans: what was proved, or what stood in the way and what would work.
+    tube : Any
+        The stochastic tube at the target probability, if the engine has one.
+    reach : ReachTube or None
+        Noise-free reach tube.
+    constants : Constants or None
+        What the tube rests on.
+    deviation : Deviation or None
+        The stochastic deviation as plain bounds.
+    applicable : bool
+        False: the engine does not fit the problem, ``reason`` says why.
+    method : str
+        Name for the verdict.
+    certified : bool
+        False where the probability is not of trajectory level (one-time bounds): such an answer is never SAFE.
+    assumption : str
+        What the answer rests on besides the problem (stated constants); empty when nothing.
+    details : Any
+        Whatever a certificate needs of the engine.
+    """
+
+    log10_delta: float = 0.0
+    margin: float | None = None
+    time: float | None = None
+    constraint: str | None = None
+    reason: str = ""
+    tube: Any = None
+    reach: ReachTube | None = None
+    constants: Constants | None = None
+    deviation: Deviation | None = None
+    applicable: bool = True
+    method: str = ""
+    certified: bool = True
+    assumption: str = ""
+    details: Any = None
+
+
+def is_at_most(log10_delta: float, target: float) -> bool:
+    """Whether 10**log10_delta <= target is proved, in ball arithmetic."""
+    with precision():
+        return log10_delta <= lower(arb(target).log() / arb(10).log())
+
+
+def settled(log10_delta: float, target: float) -> float:
+    """``log10_delta`` such that comparing floats, ``<= math.log10(target)``, says what `is_at_most` says."""
+    value = min(max(log10_delta, -1e12), 0.0) + 0.0
+    if is_at_most(value, target):
+        return min(value, math.log10(target))
+    return max(value, math.nextafter(math.log10(target), math.inf))

@@ -1,0 +1,130 @@
+"""Noise-free trajectories that provably leave the safe set.
+
+Sampled trajectories propose a start, a constant disturbance and a time; the trajectory is then enclosed (Thm K5 with
+local rates, from the start alone), and the violation is proved for every point of the enclosure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.errors import CertboundError
+from certbound.problem.distances import clearance
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Box, GaussianStart, Inside, Outside
+from certbound.reach.clearance import constraint_clearance
+from certbound.reach.flow import Flow
+from certbound.reach.local import local_contraction_tube
+from certbound.reach.norms import Norm
+from certbound.reach.tube import ReachTube
+
+__all__ = ["Violation", "find_violation"]
+
+Array = NDArray[np.float64]
+
+PATHS = 64
+STEPS = 400
+ATTEMPTS = 3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Violation:
+    """A proved violation: the enclosed trajectory, the constraint, the time and the depth (Euclidean)."""
+
+    reach: ReachTube
+    constraint: Inside
+    time: float
+    depth: float
+    start: Array
+
+
+def find_violation(problem: Problem) -> Violation | None:
+    """A noise-free trajectory from the initial set that provably breaks a constraint; None if none was found.
+
+    Leaving the model's domain is not counted: there the model says nothing.
+
+    Proves: the trajectory from ``start`` under one constant disturbance lies in ``reach``, and every point of
+    ``reach`` at ``time`` breaks ``constraint``.
+    """
+    flow = Flow(problem)
+    rng = np.random.default_rng(0)
+    starts, signals = _candidates(problem, flow, rng)
+    times, paths = _follow(flow, starts, signals)
+    deepest: dict[int, tuple[float, float, Inside]] = {}
+    for constraint in problem.safe:
+        first, last = (0.0, flow.horizon) if constraint.during is None else constraint.during
+        for k, t in enumerate(times):
+            if first <= t <= last:
+                usable = np.all(np.isfinite(paths[:, k]), axis=-1)
+                room = clearance(constraint, np.where(usable[:, None], paths[:, k], 0.0), None, float(t))
+                for path in np.flatnonzero(usable & (room < 0)).tolist():
+                    if room[path] < deepest.get(path, (0.0,))[0]:
+                        deepest[path] = (float(room[path]), float(t), constraint)
+    order = sorted(deepest, key=lambda path: deepest[path][0])
+    for path in order[:ATTEMPTS]:
+        depth, time, constraint = deepest[path]
+        violation = _proved(problem, starts[path], signals[path], time, constraint, -depth)
+        if violation is not None:
+            return violation
+    return None
+
+
+def _candidates(problem: Problem, flow: Flow, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Starts and constant disturbances: the middles first, then corners, then random ones."""
+    start, n = problem.initial, flow.dimension
+    if isinstance(start, GaussianStart):
+        starts = np.tile(np.asarray(start.mean), (PATHS, 1))
+    else:
+        starts = np.asarray(start.sample(rng, PATHS))
+        if isinstance(start, Box):
+            starts[1 : PATHS // 2] = np.where(rng.random((PATHS // 2 - 1, n)) < 0.5, start.low, start.high)
+            starts[0] = np.clip(0.5 * start.low + 0.5 * start.high, start.low, start.high)
+        else:
+            starts[0] = np.asarray(start.center)
+    box = flow.disturbance
+    signals = rng.uniform(box.lo, box.hi, (PATHS, box.shape[0]))
+    signals[1::2] = np.where(rng.random(signals[1::2].shape) < 0.5, box.lo, box.hi)
+    signals[0] = flow.centre_disturbance
+    return starts, signals
+
+
+def _follow(flow: Flow, starts: Array, signals: Array) -> tuple[Array, Array]:
+    """Times (K + 1,) and noise-free paths (paths, K + 1, n) in floating point."""
+    steps = STEPS if flow.continuous else int(flow.horizon)
+    times = np.linspace(0.0, flow.horizon, steps + 1)
+    rows = flow.plan_rows(times[:-1] + (0.25 * (times[1] - times[0]) if flow.continuous else 0.0))
+    paths = np.empty((len(starts), steps + 1, flow.dimension))
+    paths[:, 0] = x = starts
+    with np.errstate(all="ignore"):
+        for k in range(steps):
+            t, h = float(times[k]), float(times[k + 1] - times[k])
+            if flow.continuous:
+                k1 = flow.value(t, x, rows[k], signals)
+                k2 = flow.value(t + h / 2, x + h / 2 * k1, rows[k], signals)
+                k3 = flow.value(t + h / 2, x + h / 2 * k2, rows[k], signals)
+                k4 = flow.value(t + h, x + h * k3, rows[k], signals)
+                x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            else:
+                x = flow.value(t, x, rows[k], signals)
+            paths[:, k + 1] = x
+    return times, paths
+
+
+def _proved(
+    problem: Problem, start: Array, signal: Array, time: float, constraint: Inside, depth: float
+) -> Violation | None:
+    """The violation, if the enclosed trajectory shows it."""
+    try:
+        flow = Flow(problem.replace(initial=start), only=signal)
+        reach = local_contraction_tube(flow)
+    except (CertboundError, ValueError):
+        return None
+    if reach.end < time:
+        return None
+    opposite = Inside if isinstance(constraint, Outside) else Outside
+    room = constraint_clearance(reach, opposite(constraint.region, during=(time, time)), Norm(flow.dimension)).radius
+    proved = np.any(np.isfinite(room) & (room > 0))
+    return Violation(reach=reach, constraint=constraint, time=time, depth=depth, start=start) if proved else None

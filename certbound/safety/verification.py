@@ -1,0 +1,197 @@
+"""``verify_safety``: try the engines that fit, keep the smallest certified probability, answer with a verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+from certbound.problem.problem import Problem
+from certbound.reach.tube import ReachTube
+from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, settled
+from certbound.safety.contraction import constants_engine
+from certbound.safety.falsification import Violation, find_violation
+from certbound.safety.linear import linear_engine
+from certbound.tubes.constants import Constants
+from certbound.tubes.tuning import METHODS
+
+__all__ = ["EngineAnswer", "Verdict", "verify_safety"]
+
+
+def _constants(problem: Problem, **options: Any) -> EngineAnswer:
+    return constants_engine(problem, **options)
+
+
+def _linear(problem: Problem, **options: Any) -> EngineAnswer:
+    return linear_engine(problem, **options)
+
+
+_ENGINES: dict[str, Callable[..., EngineAnswer]] = {"linear": _linear, "constants": _constants}
+"""Engines in the order in which they are tried: name to function(problem, method=, cells=, constants=)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Verdict:
+    """What is proved about a problem.
+
+    Parameters
+    ----------
+    status : {"SAFE", "UNSAFE_NOMINAL", "UNKNOWN"}
+        SAFE: the probability of breaking a constraint within the horizon is at most delta, proved.
+        UNSAFE_NOMINAL: a noise-free trajectory from the initial set provably leaves the safe set.
+    log10_delta : float
+        log10 of the smallest bound on that probability that was proved: finite, at most 0 (0: nothing was). SAFE
+        exactly when it is at most log10 of the problem's delta.
+    margin : float or None
+        Least Euclidean distance to breaking a constraint that the tube at delta leaves; negative: it does not fit.
+    time, constraint
+        Where the margin is least, and for which constraint.
+    reason : str
+        Why, in words; assumptions (stated constants) are named here.
+    method : str
+        What proved it.
+    tube, reach, constants
+        The stochastic tube at delta, the noise-free reach tube, the constants (each None where there is none).
+    deviation : Deviation or None
+        The stochastic deviation at delta as plain bounds per piece.
+    certificate : Any
+        Data of the proof, for writing it to a file; None where the engine writes none.
+    answers : mapping
+        What every engine answered, by name.
+    """
+
+    status: str
+    log10_delta: float
+    margin: float | None
+    time: float | None
+    constraint: str | None
+    reason: str
+    method: str
+    tube: Any = None
+    reach: ReachTube | None = None
+    constants: Constants | None = None
+    deviation: Deviation | None = None
+    certificate: Any = None
+    answers: Mapping[str, EngineAnswer] = field(default_factory=dict, repr=False)
+
+    def __bool__(self) -> bool:
+        raise TypeError("a Verdict is neither true nor false; compare `.status` with 'SAFE'.")
+
+
+def verify_safety(
+    problem: Problem, method: str = "auto", cells: int | None = None, *, constants: Constants | None = None
+) -> Verdict:
+    """Prove that a problem's constraints are broken with probability at most delta, or say why not.
+
+    Proves, for SAFE: P(some constraint is broken at some time of its window) <= 10**log10_delta <= delta, for every
+    start in the initial set and every non-anticipating disturbance; leaving the model's domain counts as breaking.
+
+    Parameters
+    ----------
+    problem : Problem
+        With a plan if its system has inputs.
+    method : str
+        "auto" runs every engine that fits and keeps the smallest probability; "constants" or "linear" runs one; a
+        tube method such as "kummer" or "thm3" runs the constants engine with that tube.
+    cells : int, optional
+        Parts along each side of the initial set.
+    constants : Constants, optional
+        Stated constants: used instead of certified ones by the constants engine, and named in ``reason``.
+
+    Returns
+    -------
+    Verdict
+
+    Raises
+    ------
+    ValueError
+        If the system has inputs and no plan, the method is unknown, or the horizon outlives the nominal trajectory.
+
+    Source: Thms K2, K4, K5, K7 of theory.
+
+    Examples
+    --------
+    >>> import numpy as np, certbound as cb
+    >>> system = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=0.05 * np.eye(2))
+    >>> problem = cb.Problem(system, initial=[0.2, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=2)
+    >>> verify_safety(problem, method="constants").status
+    'SAFE'
+    """
+    names = _chosen(method)
+    violation = find_violation(problem)
+    if violation is not None:
+        return _unsafe(problem, violation)
+    answers = {}
+    for name in names:
+        inner = "auto" if method in _ENGINES else method
+        answers[name] = _ENGINES[name](problem, method=inner, cells=cells, constants=constants)
+    return _verdict(problem, answers)
+
+
+def _chosen(method: str) -> tuple[str, ...]:
+    if method == "auto":
+        return tuple(_ENGINES)
+    if method in _ENGINES:
+        return (method,)
+    if method in METHODS:
+        return ("constants",)
+    known = ", ".join(["auto", *_ENGINES, *(name for name in METHODS if name != "auto")])
+    raise ValueError(f"`method` must be one of {known}, got {method!r}.")
+
+
+def _verdict(problem: Problem, answers: Mapping[str, EngineAnswer]) -> Verdict:
+    """The best answer: certified before not, then the smaller probability, then the larger margin."""
+
+    def rank(name: str) -> tuple[bool, bool, float, float]:
+        answer = answers[name]
+        margin = -math.inf if answer.margin is None else answer.margin
+        return (not answer.applicable, not answer.certified, answer.log10_delta, -margin)
+
+    name = min(answers, key=rank)
+    best = answers[name]
+    level = settled(best.log10_delta, problem.delta)
+    safe = best.certified and best.applicable and is_at_most(level, problem.delta)
+    reason = best.reason
+    if not best.certified:
+        reason = (
+            f"{best.method} bounds the deviation at one time, not along the whole trajectory: it says that the "
+            f"nominal {'fits' if level <= math.log10(problem.delta) else 'does not fit'}, and proves no more. {reason}"
+        )
+        level = 0.0
+    if best.assumption:
+        reason = f"{reason} Assumption: {best.assumption}."
+    others = [f"{other}: {answers[other].reason}" for other in answers if other != name and not safe]
+    return Verdict(
+        status="SAFE" if safe else "UNKNOWN",
+        log10_delta=level,
+        margin=best.margin,
+        time=best.time,
+        constraint=best.constraint,
+        reason=" ".join([reason, *others]).strip(),
+        method=best.method or name,
+        tube=best.tube,
+        reach=best.reach,
+        constants=best.constants,
+        deviation=best.deviation,
+        answers=MappingProxyType(dict(answers)),
+    )
+
+
+def _unsafe(problem: Problem, violation: Violation) -> Verdict:
+    when = f"t = {violation.time:.4g}" if problem.system.time == "continuous" else f"step {violation.time:g}"
+    start = ", ".join(f"{value:.4g}" for value in violation.start)
+    return Verdict(
+        status="UNSAFE_NOMINAL",
+        log10_delta=0.0,
+        margin=-violation.depth,
+        time=violation.time,
+        constraint=violation.constraint.label,
+        reason=(
+            f"without any noise the trajectory from ({start}) breaks '{violation.constraint.label}' at {when}, by "
+            f"{violation.depth:.3g} (proved by intervals)."
+        ),
+        method="noise-free trajectory",
+        reach=violation.reach,
+    )
