@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh, solve_continuous_lyapunov, solve_discrete_lyapunov
 
-from certbound.constants.blocks import Sector, transformed
+from certbound.constants.blocks import Sector, contraction_value, lmi_blocks, transformed
+from certbound.constants.jacobians import JacobianSet
 from certbound.constants.matrices import frozen
 
-__all__ = ["Center", "center_metric", "center_multipliers", "lyapunov_metric"]
+__all__ = ["Center", "center_metric", "center_multipliers", "lyapunov_metric", "reachable_value"]
 
 Array = NDArray[np.float64]
 
@@ -193,6 +194,18 @@ def center_multipliers(
     return _descend([work], P, [first], value, -np.inf, tolerance, max_steps, None)
 
 
+def reachable_value(metric: Array, jacobians: JacobianSet, *, continuous: bool) -> float:
+    """c or L^2 that a metric reaches on the set, in floating point (by vertices, or by its multipliers)."""
+    values = []
+    for block in lmi_blocks(jacobians):
+        if isinstance(block, Sector):
+            values.append(center_multipliers(metric, block, continuous=continuous).value)
+        else:
+            reached = contraction_value(metric, block[None], continuous=continuous)
+            values.append(reached if continuous else reached**2)
+    return max(values)
+
+
 def _first_multipliers(block: _Block, P: Array) -> Array:
     inner = block.H[:, block.n :].T @ P @ block.H[:, block.n :]
     size = np.linalg.norm(inner, 2) if block.k else 0.0
@@ -232,12 +245,12 @@ def _recenter(
 ) -> tuple[Array, list[Array], int]:
     """Damped Newton steps to the analytic centre of {F > 0, 0 < P < I} at a fixed value."""
     for step in range(1, min(budget, 30) + 1):
-        gradient, hessian = _derivatives(blocks, P, multipliers, value, pairs)
         try:
+            gradient, hessian = _derivatives(blocks, P, multipliers, value, pairs)
             direction = -cho_solve(cho_factor(hessian + 1e-14 * np.diag(np.diag(hessian))), gradient)
         except np.linalg.LinAlgError:
             return P, multipliers, step
-        decrement = float(np.sqrt(max(-gradient @ direction, 0.0)))
+        decrement = float(np.sqrt(max(-float(gradient @ direction), 0.0)))
         length = 1.0 if decrement < 0.25 else 1 / (1 + decrement)
         if decrement >= 0.25:  # a longer step where it stays feasible and descends
             length = _search(blocks, P, multipliers, value, pairs, direction, length, gradient)
@@ -266,8 +279,7 @@ def _barrier(blocks: Sequence[_Block], P: Array, multipliers: list[Array], value
     total = 0.0
     for matrix in (P, np.eye(len(P)) - P, *matrices):
         try:
-            diagonal: Array = np.diagonal(np.linalg.cholesky(matrix))
-            total -= 2 * float(np.sum(np.log(diagonal)))
+            total -= 2 * float(np.log(np.diagonal(np.linalg.cholesky(matrix))).sum())
         except np.linalg.LinAlgError:
             return float(np.inf)
     return total

@@ -17,8 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.constants.blocks import Sector, contraction_value, lmi_blocks
-from certbound.constants.centers import center_multipliers
+from certbound.constants.centers import reachable_value
 from certbound.constants.jacobians import JacobianSet
 from certbound.constants.lmi import ErosionProgram
 from certbound.errors import SolverError
@@ -298,18 +297,6 @@ def _smallest(function: Callable[[float], float], points: Sequence[float], resol
         best = min(known, key=lambda x: known[x])
         step /= 2
     return best
-
-
-def reachable_value(metric: Array, jacobians: JacobianSet, *, continuous: bool) -> float:
-    """c or L^2 that a metric reaches on the set, in floating point (by vertices, or by its multipliers)."""
-    values = []
-    for block in lmi_blocks(jacobians):
-        if isinstance(block, Sector):
-            values.append(center_multipliers(metric, block, continuous=continuous).value)
-        else:
-            reached = contraction_value(metric, block[None], continuous=continuous)
-            values.append(reached if continuous else reached**2)
-    return max(values)
 
 
 def noise_numbers(metric: Array, noise: Sequence[Array]) -> tuple[float, float]:

@@ -1,0 +1,394 @@
+"""Which metric to use: proposals by semidefinite programs, each certified before it is returned.
+
+``propose_metrics`` proposes, ``improve`` certifies the proposals of one model and keeps the best, ``bound_metrics``
+gives each constraint a metric of its own and ``split_delta`` shares delta between them (Sec. 6 of docs/theory.md,
+"one metric per constraint").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.constants.affine import AffineSet
+from certbound.constants.jacobians import JacobianSet, as_set
+from certbound.constants.models import Model, model_of
+from certbound.constants.proposals import Proposal, erosion_proposals, rate_proposals
+from certbound.constants.structure import affine_set
+from certbound.constants.targets import constraint_targets, rooms_of
+from certbound.constants.tightening import RadiusModel, Rooms, erosion_factors
+from certbound.errors import EnclosureError, InfeasibleError, SolverError
+from certbound.problem.derivative import jacobian
+from certbound.problem.problem import Problem
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem
+from certbound.problem.tape import Tape
+from certbound.problem.trace import compile_numpy
+from certbound.tubes.constants import Constants
+
+__all__ = ["bound_metrics", "improve", "propose_metrics", "split_delta"]
+
+Array = NDArray[np.float64]
+
+_GAIN = 1e-3
+"""Smallest decrease of c or L for which another metric than the identity is worth its name."""
+
+
+def propose_metrics(
+    source: Any,
+    *,
+    objective: str = "rate",
+    horizon: float | None = None,
+    delta: float | None = None,
+    directions: Sequence[ArrayLike] | None = None,
+    clearances: ArrayLike | None = None,
+    noise: Sequence[ArrayLike] | None = None,
+    continuous: bool | None = None,
+    gaussian: bool = False,
+    domain: Any = None,
+) -> list[Array]:
+    """Metrics worth certifying, the most promising first. Nothing about them is proved.
+
+    Parameters
+    ----------
+    source : Problem, ContinuousSystem, DiscreteSystem or python-control system; or a Jacobian set
+        A set (or vertices) needs ``continuous`` and, for erosion, ``noise``.
+    objective : "rate" or "erosion"
+        Small c or L; or small erosion along ``directions`` relative to ``clearances``.
+    horizon, delta : float, optional
+        For erosion; a problem's own when omitted.
+    directions : sequence of array_like, each (n,) or (n, r), optional
+        For erosion; a problem's constraints when omitted.
+    clearances : array_like, shape (len(directions),), optional
+        Room along each direction; ones when omitted.
+    noise : sequence of array_like, each (n, m), optional
+        Noise matrices at unit proxy; the system's own when omitted.
+    continuous, gaussian : bool
+        For a bare set: continuous time; Gaussian noise in discrete time.
+    domain : Box, optional
+        As for ``bound_constants``.
+
+    Returns
+    -------
+    list of ndarray, each (n, n)
+        Smallest eigenvalue 1: ||x||_2 <= ||x||_P.
+
+    Raises
+    ------
+    ValueError
+        For an unknown objective, or erosion without horizon, delta, directions or noise.
+    EnclosureError
+        If the Jacobian is unbounded or undefined on the domain.
+    SolverError
+        If no program could be solved.
+
+    Source: Sec. 6 and 7.17 of docs/theory.md.
+    """
+    check_objective(objective)
+    if isinstance(source, JacobianSet | np.ndarray | list | tuple):
+        if continuous is None:
+            raise ValueError("`continuous` must be given with a Jacobian set: True for a rate, False for a gain.")
+        members, matrices = as_set(source), [np.asarray(G, dtype=float) for G in noise or []]
+        targets = None
+    else:
+        model = model_of(source, domain, horizon)
+        members, matrices = model_set(model), _noise_matrices(model)
+        continuous, gaussian = model.continuous, _gaussian(model)
+        horizon, delta = _horizon(model, horizon), delta if delta is not None else _delta(model)
+        targets = None if objective == "rate" or directions is not None else _targets(model, horizon)
+    if objective == "rate":
+        return [p.metric for p in rate_proposals(members, continuous=continuous)]
+    _require(horizon, delta)
+    assert horizon is not None
+    assert delta is not None
+    if targets is None:
+        targets = _stated_targets(directions, clearances, members.dimension, horizon)
+    if not matrices:
+        raise ValueError('`objective="erosion"` needs `noise`: the noise matrices at unit proxy.')
+    radius = RadiusModel(
+        continuous=continuous, dimension=members.dimension, horizon=horizon, delta=delta, gaussian=gaussian
+    )
+    return [p.metric for p in erosion_proposals(members, targets, matrices, radius)]
+
+
+def improve(
+    model: Model, euclidean: Constants, *, objective: str, horizon: float | None = None, delta: float | None = None
+) -> Constants:
+    """The best certified constants of a model: in the identity metric, or in one that was proposed.
+
+    Parameters
+    ----------
+    model : Model
+    euclidean : Constants
+        Certified, in the identity metric.
+    objective : "rate" or "erosion"
+    horizon, delta : float, optional
+        For erosion; the problem's own when omitted.
+
+    Raises
+    ------
+    ValueError
+        For erosion without horizon, delta or constraints.
+    """
+    check_objective(objective)
+    if objective == "erosion":
+        horizon = _horizon(model, horizon)
+        delta = _delta(model) if delta is None else delta
+        _require(horizon, delta)
+        assert horizon is not None
+        assert delta is not None
+        return _least_erosion(model, euclidean, _targets(model, horizon), horizon, delta)
+    if model.dimension == 1:
+        return euclidean
+    found = [euclidean]
+    for proposal in _tried(lambda: rate_proposals(model_set(model), continuous=model.continuous)):
+        found += _certified(model, proposal)
+    best = min(found, key=_value)
+    return best if _value(best) < _value(euclidean) - _GAIN * max(1e-3, abs(_value(euclidean))) else euclidean
+
+
+def bound_metrics(
+    problem: Problem, *, horizon: float | None = None, delta: float | None = None, domain: Any = None
+) -> tuple[Constants, ...]:
+    """Certified constants in a metric of its own for each constraint of a problem.
+
+    Used together, each tube serves its constraint alone and delta is shared by the union bound: `split_delta`.
+
+    Parameters
+    ----------
+    problem : Problem
+    horizon, delta : float, optional
+        The problem's own when omitted; the metrics are tuned for equal shares of delta.
+    domain : Box, optional
+        As for ``bound_constants``.
+
+    Returns
+    -------
+    tuple of Constants
+        In the order of ``problem.constraints``.
+
+    Raises
+    ------
+    TypeError
+        If ``problem`` is no Problem.
+    As ``bound_constants``.
+
+    Source: "one metric per constraint", Sec. 4 and 6 of docs/theory.md.
+    """
+    from certbound.constants.bounds import bound_constants
+
+    if not isinstance(problem, Problem):
+        raise TypeError(f"`problem` must be a Problem, got {type(problem).__name__}.")
+    euclidean = bound_constants(problem, domain, metric="euclidean", horizon=horizon)
+    model = model_of(problem, domain, horizon)
+    span = float(problem.horizon) if horizon is None else float(horizon)
+    times, targets = constraint_targets(problem)
+    share = (problem.delta if delta is None else delta) / len(problem.constraints)
+    results = []
+    for index in range(len(problem.constraints)):
+        own = [target for target in targets if target.constraint == index]
+        if own:
+            results.append(_least_erosion(model, euclidean, _cut(rooms_of(times, own), span), span, share))
+        else:
+            results.append(euclidean)
+    return tuple(results)
+
+
+def split_delta(
+    problem: Problem, constants: Sequence[Constants], *, horizon: float | None = None, delta: float | None = None
+) -> Array:
+    """Shares of delta, one per constraint, that make the largest erosion over room as small as possible.
+
+    The erosion of a constraint is a decreasing function of log delta_j and the constraint on the shares is convex
+    in it, so that the optimum equalises the ratios where it can: one scalar bisection.
+
+    Parameters
+    ----------
+    problem : Problem
+    constants : sequence of Constants
+        One per constraint, as `bound_metrics` returns them.
+    horizon, delta : float, optional
+        The problem's own when omitted.
+
+    Returns
+    -------
+    ndarray, shape (len(problem.constraints),)
+        Positive, with sum at most delta.
+
+    Raises
+    ------
+    ValueError
+        If the number of constants is wrong.
+    """
+    if len(constants) != len(problem.constraints):
+        raise ValueError(f"`constants` must hold {len(problem.constraints)} records, got {len(constants)}.")
+    span = float(problem.horizon) if horizon is None else float(horizon)
+    total = float(problem.delta if delta is None else delta)
+    times, targets = constraint_targets(problem)
+    grid = np.log(total) + np.linspace(np.log(1e-3 / len(constants)), 0.0, 9)
+    ratios = []
+    for index, record in enumerate(constants):
+        own = [target for target in targets if target.constraint == index]
+        rooms = None if not own else _cut(rooms_of(times, own), span)
+        ratios.append(np.zeros(len(grid)) if rooms is None else _ratios(record, rooms, span, np.exp(grid)))
+    low, high = 0.0, float(max(curve[0] for curve in ratios))
+
+    def shares(level: float) -> Array:
+        # the smallest share at which each ratio falls to the level
+        return np.array([np.exp(np.interp(-level, -curve, grid)) for curve in ratios])
+
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (low, middle) if shares(middle).sum() <= total else (middle, high)
+    found = shares(high)
+    return np.asarray(found * (total * (1 - 1e-12) / found.sum()))
+
+
+def check_objective(objective: str) -> None:
+    """Refuse an objective that is neither "rate" nor "erosion"."""
+    if objective not in ("rate", "erosion"):
+        raise ValueError(f'`objective` must be "rate" or "erosion", got {objective!r}.')
+
+
+def model_set(model: Model) -> AffineSet:
+    """The affine set of all Jacobians of a model over its ranges."""
+    tape = jacobian(model.dynamics, model.state_slots)
+    return affine_set(tape, [model.ranges[slot] for slot in range(len(model.ranges))])
+
+
+def erosion_ratio(constants: Constants, rooms: Rooms, horizon: float, delta: float) -> float:
+    """Largest erosion over room of the best quick tube, in floating point."""
+    from certbound.tubes.tuning import tune_tube
+
+    metric = np.eye(constants.dimension) if constants.metric is None else constants.metric
+    room = (rooms.rooms / erosion_factors(metric, rooms.directions)[:, None]).min(axis=0)
+    if constants.continuous:  # both ends of a piece count
+        times = np.concatenate([[0.0], rooms.times])
+        values = np.minimum(room, np.concatenate([room[:1], room[:-1]]))
+    else:
+        steps = np.arange(1, int(horizon) + 1)
+        values = np.concatenate([[np.inf], room[np.searchsorted(rooms.times, steps)]])
+        times = np.arange(int(horizon) + 2.0)
+    tube = tune_tube(constants, horizon=horizon, delta=delta, objective=(times, values))
+    nodes = rooms.times
+    return float(np.max(np.asarray(tube.radius(nodes)) / room))
+
+
+def _least_erosion(model: Model, euclidean: Constants, targets: Rooms, horizon: float, delta: float) -> Constants:
+    """The certified constants whose tube erodes least, among the identity metric and the proposals."""
+    radius = RadiusModel(
+        continuous=model.continuous, dimension=model.dimension, horizon=horizon, delta=delta, gaussian=_gaussian(model)
+    )
+    found = [euclidean]
+    matrices = _noise_matrices(model)
+    if model.dimension > 1 and any(G.any() for G in matrices):
+        for proposal in _tried(lambda: erosion_proposals(model_set(model), targets, matrices, radius)):
+            found += _certified(model, proposal)
+    if len(found) == 1:
+        return euclidean
+    return min(found, key=lambda constants: erosion_ratio(constants, targets, horizon, delta))
+
+
+def _tried(proposals: Any) -> list[Proposal]:
+    """The proposals, or none where the Jacobian has no bounded affine set or every solver stalls."""
+    try:
+        found: list[Proposal] = proposals()
+    except (EnclosureError, SolverError):
+        return []
+    return found
+
+
+def _certified(model: Model, proposal: Proposal) -> list[Constants]:
+    from certbound.constants.bounds import certify
+
+    try:
+        return [certify(model, proposal.metric, status=proposal.status, tolerance=2e-3, budget=60_000)]
+    except (EnclosureError, InfeasibleError):
+        return []
+
+
+def _value(constants: Constants) -> float:
+    value = constants.rate if constants.gain is None else constants.gain
+    return float(np.max(np.asarray(value)))
+
+
+def _noise_matrices(model: Model) -> list[Array]:
+    """Noise matrices at unit proxy: the constant one, or samples of a state-dependent diffusion."""
+    system = model.system
+    if isinstance(system, DiscreteSystem):
+        values, vectors = np.linalg.eigh(np.asarray(system.noise.proxy, dtype=float))
+        return [np.asarray(system.noise_matrix @ (vectors * np.sqrt(np.maximum(values, 0.0))))]
+    assert isinstance(system, ContinuousSystem)
+    if not isinstance(system.diffusion, Tape):
+        return [np.asarray(system.diffusion, dtype=float)]
+    slots = model.dimension + 1
+    low = np.maximum(model.ranges.lo[:slots], -1e3)
+    high = np.minimum(model.ranges.hi[:slots], 1e3)
+    points = np.random.default_rng(0).uniform(low, high, (16, slots))
+    with np.errstate(all="ignore"):
+        values = np.broadcast_to(compile_numpy(system.diffusion)(*points.T), (16, *system.diffusion.shape))
+    return [np.asarray(G) for G in values if np.all(np.isfinite(G))]
+
+
+def _gaussian(model: Model) -> bool:
+    return not isinstance(model.system, DiscreteSystem) or bool(model.system.noise.gaussian)
+
+
+def _horizon(model: Model, horizon: float | None) -> float | None:
+    return float(model.problem.horizon) if horizon is None and model.problem is not None else horizon
+
+
+def _delta(model: Model) -> float | None:
+    return None if model.problem is None else float(model.problem.delta)
+
+
+def _require(horizon: float | None, delta: float | None) -> None:
+    for name, value in (("horizon", horizon), ("delta", delta)):
+        if value is None:
+            raise ValueError(f'`objective="erosion"` needs `{name}=`; give it, or pass a Problem.')
+    if delta is not None and not 0 < delta < 1:
+        raise ValueError(f"`delta` must lie in (0, 1), got {delta}.")
+    if horizon is not None and not 0 < horizon < np.inf:
+        raise ValueError(f"`horizon` must be positive and finite, got {horizon}.")
+
+
+def _targets(model: Model, horizon: float | None) -> Rooms:
+    if model.problem is None:
+        raise ValueError('`objective="erosion"` needs a Problem, whose constraints say along what to erode.')
+    _require(horizon, 0.5)
+    assert horizon is not None
+    times, targets = constraint_targets(model.problem)
+    return _cut(rooms_of(times, targets), horizon)
+
+
+def _cut(rooms: Rooms, horizon: float) -> Rooms:
+    """The same up to another horizon; beyond the last time the least room is asked."""
+    if horizon == rooms.times[-1]:
+        return rooms
+    least = np.min(rooms.rooms, axis=1, keepdims=True)
+    return Rooms(directions=rooms.directions, times=np.array([float(horizon)]), rooms=least)
+
+
+def _stated_targets(
+    directions: Sequence[ArrayLike] | None, clearances: ArrayLike | None, dimension: int, horizon: float
+) -> Rooms:
+    if not directions:
+        raise ValueError('`objective="erosion"` needs `directions=`, at least one.')
+    normals = []
+    for direction in directions:
+        a = np.asarray(direction, dtype=float)
+        if a.ndim not in (1, 2) or len(a) != dimension or not np.all(np.isfinite(a)) or not a.any():
+            raise ValueError(f"`directions` must be finite, not zero, of {dimension} entries, got {direction!r}.")
+        normals.append(a.reshape(dimension, -1))
+    room = np.ones(len(normals)) if clearances is None else np.asarray(clearances, dtype=float)
+    if room.shape != (len(normals),) or not np.all(room > 0):
+        raise ValueError(f"`clearances` must hold {len(normals)} positive numbers, got {clearances!r}.")
+    return Rooms(directions=tuple(normals), times=np.array([horizon]), rooms=room[:, None])
+
+
+def _ratios(constants: Constants, rooms: Rooms, horizon: float, deltas: Array) -> Array:
+    """Erosion over room at several levels, made non-increasing."""
+    values = [erosion_ratio(constants, rooms, horizon, float(delta)) for delta in deltas]
+    return np.minimum.accumulate(np.array(values))
