@@ -10,6 +10,7 @@ generated, never one read from disk.
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import os
 import stat
@@ -103,7 +104,7 @@ def _fingerprint() -> str:
 
 
 def load_kernel(source: str) -> Callable[..., Any]:
-    """The function ``run`` of a generated module, compiled on first use and cached.
+    """The function ``run`` of a generated module, compiled or loaded from the cache.
 
     Parameters
     ----------
@@ -116,23 +117,54 @@ def load_kernel(source: str) -> Callable[..., Any]:
         if digest not in _LOADED:
             folder = cache_directory()
             text = source.replace("@CACHE@", str(folder is not None))
-            name = f"<kernel {digest}>"
-            if folder is not None:
-                name = str(_store(folder / f"kernel_{digest}.py", text.encode()))
             module = ModuleType(f"certbound_kernel_{digest}")
             sys.modules[module.__name__] = module  # numba looks it up when it loads the compiled form
+            path = None if folder is None else folder / f"kernel_{digest}.py"
+            if path is not None:
+                _store(path, text.encode())
+                _drop_damaged(path)
             # The text was written by this package a moment ago, from a validated tape.
-            exec(compile(text, name, "exec"), module.__dict__)  # noqa: S102
+            exec(compile(text, str(path or f"<kernel {digest}>"), "exec"), module.__dict__)  # noqa: S102
+            if path is not None:
+                _seal(path)
             _LOADED[digest] = module.run
         return _LOADED[digest]
 
 
-def _store(path: Path, content: bytes) -> Path:
+def _store(path: Path, content: bytes) -> None:
     """Keep the source beside its compiled form (numba compares time and size); drop the oldest ones."""
     if not path.exists() or path.read_bytes() != content:
         write_atomically(path, content)
         sources = sorted(path.parent.glob("kernel_*.py"), key=lambda file: file.stat().st_mtime)
         for old in sources[:-_KEPT]:
-            for file in [old, *(old.parent / "__pycache__").glob(f"{old.stem}.*")]:
+            for file in [old, _manifest(old), *_compiled(old)]:
                 file.unlink(missing_ok=True)
-    return path
+
+
+def _manifest(path: Path) -> Path:
+    return path.with_suffix(".json")
+
+
+def _compiled(path: Path) -> list[Path]:
+    return sorted((path.parent / "__pycache__").glob(f"{path.stem}.*"))
+
+
+def _hashes(path: Path) -> dict[str, str]:
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in _compiled(path)}
+
+
+def _drop_damaged(path: Path) -> None:
+    """Delete compiled files that are not those which were sealed (half-written, say): they are made anew."""
+    try:
+        sealed = json.loads(_manifest(path).read_bytes())
+    except (OSError, ValueError):
+        sealed = None
+    if sealed != _hashes(path):
+        for file in _compiled(path):
+            file.unlink(missing_ok=True)
+
+
+def _seal(path: Path) -> None:
+    content = json.dumps(_hashes(path), sort_keys=True).encode()
+    if not _manifest(path).exists() or _manifest(path).read_bytes() != content:
+        write_atomically(_manifest(path), content)

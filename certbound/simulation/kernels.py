@@ -22,6 +22,7 @@ from certbound.simulation.stepping import StepModel
 from certbound.simulation.tasks import LOWEST, Task, task_source
 
 __all__ = [
+    "SIGNATURE",
     "indent",
     "kernel_source",
     "load_lines",
@@ -61,12 +62,20 @@ def bin_of(value, density, bins):
 
 '''
 
-_RUN = """
-@njit(nogil=True, cache=@CACHE@, error_model="numpy")
+SIGNATURE = """
+@njit(
+    "int64(uint64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], int64[:, ::1], "
+    "float64[:, ::1], float64[::1], int64[::1], float64[::1], int64, "
+    "int64[:, ::1], int64[:, :, :, ::1], float64[:, :, ::1], float64[::1])",
+    nogil=True, cache=@CACHE@, error_model="numpy",
+)
 def run(
     stream, starts, signals, inputs, moving, windows, nominal, profile, marks, p, steps,
     counts, marginals, out, notes,
 ):
+"""
+
+_LOCALS = """\
     noise = np.empty({size})
     used = {size}
     done = 0
@@ -88,7 +97,7 @@ def kernel_source(model: StepModel, task: Task) -> tuple[str, Array]:
     path = [*start, "for k in range(steps):", *indent(loop), *finish]
     body = ["for path in range(starts.shape[0]):", *indent(path), "return done"]
     size = str(max(_BUFFER, model.noise_count))
-    text = head + _RUN.replace("{size}", size) + "\n".join(indent(body)) + "\n"
+    text = head + SIGNATURE + _LOCALS.replace("{size}", size) + "\n".join(indent(body)) + "\n"
     return text, np.array([*p.values, 0.0])
 
 

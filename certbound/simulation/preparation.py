@@ -18,6 +18,7 @@ __all__ = ["FixedStart", "Setting", "nominal_path", "prepare"]
 Array = NDArray[np.float64]
 
 _DEFAULT_STEPS = 1000
+_LONGEST_NOMINAL = 20_000  # steps; longer paths are advanced by the kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +54,8 @@ class Setting:
 
     @property
     def shared_nominal(self) -> bool:
-        """Whether all paths have the same noise-free path."""
-        return self.fixed is not None and not self.model.own_disturbance
+        """Whether all paths use one table of the noise-free path."""
+        return self.fixed is not None and not self.model.own_disturbance and self.steps <= _LONGEST_NOMINAL
 
     def work(self, kind: type[Work] = Work, **fields: Any) -> Work:
         """A piece of work on this setting; ``fields`` are those that differ from task to task."""
@@ -96,7 +97,7 @@ def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = 
     if count > fit:
         raise ValueError(
             f"`steps` must be at most {fit} for this problem, got {count}: its tables over time would take "
-            f"more than {MEMORY_LIMIT // 2**20} MiB."
+            f"more than {MEMORY_LIMIT // 2**20} MiB; take a longer step."
         )
     times = np.linspace(0.0, float(problem.horizon), count + 1)
     start, fixed = _start(problem, scenario)

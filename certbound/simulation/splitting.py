@@ -23,7 +23,7 @@ from certbound.simulation.blocks import MEMORY_LIMIT, Tally, Work, check_count, 
 from certbound.simulation.checkpoint import stored_entropy
 from certbound.simulation.executors import Progress, run_work
 from certbound.simulation.expressions import Parameters
-from certbound.simulation.kernels import indent, load_lines, module_head, nominal_lines, step_lines
+from certbound.simulation.kernels import SIGNATURE, indent, load_lines, module_head, nominal_lines, step_lines
 from certbound.simulation.preparation import nominal_path, prepare
 from certbound.simulation.score import score_source
 from certbound.simulation.statistics import bound_binomial, check_confidence
@@ -33,7 +33,7 @@ __all__ = ["RareExits", "simulate_rare_exits"]
 
 Array = NDArray[np.float64]
 
-_PARTICLES = 1000
+_PARTICLES = 500
 _DISCARDED = 0.1
 
 
@@ -83,7 +83,7 @@ class RareExits:
 def simulate_rare_exits(
     problem: Any,
     *,
-    paths: int = 100 * _PARTICLES,
+    paths: int = 200 * _PARTICLES,
     particles: int = _PARTICLES,
     rng: np.random.Generator | int | None = None,
     steps: int | None = None,
@@ -212,12 +212,7 @@ def follow(
     done = 0
 """
 
-_RUN = """
-@njit(nogil=True, cache=@CACHE@, error_model="numpy")
-def run(
-    stream, starts, signals, inputs, moving, windows, nominal, profile, marks, p, steps,
-    counts, marginals, out, notes,
-):
+_REPLICA = """\
     count, dimension = starts.shape
     noise = np.empty({size})
     place = np.full(1, {size})
@@ -306,7 +301,7 @@ def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tupl
     body = [*load, *begin, *out, "for k in range(first, steps):", *indent(loop), "place[0] = used", "return done"]
     size = str(max(512, model.noise_count))
     fields = {"{size}": size, "{own}": str(own), "{frees}": "count" if own else "0", "{discarded}": str(_DISCARDED)}
-    run = _RUN
+    run = SIGNATURE + _REPLICA
     for name, value in fields.items():
         run = run.replace(name, value)
     return head + _FOLLOW + "\n".join(indent(body)) + "\n" + run, np.array([*p.values, 0.0])
