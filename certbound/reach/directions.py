@@ -144,10 +144,7 @@ def _outside_round(region: Ball | Ellipsoid, label: str, curve: NominalPieces) -
     centre = _centre(region, curve)
     coordinates = list(range(curve.controls.shape[2]) if region.coordinates is None else region.coordinates)
     offset = curve.controls.mean(axis=1)[:, coordinates] - centre.mid
-    if isinstance(region, Ellipsoid):
-        normal = np.linalg.solve(region.shape, offset.T).T
-    else:
-        normal = offset
+    normal = np.linalg.solve(region.shape, offset.T).T if isinstance(region, Ellipsoid) else offset
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = np.where(length > 0, normal / np.maximum(length, 1e-300), np.eye(len(coordinates))[0])
     direction = Interval.point(normal)

@@ -42,7 +42,7 @@ def _ratio_down(level: Array, variance_hi: Array) -> Array:
     sd = np.sqrt(np.maximum(variance_hi, 0.0)) * _ROUND
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         value = level / sd
-    value = np.where(sd > 0, value - np.abs(value) * 4e-16, np.where(level >= 0, np.inf, -np.inf))
+        value = np.where(sd > 0, value - np.abs(value) * 4e-16, np.where(level >= 0, np.inf, -np.inf))
     return np.where(level == np.inf, np.inf, value)
 
 
@@ -51,7 +51,7 @@ def _ratio_up(level: Array, variance_lo: Array) -> Array:
     sd = np.sqrt(np.maximum(variance_lo, 0.0)) / _ROUND
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         value = level / sd
-    value = np.where(sd > 0, value + np.abs(value) * 4e-16, np.inf)
+        value = np.where(sd > 0, value + np.abs(value) * 4e-16, np.inf)
     return np.where(level == np.inf, np.inf, value)
 
 
@@ -91,6 +91,10 @@ class StepEvents:
         nodes = _numbers(len(rows))
         _, high = self.response.variance(rows[None], nodes)
         return np.asarray(np.sqrt(np.maximum(high[0], 0.0)))
+
+    def profile(self, rows: Array) -> Array:
+        """Shape of levels along ``rows``: the standard deviation."""
+        return self.standard_deviation(rows)
 
     def log_exceedance(self, rows: Array, levels: Array) -> float:
         """Upper bound of log P(exists t: rows[t] . Z_t > levels[t])."""
@@ -194,6 +198,15 @@ class WindowEvents:
         nodes = _numbers(self.response.pieces)
         ends = [self.response.variance(rows[None], nodes + shift)[1][0] for shift in (0, 1)]
         return np.asarray(np.sqrt(np.maximum(np.maximum(*ends), 0.0)))
+
+    def profile(self, rows: Array) -> Array:
+        """Shape of levels along ``rows``: the standard deviation, but in the first fifth at least that at its end.
+
+        Levels must not vanish with the standard deviation at t = 0: a rough process leaves such a band at once.
+        """
+        deviation = self.standard_deviation(rows)
+        early = max(1, len(rows) // 5)
+        return np.maximum(deviation, np.where(np.arange(len(rows)) < early, deviation[early - 1], 0.0))
 
     @cached_property
     def coordinate_levels(self) -> Array:

@@ -161,7 +161,6 @@ class LinearRun:
 
     def levels(self, log_nonlinear: float) -> tuple[Array, list[Events]]:
         """Levels of |Z| along the inner rows that together cost exp(log_nonlinear): (B, N, D)."""
-        engine = self.engine
         cells, pieces, count = self.rows.shape[:3]
         result = np.zeros((cells, pieces, count))
         share = log_nonlinear + np.log(0.9 / (2 * max(count, 1)))
@@ -171,13 +170,9 @@ class LinearRun:
             found.append(events)
             for d in range(count):
                 rows = self.rows[cell, :, d]
-                deviation = events.standard_deviation(rows)
-                if deviation.max() <= 0:
+                shape = events.profile(rows)
+                if shape.max() <= 0:
                     continue
-                shape = deviation
-                if engine.continuous:
-                    early = max(1, pieces // 5)
-                    shape = np.maximum(deviation, np.where(np.arange(pieces) < early, deviation[early - 1], 0.0))
                 result[cell, :, d] = level_scale(events, rows, shape, share) * shape
         return result, found
 
@@ -211,7 +206,7 @@ class LinearRun:
         target = np.log(self.engine.problem.delta / max(len(asked), 1))
         left = np.empty_like(rooms)
         for index, requirement in enumerate(asked):
-            shape = events.standard_deviation(requirement.rows)
+            shape = events.profile(requirement.rows)
             factor = level_scale(events, requirement.rows, shape, target) if shape.max() > 0 else 0.0
             left[:, index] = rooms[:, index] - factor * shape
         tightest = np.unravel_index(int(np.argmin(left)), left.shape) if left.size else (0, 0)

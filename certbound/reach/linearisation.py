@@ -227,7 +227,8 @@ class Linearisation:
             half = float(np.nextafter(h.hi / 2, np.inf))
             middle_slope = Interval.point(flat(slope)) + (h * 0.5) * flat(drift) + self._slope_slack
             slip = 8e-16 * float(self.problem.horizon)
-            time = Interval.around(np.tile((self.times[:-1] + self.times[1:]) / 2, cells), np.full(cells * pieces, slip))
+            middles = np.tile((self.times[:-1] + self.times[1:]) / 2, cells)
+            time = Interval.around(middles, np.full(cells * pieces, slip))
             span = Interval(time.lo - half - slip, time.hi + half + slip)
         else:
             zero = np.zeros((cells * pieces, n))

@@ -119,7 +119,8 @@ class Remainder:
         fixed = [output for output in range(n * n) if not moving[output]]
         low, high = np.zeros(n * n), np.zeros(n * n)
         if fixed:
-            values = enclose(_select(first, fixed), [Interval.point(np.zeros(1))] * len(tape.inputs), undefined="infinite")
+            nowhere = [Interval.point(np.zeros(1))] * len(tape.inputs)
+            values = enclose(_select(first, fixed), nowhere, undefined="infinite")
             low[fixed], high[fixed] = values.broadcast_to((1, len(fixed))).lo[0], values.hi.reshape(-1)
         varying = _select(first, entries)
         second = jacobian(varying, [0, *states])
@@ -275,7 +276,7 @@ class Remainder:
             slots = [known[0], *state.T, *known[1:], *(np.full(m, d) for d in frame.disturbance_middle)]
             with np.errstate(all="ignore"):
                 exact = np.asarray(function(*slots))
-            return exact - frame.middle_velocity.mid - np.einsum("mij,mj->mi", slope, shift)
+            return np.asarray(exact - frame.middle_velocity.mid - np.einsum("mij,mj->mi", slope, shift))
 
         base = value(np.zeros((m, count)))
         total_lo, total_hi = base.copy(), base.copy()

@@ -136,6 +136,12 @@ class LinearAnswer:
             return None
         return _reach_tube(self.run, bounds, tube.log10_delta, _levels_of_coordinates(self.run, self.shown)[0])
 
+    @cached_property
+    def noise_free_reach(self) -> ReachTube | None:
+        """Sets that contain every associated trajectory (its remainder lies in the noisy one's set)."""
+        bounds = self.shown.bounds
+        return None if bounds is None else _reach_tube(self.run, bounds, -np.inf, None)
+
 
 def refusal(problem: Problem) -> str | None:
     """Why the engine does not apply to ``problem``; None where it does."""
@@ -220,7 +226,7 @@ def _levels_of_coordinates(run: LinearRun, outcome: Outcome) -> tuple[list[Array
         values, logs = np.zeros((count, n)), [log_nonlinear]
         for i in range(n):
             rows = np.broadcast_to(np.eye(n)[i], (count, n))
-            shape = events[cell].standard_deviation(rows)
+            shape = events[cell].profile(rows)
             if i in active:
                 kept = levels[cell, :, active.index(i)]
                 if len(kept) < count:  # the last step does not enter the dynamics: an event of its own
@@ -279,7 +285,8 @@ def _reach_tube(
         coefficients = np.stack([p.mid for p in powers], axis=2)
         slack = sum(p.rad * (0.6 * h) ** j for j, p in enumerate(powers))
         # the pieces' ends are floats within a rounding of k h
-        speed = np.abs(coefficients[:, :, 1]) + h * np.abs(coefficients[:, :, 2]) * 2 + np.abs(coefficients[:, :, 3]) * h * h
+        size = np.abs(coefficients)
+        speed = size[:, :, 1] + 2 * h * size[:, :, 2] + h * h * size[:, :, 3]
         slack = np.asarray(slack) * (1 + 1e-12) + speed * 4e-15 * (1 + engine.times[-1])
         starts, ends = engine.times[:-1], engine.times[1:]
     else:

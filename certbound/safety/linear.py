@@ -1,0 +1,42 @@
+"""The linear-response engine (Thm K7) as one of the engines of ``verify_safety``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from certbound.problem.problem import Problem
+from certbound.reach.response_tube import DeviationTube, LinearAnswer, linear_answer, refusal
+from certbound.safety.answers import Deviation, EngineAnswer
+
+__all__ = ["linear_engine"]
+
+
+def linear_engine(problem: Problem, *, cells: int | None = None, **_: Any) -> EngineAnswer:
+    """Smallest probability that Thm K7' proves for the problem (options of other engines are ignored)."""
+    refused = refusal(problem)
+    if refused is not None:
+        return EngineAnswer(applicable=False, reason=refused, method="linear")
+    answer = linear_answer(problem, cells=cells)
+    tube = answer.tube
+    return EngineAnswer(
+        log10_delta=answer.log10_delta,
+        margin=answer.margin if np.isfinite(answer.margin) else None,
+        time=answer.time,
+        constraint=answer.constraint,
+        reason=answer.reason,
+        tube=tube,
+        reach=answer.noise_free_reach,
+        deviation=None if tube is None else _deviation(answer, tube),
+        method="linear",
+        details=answer,
+    )
+
+
+def _deviation(answer: LinearAnswer, tube: DeviationTube) -> Deviation:
+    """Bounds per piece; in discrete time a piece is a step and the next one."""
+    half, times = tube.half_widths, tube.times
+    if not answer.run.engine.continuous:
+        half, times = np.maximum(half[:-1], half[1:]), times[:-1]
+    return Deviation(times=times, radius=np.linalg.norm(half, axis=1) * (1 + 1e-14), extent=half)
