@@ -54,8 +54,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     SETTINGS.verbose, SETTINGS.quiet = "--verbose" in words, "--quiet" in words
     words = [word for word in words if word not in ("--verbose", "--quiet")]
-    if SETTINGS.verbose:
-        start_logging()
+    start_logging(verbose=SETTINGS.verbose)
     command = next((word for word in words if not word.startswith("-")), "")
     try:
         code = app(args=words, prog_name="certbound", standalone_mode=False)
@@ -79,9 +78,7 @@ def _report(error: Exception, command: str) -> int:
         write_error("the command line was not understood", why, _usage_hint(command, known))
         return BAD_INPUT
     code, why, cure = explain(error, command)
-    write_error(
-        f"{command or 'the command'} {'refused its input' if code == BAD_INPUT else 'failed'}", why, cure
-    )
+    write_error(f"{command or 'the command'} {'refused its input' if code == BAD_INPUT else 'failed'}", why, cure)
     return code
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,18 +37,20 @@ def describe_parameters(tube: Tube) -> dict[str, Any]:
 
 
 def log10_text(log10: float) -> str:
-    """A probability given by its decimal logarithm, also where no float could hold it.
+    """A probability given by its decimal logarithm, rounded up to two digits, also where no float could hold it.
 
     Examples
     --------
-    >>> log10_text(-3.0), log10_text(-49718.25), log10_text(0.0)
-    ('1e-3', '5.6e-49719', '1')
+    >>> log10_text(-3.0), log10_text(-49718.25), log10_text(-4.698), log10_text(-0.12), log10_text(0.0)
+    ('1e-3', '5.7e-49719', '2.1e-5', '0.76', '1')
     """
     if log10 >= 0:
         return "1"
-    exponent = int(np.floor(log10 + 1e-12))
-    mantissa = f"{10 ** (log10 - exponent):.2g}"
-    return f"1e{exponent + 1}" if mantissa == "10" else f"{mantissa}e{exponent}"
+    if log10 > -2:
+        return f"{math.ceil(100 * 10**log10 - 1e-6) / 100:g}"
+    exponent = math.floor(log10 + 1e-12)
+    mantissa = math.ceil(10 * 10 ** (log10 - exponent) - 1e-6) / 10
+    return f"1e{exponent + 1}" if mantissa >= 10 else f"{mantissa:g}e{exponent}"
 
 
 def describe_deviation(verdict: Verdict) -> dict[str, Any] | None:

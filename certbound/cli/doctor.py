@@ -157,10 +157,11 @@ def _tracing() -> str:
 def _solver() -> str:
     import cvxpy
 
-    matrix = cvxpy.Variable((2, 2), symmetric=True)
-    problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(matrix)), [matrix >> [[2.0, 1.0], [1.0, 2.0]]])
-    problem.solve(solver=cvxpy.CLARABEL)
-    if problem.status != cvxpy.OPTIMAL or abs(problem.value - 4.0) > 1e-5:
+    cp: Any = cvxpy
+    matrix = cp.Variable((2, 2), symmetric=True)
+    problem = cp.Problem(cp.Minimize(cp.trace(matrix)), [matrix >> [[2.0, 1.0], [1.0, 2.0]]])
+    problem.solve(solver=cp.CLARABEL)
+    if problem.status != cp.OPTIMAL or abs(problem.value - 4.0) > 1e-5:
         raise RuntimeError(f"Clarabel answered {problem.status}, {problem.value}")
     return "Clarabel solves a semidefinite program"
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -105,9 +107,7 @@ def settings_of(pairs: Sequence[str] | None) -> dict[str, float]:
         try:
             found[key] = number(value)
         except typer.BadParameter as error:
-            raise InputError(
-                f"the value of `--set {key}` {error}", f"write for example --set {key}=0.02"
-            ) from None
+            raise InputError(f"the value of `--set {key}` {error}", f"write for example --set {key}=0.02") from None
     return found
 
 
@@ -118,21 +118,27 @@ def load_problem(
     from certbound.problem.files import load
 
     parameters: dict[str, Any] = dict(settings_of(pairs))
-    try:
+    changes: dict[str, Any] = {} if delta is None else {"delta": delta}
+    with _as_input_error("run `certbound problems` for the bundled problems and their keys"):
         problem = load(source, **parameters)
-        changes: dict[str, Any] = {}
-        if horizon is not None:
-            changes["horizon"] = _whole(horizon) if problem.system.time == "discrete" else horizon
-        if delta is not None:
-            changes["delta"] = delta
-        return problem.replace(**changes) if changes else problem
+    if horizon is not None:
+        changes["horizon"] = _whole(horizon) if problem.system.time == "discrete" else horizon
+    if not changes:
+        return problem
+    with _as_input_error("choose another --horizon or --delta"):
+        return problem.replace(**changes)
+
+
+@contextlib.contextmanager
+def _as_input_error(cure: str) -> Iterator[None]:
+    """Whatever a problem refuses while it is built is the user's to mend."""
+    try:
+        yield
+    except InputError:
+        raise
     except (ValueError, TypeError, ArithmeticError) as error:
-        if isinstance(error, InputError):
-            raise
-        why, cure = split_cure(str(error))
-        raise InputError(
-            why, cure or "run `certbound problems` for the bundled problems and their keys"
-        ) from error
+        why, own = split_cure(str(error))
+        raise InputError(why, own or cure) from error
 
 
 def check_writable(*paths: Path | None) -> None:
@@ -144,15 +150,11 @@ def check_writable(*paths: Path | None) -> None:
             raise InputError(f"`{path}` is a directory", "name a file")
         if not path.parent.is_dir():
             raise InputError(f"the directory `{path.parent}` does not exist", f"run mkdir -p {path.parent}")
-        import os
-
         if not os.access(path if path.exists() else path.parent, os.W_OK):
             raise InputError(f"`{path}` cannot be written", "choose another place, or change the permissions")
 
 
 def _whole(horizon: float) -> int:
     if horizon != int(horizon):
-        raise InputError(
-            f"`--horizon` counts steps here and must be whole, got {horizon:g}", "give whole steps"
-        )
+        raise InputError(f"`--horizon` counts steps here and must be whole, got {horizon:g}", "give whole steps")
     return int(horizon)

@@ -74,8 +74,14 @@ def spinner(text: str) -> Iterator[None]:
         yield
 
 
-def start_logging() -> None:
-    """Send the library's log to standard error (with --verbose)."""
+def start_logging(*, verbose: bool) -> None:
+    """Send the library's log and every warning to standard error with --verbose, and nowhere without."""
+    logging.captureWarnings(True)
+    if not verbose:
+        warnings = logging.getLogger("py.warnings")
+        warnings.addHandler(logging.NullHandler())
+        warnings.propagate = False
+        return
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(relativeCreated)8.0f ms  %(name)s: %(message)s"))
     logger = logging.getLogger("certbound")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from certbound.cli.describe import describe_constants, describe_deviation, log10_text
+from certbound.cli.messages import InputError
 from certbound.cli.options import (
     DeltaOption,
     HorizonOption,
@@ -27,14 +29,15 @@ if TYPE_CHECKING:
 
 __all__ = ["register"]
 
+PATHS = 60
+_log = logging.getLogger(__name__)
+
 MethodOption = Annotated[
     str, typer.Option("--method", metavar="M", help="auto, linear, or a tube method such as kummer or thm3.")
 ]
 CellsOption = Annotated[
     int | None,
-    typer.Option(
-        "--cells", parser=integer, metavar="K", help="Cells per side of the initial set.", show_default=False
-    ),
+    typer.Option("--cells", parser=integer, metavar="K", help="Cells per side of the initial set.", show_default=False),
 ]
 CertificateOption = Annotated[
     Path | None,
@@ -79,7 +82,7 @@ def verify(
     seconds = time.perf_counter() - started
     result = _result(subject, verdict, seconds)
     if explain:
-        result["engines"] = _engines(subject, verdict, cells)
+        result["engines"] = _engines(verdict)
     _write(subject, verdict, certificate=certificate, report=report, plot=plot)
     if as_json:
         print_json(result)
@@ -104,21 +107,12 @@ def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any
     }
 
 
-def _engines(problem: Problem, verdict: Verdict, cells: int | None) -> list[dict[str, Any]]:
-    """What each engine says on its own (the one that gave the verdict is not run again)."""
-    from certbound.safety.verification import verify_safety
-
+def _engines(verdict: Verdict) -> list[dict[str, Any]]:
+    """What each engine answered, for --explain."""
     rows = []
-    for name in ("linear", "kummer"):
-        started = time.perf_counter()
-        try:
-            with spinner(f"trying {name}"):
-                one = verdict if verdict.method == name else verify_safety(problem, method=name, cells=cells)
-        except (ValueError, ArithmeticError) as error:
-            found = {"status": "UNKNOWN", "log10_delta": 0.0, "margin": None, "reason": str(error)}
-        else:
-            found = {key: getattr(one, key) for key in ("status", "log10_delta", "margin", "reason")}
-        rows.append({"engine": name, **found, "seconds": time.perf_counter() - started})
+    for name, answer in verdict.answers.items():
+        found = {key: getattr(answer, key) for key in ("log10_delta", "margin", "constraint", "time", "reason")}
+        rows.append({"engine": name, "method": answer.method, "applicable": answer.applicable, **found})
     return rows
 
 
@@ -138,14 +132,30 @@ def _write(
 
 
 def picture(problem: Problem, verdict: Verdict, suffix: str) -> bytes:
-    """The picture of a verdict, with 100 sample paths where the noise has a law to sample from."""
+    """The picture of a verdict, with sample paths where the noise has a law to sample from."""
     from io import BytesIO
 
-    from certbound.plotting import Scene, draw_scene
+    import numpy as np
 
-    times = paths = None
-    title = f"{problem.name}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
-    scene = Scene(problem=problem, reach=verdict.reach, tube=None, times=times, paths=paths, title=title)
+    from certbound.plotting import Scene, draw_scene, noisy_reach
+    from certbound.simulation.paths import sample_paths
+
+    if verdict.reach is None:
+        raise InputError("nothing was proved that could be drawn", "leave --plot out; the reason is in the verdict")
+    try:
+        paths = sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0))
+    except ValueError as error:
+        _log.info("no sample paths are drawn: %s", error)
+        paths = None
+    times = None if paths is None else np.linspace(0.0, float(problem.horizon), paths.shape[1])
+    scene = Scene(
+        problem=problem,
+        reach=verdict.reach,
+        tube=noisy_reach(verdict),
+        times=times,
+        paths=paths,
+        title=f"{problem.name}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}",
+    )
     stream = BytesIO()
     draw_scene(scene).savefig(stream, format=suffix, dpi=150)
     return stream.getvalue()
@@ -165,9 +175,7 @@ def _print(problem: Problem, result: dict[str, Any]) -> None:
     if SETTINGS.quiet:
         return
     if result["margin"] is not None and result["constraint"]:
-        when = (
-            "" if result["time"] is None else f" at {'t' if unit == 's' else 'step'} = {result['time']:.4g}"
-        )
+        when = "" if result["time"] is None else f" at {'t' if unit == 's' else 'step'} = {result['time']:.4g}"
         screen.print(f"margin {result['margin']:.4g}{when}, constraint: {result['constraint']}", markup=False)
     if result["reason"]:
         screen.print(result["reason"], markup=False)
@@ -177,5 +185,5 @@ def _print(problem: Problem, result: dict[str, Any]) -> None:
         screen.print(f"stochastic deviation: at most {largest:.4g} with that probability", markup=False)
     screen.print(f"method {result['method']}, {result['seconds']:.1f} s", markup=False)
     for row in result.get("engines", ()):
-        bound = log10_text(row["log10_delta"])
-        screen.print(f"  {row['engine']:<8} {row['status']:<8} <= {bound}: {row['reason']}", markup=False)
+        bound = f"<= {log10_text(row['log10_delta'])}" if row["applicable"] else "does not apply"
+        screen.print(f"  {row['engine']} ({row['method']}): {bound}. {row['reason']}", markup=False)

@@ -42,9 +42,7 @@ def panels_of(problem: Problem) -> list[Panel]:
     for constraint in problem.safe:
         region = constraint.region
         if isinstance(constraint, Outside) or region.moving or isinstance(region, (Ball, Ellipsoid)):
-            found.append(
-                Panel(label=_distance_label(constraint), constraint=constraint, during=constraint.during)
-            )
+            found.append(Panel(label=_distance_label(constraint), constraint=constraint, during=constraint.during))
             continue
         where = slice(None) if region.coordinates is None else list(region.coordinates)
         for a, b in zip(*region.halfspaces()):
@@ -68,11 +66,7 @@ def _add_face(found: list[Panel], row: Array, bound: float, states: tuple[str, .
     direction = row if upper else -row
     limit: dict[str, Any] = {"high": bound} if upper else {"low": -bound}
     for index, panel in enumerate(found):
-        same = (
-            panel.direction is not None
-            and np.array_equal(panel.direction, direction)
-            and panel.during == during
-        )
+        same = panel.direction is not None and np.array_equal(panel.direction, direction) and panel.during == during
         if same and not np.isfinite(panel.high if upper else panel.low):
             found[index] = replace(panel, **limit)
             return
@@ -93,9 +87,7 @@ def draw_panel(axes: Axes, scene: Scene, panel: Panel) -> None:
     start, end = panel.during or (0.0, float(scene.problem.horizon))
     for limit in ends:
         if np.isfinite(limit):
-            axes.plot(
-                [start, end], [limit, limit], color=VERMILION, linestyle=(0, (5, 2)), linewidth=1.2, zorder=6
-            )
+            axes.plot([start, end], [limit, limit], color=VERMILION, linestyle=(0, (5, 2)), linewidth=1.2, zorder=6)
     axes.set_title(panel.label, loc="left", fontsize=8)
     axes.margins(x=0)
     axes.autoscale_view()

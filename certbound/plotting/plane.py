@@ -39,9 +39,7 @@ def draw_plane(axes: Axes, scene: Scene, plane: Plane) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
     for order, (tube, color) in enumerate(scene.tubes):
-        shapes = PolyCollection(
-            list(outlines(tube, plane)), facecolors=color, edgecolors=color, linewidths=0.3
-        )
+        shapes = PolyCollection(list(outlines(tube, plane)), facecolors=color, edgecolors=color, linewidths=0.3)
         shapes.set_zorder(1 + order)
         axes.add_collection(shapes)
     if scene.paths is not None:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from certbound.problem.problem import Problem
     from certbound.reach.tube import ReachTube
+    from certbound.safety.verification import Verdict
 
 __all__ = [
     "BLUE",
@@ -119,6 +120,24 @@ def draw_scene(scene: Scene) -> Figure:
         figure.suptitle(scene.title + (f"  (and {rest} more constraints)" if rest else ""), fontsize=9)
         figure.legend(handles=_legend(scene), loc="outside lower center", ncols=8, fontsize=7, frameon=False)
     return figure
+
+
+def noisy_reach(verdict: Verdict) -> ReachTube | None:
+    """The reach tube of a verdict with the stochastic deviation at the problem's delta, where there is one."""
+    from certbound.reach.local import radius_over_pieces
+    from certbound.reach.tube import ReachTube
+    from certbound.tubes.tube import Tube
+
+    if verdict.reach is None or verdict.deviation is None:
+        return None
+    for answer in verdict.answers.values():
+        whole = getattr(answer.details, "reach", None)
+        if answer.reach is verdict.reach and isinstance(whole, ReachTube):
+            return whole
+    if not isinstance(verdict.tube, Tube):
+        return None
+    radius = radius_over_pieces(verdict.tube, verdict.reach.curve)
+    return verdict.reach.grown(radius, log10_delta=verdict.tube.log10_delta, method=verdict.method)
 
 
 def instants(tube: ReachTube, count: int = 400) -> Array:
