@@ -8,7 +8,6 @@ paper).
 from __future__ import annotations
 
 import functools
-import importlib
 from typing import Any
 
 import numpy as np
@@ -101,11 +100,10 @@ def bound_constants(
         raise ValueError(f'`metric` must be "auto", "euclidean" or a matrix, got {metric!r}.')
     if metric == "euclidean":
         return certify(model, None, tolerance=tolerance, budget=budget)
-    return _propose(source, model, objective, horizon, delta, tolerance, budget)
+    return _propose(model, objective, horizon, delta, tolerance, budget)
 
 
 def _propose(
-    source: Any,
     model: Model,
     objective: str,
     horizon: float | None,
@@ -114,13 +112,10 @@ def _propose(
     budget: int,
 ) -> Constants:
     """The identity metric, so that a valid bound exists, and whatever the semidefinite programs propose."""
+    from certbound.constants import metrics  # which certifies its proposals here
+
     euclidean = certify(model, None, tolerance=tolerance, budget=budget)
-    try:
-        metrics = importlib.import_module("certbound.constants.metrics")
-    except ModuleNotFoundError:
-        return euclidean
-    better: Constants = metrics.improve(model, euclidean, objective=objective, horizon=horizon, delta=delta)
-    return better
+    return metrics.improve(model, euclidean, objective=objective, horizon=horizon, delta=delta)
 
 
 def certify(

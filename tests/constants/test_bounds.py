@@ -130,6 +130,18 @@ def test_a_smaller_domain_is_never_worse(low, width, share):
     assert small.proof.sampled <= large.rate
 
 
+def test_a_proposed_metric_is_kept_only_where_it_is_certified_to_be_better():
+    pendulum = cb.ContinuousSystem(MODELS["pendulum"][0], states=2, diffusion=[[0], [0.05]])
+    euclidean, best = (bound_constants(pendulum, metric=m) for m in ("euclidean", "auto"))
+    assert best.rate < 0.7 * euclidean.rate
+    again = bound_constants(pendulum, metric=best.metric)
+    assert abs(again.rate - best.rate) < 0.02
+    skew = bound_constants(cb.linear_system([[-1.0, 2.0], [-2.0, -1.0]], diffusion=np.eye(2)))
+    assert skew.metric is None
+    with pytest.raises(ValueError, match="horizon"):
+        bound_constants(pendulum, objective="erosion")
+
+
 def test_python_control_systems_are_accepted():
     control = pytest.importorskip("control")
     a = np.array([[0.0, 1.0], [-1.0, -1.0]])
