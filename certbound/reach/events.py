@@ -86,29 +86,13 @@ class StepEvents:
         self.response, self.cell, self.gaussian = _one(response, cell), cell, gaussian
         self.shared_log = -np.inf
 
-    def standard_deviation(self, rows: Array) -> Array:
-        """Standard deviation along ``rows`` (nodes, n): an estimate to shape levels with."""
+    def along(self, rows: Array) -> StepEvent:
+        """The event along ``rows`` (nodes, n)."""
         nodes = _numbers(len(rows))
-        _, high = self.response.variance(rows[None], nodes)
-        return np.asarray(np.sqrt(np.maximum(high[0], 0.0)))
-
-    def profile(self, rows: Array) -> Array:
-        """Shape of levels along ``rows``: the standard deviation."""
-        return self.standard_deviation(rows)
-
-    def log_exceedance(self, rows: Array, levels: Array) -> float:
-        """Upper bound of log P(exists t: rows[t] . Z_t > levels[t])."""
-        nodes = _numbers(len(rows))
-        if np.any(levels < 0):
-            return 0.0
-        low, high = (v[0] for v in self.response.variance(rows[None], nodes))
-        above = _ratio_down(levels, high)
+        variances = [v[0] for v in self.response.variance(rows[None], nodes)]
         if not self.gaussian:
-            with np.errstate(over="ignore"):
-                exponent = -0.5 * np.minimum(above, 1e150) ** 2
-            return min(logsumexp(np.where(above == np.inf, -np.inf, exponent * (1 - 1e-15))), 0.0)
-        single = log_tail(above)
-        below = _ratio_up(levels, low)[:-1]
+            return StepEvent(variances[0], variances[1], None)
+        low, high = variances
         following = np.einsum("ti,tij->tj", rows[1:], self.response.transition[0, : len(rows) - 1])
         # the row at t + 1 seen from t is w F up to the rounding of this product
         cross_lo, _ = self.response.covariance_of(following[None], rows[None, :-1], nodes[:-1])
@@ -120,7 +104,33 @@ class StepEvents:
         with np.errstate(divide="ignore", invalid="ignore"):
             correlation = np.where(cross >= 0, cross / scale, cross / low_scale)
         correlation = np.where(np.isfinite(correlation), np.clip(correlation - 1e-14, -1.0, 1.0), -1.0)
-        joint = log_below_above(below, above[1:], correlation)
+        return StepEvent(low, high, correlation)
+
+
+@dataclass(frozen=True, eq=False)
+class StepEvent:
+    """One row's variances (lower and upper bounds) and lower bounds of its correlations from step to step."""
+
+    low: Array
+    high: Array
+    correlation: Array | None
+
+    @property
+    def profile(self) -> Array:
+        """Shape of levels: the standard deviation."""
+        return np.asarray(np.sqrt(np.maximum(self.high, 0.0)))
+
+    def log_exceedance(self, levels: Array) -> float:
+        """Upper bound of log P(exists t: rows[t] . Z_t > levels[t])."""
+        if np.any(levels < 0):
+            return 0.0
+        above = _ratio_down(levels, self.high)
+        if self.correlation is None:
+            with np.errstate(over="ignore"):
+                exponent = -0.5 * np.minimum(above, 1e150) ** 2
+            return min(logsumexp(np.where(above == np.inf, -np.inf, exponent * (1 - 1e-15))), 0.0)
+        single = log_tail(above)
+        joint = log_below_above(_ratio_up(levels, self.low)[:-1], above[1:], self.correlation)
         return min(logsumexp(np.concatenate([single[:1], np.minimum(joint, single[1:])])), 0.0)
 
 
@@ -193,21 +203,6 @@ class WindowEvents:
             errors.append(slack)
         return np.array(result), np.array(errors)
 
-    def standard_deviation(self, rows: Array) -> Array:
-        """Standard deviation along ``rows`` (pieces, n), the larger of both ends: an estimate."""
-        nodes = _numbers(self.response.pieces)
-        ends = [self.response.variance(rows[None], nodes + shift)[1][0] for shift in (0, 1)]
-        return np.asarray(np.sqrt(np.maximum(np.maximum(*ends), 0.0)))
-
-    def profile(self, rows: Array) -> Array:
-        """Shape of levels along ``rows``: the standard deviation, but in the first fifth at least that at its end.
-
-        Levels must not vanish with the standard deviation at t = 0: a rough process leaves such a band at once.
-        """
-        deviation = self.standard_deviation(rows)
-        early = max(1, len(rows) // 5)
-        return np.maximum(deviation, np.where(np.arange(len(rows)) < early, deviation[early - 1], 0.0))
-
     @cached_property
     def coordinate_levels(self) -> Array:
         """z_i of every window: the levels of |M_i| that together cost exp(shared_log)."""
@@ -219,38 +214,32 @@ class WindowEvents:
         sd = np.sqrt(np.maximum(variance, 0.0)) * _ROUND
         active = [i for i in range(n) if sd[:, i].max() > 0]
         low, high = 1.0, 60.0
-        rows = np.broadcast_to(np.eye(n)[:, None, :], (n, len(self.bounds) - 1, n))
+        events = [self._windows(np.broadcast_to(row, (len(self.bounds) - 1, n))) for row in np.eye(n)]
         for _ in range(24):
             factor = (low + high) / 2
-            total = logsumexp(np.array([self._windows(rows[i], factor * sd[:, i]) + np.log(2.0) for i in active]))
+            total = logsumexp(np.array([events[i].log_exceedance(factor * sd[:, i]) + np.log(2.0) for i in active]))
             low, high = (low, factor) if total <= self.shared_log else (factor, high)
         return np.asarray(high * sd)
 
-    def log_exceedance(self, rows: Array, levels: Array) -> float:
-        """Upper bound of log P(exists t: rows[k] . Z_t > levels[k] on piece k, no coordinate above its level)."""
+    def along(self, rows: Array) -> WindowEvent:
+        """The event along ``rows`` (pieces, n)."""
         g, error = self.back
         exact = np.einsum("ki,kij->kj", rows, g)
         slack = np.einsum("ki,kij->kj", np.abs(rows), error) + 1e-14 * np.abs(exact)
-        count = len(self.bounds) - 1
-        window = np.repeat(np.arange(count), np.diff(self.bounds))
-        asked = levels < np.inf
-        directions = np.zeros((count, rows.shape[1]))
-        room = np.full(count, np.inf)
-        for index in range(count):
-            inside = (window == index) & asked
-            if not inside.any():
-                continue
-            chosen = exact[inside]
-            directions[index] = (chosen.max(axis=0) + chosen.min(axis=0)) / 2
-            off = np.abs(chosen - directions[index]) + slack[inside]
-            cost = (off @ self.coordinate_levels[index]) * (1 + 1e-13)
-            room[index] = np.min(levels[inside] - cost)
-        if np.any(room < 0):
-            return 0.0
-        return min(self._windows(directions, room), 0.0)
+        starts = self.bounds[:-1]
+        directions = (np.maximum.reduceat(exact, starts) + np.minimum.reduceat(exact, starts)) / 2
+        window = np.repeat(_numbers(len(starts)), np.diff(self.bounds))
+        off = np.abs(exact - directions[window]) + slack
+        cost = np.einsum("ki,ki->k", off, self.coordinate_levels[window]) * (1 + 1e-13)
+        nodes = _numbers(self.response.pieces)
+        ends = [self.response.variance(rows[None], nodes + shift)[1][0] for shift in (0, 1)]
+        deviation = np.sqrt(np.maximum(np.maximum(*ends), 0.0))
+        early = max(1, len(rows) // 5)
+        profile = np.maximum(deviation, np.where(nodes < early, deviation[early - 1], 0.0))
+        return WindowEvent(windows=self._windows(directions), starts=starts, cost=cost, profile=profile)
 
-    def _windows(self, directions: Array, levels: Array) -> float:
-        """Log of the bound on P(some window's martingale direction . M exceeds its level)."""
+    def _windows(self, directions: Array) -> Windows:
+        """Second moments of one martingale direction per window."""
         forward, slack = self.starts
         first = np.einsum("wi,wij->wj", directions, forward)
         ends, begins = self.bounds[1:], self.bounds[:-1]
@@ -263,15 +252,10 @@ class WindowEvents:
         change = 2 * np.sqrt(np.maximum(begin_high, 0)) * loss + loss**2
         begin_low = np.maximum(begin_low - change * _ROUND, 0.0)
         begin_high = np.minimum(begin_high + change * _ROUND, end_high)
-        above = _ratio_down(levels, end_high)
-        below = _ratio_up(levels, begin_low)
         roots = (np.sqrt(begin_low) + np.sqrt(np.maximum(end_low, 0))) / _ROUND
         with np.errstate(divide="ignore", invalid="ignore"):
             spread = np.sqrt(np.maximum(end_high - begin_low, 0.0)) / roots * _ROUND
-        spread = np.where(roots > 0, spread, 1.0)
-        inside = log_below_above(below, above, spread=spread) + np.log(2.0)
-        # at a window's start: the previous window kept its own direction below its level
-        start = log_tail(_ratio_down(levels, begin_high))
+        # from one window's direction to the next one's, at their common time
         previous, own = directions[:-1], first[1:]
         p_low, p_high = (v[0] for v in self.response.variance(previous[None], begins[1:]))
         own_low, own_high = begin_low[1:], begin_high[1:]
@@ -279,17 +263,62 @@ class WindowEvents:
             unit = previous / np.sqrt(p_high)[:, None] - own / np.sqrt(own_high)[:, None]
             scale = 2 * np.sqrt(np.maximum(p_low / p_high, 0) * np.maximum(own_low / own_high, 0))
         usable = np.isfinite(unit).all(axis=1) & (scale > 0)
-        unit = np.where(usable[:, None], unit, 0.0)
-        _, gap = (v[0] for v in self.response.variance(unit[None], begins[1:]))
+        _, gap = (v[0] for v in self.response.variance(np.where(usable[:, None], unit, 0.0)[None], begins[1:]))
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = np.where(usable, loss[1:] / np.sqrt(own_high), 0.0) + 1e-14
         gap = (np.sqrt(np.maximum(gap, 0)) + relative * (1 + 1e-12)) ** 2
-        tau = np.where(usable, _spread(gap, np.where(usable, scale, 1.0)), 1e6)
-        joint = log_below_above(
-            _ratio_up(levels[:-1], p_low), _ratio_down(levels[1:], own_high), spread=tau
+        return Windows(
+            end_high=end_high, begin_low=begin_low, begin_high=begin_high,
+            spread=np.where(roots > 0, spread, 1.0), previous_low=p_low,
+            turn=np.where(usable, _spread(gap, np.where(usable, scale, 1.0)), 1e6),
         )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Windows:
+    """Bounds of the variances of r . M at the ends of every window, and spreads sqrt((1 - rho)/(1 + rho)).
+
+    ``spread`` belongs to a window's start and end; ``turn`` to the previous window's direction and the window's own,
+    at their common time.
+    """
+
+    end_high: Array
+    begin_low: Array
+    begin_high: Array
+    spread: Array
+    previous_low: Array
+    turn: Array
+
+    def log_exceedance(self, levels: Array) -> float:
+        """Upper bound of log P(some window's r . M exceeds its level)."""
+        if np.any(levels < 0):
+            return 0.0
+        above, below = _ratio_down(levels, self.end_high), _ratio_up(levels, self.begin_low)
+        inside = log_below_above(below, above, spread=self.spread) + np.log(2.0)
+        # at a window's start: the previous window kept its own direction below its level
+        start_above = _ratio_down(levels, self.begin_high)
+        start = log_tail(start_above)
+        joint = log_below_above(_ratio_up(levels[:-1], self.previous_low), start_above[1:], spread=self.turn)
         start[1:] = np.minimum(start[1:], joint)
-        return logsumexp(np.concatenate([inside, start]))
+        return min(logsumexp(np.concatenate([inside, start])), 0.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WindowEvent:
+    """The event along one family of rows; ``cost`` is what a level loses to the coordinates, piece by piece.
+
+    ``profile`` shapes levels: the standard deviation, but in the first fifth at least that at its end, since a rough
+    process at once leaves a band that vanishes with the standard deviation at t = 0.
+    """
+
+    windows: Windows
+    starts: Nodes
+    cost: Array
+    profile: Array
+
+    def log_exceedance(self, levels: Array) -> float:
+        """Upper bound of log P(exists t: rows[k] . Z_t > levels[k] on piece k, no coordinate above its level)."""
+        return self.windows.log_exceedance(np.minimum.reduceat(levels - self.cost, self.starts))
 
 
 def _longer(forward: Array, slack: float, transition: Array, error: float) -> tuple[Array, float]:

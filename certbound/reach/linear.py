@@ -16,19 +16,21 @@ from numpy.typing import NDArray
 
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.directions import Requirement, requirements
-from certbound.reach.events import StepEvents, WindowEvents, logsumexp
+from certbound.reach.events import StepEvent, StepEvents, WindowEvent, WindowEvents, logsumexp
 from certbound.reach.inclusion import Supports
 from certbound.reach.linearisation import Linearisation
 
 __all__ = ["LinearRun", "Outcome", "level_scale"]
 
 Array = NDArray[np.float64]
+Event = StepEvent | WindowEvent
 Events = StepEvents | WindowEvents
 _LOG = logging.getLogger(__name__)
 
 _GUESSES = 30
 _PICARD = 12
 _HUGE = 1e6
+_TRIES = 12
 _WINDOW = 0.05
 
 
@@ -44,21 +46,17 @@ class Outcome:
         Logarithm of delta_N.
     bounds : (ndarray, ndarray), shape (B, N, n), or None
         The proved enclosure of the remainder beta, None when it fed itself.
-    requirement : Requirement or None
-        The one that costs most.
-    margin : float
-        Its least room after the deterministic parts, in its own unit; -inf when nothing was proved.
-    piece : int
-        Where that is (or where the remainder began to feed itself).
+    cell : int
+        The worst cell.
+    logs : tuple of float
+        What every requirement costs there.
     """
 
     log_probability: float
     log_nonlinear: float
     bounds: tuple[Array, Array] | None
-    requirement: Requirement | None
-    margin: float
-    piece: int
-    costs: tuple[tuple[str, float], ...] = ()
+    cell: int = 0
+    logs: tuple[float, ...] = ()
 
 
 class LinearRun:
@@ -166,14 +164,12 @@ class LinearRun:
         share = log_nonlinear + np.log(0.9 / (2 * max(count, 1)))
         found = []
         for cell in range(cells):
-            events = self.events(cell, log_nonlinear + np.log(0.1 if count else 1.0))
+            events = self.events(cell, log_nonlinear + float(np.log(0.1 if count else 1.0)))
             found.append(events)
             for d in range(count):
-                rows = self.rows[cell, :, d]
-                shape = events.profile(rows)
-                if shape.max() <= 0:
-                    continue
-                result[cell, :, d] = level_scale(events, rows, shape, share) * shape
+                event = events.along(self.rows[cell, :, d])
+                if event.profile.max() > 0:
+                    result[cell, :, d] = level_scale(event, event.profile, share) * event.profile
         return result, found
 
     def probability(self, log_nonlinear: float, effort: int = 2) -> Outcome:
@@ -181,12 +177,9 @@ class LinearRun:
         levels, events = self.levels(log_nonlinear)
         bounds = self.include(levels, effort)
         if bounds is None:
-            return Outcome(
-                log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None, requirement=None,
-                margin=-np.inf, piece=self.failed_at,
-            )
+            return Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None)
         outcomes = [self._cell(cell, bounds, events[cell], log_nonlinear) for cell in range(len(self.supports))]
-        return max(outcomes, key=lambda outcome: (outcome.log_probability, -outcome.margin))
+        return max(outcomes, key=lambda outcome: outcome.log_probability)
 
     def rooms(self, cell: int, bounds: tuple[Array, Array]) -> Array:
         """Room that each requirement leaves to Z on each piece: (pieces, requirements), rounded down."""
@@ -198,35 +191,50 @@ class LinearRun:
         return np.asarray(np.where(np.isinf(room), np.inf, left - 4e-16 * (np.abs(room) + np.abs(used))))
 
     def _cell(self, cell: int, bounds: tuple[Array, Array], events: Events, log_nonlinear: float) -> Outcome:
-        rooms, asked = self.rooms(cell, bounds), self.requirements[cell]
-        logs = [events.log_exceedance(r.rows, rooms[:, index]) for index, r in enumerate(asked)]
+        rooms = self.rooms(cell, bounds)
         shared = log_nonlinear if len(self.engine.model.active) else events.shared_log
-        total = min(logsumexp(np.array([shared, *logs])), 0.0)
-        # the margin is what is left at the problem's own delta, shared among the requirements
-        target = np.log(self.engine.problem.delta / max(len(asked), 1))
-        left = np.empty_like(rooms)
-        for index, requirement in enumerate(asked):
-            shape = events.profile(requirement.rows)
-            factor = level_scale(events, requirement.rows, shape, target) if shape.max() > 0 else 0.0
-            left[:, index] = rooms[:, index] - factor * shape
-        tightest = np.unravel_index(int(np.argmin(left)), left.shape) if left.size else (0, 0)
+        logs = [events.along(r.rows).log_exceedance(rooms[:, i]) for i, r in enumerate(self.requirements[cell])]
         return Outcome(
-            log_probability=total, log_nonlinear=log_nonlinear, bounds=bounds,
-            requirement=asked[tightest[1]] if asked else None, piece=int(tightest[0]),
-            margin=float(left[tightest]) if left.size else np.inf,
-            costs=tuple((r.label, log) for r, log in zip(asked, logs, strict=True)),
+            log_probability=min(logsumexp(np.array([shared, *logs])), 0.0), log_nonlinear=log_nonlinear,
+            bounds=bounds, cell=cell, logs=tuple(logs),
         )
 
+    def tightest(self, outcome: Outcome) -> tuple[Requirement | None, int, float]:
+        """The requirement with the least room at the problem's delta (shared evenly), its piece, and that room."""
+        if outcome.bounds is None:
+            return None, self.failed_at, -np.inf
+        asked = self.requirements[outcome.cell]
+        if not asked:
+            return None, 0, np.inf
+        rooms, events = self.rooms(outcome.cell, outcome.bounds), self.events(outcome.cell, self._shared(outcome))
+        target = float(np.log(self.engine.problem.delta / len(asked)))
+        left = np.empty_like(rooms)
+        for index, requirement in enumerate(asked):
+            event = events.along(requirement.rows)
+            factor = level_scale(event, event.profile, target) if event.profile.max() > 0 else 0.0
+            left[:, index] = rooms[:, index] - np.where(event.profile > 0, factor * event.profile, 0.0)
+        piece, tightest = divmod(int(np.argmin(left)), len(asked))
+        return asked[tightest], piece, float(left[piece, tightest])
 
-def level_scale(events: Events, rows: Array, shape: Array, target: float) -> float:
-    """Least factor q (nearly) with P(exists t: row . Z > q shape) <= exp(target)."""
-    low, high = 0.5, 2.0 + np.sqrt(2 * max(-target, 0.0) + 20)
-    while events.log_exceedance(rows, high * shape) > target and high < 1e6:
-        low, high = high, 2 * high
-    for _ in range(12):
-        middle = (low + high) / 2
-        if events.log_exceedance(rows, middle * shape) > target:
-            low = middle
+    def _shared(self, outcome: Outcome) -> float:
+        return outcome.log_nonlinear + float(np.log(0.1 if self.rows.shape[2] else 1.0))
+
+
+def level_scale(event: Event, shape: Array, target: float) -> float:
+    """Factor q, nearly the least, with P(exists t: row . Z > q shape) <= exp(target); inf if none is found.
+
+    log P falls by about q dq, which gives the next q; the last one tried that is proved counts.
+    """
+    q = float(np.sqrt(2 * max(-target, 0.0) + 2.0))
+    best, low = np.inf, 0.0
+    for _ in range(_TRIES):
+        log = event.log_exceedance(q * shape)
+        if log <= target:
+            best = q
+            if log > target - 0.02:
+                break
         else:
-            high = middle
-    return float(high)
+            low = q
+        step = np.sqrt(max(q * q + 2 * (log - target + 0.01), 0.0)) if log < -0.1 else 1.3 * q
+        q = float(step if low < step < best else (low + best) / 2 if np.isfinite(best) else 1.3 * q)
+    return best

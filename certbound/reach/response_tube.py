@@ -14,6 +14,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
 from certbound.reach.curve import Curve
+from certbound.reach.directions import Requirement
 from certbound.reach.events import logsumexp
 from certbound.reach.inclusion import Supports
 from certbound.reach.linear import LinearRun, Outcome, level_scale
@@ -97,20 +98,24 @@ class LinearAnswer:
         value = self.outcome.log_probability / np.log(10.0)
         return float(min(max(value + 1e-15 * abs(value), -1e15), 0.0))
 
+    @cached_property
+    def _tightest(self) -> tuple[Requirement | None, int, float]:
+        return self.run.tightest(self.shown)
+
     @property
     def margin(self) -> float:
         """Room left at the problem's delta, in the units of the tightest constraint."""
-        return self.shown.margin
+        return self._tightest[2]
 
     @property
     def time(self) -> float:
         """Where the room is least, or where the remainder begins to feed itself."""
-        return float(self.shown.piece * self.run.engine.step)
+        return float(self._tightest[1] * self.run.engine.step)
 
     @property
     def constraint(self) -> str | None:
         """The tightest requirement."""
-        return None if self.shown.requirement is None else self.shown.requirement.label
+        return None if self._tightest[0] is None else self._tightest[0].label
 
     @property
     def reason(self) -> str:
@@ -226,19 +231,20 @@ def _levels_of_coordinates(run: LinearRun, outcome: Outcome) -> tuple[list[Array
         values, logs = np.zeros((count, n)), [log_nonlinear]
         for i in range(n):
             rows = np.broadcast_to(np.eye(n)[i], (count, n))
-            shape = events[cell].profile(rows)
+            event = events[cell].along(rows)
+            shape = event.profile
             if i in active:
                 kept = levels[cell, :, active.index(i)]
                 if len(kept) < count:  # the last step does not enter the dynamics: an event of its own
                     values[:-1, i] = kept
                     last = np.where(np.arange(count) == count - 1, 0.0, np.inf)
-                    factor = level_scale(events[cell], rows, np.where(np.isinf(last), np.inf, shape), share)
+                    factor = level_scale(event, np.where(np.isinf(last), np.inf, shape), share)
                     values[-1, i] = factor * shape[-1]
                     logs.append(share + np.log(2.0))
                 else:
                     values[:, i] = kept
             elif shape.max() > 0:
-                values[:, i] = level_scale(events[cell], rows, shape, share) * shape
+                values[:, i] = level_scale(event, shape, share) * shape
                 logs.append(share + np.log(2.0))
         result.append(values * (1 + 1e-15))
         worst = max(worst, logsumexp(np.array(logs)))
