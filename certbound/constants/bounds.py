@@ -8,6 +8,7 @@ paper).
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -233,7 +234,7 @@ def _record(
     """The only place where a proof is attached to constants."""
     number: Any = float(value) if value.ndim == 0 else value
     gain: Any = None if model.continuous else np.maximum(number, SMALLEST_GAIN)
-    return Constants(
+    found = Constants(
         rate=number if model.continuous else None,
         gain=gain,
         sigma=noise.sigma,
@@ -243,8 +244,11 @@ def _record(
         isotropic=noise.isotropic,
         gaussian=noise.gaussian,
         times=times,
-        proof=Proof(sampled=sampled, boxes=boxes, status=status, domain=model.domain_text),
     )
+    proof = Proof(
+        sampled=sampled, boxes=boxes, status=status, domain=model.domain_text, fingerprint=found.fingerprint
+    )
+    return replace(found, proof=proof)
 
 
 def constants_along(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,12 +27,15 @@ class Proof:
         What proposed the metric: ``closed form`` or the status of the solver.
     domain : str
         Where the constants hold, in words.
+    fingerprint : str
+        ``Constants.fingerprint`` of what was proved: altered constants are no longer certified.
     """
 
     sampled: float
     boxes: int
     status: str
     domain: str
+    fingerprint: str
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -120,12 +124,22 @@ class Constants:
     @property
     def certified(self) -> bool:
         """True only for constants that the rigorous recheck returned."""
-        return self.proof is not None
+        return self.proof is not None and self.proof.fingerprint == self.fingerprint
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of every number that a proof speaks of."""
+        digest = hashlib.sha256()
+        for name in ("rate", "gain", "sigma", "dimension", "effective_dimension", "metric", "isotropic", "gaussian", "times"):
+            value = getattr(self, name)
+            content = b"" if value is None else np.asarray(value, dtype=np.float64).tobytes()
+            digest.update(f"{name}:{len(content)}:".encode() + content)
+        return digest.hexdigest()
 
     @property
     def gap(self) -> float | None:
         """Certified minus sampled value of the rate or gain; None for stated constants."""
-        if self.proof is None:
+        if self.proof is None or not self.certified:
             return None
         value = self.rate if self.rate is not None else self.gain
         return float(np.max(np.asarray(value)) - self.proof.sampled)

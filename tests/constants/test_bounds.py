@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -244,3 +246,14 @@ def test_pieces_on_which_the_model_is_undefined_are_refused():
 def test_malformed_arguments_are_refused(options, error, message):
     with pytest.raises(error, match=message):
         bound_constants(cb.linear_system(-np.eye(2)), **options)
+
+
+@pytest.mark.parametrize(
+    "change", [{"rate": 0.99}, {"sigma": 0.99}, {"metric": 1.01}, {"effective_dimension": 0.99}, {"sigma": 1.0}]
+)
+def test_constants_that_were_altered_after_their_proof_are_no_longer_certified(change: dict[str, float]) -> None:
+    problem = cb.load("pendulum")
+    proved = cb.bound_constants(problem, metric=np.array([[9.81, 0.5], [0.5, 1.0]]))
+    assert proved.certified
+    altered = {name: getattr(proved, name) * factor for name, factor in change.items()}
+    assert replace(proved, **altered).certified == (change == {"sigma": 1.0})
