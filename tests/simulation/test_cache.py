@@ -9,13 +9,13 @@ import pytest
 from certbound.simulation import cache
 from certbound.simulation.cache import cache_directory, is_private, load_kernel, write_atomically
 
-SOURCE = '''
+SOURCE = """
 from numba import njit
 
 @njit("int64(int64)", cache=@CACHE@)
 def run(n):
     return n + {number}
-'''
+"""
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX permissions")
 

@@ -34,9 +34,9 @@ def test_without_noise_eulers_scheme_is_followed_exactly():
 
 @pytest.mark.parametrize("scheme", ["exact", "euler"])
 def test_a_linear_system_has_the_moments_of_its_scheme(scheme):
-    paths = sample_paths(
-        problem(decay(), [2.0]), paths=40_000, rng=1, steps=4, scenario=Scenario(scheme=scheme)
-    )[:, -1, 0]
+    paths = sample_paths(problem(decay(), [2.0]), paths=40_000, rng=1, steps=4, scenario=Scenario(scheme=scheme))[
+        :, -1, 0
+    ]
     factor, shock = (np.exp(-0.125), 1 - np.exp(-0.25)) if scheme == "exact" else (0.875, 0.25)
     mean = 2.0 * factor**4
     variance = shock * (1 - factor**8) / (1 - factor**2)
@@ -108,9 +108,7 @@ def test_milsteins_scheme_is_refused_for_other_diffusions():
 
 def still(high=1.0):
     """The state integrates its disturbance: after a second it is the mean of d."""
-    return cb.ContinuousSystem(
-        lambda x, d: [d[0], d[1]], states=2, disturbance=cb.Box([-1.0, 0.0], [high, 0.5])
-    )
+    return cb.ContinuousSystem(lambda x, d: [d[0], d[1]], states=2, disturbance=cb.Box([-1.0, 0.0], [high, 0.5]))
 
 
 def test_a_constant_disturbance_is_uniform_in_its_box():
@@ -133,9 +131,7 @@ def test_a_switching_disturbance_jumps_between_vertices_at_random_times():
 
 def test_given_disturbances_are_followed():
     signal = np.array([[1.0, 0.5], [-1.0, 0.0]])
-    paths = sample_paths(
-        problem(still(), [0.0, 0.0]), paths=1, rng=0, steps=10, scenario=Scenario(disturbance=signal)
-    )
+    paths = sample_paths(problem(still(), [0.0, 0.0]), paths=1, rng=0, steps=10, scenario=Scenario(disturbance=signal))
     np.testing.assert_allclose(np.diff(paths[0], axis=0) * 10, np.repeat(signal, 5, axis=0), atol=1e-12)
 
 
@@ -158,9 +154,7 @@ def test_an_adversarial_disturbance_sees_the_state_and_is_cut_off_at_its_box():
 )
 def test_malformed_disturbances_are_refused(disturbance, message):
     with pytest.raises(ValueError, match=message):
-        sample_paths(
-            problem(still(), [0.0, 0.0]), paths=1, rng=0, scenario=Scenario(disturbance=disturbance)
-        )
+        sample_paths(problem(still(), [0.0, 0.0]), paths=1, rng=0, scenario=Scenario(disturbance=disturbance))
 
 
 def test_a_disturbance_for_a_system_without_one_is_refused():
