@@ -12,7 +12,7 @@ Discrete time: `exceedance_chain`, `union`. Continuous time: `log_window` (marti
 
 from __future__ import annotations
 
-from certbound.tubes.gaussian_clock import Clock, clock_crossing, markov_clock
+from certbound.tubes.gaussian_clock import Clock, clock_crossing, decorrelation_rates, markov_clock
 from certbound.tubes.gaussian_crossing import log_line_crossing, log_polygon_crossing
 from certbound.tubes.gaussian_linear import linear_exceedance, linear_radius
 from certbound.tubes.gaussian_normal import log_below_above, log_between, log_tail
@@ -21,7 +21,8 @@ from certbound.tubes.gaussian_rate import crossing_rate
 from certbound.tubes.gaussian_scale import least_scale, split_levels
 
 __all__ = [
-    "Bounds", "Clock", "clock_crossing", "crossing_rate", "double", "exceedance_chain", "least_scale",
-    "linear_exceedance", "linear_radius", "log_below_above", "log_between", "log_line_crossing", "log_pair",
-    "log_polygon_crossing", "log_tail", "log_window", "markov_clock", "split_levels", "total", "union",
+    "Bounds", "Clock", "clock_crossing", "crossing_rate", "decorrelation_rates", "double", "exceedance_chain",
+    "least_scale", "linear_exceedance", "linear_radius", "log_below_above", "log_between", "log_line_crossing",
+    "log_pair", "log_polygon_crossing", "log_tail", "log_window", "markov_clock", "split_levels", "total",
+    "union",
 ]  # fmt: skip

@@ -18,6 +18,7 @@ from certbound.tubes.gaussian_normal import (
     EPS,
     LOG_ROOT_2PI,
     gauss_rule,
+    lift,
     log_below_above,
     log_between,
     log_tail,
@@ -69,7 +70,7 @@ def log_line_crossing(start: ArrayLike, stop: ArrayLike, span: ArrayLike) -> Arr
     direct = log_below_above(q0, q1, spread=spread)
     reflected = log_below_above(below + loose, above - loose, spread=spread) + shift
     value = np.logaddexp(direct, reflected)
-    result: Array = np.minimum(value + 16 * EPS * (1 + np.abs(shift) + np.abs(value)), 0.0)
+    result: Array = np.minimum(lift(value, 16), 0.0)
     return result
 
 
@@ -124,7 +125,7 @@ def _log_excluding(prior: tuple[Array, Array, Array], after: tuple[Array, Array,
     value = value * (1 + slack) + np.exp(tail) * (1 + slack)
     value = np.logaddexp(np.log(value), log_between(n, p))
     usable = (slack < 1e-3) & ~np.isnan(value) & (m < 30) & (p < 30) & (n < 30)
-    return np.where(usable, value + 16 * EPS * (1 + np.abs(value)), np.inf)
+    return np.where(usable, lift(value, 16), np.inf)
 
 
 def _ellipse_error(
@@ -205,7 +206,7 @@ def log_polygon_crossing(
         after = (q0, forward, length)
     linked = single[len(single) - len(before[0]) :]
     jump = log_between(after[0], before[0])
-    closed = np.logaddexp(linked, jump) + 8 * EPS * (1 + np.abs(linked))
+    closed = lift(np.logaddexp(linked, jump), 8)
     own = ~np.broadcast_to(np.asarray(fresh, dtype=bool), single.shape)[len(single) - len(linked) :]
     if np.any(own):
         refined = _log_excluding((before[0][own], *(x[own] for x in before[1:])), tuple(x[own] for x in after))

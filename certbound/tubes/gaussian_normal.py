@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.rigor.rounding import quiet
 
-__all__ = ["gauss_rule", "log_below_above", "log_between", "log_tail", "mills", "mills_deficit"]
+__all__ = ["gauss_rule", "lift", "log_below_above", "log_between", "log_tail", "mills", "mills_deficit"]
 
 Array = NDArray[np.float64]
 
@@ -114,6 +114,12 @@ def _log_right_tail(x: Array) -> tuple[Array, Array]:
     return value, EPS * (2 * square + 16 * np.abs(log_mills) + 64)
 
 
+def lift(value: Array, count: float) -> Array:
+    """``value`` + count eps (1 + |value|): room for the rounding of a few sums; infinite entries stay."""
+    raised: Array = np.where(np.isfinite(value), value + count * EPS * (1 + np.abs(value)), value)
+    return raised
+
+
 @quiet
 def log_tail(x: ArrayLike) -> Array:
     """Upper bound of log Q(x) = log P(X > x) for standard normal X, of any size.
@@ -131,7 +137,8 @@ def log_tail(x: ArrayLike) -> Array:
     value, error = _log_right_tail(np.atleast_1d(size))
     value, error = value.reshape(x.shape), error.reshape(x.shape)
     below = np.log1p(-np.exp(np.minimum(value - error, -0.5)) * (1 - 16 * EPS))
-    result = np.where(x >= 0, value + error, np.minimum(below * (1 - 16 * EPS), 0.0))
+    below = np.where(below > -1e-300, 0.0, below * (1 - 16 * EPS))
+    result = np.where(x >= 0, value + error, below)
     result = np.where(x == np.inf, -np.inf, result)
     return np.where(np.isnan(x), 0.0, result)
 
@@ -160,8 +167,7 @@ def log_between(low: ArrayLike, high: ArrayLike) -> Array:
     value = np.where(b >= 0, tail, across)
     narrow = np.log(gap) + np.where(b >= 0, log_density, -LOG_ROOT_2PI)
     value = np.minimum(np.minimum(value, narrow), 0.0)
-    value = value + 32 * EPS * (1 + np.abs(value))
-    value = np.where(a > b, value, -np.inf)
+    value = np.where(a > b, lift(value, 32), -np.inf)
     return np.where(near == np.inf, -np.inf, value.reshape(shape))
 
 
@@ -228,7 +234,7 @@ def log_below_above(
         moving = width > 0
         extra[moving] = _log_integral(first[moving], second[moving], width[moving])
         joint = np.logaddexp(log_between(second, first), extra)
-        joint = joint + 8 * EPS * (1 + np.abs(joint))
+        joint = lift(joint, 8)
         result[inner] = np.minimum(result[inner], joint)
     return result
 
@@ -236,12 +242,12 @@ def log_below_above(
 def _log_integral(a: Array, b: Array, tau: Array) -> Array:
     """Upper bound of log((1/pi) exp(-(a^2 + b^2)/4) int_0^tau exp(-g) dt/(1 + t^2)), tau > 0.
 
-    g = (D^2/t^2 + S^2 t^2)/2; with v = log t the integrand is k(v) = exp(-g) sech(v)/2. Pieces: v in
-    [left, right], three panels of 20 Gauss nodes; beyond them `_end_tail`, above ``right`` as its mirror
-    image under t -> 1/t. An n-point rule on a panel of half-length h errs by at most
-    h (64/15) M r^{-2n}/(1 - r^{-2}), M a bound of |k| on the Bernstein ellipse of any parameter r
-    (Trefethen, Approximation Theory and Approximation Practice, Thm 19.3). For |Im v| = y < pi/4:
-    |k| <= exp(-cos(2y) min g)/(2 sqrt(cosh(x)^2 - sin(y)^2)).
+    g = (D^2/t^2 + S^2 t^2)/2; with v = log t the integrand is k(v) = exp(-g) sech(v)/2. Pieces: v in [left,
+    right], three panels of 20 Gauss nodes; beyond them `_end_tail`, above ``right`` its mirror image under
+    t -> 1/t or, where shorter, (1/t_right - 1/tau) exp(-S^2 t_right^2/2). An n-point rule on a panel of
+    half-length h errs by at most h (64/15) M r^{-2n}/(1 - r^{-2}), M a bound of |k| on the Bernstein
+    ellipse of any parameter r (Trefethen, Approximation Theory and Approximation Practice, Thm 19.3). For
+    |Im v| = y < pi/4: |k| <= exp(-cos(2y) min g)/(2 sqrt(cosh(x)^2 - sin(y)^2)).
     """
     dd, ss = 0.25 * (a - b) ** 2, 0.25 * (a + b) ** 2
     end = np.log(tau)
@@ -267,7 +273,9 @@ def _log_integral(a: Array, b: Array, tau: Array) -> Array:
     total = np.einsum("pnk,n,pk->k", density, weights, half)
     total = total + _rule_error(dd, ss, reference, balance, middle, half).sum(axis=0)
     total = total + _end_tail(dd, ss, reference, np.exp(left))
-    total = total + np.where(right < end, _end_tail(ss, dd, reference, np.exp(-right)), 0.0)
+    stop = np.exp(-right)
+    short = (stop - np.exp(-end)) * np.exp(reference - 0.5 * ss / (stop * stop)) + 8 * EPS * stop
+    total = total + np.where(right < end, np.minimum(_end_tail(ss, dd, reference, stop), short), 0.0)
     scale = 0.25 * (a * a + b * b) + reference
     margin = EPS * (64 + 8 * np.abs(left)) * (4 + scale + _DROP)
     value = np.log(total) - LOG_PI - scale + margin

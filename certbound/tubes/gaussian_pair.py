@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.rigor.rounding import down, quiet, up
-from certbound.tubes.gaussian_normal import EPS, log_below_above, log_tail
+from certbound.tubes.gaussian_normal import EPS, lift, log_below_above, log_tail
 
 __all__ = [
     "Bounds", "double", "ends", "exceedance_chain", "levels_of", "log_pair", "log_window", "standard_levels",
@@ -249,5 +249,5 @@ def log_window(levels: ArrayLike, variance: Bounds, increment: Bounds) -> Array:
     spread = np.where(w_hi == 0, 0.0, np.maximum(up(spread), 0.0))
     spread = np.where(np.isnan(spread) | (v_lo == 0), np.where(w_hi == 0, 0.0, 1.0), spread)
     value = log_below_above(a, b, spread=spread) + np.log(2.0)
-    result: Array = np.minimum(value + 4 * EPS * (1 + np.abs(value)), 0.0)
+    result: Array = np.minimum(lift(value, 4), 0.0)
     return result

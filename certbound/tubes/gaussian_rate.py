@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.rigor.rounding import down, quiet, up
-from certbound.tubes.gaussian_normal import EPS, LOG_ROOT_2PI, log_tail, mills_deficit
+from certbound.tubes.gaussian_normal import EPS, LOG_ROOT_2PI, lift, log_tail, mills_deficit
 from certbound.tubes.gaussian_pair import Bounds, ends, levels_of, standard_levels, total
 
 __all__ = ["crossing_rate"]
@@ -103,7 +103,7 @@ def crossing_rate(
     initial = np.broadcast_to(initial, rates.shape[:-1])[..., None]
     jumps = np.broadcast_to(jumps, (*rates.shape[:-1], len(h) - 1))
     logs = np.concatenate([initial, rates, jumps], axis=-1)
-    return total(logs + 64 * EPS * (1 + np.abs(logs)) * (logs > -np.inf), axis=-1)
+    return total(lift(logs, 64), axis=-1)
 
 
 def _line_ends(levels: Array, count: int) -> tuple[Array, Array]:
