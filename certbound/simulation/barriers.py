@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from certbound.problem.sets import Outside
 from certbound.simulation.expressions import Parameters, linear_form
 
-__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of"]
+__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "window_test"]
 
 Array = NDArray[np.float64]
 
@@ -44,6 +44,8 @@ class Barrier:
         The second shape: one row per step, for a region that moves.
     radius : float
     first, last : int
+    always : bool
+        Whether these are all steps: then the kernel asks no further.
     """
 
     label: str
@@ -54,6 +56,7 @@ class Barrier:
     radius: float = 0.0
     first: int
     last: int
+    always: bool = False
 
     @property
     def moving(self) -> bool:
@@ -126,10 +129,9 @@ def barriers_of(problem: Any, times: Array) -> list[Barrier]:
             if len(bounds) == 0:
                 continue
             fields = {"round": False, "matrix": faces @ embed, "offset": bounds + centers @ faces.T}
-        stay = not isinstance(constraint, Outside)
-        barriers.append(
-            Barrier(label=constraint.label, stay=stay, first=min(first, last), last=min(end, last), **fields)
-        )
+        fields |= {"label": constraint.label, "stay": not isinstance(constraint, Outside)}
+        fields |= {"first": min(first, last), "last": min(end, last), "always": first == 0 and end >= last}
+        barriers.append(Barrier(**fields))
     return barriers
 
 
@@ -164,9 +166,20 @@ def barrier_source(
     return _faces(number, barrier, bridge, parameters, column)
 
 
-def _active(number: int, old: bool) -> str:
-    end = f"k + 1 <= windows[{number}, 1]"
-    return f"windows[{number}, 0] <= k and {end}" if old else f"windows[{number}, 0] <= k + 1 and {end}"
+def window_test(number: int, barrier: Barrier, start: str) -> list[str]:
+    """Conditions for a constraint to hold from step ``start`` to step k + 1; none if it always does."""
+    if barrier.always:
+        return []
+    return [f"windows[{number}, 0] <= {start}", f"k + 1 <= windows[{number}, 1]"]
+
+
+def if_all(*conditions: str, word: str = "if") -> str:
+    """``if a and b:``, or ``if True:`` without conditions."""
+    return f"{word} {' and '.join(condition for condition in conditions if condition) or 'True'}:"
+
+
+def _starts(number: int, barrier: Barrier) -> str:
+    return "" if barrier.always else f"windows[{number}, 0] == 0"
 
 
 def _names(letter: str, count: int) -> list[str]:
@@ -204,35 +217,40 @@ def _faces(
     def out(names: list[str]) -> str:
         return (" or " if barrier.stay else " and ").join(f"{name} < 0.0" for name in names)
 
-    start = [*gaps(old, "x", "0"), f"if windows[{number}, 0] == 0 and ({out(old)}):", f"    left = {number}"]
+    start = [*gaps(old, "x", "0"), if_all(_starts(number, barrier), f"({out(old)})"), f"    left = {number}"]
     step = [
         *gaps(new, "y", "k + 1"),
-        f"if ({out(new)}) and {_active(number, old=False)}:",
+        if_all(f"({out(new)})", *window_test(number, barrier, "k + 1")),
         f"    left = {number}",
     ]
     end: list[str] = []
     if bridge is not None:
         end = [f"{g} = {n}" for g, n in zip(old, new)]
         spreads = [bridge.variance(row.tolist(), p) for row in barrier.matrix]
-        step += (_bridge_stay if barrier.stay else _bridge_avoid)(number, old, new, spreads, p)
+        active = window_test(number, barrier, "k")
+        step += (_bridge_stay if barrier.stay else _bridge_avoid)(number, active, old, new, spreads, p)
     return start, step, end
 
 
-def _bridge_stay(number: int, old: list[str], new: list[str], spreads: list[str], p: Parameters) -> list[str]:
+def _bridge_stay(
+    number: int, active: list[str], old: list[str], new: list[str], spreads: list[str], p: Parameters
+) -> list[str]:
     """Each face may be touched."""
     lines = []
     for g, n, spread in zip(old, new, spreads):
         if not p.is_zero(spread):
-            near = f"0.0 <= {g} and 2.0 * {g} * {n} < {EXPONENT} * ({spread})"
-            lines += [f"if left < 0 and {near} and {_active(number, old=True)}:"]
+            near = f"0.0 <= {g} and {g} * {n} < {0.5 * EXPONENT} * ({spread})"
+            lines += [if_all(near, "left < 0", *active)]
             lines += _indent(_touch(f"2.0 * {g} * {n} / ({spread})", number))
     return lines
 
 
-def _bridge_avoid(number: int, old: list[str], new: list[str], spreads: list[str], p: Parameters) -> list[str]:
+def _bridge_avoid(
+    number: int, active: list[str], old: list[str], new: list[str], spreads: list[str], p: Parameters
+) -> list[str]:
     """All faces must be crossed: the least likely one decides; without one, the straight line does."""
     near = " and ".join(
-        f"({n} < 0.0 or 2.0 * {g} * {n} < {EXPONENT} * ({spread}))" for g, n, spread in zip(old, new, spreads)
+        f"({n} < 0.0 or {g} * {n} < {0.5 * EXPONENT} * ({spread}))" for g, n, spread in zip(old, new, spreads)
     )
     lines = ["worst, enter, leave = -1.0, 0.0, 1.0"]
     for g, n, spread in zip(old, new, spreads):
@@ -241,7 +259,7 @@ def _bridge_avoid(number: int, old: list[str], new: list[str], spreads: list[str
         lines += [f"elif {n} > 0.0:", f"    leave = min(leave, {g} / ({g} - {n}))"]
     lines += ["if worst >= 0.0:", *_indent(_touch("worst", number))]
     lines += ["elif enter < leave:", f"    left = {number}"]
-    return [f"if left < 0 and {near} and {_active(number, old=True)}:", *_indent(lines)]
+    return [if_all(near, "left < 0", *active), *_indent(lines)]
 
 
 def _round(
@@ -262,9 +280,9 @@ def _round(
 
     beyond = f"{'>' if barrier.stay else '<'} {radius} * {radius}"
     start = distance(old, "x", "0")
-    start += [f"if windows[{number}, 0] == 0 and {old} {beyond}:", f"    left = {number}"]
+    start += [if_all(_starts(number, barrier), f"{old} {beyond}"), f"    left = {number}"]
     step = distance(new, "y", "k + 1")
-    step += [f"if {new} {beyond} and {_active(number, old=False)}:", f"    left = {number}"]
+    step += [if_all(f"{new} {beyond}", *window_test(number, barrier, "k + 1")), f"    left = {number}"]
     end = [f"{old} = {new}"]
     if bridge is None:
         return start, step, []
@@ -275,9 +293,10 @@ def _round(
     lines += [f"w_{i} = {weight}" for i, weight in enumerate(weights)]
     spread = bridge.moving_variance(_names("w", dimension), p)
     lines += [f"spread = ({spread}) / {new} if {new} > 0.0 else 0.0"]
-    lines += [f"if before >= 0.0 and 2.0 * before * after < {EXPONENT} * spread:"]
+    lines += [f"if before >= 0.0 and before * after < {0.5 * EXPONENT} * spread:"]
     lines += _indent(_touch("2.0 * before * after / spread", number))
-    return start, [*step, f"elif {near}{_active(number, old=True)}:", *_indent(lines)], end
+    test = if_all(near, *window_test(number, barrier, "k"), word="elif")
+    return start, [*step, test, *_indent(lines)], end
 
 
 def _near(barrier: Barrier, bridge: Bridge, old: str, new: str, p: Parameters) -> str:
@@ -287,4 +306,4 @@ def _near(barrier: Barrier, bridge: Bridge, old: str, new: str, p: Parameters) -
     band = np.sqrt(0.5 * EXPONENT) * np.linalg.norm(barrier.matrix @ bridge.spread, 2)
     near = max(barrier.radius - band, 0.0) if barrier.stay else barrier.radius + band
     limit = p.add(float(near**2))
-    return f"max({old}, {new}) > {limit} and " if barrier.stay else f"min({old}, {new}) < {limit} and "
+    return f"max({old}, {new}) > {limit}" if barrier.stay else f"min({old}, {new}) < {limit}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from certbound.simulation.barriers import EXPONENT, Barrier, Bridge
+from certbound.simulation.barriers import EXPONENT, Barrier, Bridge, if_all, window_test
 from certbound.simulation.expressions import Parameters, linear_form
 from certbound.simulation.kernels import indent, vector
 
@@ -34,20 +34,25 @@ def score_source(
         units = 1 if barrier.round or not barrier.stay else len(barrier.matrix)
         old, new, free = (vector(f"{letter}_{number}", units) for letter in "gnc")
         begin += _gaps(barrier, old, "x", "first", column, p)
-        begin += [f"if first == 0 and windows[{number}, 0] == 0 and min({old[0]}, {old[-1]}) < 0.0:", "    top = 2.0"]
+        due = "" if barrier.always else f"windows[{number}, 0] == 0"
+        for g in old:
+            begin += [if_all("first == 0", due, f"{g} < 0.0"), "    top = 2.0"]
         within += _gaps(barrier, free, "b", "k + 1", column, p) + _gaps(barrier, new, "y", "k + 1", column, p)
-        within += [f"active = windows[{number}, 0] <= k + 1 and k + 1 <= windows[{number}, 1]"]
-        within += [f"bridged = windows[{number}, 0] <= k and k + 1 <= windows[{number}, 1]"] if bridge else []
+        active = " and ".join(window_test(number, barrier, "k + 1"))
+        bridged = " and ".join(window_test(number, barrier, "k"))
         for unit in range(units):
             spread = _spread(barrier, unit, column, bridge, p) if bridge else ([], "0.0")
-            within += _unit(old[unit], new[unit], free[unit], *spread, p)
+            within += _unit((old[unit], new[unit], free[unit]), (active, bridged), *spread, p)
         end += [f"{g} = {n}" for g, n in zip(old, new)]
         column += len(barrier.matrix) if barrier.moving else 0
     return begin, within, end
 
 
-def _unit(g: str, n: str, free: str, spread_lines: list[str], spread: str, p: Parameters) -> list[str]:
-    """Raise the record by one gap."""
+def _unit(
+    gaps: tuple[str, str, str], windows: tuple[str, str], spread_lines: list[str], spread: str, p: Parameters
+) -> list[str]:
+    """Raise the record by one gap (names of its old, new and noise-free value)."""
+    (g, n, free), (active, bridged) = gaps, windows
     lines = [f"low, floor = {n}, (1.0 - top) * {free}"]
     if not p.is_zero(spread):
         draw = [
@@ -60,13 +65,13 @@ def _unit(g: str, n: str, free: str, spread_lines: list[str], spread: str, p: Pa
             f"        fall = math.sqrt(({g} - {n}) ** 2 - 2.0 * ({spread}) * math.log(chance))",
             f"        low = 0.5 * ({g} + {n} - fall)",
         ]
-        lines += [f"if bridged and {free} > 0.0:", *indent(draw)]
+        lines += [if_all(f"{free} > 0.0", bridged), *indent(draw)]
     lines += [
         f"if {free} > 0.0:",
         f"    if low < (1.0 - top) * {free}:",
         f"        score = 1.0 - low / {free}",
-        f"        top = max(top, score if active else min(score, {_ALMOST}))",
-        "elif low < 0.0 and active:",
+        f"        top = max(top, {f'score if {active} else min(score, {_ALMOST})' if active else 'score'})",
+        if_all("low < 0.0", active, word="elif"),
         "    top = max(top, 2.0)",
     ]
     return lines
