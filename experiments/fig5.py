@@ -27,8 +27,7 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
     )
     for key, method in (("right", "thm3"), ("right_printed", "thm3_as_printed")):
         radii = [
-            tube(method, RATE, HORIZON, epsilon=EPSILON, step=float(step)).radius(np.array(INSTANTS))
-            for step in steps
+            tube(method, RATE, HORIZON, epsilon=EPSILON, step=float(step)).radius(np.array(INSTANTS)) for step in steps
         ]
         arrays[key] = np.stack(radii, axis=1)
     best = tube("thm3", RATE, HORIZON)

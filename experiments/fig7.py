@@ -29,9 +29,7 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
             values = np.array([one.bound(0.0, horizon) for one in tubes])
             arrays[f"{side}_{key}"] = values
             claims[f"{side}_{key}"] = [float(np.interp(x, grid, values)) for x in EXPONENTS]
-        largest = np.sort(
-            largest_deviations(RATE, horizon, count=count, steps=round(horizon * 100), seed=70 + seed)
-        )
+        largest = np.sort(largest_deviations(RATE, horizon, count=count, steps=round(horizon * 100), seed=70 + seed))
         ranks = np.minimum(np.ceil(count * (1 - 10.0**-grid)).astype(int), count - 1)
         seen = 10.0**-grid * count >= 10
         arrays[f"{side}_simulated"] = np.where(seen, largest[ranks], np.nan)

@@ -33,9 +33,7 @@ def step_factors(rate: float, step: float) -> tuple[float, float]:
     return growth, math.sqrt(variance)
 
 
-def paths(
-    rate: float, horizon: float, *, count: int, points: int, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
+def paths(rate: float, horizon: float, *, count: int, points: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Times (points + 1,) and paths (count, points + 1)."""
     rng = np.random.default_rng(seed)
     growth, deviation = step_factors(rate, horizon / points)

@@ -13,7 +13,7 @@ import typer
 from certbound._version import __version__
 from certbound.cli import derive, doctor, new, problems, simulate, tune, verify
 from certbound.cli.messages import BAD_INPUT, INTERRUPTED, explain, write_error
-from certbound.cli.output import SETTINGS, start_logging
+from certbound.cli.output import SETTINGS, logging_to_stderr
 
 __all__ = ["app", "run"]
 
@@ -54,21 +54,26 @@ def run(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     SETTINGS.verbose, SETTINGS.quiet = "--verbose" in words, "--quiet" in words
     words = [word for word in words if word not in ("--verbose", "--quiet")]
-    start_logging(verbose=SETTINGS.verbose)
     command = next((word for word in words if not word.startswith("-")), "")
+    with logging_to_stderr(verbose=SETTINGS.verbose):
+        return _run(words, command)
+
+
+def _run(words: list[str], command: str) -> int:
     try:
         code = app(args=words, prog_name="certbound", standalone_mode=False)
         sys.stdout.flush()
-        return code if isinstance(code, int) else 0
     except (KeyboardInterrupt, typer.Abort):
-        sys.stderr.write("certbound: interrupted; nothing was written\n")
-        return INTERRUPTED
+        code = INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()
         return 0
     except Exception as error:  # noqa: BLE001  (the outermost frame: whatever happened, three lines)
         _log.debug("the command ended with an error", exc_info=True)
         return _report(error, command)
+    if code == INTERRUPTED:
+        sys.stderr.write("certbound: interrupted; nothing was written\n")
+    return code if isinstance(code, int) else 0
 
 
 def _report(error: Exception, command: str) -> int:

@@ -156,10 +156,11 @@ def _tracing() -> str:
 
 def _solver() -> str:
     import cvxpy
+    import numpy as np
 
     cp: Any = cvxpy
     matrix = cp.Variable((2, 2), symmetric=True)
-    problem = cp.Problem(cp.Minimize(cp.trace(matrix)), [matrix >> [[2.0, 1.0], [1.0, 2.0]]])
+    problem = cp.Problem(cp.Minimize(cp.trace(matrix)), [matrix >> np.array([[2.0, 1.0], [1.0, 2.0]])])
     problem.solve(solver=cp.CLARABEL)
     if problem.status != cp.OPTIMAL or abs(problem.value - 4.0) > 1e-5:
         raise RuntimeError(f"Clarabel answered {problem.status}, {problem.value}")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["SETTINGS", "Settings", "console", "plain", "print_json", "spinner", "write_file"]
+__all__ = ["SETTINGS", "Settings", "console", "logging_to_stderr", "plain", "print_json", "spinner", "write_file"]
 
 
 class Settings:
@@ -74,19 +74,26 @@ def spinner(text: str) -> Iterator[None]:
         yield
 
 
-def start_logging(*, verbose: bool) -> None:
+@contextlib.contextmanager
+def logging_to_stderr(*, verbose: bool) -> Iterator[None]:
     """Send the library's log and every warning to standard error with --verbose, and nowhere without."""
-    logging.captureWarnings(True)
-    if not verbose:
-        warnings = logging.getLogger("py.warnings")
-        warnings.addHandler(logging.NullHandler())
-        warnings.propagate = False
-        return
-    handler = logging.StreamHandler(sys.stderr)
+    handler: logging.Handler = logging.StreamHandler(sys.stderr) if verbose else logging.NullHandler()
     handler.setFormatter(logging.Formatter("%(relativeCreated)8.0f ms  %(name)s: %(message)s"))
-    logger = logging.getLogger("certbound")
-    logger.addHandler(handler)
-    logger.setLevel(logging.DEBUG)
+    loggers = [logging.getLogger("certbound"), logging.getLogger("py.warnings")]
+    before = [(logger.level, logger.propagate) for logger in loggers]
+    logging.captureWarnings(True)
+    for logger in loggers:
+        logger.addHandler(handler)
+        logger.setLevel(logging.DEBUG if verbose else logging.WARNING)
+        logger.propagate = False
+    try:
+        yield
+    finally:
+        logging.captureWarnings(False)
+        for logger, (level, propagate) in zip(loggers, before):
+            logger.removeHandler(handler)
+            logger.setLevel(level)
+            logger.propagate = propagate
 
 
 def write_file(path: Path, content: str | bytes) -> None:

@@ -34,7 +34,7 @@ def test_settings_are_read_as_numbers() -> None:
 
 @pytest.mark.parametrize("pair", ["sigma", "sigma=", "=1", "sigma=nan", "sigma=big"])
 def test_a_malformed_setting_is_refused_with_an_example(pair: str) -> None:
-    with pytest.raises(InputError, match="write for example --set sigma=0.02"):
+    with pytest.raises(InputError, match=r"write for example --set sigma=0\.02"):
         settings_of([pair])
 
 

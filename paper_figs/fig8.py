@@ -1,0 +1,66 @@
+"""Fig. 8: six panels of the unicycle; columns are the horizons, rows nominal paths, boxes and noisy paths."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, Rectangle
+
+from paper_figs.style import BLUE, COLUMN, Data, letter, main, panels
+
+OBSTACLE, RIM, BAND, NOMINAL, NOISY = "#D55E00", "#7a3500", "#F7EC8C", "#2b6da3", "#555555"
+TITLES = {"left": "$T=2$", "right": "$T=5$"}
+
+
+def draw(data: Data) -> Figure:
+    """Three rows, two columns, one scale."""
+    figure, axes = panels(COLUMN, 4.15, 3, 2, sharex=True, sharey=True)
+    for column, side in enumerate(TITLES):
+        for row in range(3):
+            _scene(axes[row, column], data, side)
+        _paths(axes[0, column], data[f"{side}_nominal"], NOMINAL)
+        for low, high in data[f"{side}_boxes"]:
+            box = Rectangle(tuple(low), *(high - low), facecolor="#9cc8e8", edgecolor=BLUE, linewidth=0.7, alpha=0.8)
+            axes[1, column].add_patch(box)
+        _paths(axes[2, column], data[f"{side}_noisy"], NOISY)
+    for row in range(3):
+        axes[row, 0].set_ylabel("$p_y$")
+    for column in range(2):
+        axes[2, column].set_xlabel("$p_x$")
+    letter(
+        axes.flat,
+        [f"{name}, {title}" for name in ("noise-free", "reach boxes", "noisy") for title in TITLES.values()],
+    )
+    handles = [
+        Patch(facecolor=OBSTACLE, edgecolor=RIM, hatch="////", label="obstacle"),
+        Patch(facecolor=BAND, label="eroded"),
+        Line2D([], [], color=NOMINAL, label="noise-free paths"),
+        Line2D([], [], color=NOISY, label="noisy paths"),
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=4, columnspacing=1.0, handlelength=1.5)
+    return figure
+
+
+def _scene(axes: Axes, data: Data, side: str) -> None:
+    for centre, radius in zip(data["centers"], data["radii"]):
+        axes.add_patch(Circle(tuple(centre), radius + float(data[f"{side}_band"]), facecolor=BAND, zorder=0.5))
+        axes.add_patch(
+            Circle(tuple(centre), radius, facecolor=OBSTACLE, edgecolor=RIM, hatch="////", linewidth=0.4, zorder=0.6)
+        )
+    axes.plot(0.5, 0.0, "x", color="black", markersize=4, zorder=6)
+    axes.set(xlim=(-2.6, 7.8), ylim=(-1.0, 5.6), xticks=range(-2, 8, 2), yticks=range(0, 6, 2))
+    axes.set_aspect("equal", adjustable="box")
+
+
+def _paths(axes: Axes, paths: np.ndarray, color: str) -> None:
+    alpha = float(np.clip(60 / len(paths), 0.04, 0.5))
+    axes.add_collection(
+        LineCollection(list(paths), colors=color, linewidths=0.35, alpha=alpha, rasterized=True, zorder=2)
+    )
+
+
+if __name__ == "__main__":
+    main("fig8", draw)

@@ -1,0 +1,300 @@
+"""The commands as they are called: exit codes, JSON, files, and nothing else on standard output."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import certbound as cb
+from certbound.cli.app import app, run
+
+VERIFY_KEYS = {
+    "status", "log10_delta", "delta", "margin", "time", "constraint", "reason", "method", "constants", "tube",
+    "seconds",
+}  # fmt: skip
+
+
+def answer(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any]]:
+    """Exit code and the one JSON object that a command prints."""
+    code = run([*words, "--json"])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 1
+    return code, json.loads(lines[0])
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """The three lines of a refusal; nothing on standard output, exit code 2."""
+    assert run(list(words)) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 3
+    assert lines[0].startswith("certbound: ")
+    assert lines[1].startswith("  why: ")
+    assert lines[2].startswith("  try: ")
+    assert "Traceback" not in captured.err
+    return captured.err
+
+
+# ---- verify ------------------------------------------------------------------------------------------------
+
+
+def test_verify_prints_the_keys_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
+    code, found = answer(capsys, "verify", "ou", "--method", "kummer")
+    assert code == 0
+    assert found.keys() == VERIFY_KEYS
+    assert found["status"] == "SAFE"
+    assert found["delta"] == 1e-3
+    assert found["log10_delta"] <= -3
+    assert found["constants"]["rate"] == -0.5
+    tube = found["tube"]
+    assert tube.keys() == {"times", "radius", "extent"}
+    assert len(tube["times"]) == len(tube["radius"]) + 1 == len(tube["extent"]) + 1
+    assert tube["times"][0] == 0
+    assert tube["times"][-1] == 5
+    assert 1.2858 <= max(tube["radius"]) <= 1.3401
+    assert all(len(row) == 1 for row in tube["extent"])
+
+
+def test_an_answer_that_is_not_safe_exits_with_one(capsys: pytest.CaptureFixture[str]) -> None:
+    code, found = answer(capsys, "verify", "ou", "--method", "kummer", "--set", "radius=0.5")
+    assert code == 1
+    assert found.keys() == VERIFY_KEYS
+    assert found["status"] == "UNKNOWN"
+    assert -3 < found["log10_delta"] <= 0
+    assert "0.5" in found["constraint"]
+
+
+def test_a_noise_free_path_that_leaves_is_unsafe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "drift.toml"
+    path.write_text(
+        'states = ["x"]\ntime = "continuous"\nhorizon = 2\n[dynamics]\nx = "1"\n[noise]\ndiffusion = [[0.1]]\n'
+        "[initial]\npoint = [0]\n[[stay]]\nbox = { x = [-1, 1] }\n"
+    )
+    code, found = answer(capsys, "verify", str(path))
+    assert code == 1
+    assert found.keys() == VERIFY_KEYS
+    assert found["status"] == "UNSAFE_NOMINAL"
+    assert found["log10_delta"] == 0
+    assert 1 <= found["time"] <= 2
+
+
+def test_horizon_delta_and_settings_change_the_problem(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("--horizon", "1", "--delta", "1e-6", "--set", "sigma=1e-1", "--set", "rate=-1")
+    code, found = answer(capsys, "verify", "ou", "--method", "kummer", *words)
+    assert code == 0
+    assert found["delta"] == 1e-6
+    assert found["tube"]["times"][-1] == 1
+    assert found["constants"]["rate"] == -1
+    assert found["constants"]["sigma"] == pytest.approx(0.1)
+
+
+def test_explain_shows_every_engine(capsys: pytest.CaptureFixture[str]) -> None:
+    _, found = answer(capsys, "verify", "ou", "--method", "kummer", "--explain")
+    assert [row["engine"] for row in found["engines"]] == ["constants"]
+    assert found["engines"][0]["log10_delta"] == found["log10_delta"]
+
+
+def test_the_plot_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "ou.png"
+    assert run(["verify", "ou", "--method", "kummer", "--plot", str(path), "--quiet"]) == 0
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert capsys.readouterr().out.startswith("SAFE  ou: P(leaving within 5 s) <= ")
+
+
+def test_people_get_the_verdict_first(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["verify", "ou", "--method", "kummer"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("SAFE  ou: P(leaving within 5 s) <= ")
+    assert lines[0].endswith("asked 0.001")
+    assert lines[1].startswith("margin ")
+
+
+# ---- derive, tune, problems, new -----------------------------------------------------------------------------
+
+
+def test_derive_gives_the_constants(capsys: pytest.CaptureFixture[str]) -> None:
+    code, found = answer(capsys, "derive", "ou")
+    assert code == 0
+    assert {"rate", "sigma", "effective_dimension", "certified", "gap", "seconds", "metrics"} <= found.keys()
+    assert found["rate"] == -0.5
+    assert found["certified"] is True
+    assert len(found["metrics"]) == 1
+
+
+def test_tune_gives_every_method_and_the_radii_that_are_known(capsys: pytest.CaptureFixture[str]) -> None:
+    code, found = answer(capsys, "tune", "ou")
+    assert code == 0
+    for row in found["rows"]:
+        assert row.keys() == {"method", "level", "final", "maximum", "mean", "parameters", "seconds"}
+    largest = {row["method"]: row["maximum"] for row in found["rows"]}
+    assert largest["exact"] == pytest.approx(1.2858, abs=2e-4)
+    assert largest["kummer"] <= 1.340
+    windows = [row for row in found["rows"] if row["method"] == "thm3"]
+    assert any(
+        row["parameters"].get("step") == 0.05 and row["maximum"] == pytest.approx(2.124, abs=1e-3) for row in windows
+    )
+    levels = {row["method"]: row["level"] for row in found["rows"]}
+    assert levels["prop1"] == levels["markov"] == "one time"
+    assert levels["kummer"] == levels["thm3"] == "trajectory"
+    assert levels[found["method"]] == "trajectory"
+
+
+def test_problems_are_listed_with_their_keys(capsys: pytest.CaptureFixture[str]) -> None:
+    _, found = answer(capsys, "problems")
+    rows = {row["name"]: row for row in found["problems"]}
+    assert rows.keys() == {"ou", "unicycle", "chain", "chain_rest", "pendulum"}
+    for row in rows.values():
+        assert row["summary"]
+        assert "sigma" in row["parameters"]
+
+
+def test_a_new_file_loads_and_is_never_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, found = answer(capsys, "new", "my_system")
+    assert code == 0
+    problem = cb.load(found["path"])
+    assert problem.system.states == ("angle", "speed")
+    before = Path(found["path"]).read_text()
+    assert "exists already" in refusal(capsys, "new", "my_system")
+    assert Path(found["path"]).read_text() == before
+    assert "letters, digits" in refusal(capsys, "new", "two words")
+    assert [path.name for path in tmp_path.iterdir()] == ["my_system.toml"]
+
+
+def test_the_doctor_reports_every_dependency(capsys: pytest.CaptureFixture[str]) -> None:
+    code, found = answer(capsys, "doctor")
+    assert code == 0
+    assert found["ok"] is True
+    names = {row["name"] for row in found["checks"]}
+    assert {"python", "numpy", "python-flint", "rounding", "ball arithmetic", "solver", "verdict"} <= names
+
+
+def test_a_broken_installation_is_reported(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    from certbound.cli import doctor
+
+    monkeypatch.setattr(doctor, "_verdict", lambda: "fine")
+    monkeypatch.setattr(doctor, "_requirements", lambda: {"numpy": ">=99.0", "not-there": ">=1"})
+    code, found = answer(capsys, "doctor")
+    assert code == 3
+    broken = {row["name"]: row["detail"] for row in found["checks"] if not row["ok"]}
+    assert broken.keys() == {"numpy", "not-there"}
+    assert ">=99.0 is needed" in broken["numpy"]
+
+
+# ---- global options ------------------------------------------------------------------------------------------
+
+
+def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out == f"certbound {cb.__version__}\n"
+
+
+def test_no_command_is_no_success(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([]) == 2
+    assert "Usage: certbound" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", [entry.name for entry in app.registered_commands])
+def test_every_command_has_help_with_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"Example: certbound {command}" in text
+    assert "--json" in text
+
+
+def test_verbose_logs_to_standard_error_only(capsys: pytest.CaptureFixture[str]) -> None:
+    code = run(["problems", "--quiet", "--verbose"])
+    captured = capsys.readouterr()
+    assert code == 0
+    assert captured.out.split() == ["chain", "chain_rest", "ou", "pendulum", "unicycle"]
+
+
+def test_an_interrupt_leaves_nothing_and_exits_with_130(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import certbound.safety.verification as verification
+
+    def stop(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(verification, "verify_safety", stop)
+    path = tmp_path / "ou.png"
+    assert run(["verify", "ou", "--plot", str(path), "--json"]) == 130
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "interrupted" in captured.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failing_solver_exits_with_three(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    import certbound.safety.verification as verification
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise cb.SolverError("Clarabel stopped; scale the states")
+
+    monkeypatch.setattr(verification, "verify_safety", fail)
+    assert run(["verify", "ou", "--json"]) == 3
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.splitlines()[1:] == ["  why: Clarabel stopped", "  try: scale the states"]
+
+
+def test_the_installed_program_keeps_standard_output_clean(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "certbound.cli", "verify", "ou", "--method", "kummer", "--json"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert result.returncode == 0
+    assert json.loads(result.stdout)["status"] == "SAFE"
+    assert result.stderr == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- bad input -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "why", "cure"),
+    [
+        (["verify", "unicyle"], "unicyle", "unicycle"),
+        (["verify", "missing.toml"], "missing.toml", ""),
+        (["verify", "ou", "--set", "sgma=1"], "sgma", "sigma"),
+        (["verify", "ou", "--set", "sigma=nan"], "nan", "--set sigma=0.02"),
+        (["verify", "ou", "--set", "sigma"], "key=value", "--set sigma"),
+        (["verify", "ou", "--delta", "1.5"], "`delta`", "--delta"),
+        (["verify", "ou", "--delta", "0"], "`delta`", "--delta"),
+        (["verify", "ou", "--delta", "nan"], "nan", "verify --help"),
+        (["verify", "ou", "--horizon", "0"], "`horizon`", "--horizon"),
+        (["verify", "ou", "--horizon", "-1"], "`horizon`", "--horizon"),
+        (["verify", "chain_rest", "--horizon", "2.5"], "whole", "whole steps"),
+        (["verify", "ou", "--method", "magic"], "`method`", ""),
+        (["verify", "ou", "--method", "thm5"], "thm5", ""),
+        (["verify", "ou", "--cells", "1.5"], "whole", "verify --help"),
+        (["verify", "ou", "--cells", "0"], "cells", ""),
+        (["verify", "ou", "--plot", "no/such/folder/a.png"], "does not exist", "mkdir"),
+        (["verify", "ou", "--bogus"], "--bogus", "verify --help"),
+        (["verify"], "PROBLEM", "verify --help"),
+        (["verfy", "ou"], "verfy", "certbound verify"),
+        (["derive", "ou", "--set", "dimension=0"], "dimension", ""),
+        (["tune", "math:sqrt"], "", ""),
+    ],
+)
+def test_bad_input_gets_three_lines(
+    words: list[str],
+    why: str,
+    cure: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    lines = refusal(capsys, *words).splitlines()
+    assert why in lines[1]
+    assert cure in lines[2]
+    assert list(tmp_path.iterdir()) == []
