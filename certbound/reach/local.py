@@ -40,6 +40,7 @@ ITERATIONS = 12
 INFLATION = 1.03
 GUESSES = 12
 TUBE_INFLATION = 1.1
+SEGMENTS = 48
 
 
 def local_contraction_tube(
@@ -201,6 +202,13 @@ def local_tube(
 
 
 def radius_over_pieces(tube: Tube, curve: Curve) -> Array:
-    """Upper bounds of a tube's radius over each piece of a curve, shape (K,); 0 at step 0 of discrete time."""
-    radius = np.asarray(tube.bound(curve.starts, curve.ends), dtype=float)
-    return radius if curve.continuous else np.concatenate([[0.0], radius[1:]])
+    """Upper bounds of a tube's radius over each piece of a curve, shape (K,); 0 at step 0 of discrete time.
+
+    In continuous time neighbouring pieces share one bound, ``SEGMENTS`` of them over the horizon.
+    """
+    if not curve.continuous:
+        radius = np.asarray(tube.bound(curve.starts[1:], curve.ends[1:]), dtype=float)
+        return np.concatenate([[0.0], radius])
+    edges = np.unique(np.linspace(0, curve.pieces, min(SEGMENTS, curve.pieces) + 1).astype(int))
+    values = np.asarray(tube.bound(curve.starts[edges[:-1]], curve.ends[edges[1:] - 1]), dtype=float)
+    return np.repeat(values, np.diff(edges))

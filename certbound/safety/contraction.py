@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.constants.bounds import bound_constants
+from certbound.constants.metrics import bound_metrics
 from certbound.errors import CertboundError, EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
@@ -32,14 +33,22 @@ from certbound.reach.local import local_constants, local_contraction_tube, radiu
 from certbound.reach.nominal import nominal_curve
 from certbound.reach.norms import Norm
 from certbound.reach.tube import ReachTube
-from certbound.rigor.definite import is_positive_definite
-from certbound.rigor.intervals import Interval
 from certbound.safety.answers import Deviation, EngineAnswer
-from certbound.safety.erosion import Erosion, erode
+from certbound.safety.erosion import Erosion, Tightest, erode
+from certbound.safety.levels import (
+    BELOW,
+    deviation_pieces,
+    joined,
+    log10_sum,
+    needed_radius,
+    random_start,
+    room_level,
+    smallest_level,
+)
 from certbound.tubes.constants import Constants
 from certbound.tubes.kummer import Start
 from certbound.tubes.tube import Tube
-from certbound.tubes.tuning import bound_exit_probability, tune_tube
+from certbound.tubes.tuning import tune_tube
 
 __all__ = ["ONE_TIME", "constants_engine"]
 
@@ -47,14 +56,21 @@ Array = NDArray[np.float64]
 
 ONE_TIME = ("prop1", "prop1_cosh", "prop2", "markov", "chebyshev")
 """Methods that bound one time at a time: never SAFE."""
+BY_CLEARANCE = ("auto", "kummer", "bessel")
+"""Methods that go from rooms to a probability directly (Thm K2)."""
+NO_START = Start()
 SHARES = (1.15, 1.6, 2.4, 4.0)
 """Room tried with local constants, in units of the tube at the target probability."""
-BISECTIONS = 14
-SMALLEST_LOG10 = -290.0
+NEAR_MISS = 2.0
 
 
 def constants_engine(
-    problem: Problem, *, method: str = "auto", cells: int | None = None, constants: Constants | None = None
+    problem: Problem,
+    *,
+    method: str = "auto",
+    cells: int | None = None,
+    constants: Constants | None = None,
+    quick: bool = False,
 ) -> EngineAnswer:
     """The best answer from constants: global ones, or local ones along the reach tube where none are global.
 
@@ -67,39 +83,46 @@ def constants_engine(
         Parts along each side of the initial set.
     constants : Constants, optional
         Stated constants, used instead of certified ones.
+    quick : bool
+        Leave out what is slow and seldom decides: proposed metrics and local constants.
 
     Raises
     ------
     ValueError
-        If the Jacobian is unbounded on the domain that the user gave, or the nominal is lost before the horizon.
+        If the Jacobian is unbounded or undefined on the domain that the user gave, or the nominal is lost before the
+        horizon.
     """
     work = _Work(problem, method, cells)
+    by_clearance, target = method in BY_CLEARANCE, math.log10(problem.delta)
     best: EngineAnswer | None = None
     reason = ""
     try:
-        for candidate in [constants] if constants is not None else _proposals(problem):
+        for candidate in [constants] if constants is not None else _proposals(problem, quick=quick):
             answer = work.global_answer(candidate)
             best = answer if best is None else _better(best, answer)
-            if best.certified and best.log10_delta <= math.log10(problem.delta):
+            if best.certified and best.log10_delta <= target:
                 return best
+        if best is not None and constants is None and not quick:
+            best = work.with_own_metrics(best)
     except (InfeasibleError, EnclosureError) as error:
+        if problem.domain is not None and best is None:
+            raise ValueError(f"`domain` must lie where the model is defined and smooth: {error}") from error
         reason = str(error)
-    if best is not None:
+    if best is not None and (not by_clearance or quick or constants is not None or best.log10_delta <= target):
         return best
     if method in ONE_TIME:
-        return EngineAnswer(
-            applicable=False,
-            reason=f"{reason} A bound for one time must not be combined with local constants.",
-            method=method,
-        )
-    return work.local_answer(reason)
+        reason = f"{reason} A bound for one time must not be combined with local constants."
+    if method in ONE_TIME or quick or constants is not None:
+        return EngineAnswer(applicable=False, reason=reason, method=work.name)
+    local = work.local_answer(reason)
+    return local if best is None or (local.applicable and local.log10_delta < best.log10_delta) else best
 
 
-def _proposals(problem: Problem) -> Iterator[Constants]:
+def _proposals(problem: Problem, *, quick: bool) -> Iterator[Constants]:
     """Certified global constants: Euclidean first, then in the metric that the erosion asks for."""
     euclidean = bound_constants(problem, metric="euclidean")
     yield euclidean
-    if problem.system.dimension == 1:
+    if problem.system.dimension == 1 or quick:
         return
     proposed = bound_constants(problem, objective="erosion")
     if proposed.metric is not None:
@@ -126,12 +149,54 @@ class _Work:
         """With constants that hold everywhere, or on the domain."""
         reach = contraction_tube(self.flow, constants, cells=self.cells, curve=self.curve)
         erosion = erode(reach, self.problem, reach.norm)
-        start = _random_start(self.problem, constants)
+        start = random_start(self.problem, constants)
+        if start != NO_START:
+            constants = replace(constants, effective_dimension=float(constants.dimension))
         answer = EngineAnswer(reach=reach, constants=constants, method=self.name, assumption=_assumption(constants))
         refused = self._refused(reach, erosion, answer)
         if refused is not None:
             return refused
         return self._decided(answer, erosion, constants, start)
+
+    def with_own_metrics(self, common: EngineAnswer) -> EngineAnswer:
+        """The better one of ``common`` and the union bound over the constraints, each in a metric of its own.
+
+        While no constraint is broken the state is in the domain, so that all constants hold up to the first event.
+        """
+        count = len(self.problem.constraints)
+        if (
+            self.method != "auto"
+            or count < 2
+            or not common.applicable
+            or isinstance(self.problem.initial, GaussianStart)
+        ):
+            return common
+        if common.tube is not None and common.reach is not None:
+            erosion = erode(common.reach, self.problem, common.reach.norm)
+            if _taken(erosion, needed_radius(common.tube, common.reach.curve, NO_START)) > NEAR_MISS:
+                return common
+        answers = []
+        for index, constants in enumerate(bound_metrics(self.problem)):
+            reach = contraction_tube(self.flow, constants, cells=self.cells, curve=self.curve)
+            erosion = erode(reach, self.problem, reach.norm).only(index)
+            answer = EngineAnswer(reach=reach, constants=constants, method=self.name)
+            if self._refused(reach, erosion, answer) is not None:
+                return common
+            answers.append(self._decided(answer, erosion, constants, share=1 / count))
+        level = log10_sum([answer.log10_delta for answer in answers])
+        if level >= common.log10_delta:
+            return common
+        worst = min(answers, key=lambda answer: math.inf if answer.margin is None else answer.margin)
+        parts = [answer.deviation for answer in answers if answer.deviation is not None]
+        deviation = Deviation(
+            times=parts[0].times,
+            radius=np.min([part.radius for part in parts], axis=0),
+            extent=np.min([part.extent for part in parts], axis=0),
+        )
+        fits = level <= math.log10(self.problem.delta)
+        margin = None if worst.margin is None else max(worst.margin, 0.0) if fits else worst.margin
+        reason = f"with a metric of its own for each constraint: {worst.reason}"
+        return replace(worst, log10_delta=level, margin=margin, reason=reason, deviation=deviation, details=answers)
 
     def local_answer(self, why: str) -> EngineAnswer:
         """With constants along the reach tube plus the room that the tube needs (Thm K4)."""
@@ -150,7 +215,7 @@ class _Work:
             return refused
         best: EngineAnswer | None = None
         for cut, constants in self._cuts(reach, erosion):
-            found = self._decided(replace(answer, constants=constants), cut, constants, Start())
+            found = self._decided(answer, cut, constants)
             best = found if best is None else _better(best, found)
         if best is None:
             tightest = erosion.tightest()
@@ -202,85 +267,72 @@ class _Work:
     def _when(self, time: float) -> str:
         return f"t = {time:.4g}" if self.flow.continuous else f"step {time:g}"
 
-    def _decided(self, answer: EngineAnswer, erosion: Erosion, constants: Constants, start: Start) -> EngineAnswer:
-        """Probability and margin for given rooms."""
-        target, horizon = self.problem.delta, self.flow.horizon
-        profile = erosion.profile(random_start=start != Start())
+    def _decided(
+        self, answer: EngineAnswer, erosion: Erosion, constants: Constants, start: Start = NO_START, share: float = 1.0
+    ) -> EngineAnswer:
+        """Probability of the rooms of ``erosion``, and the margin of the tube at ``share`` of the target."""
+        target, horizon = self.problem.delta * share, self.flow.horizon
+        profile = erosion.profile(random_start=start != NO_START)
         curve = answer.reach.curve if answer.reach is not None else self.curve
-        by_name = self.method not in ("auto", "kummer", "bessel")
-        asked = bool(np.any(np.isfinite(profile[1])))
-        objective = _merged(profile, 0.02) if asked else "max"
+        by_name = self.method not in BY_CLEARANCE
+        objective = joined(profile, 0.02) if np.any(np.isfinite(profile[1])) else "max"
         name = self.method if by_name else "kummer"
-        tube = tune_tube(constants, horizon=horizon, delta=target, objective=objective, method=name, start=start)
-        needed = _needed(tube, curve, start)
+
+        def tube_at(delta: float) -> Tube:
+            return tune_tube(constants, horizon=horizon, delta=delta, objective=objective, method=name, start=start)
+
+        def fit(tube: Tube) -> bool:
+            return bool(np.all(needed_radius(tube, curve, start) <= erosion.least))
+
+        tube = tube_at(target)
+        needed = needed_radius(tube, curve, start)
+        fits = bool(np.all(needed <= erosion.least))
         if by_name:
-            fits = bool(np.all(needed <= erosion.least))
-            level = self._smallest_level(constants, erosion, curve, objective, fits)
+            level = smallest_level(tube_at, fit, target, tube if fits else None)
         else:
-            level = bound_exit_probability(constants, horizon=horizon, clearance=_merged(profile, 1e-7), start=start)
+            rooms = joined(profile, 1e-7)
+            level = room_level(constants, horizon=horizon, profile=rooms, start=start, fits=fits)
+            if fits and level > math.log10(target) - BELOW:
+                closer = tube_at(target * 10**-BELOW)
+                level = min(level, (closer if fit(closer) else tube).log10_delta)
             fits = level <= math.log10(target)
         worst = erosion.tightest(needed)
         margin = max(worst.margin, 0.0) if fits else worst.margin
-        deviation = Deviation.of_ball(*_deviation_pieces(curve, needed), Norm(self.flow.dimension, constants.metric))
         return replace(
             answer,
             log10_delta=level,
             margin=margin,
             time=worst.time,
             constraint=worst.label or None,
-            reason=self._explained(tube, erosion, needed, worst.label, worst.time, level, fits),
+            reason=self._explained(erosion, needed, worst, level, fits),
             tube=tube,
             constants=constants,
-            deviation=deviation,
+            deviation=Deviation.of_ball(*deviation_pieces(curve, needed), Norm(self.flow.dimension, constants.metric)),
             certified=tube.certified and tube.level == "trajectory",
             method=self.name,
         )
 
-    def _smallest_level(
-        self, constants: Constants, erosion: Erosion, curve: Curve, objective: object, fits: bool
-    ) -> float:
-        """log10 of the smallest delta at which the named tube fits, by bisection; 0 if none below 1 does."""
-        target = math.log10(self.problem.delta)
-
-        def fitting(log10: float) -> float | None:
-            delta = 10.0**log10
-            tube = tune_tube(constants, horizon=self.flow.horizon, delta=delta, objective=objective, method=self.method)
-            return tube.log10_delta if bool(np.all(_needed(tube, curve, Start()) <= erosion.least)) else None
-
-        low, high = (SMALLEST_LOG10, target) if fits else (target, -1e-3)
-        proved = target if fits else fitting(high)
-        if proved is None:
-            return 0.0
-        smallest = fitting(low) if fits else None
-        if smallest is not None:
-            return smallest
-        for _ in range(BISECTIONS):
-            middle = (low + high) / 2
-            found = fitting(middle)
-            if found is None:
-                low = middle
-            else:
-                high, proved = middle, found
-            if high - low < 0.005 * abs(high):
-                break
-        return proved
-
-    def _explained(
-        self, tube: Tube, erosion: Erosion, needed: Array, label: str, time: float, level: float, fits: bool
-    ) -> str:
+    def _explained(self, erosion: Erosion, needed: Array, worst: Tightest, level: float, fits: bool) -> str:
         """The reason, in words."""
-        if not label:
+        if not worst.label:
             return "no constraint asks anything."
-        room = erosion.least
-        with np.errstate(all="ignore"):
-            ratio = float(np.nanmax(np.where(room > 0, needed / room, np.inf)[0 if self.flow.continuous else 1 :]))
+        ratio = _taken(erosion, needed)
         if fits:
             return f"the tube takes {100 * ratio:.3g} % of the room that the constraints leave."
+        larger = f"delta >= {10**level:.2g}, or " if level < -0.01 else ""
         return (
-            f"at delta = {self.problem.delta:g} the tube takes {ratio:.3g} times the room that '{label}' leaves at "
-            f"{self._when(time)}; what would do: delta >= {10**level:.2g}, or noise at most {1 / ratio:.2g} times as "
-            "large."
+            f"at delta = {self.problem.delta:g} the tube takes {ratio:.3g} times the room that '{worst.label}' leaves "
+            f"at {self._when(worst.time)}; what would do: {larger}noise at most {1 / ratio:.2g} times as large."
         )
+
+
+def _taken(erosion: Erosion, needed: Array) -> float:
+    """Largest share of the room that a tube takes."""
+    room = erosion.least
+    first = 0 if erosion.continuous else 1
+    with np.errstate(all="ignore"):
+        shares = np.where(room > 0, needed / room, np.inf)[first:]
+    return float(np.max(shares, initial=0.0))
 
 
 def _assumption(constants: Constants) -> str:
@@ -288,53 +340,3 @@ def _assumption(constants: Constants) -> str:
         return ""
     name, value = ("rate", constants.rate) if constants.continuous else ("gain", constants.gain)
     return f"the stated constants ({name} = {value}, sigma = {constants.sigma}) are assumed, not proved"
-
-
-def _needed(tube: Tube, curve: Curve, start: Start) -> Array:
-    """Radius of a tube over each piece; step 0 of discrete time owes nothing unless the start is random."""
-    radius = radius_over_pieces(tube, curve)
-    if not curve.continuous and start != Start():
-        radius[0] = tube.bound(0.0, 0.0)
-    return radius
-
-
-def _deviation_pieces(curve: Curve, needed: Array) -> tuple[Array, Array]:
-    """Times (K + 1,) and the radius between them."""
-    if curve.continuous:
-        return np.append(curve.starts, curve.ends[-1]), needed
-    return np.asarray(curve.starts), np.maximum(needed[:-1], needed[1:])
-
-
-def _merged(profile: tuple[Array, Array], tolerance: float) -> tuple[Array, Array]:
-    """The profile with neighbours of nearly equal values joined at the smaller one."""
-    times, values = profile
-    kept, joined = [times[0]], [values[0]]
-    largest = values[0]
-    for start, value in zip(times[1:-1], values[1:]):
-        low, high = min(joined[-1], value), max(largest, value)
-        if high <= low * (1 + tolerance):
-            joined[-1], largest = low, high
-        else:
-            kept.append(start)
-            joined.append(value)
-            largest = value
-    return np.append(kept, times[-1]), np.array(joined)
-
-
-def _random_start(problem: Problem, constants: Constants) -> Start:
-    """X_0 - mean as isotropic sub-Gaussian noise: the least s with covariance <= s^2 P^-1 (item 7.4)."""
-    if not isinstance(problem.initial, GaussianStart):
-        return Start()
-    covariance = np.asarray(problem.initial.covariance, dtype=float)
-    n = len(covariance)
-    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric, dtype=float)
-    if not np.any(covariance):
-        return Start()
-    root = np.linalg.cholesky(metric)
-    square = float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1])
-    inner = Interval.point(metric) @ Interval.point(covariance) @ Interval.point(metric)
-    for slack in 10.0 ** np.arange(-12, 1):
-        factor = square * (1 + slack)
-        if bool(is_positive_definite(Interval.point(metric) * factor - inner)):
-            return Start(sigma=math.nextafter(math.sqrt(factor), math.inf))
-    raise EnclosureError("the random start could not be bounded in the metric; it is too ill-conditioned.")

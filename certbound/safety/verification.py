@@ -29,7 +29,9 @@ def _linear(problem: Problem, **options: Any) -> EngineAnswer:
 
 
 _ENGINES: dict[str, Callable[..., EngineAnswer]] = {"linear": _linear, "constants": _constants}
-"""Engines in the order in which they are tried: name to function(problem, method=, cells=, constants=)."""
+"""Engines in the order in which they are tried: name to function(problem, method=, cells=, constants=, quick=).
+
+``quick`` says that another engine has proved SAFE already: slow refinements may be left out."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,11 +125,16 @@ def verify_safety(
     violation = find_violation(problem)
     if violation is not None:
         return _unsafe(problem, violation)
-    answers = {}
+    answers: dict[str, EngineAnswer] = {}
     for name in names:
         inner = "auto" if method in _ENGINES else method
-        answers[name] = _ENGINES[name](problem, method=inner, cells=cells, constants=constants)
+        quick = any(_is_safe(answer, problem) for answer in answers.values())
+        answers[name] = _ENGINES[name](problem, method=inner, cells=cells, constants=constants, quick=quick)
     return _verdict(problem, answers)
+
+
+def _is_safe(answer: EngineAnswer, problem: Problem) -> bool:
+    return answer.applicable and answer.certified and is_at_most(min(answer.log10_delta, 0.0), problem.delta)
 
 
 def _chosen(method: str) -> tuple[str, ...]:
@@ -152,7 +159,7 @@ def _verdict(problem: Problem, answers: Mapping[str, EngineAnswer]) -> Verdict:
     name = min(answers, key=rank)
     best = answers[name]
     level = settled(best.log10_delta, problem.delta)
-    safe = best.certified and best.applicable and is_at_most(level, problem.delta)
+    safe = _is_safe(best, problem)
     reason = best.reason
     if not best.certified:
         reason = (
