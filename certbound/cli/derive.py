@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +12,15 @@ import typer
 from certbound.cli.describe import describe_constants
 from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, load_problem
 from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.errors import EnclosureError, InfeasibleError
 
 if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
     from certbound.tubes.constants import Constants
 
 __all__ = ["register"]
+
+_log = logging.getLogger(__name__)
 
 
 def register(app: typer.Typer) -> None:
@@ -31,16 +36,13 @@ def derive(
 ) -> None:
     """Bound the contraction rate (or gain) and the noise, with a metric for each constraint."""
     subject = load_problem(problem, pairs, horizon=horizon)
-    from certbound.constants.bounds import bound_constants
-    from certbound.constants.metrics import bound_metrics
-
     started = time.perf_counter()
     with spinner(f"bounding the constants of {subject.name}"):
-        constants = bound_constants(subject)
-        metrics = bound_metrics(subject)
+        constants, metrics, where = _bound(subject)
     seconds = time.perf_counter() - started
     result = {
         **describe_constants(constants),
+        "domain": where,
         "metrics": [
             {"constraint": constraint.label, **describe_constants(one)}
             for constraint, one in zip(subject.safe, metrics)
@@ -53,6 +55,27 @@ def derive(
         _print(constants, result)
 
 
+def _bound(subject: Problem) -> tuple[Constants, list[Constants], str]:
+    """Constants and where they hold: the domain, all of R^n, or else along the noise-free reach tube."""
+    from certbound.constants.bounds import bound_constants
+    from certbound.constants.metrics import bound_metrics
+    from certbound.reach import bound_reach
+    from certbound.reach.local import local_constants
+
+    try:
+        constants = bound_constants(subject)
+        where = constants.proof.domain if constants.proof is not None else "stated"
+        return constants, list(bound_metrics(subject)), where
+    except (EnclosureError, InfeasibleError) as error:
+        if subject.domain is not None:
+            raise
+        _log.info("no constants hold everywhere: %s", error)
+    reach = bound_reach(subject, noise=False)
+    unit = "s" if reach.curve.continuous else "steps"
+    where = f"the noise-free reach tube, up to {reach.end:g} {unit} (no constants hold on all of R^n)"
+    return local_constants(subject, reach), [], where
+
+
 def _print(constants: Constants, result: dict[str, Any]) -> None:
     screen = console()
     name = "rate" if constants.continuous else "gain"
@@ -61,13 +84,10 @@ def _print(constants: Constants, result: dict[str, Any]) -> None:
     screen.print(f"{name} {_range(getattr(constants, name))} {unit}, {origin}", markup=False)
     if SETTINGS.quiet:
         return
-    screen.print(
-        f"sigma {_range(constants.sigma)}, effective dimension {constants.nu:.4g} of {constants.dimension}"
-    )
+    screen.print(f"sigma {_range(constants.sigma)}, effective dimension {constants.nu:.4g} of {constants.dimension}")
     if constants.gap is not None:
         screen.print(f"at most {constants.gap:.3g} above what sampling found")
-    if constants.proof is not None:
-        screen.print(f"holds on {constants.proof.domain}", markup=False)
+    screen.print(f"holds on {result['domain']}", markup=False)
     if result["metrics"]:
         from rich.table import Table
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import shlex
+import sys
 import time
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,9 +25,10 @@ from certbound.cli.options import (
     integer,
     load_problem,
 )
-from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
+from certbound.cli.output import SETTINGS, console, plain, print_json, spinner, write_file
 
 if TYPE_CHECKING:
+    from certbound.plotting import Scene
     from certbound.problem.problem import Problem
     from certbound.safety.verification import Verdict
 
@@ -120,45 +125,44 @@ def _write(
     problem: Problem, verdict: Verdict, *, certificate: Path | None, report: Path | None, plot: Path | None
 ) -> None:
     if certificate is not None:
-        write_file(certificate, verdict.certificate_text(problem))
+        write_file(certificate, json.dumps(plain(verdict.certificate), indent=1) + "\n")
+    if plot is None and report is None:
+        return
+    scene = _scene(problem, verdict)
     if plot is not None:
+        from certbound.plotting import draw_scene
+
         with spinner("drawing"):
-            write_file(plot, picture(problem, verdict, plot.suffix.lstrip(".") or "png"))
+            stream = BytesIO()
+            draw_scene(scene).savefig(stream, format=plot.suffix.lstrip(".") or "png", dpi=150)
+            write_file(plot, stream.getvalue())
     if report is not None:
         from certbound.report import report_page
 
         with spinner("writing the report"):
-            write_file(report, report_page(problem, verdict))
+            command = shlex.join(["certbound", *(word for word in sys.argv[1:])])
+            probability = log10_text(verdict.log10_delta)
+            write_file(report, report_page(scene, verdict, command=command, probability=probability))
 
 
-def picture(problem: Problem, verdict: Verdict, suffix: str) -> bytes:
-    """The picture of a verdict, with sample paths where the noise has a law to sample from."""
-    from io import BytesIO
-
+def _scene(problem: Problem, verdict: Verdict) -> Scene:
+    """What is drawn, with sample paths where the noise has a law to sample from."""
     import numpy as np
 
-    from certbound.plotting import Scene, draw_scene, noisy_reach
+    from certbound.plotting import Scene, noisy_reach
     from certbound.simulation.paths import sample_paths
 
     if verdict.reach is None:
-        raise InputError("nothing was proved that could be drawn", "leave --plot out; the reason is in the verdict")
+        raise InputError("nothing was proved that could be drawn", "leave --plot and --report out")
     try:
         paths = sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0))
     except ValueError as error:
         _log.info("no sample paths are drawn: %s", error)
         paths = None
     times = None if paths is None else np.linspace(0.0, float(problem.horizon), paths.shape[1])
-    scene = Scene(
-        problem=problem,
-        reach=verdict.reach,
-        tube=noisy_reach(verdict),
-        times=times,
-        paths=paths,
-        title=f"{problem.name}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}",
-    )
-    stream = BytesIO()
-    draw_scene(scene).savefig(stream, format=suffix, dpi=150)
-    return stream.getvalue()
+    title = f"{problem.name}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
+    tube = noisy_reach(verdict)
+    return Scene(problem=problem, reach=verdict.reach, tube=tube, times=times, paths=paths, title=title)
 
 
 def _print(problem: Problem, result: dict[str, Any]) -> None:

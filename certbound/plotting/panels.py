@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.reach.tube import ReachTube
 
-__all__ = ["Panel", "draw_panel", "panels_of"]
+__all__ = ["Panel", "draw_panel", "least_distance", "panels_of", "stairs"]
 
 Array = NDArray[np.float64]
 
@@ -95,8 +95,8 @@ def draw_panel(axes: Axes, scene: Scene, panel: Panel) -> None:
 
 def _draw_direction(axes: Axes, scene: Scene, row: Array, panel: Panel) -> tuple[float, float]:
     for order, (tube, color) in enumerate(scene.tubes):
-        x, high = _stairs(tube, supports(tube, row))
-        _, low = _stairs(tube, -supports(tube, -row))
+        x, high = stairs(tube, supports(tube, row))
+        _, low = stairs(tube, -supports(tube, -row))
         axes.fill_between(x, low, high, color=color, linewidth=0, zorder=1 + order)
     if scene.paths is not None:
         _draw_paths(axes, scene, scene.paths @ row)
@@ -112,9 +112,9 @@ def _draw_distance(axes: Axes, scene: Scene, panel: Panel) -> tuple[float, float
     if scene.paths is not None and scene.times is not None:
         values = [distance(scene.paths[:, k], time) for k, time in enumerate(scene.times)]
         _draw_paths(axes, scene, np.stack(values, axis=1))
-    bound = None if scene.tube is None else _least_distance(scene.tube, panel.constraint)
+    bound = None if scene.tube is None else least_distance(scene.tube, panel.constraint)
     if bound is not None and scene.tube is not None:
-        axes.plot(*_stairs(scene.tube, bound), color=BLUE, linewidth=1.2, zorder=4)
+        axes.plot(*stairs(scene.tube, bound), color=BLUE, linewidth=1.2, zorder=4)
     t = instants(scene.reach)
     nominal = [float(distance(scene.reach.center(float(time)), time)) for time in t]
     axes.plot(t, nominal, color=INK, linewidth=1.1, zorder=5)
@@ -128,7 +128,7 @@ def _draw_paths(axes: Axes, scene: Scene, values: Array) -> None:
     axes.add_collection(LineCollection(segments, colors=GREY, linewidths=0.4, alpha=0.5, zorder=3))
 
 
-def _least_distance(tube: ReachTube, constraint: Inside) -> Array | None:
+def least_distance(tube: ReachTube, constraint: Inside) -> Array | None:
     """A lower bound of the distance to a round obstacle, in the middle of each piece."""
     region = constraint.region
     if not isinstance(region, Ball) or not isinstance(constraint, Outside):
@@ -143,7 +143,7 @@ def _least_distance(tube: ReachTube, constraint: Inside) -> Array | None:
     return np.asarray((lengths - region.radius - tube.spread(-rows)).min(axis=0))
 
 
-def _stairs(tube: ReachTube, values: Array) -> tuple[Array, Array]:
+def stairs(tube: ReachTube, values: Array) -> tuple[Array, Array]:
     """Piecewise-constant data as a polyline."""
     if not tube.curve.continuous:
         return np.asarray(tube.curve.starts), values
