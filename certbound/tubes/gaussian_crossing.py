@@ -29,7 +29,7 @@ __all__ = ["log_line_crossing", "log_polygon_crossing"]
 
 Array = NDArray[np.float64]
 
-_PANELS, _NODES = 4, 16
+_EDGES, _NODES = np.array([0.0, 0.12, 0.28, 0.55, 1.0]), 16  # panels, as parts of the range; nodes in each
 _ELLIPSES = np.array([1.3, 1.7, 2.2, 3.0, 4.5, 7.0])
 _DROP = 26.0
 _ERROR = 64.0 / 15.0
@@ -112,13 +112,13 @@ def _log_excluding(prior: tuple[Array, Array, Array], after: tuple[Array, Array,
     size = size + np.abs(beta_p) * np.where(len_p == np.inf, 1.0, 1 + np.sqrt(len_p))
     slack = 1024 * EPS * size * size
     nodes, weights = gauss_rule(_NODES)
-    half = reach / (2 * _PANELS)
-    middle = (2 * np.arange(_PANELS)[:, None] + 1) * half
-    s = middle[:, None, :] + half * nodes[:, None]
+    half = 0.5 * np.diff(_EDGES)[:, None] * reach
+    middle = 0.5 * (_EDGES[1:] + _EDGES[:-1])[:, None] * reach
+    s = middle[:, None, :] + half[:, None, :] * nodes[:, None]
     log_density = -0.5 * (m - s) ** 2 - LOG_ROOT_2PI
     survive = np.minimum(1.0 - _meeting(lift_p + s, beta_p, len_p) + slack, 1.0)
     meet = np.minimum(_meeting(lift_n + s, beta_n, len_n), 1.0)
-    value = np.einsum("pnk,n,k->k", np.exp(log_density) * survive * meet, weights, half)
+    value = np.einsum("pnk,n,pk->k", np.exp(log_density) * survive * meet, weights, half)
     value = value + _ellipse_error(m, (lift_p, beta_p, len_p), (lift_n, beta_n, len_n), middle, half)
     const = -0.5 * (m * m + (lift_n + beta_n * len_n) ** 2 / len_n - kappa * centre**2)
     tail = const - 0.5 * np.log(kappa) + log_tail((reach - centre) * np.sqrt(kappa))
@@ -138,14 +138,19 @@ def _ellipse_error(
     distance = np.maximum(np.maximum(m - high, low - m), 0.0)
     square = across * across
     log_size = -0.5 * distance**2 - LOG_ROOT_2PI + 0.5 * square
-    for (lift, beta, length), extra in ((prior, 1.0), (after, 0.0)):
+    for (gap, beta, length), extra in ((prior, 1.0), (after, 0.0)):
         root = np.sqrt(length)
-        a, far = lift + low, lift + high
-        tilt = np.exp(-2 * np.minimum(a * beta, far * beta))
-        bell = np.where(length == np.inf, 1.0, np.exp(log_tail((a - beta * length) / root)))
-        first = np.where(length == np.inf, 0.0, np.exp(log_tail((a + beta * length) / root)))
-        growth = np.exp(0.5 * square / length)
-        log_size = log_size + np.log(extra + (first + tilt * bell) * growth)
+        a, far = gap + low, gap + high
+        w, y = (a + beta * length) / root, (a - beta * length) / root
+        second = np.exp(log_tail(y) - 2 * np.minimum(a * beta, far * beta))
+        # the same function is phi(w) R(y)
+        peak = np.clip(0.0, w, (far + beta * length) / root)
+        joint = np.exp(-0.5 * peak * peak - LOG_ROOT_2PI) * mills(np.maximum(y, 0.0))
+        second = np.minimum(second, np.where(y >= 0, joint, np.inf))
+        first = np.exp(log_tail(w))
+        forever = np.exp(-2 * np.minimum(a * beta, far * beta))
+        size = np.where(length == np.inf, forever, (first + second) * np.exp(0.5 * square / length))
+        log_size = log_size + np.log(extra + size)
     bound = half * _ERROR * np.exp(log_size) * r ** (-2.0 * _NODES) / (1 - r**-2.0) * 1.001
     best: Array = np.where(np.isnan(bound), np.inf, bound).min(axis=0).sum(axis=0)
     return best

@@ -52,7 +52,8 @@ def standard_levels(levels: Array, lo: Array, hi: Array) -> tuple[Array, Array]:
     positive = levels >= 0
     small = down(levels / np.where(positive, largest, least))
     large = up(levels / np.where(positive, least, largest))
-    small = np.where(levels == 0, np.where(largest > 0, 0.0, np.inf), small)
+    small = np.where(levels == 0, 0.0, small)
+    small = np.where(positive & (largest == 0), np.inf, small)
     large = np.where(levels == 0, np.where(least > 0, 0.0, np.inf), large)
     return np.where(levels == np.inf, np.inf, small), np.where(levels == np.inf, np.inf, large)
 
@@ -74,10 +75,9 @@ def total(logs: ArrayLike, axis: int | tuple[int, ...] | None = None) -> Any:
     top = np.max(array, axis=axis, keepdims=True)
     safe = np.where(np.isfinite(top), top, 0.0)
     mass = np.sum(np.exp(array - safe), axis=axis, keepdims=True)
-    value = (safe + np.log(mass)) + EPS * (16 + array.size) + 16 * EPS * np.abs(safe)
-    value = np.minimum(value / np.log(10.0), 0.0)
-    value = value + 8 * EPS * np.abs(value)
-    result = np.squeeze(np.where(top == np.inf, 0.0, np.minimum(value, 0.0)), axis=axis)
+    value = lift(safe + np.log(mass), 32 + array.size) / np.log(10.0)
+    value = np.minimum(lift(value, 4), 0.0)
+    result = np.squeeze(np.where(top == np.inf, 0.0, value), axis=axis)
     return float(result) if result.ndim == 0 else result
 
 

@@ -1,5 +1,7 @@
 """Normal tails and bivariate probabilities against ball arithmetic."""
 
+from itertools import pairwise
+
 import flint
 import numpy as np
 import pytest
@@ -45,7 +47,7 @@ def log_pair_exact(a, b, rho, scale):
     low = float(a.real) - 80 - abs(float(b.real))
     ends = sorted({low, *(float(a.real) - d for d in (40, 15, 6, 2, 0.6, 0.2, 0.05)), float(a.real)})
     value = sum(
-        (flint.acb.integral(density, flint.acb(p), flint.acb(q)).real for p, q in zip(ends, ends[1:])),
+        (flint.acb.integral(density, flint.acb(p), flint.acb(q)).real for p, q in pairwise(ends)),
         flint.arb(0),
     )
     return float(value.log() + flint.arb(float(scale)))
