@@ -1,0 +1,97 @@
+"""``bound_reach``: one door to every engine."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.errors import InfeasibleError
+from certbound.problem.models import MODELS
+from certbound.reach.local import local_constants, local_contraction_tube, local_tube, radius_over_pieces
+
+
+def spiral(half=0.05, sigma=0.05, horizon=2.0) -> cb.Problem:
+    system = cb.ContinuousSystem(
+        lambda x: [-0.5 * x[0] + x[1], -x[0] - 0.5 * x[1] + 0.1 * np.sin(x[0])], states=2, diffusion=sigma * np.eye(2)
+    )
+    start = np.array([0.5, 0.0])
+    return cb.Problem(system, initial=cb.Box(start - half, start + half), safe=[cb.Inside(cb.Box([-9, -9], [9, 9]))], horizon=horizon)
+
+
+@pytest.mark.parametrize("method", ["linear", "contraction"])
+def test_noise_free_paths_lie_in_the_reach_tube(method):
+    problem = spiral()
+    reach = cb.bound_reach(problem, noise=False, method=method)
+    assert reach.end == problem.horizon
+    assert not reach.noise
+    paths = cb.sample_paths(
+        problem.replace(system=cb.ContinuousSystem(problem.system.dynamics, states=2)),
+        paths=20,
+        rng=np.random.default_rng(0),
+    )
+    times = np.linspace(0, problem.horizon, paths.shape[1])
+    for k in range(0, len(times), 50):
+        for path in paths:
+            assert reach.contains(float(times[k]), path[k], tolerance=5e-3)
+
+
+@pytest.mark.parametrize("method", ["linear", "contraction"])
+def test_noise_widens_the_tube_and_carries_its_probability(method):
+    problem = spiral()
+    calm = cb.bound_reach(problem, noise=False, method=method)
+    noisy = cb.bound_reach(problem, noise=True, method=method)
+    assert noisy.noise
+    assert noisy.log10_delta <= np.log10(problem.delta) + 1e-9
+    directions = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    for t in (0.5, 1.0, 2.0):
+        assert np.all(noisy.extent(directions, t) > calm.extent(directions, t))
+
+
+def test_auto_takes_an_engine_that_reaches_the_horizon():
+    reach = cb.bound_reach(spiral(), noise=False)
+    assert reach.end == 2.0
+
+
+def test_cells_are_passed_on():
+    assert cb.bound_reach(spiral(), noise=False, cells=2, method="contraction").curve.cells == 4
+
+
+def test_local_rates_serve_where_no_global_ones_exist():
+    problem = MODELS["unicycle"](disturbance=0.0, x0_halfwidth=0.0).replace(horizon=0.5)
+    reach = cb.bound_reach(problem, noise=False, method="contraction")
+    assert "local" in reach.method
+    assert reach.end == 0.5
+    noisy = cb.bound_reach(problem, method="contraction")
+    assert noisy.noise
+    assert float(noisy.radius.max()) > 0.02
+
+
+def test_an_unknown_method_is_refused():
+    with pytest.raises(ValueError, match="`method` must be one of auto, linear, contraction"):
+        cb.bound_reach(spiral(), method="magic")
+
+
+def test_a_local_tube_confirms_its_own_guess():
+    problem = MODELS["unicycle"](disturbance=0.0, x0_halfwidth=0.0).replace(horizon=1.0)
+    reach = local_contraction_tube(problem)
+    tube, radius = local_tube(problem, reach, delta=1e-3, method="kummer")
+    again = local_constants(problem, reach, radius)
+    assert np.all(np.asarray(again.rate) <= np.asarray(tube.constants.rate) + 1e-9)
+    assert np.all(radius_over_pieces(tube, reach.curve) <= radius + 1e-15)
+    wider = local_constants(problem, reach, 3 * radius)
+    assert np.max(np.asarray(wider.rate) - np.asarray(again.rate)) > 0
+
+
+def test_one_time_bounds_must_not_be_combined_with_local_constants():
+    problem = MODELS["unicycle"](disturbance=0.0, x0_halfwidth=0.0).replace(horizon=0.5)
+    reach = local_contraction_tube(problem)
+    with pytest.raises(ValueError, match="trajectory level"):
+        local_tube(problem, reach, delta=1e-3, method="markov")
+
+
+def test_a_local_tube_that_cannot_close_says_so():
+    problem = MODELS["unicycle"](disturbance=0.0, x0_halfwidth=0.0, sigma=1.0).replace(horizon=1.0)
+    reach = local_contraction_tube(problem)
+    with pytest.raises(InfeasibleError, match="no local tube at delta"):
+        local_tube(problem, reach, delta=1e-3, method="kummer")
