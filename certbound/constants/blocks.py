@@ -14,7 +14,7 @@ __all__ = ["VERTEX_LIMIT", "Sector", "centred", "contraction_value", "lmi_blocks
 
 Array = NDArray[np.float64]
 
-VERTEX_LIMIT = 64
+VERTEX_LIMIT = 32
 """Above this number of vertices a set that has a sector form is used in it."""
 
 

@@ -33,6 +33,9 @@ FIRST_BUDGET = 4000
 """Boxes before the affine structure of the Jacobian is looked for."""
 MOST_SIDES = 8
 """Coordinates above which bisection is left out where the affine structure gives a bound."""
+EXACT = 1e-9
+"""A relative gap that leaves nothing to gain."""
+
 SMALLEST_GAIN = 1e-12
 """Stands for L = 0, which the tubes exclude."""
 
@@ -163,14 +166,19 @@ def _supremum(
     unbounded = not (np.isfinite(jacobian.box.lo) & np.isfinite(jacobian.box.hi)).all()
     many = len(jacobian.active) > 3
     budget = max(1, int(budget * min(1.0, (6 / model.dimension) ** 2)))  # a box costs the more, the larger n
-    if many and unbounded:
+    if unbounded:
         ceiling = _structural_bound(model, jacobian, norm)
         hopeless = len(jacobian.active) > MOST_SIDES and np.isfinite(ceiling)
         return search(budget=1 if hopeless else budget, ceiling=ceiling)
     found = search(budget=min(budget, FIRST_BUDGET))
-    if found.upper - found.sampled <= limit or not np.isfinite(found.sampled):
+    if not np.isfinite(found.sampled):
         return found
-    ceiling = _structural_bound(model, jacobian, norm) if many or unbounded else np.inf
+    close = found.upper - found.sampled <= limit
+    if close and found.upper - found.sampled <= EXACT * abs(found.upper):
+        return found
+    ceiling = _structural_bound(model, jacobian, norm) if close or many else np.inf
+    if close:  # where the parameters vary independently, the affine set leaves no gap at all
+        return search(budget=1, ceiling=ceiling) if ceiling < found.upper else found
     return found if np.isinf(found.upper) and np.isinf(ceiling) else search(budget=budget, ceiling=ceiling)
 
 

@@ -23,12 +23,15 @@ from certbound.constants.blocks import Sector, contraction_value, lmi_blocks, tr
 from certbound.constants.jacobians import JacobianSet
 from certbound.constants.matrices import frozen
 
-__all__ = ["Center", "center_metric", "center_multipliers", "lyapunov_metric", "reachable_value"]
+__all__ = ["Center", "center_metric", "center_multipliers", "lyapunov_metric", "reachable_value", "starting_metric"]
 
 Array = NDArray[np.float64]
 
 _SHRINK = 0.1
 """Share of the distance to the current value that the next target keeps."""
+
+_FLOOR = 1e-5
+"""Smallest eigenvalue of P (the largest is below 1) in the coordinates of the start."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -120,7 +123,7 @@ def center_metric(
     continuous: bool,
     lower: float = -np.inf,
     tolerance: float = 1e-6,
-    max_steps: int = 400,
+    max_steps: int = 150,
 ) -> Center:
     """P and diagonal multipliers that nearly minimise c or L^2 over the blocks.
 
@@ -132,12 +135,12 @@ def center_metric(
     lower : float
         A known lower bound of the value (spectral), which lets the search stop.
     tolerance : float
-        The search stops once the value is this close to ``lower``, or gains less than this from one centre to
-        the next.
+        The search stops once the value is this close to ``lower``, or once the gains from one centre to the
+        next, extrapolated, have less than this to go.
     max_steps : int
         Limit on Newton steps.
     """
-    root = _start(blocks, continuous=continuous)
+    root = np.asarray(np.linalg.cholesky(starting_metric(blocks, continuous=continuous)).T)
     inverse = np.asarray(np.linalg.inv(root), dtype=float)
     work = [_Block(transformed(block, root, inverse), continuous=continuous) for block in blocks]
     n = work[0].n
@@ -148,8 +151,8 @@ def center_metric(
     return replace(center, metric=frozen(root.T @ center.metric @ root))
 
 
-def _start(blocks: Sequence[Array | Sector], *, continuous: bool) -> Array:
-    """Coordinates to start from: a Cholesky factor of the best Lyapunov metric of the mean Jacobian."""
+def starting_metric(blocks: Sequence[Array | Sector], *, continuous: bool) -> Array:
+    """The best Lyapunov metric of the mean Jacobian, or the identity: of the right order of magnitude."""
     middle = np.mean([block.A if isinstance(block, Sector) else block for block in blocks], axis=0)
     n = len(middle)
     best, chosen = np.inf, np.eye(n)
@@ -163,7 +166,7 @@ def _start(blocks: Sequence[Array | Sector], *, continuous: bool) -> Array:
             value = max(value, min(work.smallest_value(half, s * first) for s in (1.0, 4.0, 16.0, 64.0)))
         if value < best:
             best, chosen = value, metric
-    return np.asarray(np.linalg.cholesky(chosen).T)
+    return chosen
 
 
 def lyapunov_metric(matrix: Array, share: float, *, continuous: bool) -> Array:
@@ -223,16 +226,24 @@ def _descend(
     pairs: _Pairs | None,
 ) -> Center:
     """Shrink the target towards the value reached, and centre again, until it no longer pays."""
-    steps, target = 0, value + max(1e-3, 0.1 * abs(value))
+    best = P, multipliers, value
+    steps, target, before, last = 0, value + max(1e-3, 0.1 * abs(value)), np.inf, np.inf
     while steps < max_steps:
         P, multipliers, used = _recenter(blocks, P, multipliers, target, max_steps - steps, pairs)
         steps += used
         reached = max(block.smallest_value(P, lam) for block, lam in zip(blocks, multipliers))
-        gain, value = value - reached, min(value, reached)
-        if value <= lower + tolerance or target - reached <= tolerance or (steps > 20 and gain <= tolerance):
+        if reached < best[2]:
+            best = P, multipliers, reached
+        gain = before - reached
+        # gains shrink geometrically: what is left to gain is about gain * ratio / (1 - ratio)
+        left = gain * gain / (last - gain) if 0 <= gain < last < np.inf else np.inf
+        if best[2] <= lower + tolerance or left <= tolerance or gain <= 1e-3 * tolerance:
             break
+        before, last = reached, gain
         target = reached + _SHRINK * (target - reached)
-    return Center(metric=frozen(P), multipliers=tuple(frozen(lam) for lam in multipliers), value=value, steps=steps)
+    P, multipliers, value = best
+    frozen_multipliers = tuple(frozen(lam) for lam in multipliers)
+    return Center(metric=frozen(P), multipliers=frozen_multipliers, value=value, steps=steps)
 
 
 def _recenter(
@@ -243,7 +254,7 @@ def _recenter(
     budget: int,
     pairs: _Pairs | None,
 ) -> tuple[Array, list[Array], int]:
-    """Damped Newton steps to the analytic centre of {F > 0, 0 < P < I} at a fixed value."""
+    """Damped Newton steps to the analytic centre of {F > 0, floor < P < I} at a fixed value."""
     for step in range(1, min(budget, 30) + 1):
         try:
             gradient, hessian = _derivatives(blocks, P, multipliers, value, pairs)
@@ -277,7 +288,8 @@ def _moved(
 def _barrier(blocks: Sequence[_Block], P: Array, multipliers: list[Array], value: float) -> float:
     matrices = [block.matrix(value, P, lam) for block, lam in zip(blocks, multipliers)]
     total = 0.0
-    for matrix in (P, np.eye(len(P)) - P, *matrices):
+    identity = np.eye(len(P))
+    for matrix in (P - _FLOOR * identity, identity - P, *matrices):
         try:
             total -= 2 * float(np.log(np.diagonal(np.linalg.cholesky(matrix))).sum())
         except np.linalg.LinAlgError:
@@ -313,7 +325,8 @@ def _derivatives(
     total = size + sum(len(lam) for lam in multipliers)
     gradient, hessian = np.zeros(total), np.zeros((total, total))
     if pairs is not None:
-        for sign, matrix in ((1.0, P), (-1.0, np.eye(len(P)) - P)):
+        identity = np.eye(len(P))
+        for sign, matrix in ((1.0, P - _FLOOR * identity), (-1.0, identity - P)):
             inverse = _inverse(matrix)
             gradient[:size] -= sign * pairs.gradient(inverse)
             hessian[:size, :size] += pairs.hessian(inverse, inverse)

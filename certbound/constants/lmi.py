@@ -52,7 +52,7 @@ def solve(problem: Any) -> str:
     attempts: list[tuple[str, dict[str, Any]]] = [
         ("CLARABEL", {}),
         ("CLARABEL", {"static_regularization_constant": 1e-7, "equilibrate_max_iter": 50, "max_iter": 300}),
-        ("SCS", {"eps": 1e-6, "max_iters": 20_000}),
+        ("SCS", {"eps": 1e-6, "max_iters": 5_000}),
     ]
     statuses = []
     for name, options in attempts:
@@ -139,7 +139,7 @@ def _multipliers(groups: tuple[int, ...], *, full: bool) -> tuple[Any, Any, Any,
 
 
 class RateProgram:
-    """max margin over P with I <= P <= max_condition I: positive exactly when the value can be reached.
+    """max margin over P with I <= max_condition^{1/2} P <= max_condition I: positive where the value is reached.
 
     Parameters
     ----------
@@ -147,10 +147,12 @@ class RateProgram:
     continuous : bool
         Meaning of the value: c (continuous time) or L^2 (discrete time).
     max_condition : float
-        Bound on the condition number of P.
+        Bound on the condition number of P, in the coordinates of ``start``.
     form : {"auto", "vertices", "sector"}
     full : bool
         Full-block instead of diagonal multipliers in the sector form (at most 10 parameters).
+    start : array_like, shape (n, n), optional
+        A metric of the right order of magnitude, in whose coordinates the program is solved.
     """
 
     def __init__(
@@ -161,25 +163,24 @@ class RateProgram:
         max_condition: float = 1e6,
         form: str = "auto",
         full: bool = False,
+        start: ArrayLike | None = None,
     ) -> None:
         cp = _cvxpy()
-
         if not max_condition > 1:
             raise ValueError(f"`max_condition` must exceed 1, got {max_condition}.")
         n = jacobians.dimension
+        identity = np.eye(n)
+        self._root: Array = identity
+        if start is not None:
+            self._root = np.asarray(np.linalg.cholesky(np.asarray(start, dtype=float)).T)
+        inverse = np.asarray(np.linalg.inv(self._root), dtype=float)
+        blocks = [transformed(block, self._root, inverse) for block in lmi_blocks(jacobians, form=form)]
         self._metric = cp.Variable((n, n), symmetric=True)
         self._value = cp.Parameter()
         self._margin = cp.Variable()
-        identity = np.eye(n)
-        constraints = [self._metric >> identity, max_condition * identity - self._metric >> 0]
-        constraints += _contraction(
-            self._metric,
-            self._value,
-            lmi_blocks(jacobians, form=form),
-            self._margin,
-            continuous=continuous,
-            full=full,
-        )
+        middle = np.sqrt(max_condition)
+        constraints = [self._metric >> identity / middle, middle * identity - self._metric >> 0]
+        constraints += _contraction(self._metric, self._value, blocks, self._margin, continuous=continuous, full=full)
         self._problem = cp.Problem(cp.Maximize(self._margin), constraints)
         self.status = "not solved"
 
@@ -187,7 +188,7 @@ class RateProgram:
         """The metric of the largest margin at a given c or L^2, and that margin."""
         self._value.value = float(value)
         self.status = solve(self._problem)
-        return _symmetric(self._metric.value), float(self._margin.value)
+        return _symmetric(self._root.T @ self._metric.value @ self._root), float(self._margin.value)
 
 
 class ErosionProgram:

@@ -7,16 +7,18 @@ gives each constraint a metric of its own and ``split_delta`` shares delta betwe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.constants.affine import AffineSet
+from certbound.constants.branching import random_points
+from certbound.constants.derivatives import StateJacobian
 from certbound.constants.jacobians import JacobianSet, as_set
 from certbound.constants.models import Model, model_of
-from certbound.constants.proposals import Proposal, erosion_proposals, rate_proposals
+from certbound.constants.proposals import Proposal, erosion_proposals, rate_proposals, sampled_polytope
 from certbound.constants.structure import affine_set
 from certbound.constants.targets import constraint_targets, rooms_of
 from certbound.constants.tightening import RadiusModel, Rooms, erosion_factors
@@ -34,6 +36,8 @@ Array = NDArray[np.float64]
 
 _GAIN = 1e-3
 """Smallest decrease of c or L for which another metric than the identity is worth its name."""
+
+_SAMPLES = 2000
 
 
 def propose_metrics(
@@ -143,8 +147,9 @@ def improve(
     if model.dimension == 1:
         return euclidean
     found = [euclidean]
-    for proposal in _tried(lambda: rate_proposals(model_set(model), continuous=model.continuous)):
-        found += _certified(model, proposal)
+    for members in _candidate_sets(model):
+        for proposal in _tried(members, lambda s: rate_proposals(s, continuous=model.continuous)):
+            found += _certified(model, proposal)
     best = min(found, key=_value)
     return best if _value(best) < _value(euclidean) - _GAIN * max(1e-3, abs(_value(euclidean))) else euclidean
 
@@ -227,7 +232,7 @@ def split_delta(
     span = float(problem.horizon) if horizon is None else float(horizon)
     total = float(problem.delta if delta is None else delta)
     times, targets = constraint_targets(problem)
-    grid = np.log(total) + np.linspace(np.log(1e-3 / len(constants)), 0.0, 9)
+    grid = np.log(total) + np.linspace(np.log(1e-3 / len(constants)), 0.0, 5)
     ratios = []
     for index, record in enumerate(constants):
         own = [target for target in targets if target.constraint == index]
@@ -262,18 +267,19 @@ def erosion_ratio(constants: Constants, rooms: Rooms, horizon: float, delta: flo
     """Largest erosion over room of the best quick tube, in floating point."""
     from certbound.tubes.tuning import tune_tube
 
+    if constants.continuous:
+        rooms = rooms.coarse()
     metric = np.eye(constants.dimension) if constants.metric is None else constants.metric
     room = (rooms.rooms / erosion_factors(metric, rooms.directions)[:, None]).min(axis=0)
     if constants.continuous:  # both ends of a piece count
-        times = np.concatenate([[0.0], rooms.times])
+        times = np.concatenate([[0.0], rooms.times[:-1], [horizon]])
         values = np.minimum(room, np.concatenate([room[:1], room[:-1]]))
     else:
         steps = np.arange(1, int(horizon) + 1)
         values = np.concatenate([[np.inf], room[np.searchsorted(rooms.times, steps)]])
         times = np.arange(int(horizon) + 2.0)
     tube = tune_tube(constants, horizon=horizon, delta=delta, objective=(times, values))
-    nodes = rooms.times
-    return float(np.max(np.asarray(tube.radius(nodes)) / room))
+    return float(np.max(np.asarray(tube.radius(rooms.times)) / room))
 
 
 def _least_erosion(model: Model, euclidean: Constants, targets: Rooms, horizon: float, delta: float) -> Constants:
@@ -284,20 +290,43 @@ def _least_erosion(model: Model, euclidean: Constants, targets: Rooms, horizon: 
     found = [euclidean]
     matrices = _noise_matrices(model)
     if model.dimension > 1 and any(G.any() for G in matrices):
-        for proposal in _tried(lambda: erosion_proposals(model_set(model), targets, matrices, radius)):
-            found += _certified(model, proposal)
+        for members in _candidate_sets(model):
+            for proposal in _tried(members, lambda s: erosion_proposals(s, targets, matrices, radius)):
+                found += _certified(model, proposal)
     if len(found) == 1:
         return euclidean
     return min(found, key=lambda constants: erosion_ratio(constants, targets, horizon, delta))
 
 
-def _tried(proposals: Any) -> list[Proposal]:
-    """The proposals, or none where the Jacobian has no bounded affine set or every solver stalls."""
+def _candidate_sets(model: Model) -> list[JacobianSet]:
+    """Sets to propose for: all Jacobians, structured; and samples of them, where that set is loose or missing."""
     try:
-        found: list[Proposal] = proposals()
-    except (EnclosureError, SolverError):
+        structured = model_set(model)
+    except EnclosureError:
+        structured = None
+    slots = StateJacobian(model.dynamics, model.state_slots, model.ranges)
+    bounded = bool(np.isfinite(slots.box.lo).all() and np.isfinite(slots.box.hi).all())
+    if not bounded or not slots.active:
+        return [] if structured is None else [structured]
+    matrices = slots.values(random_points(np.random.default_rng(0), slots.box, _SAMPLES))
+    matrices = matrices[np.isfinite(matrices).all(axis=(1, 2))]
+    if not len(matrices):
+        return [] if structured is None else [structured]
+    sampled = sampled_polytope(matrices)
+    if structured is None:
+        return [sampled]
+    directions = np.random.default_rng(1).normal(size=(16, model.dimension, model.dimension))
+    widths = [members.support(directions) + members.support(-directions) for members in (structured, sampled)]
+    loose = bool(np.any(widths[0] > 1.1 * widths[1] + 1e-12 * np.abs(structured.J0).max()))
+    return [structured, sampled] if loose else [structured]
+
+
+def _tried(members: JacobianSet, propose: Callable[[JacobianSet], list[Proposal]]) -> list[Proposal]:
+    """The proposals, or none where every solver stalls: the identity metric is there already."""
+    try:
+        return propose(members)
+    except SolverError:
         return []
-    return found
 
 
 def _certified(model: Model, proposal: Proposal) -> list[Constants]:

@@ -10,15 +10,18 @@ from numpy.typing import NDArray
 
 from certbound.constants.affine import AffineForm, AffineSet
 from certbound.constants.blocks import VERTEX_LIMIT, lmi_blocks
-from certbound.constants.centers import center_metric, reachable_value
-from certbound.constants.jacobians import JacobianSet
+from certbound.constants.centers import center_metric, reachable_value, starting_metric
+from certbound.constants.jacobians import JacobianSet, VertexPolytope
 from certbound.constants.lmi import RateProgram
 from certbound.constants.tightening import RadiusModel, Rooms, tighten
 from certbound.errors import SolverError
 
-__all__ = ["Proposal", "erosion_proposals", "rate_proposals", "smallest_value", "spectral_bound"]
+__all__ = ["Proposal", "erosion_proposals", "rate_proposals", "sampled_polytope", "smallest_value", "spectral_bound"]
 
 Array = NDArray[np.float64]
+
+_FEW_BLOCKS = 4
+"""Up to so many inequalities the method of centres is used; beyond, a semidefinite solver."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -30,21 +33,50 @@ class Proposal:
 
 
 def rate_proposals(members: JacobianSet, *, continuous: bool, share: float = 5e-3) -> list[Proposal]:
-    """A metric of nearly least c or L: the method of centres, or a semidefinite program where it stalls."""
+    """A metric of nearly least c or L: the method of centres, or semidefinite programs where it stalls.
+
+    The sector form comes first: one inequality. Where it stays short of what the spectrum allows, few vertices
+    are tried as well, for it may be conservative.
+    """
     lower = spectral_bound(members, continuous=continuous)
     tolerance = share * max(abs(lower if continuous else 1 - lower), 1e-6)
-    blocks = lmi_blocks(members, form=_form(members))
-    if len(blocks) <= 4 * VERTEX_LIMIT:
-        center = center_metric(blocks, continuous=continuous, lower=lower, tolerance=tolerance)
-        metric = _normalised(center.metric)
-        if metric is not None:
-            return [Proposal(metric=metric, status="method of centres")]
-    program = RateProgram(members, continuous=continuous, form=_form(members))
-    proposal, _ = smallest_value(program, members, continuous=continuous, lower=lower, tolerance=tolerance)
-    metric = _normalised(proposal)
-    if metric is None:
-        raise SolverError("the semidefinite program returned a metric that is not positive definite.")
-    return [Proposal(metric=metric, status=f"semidefinite program: {program.status}")]
+    found: list[tuple[float, Proposal]] = []
+    structured = isinstance(members, AffineSet | AffineForm)
+    for form in ("sector", "vertices") if structured else ("vertices",):
+        if form == "vertices" and structured and members.vertex_count > VERTEX_LIMIT:
+            continue
+        blocks = lmi_blocks(members, form=form)
+        if len(blocks) <= _FEW_BLOCKS:
+            center = center_metric(blocks, continuous=continuous, lower=lower, tolerance=tolerance)
+            metric, value, status = center.metric, center.value, "method of centres"
+        else:
+            start = starting_metric(blocks, continuous=continuous)
+            program = RateProgram(members, continuous=continuous, form=form, max_condition=1e5, start=start)
+            metric, value = smallest_value(program, members, continuous=continuous, lower=lower, tolerance=tolerance)
+            status = f"semidefinite program: {program.status}"
+        scaled = normalised(metric)
+        if scaled is not None:
+            found.append((value, Proposal(metric=scaled, status=status)))
+        if value <= lower + 4 * tolerance:
+            break
+    if not found:
+        raise SolverError("no program returned a positive definite metric; scale the states, or give a metric.")
+    return [min(found, key=lambda pair: pair[0])[1]]
+
+
+def sampled_polytope(matrices: Array, *, limit: int = 24) -> VertexPolytope:
+    """Convex hull of the extreme ones among sampled Jacobians: no superset of anything, but as tight as it gets.
+
+    A metric proposed for it is certified over the whole domain like any other.
+    """
+    flat = matrices.reshape(len(matrices), -1)
+    spread = flat.max(axis=0) - flat.min(axis=0)
+    varying = np.flatnonzero(spread > 1e-12 * (1 + np.abs(flat).max()))
+    directions = np.random.default_rng(0).normal(size=(2 * limit, len(varying)))
+    directions = np.concatenate([np.eye(len(varying)), -np.eye(len(varying)), directions])
+    scaled = flat[:, varying] / spread[varying]
+    chosen = list(dict.fromkeys(int(k) for k in np.argmax(scaled @ directions.T, axis=0)))
+    return VertexPolytope(matrices=matrices[chosen[:limit] or [0]])
 
 
 def erosion_proposals(
@@ -53,7 +85,7 @@ def erosion_proposals(
     """The tightened metric, and the one of least c or L that it was searched from."""
     start = rate_proposals(members, continuous=radius.continuous, share=2e-3)[0]
     result = tighten(members, targets, noise, radius, start.metric, form=_form(members))
-    metric = _normalised(result.metric)
+    metric = normalised(result.metric)
     first = [] if metric is None else [Proposal(metric=metric, status=f"tightening: {result.status}")]
     return [*first, start]
 
@@ -76,7 +108,7 @@ def spectral_bound(members: JacobianSet, *, continuous: bool) -> float:
     return float(eigenvalues.real.max() if continuous else (np.abs(eigenvalues) ** 2).max())
 
 
-def _normalised(metric: Array) -> Array | None:
+def normalised(metric: Array) -> Array | None:
     """P scaled to smallest eigenvalue 1, exactly symmetric; None where it is not positive definite."""
     symmetric = (metric + metric.T) / 2
     if not np.all(np.isfinite(symmetric)):
@@ -128,11 +160,13 @@ def smallest_value(
             if count == 0:
                 raise
             break
+        if normalised(proposal) is None:
+            break  # the solver's accuracy ends here
         reached = reachable_value(proposal, jacobians, continuous=continuous)
         if reached < upper:
             metric, upper = proposal, reached
         if margin <= 0:
             low = target
         elif reached >= upper and reached > target:
-            break  # a positive margin that the metric does not keep: the solver's accuracy ends here
+            break  # a positive margin that the metric does not keep
     return metric, upper

@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -134,6 +135,12 @@ def affine_set(tape: Tape, inputs: Sequence[Interval], *, tolerance: float = 1e-
     """
     if len(tape.shape) != 2 or tape.shape[0] != tape.shape[1]:
         raise ValueError(f"`tape` must be square, got shape {tape.shape}.")
+    return _affine_set(tape, tuple((float(x.lo), float(x.hi)) for x in inputs), float(tolerance))
+
+
+@lru_cache(maxsize=32)
+def _affine_set(tape: Tape, box: tuple[tuple[float, float], ...], tolerance: float) -> AffineSet:
+    inputs = [Interval(np.array(low), np.array(high)) for low, high in box]
     enclose(tape, inputs)  # refuses undecided jumps and undefined operations, with the box
     forms = _expand(tape, inputs)
     entries = [forms[output] for output in tape.outputs]

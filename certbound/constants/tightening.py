@@ -115,9 +115,11 @@ class RadiusModel:
         """
         here = min(max(nu, 0.05), float(self.dimension))
         level = 1 / max(-2 * value if self.continuous else 1 - value, 1 / self.horizon)
-        powers, starts = (_POWERS, level * _STARTS) if near is None else (near.a * _STEPS, near.v0 * _STEPS)
+        powers, starts = _POWERS, level * _STARTS
+        if near is not None:
+            powers, starts = near.a * _STEPS**0.7, near.v0 * _STEPS**0.7
         best = Fit(np.inf, 0.0, 1.0, level)
-        for steps in (_STEPS, _STEPS**0.4):
+        for steps in (_STEPS, _STEPS**0.4) if near is None else (_STEPS,):
             a, v0 = (grid.ravel() for grid in np.meshgrid(powers, starts))
             if not (self.continuous or self.gaussian or nu >= self.dimension):
                 a = np.minimum(a, 0.499 * here)
@@ -167,7 +169,7 @@ class RadiusModel:
                 share = np.exp(power * info + excess - level)[rows, worst]
                 step = np.clip((goal - level[rows, worst]) / (slope[rows, worst] * share), -1.5, 1.5)
                 x = x + step
-                if np.nanmax(np.abs(step)) < 1e-7:
+                if np.nanmax(np.abs(step)) < 1e-4:
                     break
             result: Array = np.nan_to_num(np.exp(x), nan=np.inf)
         return result
