@@ -20,7 +20,7 @@ from certbound.constants.jacobians import JacobianSet, as_set
 from certbound.constants.models import Model, model_of
 from certbound.constants.proposals import Proposal, erosion_proposals, rate_proposals, sampled_polytope
 from certbound.constants.structure import affine_set
-from certbound.constants.targets import constraint_targets, rooms_of
+from certbound.constants.targets import constraint_targets, cut_rooms, rooms_of, stated_rooms
 from certbound.constants.tightening import RadiusModel, Rooms, erosion_factors
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
 from certbound.problem.derivative import jacobian
@@ -108,7 +108,7 @@ def propose_metrics(
     assert horizon is not None
     assert delta is not None
     if targets is None:
-        targets = _stated_targets(directions, clearances, members.dimension, horizon)
+        targets = stated_rooms(directions, clearances, members.dimension, horizon)
     if not matrices:
         raise ValueError('`objective="erosion"` needs `noise`: the noise matrices at unit proxy.')
     radius = RadiusModel(
@@ -195,7 +195,7 @@ def bound_metrics(
     for index in range(len(problem.constraints)):
         own = [target for target in targets if target.constraint == index]
         if own:
-            results.append(_least_erosion(model, euclidean, _cut(rooms_of(times, own), span), span, share))
+            results.append(_least_erosion(model, euclidean, cut_rooms(rooms_of(times, own), span), span, share))
         else:
             results.append(euclidean)
     return tuple(results)
@@ -236,7 +236,7 @@ def split_delta(
     ratios = []
     for index, record in enumerate(constants):
         own = [target for target in targets if target.constraint == index]
-        rooms = None if not own else _cut(rooms_of(times, own), span)
+        rooms = None if not own else cut_rooms(rooms_of(times, own), span)
         ratios.append(np.zeros(len(grid)) if rooms is None else _ratios(record, rooms, span, np.exp(grid)))
     low, high = 0.0, float(max(curve[0] for curve in ratios))
 
@@ -389,32 +389,7 @@ def _targets(model: Model, horizon: float | None) -> Rooms:
     _require(horizon, 0.5)
     assert horizon is not None
     times, targets = constraint_targets(model.problem)
-    return _cut(rooms_of(times, targets), horizon)
-
-
-def _cut(rooms: Rooms, horizon: float) -> Rooms:
-    """The same up to another horizon; beyond the last time the least room is asked."""
-    if horizon == rooms.times[-1]:
-        return rooms
-    least = np.min(rooms.rooms, axis=1, keepdims=True)
-    return Rooms(directions=rooms.directions, times=np.array([float(horizon)]), rooms=least)
-
-
-def _stated_targets(
-    directions: Sequence[ArrayLike] | None, clearances: ArrayLike | None, dimension: int, horizon: float
-) -> Rooms:
-    if not directions:
-        raise ValueError('`objective="erosion"` needs `directions=`, at least one.')
-    normals = []
-    for direction in directions:
-        a = np.asarray(direction, dtype=float)
-        if a.ndim not in (1, 2) or len(a) != dimension or not np.all(np.isfinite(a)) or not a.any():
-            raise ValueError(f"`directions` must be finite, not zero, of {dimension} entries, got {direction!r}.")
-        normals.append(a.reshape(dimension, -1))
-    room = np.ones(len(normals)) if clearances is None else np.asarray(clearances, dtype=float)
-    if room.shape != (len(normals),) or not np.all(room > 0):
-        raise ValueError(f"`clearances` must hold {len(normals)} positive numbers, got {clearances!r}.")
-    return Rooms(directions=tuple(normals), times=np.array([horizon]), rooms=room[:, None])
+    return cut_rooms(rooms_of(times, targets), horizon)
 
 
 def _ratios(constants: Constants, rooms: Rooms, horizon: float, deltas: Array) -> Array:

@@ -6,18 +6,19 @@ sampled noise-free paths to the constraint then; a safety proof measures it agai
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from certbound.constants.tightening import Rooms
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
 from certbound.problem.trace import compile_numpy
 
-__all__ = ["Target", "constraint_targets", "nominal_paths", "rooms_of"]
+__all__ = ["Target", "constraint_targets", "cut_rooms", "nominal_paths", "rooms_of", "stated_rooms"]
 
 Array = NDArray[np.float64]
 
@@ -78,6 +79,32 @@ def rooms_of(times: Array, targets: list[Target]) -> Rooms:
     floor = _SMALLEST_SHARE * largest if largest > 0 else 1.0
     directions = tuple(target.direction for target in targets)
     return Rooms(directions=directions, times=times, rooms=np.maximum(rooms, floor))
+
+
+def cut_rooms(rooms: Rooms, horizon: float) -> Rooms:
+    """The rooms up to another horizon; beyond the last time the least room is asked."""
+    if horizon == rooms.times[-1]:
+        return rooms
+    least = np.min(rooms.rooms, axis=1, keepdims=True)
+    return Rooms(directions=rooms.directions, times=np.array([float(horizon)]), rooms=least)
+
+
+def stated_rooms(
+    directions: Sequence[ArrayLike] | None, clearances: ArrayLike | None, dimension: int, horizon: float
+) -> Rooms:
+    """Directions and constant rooms that a caller states, checked; rooms of 1 when omitted."""
+    if not directions:
+        raise ValueError('`objective="erosion"` needs `directions=`, at least one.')
+    normals = []
+    for direction in directions:
+        a = np.asarray(direction, dtype=float)
+        if a.ndim not in (1, 2) or len(a) != dimension or not np.all(np.isfinite(a)) or not a.any():
+            raise ValueError(f"`directions` must be finite, not zero, of {dimension} entries, got {direction!r}.")
+        normals.append(a.reshape(dimension, -1))
+    room = np.ones(len(normals)) if clearances is None else np.asarray(clearances, dtype=float)
+    if room.shape != (len(normals),) or not np.all(room > 0):
+        raise ValueError(f"`clearances` must hold {len(normals)} positive numbers, got {clearances!r}.")
+    return Rooms(directions=tuple(normals), times=np.array([horizon]), rooms=room[:, None])
 
 
 def nominal_paths(problem: Problem, *, paths: int = _PATHS) -> tuple[Array, Array]:

@@ -77,7 +77,7 @@ def test_the_condition_number_is_bounded():
     metric, margin = RateProgram(members, continuous=True, max_condition=50.0).propose(-0.9)
     assert np.linalg.cond(metric) <= 50.0 * (1 + 1e-6)
     assert margin < 0
-    metric, margin = RateProgram(members, continuous=True, max_condition=1e6).propose(-0.9)
+    _, margin = RateProgram(members, continuous=True, max_condition=1e6).propose(-0.9)
     assert margin > 0
 
 
@@ -90,7 +90,7 @@ def test_a_union_is_served_by_one_metric():
 
 def test_the_margin_is_negative_where_no_metric_exists_and_the_status_is_still_optimal():
     program = RateProgram(as_set([[0.5, 0.0], [0.0, -1.0]]), continuous=True)
-    metric, margin = program.propose(0.4)
+    _, margin = program.propose(0.4)
     assert margin < 0
     assert program.status == "optimal"
     assert program.propose(0.6)[1] > 0

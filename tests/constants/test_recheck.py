@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.constants.chain_matrices import chain_sector
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,6 +14,7 @@ from certbound.constants.centers import center_metric
 from certbound.constants.jacobians import IntervalMatrixSet, UnionSet
 from certbound.constants.recheck import certify_gain, certify_rate, holds_gain, holds_rate
 from certbound.errors import EnclosureError
+from tests.constants.chain_matrices import chain_sector
 
 
 def random_metric(rng: np.random.Generator, n: int, spread: float = 2.0) -> np.ndarray:
