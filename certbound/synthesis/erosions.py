@@ -1,0 +1,225 @@
+"""What a tube takes from every face along a plan, in floating point: the tightening that the optimiser sees.
+
+Two kinds of tube: a ball of a metric (tubes from constants; with what the initial set and the disturbance add to it),
+and the linear response, whose sets depend on the plan. The verdict on the plan proves everything again.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem
+from certbound.problem.tape import Tape
+from certbound.problem.trace import compile_numpy, jacobian
+from certbound.reach.events import StepEvents, WindowEvents
+from certbound.reach.inclusion import Supports
+from certbound.reach.linear import LinearRun, level_scale
+from certbound.reach.linearisation import Linearisation
+from certbound.synthesis.faces import Face
+from certbound.synthesis.transcription import Grid, Plant
+from certbound.tubes.constants import Constants
+from certbound.tubes.tube import Tube
+
+__all__ = [
+    "BallTube", "LinearTube", "ScaledTube", "ball_tube", "Tightening", "initial_center", "linear_tube", "nominal_spread", "spread_tube",
+    "tighten",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+
+NONLINEAR_SHARE = 0.1
+"""Part of delta that the linear response spends on the coordinates that enter nonlinearly."""
+
+
+class Tightening:
+    """Extents of a tube along rows: what deviations can do, a . S at most."""
+
+    def extents(self, rows: Callable[[Array, Array], Array], states: Array, times: Array) -> Array:
+        """Extent along rows(states, times), (K, R, n), at every one of K points: shape (K, R)."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BallTube(Tightening):
+    """{||S||_P <= radii[k]} at point k; ``inverse`` is P^-1."""
+
+    radii: Array
+    inverse: Array
+
+    def extents(self, rows: Callable[[Array, Array], Array], states: Array, times: Array) -> Array:
+        a = rows(states, times)
+        size = np.sqrt(np.maximum(np.einsum("kri,ij,krj->kr", a, self.inverse, a), 0.0))
+        return np.asarray(self.radii[:, None] * size)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScaledTube(Tightening):
+    """Standard deviations of a linearised model, covariance (K, n, n): a shape to begin with."""
+
+    covariance: Array
+
+    def extents(self, rows: Callable[[Array, Array], Array], states: Array, times: Array) -> Array:
+        a = rows(states, times)
+        return np.asarray(np.sqrt(np.maximum(np.einsum("kri,kij,krj->kr", a, self.covariance, a), 0.0)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LinearTube(Tightening):
+    """Extents of the linear response (Thm K7) along a plan, each row's level costing exp(log_share)."""
+
+    run: LinearRun
+    bounds: tuple[Array, Array]
+    events: StepEvents | WindowEvents
+    log_share: float
+
+    def extents(self, rows: Callable[[Array, Array], Array], states: Array, times: Array) -> Array:
+        engine = self.run.engine
+        nodes = engine.nodes[0]
+        at = engine.times if not engine.continuous else (engine.times[:-1] + engine.times[1:]) / 2
+        middle = nodes if not engine.continuous else (nodes[:-1] + nodes[1:]) / 2
+        a = np.ascontiguousarray(rows(middle, at))
+        radii = engine.radii[0]
+        support = Supports(
+            engine.response, engine.gathering.of_cell(0), 0, a, np.diag(radii)[radii > 0], continuous=engine.continuous
+        )
+        _, high, _ = support.remainder(self.bounds[0][0], self.bounds[1][0])
+        taken = support.y + high
+        for index in range(a.shape[1]):
+            event = self.events.along(a[:, index])
+            if event.profile.max() > 0:
+                taken[:, index] += level_scale(event, event.profile, self.log_share) * event.profile
+        if not engine.continuous:
+            return np.asarray(taken[np.round(times).astype(int)])
+        place = times / engine.step
+        before = np.clip(np.ceil(place - 1e-9).astype(int) - 1, 0, engine.pieces - 1)
+        after = np.clip(np.floor(place + 1e-9).astype(int), 0, engine.pieces - 1)
+        return np.asarray(np.maximum(taken[before], taken[after]))
+
+
+def tighten(tube: Tightening, faces: Sequence[Face], states: Array, times: Array) -> Array:
+    """Erosions (points, parts) of all faces at the points behind the start."""
+    found = [face.erosion(tube.extents(face.rows, states[1:], times[1:])) for face in faces]
+    return np.concatenate(found, axis=1) if found else np.zeros((len(times) - 1, 0))
+
+
+def linear_tube(problem: Problem, rows: int, delta: float) -> LinearTube | None:
+    """The linear response along the problem's plan for ``rows`` one-sided rows; None where its remainder feeds itself."""
+    run = LinearRun(Linearisation.of(problem))
+    log_nonlinear = float(np.log(delta * NONLINEAR_SHARE))
+    levels, events = run.levels(log_nonlinear)
+    with np.errstate(all="ignore"):
+        bounds = run.include(levels, 1)
+    if bounds is None:
+        return None
+    share = float(np.log(delta * (1 - NONLINEAR_SHARE) / max(rows, 1)))
+    return LinearTube(run=run, bounds=bounds, events=events[0], log_share=share)
+
+
+def spread_tube(problem: Problem, plant: Plant, grid: Grid, states: Array, inputs: Array) -> ScaledTube:
+    """Covariance of the linearised deviation along a plan, the initial set as if it were random."""
+    n = plant.dimension
+    slope = compile_numpy(jacobian(plant.dynamics, range(1, 1 + n)))
+    times = grid.times()
+    held = np.repeat(inputs, grid.substeps, axis=0)
+    values = slope(times[:-1], *states[:-1].T, *held.T, *(np.full(grid.points, d) for d in plant.disturbance))
+    step = grid.step / grid.substeps
+    covariance = _start_covariance(problem.initial)
+    found = []
+    for k in range(grid.points):
+        j = values[k] if not grid.continuous else np.eye(n) + step * values[k] + step**2 / 2 * values[k] @ values[k]
+        covariance = np.clip(j @ covariance @ j.T, -1e12, 1e12) + step * _noise(problem, float(times[k]), states[k])
+        found.append(covariance)
+    stack = np.array(found)
+    floor = 1e-6 * max(float(np.trace(stack, axis1=1, axis2=2).max()), 1e-6)
+    return ScaledTube(covariance=stack + floor * np.eye(n))
+
+
+def _noise(problem: Problem, time: float, state: Array) -> Array:
+    system = problem.system
+    if isinstance(system, DiscreteSystem):
+        g = np.asarray(system.noise_matrix)
+        return np.asarray(g @ np.asarray(system.noise.proxy) @ g.T)
+    assert isinstance(system, ContinuousSystem)
+    g = system.diffusion
+    matrix = compile_numpy(g)(time, *state) if isinstance(g, Tape) else np.asarray(g)
+    return np.asarray(matrix @ matrix.T)
+
+
+def initial_center(initial: Any) -> Array:
+    """The nominal start: the middle of the initial set."""
+    if isinstance(initial, Box):
+        return np.clip(0.5 * initial.low + 0.5 * initial.high, initial.low, initial.high)
+    return np.asarray(initial.mean if isinstance(initial, GaussianStart) else initial.center, dtype=float)
+
+
+def _start_covariance(initial: Any) -> Array:
+    if isinstance(initial, GaussianStart):
+        return np.asarray(initial.covariance, dtype=float)
+    if isinstance(initial, Box):
+        return np.diag(((initial.high - initial.low) / 2) ** 2) / 9
+    shape = initial.shape if isinstance(initial, Ellipsoid) else np.eye(initial.dimension) * initial.radius**2
+    return np.asarray(shape) / 9
+
+
+def nominal_spread(
+    problem: Problem, plant: Plant, grid: Grid, constants: Constants, states: Array, inputs: Array
+) -> Array:
+    """rho (points + 1,) with ||x_t - z_t||_P <= rho for every start and disturbance (Thm K5, in floating point)."""
+    n = plant.dimension
+    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric)
+    root = np.linalg.cholesky(metric).T
+    slope = float(np.max(np.asarray(constants.rate if constants.continuous else constants.gain)))
+    box = problem.system.disturbance
+    step = grid.step / grid.substeps
+    found = [_start_radius(problem.initial, root)]
+    held = np.repeat(inputs, grid.substeps, axis=0)
+    for k in range(grid.points):
+        push = 0.0
+        if box is not None:
+            corners = np.array(list(itertools.islice(itertools.product(*zip(box.low, box.high)), 256)))
+            t = k * step
+            base = plant.evaluate(t, *states[k], *held[k], *plant.disturbance)
+            moved = np.array([plant.evaluate(t, *states[k], *held[k], *corner) for corner in corners])
+            push = float(np.max(np.linalg.norm((moved - base) @ root.T, axis=1)))
+        if grid.continuous:
+            growth = np.expm1(slope * step) / slope if abs(slope) > 1e-12 else step
+            found.append(float(np.exp(slope * step) * found[-1] + growth * push))
+        else:
+            found.append(slope * found[-1] + push)
+    return np.array(found)
+
+
+def _start_radius(initial: Any, root: Array) -> float:
+    if isinstance(initial, GaussianStart):
+        return 0.0
+    if isinstance(initial, Box):
+        half = (initial.high - initial.low) / 2
+        if not np.any(half):
+            return 0.0
+        wide = np.flatnonzero(half)
+        signs = itertools.islice(itertools.product((-1.0, 1.0), repeat=len(wide)), 4096)
+        corners = np.array([np.bincount(wide, np.array(sign) * half[wide], len(half)) for sign in signs])
+        return float(np.max(np.linalg.norm(corners @ root.T, axis=1)))
+    shape = initial.shape if isinstance(initial, Ellipsoid) else np.eye(initial.dimension) * initial.radius**2
+    assert isinstance(initial, Ball | Ellipsoid)
+    return float(np.sqrt(np.linalg.eigvalsh(root @ np.asarray(shape) @ root.T)[-1]))
+
+
+def ball_tube(tube: Tube, grid: Grid, spread: Array) -> BallTube:
+    """A tube from constants as balls at the points, widened by the noise-free spread (points + 1,)."""
+    n = tube.constants.dimension
+    times = np.minimum(grid.times(), tube.horizon)
+    radius = np.asarray(tube.radius(np.round(times) if not grid.continuous else times))
+    total = radius + spread
+    if grid.continuous:  # a piece counts from end to end
+        total = np.maximum(total, np.append(total[1:], total[-1]))
+    inverse = np.eye(n) if tube.constants.metric is None else np.linalg.inv(np.asarray(tube.constants.metric))
+    return BallTube(radii=total[1:], inverse=inverse)

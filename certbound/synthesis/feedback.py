@@ -1,0 +1,155 @@
+"""Ancillary feedback u = v + K (x - z): the closed loop as a system of its own, and where K comes from.
+
+With w = v - K z the loop is x+ = f(x, w + K x, d): an ordinary system whose input is w, so that constants, tubes and
+the linear response are those of the closed loop. The bounds of u become constraints on the state, K x + w_k within the
+bounds during piece k, which the verdict proves like every other constraint.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.constants.lmi import design_feedback
+from certbound.constants.structure import jacobian_set
+from certbound.errors import EnclosureError, InfeasibleError, SolverError
+from certbound.problem.checks import matrix
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Box, Inside, Polytope
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
+from certbound.problem.tape import Tape
+from certbound.problem.trace import jacobian, substitute, trace
+from certbound.synthesis.terminal import linearise, riccati
+
+__all__ = ["close_loop", "constrain_inputs", "depends_on", "resolve_feedback"]
+
+Array = NDArray[np.float64]
+
+_MOST_VERTICES = 64
+
+
+def resolve_feedback(problem: Problem, feedback: str | ArrayLike, start: Array) -> Array:
+    """The gain K (m, n) that ``feedback`` names or is.
+
+    Parameters
+    ----------
+    problem : Problem
+    feedback : {"riccati", "lmi"} or array_like of shape (m, n)
+        "riccati": the linear-quadratic regulator of the linearisation at ``start``; "lmi": K and a metric together,
+        with the smallest c or L over all Jacobians.
+    start : ndarray, shape (n,)
+
+    Raises
+    ------
+    ValueError
+        If K does not stabilise the linearisation, the name is unknown, or the co-design has no answer.
+    """
+    n, m = problem.system.dimension, len(problem.system.input_names)
+    if isinstance(feedback, str):
+        if feedback == "riccati":
+            gain = riccati(problem, start)[1]
+        elif feedback == "lmi":
+            gain = _designed(problem, start)
+        else:
+            raise ValueError(f"`feedback` must be 'riccati', 'lmi' or a ({m}, {n}) matrix, got {feedback!r}.")
+    else:
+        gain = matrix("feedback", feedback, m, n)
+    _check_stable(problem, gain, start)
+    return np.asarray(gain, dtype=float)
+
+
+def _check_stable(problem: Problem, gain: Array, start: Array) -> None:
+    a, b = linearise(problem, start, np.zeros(len(gain)))
+    values = np.linalg.eigvals(a + b @ gain)
+    if problem.system.time == "continuous":
+        worst, limit, name = float(values.real.max()), 0.0, "largest real part"
+    else:
+        worst, limit, name = float(np.abs(values).max()), 1.0, "spectral radius"
+    if worst >= limit:
+        raise ValueError(
+            f"`feedback` must stabilise the system linearised at the start, but the {name} of A + B K is {worst:.4g} "
+            f"(needed: below {limit:g}); try feedback='riccati'."
+        )
+
+
+def _designed(problem: Problem, start: Array) -> Array:
+    """K from the co-design LMI over all Jacobians."""
+    system = problem.system
+    slots = range(1 + system.dimension, 1 + system.dimension + len(system.input_names))
+    if depends_on(jacobian(system.dynamics, slots), range(len(system.dynamics.inputs))):
+        raise ValueError("`feedback` 'lmi' needs inputs that enter as a constant matrix times u; try 'riccati'.")
+    _, b = linearise(problem, start, np.zeros(len(system.input_names)))
+    try:
+        members = jacobian_set(system, problem.domain)
+        if members.vertex_count > _MOST_VERTICES:
+            raise ValueError(
+                f"`feedback` 'lmi' needs at most {_MOST_VERTICES} vertices of the Jacobian, got "
+                f"{members.vertex_count}; try 'riccati'."
+            )
+        return np.asarray(design_feedback(members, b, continuous=system.time == "continuous", tolerance=1e-3).feedback)
+    except (EnclosureError, InfeasibleError, SolverError) as error:
+        raise ValueError(f"`feedback` 'lmi' found no gain: {error}") from error
+
+
+def depends_on(tape: Tape, slots: Any) -> bool:
+    """Whether the outputs of a tape depend on any of the input slots."""
+    wanted, needed = set(slots), set(tape.outputs)
+    for index in range(len(tape.nodes) - 1, -1, -1):
+        if index not in needed:
+            continue
+        node = tape.nodes[index]
+        if node.op == "input":
+            if node.args[0] in wanted:
+                return True
+        else:
+            needed.update(node.args)
+    return False
+
+
+def close_loop(system: System, gain: Array) -> System:
+    """The system x+ = f(t, x, w + K x, d) (or dx = ...) with inputs w without bounds.
+
+    Parameters
+    ----------
+    system : ContinuousSystem or DiscreteSystem
+    gain : ndarray, shape (m, n)
+        K.
+    """
+    names = system.input_names
+
+    def law(x: Any, u: Any) -> Any:
+        return [u[i] + sum(gain[i, j] * x[j] for j in range(len(system.states))) for i in range(len(names))]
+
+    tape = trace(law, {"t": ["t"], "x": system.states, "u": names})
+    dynamics = substitute(system.dynamics, system.dynamics.inputs, {name: (tape, i) for i, name in enumerate(names)})
+    count = len(names)
+    options: dict[str, Any] = {
+        "states": system.states, "inputs": Box(np.full(count, -np.inf), np.full(count, np.inf)), "input_names": names,
+        "disturbance": system.disturbance, "disturbance_names": system.disturbance_names or None,
+    }  # fmt: skip
+    if isinstance(system, ContinuousSystem):
+        return ContinuousSystem(dynamics, diffusion=system.diffusion, **options)
+    assert isinstance(system, DiscreteSystem)
+    return DiscreteSystem(dynamics, noise=system.noise, noise_matrix=system.noise_matrix, **options)
+
+
+def constrain_inputs(problem: Problem, gain: Array, plan: Array) -> list[Inside]:
+    """The bounds of u = w + K x as one constraint a piece, for the plan w of shape (N, m)."""
+    box = problem.system.inputs
+    assert box is not None
+    normals = np.concatenate([gain, -gain])
+    used = np.any(normals != 0, axis=1)
+    length = float(problem.horizon) / len(plan)
+    found = []
+    for k, row in enumerate(plan):
+        bounds = np.concatenate([box.high - row, row - box.low])
+        kept = used & np.isfinite(bounds)
+        if not np.any(kept):
+            continue
+        ends = (float(k), float(k)) if problem.system.time == "discrete" else (k * length, (k + 1) * length)
+        during = (ends[0], min(ends[1], float(problem.horizon)))
+        label = f"inputs within their bounds {'at step' if ends[0] == ends[1] else 'from t ='} {ends[0]:g}"
+        found.append(Inside(Polytope(normals[kept], bounds[kept]), during=during, label=label))
+    return found

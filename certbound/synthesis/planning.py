@@ -1,0 +1,354 @@
+"""Plans for stochastic control: a deterministic optimal control problem with eroded constraints, then a verdict.
+
+The optimiser sees the noise-free state z and constraints tightened by what the tube takes, h(t, z) >= e. What is
+guaranteed is only what ``verify_safety`` proves of the plan that comes out: with it, P(some constraint is broken at
+some time) <= delta for the noisy system under the same inputs.
+
+- Tubes from constants (by name): c, L, sigma in one common metric; the Kummer tube is fitted to the room that the plan
+  leaves, and the plan to the tube, in turns.
+- The linear response depends on the plan: plan and tube are iterated to a fixed point.
+
+Source: Thm 1 and eq. (controller condition) of Sec. VII-B (paper); Thms K1, K4, K7 (theory).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.constants.bounds import bound_constants
+from certbound.errors import InfeasibleError
+from certbound.problem.problem import Problem
+from certbound.problem.regions import Region
+from certbound.problem.sets import GaussianStart
+from certbound.problem.trace import jacobian
+from certbound.synthesis.costs import Cost, cost_of
+from certbound.synthesis.erosions import (
+    BallTube,
+    Tightening,
+    ball_tube,
+    initial_center,
+    linear_tube,
+    nominal_spread,
+    spread_tube,
+    tighten,
+)
+from certbound.synthesis.faces import Face, faces_of
+from certbound.synthesis.feedback import close_loop, constrain_inputs, depends_on, resolve_feedback
+from certbound.synthesis.terminal import (
+    TerminalSet,
+    check_terminal,
+    contraction_terminal,
+    riccati_terminal,
+)
+from certbound.synthesis.transcription import Grid, Plant, Solution, Transcription
+from certbound.tubes.constants import Constants
+from certbound.tubes.tube import Tube
+from certbound.tubes.tuning import tune_tube
+
+__all__ = ["Planner", "Tightened"]
+
+Array = NDArray[np.float64]
+
+PIECES = 40
+SUBSTEPS = 2
+FITTED = ("kummer", "bessel")
+"""Tubes that are fitted to the room of the plan."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tightened:
+    """A tube along a plan and what it takes.
+
+    Parameters
+    ----------
+    erosion : ndarray, shape (points, parts)
+    inputs : ndarray, shape (points + 1, m)
+        Taken from the input bounds by the feedback.
+    tube : Tube or None
+        Where it comes from constants.
+    """
+
+    erosion: Array
+    inputs: Array
+    tube: Tube | None = None
+
+    def times(self, factor: float) -> Tightened:
+        """Everything larger by a factor."""
+        return replace(self, erosion=self.erosion * factor, inputs=self.inputs * factor)
+
+
+class Planner:
+    """One problem, one grid, one cost; plans for any tube.
+
+    Parameters
+    ----------
+    problem : Problem
+        With inputs; its plan, if any, is the first guess.
+    stage_cost : callable, optional
+        stage(t, x, u); the problem's quadratic cost when omitted.
+    terminal : "contraction", "riccati", TerminalSet, Region or None
+    feedback : "riccati", "lmi", array_like of shape (m, n) or None
+    steps : int, optional
+        Pieces of the horizon (continuous time).
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        stage_cost: Callable[..., Any] | None = None,
+        terminal: str | TerminalSet | Region | None = None,
+        feedback: str | ArrayLike | None = None,
+        steps: int | None = None,
+    ) -> None:
+        system = problem.system
+        if system.inputs is None:
+            raise ValueError("`problem` must have inputs to plan; give the system `inputs=`.")
+        self.problem = problem
+        self.grid = _grid(problem, steps)
+        self.start = initial_center(problem.initial)
+        self.feedback = None if feedback is None else resolve_feedback(problem, feedback, self.start)
+        self.system = system if self.feedback is None else close_loop(system, self.feedback)
+        self.plant = _plant(problem, self.system.dynamics, self.feedback)
+        self.faces: tuple[Face, ...] = faces_of(problem)
+        if not self.faces:
+            raise ValueError("`problem` must have a constraint that bounds something.")
+        self.terminal_name = terminal
+        self.terminal = _given_terminal(problem, terminal)
+        self.stage_cost = stage_cost
+        self.cost = self._cost()
+        self.program = self._program()
+
+    def _cost(self) -> Cost:
+        end = None if self.terminal is None else self.terminal.cost
+        center = None if self.terminal is None else self.terminal.center
+        return cost_of(self.problem, self.stage_cost, end, center)
+
+    def _program(self) -> Transcription:
+        return Transcription(self.plant, self.grid, self.faces, self.cost, terminal=self.terminal)
+
+    @property
+    def nominal(self) -> Problem:
+        """The problem with the closed loop's system, without a plan."""
+        cost = self.problem.cost if self.feedback is None else None
+        return self.problem.replace(system=self.system, plan=None, cost=cost)
+
+    def planned(self, plan: Array) -> Problem:
+        """The problem that the verdict is about: the closed loop under a plan, its input bounds included."""
+        if self.feedback is None:
+            return self.problem.replace(plan=plan)
+        bounds = constrain_inputs(self.problem, self.feedback, plan)
+        return self.problem.replace(system=self.system, plan=plan, cost=None, safe=[*self.problem.safe, *bounds])
+
+    # ---- tubes -------------------------------------------------------------------------------------------
+
+    def tightened(self, tube: Tightening, states: Array, source: Tube | None = None) -> Tightened:
+        """What a tube takes from every face, and from the inputs."""
+        times = self.grid.times()
+        inputs = np.zeros((len(times), len(self.plant.low)))
+        if self.feedback is not None:
+            gain = self.feedback
+            two = np.concatenate([gain, -gain])
+
+            def rows(x: Array, t: Array) -> Array:
+                return np.broadcast_to(two, (len(x), *two.shape))
+
+            both = tube.extents(rows, states[1:], times[1:])
+            inputs[1:] = np.maximum(both[:, : len(gain)], both[:, len(gain) :])
+            inputs[0] = self._initial_inputs(gain)
+        return Tightened(erosion=tighten(tube, self.faces, states, times), inputs=inputs, tube=source)
+
+    def _initial_inputs(self, gain: Array) -> Array:
+        initial = self.problem.initial
+        if isinstance(initial, GaussianStart):
+            return np.zeros(len(gain))
+        return np.maximum(np.asarray(initial.support(gain)) - gain @ self.start, 0.0)
+
+    def first_plan(self) -> Solution:
+        """The plan with the most room, in standard deviations of the linearised noise."""
+        guess = self._guess()
+        best: Solution | None = None
+        for _ in range(2):
+            states = self.plant.rollout(self.grid, self.start, guess)
+            if not np.all(np.isfinite(states)) or np.abs(states).max() > 1e6:
+                states = np.tile(self.start, (self.grid.points + 1, 1))
+            shape = self.tightened(spread_tube(self.problem, self.plant, self.grid, states, guess), states)
+            found = self.program.solve("scale", self.start, shape.erosion, guess, tightening=shape.inputs)
+            if not np.all(np.isfinite(found.states)):
+                break
+            best = found
+            guess = found.inputs
+        if best is None:
+            raise InfeasibleError("no noise-free trajectory was found; check the dynamics, or give the problem a `plan`.")
+        return best
+
+    def _guess(self) -> Array:
+        rows = self.problem.input_sequence
+        if rows is not None:
+            held = rows[np.arange(self.grid.steps) * len(rows) // self.grid.steps]
+            if self.feedback is None:
+                return np.asarray(held)
+            plain = replace(self.plant, dynamics=self.problem.system.dynamics, feedback=None)
+            states = plain.rollout(self.grid, self.start, held)[:: self.grid.substeps]
+            return np.asarray(held - np.nan_to_num(states[:-1]) @ self.feedback.T)
+        box = self.problem.system.inputs
+        assert box is not None
+        middle = np.where(np.isfinite(box.low + box.high), (box.low + box.high) / 2, np.clip(0.0, box.low, box.high))
+        if self.feedback is not None:
+            middle = middle - self.feedback @ self.start
+        return np.tile(middle, (self.grid.steps, 1))
+
+    def constants(self, plan: Array) -> Constants:
+        """Certified constants in the one common metric, for every input that the problem allows.
+
+        Raises
+        ------
+        ValueError
+            If the Jacobian depends on inputs without bounds.
+        """
+        nominal = self.nominal
+        dynamics = self.system.dynamics
+        n, m = self.system.dimension, len(self.system.input_names)
+        slots = range(1 + n, 1 + n + m)
+        involved = depends_on(jacobian(dynamics, range(1, 1 + n)), slots)
+        box = self.system.inputs
+        assert box is not None
+        if involved and not box.bounded:
+            raise ValueError(
+                "`inputs` must be bounded: the Jacobian depends on them, so that no constants hold for all inputs; give "
+                "cb.Box(low, high), or tube='linear'."
+            )
+        if n == 1:
+            return bound_constants(nominal, metric="euclidean")
+        proposed = bound_constants(nominal.replace(plan=plan), objective="erosion")
+        if not involved:
+            return proposed
+        return bound_constants(nominal, metric="euclidean" if proposed.metric is None else proposed.metric)
+
+    def tube_of(
+        self, constants: Constants, method: str, delta: float, solution: Solution, parameters: Mapping[str, Any]
+    ) -> Tube:
+        """A tube by name; a fitted one serves the room that a plan leaves."""
+        objective: Any = "max"
+        if method in FITTED:
+            objective = self._clearance(constants, solution)
+        horizon = self.problem.horizon
+        return tune_tube(constants, horizon=horizon, delta=delta, objective=objective, method=method, **parameters)
+
+    def _clearance(self, constants: Constants, solution: Solution) -> Any:
+        """Room of a plan in the metric, as a clearance profile; 'max' where it leaves none."""
+        n = self.plant.dimension
+        inverse = np.eye(n) if constants.metric is None else np.linalg.inv(np.asarray(constants.metric))
+        times = self.grid.times()
+        unit = BallTube(radii=np.ones(self.grid.points), inverse=inverse)
+        factor = self.tightened(unit, solution.states)
+        room = np.full(self.grid.points, np.inf)
+        part = 0
+        for face in self.faces:
+            own = factor.erosion[:, part : part + face.parts].max(axis=1)
+            value = face.room(solution.states[1:], times[1:]) / np.maximum(own, 1e-300)
+            room = np.minimum(room, np.where(face.asked(times[1:]), value, np.inf))
+            part += face.parts
+        room = room - nominal_spread(self.problem, self.plant, self.grid, constants, solution.states, solution.inputs)[1:]
+        if not np.any(np.isfinite(room)):
+            return "max"
+        room = np.maximum(room, 0.05 * float(np.median(room[np.isfinite(room)])))
+        if not np.all(room > 0):
+            return "max"
+        if self.grid.continuous:
+            return times, room
+        held = np.concatenate([[np.inf], room[:-1]])
+        held[-1] = min(held[-1], room[-1])
+        return times, held
+
+    def around(self, tube: Tube, solution: Solution) -> Tightened:
+        """A tube from constants along a plan."""
+        spread = nominal_spread(
+            self.problem, self.plant, self.grid, tube.constants, solution.states, solution.inputs
+        )
+        return self.tightened(ball_tube(tube, self.grid, spread), solution.states, tube)
+
+    def response(self, solution: Solution, delta: float) -> Tightened | None:
+        """The linear response along a plan; None where its remainder feeds itself."""
+        rows = sum(face.rows(solution.states[:1], np.zeros(1)).shape[1] for face in self.faces)
+        rows += 0 if self.feedback is None else 2 * len(self.feedback)
+        planned = self.nominal.replace(plan=solution.inputs)
+        found = linear_tube(planned, rows, delta)
+        return None if found is None else self.tightened(found, solution.states)
+
+    # ---- plans -------------------------------------------------------------------------------------------
+
+    def settle_terminal(self, constants: Constants | None, tightened: Tightened) -> None:
+        """Build or check the terminal set once the erosion at the end is known."""
+        if self.terminal_name is None:
+            return
+        last, horizon = tightened.erosion[-1], float(self.problem.horizon)
+        if isinstance(self.terminal_name, str):
+            if self.terminal_name == "riccati":
+                self.terminal = riccati_terminal(self.problem, self.faces, last, horizon)
+            else:
+                known = constants if constants is not None else self.constants(self._guess())
+                self.terminal = contraction_terminal(self.problem, known, self.faces, last, horizon)
+            self.cost = self._cost()
+            self.program = self._program()
+        else:
+            assert self.terminal is not None
+            check_terminal(self.terminal, self.faces, last, horizon)
+
+    def widest(self, tightened: Tightened, guess: Array) -> Solution:
+        """The plan with the largest s such that s times the erosion fits."""
+        return self.program.solve("scale", self.start, tightened.erosion, guess, tightening=tightened.inputs)
+
+    def cheapest(self, tightened: Tightened, guess: Array) -> Solution:
+        """The plan of least cost in the tightened constraints."""
+        return self.program.solve("cost", self.start, tightened.erosion, guess, tightening=tightened.inputs)
+
+    def softest(self, tightened: Tightened, guess: Array) -> Solution:
+        """The plan that misses the tightened constraints least."""
+        return self.program.solve("soft", self.start, tightened.erosion, guess, tightening=tightened.inputs)
+
+
+def _grid(problem: Problem, steps: int | None) -> Grid:
+    if steps is not None and (isinstance(steps, bool) or int(steps) != steps or steps < 1):
+        raise ValueError(f"`steps` must be a positive integer, got {steps!r}.")
+    if problem.system.time == "discrete":
+        if steps is not None and steps != problem.horizon:
+            raise ValueError(f"`steps` must be the horizon, {problem.horizon}, in discrete time; leave it out.")
+        return Grid(steps=int(problem.horizon), step=1.0, substeps=1, continuous=False)
+    rows = problem.input_sequence
+    count = int(steps) if steps is not None else PIECES if rows is None else len(rows)
+    return Grid(steps=count, step=float(problem.horizon) / count, substeps=SUBSTEPS, continuous=True)
+
+
+def _plant(problem: Problem, dynamics: Any, feedback: Array | None) -> Plant:
+    system, box = problem.system, problem.system.disturbance
+    middle = np.zeros(0) if box is None else np.asarray((box.low + box.high) / 2)
+    assert system.inputs is not None
+    low, high = np.asarray(system.inputs.low), np.asarray(system.inputs.high)
+    if feedback is None:
+        return Plant(dynamics=dynamics, dimension=system.dimension, disturbance=middle, low=low, high=high)
+    free = np.full(len(low), np.inf)
+    return Plant(
+        dynamics=dynamics, dimension=system.dimension, disturbance=middle, low=-free, high=free, feedback=feedback,
+        input_low=low, input_high=high,
+    )  # fmt: skip
+
+
+def _given_terminal(problem: Problem, terminal: Any) -> TerminalSet | None:
+    if terminal is None or isinstance(terminal, TerminalSet):
+        return terminal
+    if isinstance(terminal, str):
+        if terminal not in ("contraction", "riccati"):
+            raise ValueError(f"`terminal` must be 'contraction', 'riccati', a set or None, got {terminal!r}.")
+        return None
+    if not isinstance(terminal, Region) or terminal.moving:
+        raise TypeError(f"`terminal` must be 'contraction', 'riccati', a fixed set or None, got {terminal!r}.")
+    size = problem.system.dimension if terminal.coordinates is None else max(terminal.coordinates) + 1
+    if (terminal.coordinates is None and terminal.dimension != size) or size > problem.system.dimension:
+        raise ValueError(f"`terminal` must have dimension {problem.system.dimension} (the states).")
+    return TerminalSet(region=terminal)

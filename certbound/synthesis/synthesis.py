@@ -1,0 +1,464 @@
+"""``synthesize_plan``: a plan, the verdict on it, and the reason where there is none."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.errors import CertboundError, EnclosureError, InfeasibleError
+from certbound.problem.problem import Problem
+from certbound.problem.regions import Region
+from certbound.reach.response_tube import refusal
+from certbound.safety.verification import Verdict, verify_safety
+from certbound.synthesis.infeasibility import Infeasibility, bound_scale, empty_at_once, smallest_delta
+from certbound.synthesis.planning import FITTED, Planner, Tightened
+from certbound.synthesis.terminal import TerminalSet
+from certbound.synthesis.transcription import Solution
+from certbound.tubes.constants import Constants
+from certbound.tubes.tube import Tube
+from certbound.tubes.tuning import METHODS
+
+__all__ = ["Synthesis", "synthesize_plan"]
+
+Array = NDArray[np.float64]
+_LOG = logging.getLogger(__name__)
+
+WIDENING = 6
+"""Turns of tube and plan while the room still grows."""
+FIXED_POINT = 8
+CLOSE = 1e-3
+"""Relative change of the erosions at which plan and tube agree."""
+FACTORS = (1.0 + 1e-6, 1.005, 1.02, 1.06)
+"""Factors on the erosions, tried in turn until the plan is verified."""
+ENOUGH = 1.02
+"""Room (times the tube) from which no more is looked for."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Synthesis:
+    """A plan and what is known about it.
+
+    Parameters
+    ----------
+    feasible : bool
+        A plan keeps the tightened constraints. Whether that means anything is for ``status`` to say: a one-time bound
+        such as Markov's may have a feasible plan, and its status is UNKNOWN.
+    status, log10_delta, verdict
+        What ``verify_safety`` proved about ``problem``; status UNKNOWN and 0 where nothing was.
+    reason : str
+        The verdict's reason, or why there is no plan.
+    problem : Problem
+        What the verdict is about: the closed loop under the plan.
+    plan : ndarray, shape (N, m)
+        Of that problem: inputs u, or w with u = w + K x where there is a feedback K.
+    inputs : ndarray, shape (N, m)
+        Nominal inputs at the start of each piece.
+    states, times : ndarray, shape (points + 1, n), (points + 1,)
+        Noise-free path.
+    erosion : ndarray, shape (points, parts)
+        What the tube takes from each face behind the start.
+    labels : tuple of str
+        The faces.
+    method : str
+        The tube.
+    constants : Constants or None
+    feedback : ndarray or None
+        K.
+    cost : float
+        Of the noise-free path.
+    max_input : float
+        Largest |u| of the noise-free path.
+    scale : float
+        The largest s found such that s times the tube fits.
+    softened : float
+        By how much the plan misses the tightened constraints at most (soft fallback); 0 for a feasible one.
+    infeasibility : Infeasibility or None
+    seconds : float
+    """
+
+    feasible: bool
+    status: str
+    log10_delta: float
+    reason: str
+    problem: Problem
+    plan: Array
+    inputs: Array
+    states: Array
+    times: Array
+    erosion: Array
+    labels: tuple[str, ...]
+    method: str
+    constants: Constants | None
+    feedback: Array | None
+    cost: float
+    max_input: float
+    scale: float
+    softened: float
+    infeasibility: Infeasibility | None
+    verdict: Verdict | None
+    seconds: float
+
+
+def synthesize_plan(
+    problem: Problem,
+    *,
+    tube: str | Tube = "auto",
+    epsilon: float | None = None,
+    step: float | None = None,
+    constants: Constants | None = None,
+    stage_cost: Callable[..., Any] | None = None,
+    terminal: str | TerminalSet | Region | None = None,
+    feedback: str | ArrayLike | None = None,
+    steps: int | None = None,
+    find_delta: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> Synthesis:
+    """A plan of inputs of least cost under which the noisy system stays safe but for a probability of delta.
+
+    Proves, where ``status`` is SAFE: under the inputs ``plan`` (with u = plan + K x where there is a feedback),
+    P(some constraint of the problem, input bounds included, is broken within the horizon) <= 10**log10_delta <= delta.
+    The inputs must not be planned anew from measured states: the noise-free path that they belong to would change.
+
+    Parameters
+    ----------
+    problem : Problem
+        With inputs; an array plan serves as the first guess.
+    tube : str or Tube
+        "auto" (the linear response, then the Kummer tube), "linear", a tube method such as "kummer", "thm5" or
+        "markov", or a tube.
+    epsilon, step : float, optional
+        The paper's free parameters, for its methods.
+    constants : Constants, optional
+        Stated constants; certified ones in one common metric when omitted.
+    stage_cost : callable, optional
+        ``stage(t, x, u)``, one number; the problem's cost when omitted (the inputs' energy if it has none).
+    terminal : "contraction", "riccati", TerminalSet, set, or None
+        Where the noise-free path must end, inside the tightened constraints.
+    feedback : "riccati", "lmi", array_like of shape (m, n), or None
+        K of u = w + K x.
+    steps : int, optional
+        Pieces of the horizon in continuous time (40).
+    find_delta : bool
+        Look for the smallest feasible delta also where there is a plan.
+    progress : callable, optional
+        Told in words what is being done.
+
+    Returns
+    -------
+    Synthesis
+
+    Raises
+    ------
+    ValueError
+        If the system has no inputs, K does not stabilise, the inputs have no bounds where the tube needs them, the
+        terminal set leaves the tightened constraints, or the method is unknown.
+    InfeasibleError
+        If no noise-free trajectory exists to begin with.
+
+    Examples
+    --------
+    >>> import certbound as cb
+    >>> system = cb.linear_system(
+    ...     [[1, 0.1], [0, 1]], [[0], [0.1]], inputs=cb.Box([-2], [2]), noise=cb.Gaussian(std=0.01))
+    >>> problem = cb.Problem(
+    ...     system, initial=[1, 0], safe=[cb.Inside(cb.Box([-0.5, -1], [1.5, 1]))], horizon=20, delta=1e-3,
+    ...     cost=([1, 1], [0.01]))
+    >>> result = synthesize_plan(problem)
+    >>> result.feasible, result.status
+    (True, 'SAFE')
+    """
+    began = time.perf_counter()
+    names = _chosen(tube, problem)
+    work = _Work(
+        Planner(problem, stage_cost=stage_cost, terminal=terminal, feedback=feedback, steps=steps),
+        given=tube if isinstance(tube, Tube) else None,
+        parameters={name: value for name, value in (("epsilon", epsilon), ("step", step)) if value is not None},
+        constants=constants, find_delta=find_delta, tell=progress or (lambda text: _LOG.info("%s", text)),
+    )  # fmt: skip
+    work.tell("looking for the plan with the most room")
+    first = work.planner.first_plan()
+    best: Synthesis | None = None
+    for index, name in enumerate(names):
+        try:
+            found = work.attempt(name, first, last=index == len(names) - 1)
+        except (InfeasibleError, EnclosureError) as error:
+            if best is None and index == len(names) - 1:
+                raise
+            _LOG.info("tube %s: %s", name, error)
+            continue
+        if found is not None and (best is None or _rank(found) < _rank(best)):
+            best = found
+        if best is not None and best.status == "SAFE":
+            break
+    if best is None:
+        raise InfeasibleError("no tube could be computed along any plan; lower the noise, or name a tube.")
+    return replace(best, seconds=time.perf_counter() - began)
+
+
+def _rank(found: Synthesis) -> tuple[bool, bool, float, float]:
+    return found.status != "SAFE", not found.feasible, found.log10_delta, -found.scale
+
+
+def _chosen(tube: str | Tube, problem: Problem) -> tuple[str, ...]:
+    if isinstance(tube, Tube):
+        if tube.horizon < problem.horizon:
+            raise ValueError(f"`tube` must cover the horizon {problem.horizon:g}, got one up to {tube.horizon:g}.")
+        return (tube.method,)
+    if tube == "auto":
+        return ("kummer",) if refusal_of(problem) else ("linear", "kummer")
+    if tube == "linear":
+        refused = refusal_of(problem)
+        if refused:
+            raise ValueError(f"`tube` 'linear' does not fit: {refused}; use 'kummer'.")
+    elif tube not in METHODS:
+        known = ", ".join(["auto", "linear", *(name for name in METHODS if name != "auto")])
+        raise ValueError(f"`tube` must be a Tube or one of {known}, got {tube!r}.")
+    return (tube,)
+
+
+def refusal_of(problem: Problem) -> str | None:
+    """Why the linear response does not fit a problem; None where it does."""
+    return refusal(problem)
+
+
+class _Work:
+    """One call: what its attempts share."""
+
+    def __init__(
+        self, planner: Planner, *, given: Tube | None, parameters: dict[str, Any], constants: Constants | None,
+        find_delta: bool, tell: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        self.planner, self.given, self.parameters, self.stated = planner, given, parameters, constants
+        self.find_delta, self.tell = find_delta, tell
+        self.delta = float(planner.problem.delta)
+
+    def attempt(self, name: str, first: Solution, *, last: bool) -> Synthesis | None:
+        """The best plan for one tube; None where the linear response cannot be computed."""
+        self.tell(f"tube {name}: looking for the plan with the most room")
+        if name == "linear":
+            constants = None
+            widest, tightened = self._widen_response(first)
+        else:
+            constants = self._constants(first)
+            widest, tightened = self._widen_tube(name, constants, first)
+        if tightened is None:
+            return None
+        self.planner.settle_terminal(constants, tightened)
+        found = self._planned(name, constants, widest, tightened)
+        if found is None:
+            verdict = self._verified(name, constants, widest)
+            if verdict is not None and verdict.status == "SAFE":  # delta need not be split as the tightening does
+                return self._result(name, constants, widest, tightened, widest.scale, verdict, feasible=True)
+            return self._refused(name, constants, widest, tightened, explain=last)
+        solution, used, verdict = found
+        delta = self._smallest(name, constants, widest) if self.find_delta else None
+        result = self._result(name, constants, solution, used, widest.scale, verdict, feasible=True)
+        if delta is not None:
+            result = replace(result, reason=f"{result.reason} The smallest feasible delta found is {delta:.4g}.")
+        return result
+
+    # ---- tubes and room ----------------------------------------------------------------------------------
+
+    def _constants(self, first: Solution) -> Constants:
+        if self.given is not None:
+            return self.given.constants
+        if self.stated is not None:
+            return self.stated
+        self.tell("constants in one common metric")
+        self.stated = self.planner.constants(first.inputs)
+        return self.stated
+
+    def _tube(self, name: str, constants: Constants, solution: Solution, delta: float) -> Tube:
+        if self.given is not None and delta == self.delta:
+            return self.given
+        parameters = {} if self.given is not None else self.parameters
+        return self.planner.tube_of(constants, name, delta, solution, parameters)
+
+    def _widen_tube(
+        self, name: str, constants: Constants, solution: Solution, delta: float | None = None
+    ) -> tuple[Solution, Tightened]:
+        """Fit the tube to the plan and the plan to the tube in turns; the widest pair."""
+        best: tuple[Solution, Tightened] | None = None
+        turns = WIDENING if name in FITTED and self.given is None else 2
+        for _ in range(turns):
+            tube = self._tube(name, constants, solution, self.delta if delta is None else delta)
+            tightened = self.planner.around(tube, solution)
+            found = self.planner.widest(tightened, solution.inputs)
+            gain = math.inf if best is None else found.scale / max(best[0].scale, 1e-9)
+            if best is None or (found.success and found.scale > best[0].scale):
+                best = found, tightened
+            solution = found
+            if gain < ENOUGH and best[0].scale >= 1 or gain < 1.001:
+                break
+        assert best is not None
+        return best
+
+    def _widen_response(
+        self, solution: Solution, delta: float | None = None
+    ) -> tuple[Solution, Tightened | None]:
+        """Iterate plan and linear response towards the plan with the most room."""
+        best: tuple[Solution, Tightened | None] = solution, None
+        for _ in range(WIDENING):
+            tightened = self.planner.response(solution, self.delta if delta is None else delta)
+            if tightened is None:
+                break
+            found = self.planner.widest(tightened, solution.inputs)
+            grown = best[1] is None or found.scale > best[0].scale * (ENOUGH if best[0].scale >= 1 else 1.001)
+            if best[1] is None or (found.success and found.scale > best[0].scale):
+                best = found, tightened
+            if not grown:
+                break
+            solution = found
+        return best
+
+    # ---- plans -------------------------------------------------------------------------------------------
+
+    def _planned(
+        self, name: str, constants: Constants | None, widest: Solution, tightened: Tightened
+    ) -> tuple[Solution, Tightened, Verdict | None] | None:
+        """The cheapest plan that keeps the tightened constraints, and its verdict; None where there is none."""
+        first: tuple[Solution, Tightened, Verdict | None] | None = None
+        if widest.scale < 1:
+            return None
+        for factor in FACTORS:
+            if factor > 1.001 and widest.scale < factor:
+                break
+            self.tell(f"tube {name}: the cheapest plan")
+            pair = self._agreeing(name, widest, tightened, factor)
+            if pair is None:
+                continue
+            self.tell(f"tube {name}: verifying the plan")
+            verdict = self._verified(name, constants, pair[0])
+            if first is None:
+                first = (*pair, verdict)
+            if verdict is None or verdict.status == "SAFE" or not _short(verdict):
+                return (*pair, verdict) if verdict is not None and verdict.status == "SAFE" else first
+        if first is not None:  # the plan with the most room may be verified where the cheapest is not
+            verdict = self._verified(name, constants, widest)
+            if verdict is not None and verdict.status == "SAFE":
+                return widest, tightened, verdict
+        return first
+
+    def _agreeing(
+        self, name: str, widest: Solution, tightened: Tightened, factor: float
+    ) -> tuple[Solution, Tightened] | None:
+        """The cheapest plan for erosions that are the tube's along that very plan."""
+        planner = self.planner
+        solution, used = widest, tightened
+        best: tuple[Solution, Tightened] | None = None
+        for _ in range(FIXED_POINT):
+            found = planner.cheapest(used.times(factor), solution.inputs)
+            if not found.success:
+                return best
+            if name == "linear":
+                following = planner.response(found, self.delta)
+                if following is None:
+                    return best
+            elif used.tube is not None:
+                following = planner.around(used.tube, found)
+            best = found, following
+            change = float(np.max(np.abs(following.erosion - used.erosion), initial=0.0))
+            solution, used = found, following
+            if change <= CLOSE * float(np.max(used.erosion, initial=1e-300)) * min(1.0, factor - 1 + 0.1):
+                break
+        return best
+
+    def _verified(self, name: str, constants: Constants | None, solution: Solution) -> Verdict | None:
+        try:
+            planned = self.planner.planned(solution.inputs)
+            return verify_safety(planned, method=name, constants=constants)
+        except (CertboundError, ValueError) as error:
+            _LOG.info("the plan could not be verified: %s", error)
+            self.trouble = str(error)
+            return None
+
+    # ---- answers -----------------------------------------------------------------------------------------
+
+    def _refused(
+        self, name: str, constants: Constants | None, widest: Solution, tightened: Tightened, *, explain: bool
+    ) -> Synthesis:
+        """The soft plan, with the reason why there is no better one."""
+        self.tell(f"tube {name}: the plan that misses least")
+        soft = self.planner.softest(tightened, widest.inputs)
+        solution = soft if np.all(np.isfinite(soft.states)) else widest
+        verdict = self._verified(name, constants, solution)
+        found = self._infeasible(name, constants, widest, tightened, explain=explain)
+        result = self._result(name, constants, solution, tightened, widest.scale, verdict, feasible=False)
+        unit = "t =" if self.planner.grid.continuous else "step"
+        reason = f"{found.describe(unit)} The plan returned misses the tightened constraints by {result.softened:.3g}."
+        return replace(result, infeasibility=found, reason=reason)
+
+    def _infeasible(
+        self, name: str, constants: Constants | None, widest: Solution, tightened: Tightened, *, explain: bool
+    ) -> Infeasibility:
+        planner = self.planner
+        times, faces = planner.grid.times(), planner.faces
+        point, face = np.unravel_index(int(np.argmax(widest.pressure)), widest.pressure.shape)
+        label, at = faces[int(face)].label, float(times[int(point) + 1])
+        proved, kind, bound = False, "solver found no point", math.inf
+        if name != "linear":  # its erosion depends on the plan: nothing is proved about other plans
+            empty = empty_at_once(faces, tightened.erosion, times)
+            if empty is not None:
+                proved, kind, bound, (label, at) = True, "eroded set empty", 1.0, empty
+            elif planner.feedback is None and planner.terminal is None:
+                bound = bound_scale(planner.problem, planner.grid, faces, tightened.erosion)
+                proved = bound < 1
+                kind = "no noise-free trajectory" if proved else kind
+        delta = self._smallest(name, constants, widest) if explain else None
+        return Infeasibility(
+            proved=proved, kind=kind, constraint=label, time=at, scale=widest.scale, scale_bound=bound,
+            smallest_delta=delta,
+        )  # fmt: skip
+
+    def _smallest(self, name: str, constants: Constants | None, widest: Solution) -> float | None:
+        """The smallest delta at which the tube fits around some plan (bisection)."""
+        self.tell(f"tube {name}: the smallest feasible delta")
+        known = [widest]
+
+        def feasible(delta: float) -> bool:
+            try:
+                if name == "linear":
+                    found, tightened = self._widen_response(known[-1], delta)
+                else:
+                    assert constants is not None
+                    found, tightened = self._widen_tube(name, constants, known[-1], delta)
+            except (CertboundError, ValueError):
+                return False
+            return tightened is not None and found.scale >= 1
+
+        return smallest_delta(feasible, self.delta)
+
+    def _result(
+        self, name: str, constants: Constants | None, solution: Solution, tightened: Tightened, scale: float,
+        verdict: Verdict | None, *, feasible: bool,
+    ) -> Synthesis:  # fmt: skip
+        planner = self.planner
+        own = planner.program.applied_inputs(solution.inputs, solution.states)
+        missing = planner.program.missing(solution.states, planner.grid.times(), tightened.erosion)
+        trouble = getattr(self, "trouble", "it could not be verified")
+        return Synthesis(
+            feasible=feasible,
+            status="UNKNOWN" if verdict is None else verdict.status,
+            log10_delta=0.0 if verdict is None else verdict.log10_delta,
+            reason=f"the plan could not be verified: {trouble}" if verdict is None else verdict.reason,
+            problem=planner.planned(solution.inputs), plan=solution.inputs, inputs=own[:: planner.grid.substeps],
+            states=solution.states, times=planner.grid.times(), erosion=tightened.erosion,
+            labels=tuple(face.label for face in planner.faces), method=name, constants=constants,
+            feedback=planner.feedback, cost=solution.cost, max_input=float(np.abs(own).max(initial=0.0)), scale=scale,
+            softened=0.0 if feasible else float(max(missing.max(initial=0.0), 0.0)), infeasibility=None,
+            verdict=verdict, seconds=0.0,
+        )  # fmt: skip
+
+
+def _short(verdict: Verdict) -> bool:
+    """Whether a little more room could make the verdict SAFE: one-time bounds never get there."""
+    return verdict.status == "UNKNOWN" and all(answer.certified for answer in verdict.answers.values())
+
+

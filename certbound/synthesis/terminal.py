@@ -1,0 +1,301 @@
+"""Terminal sets and costs: from the contraction metric, from the Riccati equation, or the user's own.
+
+- Contraction: with ||f(x) - f(y)||_P <= L ||x - y||_P, L < 1, and an equilibrium c = f(c) under constant inputs, every
+  {||z - c||_P <= r} is mapped into itself by those inputs, and the cost beta ||z - c||_P^2 with beta (1 - L^2) P >= Q
+  falls by at least the stage cost (CT: -2 c beta P >= Q with the rate c < 0). The largest r that fits into the
+  tightened constraints serves.
+- Riccati: the infinite-horizon cost and gain of the linearisation at c (python-control's ``lqr`` and ``dlqr``); the
+  terminal set is a level set of that cost within the tightened constraints and the input bounds. Nothing is proved
+  about it; the plan is verified as a whole.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.problem.problem import Problem
+from certbound.problem.regions import Region
+from certbound.problem.sets import Ball, Box, Ellipsoid
+from certbound.problem.trace import compile_numpy, jacobian
+from certbound.synthesis.faces import Face, Facets, Round
+from certbound.tubes.constants import Constants
+
+__all__ = ["TerminalSet", "check_terminal", "contraction_terminal", "linearise", "riccati", "riccati_terminal"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TerminalSet:
+    """Where the last nominal state must lie, and what it costs there.
+
+    Parameters
+    ----------
+    region : Box, Ball, Ellipsoid or Polytope
+        Fixed; a box with low == high is a point.
+    cost : ndarray, shape (n, n), optional
+        End cost (z - center)' cost (z - center); the stage cost's weight when omitted.
+    center : ndarray, shape (n,), optional
+        The origin when omitted.
+    """
+
+    region: Region
+    cost: Array | None = None
+    center: Array | None = None
+
+    @property
+    def is_point(self) -> bool:
+        """Whether the set is a single point (in its coordinates)."""
+        return isinstance(self.region, Box) and bool(np.all(self.region.low == self.region.high))
+
+    @property
+    def rows(self) -> int:
+        """Number of scalar constraints."""
+        if self.is_point:
+            return self.region.dimension
+        return 1 if isinstance(self.region, Ball | Ellipsoid) else len(self.region.halfspaces()[1])
+
+    def _local(self, ca: Any, state: Any) -> Any:
+        places = range(state.numel()) if self.region.coordinates is None else self.region.coordinates
+        return ca.vertcat(*[state[i] for i in places])
+
+    def symbolic(self, ca: Any, state: Any) -> Any:
+        """Scalar constraints as CasADi expressions: >= 0, and = 0 for a point."""
+        local, region = self._local(ca, state), self.region
+        if isinstance(region, Box) and self.is_point:
+            return local - ca.DM(region.low)
+        if isinstance(region, Ball | Ellipsoid):
+            shape = np.eye(region.dimension) * region.radius**2 if isinstance(region, Ball) else region.shape
+            offset = local - ca.DM(np.asarray(region.center))
+            return 1 - ca.bilin(ca.DM(np.linalg.inv(shape)), offset, offset)
+        normals, bounds = region.halfspaces()
+        return ca.DM(bounds) - ca.DM(normals) @ local
+
+    def room(self, state: Array) -> float:
+        """At least 0 inside; a small negative number just outside."""
+        local, region = self.region.local(state), self.region
+        if isinstance(region, Box) and self.is_point:
+            return -float(np.max(np.abs(local - region.low)))
+        if isinstance(region, Ball | Ellipsoid):
+            shape = np.eye(region.dimension) * region.radius**2 if isinstance(region, Ball) else region.shape
+            offset = local - np.asarray(region.center)
+            return 1.0 - float(offset @ np.linalg.solve(shape, offset))
+        normals, bounds = region.halfspaces()
+        return float(np.min(bounds - normals @ local))
+
+
+def check_terminal(terminal: TerminalSet, faces: Sequence[Face], erosion: Array, time: float) -> None:
+    """Refuse a terminal set that sticks out of the tightened constraints at the last time.
+
+    Parameters
+    ----------
+    terminal : TerminalSet
+    faces : sequence of Face
+    erosion : ndarray, shape (parts,)
+        At that time.
+    time : float
+
+    Raises
+    ------
+    ValueError
+        Naming the constraint and by how much it is missed.
+    """
+    part = 0
+    for face in faces:
+        own = erosion[part : part + face.parts]
+        part += face.parts
+        if not face.asked(np.array([time]))[0]:
+            continue
+        room = _room_of_region(terminal.region, face, own, time)
+        if room < -1e-9:
+            raise ValueError(
+                f"`terminal` must lie inside the tightened constraints at t = {time:g}, but it misses '{face.label}' "
+                f"by {-room:.4g} (the tube takes {float(np.max(own)):.4g}); choose a smaller set, or move it."
+            )
+
+
+def _room_of_region(region: Region, face: Face, erosion: Array, time: float) -> float:
+    """Least room of the tightened face over the region (a lower bound for round faces)."""
+    middle = _middle(region, face.dimension)[None]
+    rows = face.rows(middle, np.array([time]))[0]
+    room = face.room(middle, np.array([time]), erosion[None])
+    if isinstance(face, Facets):
+        spread = np.array([float(region.support(a)) - float(a @ middle[0]) for a in rows])
+        local = face._local(middle, np.array([time])) @ face.normals.T - face.bounds - erosion
+        return float(np.max(local[0] - spread))
+    spread = max(float(region.support(a)) - float(a @ middle[0]) for a in rows)
+    if isinstance(face, Round) and not face.outside:
+        spread *= 1.0 if rows.shape[0] == 2 else float(np.sqrt(len(face.coordinates)))
+    return float(room[0]) - spread
+
+
+def _middle(region: Region, dimension: int) -> Array:
+    full = np.zeros(dimension)
+    places = list(range(dimension) if region.coordinates is None else region.coordinates)
+    if isinstance(region, Box):
+        low, high = np.maximum(region.low, -1e6), np.minimum(region.high, 1e6)
+        full[places] = (low + high) / 2
+    elif isinstance(region, Ball | Ellipsoid):
+        full[places] = region.center_at(0.0)
+    else:
+        eye = np.eye(len(places))
+        full[places] = (region._support(eye, 0.0) - region._support(-eye, 0.0)) / 2
+    return full
+
+
+def linearise(problem: Problem, state: ArrayLike, inputs: ArrayLike, time: float = 0.0) -> tuple[Array, Array]:
+    """D_x f and D_u f at a point, with the disturbance in its middle: shapes (n, n), (n, m)."""
+    system = problem.system
+    n, m = system.dimension, len(system.input_names)
+    box = system.disturbance
+    middle = np.zeros(0) if box is None else np.asarray((box.low + box.high) / 2)
+    slopes = compile_numpy(jacobian(system.dynamics, range(1, 1 + n + m)))
+    value = slopes(time, *np.asarray(state, dtype=float), *np.asarray(inputs, dtype=float), *middle)
+    return np.asarray(value[:, :n]), np.asarray(value[:, n:])
+
+
+def riccati(
+    problem: Problem, state: ArrayLike | None = None, inputs: ArrayLike | None = None
+) -> tuple[Array, Array, Array]:
+    """S, K and the closed loop's matrix of the linear-quadratic regulator at a point (python-control).
+
+    Without a cost of the problem, Q = I and R = I.
+
+    Returns
+    -------
+    (ndarray, ndarray, ndarray)
+        S (n, n), the cost-to-go matrix; K (m, n) with u = K z; A + B K.
+
+    Raises
+    ------
+    ValueError
+        If the linearisation cannot be stabilised.
+    """
+    control = importlib.import_module("control")
+    n, m = problem.system.dimension, len(problem.system.input_names)
+    a, b = linearise(problem, np.zeros(n) if state is None else state, np.zeros(m) if inputs is None else inputs)
+    weight, effort = problem.cost if problem.cost is not None else (np.eye(n), np.eye(m))
+    solve = control.lqr if problem.system.time == "continuous" else control.dlqr
+    try:
+        gain, value, _ = solve(a, b, np.asarray(weight), np.asarray(effort))
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError, control.ControlException) as error:
+        raise ValueError(
+            f"`feedback` needs a linearisation that can be stabilised: {error}; check the inputs and the cost's Q."
+        ) from error
+    return np.asarray(value), -np.asarray(gain), np.asarray(a - b @ gain)
+
+
+def contraction_terminal(
+    problem: Problem, constants: Constants, faces: Sequence[Face], erosion: Array, time: float,
+    *, center: ArrayLike | None = None, inputs: ArrayLike | None = None,
+) -> TerminalSet:  # fmt: skip
+    """The largest ball of the contraction metric that fits into the tightened constraints, with its cost.
+
+    Parameters
+    ----------
+    problem : Problem
+    constants : Constants
+        With a gain below 1 (rate below 0).
+    faces, erosion, time
+        The tightened constraints at the last time.
+    center, inputs : array_like, optional
+        An equilibrium; the origin with zero inputs when omitted.
+
+    Raises
+    ------
+    ValueError
+        If the constants do not contract, the centre is no equilibrium, or it lies outside the tightened constraints.
+    """
+    n, m = problem.system.dimension, len(problem.system.input_names)
+    c = np.zeros(n) if center is None else np.asarray(center, dtype=float)
+    u = np.zeros(m) if inputs is None else np.asarray(inputs, dtype=float)
+    slope = constants.rate if constants.continuous else constants.gain
+    worst = float(np.max(np.asarray(slope)))
+    if worst >= (0 if constants.continuous else 1):
+        raise ValueError(
+            f"`terminal` from the contraction metric needs a {'negative rate' if constants.continuous else 'gain < 1'},"
+            f" got {worst:.4g}; use terminal='riccati', or a feedback."
+        )
+    _check_equilibrium(problem, c, u)
+    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric)
+    radius = _largest_level(metric, c, faces, erosion, time)
+    weight = np.asarray(problem.cost[0]) if problem.cost is not None else np.zeros((n, n))
+    root = np.linalg.inv(np.linalg.cholesky(metric))
+    fall = -2 * worst if constants.continuous else 1 - worst**2
+    share = float(np.linalg.eigvalsh(root @ weight @ root.T)[-1]) / fall
+    region = Ellipsoid(c, np.linalg.inv(metric) * radius**2)
+    return TerminalSet(region=region, cost=share * metric, center=c)
+
+
+def riccati_terminal(
+    problem: Problem, faces: Sequence[Face], erosion: Array, time: float,
+    *, center: ArrayLike | None = None, inputs: ArrayLike | None = None,
+) -> TerminalSet:  # fmt: skip
+    """A level set of the Riccati cost on which the tightened constraints and the regulator's inputs are kept.
+
+    Raises
+    ------
+    ValueError
+        As ``contraction_terminal``, or if the linearisation cannot be stabilised.
+    """
+    n, m = problem.system.dimension, len(problem.system.input_names)
+    c = np.zeros(n) if center is None else np.asarray(center, dtype=float)
+    u = np.zeros(m) if inputs is None else np.asarray(inputs, dtype=float)
+    _check_equilibrium(problem, c, u)
+    value, gain, _ = riccati(problem, c, u)
+    radius = _largest_level(value, c, faces, erosion, time)
+    box = problem.system.inputs
+    assert box is not None
+    reach = np.sqrt(np.einsum("ij,jk,ik->i", gain, np.linalg.inv(value), gain))
+    with np.errstate(divide="ignore"):
+        room = np.minimum(box.high - u, u - box.low) / reach
+    radius = min(radius, float(np.min(room)))
+    if radius <= 0:
+        raise ValueError("`terminal` needs an equilibrium whose inputs lie inside their bounds.")
+    return TerminalSet(region=Ellipsoid(c, np.linalg.inv(value) * radius**2), cost=value, center=c)
+
+
+def _check_equilibrium(problem: Problem, center: Array, inputs: Array) -> None:
+    box = problem.system.disturbance
+    middle = np.zeros(0) if box is None else np.asarray((box.low + box.high) / 2)
+    value = compile_numpy(problem.system.dynamics)(0.0, *center, *inputs, *middle)
+    moved = value if problem.system.time == "continuous" else value - center
+    if np.max(np.abs(moved)) > 1e-6 * (1 + np.max(np.abs(center))):
+        raise ValueError(
+            f"`terminal` needs an equilibrium, but at {center.tolist()} with inputs {inputs.tolist()} the state moves by "
+            f"{np.max(np.abs(moved)):.3g}; give a set instead."
+        )
+
+
+def _largest_level(metric: Array, center: Array, faces: Sequence[Face], erosion: Array, time: float) -> float:
+    """Largest r with {||z - c||_P <= r} inside the tightened constraints."""
+    inverse = np.linalg.inv(metric)
+    best, part = np.inf, 0
+    for face in faces:
+        own = erosion[part : part + face.parts]
+        part += face.parts
+        if not face.asked(np.array([time]))[0]:
+            continue
+        rows = face.rows(center[None], np.array([time]))[0]
+        reach = np.sqrt(np.einsum("ij,jk,ik->i", rows, inverse, rows))
+        if isinstance(face, Facets):
+            local = (face._local(center[None], np.array([time])) @ face.normals.T - face.bounds - own)[0]
+            level = float(np.max(local / reach))
+        else:
+            taken = face.erosion(reach[None])[0, 0] if isinstance(face, Round) else float(np.max(reach))
+            level = float(face.room(center[None], np.array([time]), own[None])[0]) / float(taken)
+        if level <= 0:
+            raise ValueError(
+                f"`terminal` must have its centre inside the tightened constraints, but '{face.label}' is missed there "
+                f"at t = {time:g}; the tube takes {float(np.max(own)):.4g}."
+            )
+        best = min(best, level)
+    return float(min(best, 1e6)) * (1 - 1e-9)
+
+

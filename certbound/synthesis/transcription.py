@@ -1,0 +1,461 @@
+"""Optimal control of the noise-free system by multiple shooting, from the same tape as everything else.
+
+Decision variables are the inputs u_0 ... u_{N-1} and the states at the ends of the pieces; z_0 is a parameter. In
+continuous time a piece is integrated by the classical Runge-Kutta method in ``substeps`` steps, whose ends are where
+the constraints are imposed. Three programs over the same variables (h: faces, e: erosions, J: cost):
+
+- ``cost``: min J subject to h >= e;
+- ``scale``: max s subject to h >= s e: how many times larger the tube may be;
+- ``soft``: min J + penalty * xi subject to h >= e - xi, 0 <= xi <= e: xi is reported.
+
+A solver's word counts for nothing here: `Transcription.solve` rolls the inputs out and measures the constraints again.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.tape import Tape
+from certbound.problem.trace import casadi_module, compile_numpy, to_casadi
+from certbound.synthesis.costs import Cost
+from certbound.synthesis.faces import Face, Facets
+from certbound.synthesis.terminal import TerminalSet
+
+__all__ = ["Grid", "Mode", "Plant", "Solution", "Transcription"]
+
+Array = NDArray[np.float64]
+Mode = Literal["cost", "scale", "soft"]
+
+PENALTY = 1e4
+EFFORT = 1e-9
+TOLERANCE = 1e-6
+LARGEST_SCALE = 1e3
+_UNBOUNDED = 1e19  # what IPOPT takes for infinity
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Grid:
+    """Pieces of the horizon: ``steps`` pieces of length ``step`` with ``substeps`` Runge-Kutta steps each.
+
+    In discrete time ``step`` and ``substeps`` are 1.
+    """
+
+    steps: int
+    step: float
+    substeps: int
+    continuous: bool
+
+    @property
+    def points(self) -> int:
+        """Number of points at which constraints are imposed (the start is none)."""
+        return self.steps * self.substeps
+
+    def times(self, start: float = 0.0) -> Array:
+        """Times of the start and of all points, shape (points + 1,)."""
+        return np.asarray(start + np.arange(self.points + 1) * (self.step / self.substeps))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plant:
+    """Noise-free dynamics with a fixed disturbance and inputs in a box, and input rows that depend on the state.
+
+    Parameters
+    ----------
+    dynamics : Tape
+        Over ("t", *states, *inputs, *disturbances).
+    disturbance : ndarray, shape (q,)
+        Its middle.
+    low, high : ndarray, shape (m,)
+        Box of the decision u; infinite where there is none.
+    feedback : ndarray, shape (m, n), optional
+        The plant's own input is u + feedback z; ``input_low`` and ``input_high`` bound it.
+    input_low, input_high : ndarray, shape (m,), optional
+    """
+
+    dynamics: Tape
+    dimension: int
+    disturbance: Array
+    low: Array
+    high: Array
+    feedback: Array | None = None
+    input_low: Array | None = None
+    input_high: Array | None = None
+
+    @cached_property
+    def evaluate(self) -> Callable[..., Array]:
+        """f in floating point."""
+        return compile_numpy(self.dynamics)
+
+    def step(self, grid: Grid, time_: float, state: Array, inputs: Array) -> Array:
+        """States (substeps, n) at the points of one piece, from one or many states (..., n)."""
+
+        def f(t: float, x: Array) -> Array:
+            return self.evaluate(t, *np.moveaxis(x, -1, 0), *inputs, *self.disturbance)
+
+        if not grid.continuous:
+            return np.asarray(f(time_, state))[None]
+        h = grid.step / grid.substeps
+        found = []
+        for i in range(grid.substeps):
+            t = time_ + i * h
+            k1 = f(t, state)
+            k2 = f(t + h / 2, state + h / 2 * k1)
+            k3 = f(t + h / 2, state + h / 2 * k2)
+            k4 = f(t + h, state + h * k3)
+            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            found.append(state)
+        return np.array(found)
+
+    def rollout(self, grid: Grid, start: Array, inputs: Array, time_: float = 0.0) -> Array:
+        """Noise-free states at all points, shape (points + 1, n)."""
+        states = [np.asarray(start, dtype=float)]
+        with np.errstate(all="ignore"):
+            for k in range(len(inputs)):
+                states += list(self.step(grid, time_ + k * grid.step, states[-1], inputs[k]))
+        return np.array(states)
+
+    def symbolic_step(self, ca: Any, grid: Grid, time_: Any, state: Any, inputs: Any) -> list[Any]:
+        """CasADi expressions of the states at the points of one piece."""
+        disturbance = [ca.SX(float(value)) for value in self.disturbance]
+
+        def f(t: Any, x: Any) -> Any:
+            return to_casadi(self.dynamics, [ca.SX(t), x, inputs, *disturbance])
+
+        if not grid.continuous:
+            return [f(time_, state)]
+        h = grid.step / grid.substeps
+        found = []
+        for i in range(grid.substeps):
+            t = time_ + i * h
+            k1 = f(t, state)
+            k2 = f(t + h / 2, state + h / 2 * k1)
+            k3 = f(t + h / 2, state + h / 2 * k2)
+            k4 = f(t + h, state + h * k3)
+            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            found.append(state)
+        return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution:
+    """A plan that a solver proposed and a rollout measured.
+
+    Parameters
+    ----------
+    inputs : ndarray, shape (N, m)
+    states : ndarray, shape (points + 1, n)
+        Rolled out from the inputs.
+    success : bool
+        The rollout meets every tightened constraint up to `TOLERANCE` (with slack in mode ``soft``: the solver
+        ended well).
+    scale : float
+        s; 1 outside mode ``scale``.
+    cost : float
+    slack : ndarray, shape (points, faces)
+        By how much each tightened constraint is missed.
+    pressure : ndarray, shape (points, faces)
+        Multipliers of the tightened constraints: where they hold the plan back.
+    status : str
+        The solver's word.
+    seconds : float
+    """
+
+    inputs: Array
+    states: Array
+    success: bool
+    scale: float
+    cost: float
+    slack: Array
+    pressure: Array
+    status: str
+    seconds: float
+    iterations: int
+
+
+class Transcription:
+    """One family of optimal control problems: grid, plant, faces and cost are fixed, start and erosions vary.
+
+    Parameters
+    ----------
+    plant : Plant
+    grid : Grid
+    faces : sequence of Face
+    cost : Cost
+    terminal : TerminalSet, optional
+        Where the last state must lie.
+    options : dict, optional
+        For IPOPT.
+    """
+
+    def __init__(
+        self, plant: Plant, grid: Grid, faces: Sequence[Face], cost: Cost, *, terminal: TerminalSet | None = None,
+        warm: bool = False,
+    ) -> None:  # fmt: skip
+        self.plant, self.grid, self.faces, self.cost, self.terminal = plant, grid, tuple(faces), cost, terminal
+        self.warm = warm
+        self.parts = sum(face.parts for face in self.faces)
+        self.weights = sum(face.weights for face in self.faces)
+        self._duals: dict[str, tuple[Array, Array]] = {}
+        self._solvers: dict[str, Any] = {}
+
+    # ---- the program -------------------------------------------------------------------------------------
+
+    def _build(self, mode: Mode) -> Any:
+        """The solver of one mode; variables [u, x] piece by piece, then weights, then s or xi."""
+        ca = casadi_module()
+        grid, n, m = self.grid, self.plant.dimension, len(self.plant.low)
+        start, t0 = ca.SX.sym("z0", n), ca.SX.sym("t0")
+        erosion = ca.SX.sym("e", self.parts, grid.points)
+        tightening = ca.SX.sym("f", m, grid.points + 1)
+        weights = ca.SX.sym("w", self.weights, grid.points)
+        scale = ca.SX.sym("s")
+        slack = ca.SX.sym("xi", len(self.faces), grid.points)
+        state, variables = start, []
+        dynamics, gaps, choices, inputs_of = [], [], [], []
+        total: Any = 0
+        for k in range(grid.steps):
+            u, following = ca.SX.sym(f"u{k}", m), ca.SX.sym(f"x{k + 1}", n)
+            variables += [u, following]
+            now = t0 + k * grid.step
+            total += grid.step * self.cost.symbolic(ca, now, state, self._applied(ca, u, state))
+            inputs_of.append(self._input_rows(ca, u, state, tightening[:, k * grid.substeps]))
+            points = self.plant.symbolic_step(ca, grid, now, state, u)
+            for i, point in enumerate(points):
+                index = k * grid.substeps + i
+                at = now + (i + 1) * grid.step / grid.substeps
+                if i < grid.substeps - 1:
+                    inputs_of.append(self._input_rows(ca, u, point, tightening[:, index + 1]))
+                else:
+                    dynamics.append(following - point)
+                    point = following
+                    if grid.continuous:
+                        inputs_of.append(self._input_rows(ca, u, point, tightening[:, index + 1]))
+                gap, choice = self._gaps(ca, point, at, erosion[:, index] * scale, weights[:, index])
+                gaps.append(gap + (slack[:, index] if mode == "soft" else 0))
+                choices.append(choice)
+            state = following
+        total += self.cost.symbolic_end(ca, state)
+        last = ca.SX(0, 1) if self.terminal is None else self.terminal.symbolic(ca, state)
+        free = [ca.vec(weights)]
+        if mode == "scale":
+            objective = -scale + EFFORT * sum(ca.sumsqr(u) for u in variables[::2])
+            free.append(scale)
+        else:
+            objective = total
+        if mode == "soft":
+            objective += PENALTY * (ca.sum1(ca.vec(slack)) + ca.sumsqr(slack))
+            free.append(ca.vec(slack))
+        variable = ca.vertcat(*variables, *free)
+        constraint = ca.vertcat(*dynamics, *gaps, *choices, *inputs_of, last)
+        parameter = ca.vertcat(start, t0, ca.vec(erosion), ca.vec(tightening))
+        if mode != "scale":
+            constraint, objective = (ca.substitute(part, scale, 1) for part in (constraint, objective))
+        program = {"x": variable, "p": parameter, "f": objective, "g": constraint}
+        return ca.nlpsol("plan", "ipopt", program, _ipopt(self.warm))
+
+    def _applied(self, ca: Any, u: Any, state: Any) -> Any:
+        return u if self.plant.feedback is None else u + ca.DM(self.plant.feedback) @ state
+
+    def _input_rows(self, ca: Any, u: Any, state: Any, tightening: Any) -> Any:
+        """Room of the plant's own input below and above; nothing where the decision is the input."""
+        if self.plant.feedback is None:
+            return ca.SX(0, 1)
+        own = self._applied(ca, u, state)
+        low, high = self.plant.input_low, self.plant.input_high
+        assert low is not None
+        assert high is not None
+        rows = [own[i] - low[i] - tightening[i] for i in np.flatnonzero(np.isfinite(low))]
+        rows += [high[i] - own[i] - tightening[i] for i in np.flatnonzero(np.isfinite(high))]
+        return ca.vertcat(*rows) if rows else ca.SX(0, 1)
+
+    def _gaps(self, ca: Any, state: Any, time_: Any, erosion: Any, weights: Any) -> tuple[Any, Any]:
+        gaps, choices, part, weight = [], [], 0, 0
+        for face in self.faces:
+            own = weights[weight : weight + face.weights]
+            gaps.append(face.gap(ca, state, time_, erosion[part : part + face.parts], own))
+            if face.weights:
+                choices.append(ca.sum1(own) - 1)
+            part, weight = part + face.parts, weight + face.weights
+        return ca.vertcat(*gaps), ca.vertcat(*choices) if choices else ca.SX(0, 1)
+
+    # ---- solving -----------------------------------------------------------------------------------------
+
+    def solve(
+        self,
+        mode: Mode,
+        start: Array,
+        erosion: Array,
+        guess: Array,
+        *,
+        time_: float = 0.0,
+        tightening: Array | None = None,
+        guess_states: Array | None = None,
+    ) -> Solution:
+        """Solve one mode from a guess of the inputs.
+
+        Parameters
+        ----------
+        mode : {"cost", "scale", "soft"}
+        start : ndarray, shape (n,)
+        erosion : ndarray, shape (points, parts)
+        guess : ndarray, shape (N, m)
+        time_ : float
+            Of the start.
+        tightening : ndarray, shape (points + 1, m), optional
+            Erosion of the input bounds by the feedback.
+        guess_states : ndarray, shape (points + 1, n), optional
+            The guess's rollout where it is not used.
+        """
+        began = time.perf_counter()
+        states = self.plant.rollout(self.grid, start, guess, time_) if guess_states is None else guess_states
+        states = np.nan_to_num(np.clip(states, -1e8, 1e8))
+        times = self.grid.times(time_)
+        taken = np.zeros((self.grid.points + 1, len(self.plant.low))) if tightening is None else tightening
+        if mode not in self._solvers:
+            self._solvers[mode] = self._build(mode)
+        lower, upper = self._bounds(mode, erosion)
+        g_lower, g_upper = self._sides(times)
+        arguments = {
+            "x0": self._variables(mode, guess, states, times, erosion),
+            "p": np.concatenate([start, [time_], erosion.ravel(), taken.ravel()]),
+            "lbx": lower, "ubx": upper, "lbg": g_lower, "ubg": g_upper,
+        }  # fmt: skip
+        if self.warm and mode in self._duals:
+            arguments["lam_x0"], arguments["lam_g0"] = self._duals[mode]
+        solver = self._solvers[mode]
+        found = solver(**arguments)
+        stats = solver.stats()
+        if self.warm and stats["success"]:
+            self._duals[mode] = (np.array(found["lam_x"]).ravel(), np.array(found["lam_g"]).ravel())
+        multipliers = np.abs(np.array(found["lam_g"]).ravel())
+        return self._measured(mode, np.array(found["x"]).ravel(), multipliers, start, time_, erosion, taken, stats, began)
+
+    def _sizes(self) -> tuple[int, int]:
+        n, m = self.plant.dimension, len(self.plant.low)
+        return self.grid.steps * (n + m), self.weights * self.grid.points
+
+    def _bounds(self, mode: Mode, erosion: Array) -> tuple[Array, Array]:
+        n = self.plant.dimension
+        body, weights = self._sizes()
+        piece_low = np.concatenate([self.plant.low, np.full(n, -np.inf)])
+        piece_high = np.concatenate([self.plant.high, np.full(n, np.inf)])
+        low = [np.tile(piece_low, self.grid.steps), np.zeros(weights)]
+        high = [np.tile(piece_high, self.grid.steps), np.ones(weights)]
+        if mode == "scale":
+            low.append(np.array([-LARGEST_SCALE]))
+            high.append(np.array([LARGEST_SCALE]))
+        elif mode == "soft":
+            low.append(np.zeros(len(self.faces) * self.grid.points))
+            high.append(self._allowed(erosion).ravel())
+        return np.concatenate(low), np.concatenate(high)
+
+    def _allowed(self, erosion: Array) -> Array:
+        """Largest slack (points, faces): what the tube takes, so that the constraints themselves stay hard."""
+        places = np.cumsum([0, *(face.parts for face in self.faces)])
+        return np.stack([erosion[:, a:b].max(axis=1) for a, b in itertools.pairwise(places)], axis=1)
+
+    def _sides(self, times: Array) -> tuple[Array, Array]:
+        asked = np.stack([face.asked(times[1:]) for face in self.faces], axis=1) if self.faces else np.zeros((0, 0))
+        gaps = np.where(asked, 0.0, -_UNBOUNDED).ravel()
+        equal = self.grid.steps * self.plant.dimension
+        unions = sum(1 for face in self.faces if face.weights) * self.grid.points
+        rest = self._input_row_count()
+        last = np.zeros(0 if self.terminal is None else self.terminal.rows)
+        last_high = np.full(len(last), 0.0 if self.terminal is not None and self.terminal.is_point else np.inf)
+        low = np.concatenate([np.zeros(equal), gaps, np.zeros(unions + rest), last])
+        open_ = [np.full(gaps.size, np.inf), np.zeros(unions), np.full(rest, np.inf), last_high]
+        return low, np.concatenate([np.zeros(equal), *open_])
+
+    def _input_row_count(self) -> int:
+        if self.plant.feedback is None:
+            return 0
+        finite = np.isfinite(self.plant.input_low).sum() + np.isfinite(self.plant.input_high).sum()  # type: ignore[arg-type]
+        return int(finite) * self.grid.steps * (1 + self.grid.substeps - (0 if self.grid.continuous else 1))
+
+    def _variables(self, mode: Mode, inputs: Array, states: Array, times: Array, erosion: Array) -> Array:
+        ends = states[self.grid.substeps :: self.grid.substeps]
+        body = np.concatenate([inputs, ends], axis=1).ravel()
+        weights, part = [], 0
+        for face in self.faces:
+            if isinstance(face, Facets):
+                chosen = face.best(states[1:], times[1:], erosion[:, part : part + face.parts])
+                weights.append(0.9 * chosen + 0.1 / face.weights)
+            part += face.parts
+        extra = [np.concatenate(weights, axis=1).ravel()] if weights else []
+        if mode == "scale":
+            extra.append(np.zeros(1))
+        elif mode == "soft":
+            extra.append(np.maximum(self.missing(states, times, erosion), 0.0).ravel())
+        return np.concatenate([body, *extra])
+
+    def missing(self, states: Array, times: Array, erosion: Array, scale: float = 1.0) -> Array:
+        """e - h at the points, shape (points, faces): positive where a tightened constraint is missed."""
+        found, part = [], 0
+        for face in self.faces:
+            room = face.room(states[1:], times[1:], scale * erosion[:, part : part + face.parts])
+            found.append(np.where(face.asked(times[1:]), -room, -np.inf))
+            part += face.parts
+        return np.stack(found, axis=1) if found else np.zeros((len(states) - 1, 0))
+
+    def _measured(
+        self, mode: Mode, values: Array, multipliers: Array, start: Array, time_: float, erosion: Array, taken: Array,
+        stats: dict[str, Any], began: float,
+    ) -> Solution:  # fmt: skip
+        """Roll the proposed inputs out and measure what they keep."""
+        n, m = self.plant.dimension, len(self.plant.low)
+        body, _ = self._sizes()
+        inputs = np.clip(values[:body].reshape(self.grid.steps, m + n)[:, :m], self.plant.low, self.plant.high)
+        scale = float(values[-1]) if mode == "scale" else 1.0
+        states = self.plant.rollout(self.grid, start, inputs, time_)
+        times = self.grid.times(time_)
+        missing = np.nan_to_num(self.missing(states, times, erosion, scale), nan=np.inf)
+        worst = float(missing.max(initial=-np.inf))
+        kept = bool(np.all(np.isfinite(states))) and worst <= TOLERANCE * (1 + np.abs(states).max(initial=0.0))
+        kept = kept and self._inputs_kept(inputs, states, taken)
+        kept = kept and (self.terminal is None or self.terminal.room(states[-1]) >= -TOLERANCE)
+        first = self.grid.steps * n
+        good = bool(stats["success"]) if mode == "soft" else kept
+        return Solution(
+            inputs=inputs, states=states, success=good, scale=scale,
+            cost=self.cost.total(self.grid, self.plant.feedback, states, inputs, time_),
+            slack=np.maximum(missing, 0.0), pressure=multipliers[first : first + missing.size].reshape(missing.shape), status=str(stats["return_status"]),
+            seconds=time.perf_counter() - began, iterations=int(stats["iter_count"]),
+        )  # fmt: skip
+
+    def _inputs_kept(self, inputs: Array, states: Array, taken: Array) -> bool:
+        if self.plant.feedback is None:
+            return True
+        own = self.applied_inputs(inputs, states)
+        first = taken[:-1]
+        low, high = self.plant.input_low, self.plant.input_high
+        slack = TOLERANCE * (1 + np.abs(own).max(initial=0.0))
+        return bool(np.all(own >= low + first - slack) and np.all(own <= high - first + slack))  # type: ignore[operator]
+
+    def applied_inputs(self, inputs: Array, states: Array) -> Array:
+        """The plant's own nominal input at the start of every substep, shape (points, m)."""
+        held = np.repeat(inputs, self.grid.substeps, axis=0)
+        if self.plant.feedback is None:
+            return held
+        return np.asarray(held + states[:-1] @ self.plant.feedback.T)
+
+
+def _ipopt(warm: bool) -> dict[str, Any]:
+    options: dict[str, Any] = {
+        "print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 500, "ipopt.tol": 1e-8,
+        "ipopt.constr_viol_tol": 1e-8, "ipopt.acceptable_tol": 1e-6, "error_on_fail": False,
+    }  # fmt: skip
+    if warm:
+        options |= {
+            "ipopt.max_iter": 150, "ipopt.tol": 1e-6, "ipopt.mu_init": 1e-3, "ipopt.warm_start_init_point": "yes",
+            "ipopt.warm_start_bound_push": 1e-6, "ipopt.warm_start_mult_bound_push": 1e-6,
+            "ipopt.warm_start_slack_bound_push": 1e-6, "ipopt.mu_strategy": "monotone",
+        }  # fmt: skip
+    return options
