@@ -16,7 +16,16 @@ from certbound.tubes.gaussian_clock import Clock, clock_crossing, decorrelation_
 from certbound.tubes.gaussian_crossing import log_line_crossing, log_polygon_crossing
 from certbound.tubes.gaussian_linear import linear_exceedance, linear_radius
 from certbound.tubes.gaussian_normal import log_below_above, log_between, log_tail
-from certbound.tubes.gaussian_pair import Bounds, double, exceedance_chain, log_pair, log_window, total, union
+from certbound.tubes.gaussian_pair import (
+    Bounds,
+    double,
+    exceedance_chain,
+    log_pair,
+    log_window,
+    total,
+    total_symmetric,
+    union,
+)
 from certbound.tubes.gaussian_rate import crossing_rate
 from certbound.tubes.gaussian_scale import least_scale, split_levels
 
@@ -24,5 +33,5 @@ __all__ = [
     "Bounds", "Clock", "clock_crossing", "crossing_rate", "decorrelation_rates", "double", "exceedance_chain",
     "least_scale", "linear_exceedance", "linear_radius", "log_below_above", "log_between", "log_line_crossing",
     "log_pair", "log_polygon_crossing", "log_tail", "log_window", "markov_clock", "split_levels", "total",
-    "union",
+    "total_symmetric", "union",
 ]  # fmt: skip

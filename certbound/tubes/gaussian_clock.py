@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _WEIGHT = 2.0  # window clock times the square of the least level: near the optimum for levels of 3 to 6
-_MOST_WINDOWS = 600
+_MOST_WINDOWS = 2000
 _LEAST_CLOCK = 1e-9  # a piece of less clock is given this much
 _MISFIT, _FAR_BELOW, _SPLITS = 0.1, 0.5, 6  # a chord may pass a node this much above or below, times the level
 _FAR_ABOVE = 20.0  # levels with (z/s)^2 this much above the least do not matter
@@ -285,6 +285,11 @@ def clock_crossing(
     -------
     float
         0.0 (probability 1) where a level is negative.
+
+    Notes
+    -----
+    Where xi starts from rest the rates grow like 1/(2t): begin at a small t_0, let the pieces grow
+    geometrically, and add a bound for [0, t_0] (`log_window`, or any crude one: z/s is large there).
 
     Examples
     --------

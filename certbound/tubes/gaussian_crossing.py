@@ -122,9 +122,10 @@ def _log_excluding(prior: tuple[Array, Array, Array], after: tuple[Array, Array,
     value = value + _ellipse_error(m, (lift_p, beta_p, len_p), (lift_n, beta_n, len_n), middle, half)
     const = -0.5 * (m * m + (lift_n + beta_n * len_n) ** 2 / len_n - kappa * centre**2)
     tail = const - 0.5 * np.log(kappa) + log_tail((reach - centre) * np.sqrt(kappa))
-    value = value * (1 + slack) + np.exp(tail) * (1 + slack)
+    value = (value + np.exp(tail)) * (1 + slack)
+    usable = (value > 1e-270) & (slack < 1e-3)  # nothing that matters has underflowed
     value = np.logaddexp(np.log(value), log_between(n, p))
-    usable = (slack < 1e-3) & ~np.isnan(value) & (m < 30) & (p < 30) & (n < 30)
+    usable &= ~np.isnan(value)
     return np.where(usable, lift(value, 16), np.inf)
 
 

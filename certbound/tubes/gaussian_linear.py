@@ -97,6 +97,7 @@ def _first_window(log_u: Array, log_b: Array, clear: float, guard: float) -> tup
     unit = np.exp(top - 0.5 * log_u[1:])
     base, end = (b[0] - excess) * unit, (b[1:] - excess) * unit
     nearest = np.where(end <= 2 * base, end, 2 * np.sqrt(np.maximum(base * (end - base), 0.0)))
+    nearest = np.where(np.isnan(nearest), -np.inf, nearest)
     fine = np.flatnonzero(nearest >= clear)
     k = int(fine[-1]) if len(fine) else int(np.argmax(nearest))
     return k + 1, (float(base[k]), float(end[k]))

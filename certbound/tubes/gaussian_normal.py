@@ -24,7 +24,7 @@ MILLS_ERROR = 2.0**-48
 LOG_ROOT_2PI = 0.9189385332046727  # within eps of log sqrt(2 pi)
 LOG_PI = 1.1447298858494002
 _CELLS, _DEGREE, _FAR = 8, 11, 16.0  # cells per unit, Taylor degree, start of the asymptotic series
-_PANELS, _NODES = 3, 20
+_PANELS, _NODES = 2, 24
 _ELLIPSES = np.array([1.1, 1.25, 1.5, 1.8, 2.2, 2.8, 4.0])
 _DROP = 26.0  # the integrand is followed down to e^-26 of its peak
 _REACH = 1e60  # levels beyond it fall back on the marginal tail
@@ -175,7 +175,7 @@ def log_between(low: ArrayLike, high: ArrayLike) -> Array:
 def log_below_above(
     below: ArrayLike,
     above: ArrayLike,
-    correlation: ArrayLike | None = None,
+    correlation: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     *,
     spread: ArrayLike | None = None,
 ) -> Array:
@@ -192,8 +192,8 @@ def log_below_above(
     ----------
     below, above : array_like
         Levels, infinite ones included; they broadcast together.
-    correlation : array_like
-        Lower bound of the correlation, in [-1, 1].
+    correlation : array_like or pair of array_likes
+        Lower bound of the correlation, in [-1, 1]; or its two bounds, of which the lower one decides.
     spread : array_like, optional
         Upper bound of tau, instead of ``correlation`` where 1 - rho is known better than rho.
 
@@ -216,7 +216,8 @@ def log_below_above(
     if (correlation is None) == (spread is None):
         raise ValueError("give exactly one of `correlation` and `spread`.")
     if spread is None:
-        rho = np.asarray(correlation, dtype=np.float64)
+        lower = correlation[0] if isinstance(correlation, tuple) else correlation
+        rho = np.asarray(lower, dtype=np.float64)
         if not np.all((rho >= -1) & (rho <= 1)):
             raise ValueError("`correlation` must lie in [-1, 1]; clip it outward (downward) first.")
         spread = np.sqrt((1 - rho) / (1 + rho)) * (1 + 8 * EPS)
@@ -243,7 +244,7 @@ def _log_integral(a: Array, b: Array, tau: Array) -> Array:
     """Upper bound of log((1/pi) exp(-(a^2 + b^2)/4) int_0^tau exp(-g) dt/(1 + t^2)), tau > 0.
 
     g = (D^2/t^2 + S^2 t^2)/2; with v = log t the integrand is k(v) = exp(-g) sech(v)/2. Pieces: v in [left,
-    right], three panels of 20 Gauss nodes; beyond them `_end_tail`, above ``right`` its mirror image under
+    right], two panels of 24 Gauss nodes; beyond them `_end_tail`, above ``right`` its mirror image under
     t -> 1/t or, where shorter, (1/t_right - 1/tau) exp(-S^2 t_right^2/2). An n-point rule on a panel of
     half-length h errs by at most h (64/15) M r^{-2n}/(1 - r^{-2}), M a bound of |k| on the Bernstein
     ellipse of any parameter r (Trefethen, Approximation Theory and Approximation Practice, Thm 19.3). For
@@ -279,7 +280,7 @@ def _log_integral(a: Array, b: Array, tau: Array) -> Array:
     scale = 0.25 * (a * a + b * b) + reference
     margin = EPS * (64 + 8 * np.abs(left)) * (4 + scale + _DROP)
     value = np.log(total) - LOG_PI - scale + margin
-    return np.where(np.isnan(value), np.inf, value)
+    return np.where((total > 0) & ~np.isnan(value), value, np.inf)
 
 
 def _exponent(dd: Array, ss: Array, v: Array) -> Array:

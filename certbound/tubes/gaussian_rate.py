@@ -91,10 +91,11 @@ def crossing_rate(
     if residual_variance is not None:
         rest = np.minimum(rest, np.asarray(residual_variance, dtype=np.float64))
     log_density = _largest_density(low, high, v_lo, v_hi)
-    near = log_density + np.log(_positive_part(mean, up(np.sqrt(rest))))
+    near = log_density + _log_positive_part(mean, up(np.sqrt(rest)))
     far = _vanishing(low, v_hi, up(np.sqrt(e_hi)), fall)
     rates = np.fmin(np.where(np.isnan(near), np.inf, near), far) + np.log(h)
-    drop = np.maximum(up(right[..., :-1] - left[..., 1:]), 0.0)
+    drop = right[..., :-1] - left[..., 1:]
+    drop = np.where(drop > 0, up(drop), 0.0)
     node = (np.maximum(v_lo[..., :-1], v_lo[..., 1:]), np.minimum(v_hi[..., :-1], v_hi[..., 1:]))
     node = (np.minimum(*node), node[1])
     after, upper = left[..., 1:], np.maximum(left[..., 1:], right[..., :-1])
@@ -135,13 +136,12 @@ def _largest_density(low: Array, high: Array, v_lo: Array, v_hi: Array) -> Array
     return np.where(np.isnan(value), np.inf, value)
 
 
-def _positive_part(mean: Array, deviation: Array) -> Array:
-    """Upper bound of E(m + v N)^+ = m^+ + v phi(|m|/v) (1 - (|m|/v) R(|m|/v))."""
-    ratio = np.where(deviation > 0, np.abs(mean) / deviation, np.inf) * (1 - 4 * EPS)
-    bell = np.exp(-0.5 * ratio * ratio * (1 - 8 * EPS) - LOG_ROOT_2PI)
-    spread = np.where(deviation > 0, deviation * bell * mills_deficit(ratio), 0.0)
-    value: Array = (np.maximum(mean, 0.0) + spread) * (1 + 64 * EPS)
-    return value
+def _log_positive_part(mean: Array, deviation: Array) -> Array:
+    """Upper bound of log E(m + v N)^+, E(m + v N)^+ = m^+ + v phi(|m|/v) (1 - (|m|/v) R(|m|/v))."""
+    ratio = np.minimum(np.abs(mean) / deviation, 1e150) * (1 - 4 * EPS)
+    bell = -0.5 * ratio * ratio * (1 - 8 * EPS) - LOG_ROOT_2PI
+    spread = np.where(deviation > 0, np.log(deviation) + bell + np.log(mills_deficit(ratio)), -np.inf)
+    return lift(np.logaddexp(np.log(np.maximum(mean, 0.0)), spread), 64)
 
 
 def _vanishing(low: Array, v_hi: Array, deviation: Array, fall: Array) -> Array:

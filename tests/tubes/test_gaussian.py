@@ -83,23 +83,22 @@ def oscillator_maxima(paths, seed=0, steps=250, horizon=5.0):
     root = np.linalg.cholesky(covariance(OSCILLATOR, FORCE, step))
 
     @numba.njit(cache=False)
-    def run(flow, root, paths, steps, seed, spread):
-        np.random.seed(seed)
+    def run(flow, root, paths, steps, rng, spread):
         out = np.empty((paths, 2))
         for i in range(paths):
             x, v, top_x, top_v = 0.0, 0.0, 0.0, 0.0
             for _ in range(steps):
-                a, b = np.random.normal(), np.random.normal()
+                a, b = rng.standard_normal(), rng.standard_normal()
                 x_new = flow[0, 0] * x + flow[0, 1] * v + root[0, 0] * a
                 v_new = flow[1, 0] * x + flow[1, 1] * v + root[1, 0] * a + root[1, 1] * b
-                gap = (v_new - v) ** 2 - 2 * spread * np.log(np.random.random())
+                gap = (v_new - v) ** 2 - 2 * spread * np.log(rng.random())
                 top_v = max(top_v, 0.5 * (abs(v + v_new) + np.sqrt(gap)))
                 x, v = x_new, v_new
                 top_x = max(top_x, abs(x))
             out[i, 0], out[i, 1] = top_x, top_v
         return out
 
-    return run(flow, root, paths, steps, seed, 0.25 * step)
+    return run(flow, root, paths, steps, np.random.default_rng(seed), 0.25 * step)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from scipy.stats import norm
 from certbound.tubes.gaussian import (
     log_line_crossing,
     log_polygon_crossing,
+    log_tail,
     total,
 )
 
@@ -66,6 +67,14 @@ def test_cutting_a_line_into_windows_never_falls_below_its_exact_probability():
             0.5 * np.diff(np.log(u)), q[:-1], q[1:], origin=(height / np.sqrt(u[0]), float(q[0]))
         )
         assert np.log10(exact) - 1e-9 <= total(logs) < np.log10(exact) + 0.1
+
+
+def test_terms_beyond_the_range_of_floats_stay_upper_bounds():
+    logs = log_polygon_crossing([0.01, 0.01], [20.0, 30.0], [30.0, 45.0])
+    assert np.all(np.isfinite(logs))
+    assert logs[2] >= float(log_tail(45.0))
+    far = log_polygon_crossing([0.1, 0.1], [2000.0, 2000.0], [2000.0, 2000.0])
+    assert np.all((far > -2.1e6) & (far < -1.9e6))
 
 
 def test_a_polygon_needs_a_window():

@@ -15,6 +15,7 @@ from certbound.tubes.gaussian import (
     log_pair,
     log_tail,
     log_window,
+    total_symmetric,
     union,
 )
 
@@ -137,6 +138,19 @@ def test_a_window_bounds_simulated_martingales():
     bound = float(np.exp(log_window(2.0, (0.999, 1.0), (0.36, 0.361))))
     assert binomial_excess(bound, hits, len(start)) < 4
     assert bound < 1.05 * hits / len(start)
+
+
+def test_symmetric_events_multiply_and_never_exceed_their_sum():
+    rng = np.random.default_rng(8)
+    mixed = rng.standard_normal((100_000, 3)) @ np.array([[1, 0.5, -0.3], [0, 1, 0.8], [0, 0, 1.0]])
+    levels = np.array([1.0, 1.5, 2.5])
+    logs = np.log(2) + log_tail(levels / mixed.std(axis=0))
+    bound = 10 ** total_symmetric(logs)
+    assert binomial_excess(bound, np.sum(np.any(np.abs(mixed) > levels, axis=1)), len(mixed)) < 4
+    assert bound < np.exp(logs).sum()
+    assert total_symmetric([0.0, -3.0]) == 0.0
+    assert total_symmetric([-2e6, -2e6]) == pytest.approx((np.log(2) - 2e6) / LN10)
+    assert total_symmetric([-np.inf]) == -np.inf
 
 
 def test_malformed_events_are_refused_by_name():

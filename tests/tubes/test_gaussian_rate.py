@@ -69,6 +69,14 @@ def test_rice_takes_batches_and_enclosures():
     assert point[2] < -8e5
 
 
+def test_levels_that_run_away_keep_a_tiny_probability():
+    rising = [[10.0, 60.0], [60.0, 110.0]]
+    got = crossing_rate([1.0, 1.0], rising, ([1.0, 1.0], [1.0, 1.0]), np.zeros(2), np.full(2, 1e-4), start_variance=0.0)
+    # E(eta - 50)^+ = .01 phi(5000) / 5000^2 against the density of the level 10
+    exact = (np.log(0.01) - 0.5 * 5000.0**2 - 2 * np.log(5000.0) - 50 - np.log(2 * np.pi)) / np.log(10)
+    assert exact <= got <= exact + 1e-6
+
+
 def test_malformed_pieces_are_refused_by_name():
     with pytest.raises(ValueError, match="`durations`"):
         crossing_rate([-1.0], [1.0], [1.0], [0.0], [1.0])
