@@ -49,6 +49,8 @@ class Checkpoint:
         record = cls.fresh(work, chunk, path)
         if not path.parent.is_dir():
             raise ValueError(f"`checkpoint` must lie in an existing folder, got {path}.")
+        for left_over in path.parent.glob(f".{path.name}.*"):  # of a run that was killed while writing
+            left_over.unlink(missing_ok=True)
         if not path.exists():
             return record
         stored = _read(path)
@@ -109,7 +111,7 @@ def _short(text: str) -> str:
 
 def _read(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             stored = {name: file[name] for name in file.files}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         raise ValueError(

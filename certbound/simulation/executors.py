@@ -147,9 +147,11 @@ def _completed(pool: Executor, width: int, work: Work, chunk: int, todo: list[in
             if not waiting:
                 return
             finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in finished:
-                number = waiting.pop(future)
-                yield number, future.result()
+            failed = [future for future in finished if future.cancelled() or future.exception() is not None]
+            for future in finished.difference(failed):
+                yield waiting.pop(future), future.result()
+            for future in failed:
+                future.result()  # raises, once what is finished has been kept
     finally:
         for future in waiting:
             future.cancel()
