@@ -112,8 +112,6 @@ class Erosion:
     def tightest(self, needed: Array | None = None) -> Tightest:
         """The constraint and time with the least Euclidean room after a deviation ``needed``, shape (K,), is taken."""
         taken = np.zeros(len(self.starts)) if needed is None else np.asarray(needed, dtype=float)
-        if not self.continuous:
-            taken = np.concatenate([[0.0], taken[1:]])
         with np.errstate(invalid="ignore"):
             margins = (self.radius - taken) * self.factor
         margins = np.where(np.isnan(margins), -np.inf, margins)

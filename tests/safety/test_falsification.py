@@ -86,3 +86,20 @@ def test_a_trajectory_that_blows_up_first_breaks_the_constraint():
     violation = find_violation(problem)
     assert violation is not None
     assert violation.time > 0.66
+
+
+def test_a_wrong_proposal_is_not_believed(monkeypatch):
+    """The sampled path is off by 0.6 and seems to leave; its enclosure shows that it does not."""
+    from certbound.safety import falsification
+
+    honest = falsification._follow
+    calls = []
+
+    def lying(*arguments):
+        times, paths = honest(*arguments)
+        calls.append(1)
+        return times, paths + 0.6
+
+    monkeypatch.setattr(falsification, "_follow", lying)
+    assert find_violation(drift([Inside(HalfSpace([1.0, 0.0], 2.5))])) is None
+    assert calls
