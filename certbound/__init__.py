@@ -43,6 +43,7 @@ _HOME = {
     "bound_metrics": "constants.metrics",
     "bound_reach": "reach",
     "verify_safety": "safety.verification",
+    "synthesize_plan": "synthesis.mpc",
     "CertboundError": "errors",
     "CertificateError": "errors",
     "EnclosureError": "errors",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from certbound.problem.problem import Problem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, to_casadi, trace
-
-if TYPE_CHECKING:
-    from certbound.synthesis.transcription import Grid
+from certbound.synthesis.plant import Grid
 
 __all__ = ["Cost", "cost_of"]
 
@@ -68,7 +66,7 @@ class Cost:
         """Cost of a plan with its rolled-out states (points + 1, n)."""
         nodes = states[:: grid.substeps]
         own = inputs if feedback is None else inputs + nodes[:-1] @ feedback.T
-        times = time + np.arange(grid.steps) * grid.step
+        times = np.asarray(time + np.arange(grid.steps) * grid.step, dtype=float)
         with np.errstate(all="ignore"):
             return float(grid.step * np.sum(self.values(times, nodes[:-1], own)) + self.end_value(nodes[-1]))
 

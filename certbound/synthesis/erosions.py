@@ -24,14 +24,22 @@ from certbound.reach.inclusion import Supports
 from certbound.reach.linear import LinearRun, level_scale
 from certbound.reach.linearisation import Linearisation
 from certbound.synthesis.faces import Face
-from certbound.synthesis.transcription import Grid, Plant
+from certbound.synthesis.plant import Grid, Plant
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 
 __all__ = [
-    "BallTube", "LinearTube", "ScaledTube", "ball_tube", "Tightening", "initial_center", "linear_tube", "nominal_spread", "spread_tube",
+    "BallTube",
+    "LinearTube",
+    "ScaledTube",
+    "Tightening",
+    "ball_tube",
+    "initial_center",
+    "linear_tube",
+    "nominal_spread",
+    "spread_tube",
     "tighten",
-]  # fmt: skip
+]
 
 Array = NDArray[np.float64]
 
@@ -111,7 +119,7 @@ def tighten(tube: Tightening, faces: Sequence[Face], states: Array, times: Array
 
 
 def linear_tube(problem: Problem, rows: int, delta: float) -> LinearTube | None:
-    """The linear response along the problem's plan for ``rows`` one-sided rows; None where its remainder feeds itself."""
+    """The linear response along the problem's plan for ``rows`` one-sided rows; None where it feeds itself."""
     run = LinearRun(Linearisation.of(problem))
     log_nonlinear = float(np.log(delta * NONLINEAR_SHARE))
     levels, events = run.levels(log_nonlinear)
@@ -148,15 +156,15 @@ def _noise(problem: Problem, time: float, state: Array) -> Array:
         g = np.asarray(system.noise_matrix)
         return np.asarray(g @ np.asarray(system.noise.proxy) @ g.T)
     assert isinstance(system, ContinuousSystem)
-    g = system.diffusion
-    matrix = compile_numpy(g)(time, *state) if isinstance(g, Tape) else np.asarray(g)
+    diffusion = system.diffusion
+    matrix = compile_numpy(diffusion)(time, *state) if isinstance(diffusion, Tape) else np.asarray(diffusion)
     return np.asarray(matrix @ matrix.T)
 
 
 def initial_center(initial: Any) -> Array:
     """The nominal start: the middle of the initial set."""
     if isinstance(initial, Box):
-        return np.clip(0.5 * initial.low + 0.5 * initial.high, initial.low, initial.high)
+        return np.asarray(np.clip(0.5 * initial.low + 0.5 * initial.high, initial.low, initial.high), dtype=float)
     return np.asarray(initial.mean if isinstance(initial, GaussianStart) else initial.center, dtype=float)
 
 
@@ -175,7 +183,7 @@ def nominal_spread(
     """rho (points + 1,) with ||x_t - z_t||_P <= rho for every start and disturbance (Thm K5, in floating point)."""
     n = plant.dimension
     metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric)
-    root = np.linalg.cholesky(metric).T
+    root = np.asarray(np.linalg.cholesky(metric).T, dtype=float)
     slope = float(np.max(np.asarray(constants.rate if constants.continuous else constants.gain)))
     box = problem.system.disturbance
     step = grid.step / grid.substeps

@@ -85,7 +85,7 @@ class Face:
         return extents
 
     def room(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
-        """h - e at states (K, n) for erosions (K, parts): shape (K,); at least 0 where the tightened constraint holds."""
+        """h - e, shape (K,), at states (K, n) for erosions (K, parts)."""
         raise NotImplementedError
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:

@@ -39,13 +39,14 @@ from certbound.synthesis.erosions import (
 )
 from certbound.synthesis.faces import Face, faces_of
 from certbound.synthesis.feedback import close_loop, constrain_inputs, depends_on, resolve_feedback
+from certbound.synthesis.plant import Grid, Plant
 from certbound.synthesis.terminal import (
     TerminalSet,
     check_terminal,
     contraction_terminal,
     riccati_terminal,
 )
-from certbound.synthesis.transcription import Grid, Plant, Solution, Transcription
+from certbound.synthesis.transcription import Solution, Transcription
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
@@ -184,7 +185,7 @@ class Planner:
             best = found
             guess = found.inputs
         if best is None:
-            raise InfeasibleError("no noise-free trajectory was found; check the dynamics, or give the problem a `plan`.")
+            raise InfeasibleError("no finite noise-free path was found; check the dynamics, or give a `plan`.")
         return best
 
     def _guess(self) -> Array:
@@ -220,8 +221,8 @@ class Planner:
         assert box is not None
         if involved and not box.bounded:
             raise ValueError(
-                "`inputs` must be bounded: the Jacobian depends on them, so that no constants hold for all inputs; give "
-                "cb.Box(low, high), or tube='linear'."
+                "`inputs` must be bounded: the Jacobian depends on them, so that no constants hold for all inputs; "
+                "give cb.Box(low, high), or tube='linear'."
             )
         if n == 1:
             return bound_constants(nominal, metric="euclidean")
@@ -254,7 +255,8 @@ class Planner:
             value = face.room(solution.states[1:], times[1:]) / np.maximum(own, 1e-300)
             room = np.minimum(room, np.where(face.asked(times[1:]), value, np.inf))
             part += face.parts
-        room = room - nominal_spread(self.problem, self.plant, self.grid, constants, solution.states, solution.inputs)[1:]
+        spread = nominal_spread(self.problem, self.plant, self.grid, constants, solution.states, solution.inputs)
+        room = room - spread[1:]
         if not np.any(np.isfinite(room)):
             return "max"
         room = np.maximum(room, 0.05 * float(np.median(room[np.isfinite(room)])))

@@ -129,10 +129,10 @@ def _room_of_region(region: Region, face: Face, erosion: Array, time: float) -> 
         spread = np.array([float(region.support(a)) - float(a @ middle[0]) for a in rows])
         local = face._local(middle, np.array([time])) @ face.normals.T - face.bounds - erosion
         return float(np.max(local[0] - spread))
-    spread = max(float(region.support(a)) - float(a @ middle[0]) for a in rows)
+    reach = max(float(region.support(a)) - float(a @ middle[0]) for a in rows)
     if isinstance(face, Round) and not face.outside:
-        spread *= 1.0 if rows.shape[0] == 2 else float(np.sqrt(len(face.coordinates)))
-    return float(room[0]) - spread
+        reach *= 1.0 if rows.shape[0] == 2 else float(np.sqrt(len(face.coordinates)))
+    return float(room[0]) - reach
 
 
 def _middle(region: Region, dimension: int) -> Array:
@@ -268,8 +268,8 @@ def _check_equilibrium(problem: Problem, center: Array, inputs: Array) -> None:
     moved = value if problem.system.time == "continuous" else value - center
     if np.max(np.abs(moved)) > 1e-6 * (1 + np.max(np.abs(center))):
         raise ValueError(
-            f"`terminal` needs an equilibrium, but at {center.tolist()} with inputs {inputs.tolist()} the state moves by "
-            f"{np.max(np.abs(moved)):.3g}; give a set instead."
+            f"`terminal` needs an equilibrium, but at {center.tolist()} with inputs {inputs.tolist()} the state moves "
+            f"by {np.max(np.abs(moved)):.3g}; give a set instead."
         )
 
 

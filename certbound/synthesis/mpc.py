@@ -1,4 +1,8 @@
-"""``synthesize_plan``: a plan, the verdict on it, and the reason where there is none."""
+"""Predictive control over the whole horizon: a plan, the verdict on it, and the reason where there is none.
+
+Receding-horizon control with the noise-free state as its state (`certbound.synthesis.receding`) leads to a plan as
+well, since nothing random enters it; both are judged by ``verify_safety``.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import logging
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,15 +21,17 @@ from certbound.problem.problem import Problem
 from certbound.problem.regions import Region
 from certbound.reach.response_tube import refusal
 from certbound.safety.verification import Verdict, verify_safety
-from certbound.synthesis.infeasibility import Infeasibility, bound_scale, empty_at_once, smallest_delta
+from certbound.synthesis.infeasibility import Infeasibility, smallest_delta
+from certbound.synthesis.outcome import Synthesis
 from certbound.synthesis.planning import FITTED, Planner, Tightened
+from certbound.synthesis.relaxation import bound_scale, empty_at_once
 from certbound.synthesis.terminal import TerminalSet
 from certbound.synthesis.transcription import Solution
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import METHODS
 
-__all__ = ["Synthesis", "synthesize_plan"]
+__all__ = ["synthesize_plan"]
 
 Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
@@ -39,71 +45,6 @@ FACTORS = (1.0 + 1e-6, 1.005, 1.02, 1.06)
 """Factors on the erosions, tried in turn until the plan is verified."""
 ENOUGH = 1.02
 """Room (times the tube) from which no more is looked for."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Synthesis:
-    """A plan and what is known about it.
-
-    Parameters
-    ----------
-    feasible : bool
-        A plan keeps the tightened constraints. Whether that means anything is for ``status`` to say: a one-time bound
-        such as Markov's may have a feasible plan, and its status is UNKNOWN.
-    status, log10_delta, verdict
-        What ``verify_safety`` proved about ``problem``; status UNKNOWN and 0 where nothing was.
-    reason : str
-        The verdict's reason, or why there is no plan.
-    problem : Problem
-        What the verdict is about: the closed loop under the plan.
-    plan : ndarray, shape (N, m)
-        Of that problem: inputs u, or w with u = w + K x where there is a feedback K.
-    inputs : ndarray, shape (N, m)
-        Nominal inputs at the start of each piece.
-    states, times : ndarray, shape (points + 1, n), (points + 1,)
-        Noise-free path.
-    erosion : ndarray, shape (points, parts)
-        What the tube takes from each face behind the start.
-    labels : tuple of str
-        The faces.
-    method : str
-        The tube.
-    constants : Constants or None
-    feedback : ndarray or None
-        K.
-    cost : float
-        Of the noise-free path.
-    max_input : float
-        Largest |u| of the noise-free path.
-    scale : float
-        The largest s found such that s times the tube fits.
-    softened : float
-        By how much the plan misses the tightened constraints at most (soft fallback); 0 for a feasible one.
-    infeasibility : Infeasibility or None
-    seconds : float
-    """
-
-    feasible: bool
-    status: str
-    log10_delta: float
-    reason: str
-    problem: Problem
-    plan: Array
-    inputs: Array
-    states: Array
-    times: Array
-    erosion: Array
-    labels: tuple[str, ...]
-    method: str
-    constants: Constants | None
-    feedback: Array | None
-    cost: float
-    max_input: float
-    scale: float
-    softened: float
-    infeasibility: Infeasibility | None
-    verdict: Verdict | None
-    seconds: float
 
 
 def synthesize_plan(
@@ -212,20 +153,15 @@ def _chosen(tube: str | Tube, problem: Problem) -> tuple[str, ...]:
             raise ValueError(f"`tube` must cover the horizon {problem.horizon:g}, got one up to {tube.horizon:g}.")
         return (tube.method,)
     if tube == "auto":
-        return ("kummer",) if refusal_of(problem) else ("linear", "kummer")
+        return ("kummer",) if refusal(problem) else ("linear", "kummer")
     if tube == "linear":
-        refused = refusal_of(problem)
+        refused = refusal(problem)
         if refused:
             raise ValueError(f"`tube` 'linear' does not fit: {refused}; use 'kummer'.")
     elif tube not in METHODS:
         known = ", ".join(["auto", "linear", *(name for name in METHODS if name != "auto")])
         raise ValueError(f"`tube` must be a Tube or one of {known}, got {tube!r}.")
     return (tube,)
-
-
-def refusal_of(problem: Problem) -> str | None:
-    """Why the linear response does not fit a problem; None where it does."""
-    return refusal(problem)
 
 
 class _Work:
@@ -261,7 +197,8 @@ class _Work:
         delta = self._smallest(name, constants, widest) if self.find_delta else None
         result = self._result(name, constants, solution, used, widest.scale, verdict, feasible=True)
         if delta is not None:
-            result = replace(result, reason=f"{result.reason} The smallest feasible delta found is {delta:.4g}.")
+            reason = f"{result.reason}. The smallest feasible delta found is {delta:.4g}.".replace("..", ".")
+            result = replace(result, smallest_delta=delta, reason=reason)
         return result
 
     # ---- tubes and room ----------------------------------------------------------------------------------
@@ -295,7 +232,7 @@ class _Work:
             if best is None or (found.success and found.scale > best[0].scale):
                 best = found, tightened
             solution = found
-            if gain < ENOUGH and best[0].scale >= 1 or gain < 1.001:
+            if (gain < ENOUGH and best[0].scale >= 1) or gain < 1.001:
                 break
         assert best is not None
         return best
@@ -358,11 +295,14 @@ class _Work:
             if not found.success:
                 return best
             if name == "linear":
-                following = planner.response(found, self.delta)
-                if following is None:
+                response = planner.response(found, self.delta)
+                if response is None:
                     return best
+                following = response
             elif used.tube is not None:
                 following = planner.around(used.tube, found)
+            else:
+                following = used
             best = found, following
             change = float(np.max(np.abs(following.erosion - used.erosion), initial=0.0))
             solution, used = found, following
@@ -393,7 +333,7 @@ class _Work:
         result = self._result(name, constants, solution, tightened, widest.scale, verdict, feasible=False)
         unit = "t =" if self.planner.grid.continuous else "step"
         reason = f"{found.describe(unit)} The plan returned misses the tightened constraints by {result.softened:.3g}."
-        return replace(result, infeasibility=found, reason=reason)
+        return replace(result, infeasibility=found, smallest_delta=found.smallest_delta, reason=reason)
 
     def _infeasible(
         self, name: str, constants: Constants | None, widest: Solution, tightened: Tightened, *, explain: bool
@@ -448,11 +388,13 @@ class _Work:
             status="UNKNOWN" if verdict is None else verdict.status,
             log10_delta=0.0 if verdict is None else verdict.log10_delta,
             reason=f"the plan could not be verified: {trouble}" if verdict is None else verdict.reason,
-            problem=planner.planned(solution.inputs), plan=solution.inputs, inputs=own[:: planner.grid.substeps],
+            source=planner.problem, problem=planner.planned(solution.inputs), plan=solution.inputs,
+            inputs=own[:: planner.grid.substeps],
             states=solution.states, times=planner.grid.times(), erosion=tightened.erosion,
             labels=tuple(face.label for face in planner.faces), method=name, constants=constants,
             feedback=planner.feedback, cost=solution.cost, max_input=float(np.abs(own).max(initial=0.0)), scale=scale,
             softened=0.0 if feasible else float(max(missing.max(initial=0.0), 0.0)), infeasibility=None,
+            smallest_delta=None,
             verdict=verdict, seconds=0.0,
         )  # fmt: skip
 

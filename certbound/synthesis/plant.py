@@ -1,0 +1,121 @@
+"""The noise-free system on a grid: what is rolled out, and what multiple shooting integrates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.tape import Tape
+from certbound.problem.trace import compile_numpy, to_casadi
+
+__all__ = ["Grid", "Plant"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Grid:
+    """Pieces of the horizon: ``steps`` pieces of length ``step`` with ``substeps`` Runge-Kutta steps each.
+
+    In discrete time ``step`` and ``substeps`` are 1.
+    """
+
+    steps: int
+    step: float
+    substeps: int
+    continuous: bool
+
+    @property
+    def points(self) -> int:
+        """Number of points at which constraints are imposed (the start is none)."""
+        return self.steps * self.substeps
+
+    def times(self, start: float = 0.0) -> Array:
+        """Times of the start and of all points, shape (points + 1,)."""
+        return np.asarray(start + np.arange(self.points + 1) * (self.step / self.substeps))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plant:
+    """Noise-free dynamics with a fixed disturbance and inputs in a box, and input rows that depend on the state.
+
+    Parameters
+    ----------
+    dynamics : Tape
+        Over ("t", *states, *inputs, *disturbances).
+    disturbance : ndarray, shape (q,)
+        Its middle.
+    low, high : ndarray, shape (m,)
+        Box of the decision u; infinite where there is none.
+    feedback : ndarray, shape (m, n), optional
+        The plant's own input is u + feedback z; ``input_low`` and ``input_high`` bound it.
+    input_low, input_high : ndarray, shape (m,), optional
+    """
+
+    dynamics: Tape
+    dimension: int
+    disturbance: Array
+    low: Array
+    high: Array
+    feedback: Array | None = None
+    input_low: Array | None = None
+    input_high: Array | None = None
+
+    @cached_property
+    def evaluate(self) -> Callable[..., Array]:
+        """f in floating point."""
+        return compile_numpy(self.dynamics)
+
+    def step(self, grid: Grid, time_: float, state: Array, inputs: Array) -> Array:
+        """States (substeps, n) at the points of one piece, from one or many states (..., n)."""
+
+        def f(t: float, x: Array) -> Array:
+            return self.evaluate(t, *np.moveaxis(x, -1, 0), *inputs, *self.disturbance)
+
+        if not grid.continuous:
+            return np.asarray(f(time_, state))[None]
+        h = grid.step / grid.substeps
+        found = []
+        for i in range(grid.substeps):
+            t = time_ + i * h
+            k1 = f(t, state)
+            k2 = f(t + h / 2, state + h / 2 * k1)
+            k3 = f(t + h / 2, state + h / 2 * k2)
+            k4 = f(t + h, state + h * k3)
+            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            found.append(state)
+        return np.array(found)
+
+    def rollout(self, grid: Grid, start: Array, inputs: Array, time_: float = 0.0) -> Array:
+        """Noise-free states at all points, shape (points + 1, n)."""
+        states = [np.asarray(start, dtype=float)]
+        with np.errstate(all="ignore"):
+            for k in range(len(inputs)):
+                states += list(self.step(grid, time_ + k * grid.step, states[-1], inputs[k]))
+        return np.array(states)
+
+    def symbolic_step(self, ca: Any, grid: Grid, time_: Any, state: Any, inputs: Any) -> list[Any]:
+        """CasADi expressions of the states at the points of one piece."""
+        disturbance = [ca.SX(float(value)) for value in self.disturbance]
+
+        def f(t: Any, x: Any) -> Any:
+            return to_casadi(self.dynamics, [ca.SX(t), x, inputs, *disturbance])
+
+        if not grid.continuous:
+            return [f(time_, state)]
+        h = grid.step / grid.substeps
+        found = []
+        for i in range(grid.substeps):
+            t = time_ + i * h
+            k1 = f(t, state)
+            k2 = f(t + h / 2, state + h / 2 * k1)
+            k3 = f(t + h / 2, state + h / 2 * k2)
+            k4 = f(t + h, state + h * k3)
+            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            found.append(state)
+        return found
