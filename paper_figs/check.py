@@ -86,7 +86,7 @@ def table(rows: Sequence[Row]) -> str:
     for row in rows:
         mark = "pass" if row.passed else "FAIL"
         lines.append(
-            f"{mark}  {row.name:<34} {row.place:<24} paper {_show(row.expected):<26} "
+            f"{mark}  {row.name:<34} {row.place:<34} wanted {_show(row.expected):<38} "
             f"found {_show(row.found):<26} {row.status}"
         )
     passed = sum(row.passed for row in rows)

@@ -84,5 +84,4 @@ def test_every_expectation_names_a_place_a_status_and_a_figure_that_exists(
     assert expectation["status"] in figures_check.STATUSES
     assert {"value", "at_least", "at_most"} & expectation.keys()
     stem = expectation["claim"].split(".")[0]
-    assert (figures_check.HERE / f"{stem}.py").exists()
-    assert (figures_check.HERE / "captions" / f"{stem}.md").exists()
+    assert (figures_check.HERE.parent / "experiments" / f"{stem}.py").exists()
