@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from certbound.constants.affine import AffineSet, SectorSet
 from certbound.constants.jacobians import IntervalMatrixSet, JacobianSet, UnionSet, VertexPolytope
 
-__all__ = ["VERTEX_LIMIT", "Sector", "centred", "contraction_value", "lmi_blocks", "transformed"]
+__all__ = ["VERTEX_LIMIT", "Sector", "centred", "contraction_value", "lmi_blocks", "transformed", "varying"]
 
 Array = NDArray[np.float64]
 
@@ -54,14 +54,20 @@ def lmi_blocks(jacobians: JacobianSet, *, form: str = "auto") -> list[Array | Se
     return [centred(jacobians)]
 
 
+def varying(sector: SectorSet) -> NDArray[np.intp]:
+    """Entries of Delta that have a range and reach the matrix."""
+    low, high = sector.box
+    reaches = sector.left.any(axis=0) & sector.right.any(axis=1)
+    return np.flatnonzero((high > low) & reaches)
+
+
 def centred(sector: SectorSet) -> Sector:
     """The sector set in floating point with |delta| <= 1 and columns of B as long as the rows of C."""
     low, high = sector.box
-    wide = np.flatnonzero(high > low)
+    wide = varying(sector)
     A = sector.affine.J0 + (sector.left * ((low + high) / 2)) @ sector.right
     B, C = sector.left[:, wide], ((high - low) / 2)[wide, None] * sector.right[wide]
-    scale = np.sqrt(np.linalg.norm(C, axis=1) / np.maximum(np.linalg.norm(B, axis=0), 1e-300))
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = np.sqrt(np.linalg.norm(C, axis=1) / np.linalg.norm(B, axis=0))
     assert sector.groups is not None
     groups = tuple(sector.groups[i] for i in wide)
     return Sector(A=A, B=B * scale, C=C / scale[:, None], groups=groups, scale=scale)

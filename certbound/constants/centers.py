@@ -194,6 +194,8 @@ def center_multipliers(
     P = P / (2 * np.linalg.norm(P, 2))
     first = _first_multipliers(work, P)
     value = work.smallest_value(P, first)
+    if not len(first):
+        return Center(metric=frozen(P), multipliers=(frozen(first),), value=value, steps=0)
     return _descend([work], P, [first], value, -np.inf, tolerance, max_steps, None)
 
 

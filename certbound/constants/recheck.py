@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.constants.affine import AffineSet, SectorSet
-from certbound.constants.blocks import centred
+from certbound.constants.blocks import centred, varying
 from certbound.constants.centers import center_multipliers
 from certbound.constants.jacobians import IntervalMatrixSet, JacobianSet, UnionSet, as_set
 from certbound.constants.matrices import square_matrix
@@ -177,7 +177,7 @@ def _sector_value(metric: ArrayLike, S: Array, gram: Interval, sector: SectorSet
     P = np.asarray(metric, dtype=float)
     block = centred(sector)
     guess = center_multipliers(P, block, continuous=continuous)
-    wide = np.flatnonzero(sector.box[1] > sector.box[0])
+    wide = varying(sector)
     # the barrier works at P / (2 ||P||) and with scaled columns: undo both
     weights = guess.multipliers[0] * (2 * np.linalg.norm(P, 2)) / block.scale**2
     low, high = sector.box[:, wide]
@@ -192,12 +192,28 @@ def _sector_value(metric: ArrayLike, S: Array, gram: Interval, sector: SectorSet
             Interval.point(sector.left[:, fixed]) * Interval.point(sector.box[0, fixed]), sector.right[fixed]
         )
     F0 = _sector_matrix(P, S, A, B, C, radius, weights, continuous=continuous)
-    step = 1e-12 * (abs(guess.value) + float(np.abs(F0.mid).max()))
-    for attempt in range(40):
-        value = guess.value + step * 2.0**attempt
-        if bool(is_positive_definite(_shifted(F0, gram, 2 * value if continuous else value))):
-            return float(value)
-    return float(np.inf)
+    size = abs(guess.value) + float(np.abs(F0.mid).max())
+    return _least_proved(F0, gram, guess.value, 1e-12 * size, factor=2.0 if continuous else 1.0)
+
+
+def _least_proved(F0: Interval, gram: Interval, guess: float, step: float, *, factor: float) -> float:
+    """The smallest value near a guess for which F0 + factor value E^T P E > 0 is proved: doubling, then bisection."""
+
+    def proved(value: float) -> bool:
+        return bool(is_positive_definite(_shifted(F0, gram, factor * value)))
+
+    low, high = guess, guess + step
+    while not proved(high):
+        step *= 2
+        low, high = high, high + step
+        if not np.isfinite(high) or step > 1e6 * (1 + abs(guess)):
+            return float(np.inf)
+    while high - low > 1e-3 * (high - guess):
+        middle = (low + high) / 2
+        if not low < middle < high:
+            break
+        low, high = (low, middle) if proved(middle) else (middle, high)
+    return float(high)
 
 
 def _sector_matrix(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import flint
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -100,6 +101,28 @@ def test_the_sector_inequality_and_the_vertices_give_nearly_the_same(continuous,
 
 
 @pytest.mark.parametrize("continuous", [False, True])
+@pytest.mark.parametrize("work", [0.0, 1e9])
+def test_the_inequality_holds_in_ball_arithmetic(continuous, work, monkeypatch):
+    monkeypatch.setattr(recheck, "VERTEX_WORK", work)
+    rng = np.random.default_rng(6)
+    for _ in range(5):
+        metric = random_metric(rng, 3, 4.0)
+        low = rng.normal(size=2)
+        parts = rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), rng.normal(size=(2, 3))
+        members = SectorSet(A=parts[0], B=parts[1], C=parts[2], low=low, high=low + 0.1)
+        value = (certify_rate if continuous else certify_gain)(metric, members)
+        for delta in members.affine.corners():
+            middle = flint.arb_mat(np.diag(delta).tolist())
+            A, B, C = (flint.arb_mat(part.tolist()) for part in parts)
+            J, P = A + B * middle * C, flint.arb_mat(metric.tolist())
+            c = flint.arb(value)
+            S = 2 * c * P - (J.transpose() * P + P * J) if continuous else c * c * P - J.transpose() * P * J
+            for k in (1, 2, 3):
+                minor = flint.arb_mat([[S[i, j] for j in range(k)] for i in range(k)])
+                assert not minor.det() < 0
+
+
+@pytest.mark.parametrize("continuous", [False, True])
 def test_the_sector_inequality_bounds_every_member_in_any_metric(continuous, monkeypatch):
     monkeypatch.setattr(recheck, "VERTEX_WORK", 0.0)
     rng = np.random.default_rng(5)
@@ -120,12 +143,15 @@ def test_the_sector_inequality_bounds_every_member_in_any_metric(continuous, mon
         assert certified >= contraction_value(metric, inside, continuous=continuous) - 1e-12
 
 
-def test_slack_costs_what_it_must():
+def test_slack_costs_what_it_must(monkeypatch):
     center = np.diag([-1.0, -2.0])
     plain = AffineSet(center=center, terms=[], low=[], high=[])
     loose = AffineSet(center=center, terms=[], low=[], high=[], slack=np.diag([0.25, 0.0]))
     assert certify_rate(np.eye(2), plain) == pytest.approx(-1.0, abs=1e-14)
     assert certify_rate(np.eye(2), loose) == pytest.approx(-0.75, abs=1e-14)
+    sector = SectorSet(A=center, B=np.zeros((2, 1)), C=np.ones((1, 2)), low=[0], high=[1], slack=np.diag([0.25, 0.0]))
+    monkeypatch.setattr(recheck, "VERTEX_WORK", 0.0)
+    assert -0.75 <= certify_rate(np.eye(2), sector) <= -0.749
 
 
 def test_interval_matrices_and_unions_are_bounded_member_by_member():
