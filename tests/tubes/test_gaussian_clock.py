@@ -69,7 +69,7 @@ def test_slepian_bounds_simulated_oscillator_velocities():
     _, clock = oscillator_clock(80, 4.0)
     bound = 10 ** clock_crossing(clock, np.full(80, level))
     phi = np.array([[1 - step**2 / 2, step - step**2 / 2], [-step + step**2 / 2, 1 - step]])
-    x, v = rng.standard_normal((2, 40_000))
+    x, v = rng.standard_normal((2, 25_000))
     hit = v > level
     for _ in range(200):
         x, new = phi[0, 0] * x + phi[0, 1] * v, phi[1, 0] * x + phi[1, 1] * v
@@ -83,7 +83,7 @@ def test_slepian_bounds_simulated_oscillator_velocities():
 
 def exact_ou_crossing(level, horizon):
     """P(sup of a stationary OU > level), by the backward equation on a fine grid (Crank-Nicolson)."""
-    count, low = 1500, -7.0
+    count, low = 1000, -7.0
     x = np.linspace(low, level, count + 1)
     h, steps = x[1] - x[0], 1500
     from scipy.linalg import solve_banded

@@ -46,11 +46,11 @@ def test_pieces_without_noise_move_the_level():
 def test_random_scalar_equations_are_never_exceeded_more_often_than_bounded():
     rng = np.random.default_rng(7)
     ratios = []
-    for _ in range(6):
+    for _ in range(4):
         count = int(rng.integers(1, 5))
         h, c, sigma = rng.uniform(0.2, 1.2, count), rng.uniform(-3, 1.5, count), rng.uniform(0.1, 1, count)
         level = linear_radius(h, c, sigma, 0.05, two_sided=False, tolerance=1e-2)
-        x, hit = np.zeros(20_000), np.zeros(20_000, dtype=bool)
+        x, hit = np.zeros(15_000), np.zeros(20_000, dtype=bool)
         for rate, noise, step in zip(np.repeat(c, 40), np.repeat(sigma, 40), np.repeat(h / 40, 40)):
             new = np.exp(rate * step) * x
             new += noise * np.sqrt(np.expm1(2 * rate * step) / (2 * rate)) * rng.standard_normal(len(x))

@@ -29,7 +29,7 @@ def test_rice_is_exact_for_a_random_sinusoid():
 def test_rice_bounds_integrated_brownian_motion_from_rest():
     rng = np.random.default_rng(6)
     step, count, level = 0.005, 200, 1.2
-    w, x = np.zeros((2, 60_000))
+    w, x = np.zeros((2, 30_000))
     hit = np.zeros(len(x), dtype=bool)
     for _ in range(count):
         a, b = rng.standard_normal((2, len(x)))
