@@ -102,19 +102,21 @@ def run_work(
                     record.save()
                     saved = now
         except (BrokenExecutor, CancelledError, OSError, TimeoutError) as error:
-            raise SolverError(
-                f"the executor broke down after {record.tally.paths} of {work.paths} paths "
-                f"({type(error).__name__}: {error}); "
-                + (
-                    f"run again with the checkpoint {checkpoint} to go on."
-                    if checkpoint
-                    else "give `checkpoint=` to keep what is finished."
-                )
-            ) from error
+            raise SolverError(_breakdown(error, record, work, checkpoint)) from error
         finally:
             record.save()
     seconds = time.perf_counter() - begin
     return Outcome(tally=record.tally, seconds=seconds, rate=(record.tally.steps - steps_before) / max(seconds, 1e-9))
+
+
+def _breakdown(error: BaseException, record: Checkpoint, work: Work, checkpoint: Any) -> str:
+    """Message for an executor that broke down."""
+    why = "its tasks were cancelled: the scheduler is gone" if isinstance(error, CancelledError) else str(error)
+    cure = f"run again with the checkpoint {checkpoint} to go on" if checkpoint else "give `checkpoint=` to keep work"
+    return (
+        f"the executor broke down after {record.tally.paths} of {work.paths} paths "
+        f"({type(error).__name__}: {why}); {cure}."
+    )
 
 
 def _chunk(work: Work) -> int:

@@ -54,7 +54,7 @@ def test_finished_chunks_are_kept_and_the_answer_is_the_same(tmp_path):
 
 
 def test_without_a_checkpoint_the_message_offers_one():
-    with pytest.raises(SolverError, match="give `checkpoint=` to keep what is finished"):
+    with pytest.raises(SolverError, match="give `checkpoint=` to keep work"):
         simulate_exits(ou(), paths=80_000, rng=1, steps=STEPS, executor=Failing(3))
 
 

@@ -131,7 +131,7 @@ def test_a_model_that_returns_nan_is_reported_with_state_time_and_path():
 def test_an_explosion_inside_the_safe_set_is_reported():
     system = cb.ContinuousSystem(lambda x: x**5, states=1, diffusion=[[0.1]])
     subject = cb.Problem(system, initial=[1.0], safe=[], domain=cb.Box([-np.inf], [np.inf]), horizon=5.0)
-    with pytest.raises(ValueError, match="not finite .* use more steps, or set `domain`"):
+    with pytest.raises(ValueError, match=r"not finite .* use more steps, or set `domain`"):
         simulate_exits(subject, paths=10, rng=0, steps=100)
 
 
