@@ -50,7 +50,7 @@ def test_random_scalar_equations_are_never_exceeded_more_often_than_bounded():
         count = int(rng.integers(1, 5))
         h, c, sigma = rng.uniform(0.2, 1.2, count), rng.uniform(-3, 1.5, count), rng.uniform(0.1, 1, count)
         level = linear_radius(h, c, sigma, 0.05, two_sided=False, tolerance=1e-2)
-        x, hit = np.zeros(15_000), np.zeros(20_000, dtype=bool)
+        x, hit = np.zeros(15_000), np.zeros(15_000, dtype=bool)
         for rate, noise, step in zip(np.repeat(c, 40), np.repeat(sigma, 40), np.repeat(h / 40, 40)):
             new = np.exp(rate * step) * x
             new += noise * np.sqrt(np.expm1(2 * rate * step) / (2 * rate)) * rng.standard_normal(len(x))
