@@ -268,7 +268,7 @@ def erosion_ratio(constants: Constants, rooms: Rooms, horizon: float, delta: flo
     from certbound.tubes.tuning import tune_tube
 
     if constants.continuous:
-        rooms = rooms.coarse()
+        rooms = rooms.coarse(12)
     metric = np.eye(constants.dimension) if constants.metric is None else constants.metric
     room = (rooms.rooms / erosion_factors(metric, rooms.directions)[:, None]).min(axis=0)
     if constants.continuous:  # both ends of a piece count

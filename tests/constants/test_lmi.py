@@ -47,10 +47,10 @@ def test_the_method_of_centres_agrees_with_the_semidefinite_program(continuous):
 def test_centres_of_sectors_and_vertices_agree_on_the_chain():
     members = chain_sector(3)
     for form in ("sector", "vertices"):
-        center = center_metric(lmi_blocks(members, form=form), continuous=False, lower=LOWER, tolerance=5e-5)
-        assert LOWER - 1e-12 <= center.value <= LOWER + 6e-5
+        center = center_metric(lmi_blocks(members, form=form), continuous=False, lower=LOWER, tolerance=4e-4)
+        assert LOWER - 1e-12 <= center.value <= LOWER + 4e-4
         metric = (center.metric + center.metric.T) / 2
-        assert certify_gain(metric, members) ** 2 <= LOWER + 6e-5
+        assert certify_gain(metric, members) ** 2 <= LOWER + 5e-4
 
 
 def test_multipliers_of_a_given_metric_lose_little_on_the_chain():
