@@ -1,0 +1,124 @@
+"""What the constraints leave to the deviation along a nominal curve: rows and rooms, piece by piece."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from flint import arb
+
+from certbound.checker.arithmetic import Undecided
+from certbound.checker.graph import Graph
+from certbound.checker.model import Model
+from certbound.checker.program import Program
+from certbound.checker.regions import Constraint, Region
+from certbound.checker.report import Unproved
+from certbound.errors import CertificateError
+from certbound.problem.tape import Tape
+
+__all__ = ["Demand", "Grid", "demands"]
+
+_STRICT = arb(2) ** -300
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Demand:
+    """rows[k] . S <= rooms[k] on piece k keeps a constraint; rooms are None where it is not asked."""
+
+    label: str
+    rows: list[list[arb]]
+    rooms: list[arb | None]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Grid:
+    """Time pieces as balls, and points whose convex hull holds the nominal curve on each."""
+
+    times: list[tuple[arb, arb]]
+    hulls: list[list[list[arb]]]
+
+    def asked(self, during: tuple[float, float] | None) -> list[bool]:
+        """Which pieces may meet a time window."""
+        if during is None:
+            return [True] * len(self.times)
+        first, last = during
+        return [not (end < first or start > last) for start, end in self.times]
+
+
+def demands(model: Model, grid: Grid, separations: list[object], path: str) -> list[Demand]:
+    """Every constraint of the model as demands along a nominal curve.
+
+    Raises
+    ------
+    CertificateError
+        If the directions that keep obstacles off are malformed.
+    """
+    if len(separations) != len(model.constraints):
+        raise CertificateError(f"`{path}` must have {len(model.constraints)} entries, got {len(separations)}.")
+    result: list[Demand] = []
+    for number, (constraint, given) in enumerate(zip(model.constraints, separations)):
+        result += _demand(model, grid, constraint, given, f"{path}[{number}]")
+    return result
+
+
+def _demand(model: Model, grid: Grid, constraint: Constraint, given: object, path: str) -> list[Demand]:
+    """The rows of one constraint: fixed ones, or one a piece where the certificate names them."""
+    region, count = constraint.region, len(grid.times)
+    families: list[list[tuple[list[arb], arb]]]
+    if constraint.separated:
+        pairs = constraint.read_separation(given, path, count)
+        families = [[([-x for x in row], -height - _STRICT) for row, height in pairs]]
+    elif given is not None:
+        raise CertificateError(f"`{path}` must be null: that constraint needs no directions.")
+    elif not constraint.inside:
+        away = [-arb(x) for x in region.faces[0]]
+        families = [[(away, -arb(region.bounds[0]) - _STRICT)] * count]
+    elif region.round:
+        families = [[pair] * count for pair in region.inscribed()]
+    else:
+        families = [
+            [([arb(x) for x in face], arb(b))] * count for face, b in zip(region.faces, region.bounds)
+        ]
+    centres = _centres(region, grid)
+    asked = grid.asked(constraint.during)
+    found = []
+    for family in families:
+        rows = [region.lift(row, model.dimension) for row, _ in family]
+        rooms: list[arb | None] = []
+        for k, (row, bound) in enumerate(family):
+            if not asked[k]:
+                rooms.append(None)
+                continue
+            offset = bound + _dot(row, centres[k])
+            rooms.append(min_of([offset - _dot(rows[k], point) for point in grid.hulls[k]]).lower())
+        found.append(Demand(label=constraint.label, rows=rows, rooms=rooms))
+    return found
+
+
+def min_of(values: Sequence[arb]) -> arb:
+    """Ball of the least value."""
+    least = values[0]
+    for value in values[1:]:
+        least = arb.min(least, value)
+    return least
+
+
+def _dot(row: Sequence[arb], point: Sequence[arb]) -> arb:
+    return sum((a * b for a, b in zip(row, point) if not a.is_zero()), arb(0))
+
+
+def _centres(region: Region, grid: Grid) -> list[list[arb]]:
+    """Enclosures of the centre on every piece."""
+    if not isinstance(region.center, Tape):
+        return [[arb(x) for x in region.center]] * len(grid.times)
+    graph = Graph()
+    nodes = graph.include(region.center, [graph.input(0)])
+    program = Program(graph, [nodes[output] for output in region.center.outputs], variables=1)
+    program.prepare([])
+    result = []
+    for start, end in grid.times:
+        try:
+            result.append(program.run([start.union(end)]))
+        except Undecided as error:
+            raise Unproved("the centre of a moving set is not defined at all times") from error
+    return result

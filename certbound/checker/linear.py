@@ -1,0 +1,432 @@
+"""The linear-response proof (Thm K7'): the certificate's numbers, and the inequalities that make them a proof.
+
+Per cell of the initial set the file gives a nominal curve p, slopes, boxes B for the remainder beta, rows with levels
+for the Gaussian part Z along them, and directions that keep obstacles off. From B follow sets of the remainder's
+response R; with y (initial set and disturbance) and the levels they bound the deviation s = y + Z + R in a polytope.
+Proved here, piece by piece: beta lies in B over that polytope. Then, but for the event that Z leaves its levels, the
+constraints hold wherever Z stays below what y and R leave, and the probabilities of all these events are added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from flint import arb, arb_mat, ctx
+
+from certbound.checker.demands import Demand, Grid, demands
+from certbound.checker.events import Windows, chain, sub_gaussian
+from certbound.checker.matrices import column, identity, row_sums, upper
+from certbound.checker.model import Model
+from certbound.checker.reading import Record, number, numbers, wholes
+from certbound.checker.reading import entries as listed
+from certbound.checker.remainder import OutputRemainder, PieceData, Polytope, remainders
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.response import (
+    Load,
+    Piece,
+    Supports,
+    continuous_piece,
+    covariances,
+    discrete_piece,
+    supports,
+)
+from certbound.checker.structure import Structure, structure_of
+from certbound.errors import CertificateError
+
+__all__ = ["check_linear"]
+
+MOST_PIECES = 4000
+MOST_CELLS = 4096
+MOST_ROWS = 64
+_BITS, _MOST_BITS = 128, 3000
+
+_PROOF = ("engine", "splits", "pieces", "varying", "moving", "units", "windows", "cells")
+_CELL = (
+    "nominal", "slopes", "drifts", "gains", "remainder_low", "remainder_high", "rows", "levels", "window_levels",
+    "frames", "separations",
+)  # fmt: skip
+
+
+def check_linear(model: Model, value: object, budget: Budget) -> arb:
+    """Upper bound of the probability that a constraint is broken, for every start and disturbance.
+
+    Raises
+    ------
+    CertificateError
+        If the proof's data are malformed.
+    Unproved
+        If an inequality could not be proved.
+    """
+    record = Record(value, "proof", _PROOF)
+    structure = structure_of(model)
+    shared = _Shared(model, structure, record)
+    boxes = _cells(model, record)
+    entries = record.items("cells", len(boxes), len(boxes))
+    outputs = remainders(model, structure)
+    worst = arb(0)
+    for index, (entry, box) in enumerate(zip(entries, boxes)):
+        cell = _Cell(shared, Record(entry, f"proof.cells[{index}]", _CELL), box, budget)
+        worst = arb.max(worst, cell.probability(outputs))
+    return upper(worst)
+
+
+def _cells(model: Model, record: Record) -> list[list[tuple[arb, arb]]]:
+    """Boxes that cover the initial set: products of the intervals between the edges of ``splits``."""
+    edges: list[list[float]] = []
+    for j, item in enumerate(record.items("splits", model.dimension, model.dimension)):
+        row = numbers(item, f"proof.splits[{j}]", None)
+        if len(row) < 2 or any(a > b for a, b in pairwise(row)):
+            raise CertificateError(f"`proof.splits[{j}]` must be two or more numbers that do not fall.")
+        if not (arb(row[0]) <= model.initial.low[j].lower() and arb(row[-1]) >= model.initial.high[j].upper()):
+            raise Unproved(f"the cells do not cover the initial set along {model.states[j]}")
+        edges.append(row)
+    result: list[list[tuple[arb, arb]]] = [[]]
+    for row in edges:
+        if len(result) * (len(row) - 1) > MOST_CELLS:
+            raise CertificateError(f"`proof.splits` must make at most {MOST_CELLS} cells.")
+        result = [[*box, (arb(a), arb(b))] for box in result for a, b in pairwise(row)]
+    return result
+
+
+class _Shared:
+    """What all cells have in common."""
+
+    def __init__(self, model: Model, structure: Structure, record: Record) -> None:
+        self.model, self.structure = model, structure
+        self.count = record.whole("pieces", 1, MOST_PIECES)
+        if not model.continuous and self.count != model.steps:
+            raise CertificateError("`proof.pieces` must be the number of steps.")
+        if model.continuous and model.plan is not None and self.count % len(model.plan):
+            raise CertificateError("`proof.pieces` must be a multiple of the plan's rows.")
+        for name, expected in (("varying", structure.varying), ("moving", structure.moving)):
+            given = [tuple(wholes(item, record.at(name), 0, 10**6)) for item in record.items(name)]
+            if given != expected:
+                raise Unproved(f"`proof.{name}` does not list the entries of the Jacobian that vary")
+        self.units = wholes(record["units"], record.at("units"), 0, model.dimension - 1)
+        if len(set(self.units)) != len(self.units):
+            raise CertificateError("`proof.units` must be different states.")
+        self.windows: list[int] = []
+        if model.continuous:
+            self.windows = wholes(record["windows"], record.at("windows"), 0, self.count - 1)
+            if self.windows[:1] != [0] or any(a >= b for a, b in pairwise(self.windows)):
+                raise CertificateError("`proof.windows` must rise from 0.")
+        elif record["windows"] is not None:
+            raise CertificateError("`proof.windows` must be null in discrete time.")
+
+    @property
+    def length(self) -> arb:
+        """Length of a piece."""
+        return arb(self.model.horizon) / self.count if self.model.continuous else arb(1)
+
+    def inputs(self, k: int) -> list[arb]:
+        """The plan's inputs on piece k."""
+        plan = self.model.plan
+        if plan is None:
+            return []
+        return [arb(x) for x in plan[k * len(plan) // self.count if self.model.continuous else k]]
+
+    def full(self, values: Sequence[float], *, gains: bool = False) -> arb_mat:
+        """A Jacobian from its varying entries and the model's own constant ones."""
+        structure, n = self.structure, self.model.dimension
+        columns = len(self.model.disturbance) if gains else n
+        entries = [arb(0)] * (n * columns)
+        for (i, j), fixed in (structure.held if gains else structure.fixed).items():
+            entries[i * columns + j] = fixed
+        for (i, j), value in zip(structure.moving if gains else structure.varying, values):
+            entries[i * columns + j] = arb(value)
+        return arb_mat(n, columns, entries)
+
+    def drift(self, values: Sequence[float]) -> arb_mat:
+        """The slope's rate of change: constant entries have none."""
+        n = self.model.dimension
+        entries = [arb(0)] * (n * n)
+        for (i, j), value in zip(self.structure.varying, values):
+            entries[i * n + j] = arb(value)
+        return arb_mat(n, n, entries)
+
+
+class _Cell:
+    """One cell of the initial set."""
+
+    def __init__(self, shared: _Shared, record: Record, box: list[tuple[arb, arb]], budget: Budget) -> None:
+        self.shared, self.model, self.budget = shared, shared.model, budget
+        self.record = record
+        model, n, count = shared.model, shared.model.dimension, shared.count
+        continuous = model.continuous
+        varying, moving = len(shared.structure.varying), len(shared.structure.moving)
+        self.nominal = record.array("nominal", *((count, 4, n) if continuous else (count + 1, n)))
+        if continuous and any(a[3] != b[0] for a, b in pairwise(self.nominal)):
+            raise Unproved("the nominal curve jumps")
+        self.slopes = record.array("slopes", count, varying)
+        if not continuous and record["drifts"] is not None:
+            raise CertificateError(f"`{record.at('drifts')}` must be null in discrete time.")
+        self.drifts = record.array("drifts", count, varying) if continuous else [[0.0] * varying] * count
+        self.gains = record.array("gains", count, moving)
+        self.low, self.high = record.array("remainder_low", count, n), record.array("remainder_high", count, n)
+        if any(a > b for lows, highs in zip(self.low, self.high) for a, b in zip(lows, highs)):
+            raise CertificateError(f"`{record.at('remainder_low')}` must not exceed `remainder_high`.")
+        self.rows, self.levels = self._rows()
+        self.frames = self._frames()
+        start = self.nominal[0][0] if continuous else self.nominal[0]
+        self.start = [arb.max(high - p, p - low).upper() for (low, high), p in zip(box, map(arb, start))]
+        middles = [(low + high) / 2 for low, high in model.disturbance] if model.disturbance else []
+        self.middle = [arb(x) for x in middles]
+        self.reach = [
+            arb.max(arb(high) - m, m - arb(low)) for (low, high), m in zip(model.disturbance, self.middle)
+        ]
+        self.demands = demands(model, self._grid(), record.items("separations"), record.at("separations"))
+
+    def _rows(self) -> tuple[list[list[list[arb]]], list[list[arb]]]:
+        """Rows of Z's levels on every piece (unit rows first), over all states, and the levels."""
+        record, units, n = self.record, self.shared.units, self.model.dimension
+        given = record.items("rows", self.shared.count, self.shared.count)
+        extra = len(listed(given[0], record.at("rows"), 0, MOST_ROWS))
+        rows = []
+        for item in numbers(given, record.at("rows"), self.shared.count, extra, len(units)):
+            whole = [[arb(1 if j == unit else 0) for j in range(n)] for unit in units]
+            for row in item:
+                full = [arb(0)] * n
+                for unit, value in zip(units, row):
+                    full[unit] = arb(value)
+                whole.append(full)
+            rows.append(whole)
+        levels = [
+            [arb(number(x, record.at("levels"), least=0.0)) for x in listed(item, record.at("levels"), 0, 10**4)]
+            for item in record.items("levels", self.shared.count, self.shared.count)
+        ]
+        if any(len(item) != len(units) + extra for item in levels):
+            raise CertificateError(f"`{record.at('levels')}` must have one level a row.")
+        return rows, levels
+
+    def _frames(self) -> list[list[int]]:
+        """Rows that serve as coordinates for each output's remainder; null: the unit rows."""
+        record, structure, units = self.record, self.shared.structure, list(self.shared.units)
+        frames = []
+        most = len(self.rows[0]) - 1
+        for i, item in enumerate(record.items("frames", self.model.dimension, self.model.dimension)):
+            active = structure.active_states(i)
+            if item is not None:
+                frames.append(wholes(item, f"{record.at('frames')}[{i}]", 0, most))
+            elif any(j not in units for j in active):
+                raise Unproved("`proof.units` lacks a state that enters nonlinearly")
+            else:
+                frames.append([units.index(j) for j in active])
+        return frames
+
+    def _grid(self) -> Grid:
+        h = self.shared.length
+        if self.model.continuous:
+            times = [(h * k, h * (k + 1)) for k in range(self.shared.count)]
+            hulls = [[[arb(x) for x in point] for point in item] for item in self.nominal]
+        else:
+            times = [(arb(k), arb(k)) for k in range(self.shared.count + 1)]
+            hulls = [[[arb(x) for x in item]] for item in self.nominal]
+        return Grid(times=times, hulls=hulls)
+
+    # ---- the proof ---------------------------------------------------------------------------------------
+
+    def probability(self, outputs: Sequence[OutputRemainder]) -> arb:
+        """Upper bound of the probability that this cell's paths break a constraint."""
+        self.pieces = self._pieces()
+        growth = sum(max(0.0, float(row_sums(p.transition).log() / arb.const_log2())) for p in self.pieces)
+        if growth <= 20:
+            return self._probability(outputs)
+        with ctx.workprec(int(min(_BITS + growth, _MOST_BITS))):
+            self.pieces = self._pieces()
+            return self._probability(outputs)
+
+    def _probability(self, outputs: Sequence[OutputRemainder]) -> arb:
+        model, budget = self.model, self.budget
+        n = model.dimension
+        start = model.initial.covariance if model.initial.covariance is not None else identity(n) * 0
+        values = covariances(self.pieces, start, budget)
+        bounds = self._supports()
+        for k in range(self.shared.count):
+            self._check_remainder(k, bounds, outputs)
+        return self._events(values, bounds)
+
+    def _pieces(self) -> list[Piece]:
+        shared, noise = self.shared, self.model.noise.covariance()
+        result = []
+        for slopes, drifts in zip(self.slopes, self.drifts):
+            self.budget.check()
+            slope = shared.full(slopes)
+            if self.model.continuous:
+                result.append(continuous_piece(slope, shared.drift(drifts), shared.length, noise))
+            else:
+                result.append(discrete_piece(slope, noise))
+        return result
+
+    def _supports(self) -> _Bounds:
+        """Bounds of y and R along the rows of levels and demands, over every piece."""
+        n, count, continuous = self.model.dimension, self.shared.count, self.model.continuous
+        one = identity(n)
+        unit = [[one[i, j] for j in range(n)] for i in range(n)]
+        asked = [self._asked(k) for k in range(count if continuous else count + 1)]
+        loads = [self._load(k) for k in range(count)]
+        nodes: list[list[list[arb]]] = []
+        for k in range(count + 1):
+            own = asked[k] if k < len(asked) else []
+            if not continuous:
+                nodes.append(own)
+            elif k < count:
+                ends = [(arb_mat(1, n, row) * self.pieces[k].transition).entries() for row in own]
+                nodes.append([*unit, *own, *ends])
+            else:
+                nodes.append([])
+        found = supports([p.transition for p in self.pieces], nodes, loads, self.start, self.budget)
+        if not continuous:
+            return _Bounds(low=found.low, high=found.high, reach=found.reach)
+        low, high, reach = [], [], []
+        for k in range(count):
+            parts = self._over_piece(k, asked[k], found)
+            low.append(parts[0])
+            high.append(parts[1])
+            reach.append(parts[2])
+        return _Bounds(low=low, high=high, reach=reach)
+
+    def _asked(self, k: int) -> list[list[arb]]:
+        inner = self.rows[k] if k < self.shared.count else []
+        return [*inner, *(demand.rows[k] for demand in self.demands)]
+
+    def _box(self, k: int) -> tuple[list[arb], list[arb]]:
+        """Middle and radius of B on piece k."""
+        pairs = [(arb(a), arb(b)) for a, b in zip(self.low[k], self.high[k])]
+        return [(a + b) / 2 for a, b in pairs], [(b - a) / 2 for a, b in pairs]
+
+    def _gain(self, k: int) -> tuple[arb_mat, list[arb]] | None:
+        """E with its columns scaled by the disturbance's radii, and the bound of |E (d - d0)|."""
+        if not self.reach:
+            return None
+        gain = self.shared.full(self.gains[k], gains=True)
+        n, q = self.model.dimension, len(self.reach)
+        scaled = arb_mat(n, q, [gain[i, j] * self.reach[j] for i in range(n) for j in range(q)])
+        return scaled, [sum((abs(scaled[i, j]) for j in range(q)), arb(0)) for i in range(n)]
+
+    def _load(self, k: int) -> Load:
+        piece, n = self.pieces[k], self.model.dimension
+        middle, radius = self._box(k)
+        gain = self._gain(k)
+        zero = [arb(0)] * n
+        if not self.model.continuous:
+            return Load(centre=column(middle), radius=radius, generators=None if gain is None else gain[0], box=zero)
+        h, one = piece.length, identity(n)
+        spread = ((one + piece.deviation) * column(radius) * h).entries()
+        generators, box = None, zero
+        if gain is not None:
+            generators = (one + piece.slope * (h / 2)) * gain[0] * h
+            box = ((piece.size * (h * h / 4) + piece.second * h) * column(gain[1])).entries()
+        return Load(centre=piece.gathered * column(middle), radius=spread, generators=generators, box=box)
+
+    def _over_piece(
+        self, k: int, rows: list[list[arb]], found: Supports
+    ) -> tuple[list[arb], list[arb], list[arb]]:
+        """From the piece's start to all of it: the chord between both ends, its bulge, and what the piece adds."""
+        piece, n, count = self.pieces[k], self.model.dimension, len(rows)
+        h, one = piece.length, identity(n)
+        whole = piece.size + piece.drift * h
+        bend = (piece.drift + whole * whole) * (one + piece.deviation) * (h * h / 8)
+        middle, radius = self._box(k)
+        sizes = [arb.max(abs(a), abs(b)) for a, b in zip(found.low[k][:n], found.high[k][:n])]
+        gain = self._gain(k)
+        added_r = (piece.deviation * column([abs(m) + r for m, r in zip(middle, radius)]) + column(radius)) * h
+        columns = [bend * column(sizes) + added_r, bend * column(found.reach[k][:n])]
+        if gain is not None:
+            columns[1] = columns[1] + (one + piece.deviation) * column(gain[1]) * h
+        low, high, reach = [], [], []
+        for i, row in enumerate(rows):
+            weights = arb_mat(1, n, [x.abs_upper() for x in row])
+            rest, spread = ((weights * item)[0, 0] for item in columns)
+            linear = (arb_mat(1, n, row) * column(middle))[0, 0] * h
+            first, last = n + i, n + count + i
+            low.append((arb.min(found.low[k][first], found.low[k][last]) + arb.min(linear, arb(0)) - rest).lower())
+            high.append((arb.max(found.high[k][first], found.high[k][last]) + arb.max(linear, arb(0)) + rest).upper())
+            reach.append((arb.max(found.reach[k][first], found.reach[k][last]) + spread).upper())
+        return low, high, reach
+
+    def _check_remainder(self, k: int, bounds: _Bounds, outputs: Sequence[OutputRemainder]) -> None:
+        """beta lies in B on piece k."""
+        data = self._data(k)
+        low, high = [], []
+        for d, level in enumerate(self.levels[k]):
+            size = bounds.reach[k][d] + level
+            low.append(bounds.low[k][d] - size)
+            high.append(bounds.high[k][d] + size)
+        for i, output in enumerate(outputs):
+            output.prepare(data)
+            polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=self.frames[i])
+            if not output.prove(polytope, arb(self.low[k][i]), arb(self.high[k][i]), self.budget):
+                name = self.model.states[i]
+                at = f"piece {k}" if self.model.continuous else f"step {k}"
+                raise Unproved(f"the remainder of {name} was not shown to stay in its box on {at}")
+
+    def _data(self, k: int) -> PieceData:
+        """The parameters of the remainder's expressions."""
+        shared, n = self.shared, self.model.dimension
+        if self.model.continuous:
+            h = shared.length
+            values = [h * (2 * k + 1) / 2]
+            for j in range(n):
+                a, b, c, d = (arb(point[j]) for point in self.nominal[k])
+                values += [
+                    (a + 3 * (b + c) + d) / 8, (d + c - b - a) * 3 / (4 * h),
+                    (a - b - c + d) * 3 / (2 * h * h), (d - a + 3 * (b - c)) / (h * h * h),
+                ]  # fmt: skip
+            values += [arb(a) + arb(b) * h / 2 for a, b in zip(self.slopes[k], self.drifts[k])]
+            values += [arb(b) for b in self.drifts[k]]
+        else:
+            h = arb(0)
+            values = [arb(k), *map(arb, self.nominal[k]), *map(arb, self.nominal[k + 1])]
+            values += [arb(a) for a in self.slopes[k]]
+        values += [*map(arb, self.gains[k]), *self.middle, *shared.inputs(k)]
+        return PieceData(values=values, half=h / 2, disturbance=self.middle, disturbance_radius=self.reach)
+
+    def _events(self, values: list[arb_mat], bounds: _Bounds) -> arb:
+        """Probability that Z leaves its levels, or exceeds what the demands leave."""
+        count, inner = self.shared.count, len(self.rows[0])
+        families: list[tuple[int, Demand]] = []
+        for d in range(inner):
+            rows = [self.rows[k][d] for k in range(count)]
+            levels: list[arb | None] = [self.levels[k][d] for k in range(count)]
+            families.append((2, Demand(label="", rows=rows, rooms=levels)))
+        for number_, demand in enumerate(self.demands):
+            rooms: list[arb | None] = []
+            for k, room in enumerate(demand.rooms):
+                place = number_ + (inner if k < count else 0)
+                used = bounds.reach[k][place] + bounds.high[k][place]
+                rooms.append(None if room is None else (room - used).lower())
+            families.append((1, Demand(label=demand.label, rows=demand.rows, rooms=rooms)))
+        total, exceedance = self._exceedance(values)
+        for weight, family in families:
+            found = exceedance(family)
+            if not found < 1:
+                raise Unproved(f"nothing is left for the noise by '{family.label or 'the levels'}'")
+            total += weight * found
+        return upper(total)
+
+    def _exceedance(self, values: list[arb_mat]) -> tuple[arb, Any]:
+        """What is paid once, and the probability of one family as a function."""
+        model, budget = self.model, self.budget
+        transitions = [piece.transition for piece in self.pieces]
+        if not model.continuous:
+            if self.record["window_levels"] is not None:
+                raise CertificateError(f"`{self.record.at('window_levels')}` must be null in discrete time.")
+            if model.noise.gaussian:
+                return arb(0), lambda family: chain(family.rows, family.rooms, transitions, values, budget)
+            return arb(0), lambda family: sub_gaussian(family.rows, family.rooms, values)
+        given = self.record.array("window_levels", len(self.shared.windows), model.dimension)
+        levels = [[arb(x) for x in item] for item in given]
+        windows = Windows(self.pieces, values, self.shared.windows, budget)
+        return windows.coordinates(levels), lambda family: windows.exceedance(family.rows, family.rooms)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Bounds:
+    """Bounds along the rows of each piece: low <= row . R <= high, |row . y| <= reach."""
+
+    low: list[list[arb]]
+    high: list[list[arb]]
+    reach: list[list[arb]]

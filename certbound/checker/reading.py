@@ -1,0 +1,205 @@
+"""Reading a stranger's JSON: sizes first, then shapes, and one line for whatever is wrong.
+
+Nothing in the file is executed, imported or evaluated. Numbers are strings in exact hexadecimal notation
+(``float.hex``), so that the checker speaks of the very numbers that the prover used; JSON's own decimal and
+non-finite numbers are refused, whole numbers serve as counts and indices.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from certbound.errors import CertificateError
+
+__all__ = ["Record", "number", "numbers", "parse", "read", "text", "whole", "wholes"]
+
+LARGEST_FILE = 16 * 2**20
+"""Bytes."""
+_LONGEST_WHOLE = 9
+_NUMBER = re.compile(r"-?0x[01]\.[0-9a-f]{1,13}p[+-][0-9]{1,4}\Z")
+
+
+def read(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Raises
+    ------
+    CertificateError
+        If the file is larger than 16 MiB or is not one JSON object as described above.
+    OSError
+        If it cannot be read.
+    """
+    place = Path(path)
+    size = place.stat().st_size
+    if size > LARGEST_FILE:
+        raise CertificateError(
+            f"the certificate has {size / 2**20:.0f} MiB, more than the {LARGEST_FILE // 2**20} that a check accepts."
+        )
+    with place.open("rb") as stream:
+        return parse(stream.read(LARGEST_FILE + 1))
+
+
+def parse(content: str | bytes) -> dict[str, Any]:
+    """The JSON object in a text.
+
+    Raises
+    ------
+    CertificateError
+        If it is longer than 16 MiB, no JSON, nested too deeply, not finite, or no object.
+
+    Examples
+    --------
+    >>> parse('{"version": 1}')
+    {'version': 1}
+    """
+    if len(content) > LARGEST_FILE:
+        raise CertificateError(f"the certificate is longer than {LARGEST_FILE // 2**20} MiB.")
+    try:
+        text_ = content.decode("utf-8") if isinstance(content, bytes) else content
+        value = json.loads(
+            text_, parse_constant=_no_constant, parse_float=_no_float, parse_int=_whole, object_pairs_hook=_unique
+        )
+    except UnicodeDecodeError as error:
+        raise CertificateError("the certificate is no UTF-8 text.") from error
+    except RecursionError as error:
+        raise CertificateError("the certificate is nested too deeply.") from error
+    except json.JSONDecodeError as error:
+        raise CertificateError(f"the certificate is no JSON: {error.msg} at character {error.pos}.") from error
+    if not isinstance(value, dict):
+        raise CertificateError("the certificate must be one JSON object.")
+    return value
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise CertificateError(f"the certificate holds {name}; numbers must be finite.")
+
+
+def _no_float(written: str) -> NoReturn:
+    raise CertificateError(f"the certificate holds the decimal number {written[:20]}; numbers are hexadecimal strings.")
+
+
+def _whole(written: str) -> int:
+    if len(written) > _LONGEST_WHOLE:
+        raise CertificateError(f"the certificate holds a whole number of {len(written)} digits.")
+    return int(written)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        raise CertificateError("the certificate holds an object with the same key twice.")
+    return result
+
+
+class Record:
+    """A JSON object whose keys are all known.
+
+    Parameters
+    ----------
+    value : object
+    path : str
+        Where it stands, for messages.
+    required, optional : sequence of str
+    """
+
+    def __init__(self, value: object, path: str, required: Sequence[str], optional: Sequence[str] = ()) -> None:
+        if not isinstance(value, Mapping):
+            raise CertificateError(f"`{path}` must be an object.")
+        missing = [name for name in required if name not in value]
+        if missing:
+            raise CertificateError(f"`{path}` must have `{missing[0]}`.")
+        unknown = [str(name) for name in value if name not in required and name not in optional]
+        if unknown:
+            raise CertificateError(f"`{path}` has the unknown entry `{unknown[0][:40]}`.")
+        self.value, self.path = value, path
+
+    def __getitem__(self, name: str) -> Any:
+        return self.value.get(name)
+
+    def at(self, name: str) -> str:
+        """The path of an entry."""
+        return f"{self.path}.{name}"
+
+    def number(self, name: str, *, least: float | None = None) -> float:
+        """An entry that is a number."""
+        return number(self[name], self.at(name), least=least)
+
+    def whole(self, name: str, low: int, high: int) -> int:
+        """An entry that is a whole number."""
+        return whole(self[name], self.at(name), low, high)
+
+    def text(self, name: str, longest: int = 1000) -> str:
+        """An entry that is text."""
+        return text(self[name], self.at(name), longest)
+
+    def flag(self, name: str) -> bool:
+        """An entry that is true or false."""
+        if not isinstance(self[name], bool):
+            raise CertificateError(f"`{self.at(name)}` must be true or false.")
+        return bool(self[name])
+
+    def array(self, name: str, *shape: int | None) -> Any:
+        """An entry that is an array of numbers of the given shape (None: any length)."""
+        return numbers(self[name], self.at(name), *shape)
+
+    def items(self, name: str, low: int = 0, high: int = 100_000) -> list[Any]:
+        """An entry that is a list of ``low`` to ``high`` entries."""
+        return entries(self[name], self.at(name), low, high)
+
+
+def number(value: object, path: str, *, least: float | None = None) -> float:
+    """A finite number written in hexadecimal."""
+    if not isinstance(value, str) or not _NUMBER.match(value):
+        raise CertificateError(f"`{path}` must be a number in hexadecimal notation, such as \"0x1.8p+1\".")
+    try:
+        result = float.fromhex(value)
+    except OverflowError as error:
+        raise CertificateError(f"`{path}` must be a finite number.") from error
+    if least is not None and not result >= least:
+        raise CertificateError(f"`{path}` must be at least {least:g}, got {result:g}.")
+    return result
+
+
+def numbers(value: object, path: str, *shape: int | None) -> Any:
+    """Nested lists of numbers; ``shape`` gives the length of every axis (None: any)."""
+    if not shape:
+        return number(value, path)
+    items = entries(value, path, 0, 1_000_000)
+    if shape[0] is not None and len(items) != shape[0]:
+        raise CertificateError(f"`{path}` must have {shape[0]} entries, got {len(items)}.")
+    return [numbers(item, f"{path}[{index}]", *shape[1:]) for index, item in enumerate(items)]
+
+
+def entries(value: object, path: str, low: int, high: int) -> list[Any]:
+    """A list whose length lies in [low, high]."""
+    if not isinstance(value, list):
+        raise CertificateError(f"`{path}` must be a list.")
+    if not low <= len(value) <= high:
+        raise CertificateError(f"`{path}` must have {low} to {high} entries, got {len(value)}.")
+    return value
+
+
+def whole(value: object, path: str, low: int, high: int) -> int:
+    """A whole number in [low, high]."""
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise CertificateError(f"`{path}` must be a whole number.")
+    if not low <= value <= high:
+        raise CertificateError(f"`{path}` must lie in {low}..{high}, got {value}.")
+    return value
+
+
+def wholes(value: object, path: str, low: int, high: int) -> list[int]:
+    """A list of whole numbers in [low, high]."""
+    return [whole(item, f"{path}[{i}]", low, high) for i, item in enumerate(entries(value, path, 0, 100_000))]
+
+
+def text(value: object, path: str, longest: int) -> str:
+    """Printable text of at most ``longest`` characters."""
+    if not isinstance(value, str) or len(value) > longest or not value.isprintable():
+        raise CertificateError(f"`{path}` must be printable text of at most {longest} characters.")
+    return value

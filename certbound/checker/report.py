@@ -1,0 +1,85 @@
+"""What the checker answers, and how it says no."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from certbound.errors import CertboundError
+
+__all__ = ["Budget", "Report", "Unproved"]
+
+
+class Unproved(CertboundError):
+    """An inequality that the certificate needs could not be proved; the message names it."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Report:
+    """The answer about one certificate.
+
+    Parameters
+    ----------
+    valid : bool
+        Whether every inequality was proved again.
+    claim : str
+        What the certificate claims, in words, with the assumptions it names.
+    reason : str
+        What was proved, or the first thing that could not be.
+    seconds : float
+        Time taken.
+    log10_delta : float
+        The claimed bound on log10 of the probability.
+    log10_proved : float or None
+        The bound that the checker itself arrived at (None where it did not).
+    """
+
+    valid: bool
+    claim: str
+    reason: str
+    seconds: float
+    log10_delta: float
+    log10_proved: float | None = None
+
+
+class Budget:
+    """Limits on the checker's own time and number of boxes.
+
+    Parameters
+    ----------
+    seconds : float
+    boxes : int
+        Sub-boxes over all pieces together.
+    """
+
+    def __init__(self, seconds: float, boxes: int = 2_000_000) -> None:
+        self.started = time.monotonic()
+        self.seconds, self.boxes = seconds, boxes
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return time.monotonic() - self.started
+
+    def check(self) -> None:
+        """Stop when the time is used up.
+
+        Raises
+        ------
+        Unproved
+        """
+        if self.elapsed > self.seconds:
+            raise Unproved(f"the check was not finished within its limit of {self.seconds:g} s")
+
+    def box(self) -> None:
+        """Count one sub-box.
+
+        Raises
+        ------
+        Unproved
+        """
+        self.boxes -= 1
+        if self.boxes < 0:
+            raise Unproved("the check needs more sub-boxes than its limit")
+        if self.boxes % 64 == 0:
+            self.check()

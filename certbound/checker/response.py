@@ -1,0 +1,205 @@
+"""The linear response of one cell in ball arithmetic: transition matrices, covariances, supports along rows.
+
+On piece k of length h the slope is J(tau) = A + tau K, tau in [0, h]; Phi is its transition matrix. With
+|J| h at most J_ = |A| h + |K| h^2 entry by entry,
+
+- F = Phi(h, 0), Gamma = int_0^h Phi(h, u) du and Q = int_0^h Phi(h, u) W Phi(h, u)^T du are power series in h whose
+  rests are bounded by scalar majorants;
+- |Phi(s, u) - I| <= D = exp(J_) - I, and |Phi(h, u) - I - (h - u) A| <= S = D - |A| h, for all s, u in the piece.
+
+Discrete time: F = A, Gamma = I, Q = W, D = S = 0. Source: Thm K7 of docs/theory.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from flint import arb, arb_mat
+
+from certbound.checker.matrices import identity, magnitude, row_sums
+from certbound.checker.report import Budget, Unproved
+
+__all__ = ["Load", "Piece", "Supports", "continuous_piece", "covariances", "discrete_piece", "supports"]
+
+_TERMS = 60
+_SMALL = arb(2) ** -100
+_LARGEST_STEP = 3e8
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Piece:
+    """Linear data of one piece: the matrices of the module's docstring, and |A| and |K| themselves."""
+
+    length: arb
+    transition: arb_mat
+    gathered: arb_mat
+    noise: arb_mat
+    deviation: arb_mat
+    second: arb_mat
+    slope: arb_mat
+    size: arb_mat
+    drift: arb_mat
+
+
+def _tail(older: arb, newer: arb, alpha: arb, kappa: arb, count: int) -> arb | None:
+    """Bound of the terms beyond ``count`` of m_{i+1} = (alpha m_i + kappa m_{i-1})/(i + 1); None if not yet small."""
+    ratio = (alpha + kappa) / (count + 1)
+    if not ratio < 0.5:
+        return None
+    return (4 * ratio * arb.max(older, newer)).upper()
+
+
+def _series(
+    a: arb_mat, k: arb_mat, start: arb_mat, force: arb_mat | None, *, twosided: bool
+) -> arb_mat:
+    """Sum of X_{i+1} = (a X_i + k X_{i-1} [+ transposes] + [i = 0] force)/(i + 1), with its rest."""
+    n = a.nrows()
+    alpha, kappa = row_sums(a), row_sums(k)
+    if twosided:
+        alpha, kappa = alpha + row_sums(a.transpose()), kappa + row_sums(k.transpose())
+    older, newer, total = start * 0, start, start
+    small, big = arb(0), row_sums(start)
+    for i in range(_TERMS):
+        term = a * newer + k * older
+        if twosided:
+            term = term + term.transpose()
+        size = alpha * big + kappa * small
+        if i == 0 and force is not None:
+            term, size = term + force, size + row_sums(force)
+        older, newer = newer, term * (arb(1) / (i + 1))
+        small, big = big, (size / (i + 1)).upper()
+        total = total + newer
+        rest = _tail(small, big, alpha, kappa, i + 1)
+        if rest is not None and rest < _SMALL * (1 + row_sums(total)):
+            return total + arb_mat(n, n, [arb(0, rest)] * (n * n))
+    raise Unproved("the pieces are too long for the slope: its norm times a piece's length is beyond all use")
+
+
+def continuous_piece(slope: arb_mat, drift: arb_mat, length: arb, noise: arb_mat) -> Piece:
+    """The data of one piece in continuous time; ``noise`` is g g^T."""
+    n = slope.nrows()
+    a, k, one = slope * length, drift * (length * length), identity(n)
+    size = magnitude(slope)
+    whole = size * length + magnitude(drift) * (length * length)
+    if not row_sums(whole) < 20:
+        raise Unproved("the pieces are too long for the slope: its norm times a piece's length is beyond 20")
+    deviation = magnitude(whole.exp() - one)
+    return Piece(
+        length=length,
+        transition=_series(a, k, one, None, twosided=False),
+        gathered=_series(a, k, one * 0, one * length, twosided=False),
+        noise=_series(a, k, one * 0, noise * length, twosided=True),
+        deviation=deviation,
+        second=magnitude(deviation - size * length),
+        slope=slope,
+        size=size,
+        drift=magnitude(drift),
+    )
+
+
+def discrete_piece(slope: arb_mat, noise: arb_mat) -> Piece:
+    """The data of one step in discrete time; ``noise`` is the covariance of what is added."""
+    one = identity(slope.nrows())
+    return Piece(
+        length=arb(1), transition=slope, gathered=one, noise=noise, deviation=one * 0, second=one * 0, slope=slope,
+        size=magnitude(slope), drift=one * 0,
+    )
+
+
+def covariances(pieces: Sequence[Piece], start: arb_mat, budget: Budget) -> list[arb_mat]:
+    """Covariances of Z at the nodes: V_{k+1} = F V_k F^T + Q."""
+    result = [start]
+    for piece in pieces:
+        budget.check()
+        v = piece.transition * result[-1] * piece.transition.transpose() + piece.noise
+        result.append((v + v.transpose()) * arb(0.5))
+    return result
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Load:
+    """What one piece adds at its end: R gets ``centre`` +- ``radius``, y the segments ``generators`` and +- ``box``."""
+
+    centre: arb_mat
+    radius: list[arb]
+    generators: arb_mat | None
+    box: list[arb]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Supports:
+    """Along every row of every node: bounds ``low`` <= row . R <= ``high`` and |row . y| <= ``reach``."""
+
+    low: list[list[arb]]
+    high: list[list[arb]]
+    reach: list[list[arb]]
+
+
+def supports(
+    transitions: Sequence[arb_mat], rows: Sequence[Sequence[Sequence[arb]]], loads: Sequence[Load],
+    start: Sequence[arb], budget: Budget,
+) -> Supports:
+    """Bounds at the nodes along ``rows[k]`` (a list of rows at node k), by the adjoint rows of every earlier piece.
+
+    Parameters
+    ----------
+    transitions : sequence of arb_mat
+        F of every piece.
+    rows : sequence
+        N + 1 lists of rows.
+    loads : sequence of Load
+        One a piece.
+    start : sequence of arb
+        Half-widths of the box of y at node 0.
+    budget : Budget
+    """
+    n = transitions[0].nrows()
+    flat: list[arb] = []
+    nodes: list[int] = []
+    centre: list[arb] = []
+    radius: list[arb] = []
+    reach: list[arb] = []
+
+    def take(node: int) -> None:
+        for row in rows[node]:
+            flat.extend(row)
+            nodes.append(node)
+            for values in (centre, radius, reach):
+                values.append(arb(0))
+
+    for j in range(len(transitions) - 1, -1, -1):
+        budget.check()
+        take(j + 1)
+        count = len(nodes)
+        if not count:
+            continue
+        if count * n * n > _LARGEST_STEP:
+            raise Unproved(f"the check along {count} rows of {n} states is too large")
+        current, load = arb_mat(count, n, flat), loads[j]
+        middle = (current * load.centre).entries()
+        boxes = [value for pair in zip(load.radius, load.box) for value in pair]
+        spread = (arb_mat(count, n, [x.abs_upper() for x in flat]) * arb_mat(n, 2, boxes)).entries()
+        for i in range(count):
+            centre[i] += middle[i]
+            radius[i] += spread[2 * i]
+            reach[i] += spread[2 * i + 1]
+        if load.generators is not None:
+            columns = load.generators.ncols()
+            shares = (current * load.generators).entries()
+            for i in range(count):
+                reach[i] += sum((x.abs_upper() for x in shares[i * columns : (i + 1) * columns]), arb(0))
+        flat = (current * transitions[j]).entries()
+    take(0)
+    count = len(nodes)
+    if count:
+        spread = (arb_mat(count, n, [x.abs_upper() for x in flat]) * arb_mat(n, 1, list(start))).entries()
+        reach = [a + b for a, b in zip(reach, spread)]
+    low: list[list[arb]] = [[] for _ in rows]
+    high: list[list[arb]] = [[] for _ in rows]
+    size: list[list[arb]] = [[] for _ in rows]
+    for i, node in enumerate(nodes):
+        low[node].append((centre[i] - radius[i]).lower())
+        high[node].append((centre[i] + radius[i]).upper())
+        size[node].append(reach[i].upper())
+    return Supports(low=low, high=high, reach=size)

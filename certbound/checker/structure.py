@@ -1,0 +1,81 @@
+"""What the dynamics look like to first order: which entries of its Jacobians are constant, which states matter.
+
+Where an entry of D_x f depends on nothing, the linearisation uses the model's own (exact) value: the remainder does
+not depend on that state through that entry, whatever the floats of the certificate say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flint import arb
+
+from certbound.checker.graph import Graph
+from certbound.checker.model import Model
+from certbound.checker.program import Program
+
+__all__ = ["Structure", "structure_of"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Structure:
+    """Entries of the Jacobians of f by state and by disturbance.
+
+    ``state_nodes[i, j]`` and ``disturbance_nodes[i, l]`` are the derivative's nodes in ``graph`` (absent where it is
+    exactly 0); ``varying`` and ``moving`` list those that depend on an input, row by row, and ``fixed`` and ``held``
+    hold the values of the others.
+    """
+
+    graph: Graph
+    outputs: list[int]
+    state_nodes: dict[tuple[int, int], int]
+    disturbance_nodes: dict[tuple[int, int], int]
+    varying: list[tuple[int, int]]
+    moving: list[tuple[int, int]]
+    fixed: dict[tuple[int, int], arb]
+    held: dict[tuple[int, int], arb]
+
+    def active_states(self, output: int) -> list[int]:
+        """States on which the remainder of an output may depend."""
+        return [j for i, j in self.varying if i == output]
+
+    def active_disturbances(self, output: int) -> list[int]:
+        """Disturbances on which the remainder of an output may depend."""
+        return [j for i, j in self.moving if i == output]
+
+
+def structure_of(model: Model) -> Structure:
+    """Differentiate the model once."""
+    graph = Graph()
+    n, q = model.dimension, len(model.disturbance)
+    slots = [graph.input(slot) for slot in range(len(model.dynamics.inputs))]
+    nodes = graph.include(model.dynamics, slots)
+    outputs = [nodes[output] for output in model.dynamics.outputs]
+    first = len(slots) - q
+    by_state = _derivatives(graph, outputs, range(1, n + 1))
+    by_disturbance = _derivatives(graph, outputs, range(first, first + q))
+    varying = sorted(entry for entry, node in by_state.items() if graph.masks[node])
+    moving = sorted(entry for entry, node in by_disturbance.items() if graph.masks[node])
+    return Structure(
+        graph=graph, outputs=outputs, state_nodes=by_state, disturbance_nodes=by_disturbance, varying=varying,
+        moving=moving, fixed=_values(graph, by_state), held=_values(graph, by_disturbance),
+    )  # fmt: skip
+
+
+def _derivatives(graph: Graph, outputs: list[int], slots: range) -> dict[tuple[int, int], int]:
+    found = {}
+    for i, output in enumerate(outputs):
+        for j, slot in enumerate(slots):
+            if graph.masks[output] >> slot & 1:
+                node = graph.derivative(output, slot)
+                if not graph.is_const(node, 0.0):
+                    found[i, j] = node
+    return found
+
+
+def _values(graph: Graph, nodes: dict[tuple[int, int], int]) -> dict[tuple[int, int], arb]:
+    """Values of the entries that depend on nothing."""
+    constant = {entry: node for entry, node in nodes.items() if not graph.masks[node]}
+    program = Program(graph, list(constant.values()), variables=0)
+    program.prepare([])
+    return dict(zip(constant, program.run([])))

@@ -1,0 +1,318 @@
+"""The linear-response proof as data (Thm K7'): boxes of the remainder with room to spare, levels, rows and frames.
+
+The engine's search is run again on fewer pieces, since the checker is slower than NumPy; the boxes are widened by a few
+per cent, so that the checker needs few sub-boxes; and the events are those that the checker knows: first exceedances
+in discrete time, martingale windows in continuous time. The stated probability is what follows from exactly that.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.errors import CertificateError
+from certbound.problem.problem import Problem
+from certbound.problem.regions import Ball, Ellipsoid, HalfSpace, Region
+from certbound.problem.sets import Inside, Outside
+from certbound.problem.systems import ContinuousSystem
+from certbound.problem.tape import Tape
+from certbound.problem.trace import compile_numpy, jacobian
+from certbound.reach.events import StepEvents, WindowEvents, logsumexp
+from certbound.reach.linear import LinearRun, level_scale
+from certbound.reach.linearisation import Linearisation
+from certbound.safety.answers import EngineAnswer
+from certbound.safety.certificate import Proof, exact
+
+__all__ = ["linear_proof"]
+
+Array = NDArray[np.float64]
+Events = StepEvents | WindowEvents
+
+_STEPS = (0.25, 0.12, 0.06)
+_FEWEST, _MOST = 40, (160, 320, 640)
+_PADS = (0.08, 0.15, 0.25)
+_ROUNDS = 8
+_WINDOW = 0.05
+_SLACK = 0.01
+_LOG10 = math.log(10.0)
+
+
+def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
+    """The proof's data, the claimed log10 of the probability, and no assumptions.
+
+    Raises
+    ------
+    CertificateError
+        If the remainder feeds itself once its boxes are widened.
+    """
+    effort = min(attempt, len(_STEPS) - 1)
+    found = answer.details
+    engine: Linearisation = found.run.engine
+    if not engine.pieces or found.outcome.bounds is None:
+        raise CertificateError("the linear response bounds nothing here.")
+    target = math.log(problem.delta)
+    tried = [found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]
+    run = LinearRun(_coarser(problem, engine, effort))
+    best: _Stated | None = None
+    for log_nonlinear in dict.fromkeys(tried):
+        stated = _state(run, log_nonlinear, _PADS[effort])
+        if stated is not None and (best is None or stated.log_probability < best.log_probability):
+            best = stated
+        if best is not None and best.log_probability <= target:
+            break
+    if best is None:
+        raise CertificateError("the remainder feeds itself once its boxes are widened for the checker.")
+    log10 = best.log_probability / _LOG10
+    return _data(problem, run, best), min(log10 + _SLACK * (1 + 0.1 * abs(log10)), 0.0), []
+
+
+def _coarser(problem: Problem, engine: Linearisation, effort: int) -> Linearisation:
+    """The same cells on a grid for the checker."""
+    if not engine.continuous:
+        return engine
+    size = float(np.linalg.norm(np.nan_to_num(engine.slopes[0]), axis=(-2, -1)).max())
+    pieces = int(np.clip(np.ceil(problem.horizon * size / _STEPS[effort]), _FEWEST, _MOST[effort]))
+    along = _cells_along(engine)
+    return Linearisation(problem, cells=along if along > 1 else None, pieces=pieces)
+
+
+def _edges(engine: Linearisation) -> list[list[float]]:
+    """Edges of the cells along every state: between them lies the initial set."""
+    low = np.nextafter(engine.centres - engine.radii, -np.inf)
+    high = np.nextafter(engine.centres + engine.radii, np.inf)
+    result = []
+    for j in range(engine.n):
+        centres = np.unique(engine.centres[:, j])
+        first, last = low[:, j].min(), high[:, j].max()
+        result.append([float(first), *((centres[1:] + centres[:-1]) / 2).tolist(), float(last)])
+    return result
+
+
+def _cells_along(engine: Linearisation) -> int:
+    return max(len(np.unique(engine.centres[:, j])) for j in range(engine.n))
+
+
+# ---- the proof's numbers -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Stated:
+    """Levels of the inner rows, boxes of the remainder, and what they prove."""
+
+    levels: Array
+    bounds: tuple[Array, Array]
+    events: list[Events]
+    log_probability: float
+
+
+def _events(run: LinearRun, cell: int, shared: float) -> Events:
+    engine = run.engine
+    if isinstance(engine.system, ContinuousSystem):
+        return WindowEvents(engine.response, cell, max(1, round(_WINDOW / engine.step)), shared)
+    return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
+
+
+def _state(run: LinearRun, log_nonlinear: float, pad: float) -> _Stated | None:
+    """Levels that cost exp(log_nonlinear), boxes that prove themselves with room to spare, the probability."""
+    cells, pieces, count = run.rows.shape[:3]
+    levels = np.zeros((cells, pieces, count))
+    share = log_nonlinear + math.log(0.9 / (2 * max(count, 1)))
+    events, spent = [], []
+    for cell in range(cells):
+        own = _events(run, cell, log_nonlinear + (math.log(0.1) if count else 0.0))
+        logs = [own.shared_log]
+        for d in range(count):
+            event = own.along(run.rows[cell, :, d])
+            if event.profile.max() > 0:
+                levels[cell, :, d] = level_scale(event, event.profile, share) * event.profile
+            logs.append(math.log(2.0) + event.log_exceedance(levels[cell, :, d]))
+        events.append(own)
+        spent.append(logs)
+    if not np.isfinite(levels).all():
+        return None
+    bounds = _boxes(run, levels, pad)
+    if bounds is None:
+        return None
+    worst = -np.inf
+    for cell, own in enumerate(events):
+        rooms = run.rooms(cell, bounds)
+        asked = [own.along(r.rows).log_exceedance(rooms[:, i]) for i, r in enumerate(run.requirements[cell])]
+        worst = max(worst, logsumexp(np.array([*spent[cell], *asked])))
+    return _Stated(levels=levels, bounds=bounds, events=events, log_probability=float(min(worst, 0.0)))
+
+
+def _boxes(run: LinearRun, levels: Array, pad: float) -> tuple[Array, Array] | None:
+    """Boxes B of beta such that beta over what B implies lies in B with a margin of half the padding."""
+    engine = run.engine
+    found = run.include(levels, 2)
+    if found is None:
+        return None
+    shape = found[0].shape
+    extra = run.extra.reshape(shape[0] * shape[1], *run.extra.shape[2:])
+    low, high = _padded(found, pad)
+    for _ in range(_ROUNDS):
+        reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(run.supports, low, high, strict=True)]
+        if not all(np.isfinite(part).all() for pair in reach for part in pair):
+            return None
+        bound = engine.model.bound(engine.frame, *run.polytope(levels, reach), extra, 2)
+        inner = bound[0].reshape(shape), bound[1].reshape(shape)
+        if not all(np.isfinite(part).all() for part in inner):
+            return None
+        needed = _padded(inner, pad / 2)
+        if np.all(needed[0] >= low) and np.all(needed[1] <= high):
+            return low, high
+        wider = _padded(inner, pad)
+        low, high = np.minimum(low, wider[0]), np.maximum(high, wider[1])
+    return None
+
+
+def _padded(bounds: tuple[Array, Array], pad: float) -> tuple[Array, Array]:
+    low, high = bounds
+    size = np.maximum(np.abs(low), np.abs(high))
+    room = pad * (high - low) + 1e-9 * size + pad * 1e-11
+    return low - room, high + room
+
+
+# ---- the data ----------------------------------------------------------------------------------------------
+
+
+def _data(problem: Problem, run: LinearRun, stated: _Stated) -> dict[str, Any]:
+    engine, tape = run.engine, problem.closed_loop
+    q = len(engine.d_middle)
+    varying = _varying(tape, range(1, engine.n + 1))
+    moving = _varying(tape, range(len(tape.inputs) - q, len(tape.inputs)))
+    units = [int(j) for j in engine.model.active]
+    windows = stated.events[0].bounds if isinstance(stated.events[0], WindowEvents) else None
+    return {
+        "engine": "linear",
+        "splits": exact(_edges(engine)),
+        "pieces": engine.pieces,
+        "varying": [list(entry) for entry in varying],
+        "moving": [list(entry) for entry in moving],
+        "units": units,
+        "windows": None if windows is None else [int(k) for k in windows[:-1]],
+        "cells": [
+            _cell(problem, run, stated, cell, varying=varying, moving=moving) for cell in range(len(engine.centres))
+        ],
+    }
+
+
+def _cell(
+    problem: Problem, run: LinearRun, stated: _Stated, cell: int, *, varying: list[tuple[int, int]],
+    moving: list[tuple[int, int]],
+) -> dict[str, Any]:
+    engine = run.engine
+    slope, drift, gain = (part[cell] for part in engine.slopes)
+    events = stated.events[cell]
+    active = engine.model.active
+    extra = run.rows[cell][:, len(active) :][..., active]
+
+    def chosen(matrices: Array, entries: list[tuple[int, int]]) -> Any:
+        return exact([[float(m[i, j]) for i, j in entries] for m in matrices])
+
+    return {
+        "nominal": exact(engine.controls[cell] if engine.continuous else engine.nodes[cell]),
+        "slopes": chosen(slope, varying),
+        "drifts": chosen(drift, varying) if engine.continuous else None,
+        "gains": chosen(gain, moving),
+        "remainder_low": exact(stated.bounds[0][cell]),
+        "remainder_high": exact(stated.bounds[1][cell]),
+        "rows": exact(extra),
+        "levels": exact(stated.levels[cell]),
+        "window_levels": exact(events.coordinate_levels) if isinstance(events, WindowEvents) else None,
+        "frames": _frames(problem, run, stated, cell, varying),
+        "separations": _separations(problem, run, cell),
+    }
+
+
+def _varying(tape: Tape, columns: range) -> list[tuple[int, int]]:
+    """Entries of the derivative that depend on an input, row by row."""
+    if not columns:
+        return []
+    derivative = jacobian(tape, list(columns))
+    depends: list[bool] = []
+    for node in derivative.nodes:
+        depends.append(node.op == "input" or any(depends[arg] for arg in node.args))
+    return [divmod(o, len(columns)) for o, node in enumerate(derivative.outputs) if depends[node]]
+
+
+def _frames(
+    problem: Problem, run: LinearRun, stated: _Stated, cell: int, varying: list[tuple[int, int]]
+) -> list[list[int] | None]:
+    """Rows in which each output's Hessian costs least as they stand (None: the coordinates themselves)."""
+    engine = run.engine
+    active = [int(j) for j in engine.model.active]
+    result: list[list[int] | None] = [None] * engine.n
+    if run.extra.shape[2] == 0:
+        return result
+    hessians = _hessians(problem, engine, cell, active)
+    rows = run.rows[cell][..., active]
+    widths = _widths(run, stated, cell)
+    for i in range(engine.n):
+        own = [active.index(j) for o, j in varying if o == i]
+        if len(own) != len(active):
+            continue
+        best = math.inf
+        for choice in itertools.combinations(range(rows.shape[1]), len(active)):
+            cost = _cost(rows[:, choice], hessians[:, i], widths[:, choice])
+            if cost < best:
+                best, result[i] = cost, [int(row) for row in choice]
+        if result[i] == list(range(len(active))):
+            result[i] = None
+    return result
+
+
+def _cost(rows: Array, hessian: Array, width: Array) -> float:
+    """Mean size of sum |T' H T|_ab w_a w_b for s = T sigma; inf where the rows are nearly dependent."""
+    scaled = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-300)
+    if np.abs(np.linalg.det(scaled)).min() < 1e-3:
+        return math.inf
+    turn = np.linalg.inv(rows)
+    turned = np.abs(np.swapaxes(turn, -1, -2) @ hessian @ turn)
+    return float(np.einsum("kab,ka,kb->", turned, width, width))
+
+
+def _widths(run: LinearRun, stated: _Stated, cell: int) -> Array:
+    reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(run.supports, *stated.bounds, strict=True)]
+    low, high = run.polytope(stated.levels, reach)
+    pieces = run.engine.pieces
+    return np.asarray((high - low)[cell * pieces : (cell + 1) * pieces] / 2)
+
+
+def _hessians(problem: Problem, engine: Linearisation, cell: int, active: list[int]) -> Array:
+    """Second derivatives by the active states at the pieces' starts: (pieces, outputs, active, active)."""
+    columns = [j + 1 for j in active]
+    function = compile_numpy(jacobian(jacobian(problem.closed_loop, columns), columns))
+    x = engine.nodes[cell][: engine.pieces]
+    slots = [engine.times[: engine.pieces], *x.T, *engine.inputs.T, *(np.full(len(x), d) for d in engine.d_middle)]
+    with np.errstate(all="ignore"):
+        values = np.asarray(function(*slots))
+    return np.nan_to_num(values.reshape(len(x), engine.n, len(active), len(active)))
+
+
+def _separations(problem: Problem, run: LinearRun, cell: int) -> list[Any]:
+    """For every obstacle the direction that keeps it off on each piece; null for other constraints."""
+    found: list[Any] = []
+    for number, constraint in enumerate(problem.safe):
+        rows = [r.rows for r in run.requirements[cell] if r.constraint == number]
+        found.append(_separation(constraint, rows[0]) if _needs_direction(constraint) else None)
+    return found if problem.domain is None else [*found, None]
+
+
+def _needs_direction(constraint: Inside) -> bool:
+    return isinstance(constraint, Outside) and not isinstance(constraint.region, HalfSpace)
+
+
+def _separation(constraint: Inside, rows: Array) -> Any:
+    region: Region = constraint.region
+    states = list(range(rows.shape[1]) if region.coordinates is None else region.coordinates)
+    if isinstance(region, (Ball, Ellipsoid)):
+        return exact(-rows[:, states])
+    faces, _ = region.halfspaces()
+    distance = np.abs(faces[None] + rows[:, None, states]).sum(axis=-1)
+    return [int(face) for face in np.argmin(distance, axis=1)]
