@@ -337,5 +337,5 @@ def _one(response: LinearResponse, cell: int) -> LinearResponse:
         step=response.step, slope=response.slope[chosen], drift=response.drift[chosen],
         transition=response.transition[chosen], transition_error=response.transition_error[chosen],
         deviation=response.deviation[chosen], covariance=response.covariance[chosen],
-        covariance_error=response.covariance_error[chosen],
+        covariance_error=response.covariance_error[chosen], slope_error=response.slope_error,
     )

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.systems import ContinuousSystem
+from certbound.reach.clocks import ClockEvents, SteadyEvent
 from certbound.reach.directions import Requirement, requirements
 from certbound.reach.events import StepEvent, StepEvents, WindowEvent, WindowEvents, logsumexp
 from certbound.reach.inclusion import Supports
@@ -23,8 +25,8 @@ from certbound.reach.linearisation import Linearisation
 __all__ = ["LinearRun", "Outcome", "level_scale"]
 
 Array = NDArray[np.float64]
-Event = StepEvent | WindowEvent
-Events = StepEvents | WindowEvents
+Event = StepEvent | WindowEvent | SteadyEvent
+Events = StepEvents | ClockEvents
 _LOG = logging.getLogger(__name__)
 
 _GUESSES = 30
@@ -78,6 +80,7 @@ class LinearRun:
                 np.diag(engine.radii[cell])[engine.radii[cell] > 0], continuous=engine.continuous,
             ))
         self.inner = self.rows.shape[2]
+        self.memory: dict[int, dict[bytes, Any]] = {}
 
     def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
         """Bounds of s = y + Z + R along the inner rows over all pieces: (B N, D)."""
@@ -150,11 +153,12 @@ class LinearRun:
 
     # ---- probabilities -----------------------------------------------------------------------------------
 
-    def events(self, cell: int, shared_log: float) -> StepEvents | WindowEvents:
+    def events(self, cell: int, shared_log: float) -> Events:
         """Scalar events of one cell; ``shared_log`` is the log probability that they may share."""
         engine = self.engine
         if isinstance(engine.system, ContinuousSystem):
-            return WindowEvents(engine.response, cell, max(1, round(_WINDOW / engine.step)), shared_log)
+            windows = WindowEvents(engine.response, cell, max(1, round(_WINDOW / engine.step)), shared_log)
+            return ClockEvents(windows, engine.diffusion, self.memory.setdefault(cell, {}))
         return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
 
     def levels(self, log_nonlinear: float) -> tuple[Array, list[Events]]:

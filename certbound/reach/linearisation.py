@@ -183,14 +183,19 @@ class Linearisation:
         """Entrywise bound of |Jhat - its floats|: the model's constant entries need not be floats."""
         return float(self.model.constant_slope.rad.max(initial=0.0))
 
+    @property
+    def diffusion(self) -> Array:
+        """g of a continuous-time problem (0 without noise)."""
+        assert isinstance(self.system, ContinuousSystem)
+        return np.asarray(self.system.diffusion, dtype=float) * (1.0 if self.noise else 0.0)
+
     @cached_property
     def response(self) -> LinearResponse:
         """Linear data of all cells."""
         slope, drift, _ = self.slopes
         start = self.start_covariance
         if isinstance(self.system, ContinuousSystem):
-            g = np.asarray(self.system.diffusion, dtype=float)
-            return continuous_response(slope, drift, self.step, g if self.noise else 0 * g, start,
+            return continuous_response(slope, drift, self.step, self.diffusion, start,
                                        slope_error=self.slope_error)
         g = np.asarray(self.system.noise_matrix, dtype=float)
         proxy = np.asarray(self.system.noise.proxy, dtype=float) * (1.0 if self.noise else 0.0)

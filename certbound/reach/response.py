@@ -61,6 +61,8 @@ class LinearResponse:
         Entrywise bound of |Phi(t, s) - I| for s <= t in one piece (0 in discrete time).
     covariance, covariance_error : ndarray, shape (B, N + 1, n, n)
         V and W with -W <= V_exact - V <= W as quadratic forms.
+    slope_error : float
+        Entrywise bound of the exact slope minus its floats.
     """
 
     step: float
@@ -71,6 +73,7 @@ class LinearResponse:
     deviation: Array
     covariance: Array
     covariance_error: Array
+    slope_error: float = 0.0
 
     @property
     def pieces(self) -> int:
@@ -187,7 +190,7 @@ def continuous_response(
     v, w = _propagate(transition, error, noise, noise_error, start)
     return LinearResponse(
         step=step, slope=slope, drift=drift, transition=transition, transition_error=error,
-        deviation=deviation, covariance=v, covariance_error=w,
+        deviation=deviation, covariance=v, covariance_error=w, slope_error=slope_error,
     )
 
 
@@ -202,7 +205,7 @@ def discrete_response(
     zero = np.zeros_like(slope)
     return LinearResponse(
         step=1.0, slope=slope, drift=zero, transition=slope, transition_error=none,
-        deviation=zero, covariance=v, covariance_error=w,
+        deviation=zero, covariance=v, covariance_error=w, slope_error=slope_error,
     )
 
 

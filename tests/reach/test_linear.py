@@ -18,7 +18,8 @@ def oscillator(sigma: float = 0.1, cubic: float = 0.3, **changes: object) -> cb.
     system = cb.ContinuousSystem(
         lambda t, x: [x[1], -x[0] - x[1] - cubic * x[0] ** 3], states=["q", "v"], diffusion=np.diag([0.0, sigma])
     )
-    given = dict(initial=[0.4, 0.0], safe=[cb.Inside(cb.Box([-2.0, -2.0], [2.0, 2.0]))], horizon=3.0, delta=1e-2)
+    box = cb.Box([-2.0, -2.0], [2.0, 2.0])
+    given = {"initial": [0.4, 0.0], "safe": [cb.Inside(box)], "horizon": 3.0, "delta": 1e-2}
     return cb.Problem(system, **{**given, **changes})  # type: ignore[arg-type]
 
 
@@ -85,9 +86,10 @@ def test_the_remainder_bound_contains_the_remainder_at_random_points() -> None:
         s = s[((along <= high[k, 3:]) & (along >= low[k, 3:])).all(axis=1)]
         theta = rng.uniform(0, 1, (len(s), 1))
         b = controls[k]
-        p = (1 - theta) ** 3 * b[0] + 3 * theta * (1 - theta) ** 2 * b[1] + 3 * theta**2 * (1 - theta) * b[2] + theta**3 * b[3]
+        rest = 1 - theta
+        p = rest**3 * b[0] + 3 * theta * rest**2 * b[1] + 3 * theta**2 * rest * b[2] + theta**3 * b[3]
         speed = 3 / h * (
-            (1 - theta) ** 2 * (b[1] - b[0]) + 2 * theta * (1 - theta) * (b[2] - b[1]) + theta**2 * (b[3] - b[2])
+            rest**2 * (b[1] - b[0]) + 2 * theta * rest * (b[2] - b[1]) + theta**2 * (b[3] - b[2])
         )
         d = rng.uniform(-0.1, 0.1, len(s))
         jacobian = slope[0, k] + h * theta[:, :, None] * drift[0, k]
