@@ -62,6 +62,9 @@ NO_START = Start()
 SHARES = (1.15, 1.6, 2.4, 4.0)
 """Room tried with local constants, in units of the tube at the target probability."""
 NEAR_MISS = 2.0
+"""Metrics of their own for the constraints are tried where the tube takes at most so many times the room."""
+QUICK_BUDGET = 1000
+"""Boxes spent on global constants when another engine has proved SAFE already."""
 
 
 def constants_engine(
@@ -120,9 +123,12 @@ def constants_engine(
 
 def _proposals(problem: Problem, *, quick: bool) -> Iterator[Constants]:
     """Certified global constants: Euclidean first, then in the metric that the erosion asks for."""
+    if quick:
+        yield bound_constants(problem, metric="euclidean", budget=QUICK_BUDGET)
+        return
     euclidean = bound_constants(problem, metric="euclidean")
     yield euclidean
-    if problem.system.dimension == 1 or quick:
+    if problem.system.dimension == 1:
         return
     proposed = bound_constants(problem, objective="erosion")
     if proposed.metric is not None:
@@ -151,7 +157,7 @@ class _Work:
         erosion = erode(reach, self.problem, reach.norm)
         start = random_start(self.problem, constants)
         if start != NO_START:
-            constants = replace(constants, effective_dimension=float(constants.dimension))
+            constants = constants.with_full_dimension()
         answer = EngineAnswer(reach=reach, constants=constants, method=self.name, assumption=_assumption(constants))
         refused = self._refused(reach, erosion, answer)
         if refused is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -130,11 +130,18 @@ class Constants:
     def fingerprint(self) -> str:
         """Digest of every number that a proof speaks of."""
         digest = hashlib.sha256()
-        for name in ("rate", "gain", "sigma", "dimension", "effective_dimension", "metric", "isotropic", "gaussian", "times"):
+        for name in _PROVED:
             value = getattr(self, name)
             content = b"" if value is None else np.asarray(value, dtype=np.float64).tobytes()
             digest.update(f"{name}:{len(content)}:".encode() + content)
         return digest.hexdigest()
+
+    def with_full_dimension(self) -> Constants:
+        """The same constants with nu = n, which a smaller nu implies: a proof goes on to vouch for them."""
+        full = replace(self, effective_dimension=float(self.dimension), proof=None)
+        if self.proof is None or not self.certified:
+            return full
+        return replace(full, proof=replace(self.proof, fingerprint=full.fingerprint))
 
     @property
     def gap(self) -> float | None:
@@ -143,6 +150,9 @@ class Constants:
             return None
         value = self.rate if self.rate is not None else self.gain
         return float(np.max(np.asarray(value)) - self.proof.sampled)
+
+
+_PROVED = ("rate", "gain", "sigma", "dimension", "effective_dimension", "metric", "isotropic", "gaussian", "times")
 
 
 def _frozen(array: Array) -> Array:
