@@ -35,7 +35,7 @@ def common() -> np.ndarray:
     )[0]  # fmt: skip
 
 
-def test_one_common_metric_erodes_less_than_the_trial_on_the_chain(common):
+def test_one_common_metric_keeps_the_erosions_of_the_chain_small(common):
     constants = cb.bound_constants(cb.load("chain_rest"), metric=common)
     erosion = cb.tune_tube(constants, horizon=50, delta=0.002).extent(DIRECTIONS, 50)
     assert constants.certified
@@ -51,7 +51,7 @@ def test_the_bundled_plan_is_kept_with_one_common_metric():
 
 
 @pytest.mark.slow
-def test_a_metric_per_constraint_erodes_less_than_the_trial_on_the_chain():
+def test_a_metric_per_constraint_keeps_each_erosion_of_the_chain_small():
     problem = cb.load("chain_rest")
     constants = cb.bound_metrics(problem)
     tubes = [cb.tune_tube(k, horizon=50, delta=0.0005) for k in constants]
