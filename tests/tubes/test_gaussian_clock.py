@@ -10,6 +10,7 @@ from certbound.tubes.gaussian import (
     log_tail,
     markov_clock,
 )
+from certbound.tubes.gaussian_clock import group_windows
 
 LN10 = np.log(10.0)
 
@@ -61,6 +62,25 @@ def test_the_clock_dominates_the_decorrelation_between_all_pairs_of_times():
         gap = ahead[None, :] - ahead[:, None]
         later = times[None, :] > times[:, None]
         assert np.all(gap[later] >= -np.log(corr[later]))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_lines_of_all_windows_lie_below_the_boundary(seed):
+    rng = np.random.default_rng(seed)
+    clock = np.concatenate([[0], np.cumsum(rng.uniform(0.001, 0.2, 60))])
+    left = rng.uniform(2, 6) + np.cumsum(rng.normal(0, 0.1, 60)) + rng.uniform(0, 0.5, 60)
+    right = np.maximum(left + rng.normal(0, 0.1, 60), 0.1)
+    lines = group_windows(clock, left, right, span=0.4)
+    assert 10 < len(lines.first) < 60
+    for first, span, start, stop in zip(lines.first, lines.spans, lines.starts, lines.stops):
+        begin, end = clock[first], clock[first] + span
+        for k in np.flatnonzero((clock[:-1] >= begin - 1e-12) & (clock[1:] <= end + 1e-12)):
+            # levels of chords: q(x) = (q0 sinh(d - x) + q1 sinh(x))/sinh(d)
+            x = np.linspace(clock[k], clock[k + 1], 5)
+            d = clock[k + 1] - clock[k]
+            chord = (left[k] * np.sinh(clock[k + 1] - x) + right[k] * np.sinh(x - clock[k])) / np.sinh(d)
+            line = (start * np.sinh(end - x) + stop * np.sinh(x - begin)) / np.sinh(span)
+            assert np.all(line <= chord + 1e-12)
 
 
 def test_slepian_bounds_simulated_oscillator_velocities():

@@ -43,6 +43,12 @@ def test_pieces_without_noise_move_the_level():
     assert linear_exceedance(1.0, 1.0, 0.0, 1.0) == -np.inf
 
 
+def test_a_level_that_dips_while_the_noise_rests_is_charged_at_its_lowest():
+    # the noise of the first second is multiplied by e and back before more noise comes
+    dip = linear_exceedance([1.0] * 4, [0.0, 1.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.01], 3 * np.e)
+    assert float(log_tail(3.0)) / LN10 <= dip <= float(log_tail(3.0)) / LN10 + 0.02
+
+
 def test_random_scalar_equations_are_never_exceeded_more_often_than_bounded():
     rng = np.random.default_rng(7)
     ratios = []

@@ -115,18 +115,17 @@ def test_an_empty_strip_has_probability_zero():
     assert log_between([1.0, 2.0, np.inf, -np.inf], [1.0, 1.0, np.inf, -np.inf]).tolist() == [-np.inf] * 4
 
 
-CASES = [
-    (a, b, rho)
-    for a, b in [(3.0, 3.0), (3.0, 3.2), (4.0, 3.9), (-1.0, 0.5), (0.0, 6.0), (8.0, 7.5), (20.0, 20.1), (30.0, 29.0)]
-    for rho in (-0.999, -0.5, -1e-6, 0.0, 1e-4, 0.6, 0.95, 0.9999, 1 - 1e-8)
-]
+LEVELS = [(0.03, -0.02), (3.0, 3.0), (3.0, 3.2), (4.0, 3.9), (-1.0, 0.5), (0.0, 6.0), (8.0, 7.5), (20.0, 20.1)]
+CORRELATIONS = (-0.999999, -0.999, -0.5, -1e-6, 0.0, 1e-4, 0.6, 0.95, 0.9999, 1 - 1e-8)
+CASES = [(a, b, rho) for a, b in [*LEVELS, (30.0, 29.0)] for rho in CORRELATIONS]
 
 
 @pytest.mark.parametrize(("a", "b", "rho"), CASES)
 def test_pair_probabilities_are_bounded_from_above_within_a_thousandth(a, b, rho):
     got = float(log_below_above(a, b, rho))
     exact = log_pair_exact(a, b, rho, got)
-    assert -1e-14 * (1 + abs(got)) < got - exact < 1e-5 * (1 + 1e-6 * abs(got))
+    excess = 1e-3 if rho < -0.9999 else 1e-5
+    assert -1e-14 * (1 + abs(got)) < got - exact < excess * (1 + 1e-6 * abs(got))
 
 
 def test_closed_forms_are_met_at_the_special_correlations():
