@@ -1,0 +1,130 @@
+"""``certbound simulate``: one JSON object, reproducible counts, and every malformed input refused with exit code 2."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from certbound.cli.app import run
+
+KEYS = {
+    "paths", "exits", "probability", "lower", "upper", "confidence", "path_steps_per_second", "seconds",
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _kernel_cache(request: pytest.FixtureRequest):
+    folder = Path(request.config.cache.mkdir("kernels"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CERTBOUND_CACHE", str(folder))
+        yield
+
+
+def answer(capsys, *words, code=0):
+    """The JSON object that a command printed."""
+    assert run(["simulate", *words, "--json"]) == code
+    return json.loads(capsys.readouterr().out)
+
+
+def refusal(capsys, *words):
+    """The message of a refused command, which printed nothing else."""
+    assert run(["simulate", *words]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert len(printed.err.splitlines()) == 3
+    return printed.err
+
+
+def test_the_json_object_has_the_keys_of_the_contract(capsys):
+    found = answer(capsys, "ou", "--paths", "2e3", "--seed", "1", "--set", "radius=0.8")
+    assert set(found) >= KEYS
+    assert found["paths"] == 2000
+    assert found["lower"] <= found["probability"] == found["exits"] / 2000 <= found["upper"]
+    assert found["confidence"] == 0.99
+    assert found["steps"] == 1000
+
+
+def test_a_seed_gives_the_same_counts_and_another_gives_others(capsys):
+    words = ("ou", "--paths", "5000", "--set", "radius=0.6", "--step", "0.05")
+    first, second, other = (answer(capsys, *words, "--seed", seed)["exits"] for seed in ("1", "1", "2"))
+    assert first == second != other
+    assert answer(capsys, *words)["paths"] == 5000
+
+
+def test_a_step_is_a_number_of_steps(capsys):
+    assert answer(capsys, "ou", "--paths", "10", "--step", "0.3")["steps"] == 17
+    assert answer(capsys, "ou", "--paths", "10", "--step", "0.005")["steps"] == 1000
+    assert answer(capsys, "ou", "--paths", "10", "--horizon", "2", "--step", "0.1")["steps"] == 20
+
+
+def test_rare_exits_come_with_a_standard_error(capsys):
+    found = answer(capsys, "ou", "--paths", "5e3", "--seed", "1", "--rare", "--step", "0.05")
+    assert set(found) >= KEYS | {"standard_error"}
+    assert 0 < found["standard_error"] < found["probability"] < 1e-3
+
+
+def test_text_for_people_tells_what_is_refuted(capsys):
+    assert run(["simulate", "ou", "--paths", "2000", "--seed", "1", "--set", "radius=0.8"]) == 0
+    text = capsys.readouterr().out
+    assert "exit probability" in text
+    assert "of 2000 paths left, 1000 steps of the exact scheme" in text
+    assert "is refuted; the smallest delta supported is" in text
+
+
+@pytest.mark.parametrize(("claim", "code"), [(-1, 1), (-0.5, 0), ("-0x1.0p+0", 1)])
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_certificate_is_contradicted_or_not(tmp_path, capsys, claim, code, nested):
+    path = tmp_path / "cert.json"
+    content = {"log10_delta": claim}
+    path.write_text(json.dumps({"claim": content} if nested else content))
+    words = ("ou", "--paths", "5000", "--seed", "1", "--set", "radius=0.8", "--against", str(path))
+    found = answer(capsys, *words, code=code)
+    assert found["against"]["contradicted"] is bool(code)
+    assert run(["simulate", *words]) == code
+    word = "the simulation contradicts" if code else "does not contradict"
+    assert word in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"log10_delta": 3}', '{"log10_delta": "nan"}', "[" * 100_000])
+def test_a_file_that_is_no_certificate_is_refused(tmp_path, capsys, content):
+    path = tmp_path / "cert.json"
+    path.write_text(content)
+    assert "verify --certificate" in refusal(capsys, "ou", "--paths", "10", "--against", str(path))
+
+
+def test_a_checkpoint_is_continued_with_its_own_seed(tmp_path, capsys):
+    words = ("ou", "--paths", "3000", "--set", "radius=0.8", "--checkpoint", str(tmp_path / "run.npz"))
+    assert answer(capsys, *words)["exits"] == answer(capsys, *words)["exits"]
+    assert "belongs to another seed" in refusal(capsys, *words, "--seed", "77")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("ou", "--paths", "0"), "`paths` must be a positive whole number"),
+        (("ou", "--paths", "-5"), "`paths` must be a positive whole number"),
+        (("ou", "--paths", "1.5"), "must be a whole number"),
+        (("ou", "--paths", "nan"), "must be a finite number"),
+        (("ou", "--paths", "10", "--seed", "-1"), "`--seed` must not be negative"),
+        (("ou", "--paths", "10", "--step", "0"), "`--step` must lie in (0, 5]"),
+        (("ou", "--paths", "10", "--step", "9"), "`--step` must lie in (0, 5]"),
+        (("ou", "--paths", "10", "--step", "1e-12"), "`steps` must be at most"),
+        (("chain", "--paths", "10", "--step", "1"), "`--step` has no meaning in discrete time"),
+        (("ou", "--paths", "10", "--confidence", "1"), "`confidence` must lie in (0, 1)"),
+        (("ou", "--paths", "10", "--set", "speed=1"), "speed"),
+        (("no_such_problem", "--paths", "10"), "no_such_problem"),
+        (("ou", "--paths", "10", "--checkpoint", "/nowhere/at/all"), "does not exist"),
+        (("ou", "--paths", "10", "--against", "/nowhere/at/all"), "No such file"),
+    ],
+)
+def test_malformed_input_is_refused(capsys, words, message):
+    assert message in refusal(capsys, *words)
+
+
+def test_a_scheduler_that_is_not_there_is_refused(capsys, monkeypatch):
+    pytest.importorskip("distributed", reason="needs the extra `cluster` (dask[distributed])")
+    from certbound.simulation import executors
+
+    monkeypatch.setattr(executors.connect, "__defaults__", (0.5,))
+    message = refusal(capsys, "ou", "--paths", "10", "--cluster", "tcp://127.0.0.1:9")
+    assert "must be the address of a running dask scheduler" in message
