@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -68,7 +69,7 @@ def cosh_epsilon() -> float:
 def lemma_3() -> tuple[float, float]:
     """M = 0, 0, 1 with a = -1, b = 1: the bound on P(M_t > 1/2 for some t), and the truth."""
     values, a, b = [0.0, 0.0, 1.0], -1.0, 1.0
-    assert all(following <= a * value + b for value, following in zip(values, values[1:]))
+    assert all(following <= a * value + b for value, following in itertools.pairwise(values))
     phi = [a * a, a, 1.0]
     bound = (values[0] * phi[0] + b * phi[1] + b * phi[2]) / 0.5
     return bound, float(max(values) > 0.5)
