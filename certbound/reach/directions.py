@@ -101,11 +101,11 @@ def _constraint(constraint: Inside, curve: NominalPieces) -> Rows:
         if isinstance(region, Ball | Ellipsoid):
             yield from _inside_round(region, label, curve)
             return
-        a, b = region.halfspaces()
-        for index in range(len(b)):
+        a, b = _facets(region, curve)
+        for index in range(len(a)):
             rows = np.broadcast_to(a[index], (curve.pieces, a.shape[1])).copy()
-            text = label if len(b) == 1 else f"{label} [side {index + 1}]"
-            yield text, rows, curve.least(rows, Interval.point(np.full(curve.pieces, b[index])))
+            text = label if len(a) == 1 else f"{label} [side {index + 1}]"
+            yield text, rows, curve.least(rows, b[:, index])
     elif isinstance(region, HalfSpace):
         rows = np.broadcast_to(-region.normal, (curve.pieces, len(region.normal))).copy()
         yield label, rows, curve.least(rows, Interval.point(np.full(curve.pieces, -region.bound)))
@@ -117,23 +117,36 @@ def _constraint(constraint: Inside, curve: NominalPieces) -> Rows:
 
 def _outside_facet(region: Box | Polytope, label: str, curve: NominalPieces) -> tuple[str, Array, Array]:
     """The facet that the piece keeps farthest away from."""
-    a, b = region.halfspaces()
+    a, b = _facets(region, curve)
+    if not len(a):
+        raise ValueError(f"`safe` must not keep outside all states ({label}); give the box a finite side.")
     norms = np.linalg.norm(a, axis=1)
     middle = curve.controls.mean(axis=1)
-    best = np.argmax((middle @ a.T - b) / norms, axis=1)
+    best = np.argmax((middle @ a.T - b.mid) / norms, axis=1)
     rows = -a[best]
-    return label, rows, curve.least(rows, Interval.point(-b[best]))
+    return label, rows, curve.least(rows, -b[np.arange(curve.pieces), best])
 
 
-def _centre(region: Ball | Ellipsoid, curve: NominalPieces) -> Interval:
+def _facets(region: Box | HalfSpace | Polytope, curve: NominalPieces) -> tuple[Array, Interval]:
+    """Rows (F, n) over all states and bounds (N, F) with the set equal to {rows . x <= bounds} on every piece."""
+    a, b = region.halfspaces()
+    rows = _embed(region, a, curve.controls.shape[2])
+    bounds = Interval.point(np.broadcast_to(b, (curve.pieces, len(b))))
+    if region.center is None:
+        return rows, bounds
+    centre = _centre(region, curve)
+    return rows, bounds + (Interval.point(a)[None] * centre[:, None, :]).sum(axis=-1)
+
+
+def _centre(region: Ball | Ellipsoid | Box | HalfSpace | Polytope, curve: NominalPieces) -> Interval:
     """Enclosure of the centre over each piece: shape (N, k)."""
     if isinstance(region.center, Tape):
         values = enclose(region.center, [curve.span()])
         return values.broadcast_to((curve.pieces, values.shape[-1]))
-    return Interval.point(np.broadcast_to(region.center, (curve.pieces, len(region.center))))
+    return Interval.point(np.broadcast_to(region.center_at(), (curve.pieces, region.dimension)))
 
 
-def _embed(region: Ball | Ellipsoid, rows: Array, dimension: int) -> Array:
+def _embed(region: Ball | Ellipsoid | Box | HalfSpace | Polytope, rows: Array, dimension: int) -> Array:
     coordinates = range(dimension) if region.coordinates is None else region.coordinates
     full = np.zeros((len(rows), dimension))
     full[:, list(coordinates)] = rows
