@@ -138,7 +138,7 @@ def simulate_exits(
     >>> import certbound as cb
     >>> problem = cb.load("ou", radius=0.8)
     >>> result = cb.simulate_exits(problem, paths=20000, rng=np.random.default_rng(1))
-    >>> bool(result.lower < 0.15 < result.upper), result.paths
+    >>> bool(result.lower < 0.136 < result.upper), result.paths
     (True, 20000)
     """
     paths, confidence = check_count("paths", paths), check_confidence(confidence)
