@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from certbound._version import __version__
-from certbound.cli import derive, doctor, new, problems, simulate, synthesize, tune, verify
+from certbound.cli import check, derive, doctor, new, problems, simulate, synthesize, tune, verify
 from certbound.cli.messages import BAD_INPUT, INTERRUPTED, explain, write_error
 from certbound.cli.output import SETTINGS, logging_to_stderr
 
@@ -45,7 +45,7 @@ def _global_options(
         raise typer.Exit(BAD_INPUT)
 
 
-for _command in (verify, derive, tune, synthesize, simulate, problems, new, doctor):
+for _command in (verify, derive, tune, synthesize, simulate, check, problems, new, doctor):
     _command.register(app)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import shlex
 import sys
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from certbound.cli.check import proved_certificate
 from certbound.cli.describe import describe_constants, describe_deviation, log10_text
 from certbound.cli.messages import InputError
 from certbound.cli.options import (
@@ -25,7 +25,8 @@ from certbound.cli.options import (
     integer,
     load_problem,
 )
-from certbound.cli.output import SETTINGS, console, plain, print_json, spinner, write_file
+from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
+from certbound.errors import CertificateError
 
 if TYPE_CHECKING:
     from certbound.plotting import Scene
@@ -125,7 +126,7 @@ def _write(
     problem: Problem, verdict: Verdict, *, certificate: Path | None, report: Path | None, plot: Path | None
 ) -> None:
     if certificate is not None:
-        write_file(certificate, json.dumps(plain(verdict.certificate), indent=1) + "\n")
+        _certify(problem, verdict, certificate)
     if plot is None and report is None:
         return
     scene = _scene(problem, verdict)
@@ -143,6 +144,19 @@ def _write(
             command = shlex.join(["certbound", *(word for word in sys.argv[1:])])
             probability = log10_text(verdict.log10_delta)
             write_file(report, report_page(scene, verdict, command=command, probability=probability))
+
+
+def _certify(problem: Problem, verdict: Verdict, path: Path) -> None:
+    """Write a certificate that the checker has proved; a verdict without one says why on standard error."""
+    try:
+        with spinner("writing and checking the certificate"):
+            text = proved_certificate(problem, verdict)
+    except CertificateError as error:
+        if verdict.status == "SAFE":
+            raise
+        sys.stderr.write(f"certbound: no certificate was written: {error}\n")
+        return
+    write_file(path, text)
 
 
 def _scene(problem: Problem, verdict: Verdict) -> Scene:

@@ -203,7 +203,12 @@ def _data(problem: Problem, run: LinearRun, stated: _Stated) -> dict[str, Any]:
 
 
 def _cell(
-    problem: Problem, run: LinearRun, stated: _Stated, cell: int, *, varying: list[tuple[int, int]],
+    problem: Problem,
+    run: LinearRun,
+    stated: _Stated,
+    cell: int,
+    *,
+    varying: list[tuple[int, int]],
     moving: list[tuple[int, int]],
 ) -> dict[str, Any]:
     engine = run.engine

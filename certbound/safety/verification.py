@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
+from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.reach.tube import ReachTube
 from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, settled
+from certbound.safety.certificate import certificate_data, certificate_text
 from certbound.safety.contraction import constants_engine
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.linear import linear_engine
@@ -58,8 +61,8 @@ class Verdict:
         The stochastic tube at delta, the noise-free reach tube, the constants (each None where there is none).
     deviation : Deviation or None
         The stochastic deviation at delta as plain bounds per piece.
-    certificate : Any
-        Data of the proof, for writing it to a file; None where the engine writes none.
+    problem : Problem or None
+        What the verdict is about.
     answers : mapping
         What every engine answered, by name.
     """
@@ -75,8 +78,31 @@ class Verdict:
     reach: ReachTube | None = None
     constants: Constants | None = None
     deviation: Deviation | None = None
-    certificate: Any = None
+    problem: Problem | None = field(default=None, repr=False)
     answers: Mapping[str, EngineAnswer] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def certificate(self) -> dict[str, Any] | None:
+        """The proof as data, made when first asked for; None where no probability was bounded.
+
+        `certificate_text` says why in that case.
+        """
+        if self.problem is None:
+            return None
+        try:
+            return certificate_data(self.problem, self)
+        except CertificateError:
+            return None
+
+    def certificate_text(self, problem: Problem, *, attempt: int = 0) -> str:
+        """The proof as the text of a JSON file (docs/certificate.md); a later ``attempt`` spends more effort on it.
+
+        Raises
+        ------
+        CertificateError
+            If no probability was bounded that a certificate could state.
+        """
+        return certificate_text(problem, self, attempt=attempt)
 
     def __bool__(self) -> bool:
         raise TypeError("a Verdict is neither true nor false; compare `.status` with 'SAFE'.")
@@ -168,22 +194,28 @@ def _verdict(problem: Problem, answers: Mapping[str, EngineAnswer]) -> Verdict:
         )
         level = 0.0
     if best.assumption:
-        reason = f"{reason} Assumption: {best.assumption}."
-    others = [f"{other}: {answers[other].reason}" for other in answers if other != name and not safe]
+        reason = f"{_sentence(reason)} Assumption: {best.assumption}."
+    others = [f"By {other}: {_sentence(answers[other].reason)}" for other in answers if other != name and not safe]
     return Verdict(
         status="SAFE" if safe else "UNKNOWN",
         log10_delta=level,
         margin=best.margin,
         time=best.time,
         constraint=best.constraint,
-        reason=" ".join([reason, *others]).strip(),
+        reason=" ".join([_sentence(reason), *others]).strip(),
         method=best.method or name,
         tube=best.tube,
         reach=best.reach,
         constants=best.constants,
         deviation=best.deviation,
+        problem=problem,
         answers=MappingProxyType(dict(answers)),
     )
+
+
+def _sentence(text: str) -> str:
+    """The text with a full stop at its end."""
+    return text if not text or text.endswith((".", "!", "?")) else f"{text}."
 
 
 def _unsafe(problem: Problem, violation: Violation) -> Verdict:
@@ -201,4 +233,5 @@ def _unsafe(problem: Problem, violation: Violation) -> Verdict:
         ),
         method="noise-free trajectory",
         reach=violation.reach,
+        problem=problem,
     )

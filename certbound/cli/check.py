@@ -1,0 +1,111 @@
+"""``certbound check``: prove a certificate again, and that it speaks of a given problem."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certbound.cli.messages import InputError
+from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, load_problem
+from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.errors import SolverError
+
+if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
+    from certbound.safety.verification import Verdict
+
+__all__ = ["proved_certificate", "register"]
+
+ATTEMPTS = 3
+
+CertificateArgument = Annotated[
+    Path, typer.Argument(metavar="CERT", help="The file of verify --certificate.", show_default=False)
+]
+ProblemOption = Annotated[
+    str | None,
+    typer.Option(
+        "--problem", metavar="PROBLEM", help="Prove also that it speaks of this problem.", show_default=False
+    ),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command("check", epilog="Example: certbound check unicycle.json --problem unicycle")(check)
+
+
+def check(
+    certificate: CertificateArgument,
+    problem: ProblemOption = None,
+    pairs: SetOption = None,
+    delta: DeltaOption = None,
+    horizon: HorizonOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Prove every inequality of a certificate again, in ball arithmetic, from the file alone."""
+    from certbound.checker import check_data, read
+
+    started = time.perf_counter()
+    data = read(certificate)
+    given = _stated(problem, pairs, delta, horizon)
+    with spinner(f"checking {certificate.name}"):
+        report = check_data(data, given)
+    result = {
+        "valid": report.valid,
+        "claim": report.claim,
+        "reason": report.reason,
+        "seconds": time.perf_counter() - started,
+    }
+    if as_json:
+        print_json(result)
+    else:
+        _print(result)
+    raise typer.Exit(0 if report.valid else 1)
+
+
+def _stated(
+    problem: str | None, pairs: list[str] | None, delta: float | None, horizon: float | None
+) -> dict[str, Any] | None:
+    """The data of the problem that the certificate must speak of."""
+    if problem is None:
+        if pairs or delta is not None or horizon is not None:
+            raise InputError("`--set`, `--delta` and `--horizon` change a problem, and none is given", "add --problem")
+        return None
+    from certbound.safety.certificate import problem_data
+
+    return problem_data(load_problem(problem, pairs, horizon=horizon, delta=delta))
+
+
+def proved_certificate(problem: Problem, verdict: Verdict) -> str:
+    """The text of a verdict's certificate, which the checker has proved again.
+
+    Raises
+    ------
+    CertificateError
+        If the verdict bounds no probability.
+    SolverError
+        If the checker did not prove what was written, at any effort.
+    """
+    from certbound.checker import check_data, parse
+    from certbound.safety.certificate import problem_data
+
+    reason = ""
+    for attempt in range(ATTEMPTS):
+        text = verdict.certificate_text(problem, attempt=attempt)
+        report = check_data(parse(text), problem_data(problem))
+        if report.valid:
+            return text
+        reason = report.reason
+    raise SolverError(f"the certificate could not be proved again by the checker: {reason}")
+
+
+def _print(result: dict[str, Any]) -> None:
+    screen = console()
+    screen.print("[bold green]VALID[/]" if result["valid"] else "[bold red]NOT PROVED[/]")
+    if SETTINGS.quiet:
+        return
+    screen.print(f"claim: {result['claim']}", markup=False)
+    screen.print(f"{result['reason']}  ({result['seconds']:.1f} s)", markup=False)
