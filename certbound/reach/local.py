@@ -28,7 +28,7 @@ from certbound.reach.slopes import LocalSlopes
 from certbound.reach.tube import ReachTube
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants
-from certbound.tubes.tube import Tube
+from certbound.tubes.tube import Tube, supremum
 from certbound.tubes.tuning import tune_tube
 
 __all__ = ["local_constants", "local_contraction_tube", "local_tube", "radius_over_pieces"]
@@ -41,6 +41,7 @@ INFLATION = 1.03
 GUESSES = 12
 TUBE_INFLATION = 1.1
 SEGMENTS = 48
+SUPREMUM_GAP = 2e-3
 
 
 def local_contraction_tube(
@@ -136,7 +137,9 @@ class _March:
         return None
 
 
-def local_constants(problem: Problem, reach: ReachTube, extra: ArrayLike = 0.0, *, refine: int = 16) -> Constants:
+def local_constants(
+    problem: Problem, reach: ReachTube, extra: ArrayLike = 0.0, *, refine: int = 16, segments: int = SEGMENTS
+) -> Constants:
     """Constants per piece that hold on reach + {||y||_P <= extra}, in the metric of ``reach`` (Thm K4).
 
     Parameters
@@ -148,6 +151,8 @@ def local_constants(problem: Problem, reach: ReachTube, extra: ArrayLike = 0.0, 
         Room for the stochastic deviation on each piece.
     refine : int
         Sub-boxes per piece.
+    segments : int
+        Neighbouring pieces are joined, at their largest values, until so many are left (continuous time).
 
     Raises
     ------
@@ -161,11 +166,18 @@ def local_constants(problem: Problem, reach: ReachTube, extra: ArrayLike = 0.0, 
         times = np.append(curve.starts, curve.ends[-1])
     else:
         times, boxes = curve.starts, boxes[:-1]
-    return constants_along(problem, times, boxes, metric=reach.metric, refine=refine)
+    along = constants_along(problem, times, boxes, metric=reach.metric, refine=refine)
+    return along.with_fewer_pieces(segments) if curve.continuous else along
 
 
 def local_tube(
-    problem: Problem, reach: ReachTube, *, delta: float, method: str = "auto", objective: Any = "max"
+    problem: Problem,
+    reach: ReachTube,
+    *,
+    delta: float,
+    method: str = "auto",
+    objective: Any = "max",
+    segments: int = SEGMENTS,
 ) -> tuple[Tube, Array]:
     """A tube whose constants hold on reach + tube only, and its radius over each piece of ``reach`` (Thm K4).
 
@@ -182,7 +194,7 @@ def local_tube(
     guess = np.zeros(reach.curve.pieces)
     for _ in range(GUESSES):
         try:
-            constants = local_constants(problem, reach, guess)
+            constants = local_constants(problem, reach, guess, segments=segments)
         except (ValueError, EnclosureError) as error:
             raise InfeasibleError(
                 f"no local tube at delta = {delta:g}: with {np.max(guess):.3g} of room, {error} "
@@ -210,5 +222,12 @@ def radius_over_pieces(tube: Tube, curve: Curve) -> Array:
         radius = np.asarray(tube.bound(curve.starts[1:], curve.ends[1:]), dtype=float)
         return np.concatenate([[0.0], radius])
     edges = np.unique(np.linspace(0, curve.pieces, min(SEGMENTS, curve.pieces) + 1).astype(int))
-    values = np.asarray(tube.bound(curve.starts[edges[:-1]], curve.ends[edges[1:] - 1]), dtype=float)
+    starts, ends = curve.starts[edges[:-1]].tolist(), curve.ends[edges[1:] - 1].tolist()
+    values = np.array([_supremum(tube, start, end) for start, end in zip(starts, ends)])
     return np.repeat(values, np.diff(edges))
+
+
+def _supremum(tube: Tube, start: float, end: float) -> float:
+    """``tube.bound``, searched less closely."""
+    profiles = [tube.profile] if tube.bounded is None else [tube.profile, tube.bounded]
+    return min(supremum(profile, start, end, whole=False, gap=SUPREMUM_GAP) for profile in profiles)

@@ -59,6 +59,8 @@ ONE_TIME = ("prop1", "prop1_cosh", "prop2", "markov", "chebyshev")
 BY_CLEARANCE = ("auto", "kummer", "bessel")
 """Methods that go from rooms to a probability directly (Thm K2)."""
 NO_START = Start()
+SEGMENTS, SEGMENTS_BY_NAME = 48, 16
+"""Pieces of local constants: the paper's window bounds take time that grows with their square."""
 SHARES = (1.15, 1.6, 2.4, 4.0)
 """Room tried with local constants, in units of the tube at the target probability."""
 NEAR_MISS = 2.0
@@ -150,6 +152,7 @@ class _Work:
         self.flow = Flow(problem)
         self.curve: Curve = nominal_curve(self.flow, initial_cells(problem, cells).centres)
         self.name = "kummer" if method == "auto" else method
+        self.segments = SEGMENTS if method in BY_CLEARANCE else SEGMENTS_BY_NAME
 
     def global_answer(self, constants: Constants) -> EngineAnswer:
         """With constants that hold everywhere, or on the domain."""
@@ -235,7 +238,7 @@ class _Work:
     def _cuts(self, reach: ReachTube, erosion: Erosion) -> Iterator[tuple[Erosion, Constants]]:
         """Rooms cut to multiples of what a tube needs, with the constants that hold there."""
         try:
-            first = local_constants(self.problem, reach)
+            first = local_constants(self.problem, reach, segments=self.segments)
             tube = tune_tube(first, horizon=reach.end, delta=self.problem.delta, method="kummer")
         except (CertboundError, ValueError):
             return
@@ -247,7 +250,7 @@ class _Work:
             cut = erosion.capped(limit)
             room = np.where(np.isfinite(cut.least), cut.least, 0.0)
             try:
-                yield cut, local_constants(self.problem, reach, np.maximum(room, 0.0))
+                yield cut, local_constants(self.problem, reach, np.maximum(room, 0.0), segments=self.segments)
             except (CertboundError, ValueError):
                 return
 
@@ -294,7 +297,8 @@ class _Work:
         needed = needed_radius(tube, curve, start)
         fits = bool(np.all(needed <= erosion.least))
         if by_name:
-            level = smallest_level(tube_at, fit, target, tube if fits else None)
+            closely = constants.times is None
+            level = smallest_level(tube_at, fit, target, tube if fits else None, closely=closely)
         else:
             rooms = joined(profile, 1e-7)
             level = room_level(constants, horizon=horizon, profile=rooms, start=start, fits=fits)

@@ -76,7 +76,12 @@ def room_level(constants: Constants, *, horizon: float, profile: Profile, start:
 
 
 def smallest_level(
-    tube_at: Callable[[float], Tube], fits: Callable[[Tube], bool], target: float, fitting: Tube | None
+    tube_at: Callable[[float], Tube],
+    fits: Callable[[Tube], bool],
+    target: float,
+    fitting: Tube | None,
+    *,
+    closely: bool = True,
 ) -> float:
     """log10 of about the smallest delta at which a named tube fits; 0 if it fits at none.
 
@@ -90,6 +95,8 @@ def smallest_level(
         The delta that was asked for.
     fitting : Tube or None
         The tube at that delta, if it fits.
+    closely : bool
+        False: only the target and 1/2 are tried.
     """
 
     def proved(log10: float) -> float | None:
@@ -101,15 +108,17 @@ def smallest_level(
         low, high = SMALLEST_LOG10, asked
         below = proved(asked - BELOW)
         best = fitting.log10_delta if below is None else below
-        smallest = proved(low)
+        smallest = proved(low) if closely else best
         if smallest is not None:
             return smallest
     else:
-        low, high = asked, -1e-3
+        low, high = asked, -1e-3 if closely else math.log10(0.5)
         found = proved(high)
         if found is None:
             return 0.0
         best = found
+    if not closely:
+        return best
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         found = proved(middle)

@@ -138,10 +138,39 @@ class Constants:
 
     def with_full_dimension(self) -> Constants:
         """The same constants with nu = n, which a smaller nu implies: a proof goes on to vouch for them."""
-        full = replace(self, effective_dimension=float(self.dimension), proof=None)
+        return self._weakened(replace(self, effective_dimension=float(self.dimension), proof=None))
+
+    def with_fewer_pieces(self, count: int) -> Constants:
+        """The same constants on at most ``count`` pieces, at the largest values of those that are joined.
+
+        Larger values are implied, so that a proof goes on to vouch for them.
+        """
+        pieces = 0 if self.times is None else len(self.times) - 1
+        if self.times is None or pieces <= count:
+            return self
+        edges = np.unique(np.linspace(0, pieces, count + 1).astype(int))
+
+        def largest(values: float | Array) -> Array:
+            return np.asarray(np.maximum.reduceat(np.broadcast_to(values, pieces), edges[:-1]))
+
+        sigma = largest(self.sigma)
+        same = np.array_equal(np.repeat(sigma, np.diff(edges)), np.broadcast_to(self.sigma, pieces))
+        joined = replace(
+            self,
+            times=self.times[edges],
+            rate=None if self.rate is None else largest(self.rate),
+            gain=None if self.gain is None else largest(self.gain),
+            sigma=sigma,
+            isotropic=self.isotropic and same,
+            proof=None,
+        )
+        return self._weakened(joined)
+
+    def _weakened(self, weaker: Constants) -> Constants:
+        """``weaker`` with this record's proof, for constants that this record's imply."""
         if self.proof is None or not self.certified:
-            return full
-        return replace(full, proof=replace(self.proof, fingerprint=full.fingerprint))
+            return weaker
+        return replace(weaker, proof=replace(self.proof, fingerprint=weaker.fingerprint))
 
     @property
     def gap(self) -> float | None:

@@ -16,7 +16,8 @@ def spiral(half=0.05, sigma=0.05, horizon=2.0) -> cb.Problem:
         lambda x: [-0.5 * x[0] + x[1], -x[0] - 0.5 * x[1] + 0.1 * np.sin(x[0])], states=2, diffusion=sigma * np.eye(2)
     )
     start = np.array([0.5, 0.0])
-    return cb.Problem(system, initial=cb.Box(start - half, start + half), safe=[cb.Inside(cb.Box([-9, -9], [9, 9]))], horizon=horizon)
+    safe = [cb.Inside(cb.Box([-9, -9], [9, 9]))]
+    return cb.Problem(system, initial=cb.Box(start - half, start + half), safe=safe, horizon=horizon)
 
 
 @pytest.mark.parametrize("method", ["linear", "contraction"])
@@ -58,13 +59,16 @@ def test_cells_are_passed_on():
 
 
 def test_local_rates_serve_where_no_global_ones_exist():
-    problem = MODELS["unicycle"](disturbance=0.0, x0_halfwidth=0.0).replace(horizon=0.5)
+    system = cb.ContinuousSystem(lambda x: [-x[0] + 0.3 * x[0] ** 2], states=1, diffusion=0.02)
+    problem = cb.Problem(system, initial=cb.Box([0.4], [0.5]), safe=[], horizon=2.0)
+    with pytest.raises(InfeasibleError):
+        cb.bound_constants(problem)
     reach = cb.bound_reach(problem, noise=False, method="contraction")
     assert "local" in reach.method
-    assert reach.end == 0.5
+    assert reach.end == 2.0
     noisy = cb.bound_reach(problem, method="contraction")
     assert noisy.noise
-    assert float(noisy.radius.max()) > 0.02
+    assert 0.02 < float(noisy.radius.max()) < 0.2
 
 
 def test_an_unknown_method_is_refused():
@@ -73,7 +77,7 @@ def test_an_unknown_method_is_refused():
 
 
 def test_a_local_tube_confirms_its_own_guess():
-    problem = MODELS["unicycle"](disturbance=0.0, x0_halfwidth=0.0).replace(horizon=1.0)
+    problem = MODELS["unicycle"](disturbance=0.0, x0_halfwidth=0.0).replace(horizon=0.5)
     reach = local_contraction_tube(problem)
     tube, radius = local_tube(problem, reach, delta=1e-3, method="kummer")
     again = local_constants(problem, reach, radius)
@@ -95,3 +99,25 @@ def test_a_local_tube_that_cannot_close_says_so():
     reach = local_contraction_tube(problem)
     with pytest.raises(InfeasibleError, match="no local tube at delta"):
         local_tube(problem, reach, delta=1e-3, method="kummer")
+
+
+def test_fewer_pieces_keep_the_largest_values_and_the_proof():
+    system = cb.ContinuousSystem(
+        lambda x: [-x[0] + 0.3 * x[0] ** 2], states=1, diffusion=lambda x: [[0.02 + 0.01 * x[0]]]
+    )
+    problem = cb.Problem(system, initial=cb.Box([0.4], [0.5]), safe=[], horizon=2.0)
+    reach = local_contraction_tube(problem)
+    fine = local_constants(problem, reach, 0.1, segments=10_000)
+    coarse = local_constants(problem, reach, 0.1, segments=7)
+    assert fine.certified
+    assert coarse.certified
+    assert len(coarse.times) == 8
+    assert len(fine.times) == reach.curve.pieces + 1
+    piece = np.searchsorted(coarse.times, fine.times[:-1], side="right") - 1
+    for name in ("rate", "sigma"):
+        assert np.all(getattr(coarse, name)[piece] >= getattr(fine, name))
+        assert np.max(getattr(coarse, name)) == np.max(getattr(fine, name))
+    altered = cb.Constants(
+        rate=coarse.rate - 1e-9, sigma=coarse.sigma, dimension=1, times=coarse.times, proof=coarse.proof
+    )
+    assert not altered.certified

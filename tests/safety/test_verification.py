@@ -247,15 +247,25 @@ def test_a_random_start_enters_the_martingale():
 
 
 def test_local_constants_answer_where_no_global_ones_exist():
-    problem = MODELS["unicycle"](disturbance=0.0, x0_halfwidth=0.0, sigma=0.03).replace(horizon=1.0)
+    system = cb.ContinuousSystem(lambda x: [-x[0] + 0.3 * x[0] ** 2], states=1, diffusion=0.05)
+    problem = cb.Problem(system, initial=cb.Box([0.4], [0.5]), safe=[cb.Inside(cb.Box([-1], [1.2]))], horizon=2.0)
     verdict = verify_safety(problem, method="constants")
     consistent(verdict, problem)
     assert verdict.status == "SAFE"
     assert verdict.constants.times is not None
+    assert verdict.constants.certified
+    named = verify_safety(problem, method="thm3")
+    assert named.method == "thm3"
+    assert named.log10_delta > verdict.log10_delta
+    once = verify_safety(problem, method="markov")
+    assert once.status == "UNKNOWN"
+    assert "must not be combined with local constants" in once.reason
 
 
 def test_a_tube_that_local_constants_cannot_carry_is_explained():
-    verdict = verify_safety(MODELS["unicycle"](), method="constants")
+    system = cb.ContinuousSystem(lambda x: [-1.0 / x[0]], states=1, diffusion=0.01)
+    problem = cb.Problem(system, initial=cb.Box([0.9], [1.1]), safe=[cb.Inside(cb.Box([-9], [9]))], horizon=0.45)
+    verdict = verify_safety(problem, method="constants")
     assert verdict.status == "UNKNOWN"
     assert "could not be proved beyond t =" in verdict.reason
     assert "cells" in verdict.reason
