@@ -21,7 +21,9 @@ ORDER = [
     {"reach"},
     {"safety"},
     {"synthesis"},
-    {"plotting", "report", "cli"},
+    {"plotting"},
+    {"report"},
+    {"cli"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 
