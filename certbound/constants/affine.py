@@ -105,9 +105,7 @@ class AffineSet:
         """Parameter values of the vertices, shape (v, k)."""
         wide = np.flatnonzero(self.box[1] > self.box[0])
         if self.vertex_count > _VERTEX_LIMIT:
-            raise ValueError(
-                f"the set has 2**{len(wide)} vertices; use its sector form (`sector()`) instead."
-            )
+            raise ValueError(f"the set has 2**{len(wide)} vertices; use its sector form (`sector()`) instead.")
         signs = (np.arange(1 << len(wide))[:, None] >> np.arange(len(wide))) & 1
         theta = np.repeat(self.box[:1], len(signs), axis=0)
         theta[:, wide] = np.where(signs == 1, self.box[1, wide], self.box[0, wide])
@@ -135,9 +133,7 @@ class AffineSet:
             left.append(columns)
             right.append(rows)
             group += [k] * columns.shape[1]
-            slack += np.nextafter(residue * np.max(np.abs(self.box[:, k])) * (1 + 4 * UNIT), np.inf) * (
-                residue > 0
-            )
+            slack += np.nextafter(residue * np.max(np.abs(self.box[:, k])) * (1 + 4 * UNIT), np.inf) * (residue > 0)
         n = self.dimension
         index = np.array(group, dtype=int)
         return SectorSet(
@@ -211,16 +207,12 @@ class SectorSet(AffineForm):
         b, c = finite_array("B", self.B), finite_array("C", self.C)
         n, k = len(a), box.shape[1]
         if b.shape != (n, k) or c.shape != (k, n):
-            raise ValueError(
-                f"`B` and `C` must have shapes ({n}, {k}) and ({k}, {n}), got {b.shape} and {c.shape}."
-            )
+            raise ValueError(f"`B` and `C` must have shapes ({n}, {k}) and ({k}, {n}), got {b.shape} and {c.shape}.")
         groups = tuple(range(k)) if self.groups is None else tuple(self.groups)
         if len(groups) != k:
             raise ValueError(f"`groups` must hold {k} numbers, got {len(groups)}.")
         first = [groups.index(g) for g in sorted(set(groups))]
-        member = np.array([[g == groups[i] for g in groups] for i in first], dtype=float).reshape(
-            len(first), k
-        )
+        member = np.array([[g == groups[i] for g in groups] for i in first], dtype=float).reshape(len(first), k)
         if np.any(box != box[:, [groups.index(g) for g in groups]]):
             raise ValueError("`groups` must join entries of equal range only.")
         terms = np.einsum("gk,ik,kj->gij", member, b, c)

@@ -96,9 +96,7 @@ class VertexPolytope:
         stack = finite_array("matrices", self.matrices)
         stack = stack[None] if stack.ndim == 2 else stack
         if stack.ndim != 3 or stack.shape[0] == 0 or stack.shape[1] != stack.shape[2] or stack.shape[1] == 0:
-            raise ValueError(
-                f"`matrices` must be a list of square matrices of one size, got shape {stack.shape}."
-            )
+            raise ValueError(f"`matrices` must be a list of square matrices of one size, got shape {stack.shape}.")
         object.__setattr__(self, "_stack", frozen(stack))
         object.__setattr__(self, "matrices", self._stack)
 
@@ -115,8 +113,7 @@ class VertexPolytope:
         columns = self._stack.reshape(len(self._stack), -1).T
         one = np.ones((1, columns.shape[1]))
         flags = [
-            is_near(columns, target, tolerance, (0.0, None), one)
-            for target in batch.reshape(-1, columns.shape[0])
+            is_near(columns, target, tolerance, (0.0, None), one) for target in batch.reshape(-1, columns.shape[0])
         ]
         return np.array(flags, dtype=bool).reshape(batch.shape[:-2])
 
@@ -171,9 +168,7 @@ class IntervalMatrixSet(AffineForm):
         terms = np.zeros((len(rows), *self.box.shape[1:]))
         terms[np.arange(len(rows)), rows, columns] = 1.0
         center = np.where(self.box[1] > self.box[0], 0.0, self.box[0])
-        return AffineSet(
-            center=center, terms=terms, low=self.box[0][rows, columns], high=self.box[1][rows, columns]
-        )
+        return AffineSet(center=center, terms=terms, low=self.box[0][rows, columns], high=self.box[1][rows, columns])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

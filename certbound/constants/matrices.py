@@ -92,9 +92,7 @@ def square_matrix(name: str, value: ArrayLike) -> Array:
 def parameter_range(low: ArrayLike, high: ArrayLike) -> Array:
     lower, upper = np.atleast_1d(finite_array("low", low)), np.atleast_1d(finite_array("high", high))
     if lower.shape != upper.shape or lower.ndim != 1:
-        raise ValueError(
-            f"`low` and `high` must be vectors of one length, got shapes {lower.shape}, {upper.shape}."
-        )
+        raise ValueError(f"`low` and `high` must be vectors of one length, got shapes {lower.shape}, {upper.shape}.")
     if np.any(lower > upper):
         raise ValueError("`low` must not exceed `high`.")
     return np.stack([lower, upper])

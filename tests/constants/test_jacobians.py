@@ -72,7 +72,7 @@ def test_the_sector_form_has_one_entry_per_unit_of_rank_and_shares_parameters():
     np.testing.assert_array_equal(members.affine.error, 0.0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_the_sector_form_of_a_dense_term_differs_by_no_more_than_its_slack(seed):
     rng = np.random.default_rng(seed)

@@ -20,7 +20,7 @@ def example_weights(rng: np.random.Generator, n: int, order: float) -> np.ndarra
     return rng.uniform(0.2, 5.0, n)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 5), order=st.sampled_from(ORDERS), weighted=st.booleans())
 def test_the_measure_is_the_one_sided_derivative_of_the_norm_and_bounds_growth(seed, n, order, weighted):
     rng = np.random.default_rng(seed)
