@@ -71,7 +71,8 @@ class LinearRun:
         self.requirements = [requirements(engine.problem, engine.nominal(cell)) for cell in cells]
         self.supports: list[Supports] = []
         for cell in cells:
-            asked = np.stack([r.rows for r in self.requirements[cell]], axis=1)
+            nothing = np.zeros((engine.nodes.shape[1] - engine.continuous, 0, engine.n))
+            asked = np.concatenate([nothing, *(r.rows[:, None] for r in self.requirements[cell])], axis=1)
             inner = self.rows[cell]
             if not engine.continuous:
                 inner = np.concatenate([inner, np.zeros((1, *inner.shape[1:]))])
@@ -190,7 +191,7 @@ class LinearRun:
         support = self.supports[cell]
         _, high, _ = support.remainder(bounds[0][cell], bounds[1][cell])
         used = support.y[:, self.inner :] + high[:, self.inner :]
-        room = np.stack([r.room for r in self.requirements[cell]], axis=1)
+        room = np.concatenate([used[:, :0], *(r.room[:, None] for r in self.requirements[cell])], axis=1)
         left = room - used
         return np.asarray(np.where(np.isinf(room), np.inf, left - 4e-16 * (np.abs(room) + np.abs(used))))
 

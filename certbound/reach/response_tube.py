@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 
 _SHARES = ((0.1, 1), (0.3, 2), (0.8, 3))
 _REFINEMENTS = 3
+_LEAST = -1e12  # log10 of the smallest probability that is told apart from 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,8 +96,8 @@ class LinearAnswer:
     @property
     def log10_delta(self) -> float:
         """log10 of a bound on the probability of leaving the safe set: finite, at most 0."""
-        value = self.outcome.log_probability / np.log(10.0)
-        return float(min(max(value + 1e-15 * abs(value), -1e15), 0.0))
+        value = max(self.outcome.log_probability / np.log(10.0), _LEAST)
+        return float(min(value + 1e-15 * abs(value), 0.0))
 
     @cached_property
     def _tightest(self) -> tuple[Requirement | None, int, float]:
@@ -261,7 +262,7 @@ def _deviation_tube(run: LinearRun, outcome: Outcome, bounds: tuple[Array, Array
         half = np.maximum(half, level + np.maximum(high - low, 0.0) * (1 + 1e-15))
     count = len(half)
     times = engine.times if engine.continuous else np.arange(count + 1.0)
-    log10 = min(log_probability / np.log(10.0) * (1 - 1e-15), 0.0)
+    log10 = min(max(log_probability / np.log(10.0), _LEAST) * (1 - 1e-15), 0.0)
     return DeviationTube(times=times, half_widths=half, log10_delta=float(log10))
 
 

@@ -133,3 +133,12 @@ def test_a_gaussian_start_adds_its_covariance() -> None:
     tight = oscillator(initial=cb.GaussianStart([0.4, 0.0], 1e-4 * np.eye(2)))
     wide = oscillator(initial=cb.GaussianStart([0.4, 0.0], 4e-2 * np.eye(2)))
     assert linear_answer(tight).log10_delta < linear_answer(wide).log10_delta < 0
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_a_problem_without_constraints_has_a_reach_tube_all_the_same(discrete: bool) -> None:
+    noise = {"noise": cb.Gaussian(std=0.1)} if discrete else {"diffusion": [[0.1]]}
+    system = cb.linear_system([[0.5 if discrete else -0.5]], **noise)
+    problem = cb.Problem(system, initial=[1.0], safe=[], horizon=2, delta=1e-2)
+    assert linear_answer(problem).log10_delta <= -2
+    assert linear_reach(problem).contains(2.0, [0.25 if discrete else np.exp(-1.0)])
