@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from experiments.harness import Arrays, Claims, main
-from experiments.linear import paths, tube
+from experiments.linear import limit, paths, tube
 
 CASES = (("a", 1.0, 2.0), ("b", 0.0, 2.0), ("c", -1.0, 2.0), ("d", -1.0, 0.02))
 POINTS = 240
@@ -23,7 +23,7 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
             "paper": tube("thm2", rate, horizon, epsilon=15 / 16),
             "printed": tube("thm2", rate, horizon, epsilon=1 / 16),
             "kummer": tube("auto", rate, horizon),
-            "exact": tube("exact", rate, horizon),
+            "exact": limit(rate, horizon),
         }
         arrays[f"{name}_times"] = times
         arrays[f"{name}_paths"] = deviations.astype(np.float32)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from experiments.harness import Arrays, Claims, main
-from experiments.linear import paths, tube
+from experiments.linear import limit, paths, tube
 
 RATE, HORIZON, WINDOW = -0.5, 5.0, 0.05
 POINTS = 300
@@ -24,7 +24,7 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
         "thm3": tube("thm3", RATE, HORIZON, epsilon=15 / 16, step=WINDOW),
         "thm3_printed": tube("thm3", RATE, HORIZON, epsilon=1 / 16, step=WINDOW),
         "kummer": tube("kummer", RATE, HORIZON),
-        "exact": tube("exact", RATE, HORIZON),
+        "exact": limit(RATE, HORIZON),
     }
     arrays: Arrays = {"times": times, "paths": deviations.astype(np.float32)}
     claims: Claims = {"paths": count}

@@ -9,6 +9,7 @@ import numpy as np
 import certbound as cb
 from certbound.tubes.tube import Tube
 from experiments.harness import Arrays, Claims, main
+from experiments.limits import discrete_radius
 
 HORIZON, DELTA = 2000, 0.01
 CASES = {"left": (0.9999, 450), "right": (0.99, 40)}
@@ -41,9 +42,9 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
         kummer = tube(gain, "kummer")
         arrays[f"{side}_kummer"] = np.asarray(kummer.radius(instants))
         claims[f"{side}_kummer_final"] = float(kummer.radius(HORIZON))
-        exact = tube(gain, "exact")
-        arrays[f"{side}_exact"] = np.asarray(exact.radius(instants))
-        claims[f"{side}_exact"] = float(exact.radius(HORIZON))
+        exact = discrete_radius(gain, 1, HORIZON, DELTA, math.sqrt(0.01 * (1 - gain)))
+        arrays[f"{side}_exact"] = np.full(len(instants), exact)
+        claims[f"{side}_exact"] = exact
     return arrays, claims
 
 

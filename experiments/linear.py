@@ -7,14 +7,16 @@ grid points the running maximum is drawn from the Brownian bridge, so that no ex
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import certbound as cb
 from certbound.tubes.tube import Tube
+from experiments.limits import continuous_radius
 
-__all__ = ["DELTA", "SIGMA", "largest_deviations", "paths", "tube"]
+__all__ = ["DELTA", "SIGMA", "Limit", "largest_deviations", "limit", "paths", "tube"]
 
 SIGMA = math.sqrt(0.1)
 DELTA = 1e-3
@@ -24,6 +26,22 @@ def tube(method: str, rate: float, horizon: float, *, delta: float = DELTA, **pa
     """A tube of the scalar system by one method."""
     constants = cb.Constants(rate=rate, sigma=SIGMA, dimension=1, isotropic=True)
     return cb.tune_tube(constants, horizon=horizon, delta=delta, method=method, **parameters)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A constant radius, asked like a tube."""
+
+    maximum: float
+
+    def radius(self, times: np.ndarray) -> np.ndarray:
+        """The radius at each time."""
+        return np.full(np.shape(times), self.maximum)
+
+
+def limit(rate: float, horizon: float, *, delta: float = DELTA) -> Limit:
+    """The exact constant radius of the scalar system."""
+    return Limit(continuous_radius(rate, 1, horizon, delta, SIGMA))
 
 
 def step_factors(rate: float, step: float) -> tuple[float, float]:

@@ -19,7 +19,7 @@ def draw(data: Data) -> Figure:
     shown = local > 0
     if np.any(shown):
         style = {"color": GREEN, "linewidth": 1.3, "markersize": 3.5}
-        panel.semilogy(horizons[shown], local[shown], "^-.", label="contraction, local rates", **style)
+        panel.semilogy(horizons[shown], local[shown], "^-.", label="local rates", **style)
     panel.fill_between(horizons, 1e-3, data["linear"], color=BLUE, alpha=0.12, linewidth=0)
     panel.set(xlabel="horizon $T$ (s)", ylabel=r"noise level $\sigma$", ylim=(4e-3, 1.0))
     panel.set_yticks([0.01, 0.03, 0.1, 0.3, 1.0], ["0.01", "0.03", "0.1", "0.3", "1"])
