@@ -50,7 +50,7 @@ def test_outside_a_half_space_is_inside_the_other():
     assert agrees(exits(brownian(), safe, steps=3), above(1.3))
 
 
-@pytest.mark.parametrize("scheme", ["auto", "euler"])
+@pytest.mark.parametrize("scheme", ["auto", pytest.param("euler", marks=pytest.mark.slow)])
 def test_an_interval_has_the_exact_exit_probability(scheme):
     expected = exit_probability(1.2, rate=-1e-12, sigma=1.0, horizon=1.0)
     regions = [cb.Ball([0.0], 1.2), cb.Box([-1.2], [1.2]), cb.Ellipsoid([0.0], [[1.44]])]
@@ -59,7 +59,7 @@ def test_an_interval_has_the_exact_exit_probability(scheme):
     assert len({result.exits for result in results}) == 1
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("n", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_ball_has_the_exact_exit_probability_up_to_the_step(n):
     expected = exit_probability(2.0, rate=-1e-12, sigma=1.0, dimension=n, horizon=1.0)
     result = exits(brownian(n), [cb.Inside(cb.Ball([0.0] * n, 2.0))], steps=100)
@@ -105,6 +105,10 @@ def test_a_moving_set_is_a_fixed_one_in_its_own_frame():
     moving = exits(brownian(2), [cb.Inside(cb.Ball(lambda t: [1.0 * t, -0.5 * t], 1.8))], steps=50)
     fixed = exits(brownian(2, drift=[-1.0, 0.5]), [cb.Inside(cb.Ball([0.0, 0.0], 1.8))], steps=50)
     assert moving.exits == pytest.approx(fixed.exits, abs=3)
+
+
+@pytest.mark.slow
+def test_a_moving_box_is_a_half_space_in_its_own_frame():
     box = exits(brownian(), [cb.Inside(cb.Box([-50.0], [1.0], center=lambda t: [t]))], steps=20)
     half = exits(brownian(drift=-1.0), [cb.Inside(cb.HalfSpace([1.0], 1.0))], steps=20)
     assert box.exits == pytest.approx(half.exits, abs=3)
@@ -153,6 +157,12 @@ def test_a_state_dependent_diffusion_bridges_with_the_state_at_the_step():
     level, drift, sigma = np.log(1.3), 0.02 - 0.02, 0.2
     expected = ndtr((drift - level) / sigma) + ndtr((-drift - level) / sigma)
     assert agrees(result, expected, bias=0.02)
+
+
+@pytest.mark.slow
+def test_a_state_dependent_diffusion_bridges_to_round_sets_too():
+    level, drift, sigma = np.log(1.3), 0.0, 0.2
+    expected = ndtr((drift - level) / sigma) + ndtr((-drift - level) / sigma)
     round_set = [cb.Inside(cb.Ball([0.0, 0.0], 1.3))]
     plane = cb.ContinuousSystem(
         lambda x: [0.02 * x[0], 0.0], states=2, diffusion=lambda x: [[0.2 * x[0], 0.0], [0.0, 1e-9]]

@@ -36,6 +36,7 @@ def test_the_standard_error_is_the_scatter_between_seeds():
     assert 0.6 < stated / scatter < 1.6
 
 
+@pytest.mark.slow
 def test_plain_simulation_agrees_where_it_can():
     box = cb.Box([-0.9, -0.8], [1.0, 1.1])
     system = cb.ContinuousSystem(
