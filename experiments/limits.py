@@ -18,6 +18,8 @@ from scipy.optimize import brentq
 
 __all__ = ["continuous_radius", "discrete_radius", "exact_radius"]
 
+SPECTRAL_LIMIT = 10
+
 
 def exact_radius(
     *, rate: float | None = None, gain: float | None = None, n: int, horizon: float, delta: float, sigma: float = 1.0
@@ -32,7 +34,8 @@ def exact_radius(
 def continuous_radius(rate: float, n: int, horizon: float, delta: float, sigma: float = 1.0) -> float:
     """Continuous time, dS = rate S dt + sigma dW in n dimensions."""
     spread = sigma * math.sqrt(horizon if rate == 0 else math.expm1(2 * rate * horizon) / (2 * rate))
-    law = _implicit if rate > 0 else _spectral
+    # in many dimensions the value at the centre is too small a part of a mode for double precision
+    law = _implicit if rate > 0 or n > SPECTRAL_LIMIT else _spectral
     return _solve(lambda radius: law(rate, n, horizon, radius, sigma), spread, n, delta)
 
 

@@ -21,9 +21,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("one", "two"):
         harness.save(tmp_path / name, "fig0", arrays, {"x": np.float64(0.1), "y": [np.int64(2)]}, full=False)
     for suffix in ("npz", "json"):
-        assert (tmp_path / "one" / f"fig0.{suffix}").read_bytes() == (
-            tmp_path / "two" / f"fig0.{suffix}"
-        ).read_bytes()
+        assert (tmp_path / "one" / f"fig0.{suffix}").read_bytes() == (tmp_path / "two" / f"fig0.{suffix}").read_bytes()
     with np.load(tmp_path / "one" / "fig0.npz") as bundle:
         assert sorted(bundle.files) == ["a", "b"]
         assert np.array_equal(bundle["b"], arrays["b"])
@@ -52,9 +50,7 @@ def test_every_figure_has_an_experiment_and_a_caption(stem: str) -> None:
 
 
 def test_make_lists_every_figure() -> None:
-    result = subprocess.run(
-        ["make", "-s", "list"], cwd=ROOT / "paper_figs", capture_output=True, text=True, check=True
-    )
+    result = subprocess.run(["make", "-s", "list"], cwd=ROOT / "paper_figs", capture_output=True, text=True, check=True)
     assert sorted(result.stdout.split()) == FIGURES + TABLES
 
 

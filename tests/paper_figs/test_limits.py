@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from scipy.stats import chi, norm
 
@@ -44,3 +45,16 @@ def test_the_radius_grows_with_horizon_and_dimension_and_falls_with_delta() -> N
     assert exact_radius(**{**base, "horizon": 4.0}) > radius  # type: ignore[arg-type]
     assert exact_radius(**{**base, "n": 2}) > radius  # type: ignore[arg-type]
     assert exact_radius(**{**base, "delta": 1e-2}) < radius  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("n", [2, 30])
+def test_simulated_norms_leave_as_often_as_asked(n: int) -> None:
+    rate, horizon, steps, paths, delta = -0.5, 2.0, 400, 4000, 0.1
+    radius = continuous_radius(rate, n, horizon, delta)
+    growth, spread = math.exp(rate * horizon / steps), math.sqrt(-math.expm1(2 * rate * horizon / steps))
+    rng = np.random.default_rng(n)
+    state, top = np.zeros((paths, n)), np.zeros(paths)
+    for _ in range(steps):
+        state = growth * state + spread * rng.standard_normal((paths, n))
+        top = np.maximum(top, np.linalg.norm(state, axis=1))
+    assert 0.06 < np.mean(top > radius) < 0.12
