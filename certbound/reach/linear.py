@@ -192,8 +192,9 @@ class LinearRun:
         _, high, _ = support.remainder(bounds[0][cell], bounds[1][cell])
         used = support.y[:, self.inner :] + high[:, self.inner :]
         room = np.concatenate([used[:, :0], *(r.room[:, None] for r in self.requirements[cell])], axis=1)
-        left = room - used
-        return np.asarray(np.where(np.isinf(room), np.inf, left - 4e-16 * (np.abs(room) + np.abs(used))))
+        with np.errstate(invalid="ignore"):  # where nothing is asked
+            left = room - used - 4e-16 * (np.abs(room) + np.abs(used))
+        return np.asarray(np.where(np.isinf(room), np.inf, left))
 
     def _cell(self, cell: int, bounds: tuple[Array, Array], events: Events, log_nonlinear: float) -> Outcome:
         rooms = self.rooms(cell, bounds)
