@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from flint import arb
+from flint import arb, arb_mat
 
 from certbound.checker.arithmetic import Undecided
 from certbound.checker.graph import Graph
+from certbound.checker.matrices import column
 from certbound.checker.model import Model
 from certbound.checker.program import Program
 from certbound.checker.regions import Constraint, Region
@@ -16,7 +17,7 @@ from certbound.checker.report import Unproved
 from certbound.errors import CertificateError
 from certbound.problem.tape import Tape
 
-__all__ = ["Demand", "Grid", "demands"]
+__all__ = ["Demand", "Grid", "RoundDemand", "demands", "round_demands"]
 
 _STRICT = arb(2) ** -300
 
@@ -32,10 +33,21 @@ class Demand:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Grid:
-    """Time pieces as balls, and points whose convex hull holds the nominal curve on each."""
+    """Time pieces as balls, and points whose convex hull holds the nominal curve on each.
+
+    ``part`` gives such points for a part [start, end] of a piece.
+    """
 
     times: list[tuple[arb, arb]]
     hulls: list[list[list[arb]]]
+    part: Callable[[int, arb, arb], list[list[arb]]] | None = None
+
+    def points(self, k: int, during: tuple[float, float] | None) -> list[list[arb]]:
+        """Points around the curve on piece k while a constraint is asked."""
+        if self.part is None or during is None:
+            return self.hulls[k]
+        start, end = self.times[k]
+        return self.part(k, arb.max(start, arb(during[0])), arb.min(end, arb(during[1])))
 
     def asked(self, during: tuple[float, float] | None) -> list[bool]:
         """Which pieces may meet a time window."""
@@ -45,8 +57,8 @@ class Grid:
         return [not (end < first or start > last) for start, end in self.times]
 
 
-def demands(model: Model, grid: Grid, separations: list[object], path: str) -> list[Demand]:
-    """Every constraint of the model as demands along a nominal curve.
+def demands(model: Model, grid: Grid, separations: list[object], path: str, *, polygons: bool = True) -> list[Demand]:
+    """Every constraint of the model as demands along a nominal curve (without ``polygons``: but for round safe sets).
 
     Raises
     ------
@@ -57,7 +69,8 @@ def demands(model: Model, grid: Grid, separations: list[object], path: str) -> l
         raise CertificateError(f"`{path}` must have {len(model.constraints)} entries, got {len(separations)}.")
     result: list[Demand] = []
     for number, (constraint, given) in enumerate(zip(model.constraints, separations)):
-        result += _demand(model, grid, constraint, given, f"{path}[{number}]")
+        if polygons or not (constraint.inside and constraint.region.round):
+            result += _demand(model, grid, constraint, given, f"{path}[{number}]")
     return result
 
 
@@ -90,9 +103,42 @@ def _demand(model: Model, grid: Grid, constraint: Constraint, given: object, pat
                 rooms.append(None)
                 continue
             offset = bound + _dot(row, centres[k])
-            rooms.append(min_of([offset - _dot(rows[k], point) for point in grid.hulls[k]]).lower())
+            rooms.append(min_of([offset - _dot(rows[k], point) for point in grid.points(k, constraint.during)]).lower())
         found.append(Demand(label=constraint.label, rows=rows, rooms=rooms))
     return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RoundDemand:
+    """|W S| <= rooms[k] on piece k keeps a safe ball or ellipsoid {|W (x - o)| <= bound}; None: not asked."""
+
+    label: str
+    image: arb_mat
+    rooms: list[arb | None]
+
+
+def round_demands(model: Model, grid: Grid) -> list[RoundDemand]:
+    """The round safe sets."""
+    result = []
+    for constraint in model.constraints:
+        region = constraint.region
+        if not (constraint.inside and region.round):
+            continue
+        image, bound = region.image(model.dimension)
+        asked, centres = grid.asked(constraint.during), _centres(region, grid)
+        rooms: list[arb | None] = []
+        for k in range(len(grid.times)):
+            if not asked[k]:
+                rooms.append(None)
+                continue
+            moved = region.lift(centres[k], model.dimension)
+            sizes = []
+            for point in grid.points(k, constraint.during):
+                offset = (image * column([a - b for a, b in zip(point, moved)])).entries()
+                sizes.append(sum((x * x for x in offset), arb(0)).upper().sqrt())
+            rooms.append((bound + min_of([-size for size in sizes])).lower())
+        result.append(RoundDemand(label=constraint.label, image=image, rooms=rooms))
+    return result
 
 
 def min_of(values: Sequence[arb]) -> arb:

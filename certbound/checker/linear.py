@@ -20,6 +20,7 @@ from certbound.checker.demands import Demand, Grid, demands
 from certbound.checker.events import Windows, chain, sub_gaussian
 from certbound.checker.matrices import column, identity, row_sums, upper
 from certbound.checker.model import Model
+from certbound.checker.partition import cells_of
 from certbound.checker.reading import Record, number, numbers, wholes
 from certbound.checker.reading import entries as listed
 from certbound.checker.remainder import OutputRemainder, PieceData, Polytope, remainders
@@ -39,7 +40,6 @@ from certbound.errors import CertificateError
 __all__ = ["check_linear"]
 
 MOST_PIECES = 4000
-MOST_CELLS = 4096
 MOST_ROWS = 64
 _BITS, _MOST_BITS = 128, 3000
 
@@ -63,7 +63,7 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     record = Record(value, "proof", _PROOF)
     structure = structure_of(model)
     shared = _Shared(model, structure, record)
-    boxes = _cells(model, record)
+    boxes = cells_of(model, record)
     entries = record.items("cells", len(boxes), len(boxes))
     outputs = remainders(model, structure)
     worst = arb(0)
@@ -71,24 +71,6 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
         cell = _Cell(shared, Record(entry, f"proof.cells[{index}]", _CELL), box, budget)
         worst = arb.max(worst, cell.probability(outputs))
     return upper(worst)
-
-
-def _cells(model: Model, record: Record) -> list[list[tuple[arb, arb]]]:
-    """Boxes that cover the initial set: products of the intervals between the edges of ``splits``."""
-    edges: list[list[float]] = []
-    for j, item in enumerate(record.items("splits", model.dimension, model.dimension)):
-        row = numbers(item, f"proof.splits[{j}]", None)
-        if len(row) < 2 or any(a > b for a, b in pairwise(row)):
-            raise CertificateError(f"`proof.splits[{j}]` must be two or more numbers that do not fall.")
-        if not (arb(row[0]) <= model.initial.low[j].lower() and arb(row[-1]) >= model.initial.high[j].upper()):
-            raise Unproved(f"the cells do not cover the initial set along {model.states[j]}")
-        edges.append(row)
-    result: list[list[tuple[arb, arb]]] = [[]]
-    for row in edges:
-        if len(result) * (len(row) - 1) > MOST_CELLS:
-            raise CertificateError(f"`proof.splits` must make at most {MOST_CELLS} cells.")
-        result = [[*box, (arb(a), arb(b))] for box in result for a, b in pairwise(row)]
-    return result
 
 
 class _Shared:

@@ -28,12 +28,15 @@ class Program:
         Inputs below this number change from run to run; the others are parameters.
     generalised : bool
         The slope of |x| is all of [-1, 1] where x may be 0, instead of undecided.
+    unbounded : bool
+        Guards need only be defined, not finite.
     """
 
     def __init__(
         self, graph: Graph, outputs: Sequence[int], guards: Iterable[int] = (), *, variables: int,
-        generalised: bool = False,
+        generalised: bool = False, unbounded: bool = False,
     ) -> None:
+        self._unbounded = unbounded
         self.variables = variables
         self._operations = BALLS | {"kink": generalised_kink} if generalised else BALLS
         watched = sorted(set(guards))
@@ -88,7 +91,8 @@ class Program:
                 values[number] = variables[slot]
         _execute(self._late, values)
         for number in self._watched:
-            if not values[number].is_finite():
+            value = values[number]
+            if value.is_nan() if self._unbounded else not value.is_finite():
                 raise Undecided
         result = [values[number] for number in self._outputs]
         for value in result:

@@ -14,8 +14,8 @@ from typing import Any
 
 from flint import arb, arb_mat
 
-from certbound.checker.matrices import is_positive_definite, matrix
-from certbound.checker.reading import Record, entries, number, numbers, text, wholes
+from certbound.checker.matrices import identity, is_positive_definite, matrix
+from certbound.checker.reading import Record, entries, number, numbers, text, whole, wholes
 from certbound.checker.tapes import read_tape
 from certbound.errors import CertificateError
 from certbound.problem.tape import Tape
@@ -53,6 +53,15 @@ class Region:
         for place, value in zip(self.coordinates, row):
             full[place] = value
         return full
+
+    def image(self, dimension: int) -> tuple[arb_mat, arb]:
+        """W over all states and a bound with the region equal to {|W (x - center)| <= bound} (round ones)."""
+        k = len(self.coordinates)
+        square, bound = identity(k), arb(self.radius)
+        if self.shape is not None:
+            square, bound = _inverse_root(self.shape), arb(1)
+        rows = [self.lift([square[i, j] for j in range(k)], dimension) for i in range(k)]
+        return matrix(rows), bound
 
     def support(self, row: Sequence[arb]) -> arb:
         """Upper bound of row . y over the region moved to the origin (round ones)."""
@@ -121,8 +130,20 @@ class Constraint:
             rows = numbers(value, path, count, len(region.coordinates))
             exact = [[arb(x) for x in row] for row in rows]
             return [(row, region.support(row)) for row in exact]
-        chosen = wholes(entries(value, path, count, count), path, 0, len(region.bounds) - 1)
-        return [([arb(x) for x in region.faces[face]], arb(region.bounds[face])) for face in chosen]
+        return [self._mixed(item, f"{path}[{k}]") for k, item in enumerate(entries(value, path, count, count))]
+
+    def _mixed(self, value: object, path: str) -> tuple[Row, arb]:
+        """One face by its number, or a combination of all faces by weights that are not negative."""
+        region, faces = self.region, len(self.region.bounds)
+        if not isinstance(value, list):
+            face = whole(value, path, 0, faces - 1)
+            return [arb(x) for x in region.faces[face]], arb(region.bounds[face])
+        weights = [arb(number(x, path, least=0.0)) for x in entries(value, path, faces, faces)]
+        row = [
+            sum((w * face[i] for w, face in zip(weights, region.faces) if face[i]), arb(0))
+            for i in range(len(region.coordinates))
+        ]
+        return row, sum((w * b for w, b in zip(weights, region.bounds)), arb(0)).upper()
 
 
 def _sides(low: list[float | None], high: list[float | None]) -> tuple[list[list[float]], list[float]]:

@@ -17,7 +17,7 @@ from certbound.errors import CertificateError
 from certbound.problem.noise import Law
 from certbound.problem.problem import Problem
 from certbound.problem.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
-from certbound.problem.sets import GaussianStart, Outside
+from certbound.problem.sets import GaussianStart, Inside, Outside
 from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
 from certbound.safety.answers import EngineAnswer
@@ -25,7 +25,7 @@ from certbound.safety.answers import EngineAnswer
 if TYPE_CHECKING:
     from certbound.safety.verification import Verdict
 
-__all__ = ["FORMAT", "VERSION", "certificate_data", "certificate_text", "exact", "problem_data"]
+__all__ = ["FORMAT", "VERSION", "certificate_data", "certificate_text", "exact", "needs_direction", "problem_data"]
 
 FORMAT = "certbound certificate"
 VERSION = 1
@@ -148,6 +148,11 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         ],
         "domain": None if problem.domain is None else _ranges(zip(problem.domain.low, problem.domain.high)),
     }
+
+
+def needs_direction(constraint: Inside) -> bool:
+    """Whether the proof names a direction that keeps the obstacle off, piece by piece."""
+    return isinstance(constraint, Outside) and not isinstance(constraint.region, HalfSpace)
 
 
 def tape_data(tape: Tape) -> dict[str, Any]:

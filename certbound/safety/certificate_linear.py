@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
-from certbound.problem.regions import Ball, Ellipsoid, HalfSpace, Region
-from certbound.problem.sets import Inside, Outside
+from certbound.problem.regions import Ball, Ellipsoid, Region
+from certbound.problem.sets import Inside
 from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian
@@ -26,7 +26,7 @@ from certbound.reach.events import StepEvents, WindowEvents, logsumexp
 from certbound.reach.linear import LinearRun, level_scale
 from certbound.reach.linearisation import Linearisation
 from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificate import Proof, exact
+from certbound.safety.certificate import Proof, exact, needs_direction
 
 __all__ = ["linear_proof"]
 
@@ -305,12 +305,8 @@ def _separations(problem: Problem, run: LinearRun, cell: int) -> list[Any]:
     found: list[Any] = []
     for number, constraint in enumerate(problem.safe):
         rows = [r.rows for r in run.requirements[cell] if r.constraint == number]
-        found.append(_separation(constraint, rows[0]) if _needs_direction(constraint) else None)
+        found.append(_separation(constraint, rows[0]) if needs_direction(constraint) else None)
     return found if problem.domain is None else [*found, None]
-
-
-def _needs_direction(constraint: Inside) -> bool:
-    return isinstance(constraint, Outside) and not isinstance(constraint.region, HalfSpace)
 
 
 def _separation(constraint: Inside, rows: Array) -> Any:

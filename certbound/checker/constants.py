@@ -1,0 +1,269 @@
+"""The constants proof: contraction in a metric, a reach tube by defect, rooms, and Thm K2.
+
+With J^T P + P J <= 2 c P (or ||J||_P <= L) everywhere, on the model's domain, or piece by piece on the reach tube plus
+the rooms r_k: every noise-free trajectory stays within rho_k of the nominal curve (Thm K5), every constraint leaves
+room for a deviation of r_k around that, and P(exists t: ||S_t||_P > r_t) is bounded by Thm K2 (Thm K4 for local
+constants, which are needed only until a room is left; leaving the domain is a broken constraint).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+from flint import arb, arb_mat
+
+from certbound.checker.contraction import Contraction, Spread
+from certbound.checker.demands import Grid, demands, round_demands
+from certbound.checker.eigen import cholesky
+from certbound.checker.kummer import MOST_POWER, Kummer, exit_probability
+from certbound.checker.matrices import identity, is_positive_definite, matrix
+from certbound.checker.model import Model
+from certbound.checker.partition import cells_of
+from certbound.checker.reading import Record, entries, number
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.structure import structure_of
+from certbound.checker.tube import CurvePiece, Norm, Tube
+from certbound.errors import CertificateError
+
+__all__ = ["check_constants"]
+
+MOST_PIECES = 20_000
+MOST_DEGREE = 12
+_PROOF = (
+    "engine", "assumed", "metric", "region", "times", "middles", "rates", "reach_rates", "sigmas", "nu", "start_sigma",
+    "splits", "rooms", "kummer", "cells",
+)  # fmt: skip
+_CELL = ("nominal", "eta", "radius", "separations")
+
+Box = list[tuple[arb, arb]]
+
+
+def check_constants(model: Model, value: object, budget: Budget) -> arb:
+    """Upper bound of the probability that a constraint is broken, for every start and disturbance.
+
+    Raises
+    ------
+    CertificateError
+        If the proof's data are malformed.
+    Unproved
+        If an inequality could not be proved.
+    """
+    return _Proof(model, Record(value, "proof", _PROOF), budget).probability()
+
+
+def _none_or_numbers(value: object, path: str, count: int) -> list[arb | None]:
+    return [None if x is None else arb(number(x, path)) for x in entries(value, path, count, count)]
+
+
+class _Proof:
+    """The data of the proof, and its inequalities."""
+
+    def __init__(self, model: Model, record: Record, budget: Budget) -> None:
+        self.model, self.record, self.budget = model, record, budget
+        n = model.dimension
+        rows = None if record["metric"] is None else record.array("metric", n, n)
+        if rows is not None and any(rows[i][j] != rows[j][i] for i in range(n) for j in range(i)):
+            raise CertificateError("`proof.metric` must be symmetric.")
+        self.norm = Norm(identity(n) if rows is None else matrix(rows))
+        self._read_times()
+        self.rates = self._per_step("rates")
+        self.reach_rates = self.rates if record["reach_rates"] is None else self._per_step("reach_rates")
+        self.sigmas = self._per_step("sigmas")
+        if any(x < 0 for x in self.sigmas) or (not model.continuous and any(not x > 0 for x in self.rates)):
+            raise CertificateError("`proof.sigmas` must not be negative, and gains must be positive.")
+        self.nu = arb(record.number("nu"))
+        if not 0 < self.nu <= n:
+            raise CertificateError(f"`proof.nu` must lie in (0, {n}].")
+        self.start_sigma = arb(record.number("start_sigma", least=0.0))
+        self.rooms = _none_or_numbers(record["rooms"], "proof.rooms", self.count)
+        if record["region"] not in ("everywhere", "domain", "local"):
+            raise CertificateError('`proof.region` must be "everywhere", "domain" or "local".')
+
+    def _read_times(self) -> None:
+        """Pieces of the curve (continuous time), or the steps 0, ..., T."""
+        model, record = self.model, self.record
+        if not model.continuous:
+            if record["times"] is not None or record["middles"] is not None:
+                raise CertificateError("`proof.times` and `proof.middles` must be null in discrete time.")
+            self.count = model.steps + 1
+            self.ends = [(arb(k), arb(k)) for k in range(self.count)]
+            self.middles = [arb(k) for k in range(self.count)]
+            return
+        times = record.array("times", None)
+        if len(times) < 2 or len(times) > MOST_PIECES or any(a >= b for a, b in pairwise(times)):
+            raise CertificateError("`proof.times` must rise.")
+        if times[0] != 0.0 or times[-1] != model.horizon:
+            raise Unproved("the pieces do not cover the horizon")
+        self.count = len(times) - 1
+        self.ends = [(arb(a), arb(b)) for a, b in pairwise(times)]
+        self.middles = [arb(x) for x in record.array("middles", self.count)]
+
+    @property
+    def steps(self) -> int:
+        """Pieces (CT) or transitions (DT) on which rates hold."""
+        return self.count if self.model.continuous else self.count - 1
+
+    def _per_step(self, name: str) -> list[arb]:
+        """One number, or one a piece."""
+        values = [arb(x) for x in self.record.array(name, None)]
+        if len(values) not in (1, self.steps):
+            raise CertificateError(f"`proof.{name}` must have 1 or {self.steps} entries, got {len(values)}.")
+        return values * self.steps if len(values) == 1 else values
+
+    # ---- the proof ---------------------------------------------------------------------------------------
+
+    def probability(self) -> arb:
+        """Every inequality, then Thm K2."""
+        model, record = self.model, self.record
+        local = record["region"] == "local"
+        if local and any(room is None for room in self.rooms[0 if model.continuous else 1 :]):
+            raise Unproved("local constants need a room on every piece")
+        boxes = cells_of(model, record)
+        items = record.items("cells", len(boxes), len(boxes))
+        self.structure = structure_of(model)
+        tubes = []
+        for index, (item, box) in enumerate(zip(items, boxes)):
+            cell = Record(item, f"proof.cells[{index}]", _CELL)
+            tubes.append(self._check_cell(cell, box, whole=len(boxes) == 1))
+        if not record.flag("assumed"):
+            self._check_constants(tubes, local)
+        return exit_probability(self._kummer(), self.budget)
+
+    def _check_cell(self, cell: Record, box: Box, *, whole: bool) -> tuple[Tube, list[arb]]:
+        """Reach tube and rooms of one cell."""
+        n, count = self.model.dimension, self.count
+        nominal = cell.array("nominal", count, None, n)
+        if any(not 1 <= len(item) <= MOST_DEGREE + 1 for item in nominal):
+            raise CertificateError(f"`{cell.at('nominal')}` must hold polynomials of degree at most {MOST_DEGREE}.")
+        pieces = [
+            CurvePiece(
+                start=start, end=end, middle=middle, coefficients=[[arb(x) for x in row] for row in item],
+            )
+            for (start, end), middle, item in zip(self.ends, self.middles, nominal)
+        ]
+        if not self.model.continuous and any(len(item) != 1 for item in nominal):
+            raise CertificateError(f"`{cell.at('nominal')}` must hold points in discrete time.")
+        eta = [arb(x) for x in cell.array("eta", self.steps)]
+        radii = [arb(x) for x in cell.array("radius", count)]
+        tube = Tube(self.model, self.structure, self.norm, pieces, self.budget)
+        first = pieces[0].at(pieces[0].start)
+        start = self.norm.start(self.model, [a for a, _ in box], [b for _, b in box], first, whole)
+        tube.prove(start, self.reach_rates, eta, radii)
+        grid = Grid(
+            times=self.ends, hulls=[piece.hull() for piece in pieces],
+            part=lambda k, first, last: replace(pieces[k], start=first, end=last).hull(),
+        )  # fmt: skip
+        self._check_rooms(cell, grid, radii)
+        return tube, radii
+
+    def _check_rooms(self, cell: Record, grid: Grid, radii: Sequence[arb]) -> None:
+        """Every constraint leaves the stated room around the reach tube."""
+        given = demands(self.model, grid, cell.items("separations"), cell.at("separations"), polygons=False)
+        asked: list[tuple[str, list[arb | None], list[arb]]] = []
+        for demand in given:
+            duals: dict[int, arb] = {}
+            lengths = [duals.setdefault(id(row), self.norm.dual(row)) for row in demand.rows]
+            asked.append((demand.label, demand.rooms, lengths))
+        for ball in round_demands(self.model, grid):
+            asked.append((ball.label, ball.rooms, [self.norm.section(ball.image)] * self.count))
+        random = self.model.initial.covariance is not None
+        for label, rooms, lengths in asked:
+            for k, (left, length) in enumerate(zip(rooms, lengths)):
+                if left is None:
+                    continue
+                room = self.rooms[k]
+                if room is None and not self.model.continuous and k == 0 and not random:
+                    room = arb(0)
+                if room is None:
+                    raise Unproved(f"`proof.rooms` states nothing on piece {k}, where '{label}' is asked")
+                if not (radii[k] + room) * length <= left:
+                    raise Unproved(f"'{label}' was not shown to leave the stated room on piece {k}")
+
+    def _check_constants(self, tubes: Sequence[tuple[Tube, list[arb]]], local: bool) -> None:
+        """Rates, gains, sigma and nu hold where they are used."""
+        model = self.model
+        contraction = Contraction(model, self.structure, self.norm.metric, self.budget)
+        spread = Spread(model, self.norm.metric, self.budget)
+        what = "rate" if model.continuous else "gain"
+        if not local:
+            box = self._global_box()
+            contraction.prove(box, _least([*self.rates, *self.reach_rates]), what)
+            spread.prove(box[: 1 + model.dimension], _least(self.sigmas), self.nu)
+            return
+        for tube, radii in tubes:
+            for k in range(self.steps):
+                for rates, extra in ((self.reach_rates, arb(0)), (self.rates, self._room(k))):
+                    piece = tube.pieces[k]
+                    states = tube.ranges(k, radii[k] + extra)
+                    inputs = [(x.lower(), x.upper()) for x in tube.inputs(k)]
+                    disturbances = [(arb(a), arb(b)) for a, b in model.disturbance]
+                    box = [(piece.start, piece.end), *states, *inputs, *disturbances]
+                    contraction.prove(box, rates[k], what)
+                spread.prove(box[: 1 + model.dimension], self.sigmas[k], self.nu)
+
+    def _room(self, k: int) -> arb:
+        room = self.rooms[k]
+        return arb(0) if room is None else room
+
+    def _global_box(self) -> Box:
+        """All inputs of the dynamics, everywhere or on the domain."""
+        model = self.model
+        ends: list[tuple[float | None, float | None]] = [(None, None)] * model.dimension
+        if self.record["region"] == "domain":
+            if model.domain is None:
+                raise Unproved("the problem has no domain that constants could hold on")
+            ends = model.domain
+        states = [
+            (arb.neg_inf() if low is None else arb(low), arb.pos_inf() if high is None else arb(high))
+            for low, high in ends
+        ]
+        columns = [] if model.plan is None else list(zip(*model.plan))
+        inputs = [(arb(min(column)), arb(max(column))) for column in columns]
+        disturbances = [(arb(a), arb(b)) for a, b in model.disturbance]
+        return [(arb(0), arb(model.horizon)), *states, *inputs, *disturbances]
+
+    def _kummer(self) -> Kummer:
+        """The scalars of Thm K2."""
+        model = self.model
+        record = Record(self.record["kummer"], "proof.kummer", ("form", "a", "v0"))
+        if record["form"] not in ("kummer", "bessel"):
+            raise CertificateError('`proof.kummer.form` must be "kummer" or "bessel".')
+        bessel = record["form"] == "bessel"
+        a, v0 = arb(record.number("a", least=0.0)), arb(record.number("v0"))
+        if not v0 > 0 or not a <= MOST_POWER or (bessel and a.is_zero()):
+            raise CertificateError("`proof.kummer` must have v0 > 0 and a in range.")
+        n, half = model.dimension, self.nu / 2
+        if not model.continuous and not model.noise.gaussian and self.nu < n and (bessel or not a < half):
+            raise Unproved("sub-Gaussian noise with nu < n needs a < nu/2")
+        covariance = model.initial.covariance
+        if covariance is None:
+            start = arb(0)
+        else:
+            start = self.start_sigma
+            if not self.nu >= n:
+                raise Unproved("a random start needs nu = n")
+            self._check_start(covariance, start)
+        lengths = [end - begin for begin, end in self.ends] if model.continuous else [arb(1)] * self.steps
+        rooms = list(self.rooms)
+        if not model.continuous and covariance is None:
+            rooms[0] = None
+        return Kummer(
+            continuous=model.continuous, bessel=bessel, a=a, v0=v0, half=half, start=start, slopes=self.rates,
+            sigmas=self.sigmas, lengths=lengths, radii=rooms,
+        )
+
+    def _check_start(self, covariance: arb_mat, sigma: arb) -> None:
+        """The random start's covariance is at most sigma^2 P^-1."""
+        n = self.model.dimension
+        root = cholesky(self.norm.metric)
+        if not is_positive_definite(identity(n) * (sigma * sigma) - root.transpose() * covariance * root):
+            raise Unproved("the random start was not shown to have the stated spread")
+
+
+def _least(values: Sequence[arb]) -> arb:
+    best = values[0]
+    for value in values[1:]:
+        best = value if value < best else best
+    return best

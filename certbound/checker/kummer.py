@@ -1,0 +1,181 @@
+"""Thm K2 in ball arithmetic: the probability that ||S_t||_P ever exceeds given radii.
+
+With E_a(z) = (1F1(a; nu/2; z) - 1)/a, phi(I) = (e^{a I} - 1)/a (their limits at a = 0) and I_t = int_t^T sigma^2/v,
+v' = 2 c v + sigma^2 (in discrete time sums of log(v_{k+1}/(L_k^2 v_k)), v_{k+1} = L_k^2 v_k + sigma_k^2),
+
+    P(exists t: ||S_t||_P > r_t) <= X / min_t [phi(I_t) + e^{a I_t} E_a(r_t^2/(2 v_t))],   X = phi(I_0).
+
+Bessel form: v' = 2 c v (v_{k+1} = L_k^2 v_k, I_t = sum of sigma^2/v_{k+1}), E_a(z) = (0F1(; nu/2; a z) - 1)/a. A random
+start of proxy s^2 in P's norm enters through X (item 7.4 of docs/theory.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from flint import arb
+
+from certbound.checker.matrices import upper
+from certbound.checker.report import Budget, Unproved
+
+__all__ = ["Kummer", "exit_probability"]
+
+MOST_POWER = 1e5
+_LARGEST = arb(10) ** 7
+_DEPTH = 7
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Kummer:
+    """The scalars of the proof: per piece rate c or gain L, sigma, length and radius (None: nothing is asked)."""
+
+    continuous: bool
+    bessel: bool
+    a: arb
+    v0: arb
+    half: arb
+    start: arb
+    slopes: Sequence[arb]
+    sigmas: Sequence[arb]
+    lengths: Sequence[arb]
+    radii: Sequence[arb | None]
+
+
+def exit_probability(data: Kummer, budget: Budget) -> arb:
+    """Upper bound of P(exists t: ||S_t||_P > r_t).
+
+    In discrete time radii[k] belongs to step k (radii[0] to the start), in continuous time to piece k.
+
+    Raises
+    ------
+    Unproved
+        If v_0 is too small for a random start.
+    """
+    v: list[arb] = [data.v0]
+    steps: list[arb] = []
+    for slope, sigma, length in zip(data.slopes, data.sigmas, data.lengths):
+        after, step = _advance(data, v[-1], slope, sigma, length)
+        v.append(after)
+        steps.append(step)
+    info: list[arb] = [arb(0)]
+    for step in reversed(steps):
+        info.append(info[-1] + step)
+    info.reverse()
+    excess = _excess(data)
+    least: arb | None = None
+    for k, radius in enumerate(data.radii):
+        budget.check()
+        if radius is None:
+            continue
+        if not radius > 0:
+            return arb(1)
+        if data.continuous:
+            value = _least_on(data, excess, radius, (v[k], v[k + 1]), (info[k], info[k + 1]), k)
+        else:
+            value = _gain(data, excess, info[k], radius * radius / (2 * v[k]))
+        least = value if least is None else arb.min(least, value)
+    if least is None:
+        return arb(0)
+    first = _initial(data, info[0])
+    if not least > 0:
+        return arb(1)
+    return upper(arb.min(first / least, arb(1)))
+
+
+def _advance(data: Kummer, v: arb, slope: arb, sigma: arb, length: arb) -> tuple[arb, arb]:
+    """v at the end of a piece, and the piece's part of I."""
+    square = sigma * sigma
+    if data.continuous:
+        grown, back = v * (2 * slope * length).exp(), square * _integral(-2 * slope, length) / v
+        if data.bessel:
+            return grown, back
+        return grown + square * _integral(2 * slope, length), back.log1p()
+    grown = slope * slope * v
+    ratio = square / grown
+    return (grown, ratio) if data.bessel else (grown + square, ratio.log1p())
+
+
+def _integral(rate: arb, length: arb) -> arb:
+    """int_0^length e^{rate s} ds."""
+    if rate.is_zero():
+        return length
+    x = rate * length
+    if abs(x) < 0.25:  # a series: rate may be a ball around 0 or tiny
+        total = term = arb(1)
+        for k in range(1, 60):
+            term = term * x / (k + 1)
+            total += term
+        return length * (total + arb(0, arb(2) ** -200))
+    return x.expm1() / rate
+
+
+def _phi(data: Kummer, info: arb) -> arb:
+    return info if data.a.is_zero() else (data.a * info).expm1() / data.a
+
+
+def _excess(data: Kummer) -> Callable[[arb], arb]:
+    """Lower bound of E_a, which grows with z: large z are cut, and a partial sum of positive terms serves."""
+
+    def value(z: arb) -> arb:
+        z = arb.min(z.lower(), _LARGEST)
+        a, b = data.a, data.half
+        if not a.is_zero():
+            exact = (a * z).hypgeom_0f1(b) if data.bessel else z.hypgeom_1f1(a, b)
+            if exact.is_finite() and exact.rel_accuracy_bits() > 20:
+                return ((exact - 1) / a).lower()
+        return _partial(data, z)
+
+    return value
+
+
+def _partial(data: Kummer, z: arb) -> arb:
+    """Terms 1, 2, ... of the series of E_a: all positive."""
+    a, b = data.a, data.half
+    term = z / b
+    total = term
+    for k in range(1, 3000):
+        term = term * z / ((b + k) * (k + 1))
+        term = term * a if data.bessel else term * (a + k)
+        total += term
+        if term < total * arb(2) ** -60:
+            break
+    return total.lower()
+
+
+def _gain(data: Kummer, excess: Callable[[arb], arb], info: arb, z: arb) -> arb:
+    low = info.lower()
+    return (_phi(data, low) + (data.a * low).exp() * excess(z)).lower()
+
+
+def _least_on(
+    data: Kummer, excess: Callable[[arb], arb], radius: arb, ends: tuple[arb, arb], info: tuple[arb, arb], k: int
+) -> arb:
+    """Lower bound over a piece: I falls, v is monotone; the piece is cut where v falls, to lose less."""
+    square = radius * radius / 2
+    if not ends[1] < ends[0]:
+        return _gain(data, excess, info[1], square / ends[1])
+    best: arb | None = None
+    parts = 2**_DEPTH if ends[1] < arb(0.99) * ends[0] else 1
+    slope, sigma, length = data.slopes[k], data.sigmas[k], data.lengths[k] / parts
+    v, rest = ends[0], info[0]
+    for _ in range(parts):
+        after, step = _advance(data, v, slope, sigma, length)
+        rest = rest - step
+        value = _gain(data, excess, arb.max(rest, info[1]), square / arb.max(v, after))
+        best = value if best is None else arb.min(best, value)
+        v = after
+    assert best is not None
+    return best
+
+
+def _initial(data: Kummer, info: arb) -> arb:
+    """X = (E h_0(S_0) - 1)/a."""
+    if data.start.is_zero():
+        return _phi(data, info)
+    spread = data.start * data.start / data.v0
+    if data.bessel:
+        return _phi(data, info + spread)
+    if not spread < 1:
+        raise Unproved("v_0 is too small for the random start")
+    return _phi(data, info - (-spread).log1p())

@@ -1,0 +1,285 @@
+"""The noise-free reach tube of the constants proof (Thm K5): a nominal polynomial curve, its defect, its radius.
+
+On piece k, t = m_k + tau, the file gives p(tau) = sum_j c_j tau^j, eta_k >= sup |p' - f(p, d, t)|_P over the piece and
+all d, and rho_k >= |x_t - p_t|_P there. Proved: the defect is at most eta_k, and rho' = c rho + eta (discrete time
+rho_{k+1} = L rho_k + eta_k) from the initial set on stays below rho_k, the curve's jumps added.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import comb
+
+from flint import arb, arb_mat
+
+from certbound.checker.arithmetic import Undecided
+from certbound.checker.eigen import cholesky, largest_eigenvalue
+from certbound.checker.matrices import column, magnitude
+from certbound.checker.model import Model
+from certbound.checker.program import Program
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.series import expand
+from certbound.checker.structure import Structure
+
+__all__ = ["CurvePiece", "Norm", "Tube"]
+
+ORDER = 6
+CORNERS = 10
+
+
+class Norm:
+    """|x|_P = sqrt(x^T P x) for a positive definite P."""
+
+    def __init__(self, metric: arb_mat) -> None:
+        self.metric, self.size = metric, magnitude(metric)
+        self.root = cholesky(metric)
+        self.inverse = metric.inv()
+        self.n = metric.nrows()
+        self.sides = [self.dual([arb(1 if i == x else 0) for i in range(self.n)]) for x in range(self.n)]
+
+    def length(self, vector: Sequence[arb]) -> arb:
+        """Upper bound of the norm of a box: that of its middle plus that of its radii."""
+        middle = column([x.mid() for x in vector])
+        radius = column([x.rad() for x in vector])
+        squares = [(middle.transpose() * self.metric * middle)[0, 0], (radius.transpose() * self.size * radius)[0, 0]]
+        return sum((arb.max(x.upper(), arb(0)).sqrt() for x in squares), arb(0)).upper()
+
+    def dual(self, row: Sequence[arb]) -> arb:
+        """Upper bound of sqrt(a^T P^-1 a)."""
+        flat = arb_mat(1, self.n, list(row))
+        return arb.max((flat * self.inverse * flat.transpose())[0, 0].upper(), arb(0)).sqrt().upper()
+
+    def section(self, image: arb_mat) -> arb:
+        """Upper bound of sup |W y| over |y|_P <= 1."""
+        return largest_eigenvalue(image * self.inverse * image.transpose()).sqrt().upper()
+
+    def start(self, model: Model, low: Sequence[arb], high: Sequence[arb], centre: Sequence[arb], whole: bool) -> arb:
+        """Upper bound of |x_0 - centre|_P over a box, or over a round initial set if the box is ``whole``."""
+        sides = [(a - c, b - c) for a, b, c in zip(low, high, centre)]
+        wide = [j for j, (a, b) in enumerate(sides) if a < b]
+        bound = self.length([a.union(b) if a < b else a for a, b in sides])
+        if 0 < len(wide) <= CORNERS:
+            corners = arb(0)
+            for choice in itertools.product((0, 1), repeat=len(wide)):
+                picks = dict(zip(wide, choice))
+                corners = arb.max(corners, self.length([pair[picks.get(j, 1)] for j, pair in enumerate(sides)]))
+            bound = arb.min(bound, corners)
+        initial = model.initial
+        if whole and initial.kind in ("ball", "ellipsoid"):
+            if initial.shape is None:
+                reach = largest_eigenvalue(self.metric).sqrt() * arb(initial.radius)
+            else:
+                inner = cholesky(initial.shape)
+                reach = largest_eigenvalue(inner.transpose() * self.metric * inner).sqrt()
+            shift = self.length([arb(x) - c for x, c in zip(initial.centre, centre)])
+            bound = arb.min(bound, reach + shift)
+        return bound.upper()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CurvePiece:
+    """One piece: its ends, its middle, and the coefficients (one list of n a power)."""
+
+    start: arb
+    end: arb
+    middle: arb
+    coefficients: list[list[arb]]
+
+    def at(self, t: arb) -> list[arb]:
+        """The curve at a time."""
+        tau = t - self.middle
+        value = self.coefficients[-1]
+        for lower in self.coefficients[-2::-1]:
+            value = [c + tau * v for c, v in zip(lower, value)]
+        return value
+
+    def hull(self) -> list[list[arb]]:
+        """Bernstein points: the curve lies in their convex hull."""
+        count = len(self.coefficients)
+        degree, n = count - 1, len(self.coefficients[0])
+        if degree == 0:
+            return [self.coefficients[0]]
+        first, length = self.start - self.middle, self.end - self.start
+        # powers of lambda in [0, 1], tau = first + length * lambda
+        powers = [[arb(0)] * n for _ in range(count)]
+        for j, row in enumerate(self.coefficients):
+            for i in range(j + 1):
+                factor = comb(j, i) * first ** (j - i) * length**i
+                powers[i] = [a + factor * c for a, c in zip(powers[i], row)]
+        return [
+            [sum((arb(comb(k, i)) / comb(degree, i) * powers[i][x] for i in range(k + 1)), arb(0)) for x in range(n)]
+            for k in range(count)
+        ]
+
+    def series(self, tau: arb, order: int) -> list[list[arb]]:
+        """Taylor coefficients of every state about ``tau``."""
+        count = len(self.coefficients)
+        return [
+            [
+                sum((comb(j, i) * self.coefficients[j][x] * tau ** (j - i) for j in range(i, count)), arb(0))
+                for i in range(min(order, count - 1) + 1)
+            ]
+            for x in range(len(self.coefficients[0]))
+        ]
+
+
+class Tube:
+    """Defects and radii along the curve of one cell.
+
+    Parameters
+    ----------
+    model, structure
+        The problem.
+    norm : Norm
+    pieces : sequence of CurvePiece
+        In discrete time one a step, the last one the horizon.
+    """
+
+    def __init__(
+        self, model: Model, structure: Structure, norm: Norm, pieces: Sequence[CurvePiece], budget: Budget
+    ) -> None:
+        self.model, self.norm, self.pieces, self.budget = model, norm, pieces, budget
+        self.reach = [(arb(b) - arb(a)) / 2 for a, b in model.disturbance]
+        self.middle = [(arb(b) + arb(a)) / 2 for a, b in model.disturbance]
+        self.entries = list(structure.disturbance_nodes)
+        graph = structure.graph
+        self.gain = Program(
+            graph, list(structure.disturbance_nodes.values()), structure.outputs,
+            variables=len(model.dynamics.inputs), generalised=True,
+        )
+        self.gain.prepare([])
+
+    def inputs(self, k: int) -> list[arb]:
+        """The plan's inputs on piece k (each row holds on an equal part of the horizon)."""
+        plan = self.model.plan
+        if plan is None:
+            return []
+        if not self.model.continuous:
+            return [arb(x) for x in plan[min(k, len(plan) - 1)]]
+        piece = self.pieces[k]
+        share = arb(self.model.horizon) / len(plan)
+        row = int(float((piece.start + piece.end) / 2 / share))
+        edges = share * row, share * (row + 1)
+        slack = arb(self.model.horizon) * arb(2) ** -48
+        if not (piece.start >= edges[0] - slack and piece.end <= edges[1] + slack):
+            raise Unproved(f"piece {k} does not lie between two changes of the plan")
+        first, last = arb(0), slack
+        beside = [arb(x) for x in plan[row]]
+        # an end that misses the plan's change by rounding sees both rows
+        for edge, other in ((piece.start - edges[0], row - 1), (edges[1] - piece.end, row + 1)):
+            if not edge >= first and 0 <= other < len(plan) and last > 0:
+                beside = [a.union(arb(b)) for a, b in zip(beside, plan[other])]
+        return beside
+
+    def defect(self, k: int) -> arb:
+        """Upper bound of |p' - f(p, d, t)|_P over piece k and all d (discrete time: of |p_{k+1} - f(p_k, d, k)|_P)."""
+        self.budget.check()
+        try:
+            rest = self._at_centre(k)
+            if not self.reach:
+                return self.norm.length(rest)
+            return self._with_disturbance(k, rest)
+        except Undecided as error:
+            raise Unproved(f"the dynamics is not defined along the nominal curve on piece {k}") from error
+
+    def _at_centre(self, k: int) -> list[arb]:
+        """The defect at d0, as a box over the piece."""
+        model, piece = self.model, self.pieces[k]
+        inputs = [[x] for x in [*self.inputs(k), *self.middle]]
+        if not model.continuous:
+            states = [[x] for x in piece.coefficients[0]]
+            after = self.pieces[k + 1].coefficients[0]
+            values = expand(model.dynamics, [[arb(k)], *states, *inputs], 0)
+            return [a - value[0] for a, value in zip(after, values)]
+        span = (piece.start - piece.middle).union(piece.end - piece.middle)
+        result = []
+        parts = []
+        for tau in (arb(0), span):
+            time = [piece.middle + tau, arb(1)]
+            states = piece.series(tau, ORDER + 1)
+            flow = expand(model.dynamics, [time, *states, *inputs], ORDER)
+            parts.append((states, flow))
+        for x in range(model.dimension):
+            (thin, thin_flow), (wide, wide_flow) = ((part[0][x], part[1][x]) for part in parts)
+            total = _velocity(wide, ORDER) - wide_flow[ORDER]
+            for j in range(ORDER - 1, -1, -1):
+                total = _velocity(thin, j) - thin_flow[j] + span * total
+            result.append(total)
+        return result
+
+    def _with_disturbance(self, k: int, rest: list[arb]) -> arb:
+        """Corners of the linear effect of d, plus what is left of it over the piece."""
+        n, piece = self.model.dimension, self.pieces[k]
+        box = [low.union(high) for low, high in self.ranges(k)]
+        time = piece.start.union(piece.end) if self.model.continuous else arb(k)
+        disturbances = [m + arb(0, r) for m, r in zip(self.middle, self.reach)]
+        values = self.gain.run([time, *box, *self.inputs(k), *disturbances])
+        centre = [x.mid() for x in rest]
+        spread = [arb(0, x.rad()) for x in rest]
+        columns = [[arb(0)] * n for _ in self.reach]
+        for (i, j), value in zip(self.entries, values):
+            columns[j][i] = value.mid() * self.reach[j]
+            spread[i] = spread[i] + arb(0, value.rad()) * self.reach[j]
+        if len(columns) > CORNERS:
+            raise Unproved(f"{len(columns)} disturbances are too many for this proof")
+        worst = arb(0)
+        for signs in itertools.product((-1, 1), repeat=len(columns)):
+            corner = list(centre)
+            for sign, values_ in zip(signs, columns):
+                corner = [a + sign * b for a, b in zip(corner, values_)]
+            worst = arb.max(worst, self.norm.length(corner))
+        return (worst + self.norm.length(spread)).upper()
+
+    def ranges(self, k: int, reach: arb | None = None) -> list[tuple[arb, arb]]:
+        """The box hull of the curve on a piece, grown by ``reach`` in the norm."""
+        points = self.pieces[k].hull()
+        result = []
+        for x in range(self.model.dimension):
+            low = high = points[0][x]
+            for point in points[1:]:
+                low, high = arb.min(low, point[x]), arb.max(high, point[x])
+            grown = arb(0) if reach is None else reach * self.norm.sides[x]
+            result.append(((low - grown).lower(), (high + grown).upper()))
+        return result
+
+    def prove(self, start: arb, slopes: Sequence[arb], eta: Sequence[arb], radii: Sequence[arb]) -> None:
+        """The stated defects and radii hold.
+
+        Raises
+        ------
+        Unproved
+        """
+        rho = start
+        for k, piece in enumerate(self.pieces):
+            if k < len(eta) and not self.defect(k) <= eta[k]:
+                raise Unproved(f"the defect of the nominal curve was not shown to be at most eta on piece {k}")
+            after = rho
+            if self.model.continuous:
+                length = piece.end - piece.start
+                after = (slopes[k] * length).exp() * rho + _integral(slopes[k], length) * eta[k]
+            if not arb.max(rho, after) <= radii[k]:
+                raise Unproved(f"the reach tube was not shown to have the stated radius on piece {k}")
+            if self.model.continuous and k + 1 < len(self.pieces):
+                following = self.pieces[k + 1]
+                jump = [a - b for a, b in zip(following.at(piece.end), piece.at(piece.end))]
+                rho = (after + self.norm.length(jump)).upper()
+            elif not self.model.continuous and k < len(eta):
+                rho = (slopes[k] * rho + eta[k]).upper()
+
+
+def _velocity(series: list[arb], j: int) -> arb:
+    return (j + 1) * series[j + 1] if j + 1 < len(series) else arb(0)
+
+
+def _integral(rate: arb, length: arb) -> arb:
+    """int_0^length e^{rate s} ds."""
+    x = rate * length
+    if abs(x) < 0.25:
+        total = term = arb(1)
+        for k in range(1, 60):
+            term = term * x / (k + 1)
+            total += term
+        return length * (total + arb(0, arb(2) ** -200))
+    return x.expm1() / rate
