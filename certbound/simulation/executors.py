@@ -198,11 +198,12 @@ def connect(address: str, timeout: float = 10.0) -> Any:
         If dask is not installed, or no scheduler answers there.
     """
     try:
-        from distributed import Client
+        import distributed
     except ImportError as error:
         raise ValueError("a cluster needs dask; install it with: pip install 'certbound[cluster]'.") from error
     try:
-        return Client(address, timeout=timeout)
+        connect: Any = distributed.Client
+        return connect(address, timeout=timeout)
     except (OSError, TimeoutError, ValueError) as error:
         raise ValueError(
             f"`cluster` must be the address of a running dask scheduler, got {address!r} ({error})."

@@ -19,7 +19,8 @@ from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian
-from certbound.reach.events import StepEvents, WindowEvents
+from certbound.reach.clocks import ClockEvents
+from certbound.reach.events import StepEvents
 from certbound.reach.inclusion import Supports
 from certbound.reach.linear import LinearRun, level_scale
 from certbound.reach.linearisation import Linearisation
@@ -42,6 +43,7 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+Rows = Callable[[Array, Array], Array]
 
 NONLINEAR_SHARE = 0.1
 """Part of delta that the linear response spends on the coordinates that enter nonlinearly."""
@@ -50,8 +52,11 @@ NONLINEAR_SHARE = 0.1
 class Tightening:
     """Extents of a tube along rows: what deviations can do, a . S at most."""
 
-    def extents(self, rows: Callable[[Array, Array], Array], states: Array, times: Array) -> Array:
-        """Extent along rows(states, times), (K, R, n), at every one of K points: shape (K, R)."""
+    def extents(self, rows: Rows, states: Array, times: Array, key: object = None) -> Array:
+        """Extent along rows(states, times), (K, R, n), at every one of K points: shape (K, R).
+
+        ``key`` names the rows, so that what was found for them may be used again.
+        """
         raise NotImplementedError
 
 
@@ -62,7 +67,7 @@ class BallTube(Tightening):
     radii: Array
     inverse: Array
 
-    def extents(self, rows: Callable[[Array, Array], Array], states: Array, times: Array) -> Array:
+    def extents(self, rows: Rows, states: Array, times: Array, key: object = None) -> Array:
         a = rows(states, times)
         size = np.sqrt(np.maximum(np.einsum("kri,ij,krj->kr", a, self.inverse, a), 0.0))
         return np.asarray(self.radii[:, None] * size)
@@ -74,21 +79,26 @@ class ScaledTube(Tightening):
 
     covariance: Array
 
-    def extents(self, rows: Callable[[Array, Array], Array], states: Array, times: Array) -> Array:
+    def extents(self, rows: Rows, states: Array, times: Array, key: object = None) -> Array:
         a = rows(states, times)
         return np.asarray(np.sqrt(np.maximum(np.einsum("kri,kij,krj->kr", a, self.covariance, a), 0.0)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearTube(Tightening):
-    """Extents of the linear response (Thm K7) along a plan, each row's level costing exp(log_share)."""
+    """Extents of the linear response (Thm K7) along a plan, each row's level costing exp(log_share).
+
+    In continuous time, where a level costs most to find, the rows of one face share that of their largest one, and
+    ``factors`` keeps it (in standard deviations) from plan to plan: it hardly changes.
+    """
 
     run: LinearRun
     bounds: tuple[Array, Array]
-    events: StepEvents | WindowEvents
+    events: StepEvents | ClockEvents
     log_share: float
+    factors: dict[object, float]
 
-    def extents(self, rows: Callable[[Array, Array], Array], states: Array, times: Array) -> Array:
+    def extents(self, rows: Rows, states: Array, times: Array, key: object = None) -> Array:
         engine = self.run.engine
         nodes = engine.nodes[0]
         at = engine.times if not engine.continuous else (engine.times[:-1] + engine.times[1:]) / 2
@@ -100,10 +110,7 @@ class LinearTube(Tightening):
         )
         _, high, _ = support.remainder(self.bounds[0][0], self.bounds[1][0])
         taken = support.y + high
-        for index in range(a.shape[1]):
-            event = self.events.along(a[:, index])
-            if event.profile.max() > 0:
-                taken[:, index] += level_scale(event, event.profile, self.log_share) * event.profile
+        taken += self._levels(a, key)
         if not engine.continuous:
             return np.asarray(taken[np.round(times).astype(int)])
         place = times / engine.step
@@ -112,13 +119,27 @@ class LinearTube(Tightening):
         return np.asarray(np.maximum(taken[before], taken[after]))
 
 
+    def _levels(self, rows: Array, key: object) -> Array:
+        """Levels of Z along rows (N, R, n): a factor times the standard deviation."""
+        events = [self.events.along(rows[:, index]) for index in range(rows.shape[1])]
+        shapes = np.stack([event.profile for event in events], axis=1)
+        if isinstance(self.events, StepEvents):
+            factors = [level_scale(e, e.profile, self.log_share) if e.profile.max() > 0 else 0.0 for e in events]
+            return np.asarray(shapes * np.array(factors))
+        if key not in self.factors:
+            largest = events[int(np.argmax(shapes.max(axis=0)))]
+            quiet = largest.profile.max() <= 0
+            self.factors[key] = 0.0 if quiet else level_scale(largest, largest.profile, self.log_share)
+        return np.asarray(shapes * self.factors[key])
+
+
 def tighten(tube: Tightening, faces: Sequence[Face], states: Array, times: Array) -> Array:
     """Erosions (points, parts) of all faces at the points behind the start."""
-    found = [face.erosion(tube.extents(face.rows, states[1:], times[1:])) for face in faces]
+    found = [face.erosion(tube.extents(face.rows, states[1:], times[1:], key)) for key, face in enumerate(faces)]
     return np.concatenate(found, axis=1) if found else np.zeros((len(times) - 1, 0))
 
 
-def linear_tube(problem: Problem, rows: int, delta: float) -> LinearTube | None:
+def linear_tube(problem: Problem, rows: int, delta: float, factors: dict[object, float]) -> LinearTube | None:
     """The linear response along the problem's plan for ``rows`` one-sided rows; None where it feeds itself."""
     run = LinearRun(Linearisation.of(problem))
     log_nonlinear = float(np.log(delta * NONLINEAR_SHARE))
@@ -128,7 +149,7 @@ def linear_tube(problem: Problem, rows: int, delta: float) -> LinearTube | None:
     if bounds is None:
         return None
     share = float(np.log(delta * (1 - NONLINEAR_SHARE) / max(rows, 1)))
-    return LinearTube(run=run, bounds=bounds, events=events[0], log_share=share)
+    return LinearTube(run=run, bounds=bounds, events=events[0], log_share=share, factors=factors)
 
 
 def spread_tube(problem: Problem, plant: Plant, grid: Grid, states: Array, inputs: Array) -> ScaledTube:
