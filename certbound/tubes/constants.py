@@ -64,6 +64,9 @@ class Constants:
     gaussian : bool
         Asserts that the noise of a discrete-time system is Gaussian (implied by ``isotropic``; a Wiener process
         always is).
+    noise_bound : float or array_like, optional
+        Almost-sure bound of ||w_t|| in the metric of the next step (discrete time): every tube is then cut by the
+        almost-sure bound, pointwise.
     times : array_like, optional
         Piece ends, one entry more than the per-piece values, which hold on [times[k], times[k+1]).
 
@@ -79,6 +82,7 @@ class Constants:
     isotropic: bool = False
     gaussian: bool = False
     times: Array | None = None
+    noise_bound: float | Array | None = None
     proof: Proof | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -91,6 +95,12 @@ class Constants:
         for field_name in (name, "sigma"):
             value = _values(field_name, getattr(self, field_name), times)
             object.__setattr__(self, field_name, value)
+        if self.noise_bound is not None:
+            if self.gain is None or self.gaussian or self.isotropic:
+                raise ValueError("`noise_bound` is for discrete-time noise that is not Gaussian; leave it out.")
+            object.__setattr__(self, "noise_bound", _values("noise_bound", self.noise_bound, times))
+            if np.any(np.asarray(self.noise_bound) < 0):
+                raise ValueError(f"`noise_bound` must not be negative, got {self.noise_bound}.")
         if np.any(np.asarray(self.sigma) < 0):
             raise ValueError(f"`sigma` must not be negative, got {self.sigma}.")
         if self.gain is not None and np.any(np.asarray(self.gain) <= 0):
@@ -161,6 +171,7 @@ class Constants:
             rate=None if self.rate is None else largest(self.rate),
             gain=None if self.gain is None else largest(self.gain),
             sigma=sigma,
+            noise_bound=None if self.noise_bound is None else largest(self.noise_bound),
             isotropic=self.isotropic and same,
             proof=None,
         )
@@ -181,7 +192,18 @@ class Constants:
         return float(np.max(np.asarray(value)) - self.proof.sampled)
 
 
-_PROVED = ("rate", "gain", "sigma", "dimension", "effective_dimension", "metric", "isotropic", "gaussian", "times")
+_PROVED = (
+    "rate",
+    "gain",
+    "sigma",
+    "dimension",
+    "effective_dimension",
+    "metric",
+    "isotropic",
+    "gaussian",
+    "times",
+    "noise_bound",
+)
 
 
 def _frozen(array: Array) -> Array:

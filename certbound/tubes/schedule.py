@@ -48,6 +48,8 @@ class Schedule:
         Effective dimension.
     any_power : bool
         Whether every Kummer parameter a > 0 is valid (CT, Gaussian noise or isotropic proxy; Thm K1).
+    scale : float, optional
+        Unit of length; the largest sigma when omitted.
     """
 
     continuous: bool
@@ -56,10 +58,10 @@ class Schedule:
     sigmas: Array
     nu: float
     any_power: bool
+    scale: float | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        names = ("continuous", "times", "slopes", "sigmas", "nu", "any_power")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     @property
     def horizon(self) -> float:
@@ -68,8 +70,8 @@ class Schedule:
 
     @cached_property
     def unit(self) -> float:
-        """Largest sigma (1 when there is no noise)."""
-        return float(np.max(self.sigmas)) or 1.0
+        """Largest sigma (1 when there is no noise), or ``scale``."""
+        return self.scale or float(np.max(self.sigmas)) or 1.0
 
     @cached_property
     def rates(self) -> Array:
@@ -106,7 +108,14 @@ class Schedule:
         piece = np.searchsorted(self.times, merged[:-1], side="right") - 1
         return Schedule(
             continuous=self.continuous, times=merged, slopes=self.slopes[piece], sigmas=self.sigmas[piece],
-            nu=self.nu, any_power=self.any_power,
+            nu=self.nu, any_power=self.any_power, scale=self.scale,
+        )  # fmt: skip
+
+    def until(self, last: int) -> Schedule:
+        """The first ``last`` pieces, in the same unit."""
+        return Schedule(
+            continuous=self.continuous, times=self.times[: last + 1], slopes=self.slopes[:last], scale=self.unit,
+            sigmas=self.sigmas[:last], nu=self.nu, any_power=self.any_power,
         )  # fmt: skip
 
     def graded(self, count: int = 32) -> Schedule:

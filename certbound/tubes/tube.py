@@ -169,8 +169,11 @@ class Tube:
         return result
 
 
-def supremum(profile: Profile, start: float, end: float, *, whole: bool, gap: float = 1e-4) -> float:
-    """Rigorous upper bound of the supremum of a profile over [start, end], within ``gap`` where it is cheap."""
+def supremum(profile: Profile, start: float, end: float, *, whole: bool) -> float:
+    """Rigorous upper bound of the supremum of a profile over [start, end], nearly tight where that is cheap.
+
+    A profile may set ``gap`` (relative, 1e-4) and ``splits`` (64), which limit the effort.
+    """
     times = profile.times
     first = int(np.clip(np.searchsorted(times, start, side="right") - 1, 0, len(times) - 2))
     last = int(np.clip(np.searchsorted(times, end, side="left") - 1, first, len(times) - 2))
@@ -189,12 +192,12 @@ def supremum(profile: Profile, start: float, end: float, *, whole: bool, gap: fl
             push(piece, s, e)
         else:  # most pieces are settled by the rough bound
             heapq.heappush(heap, (-profile.rough(piece, s, e), False, piece, s, e))
-    budget = 64
+    budget, gap = getattr(profile, "splits", 64), getattr(profile, "gap", 1e-4)
     while True:
         bound, exact, piece, s, e = heap[0]
         middle = math.floor((s + e) / 2) if whole else (s + e) / 2
         settled = -bound <= attained * (1 + gap) or budget <= 0 or not math.isfinite(bound)
-        if exact and (settled or not s <= middle < e):
+        if settled or (exact and not s <= middle < e):
             return -bound
         heapq.heappop(heap)
         if not exact:

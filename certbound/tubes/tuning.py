@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from certbound.errors import InfeasibleError
+from certbound.errors import InfeasibleError, SolverError
+from certbound.tubes.almost_sure import AlmostSureProfile
 from certbound.tubes.baselines import BASELINES, baseline_tube
 from certbound.tubes.constants import Constants
+from certbound.tubes.exact import bound_exact_exit, bound_worst_exit, first_passage_tube
 from certbound.tubes.exit import exit_level
 from certbound.tubes.kummer import KummerProfile, Start, check_delta, check_power, check_start
-from certbound.tubes.objective import Objective, make_objective, read_clearance
-from certbound.tubes.schedule import Schedule, make_schedule
+from certbound.tubes.mixing import mixture_level, mixture_tube
+from certbound.tubes.objective import Clearance, Objective, make_objective, read_clearance
+from certbound.tubes.schedule import Schedule, make_schedule, spread
 from certbound.tubes.search import Search
-from certbound.tubes.tube import Tube, supremum
+from certbound.tubes.tube import Tube, log10_upper, supremum
 
 __all__ = ["METHODS", "applicable_methods", "bound_exit_probability", "tube_objective", "tune_tube"]
 
-METHODS = ("auto", "kummer", "bessel", "mixture", "exact", *BASELINES)
+METHODS = ("auto", "kummer", "bessel", "mixture", "exact", "worst_case", *BASELINES)
 """Every name that ``method`` takes."""
 
+SLOW = ("mixture", "exact", "worst_case")
+"""Methods that take seconds; ``auto`` tries them with ``thorough=True``."""
+
+_log = logging.getLogger(__name__)
 _QUICK = ("kummer", "bessel", "thm2", "thm2_cosh", "thm3_cosh", "thm3_sharp", "thm4", "prop3_sharp", "thm5_sharp")
 
 
@@ -55,9 +63,10 @@ def tune_tube(
         One of :data:`METHODS`. ``"auto"`` takes the best of all certified trajectory-level tubes; the one-time
         bounds (Props 1, 2, Markov, Chebyshev) and the printed variants only come by name.
     epsilon, step : float, optional
-        The paper's free parameters; optimised when omitted.
+        The paper's free parameters; optimised when omitted, of no effect on formulas without them.
     thorough : bool
-        Let ``"auto"`` try the slow methods as well (mixture, exact).
+        Let ``"auto"`` try the slow methods as well: ``"exact"`` (isotropic noise), ``"worst_case"`` (continuous
+        time) and ``"mixture"``; seconds instead of milliseconds.
     start : Start, optional
         Deviation at time 0 (Kummer and Bessel forms only; S_0 = 0 when omitted).
 
@@ -96,18 +105,25 @@ def tune_tube(
     best: Tube | None = None
     value = math.inf
     for name in applicable_methods(constants) if method == "auto" else (method,):
-        if name in ("kummer", "bessel"):
+        tube: Tube | None
+        if name in SLOW:
+            tube = _slow_tube(constants, schedule, delta, goal, name, seed=None)
+        elif name in ("kummer", "bessel"):
             bessel = name == "bessel"
             tube = _family_tube(constants, schedule, delta, goal, start, bessel=bessel, unless=value)
-        elif name in ("mixture", "exact"):
-            raise InfeasibleError(f"`method` {name!r} is not available for these constants; use 'auto'.")
         elif moving:
             continue
         else:
             tube = baseline_tube(
-                constants, name, horizon=schedule.horizon, delta=delta, objective=goal, epsilon=epsilon, step=step,
+                constants,
+                name,
+                horizon=schedule.horizon,
+                delta=delta,
+                objective=goal,
+                epsilon=epsilon,
+                step=step,
                 unless=value,
-            )  # fmt: skip
+            )
         if tube is None:
             continue
         other = tube_objective(tube, goal) if method == "auto" else value
@@ -115,7 +131,54 @@ def tune_tube(
             best, value = tube, other
     if best is None:
         raise InfeasibleError(f"no tube of `method` {method!r} was found; try 'kummer'.")
+    if method == "auto" and thorough and not moving and value > 0:
+        best = _thorough_tube(constants, schedule, delta, goal, best)
+    return _cut_by_bound(best, schedule, start)
+
+
+def _cut_by_bound(tube: Tube, schedule: Schedule, start: Start) -> Tube:
+    """The pointwise minimum with the almost-sure bound, where the noise has one."""
+    bound = tube.constants.noise_bound
+    if bound is None or start.sigma > 0 or tube.level != "trajectory":
+        return tube
+    pieces = len(schedule.lengths)
+    bounds = spread(np.atleast_1d(np.asarray(bound, dtype=float))[:pieces], pieces)
+    return replace(tube, bounded=AlmostSureProfile(schedule=schedule, bounds=bounds, start=start.offset))
+
+
+def _thorough_tube(constants: Constants, schedule: Schedule, delta: float, goal: Objective, best: Tube) -> Tube:
+    """The best of ``best`` and the slow methods that apply; one that fails is left out."""
+    value, seed, decided = tube_objective(best, goal), best, False
+    names = ["exact"] * constants.isotropic + ["worst_case"] * constants.continuous + ["mixture"]
+    for name in names:
+        if decided and name == "mixture":
+            continue  # a first-passage law is the limit of every mixture
+        try:
+            tube = _slow_tube(constants, schedule, delta, goal, name, seed=seed)
+        except (InfeasibleError, SolverError) as error:
+            _log.debug("%s is left out: %s", name, error)
+            continue
+        if (other := tube_objective(tube, goal)) < value:
+            best, value = tube, other
+            decided = decided or (name != "mixture" and goal.kind == "scale" and goal.clearance is None)
     return best
+
+
+def _slow_tube(
+    constants: Constants, schedule: Schedule, delta: float, goal: Objective, method: str, *, seed: Tube | None
+) -> Tube:
+    """A tube of a slow method; ``seed`` is a valid tube to start from."""
+    if np.max(schedule.sigmas) == 0:
+        raise InfeasibleError(f"`method` {method!r} needs noise, sigma is 0; use 'kummer' (the radius is 0).")
+    if seed is None:
+        seed = _family_tube(constants, schedule, delta, goal, Start(), bessel=False)
+    assert seed is not None
+    if method == "mixture":
+        return mixture_tube(constants, schedule, delta, goal, seed=seed, objective=goal.given)
+    return first_passage_tube(
+        constants, horizon=schedule.horizon, delta=delta, worst=method == "worst_case", objective=goal.given,
+        above=seed.maximum,
+    )  # fmt: skip
 
 
 def applicable_methods(constants: Constants) -> list[str]:
@@ -202,7 +265,7 @@ def replace_nu(schedule: Schedule, nu: float) -> Schedule:
 
 
 def bound_exit_probability(
-    constants: Constants, *, horizon: float, clearance: Any, start: Start | None = None
+    constants: Constants, *, horizon: float, clearance: Any, start: Start | None = None, thorough: bool = False
 ) -> float:
     """log10 of an upper bound of P(exists t in [0, T]: ||S_t||_P > clearance_t).
 
@@ -217,6 +280,8 @@ def bound_exit_probability(
         the inequality is proved between the nodes, not only at them.
     start : Start, optional
         Deviation at time 0.
+    thorough : bool
+        Try mixtures and first-passage laws as well (seconds).
 
     Returns
     -------
@@ -255,4 +320,30 @@ def bound_exit_probability(
         )  # fmt: skip
         a, v0, _ = search.solve()
         best = min(best, exit_level(data, held, a=a, v0=v0, bessel=bessel, start=start))
+        if not bessel:
+            pair = (a, v0, False)
+    if thorough and start == Start():
+        best = min(best, _thorough_level(constants, cut, held, pair, best))
     return max(best, -1e12)
+
+
+def _thorough_level(
+    constants: Constants, schedule: Schedule, held: Clearance, pair: tuple[float, float, bool], best: float
+) -> float:
+    """log10 of the probability by the slow methods that apply."""
+    levels = [0.0]
+    try:
+        levels.append(mixture_level(schedule, held, best=[pair]))
+    except SolverError as error:
+        _log.debug("mixture is left out: %s", error)
+    laws = [bound_exact_exit] * constants.isotropic + [bound_worst_exit] * constants.continuous
+    if np.all(held.values == held.values[0]) and best > -9:
+        for law in laws:
+            target = min(0.5, 10.0 ** min(best, *levels))
+            try:
+                value = law(constants, horizon=schedule.horizon, radius=float(held.values[0]), target=target)
+            except InfeasibleError as error:
+                _log.debug("%s is left out: %s", law.__name__, error)
+                continue
+            levels.append(log10_upper(value) if value > 0 else 0.0)
+    return min(levels)

@@ -1,0 +1,264 @@
+"""Tubes of constant radius from first-passage laws, certified (Sec. 4 end, items 7.9 and 7.10 of docs/theory.md).
+
+- ``exact``: the law of the linear isotropic system s -> c s, s -> L s with noise exactly sigma I, which dominates
+  every system with these constants and ``isotropic=True``. The probability is bounded in
+  :mod:`certbound.tubes.supersolution` (CT) or :mod:`certbound.tubes.recursion` (DT); where the latter would be too
+  large, the chain is compared with the diffusion that has its law at whole steps.
+- ``worst_case``: the exact worst case over g g^T <= sigma^2 I, tr <= nu sigma^2, state-dependent g included (CT).
+
+Floating point finds the radius; the number that is compared with delta is a rigorous upper bound.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from flint import arb
+from numpy.typing import NDArray
+
+from certbound.errors import InfeasibleError
+from certbound.rigor.balls import lower, precision
+from certbound.tubes.ballpath import integral
+from certbound.tubes.constants import Constants
+from certbound.tubes.recursion import Recursion
+from certbound.tubes.schedule import Schedule, make_schedule
+from certbound.tubes.supersolution import Supersolution
+from certbound.tubes.tube import Tube
+
+__all__ = ["ConstantProfile", "bound_exact_exit", "bound_worst_exit", "first_passage_tube"]
+
+Array = NDArray[np.float64]
+
+_LARGEST_CHAIN = 2.0e10
+_MOST_KERNELS = 12
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ConstantProfile:
+    """The same radius at every time."""
+
+    value: float
+    horizon: float
+
+    @property
+    def times(self) -> Array:
+        """One piece."""
+        return np.array([0.0, self.horizon])
+
+    def radius(self, t: Array) -> Array:
+        """The radius."""
+        return np.full(np.shape(t), self.value)
+
+    def stretch(self, piece: int, start: float, end: float) -> tuple[float, float]:
+        """The radius, twice."""
+        return self.value, self.value
+
+    def rough(self, piece: int, start: float, end: float) -> float:
+        """The radius."""
+        return self.value
+
+    def to_dict(self) -> dict[str, Any]:
+        """Parameters as plain data."""
+        return {"kind": "constant", "radius": self.value}
+
+
+def _exact_pieces(schedule: Schedule, square: float) -> tuple[tuple[float, float], ...]:
+    """(sigma^2 dt/R^2, -2 c R^2/sigma^2) per piece; a piece without noise may only contract, and is left out."""
+    pieces = []
+    for rate, noise, length in zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist()):
+        if noise > 0:
+            pieces.append((noise * length / square, -2 * rate * square / noise))
+        elif rate > 0:
+            raise InfeasibleError("`method` 'exact' needs noise wherever the rate is positive; use 'worst_case'.")
+    return tuple(pieces)
+
+
+def _worst_pieces(schedule: Schedule, dimension: int, square: float) -> tuple[tuple[float, float], ...] | None:
+    """(duration, kappa) per piece along y_b' = max(0, 2 c y_b + kappa_0 sigma^2), y_b(T) = R^2; None if y_b meets 0."""
+    spin = min(schedule.nu, dimension - 1.0)
+    kappa = spin + 0.1 if spin > 0 else 0.0  # a little faster than needed: the corner at the boundary then is smooth
+    pieces: list[tuple[float, float]] = []
+    with precision():
+        y, zero = arb(square), arb(kappa)
+        path = zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist())
+        for rate, noise, length in reversed(list(path)):
+            speed = 2 * arb(rate) * y + zero * arb(noise)
+            if speed > 0:
+                spread = arb(noise) * integral(-2 * arb(rate), arb(length))
+                y = y * (-2 * arb(rate) * arb(length)).exp() - zero * spread
+                if not lower(y) > 0:
+                    return None
+                duration = (zero * spread / y).log1p() / zero if kappa > 0 else spread / y
+                if noise > 0:
+                    pieces.append((float(duration), kappa))
+            elif noise > 0:
+                pieces.append((float(arb(noise) * arb(length) / y), float(-2 * arb(rate) * y / arb(noise))))
+    return tuple(reversed(pieces))
+
+
+def _diffusion(
+    constants: Constants, schedule: Schedule, radius: float, target: float, *, worst: bool, coarseness: float = 1.0
+) -> Supersolution | None:
+    """The normalised problem for a radius; None when the bound is 1."""
+    square = (radius / schedule.unit) ** 2
+    pieces = (
+        _worst_pieces(schedule, constants.dimension, square) if worst else _exact_pieces(schedule, square)
+    )  # fmt: skip
+    if pieces is None:
+        return None
+    return Supersolution(
+        pieces=pieces, dimension=constants.dimension, nu=schedule.nu, worst=worst, target=target, coarseness=coarseness
+    )
+
+
+def _chain(constants: Constants, schedule: Schedule, radius: float) -> Recursion | None:
+    """The recursion for a radius; None when it would be too large."""
+    steps = np.round(schedule.lengths).astype(np.intp)
+    if (
+        np.any(schedule.sigmas == 0)
+        or len(set(zip(schedule.slopes.tolist(), schedule.sigmas.tolist()))) > _MOST_KERNELS
+    ):
+        return None
+    chain = Recursion(
+        gains=schedule.slopes, sigmas=schedule.sigmas / schedule.unit, counts=steps, dimension=constants.dimension,
+        radius=radius / schedule.unit,
+    )  # fmt: skip
+    return chain if chain.size**2 * float(steps.sum()) < _LARGEST_CHAIN else None
+
+
+def bound_exact_exit(constants: Constants, *, horizon: float, radius: float, target: float = 1e-3) -> float:
+    """Upper bound of P(exists t <= T: ||S_t||_P > radius) for noise that is exactly isotropic.
+
+    Parameters
+    ----------
+    constants : Constants
+        With ``isotropic=True``.
+    horizon, radius : float
+        T, and the constant radius.
+    target : float
+        Expected size of the probability: it sets the mesh.
+
+    Raises
+    ------
+    ValueError
+        If the constants do not assert isotropic noise.
+
+    Source: Sec. 4 end, item 7.9 of docs/theory.md.
+    """
+    _check_isotropic(constants)
+    schedule = make_schedule(constants, horizon)
+    if not schedule.continuous:
+        chain = _chain(constants, schedule, radius)
+        if chain is not None:
+            return chain.bound()
+    problem = _diffusion(constants, schedule, radius, target, worst=False)
+    return 1.0 if problem is None else problem.bound()
+
+
+def bound_worst_exit(constants: Constants, *, horizon: float, radius: float, target: float = 1e-3) -> float:
+    """Upper bound of P(exists t <= T: ||S_t||_P > radius) for all noise with g g^T <= sigma^2 I, tr <= nu sigma^2 (CT).
+
+    Raises
+    ------
+    ValueError
+        In discrete time.
+
+    Source: item 7.9 of docs/theory.md.
+    """
+    _check_continuous(constants)
+    problem = _diffusion(constants, make_schedule(constants, horizon), radius, target, worst=True)
+    return 1.0 if problem is None else problem.bound()
+
+
+def _check_isotropic(constants: Constants) -> None:
+    if not constants.isotropic:
+        raise ValueError(
+            "`method` 'exact' needs `isotropic=True`: the noise must be exactly sigma I in the metric, not below it; "
+            "use 'worst_case' (continuous time), 'mixture' or 'kummer'."
+        )
+
+
+def _check_continuous(constants: Constants) -> None:
+    if not constants.continuous:
+        raise ValueError("`method` 'worst_case' is for continuous time; use 'mixture' or 'kummer'.")
+
+
+def first_passage_tube(
+    constants: Constants, *, horizon: float, delta: float, worst: bool, objective: Any = "max", above: float
+) -> Tube:
+    """The tube of least constant radius: P(||S_t|| <= R for all t <= T) >= 1 - delta.
+
+    Parameters
+    ----------
+    constants : Constants
+        ``isotropic=True`` for the exact law (``worst=False``); continuous time for the worst case.
+    horizon, delta : float
+        T and the level.
+    worst : bool
+        Which law.
+    above : float
+        A radius that is known to be large enough (the search starts below it).
+
+    Raises
+    ------
+    ValueError
+        If the hypotheses fail.
+    InfeasibleError
+        If no radius up to ``above`` could be certified.
+
+    Source: item 7.9 of docs/theory.md.
+    """
+    (_check_continuous if worst else _check_isotropic)(constants)
+    schedule = make_schedule(constants, horizon)
+    chained = not schedule.continuous and _chain(constants, schedule, above) is not None
+
+    def bound(radius: float, coarseness: float = 0.0) -> float:
+        if chained:
+            chain = _chain(constants, schedule, radius)
+            return 1.0 if chain is None else chain.bound()
+        problem = _diffusion(constants, schedule, radius, delta, worst=worst, coarseness=coarseness or 1.0)
+        if problem is None:
+            return 1.0
+        return problem.estimate() if coarseness else problem.bound()
+
+    radius, value = _least_radius(bound, above, delta, coarseness=0.0 if chained else 4.0)
+    return Tube(
+        method="worst_case" if worst else "exact", parameters={"radius": radius, "probability": value},
+        level="trajectory", certified=True, delta=delta, horizon=schedule.horizon, constants=constants,
+        objective=objective, profile=ConstantProfile(value=radius, horizon=schedule.horizon),
+    )  # fmt: skip
+
+
+def _least_radius(bound: Callable[..., float], above: float, delta: float, *, coarseness: float) -> tuple[float, float]:
+    """About the least radius with bound(radius) <= delta: a search on coarse estimates, then certified steps."""
+    target = math.log(delta)
+
+    def log_estimate(x: float) -> float:
+        return math.log(min(1.0, max(bound(math.exp(x), coarseness), 1e-300)))
+
+    x = math.log(above) - 0.01
+    fx, slope = log_estimate(x), -20.0
+    for _ in range(12):
+        new = x - min(max((fx - target) / -slope * -1, -0.25), 0.25)
+        value = log_estimate(new)
+        if new != x and (value - fx) / (new - x) < -0.5:
+            slope = (value - fx) / (new - x)
+        done = abs(new - x) < 2e-5
+        x, fx = new, value
+        if done:
+            break
+    excess = 0.0 if coarseness == 0.0 else 0.04
+    for _ in range(5):
+        candidate = math.exp(x + (fx - target + excess) / -slope + 1e-7)
+        certified = bound(candidate)
+        if certified <= delta:
+            return candidate, certified
+        excess += 1.2 * (math.log(certified) - target) if certified < 1 else 0.3
+    raise InfeasibleError(
+        f"no constant radius near {math.exp(x):.6g} could be certified at delta = {delta:g} "
+        f"(last bound {certified:.3g}); use 'kummer'."
+    )
