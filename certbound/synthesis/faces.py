@@ -169,7 +169,9 @@ class Round(Face):
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:
         image = ca.DM(self.matrix) @ self._relative(ca, state, time)
-        value = ca.sqrt(ca.sumsqr(image) + 1e-12 * self.size**2 + 1e-24) - self.size
+        # smooth at the centre, where a plan with the most room inside may lie: too large a distance, by little
+        smooth = (1e-6 if self.outside else 1e-2) * self.size
+        value = ca.sqrt(ca.sumsqr(image) + smooth**2 + 1e-24) - self.size
         return (value if self.outside else -value) - erosion[0]
 
 

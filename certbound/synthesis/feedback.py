@@ -135,21 +135,42 @@ def close_loop(system: System, gain: Array) -> System:
     return DiscreteSystem(dynamics, noise=system.noise, noise_matrix=system.noise_matrix, **options)
 
 
-def constrain_inputs(problem: Problem, gain: Array, plan: Array) -> list[Inside]:
-    """The bounds of u = w + K x as one constraint a piece, for the plan w of shape (N, m)."""
+def constrain_inputs(problem: Problem, gain: Array, plan: Array, used: Array) -> list[Inside]:
+    """The bounds of u = w + K x as constraints on the state, for the plan w of shape (N, m).
+
+    Neighbouring pieces share one constraint, with the tightest of their bounds, where that leaves each of them at least
+    half of its own room: fewer constraints are verified sooner.
+
+    Parameters
+    ----------
+    problem : Problem
+    gain : ndarray, shape (m, n)
+    plan : ndarray, shape (N, m)
+    used : ndarray, shape (N, 2 m)
+        Largest K z + e and -K z + e on each piece, e what the tube takes: bounds less this is the room of a piece.
+    """
     box = problem.system.inputs
     assert box is not None
     normals = np.concatenate([gain, -gain])
-    used = np.any(normals != 0, axis=1)
-    length = float(problem.horizon) / len(plan)
-    found = []
-    for k, row in enumerate(plan):
-        bounds = np.concatenate([box.high - row, row - box.low])
-        kept = used & np.isfinite(bounds)
-        if not np.any(kept):
-            continue
-        ends = (float(k), float(k)) if problem.system.time == "discrete" else (k * length, (k + 1) * length)
-        during = (ends[0], min(ends[1], float(problem.horizon)))
-        label = f"inputs within their bounds {'at step' if ends[0] == ends[1] else 'from t ='} {ends[0]:g}"
-        found.append(Inside(Polytope(normals[kept], bounds[kept]), during=during, label=label))
+    bounds = np.concatenate([box.high - plan, plan - box.low], axis=1)
+    kept = np.any(normals != 0, axis=1) & np.isfinite(bounds[0])
+    if not np.any(kept):
+        return []
+    room = np.maximum(bounds - used, 0.0)
+    discrete = problem.system.time == "discrete"
+    length = 1.0 if discrete else float(problem.horizon) / len(plan)
+    found, first = [], 0
+    for k in range(1, len(plan) + 1):
+        if k < len(plan):
+            group = slice(first, k + 1)
+            shared = bounds[group].min(axis=0)
+            if np.all((shared - used[group] >= 0.5 * room[group])[:, kept]):
+                continue
+        last = k - 1 if discrete else k
+        during = (first * length, min(last * length, float(problem.horizon)))
+        label = f"inputs within their bounds, {'step' if discrete else 't ='} {during[0]:g}"
+        label += "" if during[0] == during[1] else f" to {during[1]:g}"
+        region = Polytope(normals[kept], bounds[first:k, kept].min(axis=0))
+        found.append(Inside(region, during=during, label=label))
+        first = k
     return found

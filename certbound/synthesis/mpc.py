@@ -189,7 +189,7 @@ class _Work:
         self.planner.settle_terminal(constants, tightened)
         found = self._planned(name, constants, widest, tightened)
         if found is None:
-            verdict = self._verified(name, constants, widest)
+            verdict = self._verified(name, constants, widest, tightened)
             if verdict is not None and verdict.status == "SAFE":  # delta need not be split as the tightening does
                 return self._result(name, constants, widest, tightened, widest.scale, verdict, feasible=True)
             return self._refused(name, constants, widest, tightened, explain=last)
@@ -272,13 +272,13 @@ class _Work:
             if pair is None:
                 continue
             self.tell(f"tube {name}: verifying the plan")
-            verdict = self._verified(name, constants, pair[0])
+            verdict = self._verified(name, constants, *pair)
             if first is None:
                 first = (*pair, verdict)
             if verdict is None or verdict.status == "SAFE" or not _short(verdict):
                 return (*pair, verdict) if verdict is not None and verdict.status == "SAFE" else first
         if first is not None:  # the plan with the most room may be verified where the cheapest is not
-            verdict = self._verified(name, constants, widest)
+            verdict = self._verified(name, constants, widest, tightened)
             if verdict is not None and verdict.status == "SAFE":
                 return widest, tightened, verdict
         return first
@@ -310,9 +310,11 @@ class _Work:
                 break
         return best
 
-    def _verified(self, name: str, constants: Constants | None, solution: Solution) -> Verdict | None:
+    def _verified(
+        self, name: str, constants: Constants | None, solution: Solution, tightened: Tightened
+    ) -> Verdict | None:
         try:
-            planned = self.planner.planned(solution.inputs)
+            planned = self.planner.planned(solution, tightened)
             return verify_safety(planned, method=name, constants=constants)
         except (CertboundError, ValueError) as error:
             _LOG.info("the plan could not be verified: %s", error)
@@ -328,7 +330,7 @@ class _Work:
         self.tell(f"tube {name}: the plan that misses least")
         soft = self.planner.softest(tightened, widest.inputs)
         solution = soft if np.all(np.isfinite(soft.states)) else widest
-        verdict = self._verified(name, constants, solution)
+        verdict = self._verified(name, constants, solution, tightened)
         found = self._infeasible(name, constants, widest, tightened, explain=explain)
         result = self._result(name, constants, solution, tightened, widest.scale, verdict, feasible=False)
         unit = "t =" if self.planner.grid.continuous else "step"
@@ -388,7 +390,7 @@ class _Work:
             status="UNKNOWN" if verdict is None else verdict.status,
             log10_delta=0.0 if verdict is None else verdict.log10_delta,
             reason=f"the plan could not be verified: {trouble}" if verdict is None else verdict.reason,
-            source=planner.problem, problem=planner.planned(solution.inputs), plan=solution.inputs,
+            source=planner.problem, problem=planner.planned(solution, tightened), plan=solution.inputs,
             inputs=own[:: planner.grid.substeps],
             states=solution.states, times=planner.grid.times(), erosion=tightened.erosion,
             labels=tuple(face.label for face in planner.faces), method=name, constants=constants,

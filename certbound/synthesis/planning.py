@@ -56,6 +56,8 @@ __all__ = ["Planner", "Tightened"]
 Array = NDArray[np.float64]
 
 PIECES = 40
+ROUNDING = 1e-7
+"""Taken from the input bounds at step 0, where nothing else is: a proof needs some room."""
 SUBSTEPS = 2
 FITTED = ("kummer", "bessel")
 """Tubes that are fitted to the room of the plan."""
@@ -124,6 +126,7 @@ class Planner:
         self.stage_cost = stage_cost
         self.cost = self._cost()
         self.program = self._program()
+        self._factors: dict[float, dict[object, float]] = {}
 
     def _cost(self) -> Cost:
         end = None if self.terminal is None else self.terminal.cost
@@ -139,12 +142,19 @@ class Planner:
         cost = self.problem.cost if self.feedback is None else None
         return self.problem.replace(system=self.system, plan=None, cost=cost)
 
-    def planned(self, plan: Array) -> Problem:
+    def planned(self, solution: Solution, tightened: Tightened) -> Problem:
         """The problem that the verdict is about: the closed loop under a plan, its input bounds included."""
         if self.feedback is None:
-            return self.problem.replace(plan=plan)
-        bounds = constrain_inputs(self.problem, self.feedback, plan)
-        return self.problem.replace(system=self.system, plan=plan, cost=None, safe=[*self.problem.safe, *bounds])
+            return self.problem.replace(plan=solution.inputs)
+        moved = solution.states @ self.feedback.T
+        used = np.concatenate([moved + tightened.inputs, -moved + tightened.inputs], axis=1)
+        per_piece = [
+            used[k * self.grid.substeps : (k + 1) * self.grid.substeps + (1 if self.grid.continuous else 0)].max(axis=0)
+            for k in range(self.grid.steps)
+        ]
+        bounds = constrain_inputs(self.problem, self.feedback, solution.inputs, np.array(per_piece))
+        safe = [*self.problem.safe, *bounds]
+        return self.problem.replace(system=self.system, plan=solution.inputs, cost=None, safe=safe)
 
     # ---- tubes -------------------------------------------------------------------------------------------
 
@@ -159,9 +169,9 @@ class Planner:
             def rows(x: Array, t: Array) -> Array:
                 return np.broadcast_to(two, (len(x), *two.shape))
 
-            both = tube.extents(rows, states[1:], times[1:])
+            both = tube.extents(rows, states[1:], times[1:], "inputs")
             inputs[1:] = np.maximum(both[:, : len(gain)], both[:, len(gain) :])
-            inputs[0] = self._initial_inputs(gain)
+            inputs[0] = self._initial_inputs(gain) + (inputs[1] if self.grid.continuous else ROUNDING)
         return Tightened(erosion=tighten(tube, self.faces, states, times), inputs=inputs, tube=source)
 
     def _initial_inputs(self, gain: Array) -> Array:
@@ -280,7 +290,7 @@ class Planner:
         rows = sum(face.rows(solution.states[:1], np.zeros(1)).shape[1] for face in self.faces)
         rows += 0 if self.feedback is None else 2 * len(self.feedback)
         planned = self.nominal.replace(plan=solution.inputs)
-        found = linear_tube(planned, rows, delta)
+        found = linear_tube(planned, rows, delta, self._factors.setdefault(delta, {}))
         return None if found is None else self.tightened(found, solution.states)
 
     # ---- plans -------------------------------------------------------------------------------------------
