@@ -183,7 +183,7 @@ def sup_deviation(
     if len(np.unique(marks)) < points:
         raise ValueError(f"`points` must be at most the number of steps, {setting.steps}, got {points}.")
     measure = measure or Measure()
-    task, profile = _task(setting, measure)
+    task, profile = _task(setting, measure, points > 0)
     rows = 1 if task.directions is None else len(task.directions)
     bins = _OCTAVES * _COARSE + 2
     if 16 * points * rows * bins > MEMORY_LIMIT:
@@ -219,9 +219,10 @@ def sup_deviation(
     )
 
 
-def _task(setting: Setting, measure: Measure) -> tuple[Task, Array]:
+def _task(setting: Setting, measure: Measure, marked: bool) -> tuple[Task, Array]:
     n = setting.model.dimension
     fields: dict[str, Any] = {"norm": np.eye(n)}
+    densities = (float(_FINE), float(_COARSE))
     if measure.metric is not None:
         fields["norm"] = np.linalg.cholesky(positive_definite("metric", measure.metric, n)).T
     elif measure.coordinates is not None:
@@ -242,7 +243,7 @@ def _task(setting: Setting, measure: Measure) -> tuple[Task, Array]:
             raise ValueError("`profile` must be positive and finite after time 0.")
         fields["smallest_scale"] = float(profile[1:].min())
     own = not setting.shared_nominal
-    return Task(kind="deviation", own_nominal=own, densities=(float(_FINE), float(_COARSE)), **fields), profile
+    return Task(kind="deviation", own_nominal=own, marked=marked, densities=densities, **fields), profile
 
 
 def _edges(density: int) -> Array:

@@ -39,7 +39,7 @@ _BINARY = {
     "sub": "{0} - {1}",
     "mul": "{0} * {1}",
     "div": "{0} / {1}",
-    "atan2": "math.atan2({0}, {1})",
+    "atan2": "atan2({0}, {1})",
     "hypot": "math.hypot({0}, {1})",
     "min": "({0} if {0} < {1} or {0} != {0} else {1})",
     "max": "({0} if {0} > {1} or {0} != {0} else {1})",
@@ -64,10 +64,15 @@ class Parameters:
         self.values.append(float(value))
         return f"p[{len(self.values) - 1}]"
 
+    def value_of(self, expression: str) -> float | None:
+        """The number behind an expression, None unless it is one of these parameters or "0.0"."""
+        if expression.startswith("p[") and expression[2:-1].isdigit():
+            return self.values[int(expression[2:-1])]
+        return 0.0 if expression == "0.0" else None
+
     def is_zero(self, expression: str) -> bool:
         """Whether an expression is known to be 0."""
-        known = expression[2:-1].isdigit() and expression.startswith("p[")
-        return expression == "0.0" or (known and self.values[int(expression[2:-1])] == 0.0)
+        return self.value_of(expression) == 0.0
 
 
 def live_nodes(tape: Tape) -> list[int]:
@@ -104,12 +109,19 @@ def function_source(name: str, tape: Tape, arguments: Sequence[str], parameters:
     """
     lines = [f"def {name}({', '.join(['p', *arguments])}):"]
     names: dict[int, str] = {}
-    for index in live_nodes(tape):
+    live = live_nodes(tape)
+    pairs = _pairs(tape, live)
+    for index in live:
         node = tape.nodes[index]
         if node.op == "input":
             names[index] = arguments[node.args[0]]
         elif node.op == "const":
             names[index] = parameters.add(node.value)
+        elif index in pairs:
+            sine, cosine = pairs[index]
+            if index == min(sine, cosine):
+                lines.append(f"    v{sine}, v{cosine} = sincos({names[node.args[0]]})")
+            names[index] = f"v{index}"
         else:
             names[index] = f"v{index}"
             operands = [names[arg] for arg in node.args]
@@ -117,6 +129,21 @@ def function_source(name: str, tape: Tape, arguments: Sequence[str], parameters:
     results = "".join(f"{names[output]}, " for output in tape.outputs).rstrip()
     lines.append(f"    return ({results[:-1] if len(tape.outputs) > 1 else results})")
     return lines
+
+
+def _pairs(tape: Tape, live: Sequence[int]) -> dict[int, tuple[int, int]]:
+    """Sines and cosines of the same argument, computed together: node to (sine, cosine)."""
+    places: dict[tuple[str, int], int] = {}
+    for index in live:
+        node = tape.nodes[index]
+        if node.op in ("sin", "cos"):
+            places.setdefault((node.op, node.args[0]), index)
+    pairs: dict[int, tuple[int, int]] = {}
+    for (op, argument), index in places.items():
+        if op == "sin" and ("cos", argument) in places:
+            other = places["cos", argument]
+            pairs[index] = pairs[other] = (index, other)
+    return pairs
 
 
 def _operation(node: Node, operands: list[str], parameters: Parameters) -> str:

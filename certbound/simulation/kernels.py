@@ -45,13 +45,8 @@ import math
 import numpy as np
 from numba import njit
 
+from certbound.simulation.elementary import atan2, sincos, tanh
 from certbound.simulation.streams import {fill}, uniform
-
-
-@njit(nogil=True, error_model="numpy")
-def tanh(x):
-    e = math.exp(-2.0 * abs(x))
-    return math.copysign((1.0 - e) / (1.0 + e), x)
 
 
 @njit(nogil=True, error_model="numpy")
@@ -198,8 +193,14 @@ def _noise(model: StepModel, p: Parameters) -> tuple[list[str], list[str], Bridg
     else:
         shocks = [linear_form(row.tolist(), variates, p) for row in model.noise]
         bridge = Bridge(spread=model.spread) if model.bridge and model.spread is not None else None
-    moved = _moved(model, "x", "f", p)
-    new = [f"y_{i} = {moved[i]}" + (f" + {shocks[i]}" if shocks[i] != "0.0" else "") for i in range(n)]
+    new = []
+    step = p.add(model.step)
+    for i, shock in enumerate(shocks):  # noise first: the drift is known last, and its chain of operations is short
+        if model.step > 0.0:
+            noisy = f"x_{i}" if shock == "0.0" else f"(x_{i} + ({shock}))"
+            new.append(f"y_{i} = {noisy} + {step} * f_{i}")
+        else:
+            new.append(f"y_{i} = f_{i}" + ("" if shock == "0.0" else f" + ({shock})"))
     return drawn, new, bridge
 
 

@@ -45,6 +45,8 @@ class Task:
         all share one. In a ``record`` task: whether to store the deviation instead of the state.
     smallest_scale : float
         Smallest value of the profile that deviations are divided by; 0: no profile.
+    marked : bool
+        Whether histograms are also taken at marked steps.
     densities : tuple of float
         Bins per factor of two of the histograms of suprema, and of those at the marked times.
     """
@@ -55,6 +57,7 @@ class Task:
     directions: Array | None = None
     own_nominal: bool = True
     smallest_scale: float = 0.0
+    marked: bool = False
     densities: tuple[float, float] = (1.0, 1.0)
 
 
@@ -123,14 +126,15 @@ def _deviation(task: Task, dimension: int, bridge: Bridge | None, p: Parameters)
         value = "math.sqrt(new_{0})"
         if bridge is None:
             finish, top = ["top_0 = math.sqrt(limit_0)"], "math.sqrt(limit_{0})"
-    within += ["if mark < marks.shape[0] and marks[mark] == k + 1:"]
-    for j in range(count):
+    begin = ["mark = 0", *begin] if task.marked else begin
+    within += ["if mark < marks.shape[0] and marks[mark] == k + 1:"] if task.marked else []
+    for j in range(count if task.marked else 0):
         for kind, text in enumerate((value, top)):
             bin_of = f"bin_of({text.format(j)}, {marginal}, marginals.shape[3])"
             within += [f"    marginals[{kind}, mark, {j}, {bin_of}] += 1"]
-    within += ["    mark += 1"]
+    within += ["    mark += 1"] if task.marked else []
     finish += [f"counts[{j}, bin_of(top_{j}, {sup}, counts.shape[1])] += 1" for j in range(count)]
-    return ["mark = 0", *begin], within, end, finish
+    return begin, within, end, finish
 
 
 def _norm_supremum(task: Task, norm: Array, n: int, bridge: Bridge | None, p: Parameters) -> list[str]:
@@ -151,7 +155,7 @@ def _norm_supremum(task: Task, norm: Array, n: int, bridge: Bridge | None, p: Pa
         variance = bridge.moving_variance([f"w_{i}" for i in range(n)], p)
         near += [f"spread = ({variance}) / new_0{shrink} if new_0 > 0.0 else 0.0"]
         spread = "spread"
-    near += _bridge_top("0", "before", "after", spread)
+    near += _bridge_top("0", "before", "after", spread, p)
     if bridge.spread is not None:
         band = _band(norm @ bridge.spread, task)
         near += [f"limit_0 = max(top_0 - {p.add(band)}, 0.0) ** 2"]
@@ -173,7 +177,8 @@ def _scalar_suprema(task: Task, rows: Array, n: int, bridge: Bridge | None, p: P
             lines += [f"spread = ({spread}){shrink}"]
             spread = "spread"
         half = f"{0.5 * EXPONENT} * {spread}"
-        near = [f"top_{j} = max(top_{j}, new_{j})", *_bridge_top(str(j), f"old_{j}", f"new_{j}", spread)]
+        top = _bridge_top(str(j), f"old_{j}", f"new_{j}", spread, p, tested=True)
+        near = [f"top_{j} = max(top_{j}, new_{j})", *top]
         lines += [f"if (top_{j} - old_{j}) * (top_{j} - new_{j}) < {half}:", *_indent(near)]
     return lines
 
@@ -182,19 +187,26 @@ def _indent(lines: Sequence[str]) -> list[str]:
     return [f"    {line}" for line in lines]
 
 
-def _bridge_top(j: str, before: str, after: str, spread: str) -> list[str]:
+def _bridge_top(j: str, before: str, after: str, spread: str, p: Parameters, tested: bool = False) -> list[str]:
     """Draw the largest value of the bridge between two values where it can exceed the record.
 
     It does so when the variate is below exp(-e), and e^-e < 1/(1 + e + e^2/2) saves most logarithms.
     """
-    return [
-        f"exponent = math.inf if {spread} <= 0.0 else 2.0 * (top_{j} - {before}) * (top_{j} - {after}) / {spread}",
-        f"if exponent < {EXPONENT}:",
-        "    chance = uniform(stream)",
-        "    if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0:",
-        f"        rise = math.sqrt(({after} - {before}) ** 2 - 2.0 * {spread} * math.log(chance))",
-        f"        top_{j} = max(top_{j}, 0.5 * ({before} + {after} + rise))",
+    product = f"2.0 * (top_{j} - {before}) * (top_{j} - {after})"
+    variance = p.value_of(spread)
+    if variance is None:
+        exponent = f"{product} / {spread} if {spread} > 0.0 else math.inf"
+    else:
+        exponent = f"{product} * {p.add(1.0 / variance if variance > 0.0 else np.inf)}"
+    draw = [
+        "chance = uniform(stream)",
+        "if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0:",
+        f"    rise = math.sqrt(({after} - {before}) ** 2 - 2.0 * {spread} * math.log(chance))",
+        f"    top_{j} = max(top_{j}, 0.5 * ({before} + {after} + rise))",
     ]
+    if tested:
+        return [f"exponent = {exponent}", *draw]
+    return [f"exponent = {exponent}", f"if exponent < {EXPONENT}:", *_indent(draw)]
 
 
 def _band(spread: Array, task: Task) -> float:

@@ -14,7 +14,8 @@ def run(tape, *values):
     """Evaluate the generated source as plain Python."""
     parameters = Parameters()
     names = [f"x_{i}" for i in range(len(tape.inputs))]
-    space = {"math": math, "np": np, "tanh": math.tanh}
+    space = {"math": math, "np": np, "tanh": math.tanh, "atan2": math.atan2}
+    space["sincos"] = lambda x: (math.sin(x), math.cos(x))
     exec("\n".join(function_source("f", tape, names, parameters)), space)  # noqa: S102
     return space["f"](parameters.values, *values)
 
@@ -70,6 +71,14 @@ def test_numbers_of_the_tape_do_not_show_in_the_source():
         sources.append(function_source("f", tape, ["x_0"], Parameters()))
     assert sources[0] == sources[1]
     assert "0.123" not in "".join(sources[0])
+
+
+def test_a_sine_and_a_cosine_of_one_argument_are_computed_together():
+    tape = trace(lambda x: [np.cos(x[0]) * x[0] + np.sin(x[0]), np.sin(x[1])], {"x": ["a", "b"]})
+    source = "\n".join(function_source("f", tape, ["x_0", "x_1"], Parameters()))
+    assert source.count("sincos(x_0)") == 1
+    assert source.count("math.sin(x_1)") == 1
+    np.testing.assert_allclose(run(tape, 0.3, 0.7), compile_numpy(tape)(0.3, 0.7), rtol=1e-14)
 
 
 def test_dead_nodes_are_left_out():
