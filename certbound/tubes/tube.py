@@ -169,10 +169,10 @@ class Tube:
         return result
 
 
-def supremum(profile: Profile, start: float, end: float, *, whole: bool) -> float:
-    """Rigorous upper bound of the supremum of a profile over [start, end], nearly tight where that is cheap.
+def supremum(profile: Profile, start: float, end: float, *, whole: bool, gap: float = 1e-4) -> float:
+    """Rigorous upper bound of the supremum of a profile over [start, end], within ``gap`` where it is cheap.
 
-    A profile may set ``gap`` (relative, 1e-4) and ``splits`` (64), which limit the effort.
+    A profile may set ``splits`` (64 halvings), which limits the effort.
     """
     times = profile.times
     first = int(np.clip(np.searchsorted(times, start, side="right") - 1, 0, len(times) - 2))
@@ -192,7 +192,7 @@ def supremum(profile: Profile, start: float, end: float, *, whole: bool) -> floa
             push(piece, s, e)
         else:  # most pieces are settled by the rough bound
             heapq.heappush(heap, (-profile.rough(piece, s, e), False, piece, s, e))
-    budget, gap = getattr(profile, "splits", 64), getattr(profile, "gap", 1e-4)
+    budget = getattr(profile, "splits", 64)
     while True:
         bound, exact, piece, s, e = heap[0]
         middle = math.floor((s + e) / 2) if whole else (s + e) / 2
