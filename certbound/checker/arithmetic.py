@@ -150,11 +150,23 @@ def power(x: arb, exponent: float) -> arb:
     if n < 0:
         return 1 / power(x, -exponent)
     if not is_wide(x):
-        return x**n
+        return _whole_power(x, n)
     if n % 2:
-        return (x.lower() ** n).union(x.upper() ** n)
-    least = arb(0) if x.contains(0) else x.abs_lower() ** n
-    return least.union(x.abs_upper() ** n)
+        return _whole_power(x.lower(), n).union(_whole_power(x.upper(), n))
+    least = arb(0) if x.contains(0) else _whole_power(x.abs_lower(), n)
+    return least.union(_whole_power(x.abs_upper(), n))
+
+
+def _whole_power(x: arb, n: int) -> arb:
+    """x^n by squaring (the library's own power is undefined on some balls around 0)."""
+    result = arb(1)
+    while n:
+        if n & 1:
+            result = result * x
+        n >>= 1
+        if n:
+            x = x * x
+    return result
 
 
 def _power_of_positive(x: arb, exponent: float) -> arb:

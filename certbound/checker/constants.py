@@ -1,9 +1,9 @@
 """The constants proof: contraction in a metric, a reach tube by defect, rooms, and Thm K2.
 
-With J^T P + P J <= 2 c P (or ||J||_P <= L) everywhere, on the model's domain, or piece by piece on the reach tube plus
-the rooms r_k: every noise-free trajectory stays within rho_k of the nominal curve (Thm K5), every constraint leaves
-room for a deviation of r_k around that, and P(exists t: ||S_t||_P > r_t) is bounded by Thm K2 (Thm K4 for local
-constants, which are needed only until a room is left; leaving the domain is a broken constraint).
+With J^T P + P J <= 2 c P (or ||J||_P <= L) everywhere, or on the model's domain: every noise-free trajectory stays
+within rho_k of the nominal curve (Thm K5), every constraint leaves room for a deviation of r_k around that, and
+P(exists t: ||S_t||_P > r_t) is bounded by Thm K2. Constants are needed only until a room is left, and leaving the
+domain is a broken constraint.
 """
 
 from __future__ import annotations
@@ -31,9 +31,11 @@ __all__ = ["check_constants"]
 
 MOST_PIECES = 20_000
 MOST_DEGREE = 12
+MOST_STATES = 200
+SMALLEST_NU = 1e-6
 _PROOF = (
-    "engine", "assumed", "metric", "region", "times", "middles", "rates", "reach_rates", "sigmas", "nu", "start_sigma",
-    "splits", "rooms", "kummer", "cells",
+    "engine", "assumed", "metric", "region", "times", "middles", "rate", "sigma", "nu", "start_sigma", "splits",
+    "rooms", "kummer", "cells",
 )  # fmt: skip
 _CELL = ("nominal", "eta", "radius", "separations")
 
@@ -63,23 +65,23 @@ class _Proof:
     def __init__(self, model: Model, record: Record, budget: Budget) -> None:
         self.model, self.record, self.budget = model, record, budget
         n = model.dimension
+        if n > MOST_STATES:
+            raise Unproved(f"{n} states are too many for this proof")
         rows = None if record["metric"] is None else record.array("metric", n, n)
         if rows is not None and any(rows[i][j] != rows[j][i] for i in range(n) for j in range(i)):
             raise CertificateError("`proof.metric` must be symmetric.")
         self.norm = Norm(identity(n) if rows is None else matrix(rows))
         self._read_times()
-        self.rates = self._per_step("rates")
-        self.reach_rates = self.rates if record["reach_rates"] is None else self._per_step("reach_rates")
-        self.sigmas = self._per_step("sigmas")
-        if any(x < 0 for x in self.sigmas) or (not model.continuous and any(not x > 0 for x in self.rates)):
-            raise CertificateError("`proof.sigmas` must not be negative, and gains must be positive.")
+        self.rate, self.sigma = arb(record.number("rate")), arb(record.number("sigma", least=0.0))
+        if not model.continuous and not self.rate > 0:
+            raise CertificateError("`proof.rate` must be positive in discrete time, where it is a gain.")
         self.nu = arb(record.number("nu"))
-        if not 0 < self.nu <= n:
-            raise CertificateError(f"`proof.nu` must lie in (0, {n}].")
+        if not SMALLEST_NU <= self.nu <= n:
+            raise CertificateError(f"`proof.nu` must lie in [{SMALLEST_NU}, {n}].")
         self.start_sigma = arb(record.number("start_sigma", least=0.0))
         self.rooms = _none_or_numbers(record["rooms"], "proof.rooms", self.count)
-        if record["region"] not in ("everywhere", "domain", "local"):
-            raise CertificateError('`proof.region` must be "everywhere", "domain" or "local".')
+        if record["region"] not in ("everywhere", "domain"):
+            raise CertificateError('`proof.region` must be "everywhere" or "domain".')
 
     def _read_times(self) -> None:
         """Pieces of the curve (continuous time), or the steps 0, ..., T."""
@@ -105,33 +107,21 @@ class _Proof:
         """Pieces (CT) or transitions (DT) on which rates hold."""
         return self.count if self.model.continuous else self.count - 1
 
-    def _per_step(self, name: str) -> list[arb]:
-        """One number, or one a piece."""
-        values = [arb(x) for x in self.record.array(name, None)]
-        if len(values) not in (1, self.steps):
-            raise CertificateError(f"`proof.{name}` must have 1 or {self.steps} entries, got {len(values)}.")
-        return values * self.steps if len(values) == 1 else values
-
     # ---- the proof ---------------------------------------------------------------------------------------
 
     def probability(self) -> arb:
         """Every inequality, then Thm K2."""
         model, record = self.model, self.record
-        local = record["region"] == "local"
-        if local and any(room is None for room in self.rooms[0 if model.continuous else 1 :]):
-            raise Unproved("local constants need a room on every piece")
         boxes = cells_of(model, record)
         items = record.items("cells", len(boxes), len(boxes))
-        self.structure = structure_of(model)
-        tubes = []
+        self.structure = structure_of(model, budget)
         for index, (item, box) in enumerate(zip(items, boxes)):
-            cell = Record(item, f"proof.cells[{index}]", _CELL)
-            tubes.append(self._check_cell(cell, box, whole=len(boxes) == 1))
+            self._check_cell(Record(item, f"proof.cells[{index}]", _CELL), box, whole=len(boxes) == 1)
         if not record.flag("assumed"):
-            self._check_constants(tubes, local)
+            self._check_constants()
         return exit_probability(self._kummer(), self.budget)
 
-    def _check_cell(self, cell: Record, box: Box, *, whole: bool) -> tuple[Tube, list[arb]]:
+    def _check_cell(self, cell: Record, box: Box, *, whole: bool) -> None:
         """Reach tube and rooms of one cell."""
         n, count = self.model.dimension, self.count
         nominal = cell.array("nominal", count, None, n)
@@ -150,13 +140,12 @@ class _Proof:
         tube = Tube(self.model, self.structure, self.norm, pieces, self.budget)
         first = pieces[0].at(pieces[0].start)
         start = self.norm.start(self.model, [a for a, _ in box], [b for _, b in box], first, whole)
-        tube.prove(start, self.reach_rates, eta, radii)
+        tube.prove(start, self.rate, eta, radii)
         grid = Grid(
             times=self.ends, hulls=[piece.hull() for piece in pieces],
             part=lambda k, first, last: replace(pieces[k], start=first, end=last).hull(),
         )  # fmt: skip
         self._check_rooms(cell, grid, radii)
-        return tube, radii
 
     def _check_rooms(self, cell: Record, grid: Grid, radii: Sequence[arb]) -> None:
         """Every constraint leaves the stated room around the reach tube."""
@@ -181,31 +170,14 @@ class _Proof:
                 if not (radii[k] + room) * length <= left:
                     raise Unproved(f"'{label}' was not shown to leave the stated room on piece {k}")
 
-    def _check_constants(self, tubes: Sequence[tuple[Tube, list[arb]]], local: bool) -> None:
-        """Rates, gains, sigma and nu hold where they are used."""
+    def _check_constants(self) -> None:
+        """Rate or gain, sigma and nu hold on the region."""
         model = self.model
+        box = self._global_box()
         contraction = Contraction(model, self.structure, self.norm.metric, self.budget)
+        contraction.prove(box, self.rate, "rate" if model.continuous else "gain")
         spread = Spread(model, self.norm.metric, self.budget)
-        what = "rate" if model.continuous else "gain"
-        if not local:
-            box = self._global_box()
-            contraction.prove(box, _least([*self.rates, *self.reach_rates]), what)
-            spread.prove(box[: 1 + model.dimension], _least(self.sigmas), self.nu)
-            return
-        for tube, radii in tubes:
-            for k in range(self.steps):
-                for rates, extra in ((self.reach_rates, arb(0)), (self.rates, self._room(k))):
-                    piece = tube.pieces[k]
-                    states = tube.ranges(k, radii[k] + extra)
-                    inputs = [(x.lower(), x.upper()) for x in tube.inputs(k)]
-                    disturbances = [(arb(a), arb(b)) for a, b in model.disturbance]
-                    box = [(piece.start, piece.end), *states, *inputs, *disturbances]
-                    contraction.prove(box, rates[k], what)
-                spread.prove(box[: 1 + model.dimension], self.sigmas[k], self.nu)
-
-    def _room(self, k: int) -> arb:
-        room = self.rooms[k]
-        return arb(0) if room is None else room
+        spread.prove(box[: 1 + model.dimension], self.sigma, self.nu)
 
     def _global_box(self) -> Box:
         """All inputs of the dynamics, everywhere or on the domain."""
@@ -250,8 +222,8 @@ class _Proof:
         if not model.continuous and covariance is None:
             rooms[0] = None
         return Kummer(
-            continuous=model.continuous, bessel=bessel, a=a, v0=v0, half=half, start=start, slopes=self.rates,
-            sigmas=self.sigmas, lengths=lengths, radii=rooms,
+            continuous=model.continuous, bessel=bessel, a=a, v0=v0, half=half, start=start,
+            slopes=[self.rate] * self.steps, sigmas=[self.sigma] * self.steps, lengths=lengths, radii=rooms,
         )
 
     def _check_start(self, covariance: arb_mat, sigma: arb) -> None:
@@ -261,9 +233,3 @@ class _Proof:
         if not is_positive_definite(identity(n) * (sigma * sigma) - root.transpose() * covariance * root):
             raise Unproved("the random start was not shown to have the stated spread")
 
-
-def _least(values: Sequence[arb]) -> arb:
-    best = values[0]
-    for value in values[1:]:
-        best = value if value < best else best
-    return best

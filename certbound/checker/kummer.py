@@ -23,7 +23,7 @@ __all__ = ["Kummer", "exit_probability"]
 
 MOST_POWER = 1e5
 _LARGEST = arb(10) ** 7
-_DEPTH = 7
+_CLOSE, _MOST_PARTS = 0.998, 1024
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,25 +62,55 @@ def exit_probability(data: Kummer, budget: Budget) -> arb:
     for step in reversed(steps):
         info.append(info[-1] + step)
     info.reverse()
-    excess = _excess(data)
+    found = _least_continuous(data, v, info, budget) if data.continuous else _least_discrete(data, v, info)
+    if found is None:
+        return arb(0)
+    first = _initial(data, info[0])
+    if not found > 0:
+        return arb(1)
+    return upper(arb.min(first / found, arb(1)))
+
+
+def _least_discrete(data: Kummer, v: list[arb], info: list[arb]) -> arb | None:
+    """Lower bound of the least gain over the steps; None where nothing is asked."""
     least: arb | None = None
+    excess = _excess(data)
     for k, radius in enumerate(data.radii):
-        budget.check()
+        if radius is None:
+            continue
+        value = _gain(data, excess, info[k], radius * radius / (2 * v[k])) if radius > 0 else arb(0)
+        least = value if least is None else arb.min(least, value)
+    return least
+
+
+def _least_continuous(data: Kummer, v: list[arb], info: list[arb], budget: Budget) -> arb | None:
+    """The same over the pieces: I falls and v is monotone on a piece, and pieces are cut where that loses much."""
+    excess = _excess(data)
+    bounds: dict[int, arb] = {}
+    attained: arb | None = None
+    for k, radius in enumerate(data.radii):
         if radius is None:
             continue
         if not radius > 0:
-            return arb(1)
-        if data.continuous:
-            value = _least_on(data, excess, radius, (v[k], v[k + 1]), (info[k], info[k + 1]), k)
-        else:
-            value = _gain(data, excess, info[k], radius * radius / (2 * v[k]))
-        least = value if least is None else arb.min(least, value)
-    if least is None:
-        return arb(0)
-    first = _initial(data, info[0])
-    if not least > 0:
-        return arb(1)
-    return upper(arb.min(first / least, arb(1)))
+            return arb(0)
+        bounds[k] = _least_on(data, excess, radius, (v[k], v[k + 1]), (info[k], info[k + 1]), k, 1)
+        value = _gain(data, excess, info[k + 1], radius * radius / (2 * v[k + 1]))
+        attained = value if attained is None else arb.min(attained, value)
+    if attained is None:
+        return None
+    for k, bound in bounds.items():
+        budget.check()
+        radius, parts = data.radii[k], 1
+        assert radius is not None
+        while bound < attained * _CLOSE and parts < _MOST_PARTS:
+            parts *= 4
+            bound = _least_on(data, excess, radius, (v[k], v[k + 1]), (info[k], info[k + 1]), k, parts)
+        bounds[k] = bound
+    values = list(bounds.values())
+    least = values[0]
+    for value in values[1:]:
+        least = arb.min(least, value)
+    return least
 
 
 def _advance(data: Kummer, v: arb, slope: arb, sigma: arb, length: arb) -> tuple[arb, arb]:
@@ -149,16 +179,14 @@ def _gain(data: Kummer, excess: Callable[[arb], arb], info: arb, z: arb) -> arb:
 
 
 def _least_on(
-    data: Kummer, excess: Callable[[arb], arb], radius: arb, ends: tuple[arb, arb], info: tuple[arb, arb], k: int
+    data: Kummer, excess: Callable[[arb], arb], radius: arb, ends: tuple[arb, arb], info: tuple[arb, arb], k: int,
+    parts: int,
 ) -> arb:
-    """Lower bound over a piece: I falls, v is monotone; the piece is cut where v falls, to lose less."""
+    """Lower bound over a piece that is cut into equal parts."""
     square = radius * radius / 2
-    if not ends[1] < ends[0]:
-        return _gain(data, excess, info[1], square / ends[1])
-    best: arb | None = None
-    parts = 2**_DEPTH if ends[1] < arb(0.99) * ends[0] else 1
     slope, sigma, length = data.slopes[k], data.sigmas[k], data.lengths[k] / parts
     v, rest = ends[0], info[0]
+    best: arb | None = None
     for _ in range(parts):
         after, step = _advance(data, v, slope, sigma, length)
         rest = rest - step

@@ -41,6 +41,7 @@ __all__ = ["check_linear"]
 
 MOST_PIECES = 4000
 MOST_ROWS = 64
+MOST_STATES = 100
 _BITS, _MOST_BITS = 128, 3000
 
 _PROOF = ("engine", "splits", "pieces", "varying", "moving", "units", "windows", "cells")
@@ -61,11 +62,13 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
         If an inequality could not be proved.
     """
     record = Record(value, "proof", _PROOF)
-    structure = structure_of(model)
+    if model.continuous and model.dimension > MOST_STATES:
+        raise Unproved(f"{model.dimension} states are too many for this proof in continuous time")
+    structure = structure_of(model, budget)
     shared = _Shared(model, structure, record)
     boxes = cells_of(model, record)
     entries = record.items("cells", len(boxes), len(boxes))
-    outputs = remainders(model, structure)
+    outputs = remainders(model, structure, budget)
     worst = arb(0)
     for index, (entry, box) in enumerate(zip(entries, boxes)):
         cell = _Cell(shared, Record(entry, f"proof.cells[{index}]", _CELL), box, budget)

@@ -61,7 +61,7 @@ class _Box:
     radius: list[arb]
 
 
-def remainders(model: Model, structure: Structure) -> list[OutputRemainder]:
+def remainders(model: Model, structure: Structure, budget: Budget) -> list[OutputRemainder]:
     """The remainder of every output.
 
     Inputs of the expressions: tau, the states s, the disturbances d, and then the parameters: t_m; in continuous time
@@ -111,7 +111,7 @@ def remainders(model: Model, structure: Structure) -> list[OutputRemainder]:
         result.append(OutputRemainder(
             graph, graph.sub(values[i], velocities[i]), nodes[model.dynamics.outputs[i]], count=count,
             time=model.continuous, states=structure.active_states(i), disturbances=structure.active_disturbances(i),
-            dimension=n,
+            dimension=n, budget=budget,
         ))
     return result
 
@@ -132,14 +132,17 @@ class OutputRemainder:
 
     def __init__(
         self, graph: Graph, node: int, value: int, *, count: int, time: bool, states: list[int],
-        disturbances: list[int], dimension: int,
+        disturbances: list[int], dimension: int, budget: Budget,
     ) -> None:
         self.count, self.dimension, self.states, self.disturbances = count, dimension, states, disturbances
         self.time = time
         self.slots = [*([0] if time else []), *(1 + j for j in states), *(1 + dimension + j for j in disturbances)]
         gradient = [graph.derivative(node, slot) for slot in self.slots]
         pairs = [(a, b) for a in range(len(gradient)) for b in range(a, len(gradient))]
-        second = {(a, b): graph.derivative(gradient[a], self.slots[b]) for a, b in pairs}
+        second = {}
+        for a, b in pairs:
+            budget.check()
+            second[a, b] = graph.derivative(gradient[a], self.slots[b])
         self.pairs = [pair for pair, index in second.items() if not graph.is_const(index, 0.0)]
         hessian = [second[pair] for pair in self.pairs]
         risky = {index for index in graph.reachable([*gradient, *hessian]) if graph.node(index).op in _RISKY}

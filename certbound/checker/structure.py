@@ -13,6 +13,7 @@ from flint import arb
 from certbound.checker.graph import Graph
 from certbound.checker.model import Model
 from certbound.checker.program import Program
+from certbound.checker.report import Budget
 
 __all__ = ["Structure", "structure_of"]
 
@@ -44,7 +45,7 @@ class Structure:
         return [j for i, j in self.moving if i == output]
 
 
-def structure_of(model: Model) -> Structure:
+def structure_of(model: Model, budget: Budget) -> Structure:
     """Differentiate the model once."""
     graph = Graph()
     n, q = model.dimension, len(model.disturbance)
@@ -52,8 +53,8 @@ def structure_of(model: Model) -> Structure:
     nodes = graph.include(model.dynamics, slots)
     outputs = [nodes[output] for output in model.dynamics.outputs]
     first = len(slots) - q
-    by_state = _derivatives(graph, outputs, range(1, n + 1))
-    by_disturbance = _derivatives(graph, outputs, range(first, first + q))
+    by_state = _derivatives(graph, outputs, range(1, n + 1), budget)
+    by_disturbance = _derivatives(graph, outputs, range(first, first + q), budget)
     varying = sorted(entry for entry, node in by_state.items() if graph.masks[node])
     moving = sorted(entry for entry, node in by_disturbance.items() if graph.masks[node])
     return Structure(
@@ -62,11 +63,12 @@ def structure_of(model: Model) -> Structure:
     )  # fmt: skip
 
 
-def _derivatives(graph: Graph, outputs: list[int], slots: range) -> dict[tuple[int, int], int]:
+def _derivatives(graph: Graph, outputs: list[int], slots: range, budget: Budget) -> dict[tuple[int, int], int]:
     found = {}
     for i, output in enumerate(outputs):
         for j, slot in enumerate(slots):
             if graph.masks[output] >> slot & 1:
+                budget.check()
                 node = graph.derivative(output, slot)
                 if not graph.is_const(node, 0.0):
                     found[i, j] = node

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 
 from flint import arb, arb_mat
@@ -37,7 +37,6 @@ class Norm:
         self.root = cholesky(metric)
         self.inverse = metric.inv()
         self.n = metric.nrows()
-        self.sides = [self.dual([arb(1 if i == x else 0) for i in range(self.n)]) for x in range(self.n)]
 
     def length(self, vector: Sequence[arb]) -> arb:
         """Upper bound of the norm of a box: that of its middle plus that of its radii."""
@@ -101,12 +100,12 @@ class CurvePiece:
         degree, n = count - 1, len(self.coefficients[0])
         if degree == 0:
             return [self.coefficients[0]]
-        first, length = self.start - self.middle, self.end - self.start
+        first, length = _powers(self.start - self.middle, degree), _powers(self.end - self.start, degree)
         # powers of lambda in [0, 1], tau = first + length * lambda
         powers = [[arb(0)] * n for _ in range(count)]
         for j, row in enumerate(self.coefficients):
             for i in range(j + 1):
-                factor = comb(j, i) * first ** (j - i) * length**i
+                factor = comb(j, i) * first[j - i] * length[i]
                 powers[i] = [a + factor * c for a, c in zip(powers[i], row)]
         return [
             [sum((arb(comb(k, i)) / comb(degree, i) * powers[i][x] for i in range(k + 1)), arb(0)) for x in range(n)]
@@ -116,9 +115,10 @@ class CurvePiece:
     def series(self, tau: arb, order: int) -> list[list[arb]]:
         """Taylor coefficients of every state about ``tau``."""
         count = len(self.coefficients)
+        powers = _powers(tau, count)
         return [
             [
-                sum((comb(j, i) * self.coefficients[j][x] * tau ** (j - i) for j in range(i, count)), arb(0))
+                sum((comb(j, i) * self.coefficients[j][x] * powers[j - i] for j in range(i, count)), arb(0))
                 for i in range(min(order, count - 1) + 1)
             ]
             for x in range(len(self.coefficients[0]))
@@ -177,74 +177,69 @@ class Tube:
         """Upper bound of |p' - f(p, d, t)|_P over piece k and all d (discrete time: of |p_{k+1} - f(p_k, d, k)|_P)."""
         self.budget.check()
         try:
-            rest = self._at_centre(k)
-            if not self.reach:
-                return self.norm.length(rest)
-            return self._with_disturbance(k, rest)
+            points, rest = self._at_centre(k)
+            columns = [] if not self.reach else self._with_disturbance(k, rest)
         except Undecided as error:
             raise Unproved(f"the dynamics is not defined along the nominal curve on piece {k}") from error
+        worst = arb(0)
+        for point in points:
+            for signs in itertools.product((-1, 1), repeat=len(columns)):
+                corner = list(point)
+                for sign, values in zip(signs, columns):
+                    corner = [a + sign * b for a, b in zip(corner, values)]
+                worst = arb.max(worst, self.norm.length(corner))
+        return (worst + self.norm.length(rest)).upper()
 
-    def _at_centre(self, k: int) -> list[arb]:
-        """The defect at d0, as a box over the piece."""
+    def _at_centre(self, k: int) -> tuple[list[list[arb]], list[arb]]:
+        """The defect at d0: points whose convex hull holds its Taylor polynomial, and a box for the rest."""
         model, piece = self.model, self.pieces[k]
         inputs = [[x] for x in [*self.inputs(k), *self.middle]]
         if not model.continuous:
             states = [[x] for x in piece.coefficients[0]]
             after = self.pieces[k + 1].coefficients[0]
             values = expand(model.dynamics, [[arb(k)], *states, *inputs], 0)
-            return [a - value[0] for a, value in zip(after, values)]
+            return [[a - value[0] for a, value in zip(after, values)]], [arb(0)] * model.dimension
         span = (piece.start - piece.middle).union(piece.end - piece.middle)
-        result = []
         parts = []
         for tau in (arb(0), span):
             time = [piece.middle + tau, arb(1)]
             states = piece.series(tau, ORDER + 1)
-            flow = expand(model.dynamics, [time, *states, *inputs], ORDER)
-            parts.append((states, flow))
-        for x in range(model.dimension):
-            (thin, thin_flow), (wide, wide_flow) = ((part[0][x], part[1][x]) for part in parts)
-            total = _velocity(wide, ORDER) - wide_flow[ORDER]
-            for j in range(ORDER - 1, -1, -1):
-                total = _velocity(thin, j) - thin_flow[j] + span * total
-            result.append(total)
-        return result
+            parts.append((states, expand(model.dynamics, [time, *states, *inputs], ORDER)))
+        (thin, thin_flow), (wide, wide_flow) = parts
+        rows = [
+            [_velocity(thin[x], j) - thin_flow[x][j] for x in range(model.dimension)] for j in range(ORDER)
+        ]
+        size = _powers(span, ORDER)[ORDER]
+        rest = [(_velocity(wide[x], ORDER) - wide_flow[x][ORDER]) * size for x in range(model.dimension)]
+        return replace(piece, coefficients=rows).hull(), rest
 
-    def _with_disturbance(self, k: int, rest: list[arb]) -> arb:
-        """Corners of the linear effect of d, plus what is left of it over the piece."""
+    def _with_disturbance(self, k: int, rest: list[arb]) -> list[list[arb]]:
+        """Columns of the linear effect of d; what is left of it is added to ``rest``."""
         n, piece = self.model.dimension, self.pieces[k]
         box = [low.union(high) for low, high in self.ranges(k)]
         time = piece.start.union(piece.end) if self.model.continuous else arb(k)
         disturbances = [m + arb(0, r) for m, r in zip(self.middle, self.reach)]
         values = self.gain.run([time, *box, *self.inputs(k), *disturbances])
-        centre = [x.mid() for x in rest]
-        spread = [arb(0, x.rad()) for x in rest]
         columns = [[arb(0)] * n for _ in self.reach]
         for (i, j), value in zip(self.entries, values):
             columns[j][i] = value.mid() * self.reach[j]
-            spread[i] = spread[i] + arb(0, value.rad()) * self.reach[j]
+            rest[i] = rest[i] + arb(0, value.rad()) * self.reach[j]
         if len(columns) > CORNERS:
             raise Unproved(f"{len(columns)} disturbances are too many for this proof")
-        worst = arb(0)
-        for signs in itertools.product((-1, 1), repeat=len(columns)):
-            corner = list(centre)
-            for sign, values_ in zip(signs, columns):
-                corner = [a + sign * b for a, b in zip(corner, values_)]
-            worst = arb.max(worst, self.norm.length(corner))
-        return (worst + self.norm.length(spread)).upper()
+        return columns
 
-    def ranges(self, k: int, reach: arb | None = None) -> list[tuple[arb, arb]]:
-        """The box hull of the curve on a piece, grown by ``reach`` in the norm."""
+    def ranges(self, k: int) -> list[tuple[arb, arb]]:
+        """The box hull of the curve on a piece."""
         points = self.pieces[k].hull()
         result = []
         for x in range(self.model.dimension):
             low = high = points[0][x]
             for point in points[1:]:
                 low, high = arb.min(low, point[x]), arb.max(high, point[x])
-            grown = arb(0) if reach is None else reach * self.norm.sides[x]
-            result.append(((low - grown).lower(), (high + grown).upper()))
+            result.append((low.lower(), high.upper()))
         return result
 
-    def prove(self, start: arb, slopes: Sequence[arb], eta: Sequence[arb], radii: Sequence[arb]) -> None:
+    def prove(self, start: arb, slope: arb, eta: Sequence[arb], radii: Sequence[arb]) -> None:
         """The stated defects and radii hold.
 
         Raises
@@ -258,7 +253,7 @@ class Tube:
             after = rho
             if self.model.continuous:
                 length = piece.end - piece.start
-                after = (slopes[k] * length).exp() * rho + _integral(slopes[k], length) * eta[k]
+                after = (slope * length).exp() * rho + _integral(slope, length) * eta[k]
             if not arb.max(rho, after) <= radii[k]:
                 raise Unproved(f"the reach tube was not shown to have the stated radius on piece {k}")
             if self.model.continuous and k + 1 < len(self.pieces):
@@ -266,7 +261,15 @@ class Tube:
                 jump = [a - b for a, b in zip(following.at(piece.end), piece.at(piece.end))]
                 rho = (after + self.norm.length(jump)).upper()
             elif not self.model.continuous and k < len(eta):
-                rho = (slopes[k] * rho + eta[k]).upper()
+                rho = (slope * rho + eta[k]).upper()
+
+
+def _powers(x: arb, most: int) -> list[arb]:
+    """1, x, ..., x^most."""
+    result = [arb(1)]
+    for _ in range(most):
+        result.append(result[-1] * x)
+    return result
 
 
 def _velocity(series: list[arb], j: int) -> arb:

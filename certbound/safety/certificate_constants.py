@@ -39,7 +39,8 @@ __all__ = ["constants_proof"]
 
 Array = NDArray[np.float64]
 
-_TINY = (1e-8, 1e-6, 1e-4)
+_TINY = (1e-7, 1e-5, 1e-3)
+_ROOM = (1e-3, 0.1, 3.0)
 _SLACK = 0.005
 
 
@@ -56,7 +57,8 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
         raise CertificateError("no constants were found.")
     if given.times is not None:
         raise CertificateError("constants along a tube are not stated in certificates; use --method linear.")
-    slack = _TINY[min(attempt, len(_TINY) - 1)]
+    effort = min(attempt, len(_TINY) - 1)
+    slack = _TINY[effort]
     start = random_start(problem, given)
     if start != Start():
         given = given.with_full_dimension()
@@ -68,8 +70,8 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
     curve = reach.curve
     norm = Norm(flow.dimension, constants.metric)
     cells = initial_cells(problem, _cells_along(curve))
-    eta = bound_forcing(flow, curve, norm) * (1 + 10 * slack) + _smallest(curve, norm) * slack
-    slope = constants.rate if constants.rate is not None else constants.gain
+    eta = bound_forcing(flow, curve, norm) * (1 + _ROOM[effort]) + _smallest(curve, norm) * slack
+    slope = float(np.max(np.asarray(constants.rate if constants.rate is not None else constants.gain, dtype=float)))
     rho = cells.radii(norm, curve.initial())
     slopes = np.full(curve.pieces, slope)
     radius, _ = integrate_radius(curve, jump_sizes(curve, norm), rho, slopes, eta)
@@ -88,9 +90,8 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
         "region": "everywhere" if problem.domain is None else "domain",
         "times": exact(np.append(curve.starts, curve.ends[-1])) if flow.continuous else None,
         "middles": exact(curve.middles) if flow.continuous else None,
-        "rates": exact([float(slope)]),  # type: ignore[arg-type]
-        "reach_rates": None,
-        "sigmas": exact([float(np.max(constants.sigma))]),
+        "rate": exact(slope),
+        "sigma": exact(float(np.max(constants.sigma))),
         "nu": exact(float(constants.nu)),
         "start_sigma": exact(float(start.sigma)),
         "splits": exact(_edges(cells.boxes.lo, cells.boxes.hi)),
@@ -144,8 +145,7 @@ def _edges(low: Array, high: Array) -> list[list[float]]:
     result = []
     for j in range(low.shape[1]):
         inner = np.unique(low[:, j])[1:]
-        ends = np.nextafter(low[:, j].min(), -np.inf), np.nextafter(high[:, j].max(), np.inf)
-        result.append([float(ends[0]), *inner.tolist(), float(ends[1])])
+        result.append([float(low[:, j].min()), *inner.tolist(), float(high[:, j].max())])
     return result
 
 
