@@ -114,7 +114,7 @@ class _Proof:
         model, record = self.model, self.record
         boxes = cells_of(model, record)
         items = record.items("cells", len(boxes), len(boxes))
-        self.structure = structure_of(model, budget)
+        self.structure = structure_of(model, self.budget)
         for index, (item, box) in enumerate(zip(items, boxes)):
             self._check_cell(Record(item, f"proof.cells[{index}]", _CELL), box, whole=len(boxes) == 1)
         if not record.flag("assumed"):

@@ -10,7 +10,6 @@ constraints hold wherever Z stays below what y and R leave, and the probabilitie
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -245,7 +244,7 @@ class _Cell:
                 result.append(discrete_piece(slope, noise))
         return result
 
-    def _supports(self) -> _Bounds:
+    def _supports(self) -> Supports:
         """Bounds of y and R along the rows of levels and demands, over every piece."""
         n, count, continuous = self.model.dimension, self.shared.count, self.model.continuous
         one = identity(n)
@@ -264,14 +263,14 @@ class _Cell:
                 nodes.append([])
         found = supports([p.transition for p in self.pieces], nodes, loads, self.start, self.budget)
         if not continuous:
-            return _Bounds(low=found.low, high=found.high, reach=found.reach)
+            return found
         low, high, reach = [], [], []
         for k in range(count):
             parts = self._over_piece(k, asked[k], found)
             low.append(parts[0])
             high.append(parts[1])
             reach.append(parts[2])
-        return _Bounds(low=low, high=high, reach=reach)
+        return Supports(low=low, high=high, reach=reach)
 
     def _asked(self, k: int) -> list[list[arb]]:
         inner = self.rows[k] if k < self.shared.count else []
@@ -332,7 +331,7 @@ class _Cell:
             reach.append((arb.max(found.reach[k][first], found.reach[k][last]) + spread).upper())
         return low, high, reach
 
-    def _check_remainder(self, k: int, bounds: _Bounds, outputs: Sequence[OutputRemainder]) -> None:
+    def _check_remainder(self, k: int, bounds: Supports, outputs: Sequence[OutputRemainder]) -> None:
         """beta lies in B on piece k."""
         data = self._data(k)
         low, high = [], []
@@ -369,7 +368,7 @@ class _Cell:
         values += [*map(arb, self.gains[k]), *self.middle, *shared.inputs(k)]
         return PieceData(values=values, half=h / 2, disturbance=self.middle, disturbance_radius=self.reach)
 
-    def _events(self, values: list[arb_mat], bounds: _Bounds) -> arb:
+    def _events(self, values: list[arb_mat], bounds: Supports) -> arb:
         """Probability that Z leaves its levels, or exceeds what the demands leave."""
         count, inner = self.shared.count, len(self.rows[0])
         families: list[tuple[int, Demand]] = []
@@ -406,12 +405,3 @@ class _Cell:
         levels = [[arb(x) for x in item] for item in given]
         windows = Windows(self.pieces, values, self.shared.windows, budget)
         return windows.coordinates(levels), lambda family: windows.exceedance(family.rows, family.rooms)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Bounds:
-    """Bounds along the rows of each piece: low <= row . R <= high, |row . y| <= reach."""
-
-    low: list[list[arb]]
-    high: list[list[arb]]
-    reach: list[list[arb]]
