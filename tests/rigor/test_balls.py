@@ -1,0 +1,156 @@
+"""Special functions in ball arithmetic."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import pytest
+from flint import arb
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import hyp1f1, log_ndtr
+
+from certbound.rigor.balls import (
+    bessel_excess,
+    kummer_excess,
+    log_bessel0f1,
+    log_expm1,
+    log_kummer,
+    log_q_bounds,
+    log_q_upper,
+    lower,
+    precision,
+    solve_upward,
+    upper,
+)
+
+
+def exact_excess(a, b, z, terms=400):
+    """(1F1 - 1)/a by exact rational partial sums: a lower bound, and the value to the last term."""
+    a, b, z = Fraction(a), Fraction(b), Fraction(z)
+    term = total = z / b
+    for k in range(1, terms):
+        term *= (a + k) * z / ((b + k) * (k + 1))
+        total += term
+        if term < total * Fraction(1, 2**120):
+            break
+    return total
+
+
+@pytest.mark.parametrize("a", [0.0, 1e-300, 1e-12, 0.25, 3.0, 50.0])
+@pytest.mark.parametrize("b", [0.0625, 0.5, 7.5, 500.0])
+@pytest.mark.parametrize("z", [2.0**-40, 0.5, 9.0])
+def test_the_excess_encloses_exact_rational_sums(a, b, z):
+    value = exact_excess(a, b, z)
+    with precision():
+        ball = kummer_excess(arb(a), arb(b), arb(z))
+        numerator = arb(value.numerator) / arb(value.denominator)
+        assert abs(ball / numerator - 1) < 1e-15
+        assert not ball < numerator * (1 - arb(2) ** -90)
+
+
+def test_the_limit_at_zero_is_approached_from_above():
+    with precision():
+        limit, near = (kummer_excess(arb(a), arb(0.5), arb(6)) for a in (0.0, 1e-6))
+        assert limit < near < limit * 1.0001
+
+
+@pytest.mark.parametrize(("a", "z"), [(0.3, 1e5), (2.5, 1e12), (0.3, 1e17)])
+def test_log_kummer_follows_its_asymptotics_at_any_size(a, z):
+    lo, hi = log_kummer(a, 0.5, z)
+    leading = z + (a - 0.5) * math.log(z) + math.lgamma(0.5) - math.lgamma(a)
+    assert lo <= hi
+    assert (lo + hi) / 2 == pytest.approx(leading, rel=1e-9)
+
+
+def test_log_kummer_is_found_where_the_library_gives_up():
+    lo, hi = log_kummer(0.5, 500.0, 700.0)
+    assert hi - lo < 1e-12
+    assert lo == pytest.approx(32.90881629253, abs=1e-9)
+
+
+def test_beyond_all_reach_the_bounds_are_infinite_not_wrong():
+    lo, hi = log_kummer(0.0, 0.5, 1e9)
+    assert lo <= 0.0 <= hi
+    assert upper(kummer_excess(arb(0), arb(0.5), arb(1e9))) == math.inf
+
+
+@given(st.floats(1e-3, 30), st.floats(0.1, 40), st.floats(1e-3, 60))
+@settings(max_examples=60, deadline=None)
+def test_log_kummer_agrees_with_scipy(a, b, z):
+    lo, hi = log_kummer(a, b, z)
+    assert lo <= hi
+    assert lo == pytest.approx(math.log(hyp1f1(a, b, z)), rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("z", [1e-200, 1e-3, 1.0, 400.0, 1e6])
+def test_log_bessel_in_one_dimension_is_log_cosh(z):
+    x = 2 * math.sqrt(z)
+    lo, hi = log_bessel0f1(0.5, z)
+    expected = x + math.log1p(math.exp(-2 * x)) - math.log(2) if x > 1e-3 else 2 * z
+    assert lo - 1e-13 * abs(lo) <= expected <= hi + 1e-13 * abs(hi)
+
+
+def test_bessel_excess_at_zero_is_zero():
+    assert bessel_excess(arb(0.5), arb(0)).is_zero()
+    assert kummer_excess(arb(0.5), arb(0.5), arb(0)).is_zero()
+
+
+@pytest.mark.parametrize("x", [-40.0, -3.0, 0.0, 1.0, 8.0, 37.0, 1e4])
+def test_normal_tails_enclose_scipys(x):
+    lo, hi = log_q_bounds(x)
+    expected = log_ndtr(-x)
+    assert lo - 1e-12 * abs(lo) - 1e-300 <= expected <= hi + 1e-12 * abs(hi) + 1e-300
+    assert log_q_upper(x) == hi
+
+
+def test_normal_tails_at_infinity():
+    assert log_q_bounds(math.inf) == (-math.inf, -math.inf)
+    assert log_q_bounds(-math.inf) == (0.0, 0.0)
+    lo, hi = log_q_bounds(1e9)
+    assert lo <= -5e17
+    assert hi - lo <= 512  # eight units in the last place
+    with pytest.raises(ValueError, match="`x` must not be nan"):
+        log_q_bounds(math.nan)
+
+
+@given(st.integers(-(10**30), 10**30), st.integers(1, 10**20))
+@settings(max_examples=60, deadline=None)
+def test_conversion_to_floats_rounds_outward(numerator, denominator):
+    with precision():
+        ball = arb(numerator) / arb(denominator)
+        lo, hi = lower(ball), upper(ball)
+    exact = Fraction(numerator, denominator)
+    assert Fraction(lo) <= exact <= Fraction(hi)
+    assert hi - lo <= 4 * math.ulp(max(abs(lo), abs(hi)))
+
+
+def test_indeterminate_balls_become_infinite():
+    assert upper(arb.nan()) == math.inf
+    assert lower(arb.nan()) == -math.inf
+
+
+def test_log_expm1_holds_at_both_ends():
+    with precision():
+        assert abs(log_expm1(arb(1e-12)) - arb(1e-12).expm1().log()) < 1e-20
+        assert abs(log_expm1(arb(1e4)) - arb(1e4)) < 1e-20
+
+
+def test_the_solution_found_upward_is_proved():
+    with precision():
+        for guess in (math.sqrt(2), 1.0, math.nan):
+            z = solve_upward(lambda x: x * x, arb(2), guess)
+            assert arb(z) ** 2 >= 2
+        assert solve_upward(lambda x: x * x, arb(2), math.sqrt(2)) == pytest.approx(math.sqrt(2), rel=1e-12)
+        assert solve_upward(lambda x: arb(0), arb(1), 1.0) == math.inf
+
+
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda: log_kummer(-1.0, 0.5, 1.0), "`a` must be finite and not negative"),
+    (lambda: log_kummer(1.0, 0.0, 1.0), "`b` must be positive and finite"),
+    (lambda: log_bessel0f1(0.5, math.inf), "`z` must be finite and not negative"),
+])  # fmt: skip
+def test_arguments_out_of_range_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
