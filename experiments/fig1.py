@@ -52,7 +52,7 @@ def distances(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 def compute(full: bool) -> tuple[Arrays, Claims]:
     """Nominal, walls with the eroded band, tubes at three levels, sample paths."""
     aisle = problem()
-    constants = cb.bound_constants(aisle)
+    constants = cb.bound_constants(aisle, metric="euclidean")  # the pictures are of Euclidean balls
     tubes = [cb.tune_tube(constants, horizon=HORIZON, delta=level, method="kummer") for level in LEVELS]
     times = np.linspace(0.0, HORIZON, 241)
     count = 2000 if full else 200

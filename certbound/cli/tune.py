@@ -54,7 +54,7 @@ def tune(
     if as_json:
         print_json({"method": best, "rows": rows})
     else:
-        _print(best, rows)
+        _print(best, rows, "" if constants.metric is None else " (radii in the norm of the certified metric)")
 
 
 def _rows(constants: Constants, horizon: float, delta: float) -> list[dict[str, Any]]:
@@ -92,7 +92,7 @@ def _row(tube: Tube, method: str, horizon: float, seconds: float, continuous: bo
     }
 
 
-def _print(best: str, rows: list[dict[str, Any]]) -> None:
+def _print(best: str, rows: list[dict[str, Any]], norm: str) -> None:
     screen = console()
     if SETTINGS.quiet:
         screen.print(best)
@@ -111,7 +111,7 @@ def _print(best: str, rows: list[dict[str, Any]]) -> None:
         parameters = ", ".join(f"{key} {_short(value)}" for key, value in row["parameters"].items())
         table.add_row(name, row["level"], *numbers, parameters)
     screen.print(table)
-    screen.print(f"smallest trajectory-level tube: {best}")
+    screen.print(f"smallest trajectory-level tube: {best}{norm}")
 
 
 def _short(value: Any) -> str:
