@@ -133,7 +133,7 @@ def test_tune_gives_every_method_and_the_radii_that_are_known(capsys: pytest.Cap
     for row in found["rows"]:
         assert row.keys() == {"method", "level", "final", "maximum", "mean", "parameters", "seconds"}
     largest = {row["method"]: row["maximum"] for row in found["rows"]}
-    assert largest["exact"] == pytest.approx(1.2858, abs=2e-4)
+    assert 1.2857 <= largest["exact"] <= 1.003 * 1.2858  # the exact radius is 1.2858; a certified one lies above it
     assert largest["kummer"] <= 1.340
     windows = [row for row in found["rows"] if row["method"] == "thm3"]
     assert any(
