@@ -179,8 +179,7 @@ def sup_deviation(
     paths = check_count("paths", paths)
     setting = prepare(problem, steps, scenario)
     points = check_count("points", points) if points else 0
-    marks = np.round(np.arange(1, points + 1) * setting.steps / max(points, 1)).astype(np.int64)
-    if len(np.unique(marks)) < points:
+    if points > setting.steps:
         raise ValueError(f"`points` must be at most the number of steps, {setting.steps}, got {points}.")
     measure = measure or Measure()
     task, profile = _task(setting, measure, points > 0)
@@ -188,6 +187,7 @@ def sup_deviation(
     bins = _OCTAVES * _COARSE + 2
     if 16 * points * rows * bins > MEMORY_LIMIT:
         raise ValueError(f"`points` must be at most {MEMORY_LIMIT // (16 * rows * bins)}, got {points}.")
+    marks = np.round(np.arange(1, points + 1) * setting.steps / max(points, 1)).astype(np.int64)
     entropy = stored_entropy(checkpoint) if checkpoint is not None and rng is None else None
     source, p = kernel_source(setting.model, task)
     shared = setting.fixed if setting.shared_nominal else None

@@ -149,14 +149,28 @@ def _completed(pool: Executor, width: int, work: Work, chunk: int, todo: list[in
             if not waiting:
                 return
             finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
-            failed = [future for future in finished if future.cancelled() or future.exception() is not None]
+            failed = [future for future in finished if _error(future) is not None]
             for future in finished.difference(failed):
                 yield waiting.pop(future), future.result()
-            for future in failed:
-                future.result()  # raises, once what is finished has been kept
+            if failed:
+                _first_error(failed, waiting).result()  # raises, once what is finished has been kept
     finally:
         for future in waiting:
             future.cancel()
+
+
+def _error(future: Future[Tally]) -> BaseException | None:
+    return CancelledError() if future.cancelled() else future.exception()
+
+
+def _first_error(failed: list[Future[Tally]], waiting: dict[Future[Tally], int]) -> Future[Tally]:
+    """The failed chunk of the lowest number, so that a defect of the model is reported the same way always."""
+    if isinstance(_error(failed[0]), ValueError):
+        last = min(waiting[future] for future in failed)
+        before = [future for future, number in waiting.items() if number < last]
+        wait(before)
+        failed = failed + [future for future in before if _error(future) is not None]
+    return min(failed, key=lambda future: waiting[future])
 
 
 def _submit(pool: Executor, work: Work, number: int, chunk: int) -> Future[Tally]:

@@ -82,9 +82,13 @@ def test_a_ball_to_avoid_is_hit_with_the_probability_of_three_dimensional_browni
     assert agrees(result, expected, bias=0.01)
 
 
-def test_a_wide_box_to_avoid_is_a_half_space_and_touching_needs_both_faces():
+def test_a_wide_box_to_avoid_is_a_half_space():
     wide = exits(brownian(2), [cb.Outside(cb.Box([1.3, -50.0], [80.0, 50.0]))], steps=4)
     assert agrees(wide, above(1.3))
+
+
+@pytest.mark.slow
+def test_a_corner_is_touched_across_both_faces_only():
     corner = exits(brownian(2), [cb.Outside(cb.Box([0.5, 0.5], [80.0, 80.0]))], steps=200)
     fine = exits(brownian(2), [cb.Outside(cb.Box([0.5, 0.5], [80.0, 80.0]))], steps=1600)
     assert corner.probability == pytest.approx(fine.probability, rel=0.04)

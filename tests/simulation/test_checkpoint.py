@@ -142,7 +142,7 @@ print(result.exits)
 
 def test_a_run_that_was_killed_goes_on(tmp_path):
     path = tmp_path / "run.npz"
-    paths, steps = 600_000, 200
+    paths, steps = 300_000, 200
     script = SCRIPT.format(paths=paths, steps=steps)
     process = subprocess.Popen([sys.executable, "-c", script, str(path)])
     deadline = time.monotonic() + 60

@@ -44,6 +44,7 @@ def test_two_workers_give_the_answer_of_this_process(cluster, truth):
     np.testing.assert_array_equal(result.exits_by_time, truth)
 
 
+@pytest.mark.slow
 def test_a_clients_own_executor_will_do(cluster, truth):
     with distributed.Client(cluster) as client, client.get_executor() as pool:
         result = simulate_exits(ou(), paths=PATHS, rng=1, steps=STEPS, executor=pool)
@@ -64,6 +65,7 @@ def test_a_worker_that_is_killed_changes_nothing(cluster, truth):
     np.testing.assert_array_equal(result.exits_by_time, truth)
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_is_an_error_and_the_checkpoint_goes_on(tmp_path, truth):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -128,6 +128,18 @@ def test_a_model_that_returns_nan_is_reported_with_state_time_and_path():
         simulate_exits(subject, paths=3000, rng=0, steps=100)
 
 
+def test_the_first_bad_path_is_reported_whichever_thread_meets_one_first():
+    system = cb.DiscreteSystem(lambda x: np.log(x), states=1, noise=cb.Gaussian(std=1.0))
+    subject = cb.Problem(system, initial=cb.Box([2.5], [2.6]), safe=[], domain=cb.Box([-np.inf], [np.inf]), horizon=2)
+    with ThreadPoolExecutor(4) as pool:
+        messages = set()
+        for _ in range(10):
+            with pytest.raises(ValueError, match="not finite") as caught:
+                simulate_exits(subject, paths=20_000, rng=3, executor=pool)
+            messages.add(str(caught.value))
+    assert len(messages) == 1
+
+
 def test_an_explosion_inside_the_safe_set_is_reported():
     system = cb.ContinuousSystem(lambda x: x**5, states=1, diffusion=[[0.1]])
     subject = cb.Problem(system, initial=[1.0], safe=[], domain=cb.Box([-np.inf], [np.inf]), horizon=5.0)
