@@ -99,7 +99,7 @@ def _proved(model: Model, record: Record, named: list[str], budget: Budget) -> a
     """The probability that the engine's proof bounds."""
     proof = record["proof"]
     engine = proof.get("engine") if isinstance(proof, dict) else None
-    if engine not in _ENGINES:
+    if not isinstance(engine, str) or engine not in _ENGINES:
         raise CertificateError(f"`proof.engine` must be one of {', '.join(_ENGINES)}.")
     return _ENGINES[engine](model, proof, budget)
 
@@ -124,7 +124,7 @@ def _claim(model: Model, level: float, assumptions: list[str]) -> str:
     unit = "s" if model.continuous else "steps"
     start = "a normal start" if model.initial.covariance is not None else "every start in the initial set"
     also = ", whatever the disturbance does," if model.disturbance else ""
-    safe = "at most" if arb(level) <= arb(model.delta).log() / arb(10).log() else "NOT shown to be at most"
+    safe = "at most" if arb(level) <= arb(model.delta).log() / arb(10).log() else "more than"
     words = (
         f"from {start}{also} {model.name} breaks one of its {len(model.constraints)} constraints within "
         f"{model.horizon:g} {unit} with probability at most 10^{level:.6g} ({safe} delta = {model.delta:g})"

@@ -8,7 +8,7 @@ A box on which that fails is halved.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from flint import arb, arb_mat
 
@@ -60,6 +60,9 @@ class Contraction:
             graph, self.atoms, risky, variables=len(model.dynamics.inputs), generalised=True, unbounded=True
         )
         self.program.prepare([])
+        self.relevant = 0
+        for node in [*self.atoms, *risky]:
+            self.relevant |= graph.masks[node]
 
     def prove(self, box: Box, bound: arb, what: str) -> None:
         """The rate (CT) or gain (DT) is at most ``bound`` over a box of all inputs of the dynamics.
@@ -68,18 +71,7 @@ class Contraction:
         ------
         Unproved
         """
-        stack = [box]
-        for _ in range(_MOST_BOXES):
-            if not stack:
-                return
-            self.budget.box()
-            current = stack.pop()
-            if not self._holds(current, bound):
-                parts = halves(current)
-                if parts is None:
-                    break
-                stack += parts
-        if stack:
+        if not _everywhere(box, lambda part: self._holds(part, bound), self.relevant, self.budget):
             raise Unproved(f"{what} {float(bound):.9g} was not shown to bound the Jacobian")
 
     def _holds(self, box: Box, bound: arb) -> bool:
@@ -150,12 +142,44 @@ def _constant(graph: Graph, index: int) -> arb:
         raise Unproved("a constant of the model is not defined") from error
 
 
-def halves(box: Box) -> list[Box] | None:
+def _everywhere(box: Box, holds: Callable[[Box], bool], relevant: int, budget: Budget) -> bool:
+    """Whether something holds on a box, cut across the inputs in the mask ``relevant`` where need be.
+
+    A part on which it fails although its middle point alone fails too, or which cannot be cut, settles that it is not
+    proved.
+    """
+    stack = [box]
+    for _ in range(_MOST_BOXES):
+        if not stack:
+            return True
+        budget.box()
+        current = stack.pop()
+        if holds(current):
+            continue
+        if not holds([_point(low, high) for low, high in current]):
+            return False
+        parts = _halves(current, relevant)
+        if parts is None:
+            return False
+        stack += parts
+    return False
+
+
+def _point(low: arb, high: arb) -> tuple[arb, arb]:
+    """A point of a side, which may be unbounded."""
+    if low.is_finite() and high.is_finite():
+        middle = ((low + high) / 2).mid()
+    else:
+        middle = low if low.is_finite() else high if high.is_finite() else arb(0)
+    return middle, middle
+
+
+def _halves(box: Box, relevant: int) -> list[Box] | None:
     """A box cut across its widest bounded side (relative to its size); None where there is none."""
     best, widest = -1, arb(0)
     for place, (low, high) in enumerate(box):
         width = high - low
-        if width.is_finite() and width > 0:
+        if relevant >> place & 1 and width.is_finite() and width > 0:
             scaled = (width / (1 + abs(low + high))).mid()
             if scaled > widest:
                 best, widest = place, scaled
@@ -175,6 +199,7 @@ class Spread:
         self.model, self.metric, self.budget = model, metric, budget
         self.root = cholesky(metric)
         self.program: Program | None = None
+        self.relevant = 0
         diffusion = model.noise.diffusion
         if isinstance(diffusion, Tape):
             graph = Graph()
@@ -182,11 +207,8 @@ class Spread:
             outputs = [nodes[output] for output in diffusion.outputs]
             self.program = Program(graph, outputs, variables=len(diffusion.inputs))
             self.program.prepare([])
-
-    @property
-    def constant(self) -> bool:
-        """Whether the noise is the same everywhere."""
-        return self.program is None
+            for node in outputs:
+                self.relevant |= graph.masks[node]
 
     def prove(self, box: Box, sigma: arb, nu: arb) -> None:
         """The constants hold on a box of (t, states).
@@ -195,18 +217,7 @@ class Spread:
         ------
         Unproved
         """
-        stack = [box]
-        for _ in range(_MOST_BOXES):
-            if not stack:
-                return
-            self.budget.box()
-            current = stack.pop()
-            if not self._holds(current, sigma, nu):
-                parts = None if self.constant else halves(current)
-                if parts is None:
-                    break
-                stack += parts
-        if stack:
+        if not _everywhere(box, lambda part: self._holds(part, sigma, nu), self.relevant, self.budget):
             raise Unproved(f"sigma = {float(sigma):.9g} and nu = {float(nu):.6g} were not shown to bound the noise")
 
     def _holds(self, box: Box, sigma: arb, nu: arb) -> bool:

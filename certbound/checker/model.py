@@ -238,7 +238,7 @@ def _initial(value: object, path: str, n: int) -> Initial:
         "gaussian": ("mean", "covariance"),
     }  # fmt: skip
     kind = value.get("kind") if isinstance(value, dict) else None
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         raise CertificateError(f"`{path}.kind` must be one of {', '.join(kinds)}.")
     record = Record(value, path, ("kind", *kinds[kind]))
     if kind == "box":

@@ -191,7 +191,7 @@ _KINDS = {
 
 def _region(value: object, path: str, dimension: int) -> Region:
     kind = value.get("kind") if isinstance(value, dict) else None
-    if kind not in _KINDS:
+    if not isinstance(kind, str) or kind not in _KINDS:
         raise CertificateError(f"`{path}.kind` must be one of {', '.join(_KINDS)}.")
     record = Record(value, path, ("kind", *_KINDS[kind]))
     everything = tuple(range(dimension))

@@ -61,6 +61,16 @@ class _Box:
     radius: list[arb]
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Found:
+    """Value at a box's centre, bounds over the box, and how much each coordinate contributes to their distance."""
+
+    value: arb
+    low: arb
+    high: arb
+    smear: list[arb]
+
+
 def remainders(model: Model, structure: Structure, budget: Budget) -> list[OutputRemainder]:
     """The remainder of every output.
 
@@ -175,9 +185,12 @@ class OutputRemainder:
             if not frame.meets(box):
                 continue
             found = self._bound(frame, box)
-            if found is not None and found[0] >= low and found[1] <= high:
-                continue
-            parts = _halves(box, None if found is None else found[2])
+            if found is not None:
+                if found.low >= low and found.high <= high:
+                    continue
+                if (found.value > high or found.value < low) and frame.holds_centre(box):
+                    return False
+            parts = _halves(box, None if found is None else found.smear)
             if parts is None:
                 return False
             stack.extend(parts)
@@ -194,8 +207,8 @@ class OutputRemainder:
             thin[slot], wide[slot] = value, value + arb(0, size)
         return thin, wide
 
-    def _bound(self, frame: _Frame, box: _Box) -> tuple[arb, arb, list[arb]] | None:
-        """Lower and upper bound on a box, and how much each coordinate contributes; None where undecided."""
+    def _bound(self, frame: _Frame, box: _Box) -> _Found | None:
+        """Bounds on a box; None where undecided."""
         thin, wide = self._inputs(frame, box)
         try:
             value, *gradient = self.thin.run(thin)
@@ -226,11 +239,11 @@ class OutputRemainder:
             high += arb.max(own.upper(), arb(0)) * square
             low += arb.min(own.lower(), arb(0)) * square
             smear.append(((share + abs(own) * radius[a]) * radius[a]).upper())
-        return (value - spread + low).lower(), (value + spread + high).upper(), smear
+        return _Found(
+            value=value, low=(value - spread + low).lower(), high=(value + spread + high).upper(), smear=smear
+        )
 
-    def _kinked_bound(
-        self, frame: _Frame, box: _Box, thin: list[arb], wide: list[arb]
-    ) -> tuple[arb, arb, list[arb]] | None:
+    def _kinked_bound(self, frame: _Frame, box: _Box, thin: list[arb], wide: list[arb]) -> _Found | None:
         """The same to first order, with generalised slopes over the box."""
         if self.kinked is None:
             return None
@@ -241,7 +254,7 @@ class OutputRemainder:
             return None
         smear = [(abs(g) * r).upper() for g, r in zip(frame.turned(slopes), box.radius)]
         spread = sum(smear, arb(0))
-        return (value - spread).lower(), (value + spread).upper(), smear
+        return _Found(value=value, low=(value - spread).lower(), high=(value + spread).upper(), smear=smear)
 
 
 class _Frame:
@@ -299,6 +312,14 @@ class _Frame:
                 value += factor * box.centre[self.start + place]
                 reach += abs(factor) * box.radius[self.start + place]
             if value - reach > high or value + reach < low:
+                return False
+        return True
+
+    def holds_centre(self, box: _Box) -> bool:
+        """Whether the box's centre surely lies in the polytope."""
+        for form, low, high in self.cuts:
+            value = sum((factor * box.centre[self.start + place] for place, factor in enumerate(form)), arb(0))
+            if not (value >= low and value <= high):
                 return False
         return True
 

@@ -1,0 +1,94 @@
+"""Certificates of small problems, made once for all tests of the checker."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import ctx
+
+import certbound as cb
+from certbound.checker import parse
+from certbound.safety.certificate import certificate_text, problem_data
+from certbound.safety.verification import verify_safety
+
+
+class Case:
+    """A problem, its certificate as data, and its problem part."""
+
+    def __init__(self, problem: cb.Problem, method: str) -> None:
+        self.problem = problem
+        self.verdict = verify_safety(problem, method=method)
+        self.text = certificate_text(problem, self.verdict)
+        self.given = json.loads(json.dumps(problem_data(problem)))
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """A fresh copy of the certificate."""
+        return parse(self.text)
+
+
+def steps() -> cb.Problem:
+    """Discrete time: coupled nonlinear states, a disturbance, an obstacle, a window, a domain."""
+
+    def move(x: Any, d: Any) -> Any:
+        return [0.9 * x[0] + 0.1 * np.sin(x[1]) + 0.02 * d[0], 0.8 * x[1] - 0.1 * x[0] * x[1]]
+
+    system = cb.DiscreteSystem(
+        move, states=2, disturbance=cb.Box([-1], [1]), noise=cb.Gaussian(std=0.02)
+    )
+    safe = [
+        cb.Inside(cb.Box([-2, -2], [2, 2])),
+        cb.Outside(cb.Ball([1.5, 1.0], 0.3)),
+        cb.Outside(cb.Box([1.0, -1.8], [1.5, -1.2]), during=(2, 4)),
+    ]
+    return cb.Problem(
+        system, initial=cb.Box([0.2, 0.1], [0.3, 0.2]), safe=safe, horizon=6, domain=cb.Box([-4, -4], [4, 4])
+    )
+
+
+def flow() -> cb.Problem:
+    """Continuous time, nonlinear: a moving obstacle and a round safe set."""
+
+    def rate(x: Any) -> Any:
+        return [x[1], -2.0 * np.sin(x[0]) - x[1]]
+
+    system = cb.ContinuousSystem(rate, states=2, diffusion=[[0.0], [0.05]])
+    safe = [cb.Inside(cb.Ball([0, 0], 1.5)), cb.Outside(cb.Ball(lambda t: [1.0 + t, 1.0], 0.3))]
+    return cb.Problem(system, initial=cb.Box([0.3, -0.02], [0.34, 0.02]), safe=safe, horizon=1.5)
+
+
+def contraction() -> cb.Problem:
+    """Continuous time, for the constants: a disturbance, a saturation, an obstacle."""
+
+    def rate(x: Any, d: Any) -> Any:
+        return [-x[0] - np.tanh(x[0]) + 0.1 * d[0], -1.5 * x[1] + 0.5 * x[0]]
+
+    system = cb.ContinuousSystem(rate, states=2, disturbance=cb.Box([-1], [1]), diffusion=0.1 * np.eye(2))
+    safe = [cb.Inside(cb.Ball([0, 0], 1.3)), cb.Outside(cb.Ball([1.5, 1.5], 0.4))]
+    return cb.Problem(system, initial=cb.Box([0.1, 0.1], [0.2, 0.2]), safe=safe, horizon=1.0, delta=1e-2)
+
+
+@pytest.fixture(autouse=True)
+def precise() -> Iterator[None]:
+    """The working precision of a check."""
+    with ctx.workprec(128):
+        yield
+
+
+@pytest.fixture(scope="session")
+def stepping() -> Case:
+    return Case(steps(), "linear")
+
+
+@pytest.fixture(scope="session")
+def flowing() -> Case:
+    return Case(flow(), "linear")
+
+
+@pytest.fixture(scope="session")
+def contracting() -> Case:
+    return Case(contraction(), "constants")

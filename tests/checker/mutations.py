@@ -1,0 +1,337 @@
+"""Changes of single fields of a certificate: some that take away what a claim rests on, some that do no harm."""
+
+from __future__ import annotations
+
+import copy
+import random
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from certbound.checker import check_data
+from certbound.errors import CertificateError
+
+Data = dict[str, Any]
+Change = Callable[[Data, random.Random], str | None]
+
+
+def rejected(data: Data, problem: Data | None = None) -> bool:
+    """Whether the checker refuses or refutes a certificate."""
+    try:
+        return not check_data(data, problem).valid
+    except CertificateError:
+        return True
+
+
+def mutated(data: Data, changes: list[Change], count: int, seed: int) -> Iterator[tuple[str, Data]]:
+    """``count`` changed copies, each with the name of its change; changes take turns."""
+    rng = random.Random(seed)
+    made = tried = 0
+    while made < count:
+        altered = copy.deepcopy(data)
+        name = changes[tried % len(changes)](altered, rng)
+        tried += 1
+        if tried > 50 * count + 100:
+            raise AssertionError("too few of the changes apply to this certificate")
+        if name is not None:
+            made += 1
+            yield name, altered
+
+
+def _scaled(text: str, factor: float, shift: float = 0.0) -> str:
+    return (float.fromhex(text) * factor + shift).hex()
+
+
+def _pick(items: list[Any], rng: random.Random) -> int:
+    return rng.randrange(len(items))
+
+
+# ---- what every certificate rests on -----------------------------------------------------------------------
+
+
+def stronger_claim(proved: float) -> Change:
+    """A probability below the one that follows."""
+
+    def change(data: Data, rng: random.Random) -> str | None:
+        data["claim"]["log10_delta"] = (proved * (1 + rng.uniform(0.001, 0.5)) - 1e-6).hex()
+        return "claim"
+
+    return change
+
+
+def other_problem(data: Data, rng: random.Random) -> str | None:
+    """A change of the problem's data, to be compared with the problem itself."""
+    problem = data["problem"]
+    places = [(problem, "horizon"), (problem, "delta")]
+    places += [(region, key) for c in problem["constraints"] for region in [c["region"]] for key in _numbers_in(region)]
+    initial, noise = problem["initial"], problem["noise"]
+    places += [(initial, key) for key in _numbers_in(initial)]
+    places += [(noise, key) for key in _numbers_in(noise)]
+    places += [(pair, i) for pair in problem["disturbance_set"] for i in (0, 1)]
+    places += [(row, i) for row in problem["plan"] or [] for i in range(len(row))]
+    holder, key = rng.choice(places)
+    return _perturbed(holder, key, rng)
+
+
+def _numbers_in(record: Data) -> list[str]:
+    names = ("low", "high", "center", "radius", "shape", "normal", "bound", "A", "b", "values", "matrix", "diffusion")
+    return [name for name in (*names, "mean", "covariance") if isinstance(record.get(name), (str, list))]
+
+
+def _perturbed(holder: Any, key: Any, rng: random.Random) -> str | None:
+    value = holder[key]
+    while isinstance(value, list):
+        if not value:
+            return None
+        holder, key = value, _pick(value, rng)
+        value = holder[key]
+    if not isinstance(value, str):
+        return None
+    holder[key] = _scaled(value, 1 + rng.choice((-1, 1)) * 1e-6, rng.choice((-1, 1)) * 1e-9)
+    return "problem"
+
+
+def other_dynamics(data: Data, rng: random.Random) -> str | None:
+    """Another operation, another argument or another constant in the tape."""
+    nodes = data["problem"]["dynamics"]["nodes"]
+    used, stack = set(), list(data["problem"]["dynamics"]["outputs"])
+    while stack:
+        index = stack.pop()
+        if index not in used:
+            used.add(index)
+            op, *rest = nodes[index]
+            stack += [] if op in ("input", "const") else [arg for arg in rest if isinstance(arg, int)]
+    node = nodes[rng.choice(sorted(used))]
+    if node[0] == "const":
+        node[1] = _scaled(node[1], 1 + 1e-9, 1e-12)
+    elif node[0] == "input":
+        node[1] = node[1] + 1 if node[1] == 0 else node[1] - 1
+    elif len(node) == 3 and node[0] != "pow":
+        swaps = {"add": "sub", "sub": "add", "mul": "div", "div": "mul"}
+        node[0] = swaps.get(node[0], "add")
+    else:
+        node[0] = "sin" if node[0] != "sin" else "cos"
+        del node[2:]
+    return "dynamics"
+
+
+# ---- the linear response -----------------------------------------------------------------------------------
+
+
+def lower_level(data: Data, rng: random.Random) -> str | None:
+    """A level that the Gaussian part exceeds far more often."""
+    levels = rng.choice(data["proof"]["cells"])["levels"]
+    piece = rng.randrange(1, len(levels)) if len(levels) > 1 else 0
+    if not levels[piece]:
+        return None
+    place = _pick(levels[piece], rng)
+    if float.fromhex(levels[piece][place]) == 0.0:
+        return None
+    levels[piece][place] = _scaled(levels[piece][place], rng.uniform(0.05, 0.3))
+    return "level"
+
+
+def lower_window_level(data: Data, rng: random.Random) -> str | None:
+    """The same for a coordinate in a window."""
+    levels = rng.choice(data["proof"]["cells"])["window_levels"]
+    if levels is None:
+        return None
+    window = _pick(levels, rng)
+    place = _pick(levels[window], rng)
+    if float.fromhex(levels[window][place]) < 1e-9:
+        return None
+    levels[window][place] = _scaled(levels[window][place], rng.uniform(0.05, 0.3))
+    return "window level"
+
+
+def moved_nominal(data: Data, rng: random.Random) -> str | None:
+    """A nominal point that the dynamics does not reach."""
+    nominal = rng.choice(data["proof"]["cells"])["nominal"]
+    point = nominal[_pick(nominal, rng)]
+    while isinstance(point[0], list):
+        point = point[_pick(point, rng)]
+    place = _pick(point, rng)
+    point[place] = _scaled(point[place], 1.0, rng.choice((-1, 1)) * rng.uniform(0.5, 2.0))
+    return "nominal"
+
+
+def wrong_slope(data: Data, rng: random.Random) -> str | None:
+    """A slope far from the Jacobian."""
+    slopes = rng.choice(data["proof"]["cells"])["slopes"]
+    row = slopes[_pick(slopes, rng)]
+    if not row:
+        return None
+    place = _pick(row, rng)
+    row[place] = _scaled(row[place], 1.0, rng.choice((-1, 1)) * rng.uniform(1.0, 3.0))
+    return "slope"
+
+
+def missing_box(data: Data, rng: random.Random) -> str | None:
+    """A box of the remainder that lies beside it."""
+    cell = rng.choice(data["proof"]["cells"])
+    piece = _pick(cell["remainder_low"], rng)
+    place = _pick(cell["remainder_low"][piece], rng)
+    low, high = (float.fromhex(cell[name][piece][place]) for name in ("remainder_low", "remainder_high"))
+    if rng.random() < 0.5:
+        cell["remainder_low"][piece][place] = (high + (high - low)).hex()
+        cell["remainder_high"][piece][place] = (high + 2 * (high - low)).hex()
+    else:
+        cell["remainder_high"][piece][place] = (low - (high - low)).hex()
+        cell["remainder_low"][piece][place] = (low - 2 * (high - low)).hex()
+    return "remainder"
+
+
+def fewer_starts(data: Data, rng: random.Random) -> str | None:
+    """Cells that leave out a part of the initial set."""
+    edges = data["proof"]["splits"][_pick(data["proof"]["splits"], rng)]
+    low, high = float.fromhex(edges[0]), float.fromhex(edges[-1])
+    if not high - low > 1e-9:
+        edges[-1] = edges[0] = (high + 1e-3).hex()
+    elif rng.random() < 0.5:
+        edges[0] = (low + 0.01 * (high - low)).hex()
+    else:
+        edges[-1] = (high - 0.01 * (high - low)).hex()
+    return "splits"
+
+
+def flipped_direction(data: Data, rng: random.Random) -> str | None:
+    """A direction that points into the obstacle."""
+    given = [item for item in rng.choice(data["proof"]["cells"])["separations"] if isinstance(item, list)]
+    if not given:
+        return None
+    rows = rng.choice(given)
+    row = rows[_pick(rows, rng)]
+    if not isinstance(row, list):
+        return None
+    row[:] = [_scaled(x, -1.0) for x in row]
+    return "direction"
+
+
+def wrong_structure(data: Data, rng: random.Random) -> str | None:
+    """Entries of the Jacobian declared constant that are not, or a grid that does not fit."""
+    proof = data["proof"]
+    kind = rng.choice(("varying", "units", "pieces"))
+    if kind == "pieces":
+        proof["pieces"] += 1
+    elif proof[kind]:
+        del proof[kind][_pick(proof[kind], rng)]
+    else:
+        return None
+    return kind
+
+
+LINEAR: list[Change] = [
+    other_problem, other_dynamics, lower_level, lower_window_level, moved_nominal, wrong_slope, missing_box,
+    fewer_starts, flipped_direction, wrong_structure,
+]  # fmt: skip
+
+
+# ---- the constants -----------------------------------------------------------------------------------------
+
+
+def smaller(name: str, low: float, high: float) -> Change:
+    """A number of the proof reduced by a share between ``low`` and ``high`` of its size."""
+
+    def change(data: Data, rng: random.Random) -> str | None:
+        value = float.fromhex(data["proof"][name])
+        data["proof"][name] = (value - rng.uniform(low, high) * abs(value)).hex()
+        return name
+
+    return change
+
+
+def smaller_in_cell(name: str) -> Change:
+    """A defect or a radius reduced below what the pieces before prove."""
+
+    def change(data: Data, rng: random.Random) -> str | None:
+        values = rng.choice(data["proof"]["cells"])[name]
+        place = _pick(values, rng)
+        if float.fromhex(values[place]) < 1e-6:
+            return None
+        values[place] = _scaled(values[place], rng.uniform(0.3, 0.9))
+        return name
+
+    return change
+
+
+def larger_room(data: Data, rng: random.Random) -> str | None:
+    """More room than a constraint leaves."""
+    rooms = data["proof"]["rooms"]
+    place = _pick(rooms, rng)
+    if rooms[place] is None:
+        return None
+    rooms[place] = _scaled(rooms[place], 1 + rng.uniform(0.01, 0.5))
+    return "room"
+
+
+def other_metric(data: Data, rng: random.Random) -> str | None:
+    """A metric far from the stated one."""
+    metric = data["proof"]["metric"]
+    if metric is None:
+        return None
+    place = _pick(metric, rng)
+    metric[place][place] = _scaled(metric[place][place], rng.choice((0.2, 3.0)))
+    return "metric"
+
+
+def other_parameters(data: Data, rng: random.Random) -> str | None:
+    """Kummer parameters that prove less."""
+    kummer = data["proof"]["kummer"]
+    kummer["v0"] = _scaled(kummer["v0"], rng.choice((1e-9, 1e9)))
+    return "kummer"
+
+
+CONSTANTS: list[Change] = [
+    other_problem, other_dynamics, smaller("rate", 0.001, 0.5), smaller("sigma", 0.01, 0.5), smaller("nu", 0.01, 0.5),
+    smaller_in_cell("eta"), smaller_in_cell("radius"), larger_room, other_metric, other_parameters, moved_nominal,
+    fewer_starts, flipped_direction,
+]  # fmt: skip
+
+
+# ---- changes that do no harm -------------------------------------------------------------------------------
+
+
+def reordered(data: Data, rng: random.Random) -> str | None:
+    """Other orders of the keys."""
+
+    def shuffled(value: Any) -> Any:
+        if isinstance(value, dict):
+            items = [(key, shuffled(item)) for key, item in value.items()]
+            rng.shuffle(items)
+            return dict(items)
+        return [shuffled(item) for item in value] if isinstance(value, list) else value
+
+    replaced = shuffled(data)
+    data.clear()
+    data.update(replaced)
+    return "order"
+
+
+def other_names(data: Data, rng: random.Random) -> str | None:
+    """Names for humans."""
+    data["problem"]["name"] = f"name {rng.random()}"
+    for constraint in data["problem"]["constraints"]:
+        constraint["label"] = "renamed"
+    return "names"
+
+
+def weaker_claim(data: Data, rng: random.Random) -> str | None:
+    """A larger probability."""
+    data["claim"]["log10_delta"] = _scaled(data["claim"]["log10_delta"], rng.uniform(0.5, 0.999))
+    return "weaker claim"
+
+
+def wider(data: Data, rng: random.Random) -> str | None:
+    """A little more of a number that may grow."""
+    cell = rng.choice(data["proof"]["cells"])
+    names = [name for name in ("eta", "radius", "remainder_high", "levels") if name in cell]
+    values = cell[rng.choice(names)]
+    while isinstance(values[0], list):
+        values = values[_pick(values, rng)]
+        if not values:
+            return None
+    place = _pick(values, rng)
+    values[place] = _scaled(values[place], 1.0, 1e-9 * abs(float.fromhex(values[place])))
+    return "wider"
+
+
+HARMLESS: list[Change] = [reordered, other_names, weaker_claim, wider]
