@@ -34,6 +34,8 @@ _HOME = {
     "Problem": "problem.problem",
     "load": "problem.files",
     "save": "problem.files",
+    "export_casadi": "problem.export",
+    "export_control": "problem.export",
     "Constants": "tubes.constants",
     "tune_tube": "tubes.tuning",
     "bound_exit_probability": "tubes.tuning",

@@ -18,8 +18,9 @@ from certbound.problem.checks import frozen, matrix, names, number, vector
 from certbound.problem.io_systems import import_control, is_control_system
 from certbound.problem.noise import Gaussian, Law
 from certbound.problem.sets import Box
+from certbound.problem.symbolic import is_symbolic, read_model, symbol_names
 from certbound.problem.tape import Tape
-from certbound.problem.trace import compile_numpy, trace
+from certbound.problem.trace import compile_numpy
 
 __all__ = ["ContinuousSystem", "DiscreteSystem", "System", "from_control", "linear_system"]
 
@@ -72,6 +73,8 @@ class System:
         if imported is not None:
             f, states = imported.function, imported.states if states is None else states
             options = imported.options(options)
+        states = symbol_names(states)
+        options = {name: symbol_names(value) if name.endswith("names") else value for name, value in options.items()}
         if states is None:
             raise TypeError("`states` must be given: a number, or the states' names.")
         self._set("states", _state_names(states))
@@ -92,7 +95,7 @@ class System:
         arguments |= {"u": self.input_names} if self.inputs is not None else {}
         arguments |= {"d": self.disturbance_names} if self.disturbance is not None else {}
         inputs = tuple(name for entries in arguments.values() for name in entries)
-        tape = f if isinstance(f, Tape) else trace(f, arguments)
+        tape = f if isinstance(f, Tape) else read_model(f, arguments)
         if tape.inputs != inputs:
             raise ValueError(f"`dynamics` must be a tape over {inputs}, got {tape.inputs}.")
         if tape.shape not in ((self.dimension,), (self.dimension, 1)):
@@ -112,10 +115,10 @@ class ContinuousSystem(System):
 
     Parameters
     ----------
-    f : function, Tape, or python-control system
-        Takes any of t, x, u, d by name and returns n values: NumPy-style, traced once.
+    f : function, SymPy or CasADi expressions, casadi.Function, Tape, or python-control system
+        Takes any of t, x, u, d by name and returns n values; expressions are read by their symbols' names.
     states : int or sequence of str
-        Number of states (named x1, x2, ...) or their names.
+        Number of states (named x1, x2, ...) or their names; symbols will do.
     inputs : Box, optional
         Bounds of the inputs u (infinite sides allowed); without it the system has none.
     disturbance : Box, optional
@@ -172,10 +175,10 @@ class DiscreteSystem(System):
 
     Parameters
     ----------
-    f : function, Tape, or python-control system
+    f : function, SymPy or CasADi expressions, casadi.Function, Tape, or python-control system
         Takes any of t, x, u, d by name and returns the n next values; t is the number of the step.
     states : int or sequence of str
-        Number of states (named x1, x2, ...) or their names.
+        Number of states (named x1, x2, ...) or their names; symbols will do.
     inputs : Box, optional
         Bounds of the inputs u (infinite sides allowed); without it the system has none.
     disturbance : Box, optional
@@ -379,9 +382,9 @@ def _diffusion(value: Any, states: Sequence[str]) -> Array | Tape:
     n = len(states)
     if value is None:
         return frozen(np.zeros((n, 1)))
-    if not callable(value) and not isinstance(value, Tape):
+    if not callable(value) and not isinstance(value, Tape) and not is_symbolic(value):
         return _noise_matrix("diffusion", value, states)
-    tape = value if isinstance(value, Tape) else trace(value, {"t": ["t"], "x": states})
+    tape = value if isinstance(value, Tape) else read_model(value, {"t": ["t"], "x": states}, matrix=True)
     if tape.inputs != ("t", *states):
         raise ValueError(f"`diffusion` must be a tape over {('t', *states)}, got {tape.inputs}.")
     shape = tape.shape if len(tape.shape) == 2 else (1, *tape.shape)
