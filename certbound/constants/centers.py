@@ -12,12 +12,20 @@ Source: Boyd and El Ghaoui, "Method of centers for minimizing generalized eigenv
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, eigh, solve_continuous_lyapunov, solve_discrete_lyapunov
+from scipy.linalg import (
+    LinAlgWarning,
+    cho_factor,
+    cho_solve,
+    eigh,
+    solve_continuous_lyapunov,
+    solve_discrete_lyapunov,
+)
 
 from certbound.constants.blocks import Sector, contraction_value, lmi_blocks, transformed
 from certbound.constants.jacobians import JacobianSet
@@ -157,7 +165,10 @@ def starting_metric(blocks: Sequence[Array | Sector], *, continuous: bool) -> Ar
     n = len(middle)
     best, chosen = np.inf, np.eye(n)
     for share in (0.0, 0.1, 0.3, 1.0, 3.0, 10.0):
-        metric = np.eye(n) if share == 0 else lyapunov_metric(middle, share, continuous=continuous)
+        try:
+            metric = np.eye(n) if share == 0 else lyapunov_metric(middle, share, continuous=continuous)
+        except np.linalg.LinAlgError:
+            continue
         half = metric / 2
         value = -np.inf
         for block in blocks:
@@ -170,7 +181,13 @@ def starting_metric(blocks: Sequence[Array | Sector], *, continuous: bool) -> Ar
 
 
 def lyapunov_metric(matrix: Array, share: float, *, continuous: bool) -> Array:
-    """P of largest eigenvalue 1 in which one Jacobian contracts, with a margin of ``share`` of its decay."""
+    """P of largest eigenvalue 1 in which one Jacobian contracts, with a margin of ``share`` of its decay.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the equation is singular in floating point (a Jordan block on the stability limit).
+    """
     n = len(matrix)
     eigenvalues = np.linalg.eigvals(matrix)
     if continuous:
@@ -180,7 +197,12 @@ def lyapunov_metric(matrix: Array, share: float, *, continuous: bool) -> Array:
     else:
         top = float(np.abs(eigenvalues).max()) ** 2
         scale = top + share * max(abs(1 - top), 1e-6)
-        metric = solve_discrete_lyapunov(matrix.T / np.sqrt(scale), np.eye(n))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", LinAlgWarning)
+            try:
+                metric = solve_discrete_lyapunov(matrix.T / np.sqrt(scale), np.eye(n))
+            except LinAlgWarning as warning:
+                raise np.linalg.LinAlgError(str(warning)) from warning
     metric = (metric + metric.T) / 2
     return np.asarray(metric / np.linalg.norm(metric, 2))
 

@@ -92,7 +92,7 @@ class Face:
         """h - e as a CasADi expression; for a union, the weighted sum over its parts."""
         raise NotImplementedError
 
-    def _local(self, states: Array, times: Array) -> Array:
+    def local(self, states: Array, times: Array) -> Array:
         """Coordinates relative to the centre, shape (K, q)."""
         chosen = states[:, list(self.coordinates)]
         if isinstance(self.center, Tape):
@@ -101,7 +101,8 @@ class Face:
             return np.asarray(chosen - compile_numpy(self.center)(times))
         return np.asarray(chosen - self.center)
 
-    def _relative(self, ca: Any, state: Any, time: Any) -> Any:
+    def relative(self, ca: Any, state: Any, time: Any) -> Any:
+        """Coordinates relative to the centre as a CasADi expression."""
         chosen = ca.vertcat(*[state[i] for i in self.coordinates])
         if isinstance(self.center, Tape):
             return chosen - to_casadi(self.center, [time])
@@ -126,10 +127,10 @@ class Plane(Face):
 
     def room(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
         taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), 1))[:, 0]
-        return np.asarray(self.bound - self._local(states, times) @ self.normal - taken)
+        return np.asarray(self.bound - self.local(states, times) @ self.normal - taken)
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:
-        return self.bound - ca.dot(ca.DM(self.normal), self._relative(ca, state, time)) - erosion[0]
+        return self.bound - ca.dot(ca.DM(self.normal), self.relative(ca, state, time)) - erosion[0]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -143,7 +144,7 @@ class Round(Face):
     def rows(self, states: Array, times: Array) -> Array:
         count = len(self.coordinates)
         if self.outside:
-            image = self._local(states, times) @ self.matrix.T
+            image = self.local(states, times) @ self.matrix.T
             length = np.linalg.norm(image, axis=1, keepdims=True)
             unit = np.where(length > 0, image / np.maximum(length, 1e-300), np.eye(count)[0])
             return self._embedded(-(unit @ self.matrix)[:, None, :])
@@ -164,11 +165,11 @@ class Round(Face):
 
     def room(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
         taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), 1))[:, 0]
-        value = np.linalg.norm(self._local(states, times) @ self.matrix.T, axis=1) - self.size
+        value = np.linalg.norm(self.local(states, times) @ self.matrix.T, axis=1) - self.size
         return np.asarray((value if self.outside else -value) - taken)
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:
-        image = ca.DM(self.matrix) @ self._relative(ca, state, time)
+        image = ca.DM(self.matrix) @ self.relative(ca, state, time)
         # smooth at the centre, where a plan with the most room inside may lie: too large a distance, by little
         smooth = (1e-6 if self.outside else 1e-2) * self.size
         value = ca.sqrt(ca.sumsqr(image) + smooth**2 + 1e-24) - self.size
@@ -196,16 +197,16 @@ class Facets(Face):
 
     def room(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
         taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), self.parts))
-        return np.asarray(np.max(self._local(states, times) @ self.normals.T - self.bounds - taken, axis=1))
+        return np.asarray(np.max(self.local(states, times) @ self.normals.T - self.bounds - taken, axis=1))
 
     def best(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
         """Weights (K, facets) that choose the facet with the most room."""
         taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), self.parts))
-        value = self._local(states, times) @ self.normals.T - self.bounds - taken
+        value = self.local(states, times) @ self.normals.T - self.bounds - taken
         return np.asarray(np.eye(self.parts)[np.argmax(value, axis=1)])
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:
-        value = ca.DM(self.normals) @ self._relative(ca, state, time) - ca.DM(self.bounds) - erosion
+        value = ca.DM(self.normals) @ self.relative(ca, state, time) - ca.DM(self.bounds) - erosion
         return ca.dot(weights, value)
 
 

@@ -28,6 +28,7 @@ __all__ = ["close_loop", "constrain_inputs", "depends_on", "resolve_feedback"]
 Array = NDArray[np.float64]
 
 _MOST_VERTICES = 64
+LARGER = 2.0
 
 
 def resolve_feedback(problem: Problem, feedback: str | ArrayLike, start: Array) -> Array:
@@ -88,7 +89,10 @@ def _designed(problem: Problem, start: Array) -> Array:
                 f"`feedback` 'lmi' needs at most {_MOST_VERTICES} vertices of the Jacobian, got "
                 f"{members.vertex_count}; try 'riccati'."
             )
-        return np.asarray(design_feedback(members, b, continuous=system.time == "continuous", tolerance=1e-3).feedback)
+        # without a bound there is no smallest c or L: allow a few times what the regulator takes
+        most = LARGER * float(np.linalg.norm(riccati(problem, start)[1], 2))
+        continuous = system.time == "continuous"
+        return np.asarray(design_feedback(members, b, continuous=continuous, max_gain=most, tolerance=1e-3).feedback)
     except (EnclosureError, InfeasibleError, SolverError) as error:
         raise ValueError(f"`feedback` 'lmi' found no gain: {error}") from error
 

@@ -38,11 +38,13 @@ _LOG = logging.getLogger(__name__)
 
 WIDENING = 6
 """Turns of tube and plan while the room still grows."""
-FIXED_POINT = 8
+FIXED_POINT = 5
 CLOSE = 1e-3
-"""Relative change of the erosions at which plan and tube agree."""
-FACTORS = (1.0 + 1e-6, 1.005, 1.02, 1.06)
-"""Factors on the erosions, tried in turn until the plan is verified."""
+"""Relative change of the erosions at which plan and tube agree; at most FIXED_POINT turns."""
+SLACK = 1e-6
+"""Share by which every erosion is enlarged: a proof needs some room."""
+REPAIRS = 5
+"""Plans that are verified before the one with the most room is taken."""
 ENOUGH = 1.02
 """Room (times the tube) from which no more is looked for."""
 
@@ -260,38 +262,55 @@ class _Work:
     def _planned(
         self, name: str, constants: Constants | None, widest: Solution, tightened: Tightened
     ) -> tuple[Solution, Tightened, Verdict | None] | None:
-        """The cheapest plan that keeps the tightened constraints, and its verdict; None where there is none."""
+        """The cheapest plan that keeps the tightened constraints, and its verdict; None where there is none.
+
+        Where the verdict falls short (between the points, say), the constraint that it names is tightened by as much.
+        """
         first: tuple[Solution, Tightened, Verdict | None] | None = None
         if widest.scale < 1:
             return None
-        for factor in FACTORS:
-            if factor > 1.001 and widest.scale < factor:
-                break
+        begin = widest, tightened
+        extra, factor = np.zeros(tightened.erosion.shape[1]), 1.0 + SLACK
+        for turn in range(REPAIRS):
             self.tell(f"tube {name}: the cheapest plan")
-            pair = self._agreeing(name, widest, tightened, factor)
+            pair = self._agreeing(name, *begin, factor, extra, FIXED_POINT if turn == 0 else 3)
             if pair is None:
-                continue
+                break
+            begin = pair
             self.tell(f"tube {name}: verifying the plan")
             verdict = self._verified(name, constants, *pair)
-            if first is None:
-                first = (*pair, verdict)
-            if verdict is None or verdict.status == "SAFE" or not _short(verdict):
+            first = (*pair, verdict) if first is None else first
+            if verdict is None or not _short(verdict):
                 return (*pair, verdict) if verdict is not None and verdict.status == "SAFE" else first
+            if verdict.margin is not None and verdict.margin < 0:
+                extra += 1.2 * abs(verdict.margin) * self._named(verdict.constraint)
+            else:
+                factor *= 1.02
         if first is not None:  # the plan with the most room may be verified where the cheapest is not
             verdict = self._verified(name, constants, widest, tightened)
             if verdict is not None and verdict.status == "SAFE":
                 return widest, tightened, verdict
         return first
 
+    def _named(self, constraint: str | None) -> Array:
+        """1 for the parts of the faces that a verdict names, shape (parts,)."""
+        faces = self.planner.faces
+        hit = [constraint == face.label for face in faces]
+        if not any(hit):  # an engine may name a side or a direction of its own
+            hit = [str(constraint).startswith(face.label.split(" [side")[0]) for face in faces]
+        if not any(hit):
+            hit = [True] * len(faces)
+        return np.concatenate([np.full(face.parts, float(named)) for face, named in zip(faces, hit)])
+
     def _agreeing(
-        self, name: str, widest: Solution, tightened: Tightened, factor: float
+        self, name: str, widest: Solution, tightened: Tightened, factor: float, extra: Array, turns: int
     ) -> tuple[Solution, Tightened] | None:
         """The cheapest plan for erosions that are the tube's along that very plan."""
         planner = self.planner
         solution, used = widest, tightened
         best: tuple[Solution, Tightened] | None = None
-        for _ in range(FIXED_POINT):
-            found = planner.cheapest(used.times(factor), solution.inputs)
+        for _ in range(turns):
+            found = planner.cheapest(used.more(factor, extra), solution.inputs)
             if not found.success:
                 return best
             if name == "linear":
@@ -306,7 +325,7 @@ class _Work:
             best = found, following
             change = float(np.max(np.abs(following.erosion - used.erosion), initial=0.0))
             solution, used = found, following
-            if change <= CLOSE * float(np.max(used.erosion, initial=1e-300)) * min(1.0, factor - 1 + 0.1):
+            if change <= CLOSE * float(np.max(used.erosion, initial=1e-300)):
                 break
         return best
 

@@ -51,7 +51,7 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
-__all__ = ["Planner", "Tightened"]
+__all__ = ["Path", "Planner", "Tightened"]
 
 Array = NDArray[np.float64]
 
@@ -80,9 +80,17 @@ class Tightened:
     inputs: Array
     tube: Tube | None = None
 
-    def times(self, factor: float) -> Tightened:
-        """Everything larger by a factor."""
-        return replace(self, erosion=self.erosion * factor, inputs=self.inputs * factor)
+    def more(self, factor: float, extra: Array) -> Tightened:
+        """Everything larger by a factor, and the erosions by ``extra`` (parts,) on top."""
+        return replace(self, erosion=self.erosion * factor + extra, inputs=self.inputs * factor)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Path:
+    """Inputs (N, m), and the noise-free states (points + 1, n) that they lead to."""
+
+    inputs: Array
+    states: Array
 
 
 class Planner:
@@ -182,10 +190,10 @@ class Planner:
 
     def first_plan(self) -> Solution:
         """The plan with the most room, in standard deviations of the linearised noise."""
-        guess = self._guess()
+        guess = self.guess()
         best: Solution | None = None
         for _ in range(2):
-            states = self.plant.rollout(self.grid, self.start, guess)
+            states = self.program.rollout(self.start, guess)
             if not np.all(np.isfinite(states)) or np.abs(states).max() > 1e6:
                 states = np.tile(self.start, (self.grid.points + 1, 1))
             shape = self.tightened(spread_tube(self.problem, self.plant, self.grid, states, guess), states)
@@ -198,7 +206,8 @@ class Planner:
             raise InfeasibleError("no finite noise-free path was found; check the dynamics, or give a `plan`.")
         return best
 
-    def _guess(self) -> Array:
+    def guess(self) -> Array:
+        """A first plan: the problem's own, or inputs in the middle of their bounds."""
         rows = self.problem.input_sequence
         if rows is not None:
             held = rows[np.arange(self.grid.steps) * len(rows) // self.grid.steps]
@@ -209,7 +218,9 @@ class Planner:
             return np.asarray(held - np.nan_to_num(states[:-1]) @ self.feedback.T)
         box = self.problem.system.inputs
         assert box is not None
-        middle = np.where(np.isfinite(box.low + box.high), (box.low + box.high) / 2, np.clip(0.0, box.low, box.high))
+        bounded = np.isfinite(box.low) & np.isfinite(box.high)
+        low, high = np.where(bounded, box.low, 0.0), np.where(bounded, box.high, 0.0)
+        middle = np.where(bounded, (low + high) / 2, np.clip(0.0, box.low, box.high))
         if self.feedback is not None:
             middle = middle - self.feedback @ self.start
         return np.tile(middle, (self.grid.steps, 1))
@@ -278,12 +289,18 @@ class Planner:
         held[-1] = min(held[-1], room[-1])
         return times, held
 
-    def around(self, tube: Tube, solution: Solution) -> Tightened:
-        """A tube from constants along a plan."""
-        spread = nominal_spread(
-            self.problem, self.plant, self.grid, tube.constants, solution.states, solution.inputs
-        )
-        return self.tightened(ball_tube(tube, self.grid, spread), solution.states, tube)
+    def ball(self, tube: Tube, path: Path | Solution) -> BallTube:
+        """A tube from constants around a path, as balls of its metric."""
+        spread = nominal_spread(self.problem, self.plant, self.grid, tube.constants, path.states, path.inputs)
+        return ball_tube(tube, self.grid, spread)
+
+    def around(self, tube: Tube, path: Path | Solution) -> Tightened:
+        """What a tube from constants takes along a path."""
+        return self.tightened(self.ball(tube, path), path.states, tube)
+
+    def rollout(self, inputs: Array) -> Path:
+        """The noise-free path of a plan."""
+        return Path(inputs=inputs, states=self.program.rollout(self.start, inputs))
 
     def response(self, solution: Solution, delta: float) -> Tightened | None:
         """The linear response along a plan; None where its remainder feeds itself."""
@@ -304,7 +321,7 @@ class Planner:
             if self.terminal_name == "riccati":
                 self.terminal = riccati_terminal(self.problem, self.faces, last, horizon)
             else:
-                known = constants if constants is not None else self.constants(self._guess())
+                known = constants if constants is not None else self.constants(self.guess())
                 self.terminal = contraction_terminal(self.problem, known, self.faces, last, horizon)
             self.cost = self._cost()
             self.program = self._program()

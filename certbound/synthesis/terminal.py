@@ -127,7 +127,7 @@ def _room_of_region(region: Region, face: Face, erosion: Array, time: float) -> 
     room = face.room(middle, np.array([time]), erosion[None])
     if isinstance(face, Facets):
         spread = np.array([float(region.support(a)) - float(a @ middle[0]) for a in rows])
-        local = face._local(middle, np.array([time])) @ face.normals.T - face.bounds - erosion
+        local = face.local(middle, np.array([time])) @ face.normals.T - face.bounds - erosion
         return float(np.max(local[0] - spread))
     reach = max(float(region.support(a)) - float(a @ middle[0]) for a in rows)
     if isinstance(face, Round) and not face.outside:
@@ -184,7 +184,7 @@ def riccati(
     solve = control.lqr if problem.system.time == "continuous" else control.dlqr
     try:
         gain, value, _ = solve(a, b, np.asarray(weight), np.asarray(effort))
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError, control.ControlException) as error:
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         raise ValueError(
             f"`feedback` needs a linearisation that can be stabilised: {error}; check the inputs and the cost's Q."
         ) from error
@@ -285,7 +285,7 @@ def _largest_level(metric: Array, center: Array, faces: Sequence[Face], erosion:
         rows = face.rows(center[None], np.array([time]))[0]
         reach = np.sqrt(np.einsum("ij,jk,ik->i", rows, inverse, rows))
         if isinstance(face, Facets):
-            local = (face._local(center[None], np.array([time])) @ face.normals.T - face.bounds - own)[0]
+            local = (face.local(center[None], np.array([time])) @ face.normals.T - face.bounds - own)[0]
             level = float(np.max(local / reach))
         else:
             taken = face.erosion(reach[None])[0, 0] if isinstance(face, Round) else float(np.max(reach))
