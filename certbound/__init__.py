@@ -36,6 +36,7 @@ _HOME = {
     "save": "problem.files",
     "export_casadi": "problem.export",
     "export_control": "problem.export",
+    "load_result": "display",
     "Constants": "tubes.constants",
     "tune_tube": "tubes.tuning",
     "bound_exit_probability": "tubes.tuning",

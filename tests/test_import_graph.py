@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "certbound"
 
 ORDER = [
     {"errors", "_version"},
+    {"display"},
     {"rigor"},
     {"problem"},
     {"tubes"},
@@ -67,7 +68,7 @@ def allowed(importer: str, imported: str) -> bool:
     if other == "checker":
         return room in ("cli", "report")
     if room == "tubes":
-        return other in ("rigor", "errors")
+        return other in ("rigor", "errors", "display")
     return room is None or LEVEL.get(other, 99) < LEVEL[room]
 
 

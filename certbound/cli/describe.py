@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from certbound.display import log10_text
 
 if TYPE_CHECKING:
     from certbound.safety.verification import Verdict
@@ -34,23 +35,6 @@ def describe_constants(constants: Constants) -> dict[str, Any]:
 def describe_parameters(tube: Tube) -> dict[str, Any]:
     """The free parameters that the tuning settled on."""
     return {key: np.asarray(value).tolist() for key, value in dict(tube.parameters).items()}
-
-
-def log10_text(log10: float) -> str:
-    """A probability given by its decimal logarithm, rounded up to two digits, also where no float could hold it.
-
-    Examples
-    --------
-    >>> log10_text(-3.0), log10_text(-49718.25), log10_text(-4.698), log10_text(-0.12), log10_text(0.0)
-    ('1e-3', '5.7e-49719', '2.1e-5', '0.76', '1')
-    """
-    if log10 >= 0:
-        return "1"
-    if log10 > -2:
-        return f"{math.ceil(100 * 10**log10 - 1e-6) / 100:g}"
-    exponent = math.floor(log10 + 1e-12)
-    mantissa = math.ceil(10 * 10 ** (log10 - exponent) - 1e-6) / 10
-    return f"1e{exponent + 1}" if mantissa >= 10 else f"{mantissa:g}e{exponent}"
 
 
 def describe_deviation(verdict: Verdict) -> dict[str, Any] | None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import math
 import os
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from certbound.display import plain
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,21 +43,6 @@ def print_json(value: Mapping[str, Any]) -> None:
     """One JSON object on standard output, on one line; nothing else is printed there."""
     sys.stdout.write(json.dumps(plain(value), allow_nan=False) + "\n")
     sys.stdout.flush()
-
-
-def plain(value: Any) -> Any:
-    """JSON types: arrays become lists, numpy scalars numbers, what is not finite null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, (bool, str, int)) or value is None:
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    raise TypeError(f"`value` must be made of JSON types and arrays, got {type(value).__name__}.")
 
 
 @contextlib.contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import importlib
 import sys
 import tomllib
@@ -111,18 +110,13 @@ def save(problem: Problem, path: str | Path) -> None:
         If the path does not end in ``.toml``, or the model uses what problem files do not have (np.where,
         ...).
     """
-    from certbound.problem.writing import describe_problem
+    from certbound.problem.writing import content_of
 
     target = Path(path)
     if target.suffix != ".toml":
         raise ValueError(f"`path` must end in .toml, got {str(path)!r}.")
     plan_file = f"{target.stem}.plan.json"
-    if problem.source is not None:
-        content = copy.deepcopy(dict(problem.source))
-        if isinstance(problem.plan, np.ndarray):
-            content["plan"] = {"file": plan_file}
-    else:
-        content = describe_problem(problem, plan_file)
+    content = content_of(problem, plan_file)
     if isinstance(problem.plan, np.ndarray):
         write_plan(target.with_name(plan_file), problem.plan, problem.system.input_names)
     target.write_text(toml_text(content), encoding="utf-8")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.display import Shown
 from certbound.problem.checks import frozen, nearest, number, positive_definite, vector
 from certbound.problem.initial import check_start
 from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, Inside
@@ -22,8 +23,8 @@ __all__ = ["GaussianStart", "Problem"]
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
+@dataclass(frozen=True, eq=False, repr=False)
+class Problem(Shown):
     """Does the state satisfy every constraint over the horizon, but for a probability delta?
 
     Parameters
@@ -137,6 +138,32 @@ class Problem:
     def fixed_start(self) -> bool:
         """True when the initial set is a single point."""
         return isinstance(self.initial, Box) and bool(np.all(self.initial.low == self.initial.high))
+
+    def summary(self) -> str:
+        """The problem in one line."""
+        unit = "s" if self.system.time == "continuous" else "steps"
+        what = f"{self.system.dimension} states, {len(self.safe)} constraints"
+        return f"{self.name}, {what}, {self.horizon:g} {unit}, delta {self.delta:g}"
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Signals, start and constraints."""
+        signals = {"states": self.system.states, "inputs": self.system.input_names}
+        signals["disturbances"] = self.system.disturbance_names
+        found = [(name, ", ".join(values)) for name, values in signals.items() if values]
+        found.append(("start", "a point" if self.fixed_start else type(self.initial).__name__))
+        return [*found, *(("constraint", constraint.label) for constraint in self.constraints)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of the problem file that ``cb.save`` writes.
+
+        Raises
+        ------
+        ValueError
+            If the model uses what problem files do not have (np.where, ...).
+        """
+        from certbound.problem.writing import content_of
+
+        return content_of(self, f"{self.name}.plan.json")
 
     def replace(self, **changes: Any) -> Problem:
         """The same problem with other values of some arguments; everything is checked again.

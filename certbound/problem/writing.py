@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -14,7 +15,23 @@ from certbound.problem.reading import LEVELS, RESERVED
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.problem.tape import Tape
 
-__all__ = ["describe_problem"]
+__all__ = ["content_of", "describe_problem"]
+
+
+def content_of(problem: Problem, plan_file: str) -> dict[str, Any]:
+    """Content of a problem's file: as it was in its own file, or with the traced model as expressions.
+
+    Raises
+    ------
+    ValueError
+        As for ``describe_problem``.
+    """
+    if problem.source is None:
+        return describe_problem(problem, plan_file)
+    content = copy.deepcopy(dict(problem.source))
+    if isinstance(problem.plan, np.ndarray):
+        content["plan"] = {"file": plan_file}
+    return content
 
 
 def describe_problem(problem: Problem, plan_file: str) -> dict[str, Any]:

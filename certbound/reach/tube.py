@@ -9,6 +9,7 @@ has an ellipsoid only, the linear response (Thm K7) a zonotope and a box.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.display import Shown, log10_text
 from certbound.problem.sets import Inside
 from certbound.reach.curve import Curve
 from certbound.reach.norms import Norm
@@ -37,8 +39,8 @@ class Piece:
     high: Array
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ReachTube:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class ReachTube(Shown):
     """Sets that contain the state at every time, piece by piece (shapes: cells B, pieces K, states n).
 
     Proves, for ``noise=False``: every noise-free trajectory from the initial set, under every disturbance
@@ -101,6 +103,28 @@ class ReachTube:
             object.__setattr__(self, "generators", generators)
         if self.box is not None and self.box.shape != (*shape, self.curve.dimension):
             raise ValueError(f"`box` must have shape (*{shape}, n), got {self.box.shape}.")
+
+    def summary(self) -> str:
+        """The tube in one line."""
+        kind = f"left with probability at most {log10_text(self.log10_delta)}" if self.noise else "noise-free"
+        cells = f"{self.curve.cells} cells, " if self.curve.cells > 1 else ""
+        return f"{kind}, by {self.method}, up to {self.end:g} in {self.curve.pieces} pieces, {cells}" + (
+            f"{self.curve.dimension} states" + (f"; assumes {self.assumption}" if self.assumption else "")
+        )
+
+    def to_columns(self, states: Sequence[str] | None = None) -> dict[str, Array]:
+        """Columns start, end and, per state, low and high of the box hulls, as ``pandas.DataFrame`` takes them."""
+        names = [f"x{k + 1}" for k in range(self.curve.dimension)] if states is None else states
+        columns = {"start": np.asarray(self.curve.starts), "end": np.asarray(self.curve.ends)}
+        for k, name in enumerate(names):
+            columns |= {f"{name}_low": self.hull.lo[:, k], f"{name}_high": self.hull.hi[:, k]}
+        return columns
+
+    def to_dict(self) -> dict[str, Any]:
+        """Box hulls per piece, and what they rest on."""
+        found = {"noise": self.noise, "log10_delta": self.log10_delta if self.noise else None, "method": self.method}
+        columns = {name: column.tolist() for name, column in self.to_columns().items()}
+        return {**found, "assumption": self.assumption, **columns}
 
     @property
     def end(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from flint import arb
 from numpy.typing import NDArray
 
+from certbound.display import Shown
 from certbound.reach.norms import Norm
 from certbound.reach.tube import ReachTube
 from certbound.rigor.balls import lower, precision
@@ -20,8 +22,8 @@ __all__ = ["Deviation", "EngineAnswer", "is_at_most", "settled"]
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Deviation:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Deviation(Shown):
     """Upper bounds on the stochastic deviation S = X - x at the target probability, piece by piece.
 
     Parameters
@@ -37,6 +39,20 @@ class Deviation:
     times: Array
     radius: Array
     extent: Array
+
+    def summary(self) -> str:
+        """The largest radius, in one line."""
+        return f"stochastic deviation of at most {np.max(self.radius):.6g} in {len(self.radius)} pieces of time"
+
+    def to_dict(self) -> dict[str, Any]:
+        """``times``, ``radius`` and ``extent`` as lists."""
+        return {name: getattr(self, name).tolist() for name in ("times", "radius", "extent")}
+
+    def to_columns(self, states: Sequence[str] | None = None) -> dict[str, Array]:
+        """Columns start, end, radius and one per state, as ``pandas.DataFrame`` takes them."""
+        names = [f"x{k + 1}" for k in range(self.extent.shape[1])] if states is None else states
+        columns = {"start": self.times[:-1], "end": self.times[1:], "radius": self.radius}
+        return columns | {f"extent_{name}": self.extent[:, k] for k, name in enumerate(names)}
 
     @classmethod
     def of_ball(cls, times: Array, radius: Array, norm: Norm) -> Deviation:

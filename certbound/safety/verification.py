@@ -9,6 +9,7 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
+from certbound.display import Shown, log10_text
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.reach.tube import ReachTube
@@ -37,8 +38,8 @@ _ENGINES: dict[str, Callable[..., EngineAnswer]] = {"linear": _linear, "constant
 ``quick`` says that another engine has proved SAFE already: slow refinements may be left out."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Verdict:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Verdict(Shown):
     """What is proved about a problem.
 
     Parameters
@@ -103,6 +104,39 @@ class Verdict:
             If no probability was bounded that a certificate could state.
         """
         return certificate_text(problem, self, attempt=attempt)
+
+    def summary(self) -> str:
+        """The verdict in one line."""
+        asked = "" if self.problem is None else f"{self.problem.name}: "
+        target = "" if self.problem is None else f", asked {self.problem.delta:g}"
+        return f"{self.status}  {asked}P(leaving) <= {log10_text(self.log10_delta)}{target}"
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Margin, method and reason."""
+        where = "" if self.time is None else f" at t = {self.time:.4g}"
+        found = [] if self.margin is None else [("margin", f"{self.margin:.4g}{where}, {self.constraint}")]
+        found += [] if self.constants is None else [("constants", self.constants.summary())]
+        return [*found, ("method", self.method), ("reason", self.reason)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``certbound verify --json`` prints, but for the seconds."""
+        names = ("status", "log10_delta", "margin", "time", "constraint", "reason", "method")
+        found: dict[str, Any] = {name: getattr(self, name) for name in names}
+        found["delta"] = None if self.problem is None else self.problem.delta
+        found["constants"] = None if self.constants is None else self.constants.to_dict()
+        return found | {"tube": None if self.deviation is None else self.deviation.to_dict()}
+
+    def to_columns(self) -> dict[str, Any]:
+        """The stochastic deviation per piece of time, under the states' names, as ``pandas.DataFrame`` takes it.
+
+        Raises
+        ------
+        ValueError
+            If no tube could be certified.
+        """
+        if self.deviation is None:
+            raise ValueError(f"the verdict has no tube to tabulate; {self.reason}")
+        return self.deviation.to_columns(None if self.problem is None else self.problem.system.states)
 
     def __bool__(self) -> bool:
         raise TypeError("a Verdict is neither true nor false; compare `.status` with 'SAFE'.")

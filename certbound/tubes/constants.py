@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from certbound.display import Shown, plain, span_text
 
 __all__ = ["Constants", "Proof"]
 
@@ -38,8 +42,8 @@ class Proof:
     fingerprint: str
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Constants:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Constants(Shown):
     """Bounds on a system's contraction and noise: mu_P(D_x f) <= rate (CT) or ||D_x f||_P <= gain (DT).
 
     Constants that a user states are an assumption: ``certified`` is False on them, and every verdict built on
@@ -145,6 +149,42 @@ class Constants:
             content = b"" if value is None else np.asarray(value, dtype=np.float64).tobytes()
             digest.update(f"{name}:{len(content)}:".encode() + content)
         return digest.hexdigest()
+
+    def summary(self) -> str:
+        """The constants in one line."""
+        name, unit = ("rate", "1/s") if self.continuous else ("gain", "per step")
+        origin = "certified" if self.certified else "stated"
+        value = span_text(self.rate if self.continuous else self.gain)
+        return f"{name} {value} {unit}, sigma {span_text(self.sigma)}, {self.dimension} states, {origin}"
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Effective dimension, metric, and what the constants rest on."""
+        found = [("effective dimension", f"{self.nu:.4g} of {self.dimension}")]
+        found.append(("metric", "identity" if self.metric is None else f"{self.dimension} x {self.dimension} matrix"))
+        found += [] if self.times is None else [("pieces of time", str(len(self.times) - 1))]
+        if self.proof is not None and self.certified:
+            found += [("holds on", self.proof.domain), ("above what sampling found", f"{self.gap:.3g}")]
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Every field as plain data, with ``certified``, ``gap`` and ``domain`` (where it is proved)."""
+        found = {name: plain(getattr(self, name)) for name in _PROVED}
+        domain = None if self.proof is None else self.proof.domain
+        return found | {"certified": self.certified, "gap": self.gap, "domain": domain}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Constants:
+        """Constants from ``to_dict``'s data, as stated ones: only proving them again certifies them.
+
+        Raises
+        ------
+        ValueError
+            If an entry is missing or malformed.
+        """
+        missing = [name for name in ("sigma", "dimension") if data.get(name) is None]
+        if missing:
+            raise ValueError(f"`data` must have {missing[0]}, got {', '.join(data) or 'nothing'}.")
+        return cls(**{name: data[name] for name in _PROVED if data.get(name) is not None})
 
     def with_full_dimension(self) -> Constants:
         """The same constants with nu = n, which a smaller nu implies: a proof goes on to vouch for them."""

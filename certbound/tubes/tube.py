@@ -13,6 +13,7 @@ import numpy as np
 from flint import arb, arb_mat
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.display import Shown, log10_text
 from certbound.rigor.balls import lower, precision, upper
 from certbound.tubes.constants import Constants
 
@@ -41,8 +42,8 @@ class Profile(Protocol):
         """Everything needed to evaluate the radius again, as plain data."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Tube:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Tube(Shown):
     """A probabilistic tube around the associated trajectory.
 
     The inequality is P(||S_t||_P <= r_t for all t in [0, T]) >= 1 - delta for ``level`` ``"trajectory"``, and
@@ -126,6 +127,31 @@ class Tube:
         size = np.multiply.outer(np.asarray(self.bound(times, times)), factor)
         result = np.nextafter(size, np.inf)
         return float(result) if result.ndim == 0 else result
+
+    def summary(self) -> str:
+        """The tube in one line."""
+        unit = "s" if self.constants.continuous else "steps"
+        size = f"radius at most {self.maximum:.6g} within {self.horizon:g} {unit}"
+        return f"{self.method}, {size}, delta {log10_text(self.log10_delta)}, {self.level} level"
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Parameters, and what the tube rests on."""
+        found = [(name, f"{value:.6g}") for name, value in self.parameters.items() if isinstance(value, float)]
+        formula = "evaluated rigorously" if self.certified else "not certified"
+        return [*found, ("formula", formula), ("constants", self.constants.summary())]
+
+    def to_columns(self, times: ArrayLike | None = None) -> dict[str, Array]:
+        """Columns ``time`` and ``radius``, as ``pandas.DataFrame`` takes them.
+
+        Parameters
+        ----------
+        times : array_like, optional
+            Times; 201 equal ones, or every step, when omitted.
+        """
+        if times is None:
+            times = np.linspace(0, self.horizon, 201) if self.constants.continuous else np.arange(self.horizon + 1)
+        chosen = np.atleast_1d(np.asarray(times, dtype=float))
+        return {"time": chosen, "radius": np.asarray(self.radius(chosen))}
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data: what was claimed, and everything needed to evaluate the radius again."""

@@ -1,0 +1,218 @@
+"""How results show themselves: one line, a few rows, HTML in notebooks, plain data, a picture, a JSON file."""
+
+from __future__ import annotations
+
+import html
+import importlib
+import json
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from certbound._version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["Record", "Shown", "load_result", "log10_text", "plain", "span_text"]
+
+Rows = list[tuple[str, str]]
+
+
+class Shown:
+    """A result that shows itself; a subclass says its ``summary``, its ``rows`` and its plain data (``to_dict``)."""
+
+    __slots__ = ()
+
+    def summary(self) -> str:
+        """The result in one line."""
+        raise NotImplementedError
+
+    def rows(self) -> Rows:
+        """What else there is to say: names and values."""
+        return []
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data: numbers, texts, lists, dictionaries, None."""
+        raise NotImplementedError
+
+    def to_json(self) -> str:
+        """The plain data as one JSON object; what is not finite becomes null."""
+        return json.dumps(plain(self.to_dict()), allow_nan=False)
+
+    def save(self, path: str | Path) -> None:
+        """Write the plain data to a JSON file, for ``cb.load_result``.
+
+        The file holds numbers, no proof: a stranger should be given a certificate.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
+        content = {"certbound": __version__, "type": type(self).__name__, "data": plain(self.to_dict())}
+        Path(path).write_text(json.dumps(content, allow_nan=False, indent=1) + "\n", encoding="utf-8")
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the result into matplotlib axes (the current ones when omitted) and return them."""
+        if ax is None:
+            import matplotlib.pyplot as plt
+
+            ax = plt.gca()
+        # The one door that opens upwards: a result draws itself when it is asked to.
+        importlib.import_module("certbound.plotting.results").draw(self, ax)
+        return ax
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.summary()}>"
+
+    def __str__(self) -> str:
+        return "\n".join([self.summary(), *(f"  {name}: {value}" for name, value in self.rows())])
+
+    def _repr_html_(self) -> str:
+        cells = "".join(
+            f'<tr><th style="text-align:left">{html.escape(name)}</th>'
+            f'<td style="text-align:left">{html.escape(value)}</td></tr>'
+            for name, value in self.rows()
+        )
+        return f"<div><b>{html.escape(self.summary())}</b><table>{cells}</table></div>"
+
+
+class Record(Shown, Mapping[str, Any]):
+    """A result read back from a file: a mapping whose keys are attributes too. It proves nothing.
+
+    Examples
+    --------
+    >>> Record("Verdict", {"status": "SAFE", "log10_delta": -4.0}).status
+    'SAFE'
+    """
+
+    __slots__ = ("_data", "_kind")
+
+    def __init__(self, kind: str, data: Mapping[str, Any]) -> None:
+        self._kind = kind
+        self._data = dict(data)
+
+    def __getitem__(self, key: str) -> Any:
+        return self._data[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._data)
+
+    def __len__(self) -> int:
+        return len(self._data)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name not in self._data:
+            raise AttributeError(f"the record of a {self._kind} has no `{name}`; it has {', '.join(self._data)}")
+        return self._data[name]
+
+    def summary(self) -> str:
+        """What was saved."""
+        return f"{self._kind}, as saved"
+
+    def rows(self) -> Rows:
+        """Every entry, shortened."""
+        texts = {name: str(value) for name, value in self._data.items()}
+        return [(name, text if len(text) <= 70 else text[:67] + "...") for name, text in texts.items()]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The entries."""
+        return dict(self._data)
+
+    def plot(self, ax: Any = None) -> Any:
+        """A record cannot be drawn.
+
+        Raises
+        ------
+        TypeError
+            Always.
+        """
+        raise TypeError("a saved record cannot be drawn; compute the result again, or plot its numbers.")
+
+
+def load_result(path: str | Path) -> Any:
+    """A result written by ``.save``: constants come back as stated ones, anything else as a ``Record``.
+
+    Nothing is proved by reading: constants are ``certified`` no more. Problems are read by ``cb.load``, certificates by
+    ``certbound check``.
+
+    Parameters
+    ----------
+    path : str or Path
+        The JSON file.
+
+    Raises
+    ------
+    ValueError
+        If the file is none of certbound's results.
+
+    Examples
+    --------
+    >>> import tempfile, certbound as cb
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     cb.Constants(rate=-0.5, sigma=0.1, dimension=2).save(f"{folder}/k.json")
+    ...     load_result(f"{folder}/k.json").rate
+    -0.5
+    """
+    cure = "give a file that `.save` wrote (`cb.load` reads problems)"
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        kind, data = str(content["type"]), dict(content["data"])
+    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"`path` must be a saved result, got {str(path)!r}: {error!r}; {cure}.") from error
+    if kind == "Constants":
+        return importlib.import_module("certbound.tubes.constants").Constants.from_dict(data)
+    return Record(kind, data)
+
+
+def plain(value: Any) -> Any:
+    """JSON types: arrays become lists, numpy scalars numbers, what is not finite null.
+
+    Examples
+    --------
+    >>> plain({"a": (1, float("inf"))})
+    {'a': [1, None]}
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (bool, str, int)) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    raise TypeError(f"`value` must be made of JSON types and arrays, got {type(value).__name__}.")
+
+
+def span_text(value: Any) -> str:
+    """A number, or the range of several.
+
+    Examples
+    --------
+    >>> span_text(0.5), span_text([1.0, 2.0])
+    ('0.5', '1 ... 2')
+    """
+    values = [float(entry) for entry in value] if hasattr(value, "__len__") else [float(value)]
+    low, high = min(values), max(values)
+    return f"{high:.6g}" if low == high else f"{low:.4g} ... {high:.4g}"
+
+
+def log10_text(log10: float) -> str:
+    """A probability given by its decimal logarithm, rounded up to two digits, also where no float could hold it.
+
+    Examples
+    --------
+    >>> log10_text(-3.0), log10_text(-49718.25), log10_text(-4.698), log10_text(-0.12), log10_text(0.0)
+    ('1e-3', '5.7e-49719', '2.1e-5', '0.76', '1')
+    """
+    if log10 >= 0:
+        return "1"
+    if log10 > -2:
+        return f"{math.ceil(100 * 10**log10 - 1e-6) / 100:g}"
+    exponent = math.floor(log10 + 1e-12)
+    mantissa = math.ceil(10 * 10 ** (log10 - exponent) - 1e-6) / 10
+    return f"1e{exponent + 1}" if mantissa >= 10 else f"{mantissa:g}e{exponent}"
