@@ -13,7 +13,7 @@ the same inputs: they act like a disturbance that reacts to the state. With a tr
 constants that hold for all inputs, and as long as every step kept H_j(z) >= 0, the noisy state of a discrete-time
 system stays safe along the whole trajectory but for a probability of delta (``guaranteed``). In continuous time this
 holds at the samples, up to the integrator's error. Nothing promises that the next step has a point: a step without one
-is taken with slack, and ends the guarantee.
+is taken with slack, and ends the guarantee. (A system that can stand still has one always with ``steady``.)
 """
 
 from __future__ import annotations
@@ -87,6 +87,9 @@ class SafetyFilter:
         Stated; certified ones for all inputs in one common metric when omitted.
     decay : float
         In (0, 1]: the share of the room that one step may use; 1 asks only that the next state is in the eroded set.
+    steady : bool
+        Take the largest tube at all times. The eroded set then does not shrink: a system that can stand still never
+        runs out of inputs.
     steps : int, optional
         Samples of the horizon in continuous time.
 
@@ -115,6 +118,7 @@ class SafetyFilter:
         tube: str | Tube = "auto",
         constants: Constants | None = None,
         decay: float = 0.5,
+        steady: bool = False,
         steps: int | None = None,
     ) -> None:
         if problem.system.disturbance is not None:
@@ -129,8 +133,9 @@ class SafetyFilter:
         start = self.planner.rollout(self.planner.guess())
         self._ball = self.planner.ball(self.tube, start)
         substeps = self.planner.grid.substeps
-        self._radii = np.concatenate([[0.0], self._ball.radii[substeps - 1 :: substeps]])
-        self._step = self._compiled()
+        radii = self._ball.radii[substeps - 1 :: substeps]
+        self._radii = np.full_like(radii, self._ball.radii.max()) if steady else radii
+        self._rooms, self._step = self._compiled()
         box = problem.system.inputs
         assert box is not None
         self._low, self._high = np.asarray(box.low), np.asarray(box.high)
@@ -138,25 +143,46 @@ class SafetyFilter:
         self.reset()
 
     def _tube(self, name: str, constants: Constants | None) -> Tube:
+        """A tube of the metric that takes least where the obstacle may lie in any direction."""
         first = self.planner.first_plan()
-        known = self.planner.constants(first.inputs) if constants is None else constants
-        return self.planner.tube_of(known, name, float(self.problem.delta), first, {})
+        known = [constants] if constants is not None else [self.planner.constants(first.inputs)]
+        if constants is None and known[0].metric is not None:
+            known.append(self.planner.constants(first.inputs, metric="euclidean"))
+        delta = float(self.problem.delta)
+        tubes = [self.planner.tube_of(k, name, delta, first, {}) for k in known]
+        return min(tubes, key=self._size)
 
-    def _compiled(self) -> Any:
-        """(z, u, t, r) -> z+, H of all parts at z+ for the tube's radius r, and their derivative in u."""
+    def _size(self, tube: Tube) -> float:
+        """Sum of the logarithms of what a tube takes from the faces at most."""
+        metric, last = tube.constants.metric, float(tube.radius(tube.horizon))
+        inverse = np.eye(self.planner.plant.dimension) if metric is None else np.linalg.inv(np.asarray(metric))
+        found = []
+        for face in self.planner.faces:
+            if isinstance(face, Round):
+                block = inverse[np.ix_(face.coordinates, face.coordinates)]
+                found.append(float(np.linalg.eigvalsh(face.matrix @ block @ face.matrix.T)[-1]) ** 0.5)
+            else:
+                rows = face.rows(np.zeros((1, face.dimension)), np.zeros(1))[0]
+                found.append(float(np.einsum("ri,ij,rj->r", rows, inverse, rows).max()) ** 0.5)
+        return float(np.sum(np.log(last * np.array(found) + 1e-300)))
+
+    def _compiled(self) -> tuple[Any, Any]:
+        """(z, t, r) -> H of all parts for the tube's radius r; (z, u, t, r) -> z+, H at z+, its derivative in u."""
         ca = casadi_module()
         planner = self.planner
         z, u = ca.SX.sym("z", planner.plant.dimension), ca.SX.sym("u", len(planner.plant.low))
         t, radius = ca.SX.sym("t"), ca.SX.sym("r")
-        following = planner.plant.symbolic_step(ca, planner.grid, t, z, u)[-1]
-        at, parts = t + planner.grid.step, []
+        parts = []
         for face in planner.faces:
-            taken = radius * _taken(ca, face, self._ball.inverse, following, at)
+            taken = radius * _taken(ca, face, self._ball.inverse, z, t)
             for part in range(face.parts):
                 choice = ca.DM(np.eye(face.parts)[part]) if face.weights else ca.DM(0, 1)
-                parts.append(face.gap(ca, following, at, taken, choice))
-        stacked = ca.vertcat(*parts)
-        return ca.Function("step", [z, u, t, radius], [following, stacked, ca.jacobian(stacked, u)])
+                parts.append(face.gap(ca, z, t, taken, choice))
+        rooms = ca.Function("rooms", [z, t, radius], [ca.vertcat(*parts)])
+        following = planner.plant.symbolic_step(ca, planner.grid, t, z, u)[-1]
+        stacked = rooms(following, t + planner.grid.step, radius)
+        step = ca.Function("step", [z, u, t, radius], [following, stacked, ca.jacobian(stacked, u)])
+        return rooms, step
 
     def reset(self) -> None:
         """Back to the start of the problem."""
@@ -165,7 +191,8 @@ class SafetyFilter:
         self.applied: list[Array] = []
         constants = self.tube.constants
         self.guaranteed = constants.certified and self.tube.certified and self.tube.level == "trajectory"
-        self._room = self._rooms_now()
+        parts = self._rooms(self.state, 0.0, float(self._radii[0])).full()
+        self._room, _ = self._chosen(0, parts.ravel(), np.zeros((len(parts), 0)))
 
     @property
     def time(self) -> float:
@@ -175,11 +202,6 @@ class SafetyFilter:
     def _asked(self, index: int) -> NDArray[np.bool_]:
         times = np.array([index * self.planner.grid.step])
         return np.concatenate([np.repeat(face.asked(times), face.parts) for face in self.planner.faces])
-
-    def _rooms_now(self) -> Array:
-        """H of every face at the start, where the tube takes nothing yet; the best part of a union."""
-        times = np.array([self.time])
-        return np.array([float(face.room(self.state[None], times)[0]) for face in self.planner.faces])
 
     def step(self, desired: ArrayLike) -> FilterReport:
         """The input nearest to ``desired`` that keeps the noise-free state in the eroded set.
@@ -201,15 +223,19 @@ class SafetyFilter:
         u = np.clip(wanted, self._low, self._high)
         known = np.where(np.isfinite(self._room), self._room, 0.0)  # nothing is known of a face not asked before
         needed = np.maximum((1 - self.decay) * known, 0.0)
-        radius = float(self._radii[min(self.index + 1, len(self._radii) - 1)])
+        radius = float(self._radii[min(self.index, len(self._radii) - 1)])
+        best = -np.inf
         for turn in range(TURNS):
             following, values, slope = (part.full() for part in self._step(self.state, u, self.time, radius))
             following = following.ravel()
-            rooms, rows = self._chosen(values.ravel(), slope)
-            if turn == TURNS - 1 or np.all(rooms >= needed + KEPT):
+            rooms, rows = self._chosen(self.index + 1, values.ravel(), slope)
+            if turn == 0 or np.min(rooms - needed, initial=np.inf) > best:  # the linearisation may lead astray
+                best, chosen = float(np.min(rooms - needed, initial=np.inf)), (u, following, rooms)
+            if turn == TURNS - 1 or best >= KEPT:
                 break
             kept = np.isfinite(rooms)
             u = self._program.solve(wanted, rows[kept], rows[kept] @ u - rooms[kept] + needed[kept] + AIM)
+        u, following, rooms = chosen
         self._move(u, following, rooms)
         return FilterReport(
             time=self.time - self.planner.grid.step, input=u, changed=float(np.max(np.abs(u - wanted), initial=0.0)),
@@ -217,9 +243,9 @@ class SafetyFilter:
             seconds=time.perf_counter() - began,
         )  # fmt: skip
 
-    def _chosen(self, parts: Array, slope: Array) -> tuple[Array, Array]:
-        """Room and slope of every face at the next state: those of the best part; inf where it is not asked."""
-        asked = self._asked(self.index + 1)
+    def _chosen(self, index: int, parts: Array, slope: Array) -> tuple[Array, Array]:
+        """Room and slope of every face at one time: those of the best part; inf where it is not asked."""
+        asked = self._asked(index)
         rooms, rows, part = [], [], 0
         for face in self.planner.faces:
             best = part + int(np.argmax(parts[part : part + face.parts]))

@@ -225,8 +225,15 @@ class Planner:
             middle = middle - self.feedback @ self.start
         return np.tile(middle, (self.grid.steps, 1))
 
-    def constants(self, plan: Array) -> Constants:
+    def constants(self, plan: Array, *, metric: Any = None) -> Constants:
         """Certified constants in the one common metric, for every input that the problem allows.
+
+        Parameters
+        ----------
+        plan : ndarray, shape (N, m)
+            Around which the metric is chosen.
+        metric : "euclidean" or ndarray, shape (n, n), optional
+            The metric instead.
 
         Raises
         ------
@@ -245,8 +252,8 @@ class Planner:
                 "`inputs` must be bounded: the Jacobian depends on them, so that no constants hold for all inputs; "
                 "give cb.Box(low, high), or tube='linear'."
             )
-        if n == 1:
-            return bound_constants(nominal, metric="euclidean")
+        if n == 1 or metric is not None:
+            return bound_constants(nominal, metric="euclidean" if metric is None else metric)
         proposed = bound_constants(nominal.replace(plan=plan), objective="erosion")
         if not involved:
             return proposed

@@ -57,9 +57,20 @@ def test_the_filtered_input_solves_the_quadratic_program() -> None:
     report = guard.step(wanted)
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, 401), np.linspace(-1, 1, 401)), axis=-1).reshape(-1, 2)
     following = np.array([0.55, 0.05]) + 0.1 * grid
-    kept = np.linalg.norm(following - [1.0, 0.05], axis=1) - 0.4 >= guard._radii[1]
+    kept = np.linalg.norm(following - [1.0, 0.05], axis=1) - 0.4 >= guard._radii[0]
     best = np.min(np.linalg.norm(grid[kept] - wanted, axis=1))
     assert np.linalg.norm(report.input - wanted) == pytest.approx(best, abs=5e-3)
+
+
+def test_a_steady_tube_leaves_an_input_to_a_system_that_can_stand_still() -> None:
+    kept = []
+    for steady in (True, False):
+        guard = cb.SafetyFilter(integrator(safe=[cb.Outside(cb.Ball([1.0, 0.0], 0.4))]), steady=steady)
+        for _ in range(30):
+            guard.step([1.0, 0.0])
+        kept.append(guard.state[0])
+        assert guard.guaranteed
+    assert kept[0] == pytest.approx(0.6 - guard._radii.max(), abs=0.01)
 
 
 def test_a_step_without_a_point_is_reported_and_ends_the_guarantee() -> None:
