@@ -17,6 +17,7 @@ __all__ = [
     "PRECISION",
     "ball",
     "bessel_excess",
+    "excess_floor",
     "kummer_excess",
     "log_bessel0f1",
     "log_expm1",
@@ -33,6 +34,9 @@ PRECISION = 96
 """Working precision in bits: enough that rounding to a float costs the last place only."""
 
 _SERIES_LIMIT = 200_000
+_SUMMED = 4_000  # beyond this index of the largest term only a block around it is summed
+_BLOCK = 256
+_FARTHEST = 1e14
 
 
 def precision(bits: int = PRECISION) -> AbstractContextManager[object]:
@@ -127,6 +131,53 @@ def _sharpened(evaluate: Callable[[], arb], size: arb) -> arb | None:
         if value.is_finite() and value > 0 and value.rel_accuracy_bits() >= min(bits, 56):
             return value
     return None
+
+
+def excess_floor(a: arb, b: arb, z: arb, *, bessel: bool = False) -> arb:
+    """Ball that lies below E_a(z), or below (0F1(; b; a z) - 1)/a, at any size: sharp where they are within reach.
+
+    Beyond it a block of the largest terms stands for the sum (all of them are positive, and their logarithms are
+    gamma functions), and past z = 1e14 the value there (it rises).
+
+    Examples
+    --------
+    >>> from flint import arb
+    >>> bool(excess_floor(arb(0.5), arb(0.5), arb(1e9)).log() > 1e9 - 40)
+    True
+    """
+    z = arb.min(z, arb(_FARTHEST) ** 2 / arb.max(a, arb(1)) if bessel else arb(_FARTHEST))
+    x = a * z if bessel else z
+    if x.is_zero():
+        return arb(0)
+    if bessel or not a.is_zero():
+        small = x / b if bessel else a * z / b
+        value = _sharpened(lambda: ((x.hypgeom_0f1(b) if bessel else z.hypgeom_1f1(a, b)) - 1) / a, small)
+        if value is not None:
+            return value
+    peak = _peak(float(a), float(b), float(x), bessel=bessel)
+    if peak <= _SUMMED:
+        return _series(None, b, x) / a if bessel else _series(a, b, z)
+    first = arb(math.floor(peak) - _BLOCK // 2)
+    with precision(int(ctx.prec) + 64):  # logarithms of up to 1e17 keep their absolute accuracy
+        log_term = first * x.log() - (b + first).lgamma() + b.lgamma() - (first + 1).lgamma()
+        log_term += -a.log() if bessel else (a + first).lgamma() - (a + 1).lgamma()
+        term = log_term.exp()
+    total = term
+    for _ in range(_BLOCK):
+        first = first + 1
+        term = term * x / ((b + first - 1) * first)
+        if not bessel:
+            term = term * (a + first - 1)
+        total += term
+    return total
+
+
+def _peak(a: float, b: float, x: float, *, bessel: bool) -> float:
+    """About the index of the largest term."""
+    if bessel:
+        return math.sqrt((b - 1) ** 2 / 4 + x) - (b + 1) / 2
+    half = (x - b - 1) / 2
+    return half + math.sqrt(max(half * half + a * x - b, 0.0))
 
 
 def log_expm1(x: arb) -> arb:

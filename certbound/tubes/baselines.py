@@ -52,6 +52,7 @@ class Baseline:
 
 
 _ONE, _ALL = "one time", "trajectory"
+_MOST_WINDOWS = 512
 _SLACK = 0.85  # the sharp tail gains at most that over the growth bound that the estimates use
 BASELINES: dict[str, Baseline] = {
     "prop1": Baseline(time="continuous", kind="variance", level=_ONE, title="Prop 1 (paper)"),
@@ -203,12 +204,17 @@ class _Builder:
         data, row = self.schedule, self.row
         if row.kind == "windows":
             scale = self._closed_scale() if self._plain else self._sum_scale
-            return scale(step) if step is not None else rough_scale(data, scale)
+            return scale(step) if step is not None else rough_scale(data, scale, self._most)
         roots, weights = self.objective.roots(data, scaled=row.kind == "scaled")
         count = data.horizon if self.method.startswith("prop3") else 1.0
         with np.errstate(over="ignore", invalid="ignore"):
             scale_value = float(np.max(roots / weights)) * math.sqrt(self.size(count)) * data.unit
         return scale_value if scale_value == scale_value else math.inf
+
+    @property
+    def _most(self) -> int:
+        """Largest number of windows to try: sums over windows are evaluated one by one."""
+        return 1 << 40 if self._plain else _MOST_WINDOWS
 
     @property
     def _plain(self) -> bool:
@@ -225,7 +231,7 @@ class _Builder:
         """Thms 3 and 5."""
         data = self.schedule
         if step is None:
-            step = best_step(data, self._closed_scale() if self._plain else self._sum_scale)
+            step = best_step(data, self._closed_scale() if self._plain else self._sum_scale, self._most)
         if self._plain:
             windows = _window_count(data.horizon, step)
             tail = self.tail(self._events(step))
@@ -275,31 +281,34 @@ def _window_count(horizon: float, step: float) -> int:
     return max(1, math.ceil(horizon / step * (1 - 1e-12)))
 
 
-def best_step(schedule: Schedule, scale: Callable[[float], float]) -> float:
-    """The step with the least objective: T/N over whole N in CT, whole steps in DT.
+def best_step(schedule: Schedule, scale: Callable[[float], float], most: int) -> float:
+    """The step with the least objective: T/N over whole N up to ``most`` in CT, whole steps of at least T/most in DT.
 
     The objective is one valley in N (a falling root plus a slowly rising level) up to the ceilings of DT.
     """
     horizon = schedule.horizon
     if not schedule.continuous:
-        return _best_whole(lambda k: scale(float(k)), int(horizon))
-    count = _best_whole(lambda k: scale(horizon / k), 1 << 40)
+        return _best_whole(lambda k: scale(float(k)), int(horizon), math.ceil(horizon / most))
+    count = _best_whole(lambda k: scale(horizon / k), most)
     return horizon / count
 
 
-def rough_scale(schedule: Schedule, scale: Callable[[float], float]) -> float:
+def rough_scale(schedule: Schedule, scale: Callable[[float], float], most: int) -> float:
     """Least objective over doubled window counts (CT) or steps (DT)."""
-    best, k, limit = math.inf, 1, int(schedule.horizon) if not schedule.continuous else 1 << 40
+    best, k, limit = math.inf, 1, most
+    if not schedule.continuous:
+        k, limit = math.ceil(schedule.horizon / most), int(schedule.horizon)
+    first = k
     while k <= limit:
         value = scale(schedule.horizon / k if schedule.continuous else float(k))
-        if value > best and k >= 8:
+        if value > best and k >= 8 * first:
             break
         best, k = min(best, value), 2 * k
     return best
 
 
-def _best_whole(function: Callable[[int], float], limit: int) -> int:
-    """Whole number in [1, limit] of the least value: doubling, then thirds, then all the neighbours."""
+def _best_whole(function: Callable[[int], float], limit: int, least: int = 1) -> int:
+    """Whole number in [least, limit] of the least value: doubling, then thirds, then all the neighbours."""
     known: dict[int, float] = {}
 
     def value(k: int) -> float:
@@ -307,16 +316,16 @@ def _best_whole(function: Callable[[int], float], limit: int) -> int:
             known[k] = function(k)
         return known[k]
 
-    k = 1
-    while k < limit and (k < 4 or value(min(2 * k, limit)) <= value(k)):
+    k = least
+    while k < limit and (k < 4 * least or value(min(2 * k, limit)) <= value(k)):
         k = min(2 * k, limit)
-    low, high = max(1, k // 4), min(limit, 2 * k)
+    low, high = max(least, k // 4), min(limit, 2 * k)
     while high - low > 8:
         a, b = low + (high - low) // 3, high - (high - low) // 3
         if value(a) <= value(b):
             high = b
         else:
             low = a
-    for j in range(max(1, low - 4), min(limit, high + 4) + 1):
+    for j in range(max(least, low - 4), min(limit, high + 4) + 1):
         value(j)
     return min(known, key=lambda j: known[j])

@@ -6,13 +6,17 @@ import math
 
 from flint import arb
 
-from certbound.rigor.balls import lower, precision, upper
+from certbound.rigor.balls import excess_floor, lower, precision, upper
 from certbound.tubes.ballpath import ball_path
 from certbound.tubes.kummer import Start, excess_function, initial_ball, phi_ball
 from certbound.tubes.objective import Clearance
+from certbound.tubes.paper import golden
 from certbound.tubes.schedule import Schedule
+from certbound.tubes.series import log_excess_one, log_phi_one
 
-__all__ = ["exit_level"]
+__all__ = ["exit_level", "union_level"]
+
+_MOST_UNIONS = 128
 
 
 def exit_level(
@@ -37,6 +41,50 @@ def exit_level(
         if not least.is_finite():
             return -1e12 if least > 0 else 0.0
         return min(0.0, upper((gain.initial / least).log() / arb(10).log()))
+
+
+def union_level(schedule: Schedule, clearance: Clearance) -> float:
+    """log10 of the sum over steps of inf_k (e^k - 1)/(0F1(; nu/2; k r_t^2/(2 V_t)) - 1) (DT), rounded up, at most 0.
+
+    The steps of a piece share its largest V, so that a piece costs one evaluation; nothing is claimed (0) for more
+    than 128 pieces. The schedule's nu must be n for sub-Gaussian noise that is not Gaussian (``any_power``).
+
+    Source: items 7.11 and 7.12 of docs/theory.md.
+    """
+    if schedule.continuous or not schedule.any_power or len(schedule.lengths) > _MOST_UNIONS:
+        return 0.0
+    radii = clearance.at(schedule.times[:-1]).tolist()
+    half, last = schedule.nu / 2, len(radii) - 1
+    path = ball_path(schedule, 0.0)
+    with precision():
+        total = arb(0)
+        for piece, radius in enumerate(radii):
+            s, e = max(float(schedule.times[piece]), 1.0), float(schedule.times[piece + 1]) - (piece < last)
+            if s > e or not math.isfinite(radius):
+                continue
+            largest = arb.max(path.at(piece, s)[0], path.at(piece, e)[0])
+            if not (largest > 0):
+                continue  # no noise so far
+            x = (arb(radius) / arb(schedule.unit)) ** 2 / (2 * largest)
+            power = arb(best_power(half, float(x)))
+            total += (e - s + 1) * power.expm1() / (power * excess_floor(power, arb(half), x, bessel=True))
+        if total.is_zero():
+            return -1e12
+        level = total.log() / arb(10).log()
+        return min(0.0, upper(level)) if level.is_finite() else 0.0
+
+
+def best_power(half: float, x: float) -> float:
+    """k > 0 with about the least (e^k - 1)/(0F1(; half; k x) - 1)."""
+    if not 0 < x < 1e18:
+        return 1.0
+
+    def level(y: float) -> float:
+        k = math.exp(y)
+        return log_phi_one(k) - log_excess_one(k, half, x, bessel=True)[0]
+
+    middle = math.log(x)  # 0F1(; half; k x) is about e^{2 sqrt(k x)}
+    return math.exp(golden(level, middle - 2.5, middle + 0.5, 1e-2))
 
 
 class _Gain:

@@ -24,7 +24,7 @@ import numpy as np
 from flint import arb
 from numpy.typing import NDArray
 
-from certbound.rigor.balls import bessel_excess, kummer_excess, lower, precision, solve_upward, upper
+from certbound.rigor.balls import bessel_excess, excess_floor, kummer_excess, lower, precision, solve_upward, upper
 from certbound.tubes.ballpath import BallPath, ball_path
 from certbound.tubes.constants import Constants
 from certbound.tubes.schedule import Schedule, make_schedule
@@ -172,11 +172,9 @@ class KummerProfile:
 
 
 def excess_function(a: float, b: float, bessel: bool) -> Callable[[arb], arb]:
-    """E_a, or its Bessel companion, as a function of balls."""
+    """Lower bound of E_a, or of its Bessel companion, as a function of balls: sharp where it is within reach."""
     power, half = arb(a), arb(b)
-    if bessel:
-        return lambda z: bessel_excess(half, power * z) / power
-    return lambda z: kummer_excess(power, half, z)
+    return lambda z: excess_floor(power, half, z, bessel=bessel)
 
 
 def phi_ball(a: arb, info: arb) -> arb:
@@ -201,7 +199,9 @@ def initial_ball(path: BallPath, a: float, start: Start) -> arb:
     base = phi_ball(power, info)
     if start.offset > 0:
         z = (arb(start.offset) / unit) ** 2 / (2 * v)
-        base += (power * info).exp() * excess_function(a, data.nu / 2, path.bessel)(z)
+        half = arb(data.nu / 2)
+        excess = bessel_excess(half, power * z) / power if path.bessel else kummer_excess(power, half, z)
+        base += (power * info).exp() * excess
     return base
 
 

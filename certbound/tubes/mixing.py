@@ -44,7 +44,8 @@ def _dictionary(data: Schedule, best: list[Pair]) -> tuple[list[Pair], NDArray[n
     count = len(data.lengths)
     cap = math.inf if data.any_power else data.nu / 2
     gain, variance = data.nodes
-    reference = float(np.max(np.where(np.isfinite(variance / gain), variance / np.maximum(gain, 1.0), 0.0)))
+    finite = np.isfinite(variance) & np.isfinite(gain)
+    reference = float(np.max(variance[finite] / np.maximum(gain[finite], 1.0)))
     small = count > 64 and not data.continuous
     powers = [0.0, 0.5, 4.0, 40.0] if small else [0.0, 0.15, 0.5, 1.5, 6.0, 30.0, 300.0]
     spreads = [-2.5, -1.2, -0.4, 0.0, 0.5, 1.5] if small else [-3.0, -2.0, -1.3, -0.8, -0.4, -0.15, 0.05, 0.3, 0.8, 2.0]

@@ -97,8 +97,8 @@ class Objective:
             if self.kind == "mean":
                 fine = schedule.graded(64)
                 return np.array([_mean(fine, root(fine))]), np.ones(1)
-            if self.kind == "final":
-                return root(schedule)[-1:], np.ones(1)
+            if self.kind == "final":  # e^C sqrt(W_T) is sqrt(V_T) there
+                return np.sqrt(schedule.nodes[1][-1:]), np.ones(1)
             if self.clearance is None:
                 return root(schedule), np.ones(1)
             cut = schedule.refined(self.clearance.ends(schedule))

@@ -9,7 +9,8 @@ the largest sigma, so that no sigma overflows or underflows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -92,13 +93,16 @@ class Schedule:
     @cached_property
     def nodes(self) -> tuple[Array, Array]:
         """(gain, variance) at the times: v = gain v_0 + variance."""
+        same = (np.diff(self.rates) == 0) & (np.diff(self.noise) == 0)
+        starts = np.flatnonzero(np.append(True, ~same))  # runs of equal data are closed forms
+        gain, variance = np.ones(len(self.times)), np.zeros(len(self.times))
         with np.errstate(over="ignore", invalid="ignore"):
-            growth = np.exp(2 * self.rates * self.lengths)
-            forward = self.noise * integral(2 * self.rates, self.lengths)
-            gain, variance = np.ones(len(self.times)), np.zeros(len(self.times))
-            for k in range(len(self.lengths)):
-                gain[k + 1] = gain[k] * growth[k]
-                variance[k + 1] = variance[k] * growth[k] + forward[k]
+            for first, last in zip(starts, np.append(starts[1:], len(self.lengths))):
+                rate, noise = self.rates[first], self.noise[first]
+                elapsed = self.times[first + 1 : last + 1] - self.times[first]
+                growth = np.exp(2 * rate * elapsed)
+                gain[first + 1 : last + 1] = gain[first] * growth
+                variance[first + 1 : last + 1] = variance[first] * growth + noise * integral(2 * rate, elapsed)
         return gain, np.nan_to_num(variance, nan=np.inf, posinf=np.inf)
 
     def refined(self, times: Array) -> Schedule:
@@ -117,6 +121,26 @@ class Schedule:
             continuous=self.continuous, times=self.times[: last + 1], slopes=self.slopes[:last], scale=self.unit,
             sigmas=self.sigmas[:last], nu=self.nu, any_power=self.any_power,
         )  # fmt: skip
+
+    def idle_time(self, limit: float = 250.0) -> float:
+        """Time after which the contraction adds up to e^-limit; 0 where the whole of it is weaker."""
+        inward = np.maximum(-self.rates, 0.0)
+        later = np.append(np.cumsum((inward * self.lengths)[::-1])[::-1], 0.0)
+        if later[0] <= limit:
+            return 0.0
+        k = int(np.flatnonzero(later > limit)[-1])
+        t = float(self.times[k + 1] - (limit - later[k + 1]) / inward[k])
+        return t if self.continuous else math.floor(t)
+
+    def idled(self, until: float) -> Schedule:
+        """The data without contraction up to a time: larger rates, which the smaller ones imply.
+
+        For what happens long after, v may then wait at any size without leaving the range of floats.
+        """
+        data = self.refined(np.array([until]))
+        early = data.times[1:] <= until
+        slopes = np.where(early, np.maximum(data.slopes, 0.0 if self.continuous else 1.0), data.slopes)
+        return replace(data, slopes=slopes)
 
     def graded(self, count: int = 32) -> Schedule:
         """Refined inside the pieces, more densely after their starts, to about ``count`` pieces or more."""

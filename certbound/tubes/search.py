@@ -64,10 +64,13 @@ class Search:
 
     @cached_property
     def reference(self) -> float:
-        """Scale of v_0: the largest variance, in the moving coordinates where it grows."""
+        """Scale of v_0: the largest variance, in the moving coordinates where it grows; I_0 = 1 in the Bessel form."""
+        if self.bessel:
+            whole = float(self.schedule.path(np.asarray(1.0), bessel=True)[1][0])
+            return min(max(whole, 1e-290), 1e300)
         gain, variance = self.schedule.nodes
         finite = np.isfinite(variance) & np.isfinite(gain)
-        top = float(np.max(np.where(finite, variance / np.maximum(gain, 1.0), 0.0)))
+        top = float(np.max(variance[finite] / np.maximum(gain[finite], 1.0)))
         return max(top, 1e-290)
 
     @cached_property
@@ -245,8 +248,8 @@ class Search:
 
     def _typical(self) -> float:
         """A scale of the right size: Gaussian tail at the node of the largest variance."""
-        _, variance = self.schedule.nodes
-        size = np.sqrt(np.nanmax(np.where(np.isfinite(variance), variance, 0.0) / self._squares))
+        variance = np.where(np.isfinite(self.schedule.nodes[1]), self.schedule.nodes[1], 0.0)
+        size = np.sqrt(variance[-1] if self.kind == "final" else np.nanmax(variance / self._squares))
         tail = max(1e-3, -self.log_delta)
         return float(size * math.sqrt(2 * self.half + 2 * math.sqrt(2 * self.half * tail) + 2 * tail))
 

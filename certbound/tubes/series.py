@@ -17,6 +17,7 @@ __all__ = ["log_excess", "log_excess_one", "log_phi", "log_phi_one", "solve_exce
 Array = NDArray[np.float64]
 
 _DIRECT = 1200
+_LARGEST = 700.0  # logarithm of the largest argument that is tried
 _CHUNK = 1 << 21
 
 
@@ -36,7 +37,7 @@ def log_excess(a: Array, b: float, z: Array, *, bessel: bool = False) -> tuple[A
     shape = z.shape
     a, z = a.ravel(), z.ravel()
     value, slope = np.empty(z.size), np.empty(z.size)
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         peak, width = _peak(a, b, z, bessel)
         last = peak + 12 * width + 60
     bad = ~np.isfinite(last) | ~(z > 0)
@@ -138,8 +139,7 @@ def log_phi_one(x: float) -> float:
 def log_excess_one(a: float, b: float, z: float, *, bessel: bool = False, digits: float = 1e-17) -> tuple[float, float]:
     """Scalar :func:`log_excess`, to ``digits``; a plain loop is quicker than arrays here."""
     if not 0 < z < 300 or a > 1e4:
-        value, slope = log_excess(np.asarray(a), b, np.asarray(z), bessel=bessel)
-        return float(value), float(slope)
+        return _strided_one(a, b, z, bessel)
     term = total = moment = z / b
     k = 1.0
     step = 0.0 if bessel else 1.0
@@ -156,9 +156,37 @@ def log_excess_one(a: float, b: float, z: float, *, bessel: bool = False, digits
     return float(value), float(slope)
 
 
+def _strided_one(a: float, b: float, z: float, bessel: bool) -> tuple[float, float]:
+    """Scalar :func:`_strided` where the bell is far from the first term, else :func:`log_excess`."""
+    if 0 < z < 1e18 and (a > 0 or not bessel):
+        if bessel:
+            peak = math.sqrt((b - 1) ** 2 / 4 + a * z) - (b + 1) / 2
+            curvature = 1 / (b + max(peak, 0.0) + 1) + 1 / (max(peak, 0.0) + 1)
+        else:
+            half = (z - b - 1) / 2
+            peak = half + math.sqrt(max(half * half + a * z - b, 0.0))
+            k = max(peak, 0.0)
+            curvature = 1 / (b + k) + 1 / (k + 1) - 1 / (a + k + 1e-300)
+        if peak > 200 and curvature > 0 and peak > 15 * (width := curvature**-0.5):
+            stride = width / 1.5
+            x, lgamma = math.log(z), math.lgamma
+            rate = math.log(a) if bessel else 0.0
+            base = lgamma(b) - (rate if bessel else lgamma(a + 1))
+            ks = [peak + stride * j for j in range(-13, 14)]
+            logs = [
+                k * (x + rate) - lgamma(b + k) - lgamma(k + 1) + base + (0.0 if bessel else lgamma(a + k)) for k in ks
+            ]
+            top = max(logs)
+            parts = [math.exp(value - top) for value in logs]
+            total = sum(parts)
+            return top + math.log(total * stride), sum(k * part for k, part in zip(ks, parts)) / total
+    value, slope = log_excess(np.asarray(a), b, np.asarray(z), bessel=bessel)
+    return float(value), float(slope)
+
+
 def solve_excess_one(a: float, b: float, target: float, *, bessel: bool = False, guess: float = 0.0) -> float:
     """Scalar :func:`solve_excess`."""
-    if math.isinf(target) or math.isnan(target):
+    if not -math.inf < target < 1e100:
         return 0.0 if target == -math.inf else math.inf
     if guess > 0 and math.isfinite(guess):
         x = math.log(guess)
@@ -168,10 +196,12 @@ def solve_excess_one(a: float, b: float, target: float, *, bessel: bool = False,
             big = (big + 0.5 * b) ** 2 / max(4 * a, 1e-300)
         x = min(target + math.log(b), math.log(big))
     for _ in range(60):
+        if x > _LARGEST:
+            return math.inf
         value, slope = log_excess_one(a, b, math.exp(x), bessel=bessel)
         step = min(max((target - value) / slope, -2.0), 2.0)
         x += step
         # the next Newton step is about step^2: below this one it is rounding
         if abs(step) < 1e-8 * max(1.0, abs(x)):
             break
-    return math.exp(x)
+    return math.exp(x) if x <= _LARGEST else math.inf

@@ -14,7 +14,7 @@ from certbound.tubes.almost_sure import AlmostSureProfile
 from certbound.tubes.baselines import BASELINES, baseline_tube
 from certbound.tubes.constants import Constants
 from certbound.tubes.exact import bound_exact_exit, bound_worst_exit, first_passage_tube
-from certbound.tubes.exit import exit_level
+from certbound.tubes.exit import exit_level, union_level
 from certbound.tubes.kummer import KummerProfile, Start, check_delta, check_power, check_start
 from certbound.tubes.mixing import mixture_level, mixture_tube
 from certbound.tubes.objective import Clearance, Objective, make_objective, read_clearance
@@ -29,6 +29,9 @@ METHODS = ("auto", "kummer", "bessel", "mixture", "exact", "worst_case", *BASELI
 
 SLOW = ("mixture", "exact", "worst_case")
 """Methods that take seconds; ``auto`` tries them with ``thorough=True``."""
+
+_FAR = 2e-3
+"""Standard deviation in units of the clearance below which the search works at a smaller scale."""
 
 _log = logging.getLogger(__name__)
 _QUICK = ("kummer", "bessel", "thm2", "thm2_cosh", "thm3_cosh", "thm3_sharp", "thm4", "prop3_sharp", "thm5_sharp")
@@ -238,6 +241,9 @@ def _family_tube(
         # isotropic proxy: nu = n always holds
         schedule = replace_nu(schedule, float(constants.dimension))
     unit = schedule.unit
+    idle = schedule.idle_time() if goal.kind == "final" else 0.0
+    if idle > 0:
+        schedule = schedule.idled(idle)
     cut = schedule if goal.clearance is None else schedule.refined(goal.clearance.ends(schedule))
     search = Search(
         schedule=cut.graded(6 if goal.kind != "mean" else 16), kind=goal.kind, weights=np.ones(1),
@@ -252,8 +258,9 @@ def _family_tube(
         a, v0, _ = search.solve()
     check_power(schedule, a, bessel=bessel)
     profile = KummerProfile(schedule=schedule, a=a, v0=v0, delta=delta, bessel=bessel, start=start)
+    parameters = {"a": a, "v0": v0 * unit**2, **({"idle": idle} if idle > 0 else {})}
     return Tube(
-        method="bessel" if bessel else "kummer", parameters={"a": a, "v0": v0 * unit**2}, level="trajectory",
+        method="bessel" if bessel else "kummer", parameters=parameters, level="trajectory",
         certified=True, delta=delta, horizon=schedule.horizon, constants=constants, objective=goal.given,
         profile=profile,
     )  # fmt: skip
@@ -310,18 +317,25 @@ def bound_exit_probability(
     cut = schedule.refined(held.ends(schedule))
     best = 0.0
     forms: list[tuple[Schedule, bool]] = [(cut, False)]
+    scaled = cut if cut.any_power else replace_nu(cut, float(constants.dimension))
     if np.max(cut.rates) >= 0:
-        forms.append((cut if cut.any_power else replace_nu(cut, float(constants.dimension)), True))
+        forms.append((scaled, True))
     for data, bessel in forms:
         graded = data.graded(6)
         search = Search(
             schedule=graded, kind="probability", weights=Objective(None, "scale", held).weights(graded), bessel=bessel,
             start=start,
         )  # fmt: skip
+        # far out the parameters hardly change, but the sums grow: they are sought nearer
+        farthest = float(np.max(np.sqrt(graded.nodes[1]) * (schedule.unit / search.weights)))
+        if 0 < farthest < _FAR:
+            search = replace(search, weights=search.weights * (farthest / _FAR))
         a, v0, _ = search.solve()
         best = min(best, exit_level(data, held, a=a, v0=v0, bessel=bessel, start=start))
         if not bessel:
             pair = (a, v0, False)
+    if start == Start():
+        best = min(best, union_level(scaled, held))
     if thorough and start == Start():
         best = min(best, _thorough_level(constants, cut, held, pair, best))
     return max(best, -1e12)

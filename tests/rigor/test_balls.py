@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 
+import numpy as np
 import pytest
 from flint import arb
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.special import hyp1f1, log_ndtr
+from scipy.special import gammaln, hyp1f1, log_ndtr, logsumexp
 
 from certbound.rigor.balls import (
     bessel_excess,
+    excess_floor,
     kummer_excess,
     log_bessel0f1,
     log_expm1,
@@ -154,3 +156,27 @@ def test_the_solution_found_upward_is_proved():
 def test_arguments_out_of_range_are_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "z", "bessel"),
+    [(0.0, 0.5, 3.0, False), (0.0, 0.5, 8e3, False), (9e3, 0.5, 700.0, False), (0.3, 3.0, 1e5, False),
+     (2.0, 500.0, 1e3, True), (1e4, 0.15, 2e4, False)],
+)  # fmt: skip
+def test_the_floor_is_below_the_excess_and_close_to_it(a, b, z, bessel):
+    k = np.arange(1.0, 120_000.0)
+    terms = k * math.log(z) + gammaln(b) - gammaln(b + k) - gammaln(k + 1)
+    terms += (k - 1) * math.log(a) if bessel else gammaln(a + k) - gammaln(a + 1)
+    exact = logsumexp(terms)
+    with precision():
+        floor = excess_floor(arb(a), arb(b), arb(z), bessel=bessel).log()
+    assert exact - 0.7 < lower(floor) <= exact + 1e-9 * abs(exact)
+
+
+def test_the_floor_answers_at_any_size():
+    for z in (1e9, 1e20, 1e300):
+        for a in (0.0, 1e-9, 0.5, 1e4):
+            with precision():
+                assert lower(excess_floor(arb(a), arb(0.15), arb(z)).log()) > 0.99 * min(z, 1e14)
+                if a > 0:
+                    assert excess_floor(arb(a), arb(0.15), arb(z), bessel=True).log() > 0
