@@ -6,13 +6,21 @@ input), 3 (a solver or certbound itself failed) and 130 (interrupted).
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 __all__ = ["main"]
 
+EARLY = "certbound: interrupted\n  why: it had not begun yet; nothing was written\n  try: run it again\n"
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and leave with its exit code."""
-    from certbound.cli.app import run
+    try:
+        from certbound.cli.app import run
 
-    raise SystemExit(run(arguments))
+        code = run(arguments)
+    except KeyboardInterrupt:  # before the command had begun
+        sys.stderr.write(EARLY)
+        code = 130
+    raise SystemExit(code)

@@ -72,8 +72,18 @@ def _run(words: list[str], command: str) -> int:
         _log.debug("the command ended with an error", exc_info=True)
         return _report(error, command)
     if code == INTERRUPTED:
-        sys.stderr.write("certbound: interrupted; nothing was written\n")
+        kept = "--checkpoint" in words
+        write_error(
+            f"{command or 'the command'} was interrupted",
+            "it had no answer yet" + ("; what was counted is in the checkpoint" if kept else "; nothing was written"),
+            "run it again to go on" if kept else f"run it again{_shorter(command)}",
+        )
     return code if isinstance(code, int) else 0
+
+
+def _shorter(command: str) -> str:
+    limited = command in ("verify", "derive", "tune", "simulate")
+    return "; --time-limit SECONDS gives the best answer after some time" if limited else " and let it finish"
 
 
 def _report(error: Exception, command: str) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from certbound.cli.messages import InputError
-from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, load_problem
+from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, examples, load_problem
 from certbound.cli.output import SETTINGS, console, print_json, spinner
 from certbound.errors import SolverError
 
@@ -26,15 +26,19 @@ CertificateArgument = Annotated[
 ]
 ProblemOption = Annotated[
     str | None,
-    typer.Option(
-        "--problem", metavar="PROBLEM", help="Prove also that it speaks of this problem.", show_default=False
-    ),
+    typer.Option("--problem", metavar="PROBLEM", help="Prove also that it speaks of this problem.", show_default=False),
 ]
 
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
-    app.command("check", epilog="Example: certbound check unicycle.json --problem unicycle")(check)
+    app.command(
+        "check",
+        epilog=examples(
+            "certbound check unicycle.json --problem unicycle",
+            "certbound check my_system.json --problem my_system.toml --json",
+        ),
+    )(check)
 
 
 def check(

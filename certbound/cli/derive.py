@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from typing import TYPE_CHECKING, Any
@@ -10,9 +11,10 @@ import numpy as np
 import typer
 
 from certbound.cli.describe import describe_constants
-from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, load_problem
+from certbound.cli.limits import Clock, OutOfTime, TimeLimitOption
+from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, examples, load_problem
 from certbound.cli.output import SETTINGS, console, print_json, spinner
-from certbound.errors import EnclosureError, InfeasibleError
+from certbound.errors import EnclosureError, InfeasibleError, SolverError
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
@@ -20,25 +22,27 @@ if TYPE_CHECKING:
 
 __all__ = ["register"]
 
+EXAMPLES = examples("certbound derive chain --json", "certbound derive unicycle --time-limit 20")
 _log = logging.getLogger(__name__)
 
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
-    app.command("derive", epilog="Example: certbound derive chain --json")(derive)
+    app.command("derive", epilog=EXAMPLES)(derive)
 
 
 def derive(
     problem: ProblemArgument,
     pairs: SetOption = None,
     horizon: HorizonOption = None,
+    time_limit: TimeLimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Bound the contraction rate (or gain) and the noise, with a metric for each constraint."""
     subject = load_problem(problem, pairs, horizon=horizon)
     started = time.perf_counter()
     with spinner(f"bounding the constants of {subject.name}"):
-        constants, metrics, where = _bound(subject)
+        constants, metrics, where = _bound(subject, Clock(time_limit))
     seconds = time.perf_counter() - started
     result = {
         **describe_constants(constants),
@@ -55,8 +59,28 @@ def derive(
         _print(constants, result)
 
 
-def _bound(subject: Problem) -> tuple[Constants, list[Constants], str]:
-    """Constants and where they hold: the domain, all of R^n, or else along the noise-free reach tube."""
+def _bound(subject: Problem, clock: Clock) -> tuple[Constants, list[Constants], str]:
+    """Constants and where they hold: the domain, all of R^n, or else along the noise-free reach tube.
+
+    With a limit, quick constants in the Euclidean norm come first, and are what is left when the time is over.
+    """
+    if clock.limit is None:
+        return _searched(subject)
+    from certbound.constants.bounds import bound_constants
+
+    found: tuple[Constants, list[Constants], str] | None = None
+    with contextlib.suppress(OutOfTime):
+        with clock.running(), contextlib.suppress(EnclosureError, InfeasibleError):
+            quick = bound_constants(subject, metric="euclidean")
+            found = quick, [], "stated" if quick.proof is None else quick.proof.domain
+        with clock.running():
+            found = _searched(subject)
+    if found is None:
+        raise SolverError(f"no constants were proved within {clock.limit:g} s; give a larger --time-limit")
+    return found
+
+
+def _searched(subject: Problem) -> tuple[Constants, list[Constants], str]:
     from certbound.constants.bounds import bound_constants
     from certbound.constants.metrics import bound_metrics
     from certbound.reach import bound_reach

@@ -13,7 +13,7 @@ from typing import Any
 import typer
 
 from certbound.cli.messages import FAILED
-from certbound.cli.options import JsonOption
+from certbound.cli.options import JsonOption, examples
 from certbound.cli.output import SETTINGS, console, print_json, spinner
 
 __all__ = ["register"]
@@ -23,7 +23,7 @@ EXTRAS = {"cluster": ["dask", "distributed"], "learn": ["sklearn"]}
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
-    app.command("doctor", epilog="Example: certbound doctor")(doctor)
+    app.command("doctor", epilog=examples("certbound doctor", "certbound doctor --json"))(doctor)
 
 
 def doctor(as_json: JsonOption = False) -> None:
@@ -62,19 +62,13 @@ def _print(rows: list[dict[str, Any]], healthy: bool) -> None:
             mark = "[green]ok  [/]" if row["ok"] else "[red]FAIL[/]"
             screen.print(f"{mark} {row['name']:<16}", end="")
             screen.print(row["detail"], markup=False)
-        present = [
-            f"{name} ({'installed' if found else 'not installed'})" for name, found in _extras().items()
-        ]
+        present = [f"{name} ({'installed' if found else 'not installed'})" for name, found in _extras().items()]
         screen.print(f"     {'extras':<16}{', '.join(present)}")
-    screen.print(
-        "certbound is ready" if healthy else "certbound is not able to work here: mend what failed above"
-    )
+    screen.print("certbound is ready" if healthy else "certbound is not able to work here: mend what failed above")
 
 
 def _extras() -> dict[str, bool]:
-    return {
-        name: all(importlib.util.find_spec(module) for module in modules) for name, modules in EXTRAS.items()
-    }
+    return {name: all(importlib.util.find_spec(module) for module in modules) for name, modules in EXTRAS.items()}
 
 
 def _requirements() -> dict[str, str]:
@@ -98,9 +92,7 @@ def _version_of(distribution: str) -> Callable[[], str]:
         version = importlib.metadata.version(distribution)
         needed = _requirements()[distribution]
         if not _satisfies(version, needed):
-            raise RuntimeError(
-                f"version {version} is installed, {needed} is needed; pip install -U {distribution}"
-            )
+            raise RuntimeError(f"version {version} is installed, {needed} is needed; pip install -U {distribution}")
         return version
 
     return check
@@ -111,8 +103,7 @@ def _satisfies(version: str, needed: str) -> bool:
     if not needed.startswith(">="):
         return True
     numbers = [
-        [int(part) for part in text.split(".") if part.isdigit()]
-        for text in (version, needed[2:].split(",")[0])
+        [int(part) for part in text.split(".") if part.isdigit()] for text in (version, needed[2:].split(",")[0])
     ]
     return numbers[0] >= numbers[1]
 
@@ -129,9 +120,7 @@ def _rounding() -> str:
     third = Interval.point(np.array(1.0)) / 3.0
     back = third * 3.0
     grown = exp(Interval.point(np.array(1.0)))
-    if not (
-        back.lo < 1.0 < back.hi and grown.lo < 2.718281828459045 < grown.hi and grown.hi - grown.lo < 1e-14
-    ):
+    if not (back.lo < 1.0 < back.hi and grown.lo < 2.718281828459045 < grown.hi and grown.hi - grown.lo < 1e-14):
         raise RuntimeError("interval arithmetic does not enclose 1/3*3 and e as it must")
     return "1/3*3 and e are enclosed"
 

@@ -46,6 +46,9 @@ def explain(error: Exception, command: str) -> tuple[int, str, str]:
     if isinstance(error, (EnclosureError, CertificateError)):
         why, cure = split_cure(str(error))
         return BAD_INPUT, why, cure or help_line
+    if isinstance(error, SyntaxError):
+        place = f"line {error.lineno} of {error.filename}"
+        return BAD_INPUT, f"{place} is not Python: {error.msg}", "mend the module"
     if isinstance(error, OSError):
         subject = f"`{error.filename}`: " if error.filename else ""
         why = f"{subject}{error.strerror or error}"
@@ -100,11 +103,7 @@ def _install_hint(module: str) -> str:
         "immrax": "compare",
     }
     name = extra.get(module.split(".")[0])
-    return (
-        f'pip install "certbound[{name}]"'
-        if name
-        else f"install it, or check the spelling: pip install {module}"
-    )
+    return f'pip install "certbound[{name}]"' if name else f"install it, or check the spelling: pip install {module}"
 
 
 def _one_line(message: str) -> str:

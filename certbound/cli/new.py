@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from certbound.cli.messages import InputError
-from certbound.cli.options import JsonOption, check_writable
+from certbound.cli.options import JsonOption, check_writable, examples
 from certbound.cli.output import SETTINGS, console, print_json, write_file
 
 __all__ = ["TEMPLATE", "register"]
@@ -56,7 +56,7 @@ during = [0, 2]            # seconds; leave it out for the whole horizon
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
-    app.command("new", epilog="Example: certbound new my_system && certbound verify my_system.toml")(new)
+    app.command("new", epilog=examples("certbound new my_system && certbound verify my_system.toml"))(new)
 
 
 def new(

@@ -20,7 +20,9 @@ __all__ = [
     "JsonOption",
     "ProblemArgument",
     "SetOption",
+    "check_picture",
     "check_writable",
+    "examples",
     "integer",
     "load_problem",
     "number",
@@ -119,7 +121,7 @@ def load_problem(
 
     parameters: dict[str, Any] = dict(settings_of(pairs))
     changes: dict[str, Any] = {} if delta is None else {"delta": delta}
-    with _as_input_error("run `certbound problems` for the bundled problems and their keys"):
+    with _as_input_error(_cure(source), module=":" in source):
         problem = load(source, **parameters)
     if horizon is not None:
         changes["horizon"] = _whole(horizon) if problem.system.time == "discrete" else horizon
@@ -129,16 +131,28 @@ def load_problem(
         return problem.replace(**changes)
 
 
+def _cure(source: str) -> str:
+    if source.endswith(".toml") or Path(source).is_file():
+        return "mend the file; `certbound new NAME` writes one that works"
+    if ":" in source:
+        return "mend the module"
+    return "run `certbound problems` for the bundled problems and their keys"
+
+
 @contextlib.contextmanager
-def _as_input_error(cure: str) -> Iterator[None]:
-    """Whatever a problem refuses while it is built is the user's to mend."""
+def _as_input_error(cure: str, *, module: bool = False) -> Iterator[None]:
+    """Whatever a problem refuses while it is built, or the user's own module raises, is the user's to mend."""
     try:
         yield
-    except InputError:
+    except (InputError, SyntaxError):
         raise
     except (ValueError, TypeError, ArithmeticError) as error:
         why, own = split_cure(str(error))
         raise InputError(why, own or cure) from error
+    except Exception as error:
+        if not module:
+            raise
+        raise InputError(f"the module raised {type(error).__name__}: {' '.join(str(error).split())}", cure) from error
 
 
 def check_writable(*paths: Path | None) -> None:
@@ -152,6 +166,24 @@ def check_writable(*paths: Path | None) -> None:
             raise InputError(f"the directory `{path.parent}` does not exist", f"run mkdir -p {path.parent}")
         if not os.access(path if path.exists() else path.parent, os.W_OK):
             raise InputError(f"`{path}` cannot be written", "choose another place, or change the permissions")
+
+
+def check_picture(path: Path | None) -> None:
+    """Refuse, before any work, to draw in a format that matplotlib does not write."""
+    if path is None or not path.suffix:
+        return
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    known = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix[1:].lower() not in known:
+        raise InputError(
+            f"`{path.name}` ends in {path.suffix}, which is no format of pictures", "end it in .png or .pdf"
+        )
+
+
+def examples(*lines: str) -> str:
+    """The examples at the end of a command's help."""
+    return "\n\n".join(f"Example: {line}" for line in lines)
 
 
 def _whole(horizon: float) -> int:

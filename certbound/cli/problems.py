@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from certbound.cli.options import JsonOption
+from certbound.cli.options import JsonOption, examples
 from certbound.cli.output import SETTINGS, console, print_json
 
 __all__ = ["register"]
@@ -15,7 +15,7 @@ __all__ = ["register"]
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
-    app.command("problems", epilog="Example: certbound problems")(problems)
+    app.command("problems", epilog=examples("certbound problems", "certbound problems --quiet"))(problems)
 
 
 def problems(as_json: JsonOption = False) -> None:

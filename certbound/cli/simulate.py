@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from certbound.cli.limits import Clock, TimeLimitOption
 from certbound.cli.messages import InputError
 from certbound.cli.options import (
     HorizonOption,
@@ -19,6 +20,7 @@ from certbound.cli.options import (
     ProblemArgument,
     SetOption,
     check_writable,
+    examples,
     integer,
     load_problem,
     number,
@@ -30,6 +32,14 @@ if TYPE_CHECKING:
     from certbound.simulation.executors import Progress
 
 __all__ = ["register"]
+
+EXAMPLES = examples(
+    "certbound simulate ou --paths 1e6 --seed 1",
+    "certbound simulate unicycle --paths 1e9 --time-limit 60",
+    "certbound simulate chain --paths 1e7 --checkpoint run.npz --against chain.json",
+    "certbound simulate ou --paths 1e4 --rare",
+)
+FIRST = 2000
 
 PathsOption = Annotated[
     int, typer.Option("--paths", parser=integer, metavar="N", help="Paths to simulate, such as 3e6.")
@@ -68,7 +78,7 @@ AgainstOption = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
-    app.command("simulate", epilog="Example: certbound simulate ou --paths 1e6 --seed 1")(simulate)
+    app.command("simulate", epilog=EXAMPLES)(simulate)
 
 
 def simulate(
@@ -83,12 +93,17 @@ def simulate(
     checkpoint: CheckpointOption = None,
     cluster: ClusterOption = None,
     against: AgainstOption = None,
+    time_limit: TimeLimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Count how many random paths leave the safe set or the domain, with confidence limits."""
     check_writable(checkpoint)
     if seed is not None and seed < 0:
         raise InputError(f"`--seed` must not be negative, got {seed}", "give a whole number such as 1")
+    if time_limit is not None and checkpoint is not None:
+        raise InputError(
+            "`--time-limit` and `--checkpoint` exclude each other", "stop a run with Ctrl-C and go on later"
+        )
     subject = load_problem(problem, pairs, horizon=horizon)
     claim = None if against is None else _claimed(against)
     options: dict[str, Any] = {"paths": paths, "steps": _steps(subject, step), "confidence": confidence}
@@ -98,7 +113,7 @@ def simulate(
         options["rng"] = np.random.default_rng(seed)
     with _executor(cluster) as executor, _progress_bar(paths) as progress:
         options |= {"executor": executor, "progress": progress, "checkpoint": checkpoint}
-        result = _rare(subject, options) if rare else _plain(subject, options)
+        result = _within(Clock(time_limit), _rare if rare else _plain, subject, options)
     if claim is not None:
         contradicted = result["lower"] > 10.0**claim
         result["against"] = {"certificate": str(against), "log10_delta": claim, "contradicted": contradicted}
@@ -107,6 +122,26 @@ def simulate(
     else:
         _print(result)
     raise typer.Exit(1 if claim is not None and result["against"]["contradicted"] else 0)
+
+
+def _within(
+    clock: Clock, count: Callable[[Problem, dict[str, Any]], dict[str, Any]], problem: Problem, options: dict[str, Any]
+) -> dict[str, Any]:
+    """A run of all paths, or of as many as are expected to fit into the time.
+
+    Trial runs of growing size measure the speed and are thrown away, so that the number of paths of the run that
+    counts does not depend on what it finds.
+    """
+    if clock.limit is None:
+        return count(problem, options)
+    asked = options["paths"]
+    number = min(asked, FIRST)
+    while True:
+        result = count(problem, options | {"paths": number})
+        affordable = int(0.8 * max(clock.left, 0.0) / max(result["seconds"], 1e-3) * number)
+        if number == asked or affordable < 2 * number:
+            return result | {"asked": asked}
+        number = min(asked, affordable, 30 * number)
 
 
 def _steps(problem: Problem, step: float | None) -> int | None:
@@ -230,6 +265,8 @@ def _print(result: dict[str, Any]) -> None:
     for label, count in result.get("by_constraint", {}).items():
         screen.print(f"  {count:>9}  {label}", markup=False)
     screen.print(f"a claim of less than {low:.4g} is refuted; the smallest delta supported is {high:.4g}")
+    if result.get("asked", result["paths"]) != result["paths"]:
+        screen.print(f"the time was enough for {result['paths']} of {result['asked']} paths")
     if "against" in result:
         word = "contradicts" if result["against"]["contradicted"] else "does not contradict"
         screen.print(f"the simulation {word} the certificate (10^{result['against']['log10_delta']:.6g})")

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import typer
 
 from certbound.cli.describe import describe_parameters
+from certbound.cli.limits import Clock, OutOfTime, TimeLimitOption
 from certbound.cli.options import (
     DeltaOption,
     HorizonOption,
     JsonOption,
     ProblemArgument,
     SetOption,
+    examples,
     load_problem,
 )
 from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.errors import SolverError
 
 if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
@@ -27,12 +32,13 @@ if TYPE_CHECKING:
 __all__ = ["register"]
 
 SAMPLES = 513
+EXAMPLES = examples("certbound tune ou --json", "certbound tune chain_rest --delta 1e-6 --time-limit 30")
 _log = logging.getLogger(__name__)
 
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
-    app.command("tune", epilog="Example: certbound tune ou --json")(tune)
+    app.command("tune", epilog=EXAMPLES)(tune)
 
 
 def tune(
@@ -40,16 +46,23 @@ def tune(
     pairs: SetOption = None,
     horizon: HorizonOption = None,
     delta: DeltaOption = None,
+    time_limit: TimeLimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compute the probabilistic tube by every method that applies, and say which is smallest."""
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
-    from certbound.constants.bounds import bound_constants
+    rows: list[dict[str, Any]] = []
+    constants: Constants | None = None
+    with contextlib.suppress(OutOfTime), Clock(time_limit).running():
+        from certbound.constants.bounds import bound_constants
 
-    with spinner(f"bounding the constants of {subject.name}"):
-        constants = bound_constants(subject)
-    rows = _rows(constants, subject.horizon, subject.delta)
+        with spinner(f"bounding the constants of {subject.name}"):
+            constants = bound_constants(subject)
+        for row in _rows(constants, subject.horizon, subject.delta):
+            rows.append(row)
     valid = [row for row in rows if row["level"] == "trajectory" and not row["method"].endswith("_as_printed")]
+    if constants is None or not valid:
+        raise SolverError(f"no tube was computed within {time_limit:g} s; give a larger --time-limit")
     best = min(valid, key=lambda row: row["maximum"])["method"]
     if as_json:
         print_json({"method": best, "rows": rows})
@@ -57,14 +70,13 @@ def tune(
         _print(best, rows, "" if constants.metric is None else " (radii in the norm of the certified metric)")
 
 
-def _rows(constants: Constants, horizon: float, delta: float) -> list[dict[str, Any]]:
+def _rows(constants: Constants, horizon: float, delta: float) -> Iterator[dict[str, Any]]:
     """Every method whose hypotheses hold, its parameters tuned; the paper's windows also with its own ones."""
     from certbound.tubes.tuning import METHODS, tune_tube
 
     asked: list[tuple[str, dict[str, float]]] = [(method, {}) for method in METHODS if method != "auto"]
     window = horizon / 100 if constants.continuous else 1
     asked += [(method, {"epsilon": 15 / 16, "step": window}) for method in ("thm3", "thm5")]
-    rows = []
     for method, fixed in asked:
         started = time.perf_counter()
         try:
@@ -73,8 +85,7 @@ def _rows(constants: Constants, horizon: float, delta: float) -> list[dict[str, 
         except ValueError as error:
             _log.debug("%s does not apply: %s", method, error)
             continue
-        rows.append(_row(tube, method, horizon, time.perf_counter() - started, constants.continuous))
-    return rows
+        yield _row(tube, method, horizon, time.perf_counter() - started, constants.continuous)
 
 
 def _row(tube: Tube, method: str, horizon: float, seconds: float, continuous: bool) -> dict[str, Any]:

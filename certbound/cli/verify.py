@@ -6,6 +6,7 @@ import logging
 import shlex
 import sys
 import time
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,14 +15,16 @@ import typer
 
 from certbound.cli.check import proved_certificate
 from certbound.cli.describe import describe_constants, describe_deviation, log10_text
-from certbound.cli.messages import InputError
+from certbound.cli.limits import Clock, OutOfTime, TimeLimitOption
 from certbound.cli.options import (
     DeltaOption,
     HorizonOption,
     JsonOption,
     ProblemArgument,
     SetOption,
+    check_picture,
     check_writable,
+    examples,
     integer,
     load_problem,
 )
@@ -31,11 +34,17 @@ from certbound.errors import CertificateError
 if TYPE_CHECKING:
     from certbound.plotting import Scene
     from certbound.problem.problem import Problem
+    from certbound.reach.tube import ReachTube
     from certbound.safety.verification import Verdict
 
 __all__ = ["register"]
 
 PATHS = 60
+EXAMPLES = examples(
+    "certbound verify unicycle --horizon 2 --plot tube.png",
+    "certbound verify my_system.toml --set sigma=0.1 --delta 1e-6 --json",
+    "certbound verify chain --certificate chain.json --report chain.html",
+)
 _log = logging.getLogger(__name__)
 
 MethodOption = Annotated[
@@ -61,7 +70,7 @@ ExplainOption = Annotated[bool, typer.Option("--explain", help="Show what each e
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
-    app.command("verify", epilog="Example: certbound verify unicycle --horizon 2 --plot tube.png")(verify)
+    app.command("verify", epilog=EXAMPLES)(verify)
 
 
 def verify(
@@ -75,16 +84,16 @@ def verify(
     report: ReportOption = None,
     plot: PlotOption = None,
     explain: ExplainOption = False,
+    time_limit: TimeLimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Decide whether the system stays safe but for a probability of delta, and prove it."""
     check_writable(certificate, report, plot)
+    check_picture(plot)
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
-    from certbound.safety.verification import verify_safety
-
     started = time.perf_counter()
     with spinner(f"verifying {subject.name}"):
-        verdict = verify_safety(subject, method=method, cells=cells)
+        verdict = _verdict(subject, method, cells, Clock(time_limit))
     seconds = time.perf_counter() - started
     result = _result(subject, verdict, seconds)
     if explain:
@@ -95,6 +104,34 @@ def verify(
     else:
         _print(subject, result)
     raise typer.Exit(0 if verdict.status == "SAFE" else 1)
+
+
+def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> Verdict:
+    """The verdict; with a limit, the best one of the engines that finished in time."""
+    from certbound.safety.verification import Verdict, verify_safety
+
+    if clock.limit is None:
+        return verify_safety(problem, method=method, cells=cells)
+    best: Verdict | None = None
+    over = f"The search was stopped after {clock.limit:g} s."
+    try:
+        for engine in ("linear", "constants") if method == "auto" else (method,):
+            with clock.running():
+                found = verify_safety(problem, method=engine, cells=cells)
+            if best is None or (found.status != "SAFE", found.log10_delta) < (best.status != "SAFE", best.log10_delta):
+                best = found
+            if found.status == "UNSAFE_NOMINAL":
+                return found
+    except OutOfTime:
+        if best is not None:
+            return replace(best, reason=f"{best.reason} {over}")
+    if best is not None:
+        return best
+    cure = "Give it more time, fewer --cells or a shorter --horizon."
+    return Verdict(
+        status="UNKNOWN", log10_delta=0.0, margin=None, time=None, constraint=None, reason=f"{over} {cure}",
+        method=method, problem=problem,
+    )  # fmt: skip
 
 
 def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any]:
@@ -129,7 +166,10 @@ def _write(
         _certify(problem, verdict, certificate)
     if plot is None and report is None:
         return
-    scene = _scene(problem, verdict)
+    if verdict.reach is None:
+        sys.stderr.write("certbound: nothing was drawn or reported: no set was proved that could be\n")
+        return
+    scene = _scene(problem, verdict, verdict.reach)
     if plot is not None:
         from certbound.plotting import draw_scene
 
@@ -159,15 +199,13 @@ def _certify(problem: Problem, verdict: Verdict, path: Path) -> None:
     write_file(path, text)
 
 
-def _scene(problem: Problem, verdict: Verdict) -> Scene:
+def _scene(problem: Problem, verdict: Verdict, reach: ReachTube) -> Scene:
     """What is drawn, with sample paths where the noise has a law to sample from."""
     import numpy as np
 
     from certbound.plotting import Scene, noisy_reach
     from certbound.simulation.paths import sample_paths
 
-    if verdict.reach is None:
-        raise InputError("nothing was proved that could be drawn", "leave --plot and --report out")
     try:
         paths = sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0))
     except ValueError as error:
@@ -176,7 +214,7 @@ def _scene(problem: Problem, verdict: Verdict) -> Scene:
     times = None if paths is None else np.linspace(0.0, float(problem.horizon), paths.shape[1])
     title = f"{problem.name}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
     tube = noisy_reach(verdict)
-    return Scene(problem=problem, reach=verdict.reach, tube=tube, times=times, paths=paths, title=title)
+    return Scene(problem=problem, reach=reach, tube=tube, times=times, paths=paths, title=title)
 
 
 def _print(problem: Problem, result: dict[str, Any]) -> None:

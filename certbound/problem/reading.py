@@ -297,7 +297,7 @@ class _Reader:
             if pair[0] > pair[1]:
                 state = self.states[index]
                 got = f"{pair[0]:g} > {pair[1]:g}"
-                raise ValueError(f"`{where}.{state}` must be [low, high], got {got}; swap.")
+                raise ValueError(f"`{where}.{state}` must be [low, high], got {got}; swap the two.")
             low[index], high[index] = pair
         return sets.Box(low, high, center=center)
 

@@ -137,7 +137,7 @@ class Box(Region):
         if np.any(low > high):
             index = int(np.argmax(low > high))
             raise ValueError(
-                f"`low` must not exceed `high`, got {low[index]:g} > {high[index]:g} in entry {index}; swap."
+                f"`low` must not exceed `high`, got {low[index]:g} > {high[index]:g} in entry {index}; swap the two."
             )
         if np.any(low == np.inf) or np.any(high == -np.inf):
             raise ValueError("`low` must be below inf and `high` above -inf.")

@@ -203,7 +203,7 @@ def explain(error: ValidationError) -> str:
         line = f"`{'.'.join(keys)}`: {message}" if keys else message
         if line not in lines:
             lines.append(line)
-    return "; ".join(lines[:4]) + ("; ..." if len(lines) > 4 else "") + "."
+    return ", and ".join(lines[:4]) + (", and more" if len(lines) > 4 else "") + "."
 
 
 def _is_machinery(part: str) -> bool:

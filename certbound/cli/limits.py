@@ -1,0 +1,92 @@
+"""``--time-limit``: the best answer after some seconds."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from certbound.cli.messages import InputError
+
+__all__ = ["Clock", "OutOfTime", "TimeLimitOption", "positive"]
+
+
+class OutOfTime(BaseException):
+    """The time limit has passed; like KeyboardInterrupt, it is no error that a handler may swallow."""
+
+
+def positive(text: str) -> float:
+    """A positive number of seconds from the command line.
+
+    Examples
+    --------
+    >>> positive("2.5")
+    2.5
+    """
+    from certbound.cli.options import number
+
+    value = number(text)
+    if value <= 0:
+        raise typer.BadParameter(f"must be positive, got `{text}`")
+    return value
+
+
+TimeLimitOption = Annotated[
+    float | None,
+    typer.Option(
+        "--time-limit",
+        parser=positive,
+        metavar="SECONDS",
+        help="Stop searching then, and give the best answer so far.",
+        show_default=False,
+    ),
+]
+
+
+class Clock:
+    """Time that is left of a limit; None is no limit."""
+
+    def __init__(self, limit: float | None) -> None:
+        self.limit = limit
+        self.started = time.perf_counter()
+
+    @property
+    def left(self) -> float:
+        """Seconds left (infinite without a limit)."""
+        return float("inf") if self.limit is None else self.limit - (time.perf_counter() - self.started)
+
+    @contextlib.contextmanager
+    def running(self) -> Iterator[None]:
+        """Raise ``OutOfTime`` in the block when the time is over (between two steps of Python).
+
+        Raises
+        ------
+        OutOfTime
+            When the time is over.
+        InputError
+            On systems without interval timers.
+        """
+        if self.limit is None:
+            yield
+            return
+        if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
+            raise InputError("`--time-limit` needs a system with interval timers", "leave it out")
+        if self.left <= 0:
+            raise OutOfTime
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            raise OutOfTime
+
+        before = signal.signal(signal.SIGALRM, stop)
+        signal.setitimer(signal.ITIMER_REAL, self.left)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, before)
