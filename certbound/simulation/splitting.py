@@ -23,7 +23,16 @@ from certbound.simulation.blocks import MEMORY_LIMIT, Tally, Work, check_count, 
 from certbound.simulation.checkpoint import stored_entropy
 from certbound.simulation.executors import Progress, run_work
 from certbound.simulation.expressions import Parameters
-from certbound.simulation.kernels import SIGNATURE, indent, load_lines, module_head, nominal_lines, step_lines
+from certbound.simulation.kernels import (
+    SIGNATURE,
+    close_noise,
+    indent,
+    load_lines,
+    module_head,
+    nominal_lines,
+    open_noise,
+    step_lines,
+)
 from certbound.simulation.preparation import nominal_path, prepare
 from certbound.simulation.score import score_source
 from certbound.simulation.statistics import bound_binomial, check_confidence
@@ -205,17 +214,13 @@ class RareWork(Work):
 _FOLLOW = """
 @njit(nogil=True, error_model="numpy")
 def follow(
-    stream, noise, place, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops,
-    path, first
+    stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path, first
 ):
-    used = place[0]
     done = 0
 """
 
 _REPLICA = """\
     count, dimension = starts.shape
-    noise = np.empty({size})
-    place = np.full(1, {size})
     states = np.empty((count, steps + 1, dimension))
     frees = np.empty(({frees}, steps + 1, dimension))
     tops = np.zeros((count, steps + 1))
@@ -227,8 +232,7 @@ _REPLICA = """\
         if {own}:
             frees[path, 0] = starts[path]
         moved = follow(
-            stream, noise, place, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees,
-            tops, path, 0
+            stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path, 0
         )
         if moved < 0:
             return -1
@@ -261,8 +265,8 @@ _REPLICA = """\
                 if {own}:
                     frees[path, k] = frees[parent, k]
             moved = follow(
-                stream, noise, place, signals, inputs, moving, windows, nominal, p, steps, notes, states,
-                frees, tops, path, first,
+                stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path,
+                first,
             )
             if moved < 0:
                 return -1
@@ -298,9 +302,9 @@ def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tupl
     full = ["tops[path, k + 1:] = top", "break"]
     loop = [*step, *free, *within, *store, "if top >= 1.0:", *indent(full), *[f"x_{i} = y_{i}" for i in n], *end]
     out = ["if top >= 1.0:", "    tops[path, first:] = top", "    return done"]
-    body = [*load, *begin, *out, "for k in range(first, steps):", *indent(loop), "place[0] = used", "return done"]
-    size = str(max(512, model.noise_count))
-    fields = {"{size}": size, "{own}": str(own), "{frees}": "count" if own else "0", "{discarded}": str(_DISCARDED)}
+    body = [*load, *begin, *out, *open_noise(model), "for k in range(first, steps):", *indent(loop)]
+    body += [close_noise(), "return done"]
+    fields = {"{own}": str(own), "{frees}": "count" if own else "0", "{discarded}": str(_DISCARDED)}
     run = SIGNATURE + _REPLICA
     for name, value in fields.items():
         run = run.replace(name, value)

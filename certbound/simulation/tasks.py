@@ -126,6 +126,19 @@ def _deviation(task: Task, dimension: int, bridge: Bridge | None, p: Parameters)
         value = "math.sqrt(new_{0})"
         if bridge is None:
             finish, top = ["top_0 = math.sqrt(limit_0)"], "math.sqrt(limit_{0})"
+    if bridge is not None and _late(task, bridge) and not radial:
+        spreads = [bridge.variance(row.tolist(), p) for row in rows]
+        asked = [
+            f"top_{j} = raise_top(stream, track_{j}, at, top_{j}, {spread}, {EXPONENT})"
+            for j, spread in enumerate(spreads)
+        ] + ["at = 0"]
+        for j in range(count):
+            begin += [f"track_{j} = np.empty(STRETCH + 1)", f"track_{j}[0] = 0.0"]
+        begin += ["at = 0"]
+        within += ["at += 1", *[f"track_{j}[at] = new_{j}" for j in range(count)]]
+        due = "at == STRETCH or (mark < marks.shape[0] and marks[mark] == k + 1)" if task.marked else "at == STRETCH"
+        within += [f"if {due}:", *_indent(asked)]
+        finish += asked
     begin = ["mark = 0", *begin] if task.marked else begin
     within += ["if mark < marks.shape[0] and marks[mark] == k + 1:"] if task.marked else []
     for j in range(count if task.marked else 0):
@@ -169,18 +182,21 @@ def _scalar_suprema(task: Task, rows: Array, n: int, bridge: Bridge | None, p: P
     for j, row in enumerate(rows):
         value = linear_form(row.tolist(), [f"s_{i}" for i in range(n)], p)
         lines += [f"new_{j} = {value}" if task.norm is None else f"new_{j} = abs({value})"]
-        if bridge is None:
+        if bridge is None or _late(task, bridge):
             lines += [f"top_{j} = max(top_{j}, new_{j})"]
             continue
         spread = bridge.variance(row.tolist(), p)
-        if shrink or bridge.spread is None:
-            lines += [f"spread = ({spread}){shrink}"]
-            spread = "spread"
-        half = f"{0.5 * EXPONENT} * {spread}"
-        top = _bridge_top(str(j), f"old_{j}", f"new_{j}", spread, p, tested=True)
+        lines += [f"spread = ({spread}){shrink}"]
+        half = f"{0.5 * EXPONENT} * spread"
+        top = _bridge_top(str(j), f"old_{j}", f"new_{j}", "spread", p, tested=True)
         near = [f"top_{j} = max(top_{j}, new_{j})", *top]
         lines += [f"if (top_{j} - old_{j}) * (top_{j} - new_{j}) < {half}:", *_indent(near)]
     return lines
+
+
+def _late(task: Task, bridge: Bridge) -> bool:
+    """Whether the bridges of scalar values are alike, and are looked at when a stretch of steps is over."""
+    return bridge.spread is not None and task.smallest_scale <= 0.0
 
 
 def _indent(lines: Sequence[str]) -> list[str]:

@@ -69,7 +69,7 @@ def test_a_profile_tells_how_much_a_tube_must_be_scaled():
     exact = exit_radius(0.1, **OU)
     flat = sup_deviation(ou(), paths=20_000, rng=5, steps=100, measure=Measure(profile=lambda t: 0.0 * t + exact))
     plain = sup_deviation(ou(), paths=20_000, rng=5, steps=100)
-    assert flat.quantile(0.9).value == pytest.approx(plain.quantile(0.9).value / exact, rel=1e-3)
+    assert flat.quantile(0.9).value == pytest.approx(plain.quantile(0.9).value / exact, rel=1e-2)
     growing = np.sqrt(np.linspace(0.0, 5.0, 101))
     scaled = sup_deviation(ou(), paths=20_000, rng=5, steps=100, measure=Measure(profile=growing))
     paths = cb.sample_paths(ou(), paths=20_000, rng=5, steps=100)[:, 1:, 0]
