@@ -35,6 +35,8 @@ Array = NDArray[np.float64]
 
 _LARGEST_CHAIN = 2.0e10
 _MOST_KERNELS = 12
+_OUTWARD = 180.0
+"""K of the boundary in expanding systems: it costs about 0.8/K of the radius."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,14 +69,37 @@ class ConstantProfile:
 
 
 def _exact_pieces(schedule: Schedule, square: float) -> tuple[tuple[float, float], ...]:
-    """(sigma^2 dt/R^2, -2 c R^2/sigma^2) per piece; a piece without noise may only contract, and is left out."""
-    pieces = []
-    for rate, noise, length in zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist()):
-        if noise > 0:
-            pieces.append((noise * length / square, -2 * rate * square / noise))
-        elif rate > 0:
-            raise InfeasibleError("`method` 'exact' needs noise wherever the rate is positive; use 'worst_case'.")
-    return tuple(pieces)
+    """(duration, kappa) per piece along a boundary y_b <= R^2 with y_b(T) = R^2; pieces without noise are left out.
+
+    Where the rate is positive the boundary moves by y_b' = 2 c y_b + kappa sigma^2, kappa = -min(2 c y_b/sigma^2, K):
+    far before the end it stands K^{1/2} standard deviations out, and who leaves there would leave R^2 as well.
+    """
+    pieces: list[tuple[float, float]] = []
+    with precision():
+        y = arb(square)
+        path = zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist())
+        for rate, noise, length in reversed(list(path)):
+            if noise == 0 and rate > 0:
+                raise InfeasibleError("`method` 'exact' needs noise wherever the rate is positive; use 'worst_case'.")
+            if noise == 0:
+                continue
+            kappa = -2 * rate * float(y) / noise
+            if kappa < -_OUTWARD:
+                y, duration = _moved(y, rate, noise, length, -_OUTWARD)
+                pieces.append((duration, -_OUTWARD))
+            else:
+                pieces.append((float(arb(noise) * arb(length) / y), kappa))
+    return tuple(reversed(pieces))
+
+
+def _moved(y: arb, rate: float, noise: float, length: float, kappa: float) -> tuple[arb, float]:
+    """(y at the start, duration int sigma^2/y) of a piece with y' = 2 c y + kappa sigma^2 that ends at ``y``."""
+    spread = arb(noise) * integral(-2 * arb(rate), arb(length))
+    start = y * (-2 * arb(rate) * arb(length)).exp() - arb(kappa) * spread
+    if not lower(start) > 0:
+        return start, math.nan
+    # y e^{-2 C} gains kappa * spread over the piece, and its logarithm gains kappa * duration
+    return start, float((arb(kappa) * spread / start).log1p() / kappa if kappa != 0 else spread / start)
 
 
 def _worst_pieces(schedule: Schedule, dimension: int, square: float) -> tuple[tuple[float, float], ...] | None:
@@ -83,18 +108,15 @@ def _worst_pieces(schedule: Schedule, dimension: int, square: float) -> tuple[tu
     kappa = spin + 0.1 if spin > 0 else 0.0  # a little faster than needed: the corner at the boundary then is smooth
     pieces: list[tuple[float, float]] = []
     with precision():
-        y, zero = arb(square), arb(kappa)
+        y = arb(square)
         path = zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist())
         for rate, noise, length in reversed(list(path)):
-            speed = 2 * arb(rate) * y + zero * arb(noise)
-            if speed > 0:
-                spread = arb(noise) * integral(-2 * arb(rate), arb(length))
-                y = y * (-2 * arb(rate) * arb(length)).exp() - zero * spread
-                if not lower(y) > 0:
+            if 2 * arb(rate) * y + arb(kappa) * arb(noise) > 0:
+                y, duration = _moved(y, rate, noise, length, kappa)
+                if math.isnan(duration):
                     return None
-                duration = (zero * spread / y).log1p() / zero if kappa > 0 else spread / y
                 if noise > 0:
-                    pieces.append((float(duration), kappa))
+                    pieces.append((duration, kappa))
             elif noise > 0:
                 pieces.append((float(arb(noise) * arb(length) / y), float(-2 * arb(rate) * y / arb(noise))))
     return tuple(reversed(pieces))
@@ -110,9 +132,12 @@ def _diffusion(
     )  # fmt: skip
     if pieces is None:
         return None
+    # an outward drift carries defects along: a finer mesh and a little more room
+    outward = not worst and any(kappa < -1 for _, kappa in pieces)
     return Supersolution(
-        pieces=pieces, dimension=constants.dimension, nu=schedule.nu, worst=worst, target=target, coarseness=coarseness
-    )
+        pieces=pieces, dimension=constants.dimension, nu=schedule.nu, worst=worst, target=target,
+        coarseness=coarseness * (0.6 if outward else 1.0), inflation=1e-3 if outward else 3e-4,
+    )  # fmt: skip
 
 
 def _chain(constants: Constants, schedule: Schedule, radius: float) -> Recursion | None:
@@ -251,13 +276,27 @@ def _least_radius(bound: Callable[..., float], above: float, delta: float, *, co
         x, fx = new, value
         if done:
             break
-    excess = 0.0 if coarseness == 0.0 else 0.04
-    for _ in range(5):
-        candidate = math.exp(x + (fx - target + excess) / -slope + 1e-7)
-        certified = bound(candidate)
+    y = x + (fx - target + (0.0 if coarseness == 0.0 else 0.04)) / -slope + 1e-7
+    before: tuple[float, float] | None = None
+    best: tuple[float, float] | None = None
+    for _ in range(6):
+        certified = bound(math.exp(y))
+        level = math.log(certified) if certified > 0 else -math.inf
         if certified <= delta:
-            return candidate, certified
-        excess += 1.2 * (math.log(certified) - target) if certified < 1 else 0.3
+            retry = best is None and level < target - 0.01
+            best = math.exp(y), certified
+            if not retry:
+                break
+            y -= min(0.9 * (target - level) / -slope, 0.02)
+            continue
+        if best is not None:
+            break
+        if before is not None and level < before[1]:
+            slope = max(slope, (level - before[1]) / (y - before[0]))
+        before = y, level
+        y += (1.1 * (level - target) + 1e-3) / -slope if certified < 1 else 0.02
+    if best is not None:
+        return best
     raise InfeasibleError(
         f"no constant radius near {math.exp(x):.6g} could be certified at delta = {delta:g} "
         f"(last bound {certified:.3g}); use 'kummer'."

@@ -1,31 +1,33 @@
 """Exit probability of S+ = L S + w, w ~ N(0, sigma^2 I), bounded rigorously (DT; Secs. 4 and 5 of docs/theory.md).
 
 v_{k+1}(s) = P(||L s e_1 + w|| > R) + int_0^R q(L s -> y) v_k(y) dy, v_0 = 0, and v_T(0) is the probability. The
-integral is a Gauss-Legendre sum on panels of about one sigma: on a Bernstein ellipse of height h the density obeys
+integral is a Gauss-Legendre sum on panels of one or two sigma: on a Bernstein ellipse of height h the density obeys
 |q| <= C e^{h^2/(2 sigma^2)} and, as an expectation over a shifted Gaussian, |v_k| <= e^{L^2 h^2/(2 sigma^2)}, which
 bounds the error of the sum (Trefethen, Approximation Theory and Approximation Practice, Thm 19.3). All terms are
-positive: rounding of sums and of kernel entries is paid for by a factor. The Bessel factor E(x) = e^{-x} 0F1(; n/2;
-x^2/4) of q is log-convex: chords of its logarithm between points where ball arithmetic gave an upper bound lie above.
+positive: rounding of sums and of kernel entries is paid for by the factor :attr:`Recursion.inflation`. v_k rises in s:
+taken a little above a node, it exceeds its value there. The Bessel factor E(x) = e^{-x} 0F1(; n/2; x^2/4) of q is
+log-convex: chords of its logarithm between points where ball arithmetic gave an upper bound lie above.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from flint import arb
 from numpy.typing import NDArray
 
 from certbound.rigor.balls import bessel_excess, precision, upper
+from certbound.rigor.rounding import LIBRARY_ULPS, UNIT
 
 __all__ = ["Recursion"]
 
 Array = NDArray[np.float64]
 
 _POINTS = 14
-_INFLATION = 1 + 1e-11  # elementary functions, nodes and weights in double precision, and sums of a few thousand terms
+_TINY = 1e-290  # more than what entries below the smallest float add up to
 _TABLE_RATIO = 2e-3
 
 
@@ -58,16 +60,36 @@ class Recursion:
 
     @cached_property
     def _panels(self) -> int:
-        return max(1, math.ceil(self.radius / float(np.min(self.sigmas))))
+        wide = 2.0 if self.dimension <= 3 else (1.5 if self.dimension <= 20 else 1.0)
+        return max(1, math.ceil(self.radius / (wide * float(np.min(self.sigmas)))))
 
     @cached_property
     def _grid(self) -> tuple[Array, Array]:
         """Nodes and weights on [0, R] and on as many panels beyond as carry probability."""
-        points, weights = np.polynomial.legendre.leggauss(_POINTS)
+        points, weights = _legendre()
         width = self.radius / self._panels
         panels = np.arange(self._panels + math.ceil(self._beyond / width))
         nodes = ((points[None, :] + 1) / 2 + panels[:, None]).ravel() * width
         return nodes, np.tile(weights / 2 * width, len(panels))
+
+    @cached_property
+    def inflation(self) -> float:
+        """1 + twice a bound of the relative rounding of a kernel entry and of a sum of such entries.
+
+        With u = 2^-53: y and x are off by at most 6u of their size, so that (y - x)^2/2 is off by 12u times the
+        size times |y - x|, at most 39 where the entry does not underflow, and 4u of itself; log and exp are off by
+        ``LIBRARY_ULPS`` units of 2u each, the summands of the exponent and their sum by 8u of their sizes; x E'/E lies
+        between -n and 0.
+        """
+        far = (self.radius + self._beyond) * max(1.0, float(np.max(self.gains))) / float(np.min(self.sigmas))
+        n, nodes = self.dimension, len(self._grid[0])
+        summands = 760.0
+        if n > 1:
+            widest = math.log(far / float(self._grid[0][0]) * self.radius) + abs(math.log(far)) + 800
+            summands += (n - 1) * widest * (2 * LIBRARY_ULPS) / 8 + n * math.log(4 * n)
+            summands += float(np.max(np.abs(self._table[1])))
+        units = 12 * 39 * far + 8 * summands + 8 * n + 4 * LIBRARY_ULPS + 2 * nodes + 64
+        return 1 + 2 * UNIT * units
 
     @cached_property
     def _beyond(self) -> float:
@@ -127,12 +149,13 @@ class Recursion:
             log_e = np.interp(x * y, points, logs)
             constant = (n / 2 - 1) * math.log(2) + math.lgamma(n / 2)
             density = np.exp((n - 1) * np.log(y) - (y - x) ** 2 / 2 + log_e - constant)
-        return np.asarray(density * (weights / sigma * _INFLATION))
+        return np.asarray(density * (weights / sigma * self.inflation))
 
     def bound(self) -> float:
         """Upper bound of the probability of leaving the ball."""
         nodes, inside = self._grid[0], self.size
-        starts = nodes[:inside]
+        width = self.radius / self._panels
+        starts = nodes[:inside] + 8 * UNIT * (nodes[:inside] + width)  # not below the exact nodes
         v = np.zeros(inside)
         kernels: dict[tuple[float, float], tuple[Array, Array]] = {}
         first = (float(self.gains[0]), float(self.sigmas[0]))
@@ -141,11 +164,20 @@ class Recursion:
             if key not in kernels:
                 kernel = self._kernel(starts, *key)
                 error = self.quadrature_error(*key)
-                leave = kernel[:, inside:].sum(axis=1) * _INFLATION + (2 * error + self._lost)
+                leave = kernel[:, inside:].sum(axis=1) * self.inflation + (2 * error + self._lost + _TINY)
                 kernels[key] = np.ascontiguousarray(kernel[:, :inside]), leave
             kernel, leave = kernels[key]
             for _ in range(int(self.counts[k]) - (k == 0)):
-                v = np.minimum((kernel @ v) * _INFLATION + leave, 1.0)
+                v = np.minimum((kernel @ v) * self.inflation + leave, 1.0)
         last = self._kernel(np.zeros(1), *first)[0]
-        error = 2 * self.quadrature_error(*first) + self._lost
-        return min(1.0, float((last[:inside] @ v + last[inside:].sum()) * _INFLATION + error) * _INFLATION)
+        error = 2 * self.quadrature_error(*first) + self._lost + _TINY
+        return min(1.0, float((last[:inside] @ v + last[inside:].sum()) * self.inflation + error) * self.inflation)
+
+
+@cache
+def _legendre() -> tuple[Array, Array]:
+    """Gauss-Legendre nodes on [-1, 1] to the last place, and their weights rounded up."""
+    with precision():
+        roots = [arb.legendre_p_root(_POINTS, k, weight=True) for k in range(_POINTS)]
+    pairs = sorted((float(root.mid()), upper(weight)) for root, weight in roots)
+    return np.array([root for root, _ in pairs]), np.array([weight for _, weight in pairs])

@@ -36,7 +36,13 @@ __all__ = ["Supersolution"]
 Array = NDArray[np.float64]
 
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) * math.sqrt(3) / 6
-_ROUNDING = 128 * 2.0**-53  # more than the operations behind any term of a defect, coefficients included
+_ROUNDING = 128 * 2.0**-53
+"""Bound of the relative rounding of each term of a defect: a product of at most 40 rounded factors and sums.
+
+Nodes, states and the ends of slabs are exact as they stand, a slab's length is one rounded subtraction, and no
+function but + - * / enters: sizes carry the absolute values of all summands. 60 of the units are left for kappa and
+the durations, which come from at most 12 rounded operations, each of them within 4 units.
+"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -209,17 +215,28 @@ class Supersolution:
             extra, rate = self._payment(slab, lift)
             added, grown = added + extra * slab.size, grown + rate * slab.size
         start = _Bernstein.cubic(slabs[0].states[:1], np.diff(self.mesh))
-        if np.any(start.value - _ROUNDING * start.size < 0):
+        if np.any(start.value - _ROUNDING * start.size < 0) or not grown < 700:
             return 1.0
-        result = (float(slabs[-1].states[-1, 0]) + added) * math.exp(min(grown, 50.0)) * (1 + 1e-10)
+        # the sums over the slabs, and exp, in double precision
+        result = (float(slabs[-1].states[-1, 0]) + added) * math.exp(grown) * (1 + 1e-10)
         return min(1.0, result) if result == result else 1.0
+
+    @cached_property
+    def _rounding(self) -> Array:
+        """Relative rounding of the terms of a defect, per piece.
+
+        To that of the evaluation comes that of the pieces' ends, sums of durations: a piece that lasts (1 + eta)
+        times as long is one with (1 + eta) times the noise and drift.
+        """
+        durations = np.array([duration for duration, _ in self.pieces])
+        return _ROUNDING + 2.0**-52 * (len(durations) + 2) * self.horizon / durations
 
     def _payment(self, slab: _Slab, lift: float) -> tuple[float, float]:
         """(a, p) with H[u] - u_tau <= a + p u on the slab: then e^{int p} (u + int a) is a supersolution."""
         defect, value = self._defect(slab, lift)
         if not np.all(np.isfinite(defect)):
             return math.inf, 0.0
-        kept = defect > 0
+        kept = (defect > 0) | (value < 0)
         defect, value = defect[kept], value[kept]
         if not len(defect):
             return 0.0, 0.0
@@ -249,7 +266,7 @@ class Supersolution:
             total += lifted + outer * lift - flow.value
             size = abs(kappa) * drift.size + 2 * rho * bent.size + outer * flat.size
             size += np.abs(lifted) + outer * lift + flow.size
-            worst = np.maximum(worst, total + _ROUNDING * size)
+            worst = np.maximum(worst, total + self._rounding[slab.piece] * size)
         return worst, value.value
 
 
