@@ -66,7 +66,8 @@ def test_every_command_that_the_readme_shows_exists() -> None:
     from certbound.cli.app import app
 
     known = {command.name for command in app.registered_commands}
-    shown = [word for _, text in BLOCKS for word in re.findall(r"^certbound ([a-z]+)", text, flags=re.MULTILINE)]
+    pattern = re.compile(r"^(?:\$ )?certbound ([a-z]+)", flags=re.MULTILINE)
+    shown = [word for _, text in BLOCKS for word in pattern.findall(text)]
     assert shown
     assert set(shown) <= known
 

@@ -126,4 +126,6 @@ def _print(best: str, rows: list[dict[str, Any]], norm: str) -> None:
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return f"({len(value)})"
     return f"{value:.4g}" if isinstance(value, (int, float)) else str(value)
