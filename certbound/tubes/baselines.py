@@ -317,6 +317,7 @@ def _best_whole(function: Callable[[int], float], limit: int, least: int = 1) ->
         return known[k]
 
     k = least
+    value(k)  # one step a window is a formula of its own (Thm 5)
     while k < limit and (k < 4 * least or value(min(2 * k, limit)) <= value(k)):
         k = min(2 * k, limit)
     low, high = max(least, k // 4), min(limit, 2 * k)
