@@ -14,6 +14,7 @@ import numpy as np
 
 import certbound as cb
 from certbound.problem.trace import compile_numpy
+from certbound.synthesis.erosions import initial_center
 from experiments.harness import Arrays, Claims, main
 
 HORIZON = 20
@@ -54,7 +55,7 @@ def receding(masses: int, rounds: int) -> Claims:
 def convex(masses: int) -> Claims:
     """Steps of the convex path on the chain, whose dynamics are linearised along the last prediction."""
     chain = cb.load("chain", masses=masses)
-    planner, state = cb.ConvexPlanner(chain, horizon=HORIZON), np.asarray(chain.initial.center_at(0.0))
+    planner, state = cb.ConvexPlanner(chain, horizon=HORIZON), initial_center(chain.initial)
     times: list[float] = []
     for k in range(30):
         found, spent = timed(lambda start=state: planner.solve(start))  # type: ignore[misc]
