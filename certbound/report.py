@@ -25,6 +25,7 @@ from certbound.problem.distances import clearance
 from certbound.problem.sets import Ball, Outside
 
 if TYPE_CHECKING:
+    from certbound.reach.tube import ReachTube
     from certbound.safety.verification import Verdict
 
 __all__ = ["report_page"]
@@ -42,7 +43,9 @@ SENTENCES = {
 PACKAGES = ("numpy", "scipy", "casadi", "cvxpy", "clarabel", "python-flint", "numba", "plotly")
 
 
-def report_page(scene: Scene, verdict: Verdict, *, command: str = "", probability: str = "") -> str:
+def report_page(
+    scene: Scene, verdict: Verdict, *, command: str = "", probability: str = "", certificate: str = ""
+) -> str:
     """The page as one string.
 
     Parameters
@@ -55,6 +58,8 @@ def report_page(scene: Scene, verdict: Verdict, *, command: str = "", probabilit
         The command that gives the verdict again.
     probability : str
         The certified bound in words, such as ``3.7e-4``.
+    certificate : str
+        Text of the certificate that was written; the page shows its hash, as ``sha256sum`` prints it.
     """
     from plotly.offline import get_plotlyjs
 
@@ -66,7 +71,7 @@ def report_page(scene: Scene, verdict: Verdict, *, command: str = "", probabilit
         *(_figure_section(*figure) for figure in figures),
         _engine_section(verdict),
         _constants_section(verdict),
-        _origin_section(verdict, command),
+        _origin_section(command, certificate),
         f"</main><script>{SCRIPT}</script></body></html>\n",
     ]
     return "".join(parts)
@@ -136,12 +141,10 @@ def _constants_section(verdict: Verdict) -> str:
     return f"<section><h2>Constants</h2>{_table(None, rows)}</section>"
 
 
-def _origin_section(verdict: Verdict, command: str) -> str:
+def _origin_section(command: str, certificate: str) -> str:
     rows = [("certbound", __version__), ("Python", platform.python_version())]
     rows += [(name, importlib.metadata.version(name)) for name in PACKAGES]
-    certificate = verdict.certificate
-    text = json.dumps(certificate, sort_keys=True, default=str) if certificate is not None else ""
-    digest = hashlib.sha256(text.encode()).hexdigest() if text else "none was written"
+    digest = hashlib.sha256(certificate.encode()).hexdigest() if certificate else "none was written (--certificate)"
     again = f"<p>To get it again:</p><pre><code>{_text(command)}</code></pre>" if command else ""
     return (
         f"<section><h2>Where this comes from</h2>{again}<p>SHA-256 of the certificate: <code>{digest}</code></p>"
@@ -181,7 +184,11 @@ def _figures(scene: Scene) -> Iterable[tuple[str, str, list[Trace], Trace]]:
     plane = plane_of(scene.problem)
     if plane is not None:
         yield _plane_figure(scene, plane)
-    for panel in panels_of(scene.problem):
+    panels = panels_of(scene.problem)
+    margins = _margins_figure(scene, panels)
+    if margins is not None:
+        yield margins
+    for panel in panels:
         yield _panel_figure(scene, panel)
 
 
@@ -266,6 +273,36 @@ def _panel_figure(scene: Scene, panel: Panel) -> tuple[str, str, list[Trace], Tr
     least = f"Nominal between {nominal.min():.4g} and {nominal.max():.4g}"
     words = f"{least}; limit {', '.join(f'{limit:.4g}' for limit in limits)}."
     return f"{panel.label} over time", words, traces, {"xaxis": {"title": {"text": f"time ({unit})"}}}
+
+
+def _margins_figure(scene: Scene, panels: list[Panel]) -> tuple[str, str, list[Trace], Trace] | None:
+    """What the tube leaves of every constraint over time: certified, in the units of the constraint."""
+    traces: list[Trace] = []
+    smallest = []
+    tube = scene.tube
+    for panel in panels:
+        room = None if tube is None else _room(tube, panel)
+        if tube is None or room is None:
+            continue
+        x, y = stairs(tube, room)
+        start, end = panel.during or (0.0, float(scene.problem.horizon))
+        asked = (x >= start) & (x <= end)
+        if np.any(asked):
+            name = panel.label if len(panel.label) < 30 else f"{panel.label[:27]}..."
+            traces.append({"x": _list(x[asked]), "y": _list(y[asked]), "name": name, "mode": "lines"})
+            smallest.append(f"{panel.label}: at least {np.min(y[asked]):.4g}")
+    if not traces:
+        return None
+    unit = "s" if scene.problem.system.time == "continuous" else "steps"
+    words = f"Room that the tube with noise leaves. {'; '.join(smallest)}."
+    return "Margin over time", words, traces, {"xaxis": {"title": {"text": f"time ({unit})"}}}
+
+
+def _room(tube: ReachTube, panel: Panel) -> Array | None:
+    if panel.direction is None:
+        return least_distance(tube, panel.constraint)
+    above = panel.high - supports(tube, panel.direction)
+    return np.minimum(above, -panel.low - supports(tube, -panel.direction))
 
 
 def _line(color: str, width: float) -> Trace:

@@ -162,8 +162,7 @@ def _engines(verdict: Verdict) -> list[dict[str, Any]]:
 def _write(
     problem: Problem, verdict: Verdict, *, certificate: Path | None, report: Path | None, plot: Path | None
 ) -> None:
-    if certificate is not None:
-        _certify(problem, verdict, certificate)
+    proof = "" if certificate is None else _certify(problem, verdict, certificate)
     if plot is None and report is None:
         return
     if verdict.reach is None:
@@ -183,11 +182,11 @@ def _write(
         with spinner("writing the report"):
             command = shlex.join(["certbound", *(word for word in sys.argv[1:])])
             probability = log10_text(verdict.log10_delta)
-            write_file(report, report_page(scene, verdict, command=command, probability=probability))
+            write_file(report, report_page(scene, verdict, command=command, probability=probability, certificate=proof))
 
 
-def _certify(problem: Problem, verdict: Verdict, path: Path) -> None:
-    """Write a certificate that the checker has proved; a verdict without one says why on standard error."""
+def _certify(problem: Problem, verdict: Verdict, path: Path) -> str:
+    """Write a certificate that the checker has proved, and return it; a verdict without one says why, on stderr."""
     try:
         with spinner("writing and checking the certificate"):
             text = proved_certificate(problem, verdict)
@@ -195,8 +194,9 @@ def _certify(problem: Problem, verdict: Verdict, path: Path) -> None:
         if verdict.status == "SAFE":
             raise
         sys.stderr.write(f"certbound: no certificate was written: {error}\n")
-        return
+        return ""
     write_file(path, text)
+    return text
 
 
 def _scene(problem: Problem, verdict: Verdict, reach: ReachTube) -> Scene:

@@ -71,6 +71,8 @@ def test_the_page_is_well_formed_and_asks_the_network_for_nothing(page: str) -> 
     assert outline.open == []
     assert outline.references == ["#verdict"]
     assert "verdict" in outline.ids
+    assert page.count('<div class="wide" tabindex="0"><table>') == page.count("<table>") > 2  # scrolled by keyboard
+    assert page.count('role="img" aria-label="') == page.count("<figure>")
     assert len(outline.ids) == len(set(outline.ids))
 
 
@@ -91,8 +93,28 @@ def test_the_page_says_the_verdict_in_words(page: str) -> None:
 
 
 def test_every_constraint_and_the_plane_have_a_picture(page: str) -> None:
-    assert len(re.findall(r"Plotly\.newPlot\('plot-", page)) == 4
-    assert page.count("<figcaption>") == 4
+    assert len(re.findall(r"Plotly\.newPlot\('plot-", page)) == 5
+    assert page.count("<figcaption>") == 5
+
+
+def test_the_margins_are_what_the_tube_leaves(case: tuple[Scene, Verdict], page: str) -> None:
+    """The least margin in the figure agrees with the tube's distance to the constraint."""
+    scene, _ = case
+    found = re.search(r"<figcaption>Room that the tube with noise leaves\. (.*?)</figcaption>", page)
+    assert found is not None
+    numbers = [float(text) for text in re.findall(r"at least ([-+.e\d]+?)(?=[;.](?: |$))", html.unescape(found[1]))]
+    assert scene.tube is not None
+    distances = [scene.tube.distance_to(constraint) for constraint in scene.problem.safe]
+    assert min(numbers) == pytest.approx(min(distances), rel=0.05)
+    assert len(numbers) == 3
+
+
+def test_the_hash_is_that_of_the_certificate(case: tuple[Scene, Verdict], page: str) -> None:
+    import hashlib
+
+    assert "none was written" in page
+    text = "some certificate\n"
+    assert hashlib.sha256(text.encode()).hexdigest() in report_page(*case, certificate=text)
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
@@ -124,7 +146,7 @@ def test_the_pictures_are_drawn_in_a_browser(page: str, width: int, tmp_path: Pa
     found = json.loads(html.unescape(re.search(r'<pre id="found">(.*?)</pre>', dom, re.DOTALL)[1]))  # type: ignore[index]
     assert found["errors"] == []
     assert found["wide"] <= width
-    assert len(found["widths"]) == 4
+    assert len(found["widths"]) == 5
     for outer, inner, traces in found["widths"]:
         assert 0 < inner <= outer
-        assert traces >= 3
+        assert traces >= 2
