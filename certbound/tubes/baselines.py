@@ -266,7 +266,8 @@ class _Builder:
         """Objective of the window sums, as a function of the step."""
         data, weights = self.objective.pieces(self.schedule)
         with np.errstate(over="ignore", invalid="ignore"):
-            scale = window_scale(data, step, weights) * math.sqrt(self.size(self._events(step)))
+            scale = window_scale(data, step, weights, final=self.objective.kind == "final")
+            scale *= math.sqrt(self.size(self._events(step)))
         return scale if scale == scale else math.inf
 
 

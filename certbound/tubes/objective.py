@@ -106,11 +106,9 @@ class Objective:
             return root(cut)[1:], self.clearance.at(cut.times[1:], side=side)
 
     def pieces(self, schedule: Schedule) -> tuple[Schedule, Any]:
-        """Schedule cut for the clearance, and the clearance as a function of piece starts (None for the mean)."""
-        if self.kind == "mean":
+        """Schedule cut for the clearance, and the clearance as a function of piece starts (None without one)."""
+        if self.kind in ("mean", "final"):
             return schedule, None
-        if self.kind == "final":
-            return schedule, lambda grid: np.where(np.arange(len(grid.lengths)) == len(grid.lengths) - 1, 1.0, np.inf)
         if self.clearance is None:
             return schedule, lambda grid: np.ones(len(grid.lengths))
         held = self.clearance

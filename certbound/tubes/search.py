@@ -84,8 +84,14 @@ class Search:
         return self.schedule.nu / 2
 
     @cached_property
+    def _norm(self) -> float:
+        """Least clearance in the schedule's unit: scales are measured by it, lest their squares overflow."""
+        least = float(np.min(self.weights))
+        return least / self.schedule.unit if least < math.inf else 1.0
+
+    @cached_property
     def _squares(self) -> Array:
-        return (self.weights / self.schedule.unit) ** 2
+        return (self.weights / self.schedule.unit / self._norm) ** 2
 
     def solve(self) -> tuple[float, float, float]:
         """(a, v_0, objective): the objective is a radius, a scale, or log P."""
@@ -144,6 +150,7 @@ class Search:
 
     def log_probability(self, a: float, v0: float, scale: float) -> float:
         """Logarithm of Thm K2's bound for the clearance ``scale`` times ``weights``."""
+        scale *= self._norm
         if len(self._pieces) <= _FEW:
             return self._short(a, v0, scale)
         v, info = self.schedule.path(np.asarray(v0), bessel=self.bessel)
@@ -206,6 +213,8 @@ class Search:
         if not math.isfinite(log_x):
             return math.inf
         chosen = np.arange(len(v)) if self.kind == "mean" else self._active(v)
+        if not len(chosen):
+            return math.inf
         target = log_target(a, info[chosen], log_x, self.log_delta)
         with np.errstate(over="ignore", invalid="ignore"):
             if len(chosen) == 1:
@@ -215,7 +224,7 @@ class Search:
             size = np.sqrt(2 * v[chosen] * z)
             if self.kind == "mean":
                 return self._mean(size * self.schedule.unit)
-            return float(np.max(size / np.sqrt(self._squares[chosen])))
+            return float(np.max(size / np.sqrt(self._squares[chosen]))) / self._norm
 
     def _mean(self, radius: Array) -> float:
         times = self.schedule.times
@@ -249,7 +258,8 @@ class Search:
     def _typical(self) -> float:
         """A scale of the right size: Gaussian tail at the node of the largest variance."""
         variance = np.where(np.isfinite(self.schedule.nodes[1]), self.schedule.nodes[1], 0.0)
-        size = np.sqrt(variance[-1] if self.kind == "final" else np.nanmax(variance / self._squares))
+        roots = np.sqrt(variance) * (self.schedule.unit / self.weights)
+        size = roots[-1] if self.kind == "final" else np.max(roots)
         tail = max(1e-3, -self.log_delta)
         return float(size * math.sqrt(2 * self.half + 2 * math.sqrt(2 * self.half * tail) + 2 * tail))
 

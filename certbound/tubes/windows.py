@@ -155,7 +155,9 @@ class WindowProfile:
         return (held.growth * (2 * rate * (arb(t) - arb(float(data.times[piece])))).exp()).sqrt() * held.whole
 
 
-def window_scale(schedule: Schedule, step: float, clearance: Callable[[Schedule], Array] | None) -> float:
+def window_scale(
+    schedule: Schedule, step: float, clearance: Callable[[Schedule], Array] | None, *, final: bool = False
+) -> float:
     """max_t r_t/(clearance_t sqrt(B)) in floating point, over the ends of the pieces; the mean without weights."""
     starts = _starts(schedule.horizon, step)
     grid = schedule.refined(starts)
@@ -171,6 +173,8 @@ def window_scale(schedule: Schedule, step: float, clearance: Callable[[Schedule]
     whole = np.sqrt(variance[k]) + np.sqrt(np.maximum(inside, 0.0))
     left, right = np.exp((drift[:-1] - base) / 2) * whole[owner], np.exp((drift[1:] - base) / 2) * whole[owner]
     unit = grid.unit
+    if final:
+        return float(unit * right[-1])
     if clearance is None:
         return float(unit * np.sum((left + right) / 2 * grid.lengths) / grid.horizon)
     weights = clearance(grid)

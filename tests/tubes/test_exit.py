@@ -1,0 +1,151 @@
+"""The probability of given clearances: the formula of Thm K2 in floats, the union bound, and what lies far out."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import gamma, hyp1f1, iv
+
+from certbound.tubes.constants import Constants
+from certbound.tubes.exit import exit_level, union_level
+from certbound.tubes.kummer import Start, kummer_tube
+from certbound.tubes.objective import read_clearance
+from certbound.tubes.radial import estimate_exit_probability
+from certbound.tubes.schedule import make_schedule
+from certbound.tubes.tuning import bound_exit_probability, tune_tube
+
+OU = Constants(rate=-0.5, sigma=0.1**0.5, dimension=1)
+CHAIN = Constants(gain=0.6, sigma=1.0, dimension=2)
+
+
+def level(constants, horizon, clearance, **options):
+    schedule, held = make_schedule(constants, horizon), read_clearance(clearance, horizon)
+    return exit_level(schedule.refined(held.ends(schedule)), held, **options)
+
+
+def test_the_level_is_the_formula_of_the_theorem_on_a_dense_grid_of_times():
+    # sigma = .1^.5: unit^2 = .1; v' = -v + 1 in units; I by quadrature
+    a, v0, horizon = 0.7, 0.2, 5.0
+
+    def v(t):
+        return v0 * math.exp(-t) + 1 - math.exp(-t)
+
+    def info(t):
+        return quad(lambda s: 1 / v(s), t, horizon)[0]
+
+    t = np.linspace(0, horizon, 400)
+    radius = np.where(t < 2.0, 0.9, 1.4)
+    gain = [math.exp(a * info(s)) * hyp1f1(a, 0.5, r * r / 0.1 / (2 * v(s))) for s, r in zip(t, radius)]
+    expected = math.log10(math.expm1(a * info(0)) / (min(gain) - 1))
+    got = level(OU, horizon, ((0.0, 2.0, 5.0), (0.9, 1.4)), a=a, v0=v0)
+    assert expected - 1e-3 < got < expected + 0.02
+
+
+def test_a_tube_at_delta_leaves_at_most_about_delta_as_clearance():
+    for constants, horizon in ((OU, 5.0), (CHAIN, 20)):
+        tube = tune_tube(constants, horizon=horizon, delta=1e-4, method="kummer")
+        a, v0 = tube.parameters["a"], tube.parameters["v0"] / make_schedule(constants, horizon).unit ** 2
+        assert level(constants, horizon, tube.maximum, a=a, v0=v0) <= -4 + 0.01
+        assert bound_exit_probability(constants, horizon=horizon, clearance=tube.maximum) <= -4 + 0.01
+
+
+@pytest.mark.parametrize("radius", [0.9, 1.2, 1.6])
+def test_the_bound_is_above_the_probability_itself_and_near_it(radius):
+    truth = math.log10(estimate_exit_probability(OU, horizon=5.0, radius=radius))
+    assert truth < bound_exit_probability(OU, horizon=5.0, clearance=radius) < truth + 0.5
+
+
+def one_time_tail(dimension, x):
+    """inf over k of (e^k - 1)/(0F1(; n/2; k x) - 1) by a dense grid, 0F1 from the Bessel function."""
+    k = np.geomspace(0.05, 100, 4000)
+    order, root = dimension / 2 - 1, 2 * np.sqrt(k * x)
+    phi = gamma(dimension / 2) * (root / 2) ** -order * iv(order, root)
+    return float(np.min(np.expm1(k) / (phi - 1)))
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 5])
+def test_the_union_bound_adds_the_one_time_tails_of_the_steps(dimension):
+    constants = Constants(gain=0.6, sigma=1.0, dimension=dimension)
+    schedule, radii = make_schedule(constants, 4), (4.0, 5.0, 4.5, 6.0, 5.5)
+    held = read_clearance(((0, 1, 2, 3, 4, 5), radii), 4)
+    variance = np.cumsum(0.6 ** (2 * np.arange(4)))
+    # at the horizon itself the last piece's clearance counts
+    expected = sum(one_time_tail(dimension, r * r / (2 * v)) for r, v in zip((5.0, 4.5, 6.0, 6.0), variance))
+    got = union_level(schedule.refined(held.ends(schedule)), held)
+    assert math.log10(expected) - 1e-3 < got < math.log10(expected) + 0.01
+
+
+def test_the_union_bound_claims_nothing_where_it_is_not_proved():
+    held = read_clearance(3.0, 5)
+    rough = Constants(gain=0.5, sigma=1.0, dimension=3, effective_dimension=1.2)
+    assert union_level(make_schedule(rough, 5), held) == 0.0
+    assert union_level(make_schedule(OU, 5.0), held) == 0.0
+    # there bound_exit_probability takes the full dimension for it
+    assert bound_exit_probability(rough, horizon=5, clearance=9.0) < -6
+
+
+def test_weak_gains_profit_from_the_union_bound():
+    constants = Constants(gain=1e-3, sigma=1.0, dimension=1)
+    tube = tune_tube(constants, horizon=10, delta=1e-3)
+    assert tube.method == "prop3_sharp"
+    assert bound_exit_probability(constants, horizon=10, clearance=tube.maximum) < -3 + 0.01
+
+
+def test_in_discrete_time_a_piece_counts_at_its_own_whole_steps_only():
+    base = bound_exit_probability(CHAIN, horizon=6, clearance=9.0)
+    hollow = ((0, 2.2, 2.8, 6), (9.0, 0.01, 9.0))  # no whole step in [2.2, 2.8)
+    assert base - 0.3 < bound_exit_probability(CHAIN, horizon=6, clearance=hollow) < base + 0.05
+    assert bound_exit_probability(CHAIN, horizon=6, clearance=((0, 2, 2.8, 6), (9.0, 0.01, 9.0))) > -0.01
+
+
+def test_a_short_narrow_piece_counts_in_continuous_time():
+    wide = bound_exit_probability(OU, horizon=5.0, clearance=2.0)
+    narrow = bound_exit_probability(OU, horizon=5.0, clearance=((0, 2.2, 2.2001, 5), (2.0, 0.9, 2.0)))
+    assert narrow > wide / 2
+    truth = math.log10(math.erfc(0.9 / math.sqrt(2 * 0.1 * (1 - math.exp(-2.2)))))
+    assert narrow > truth  # P(|S_t| > .9) at that time alone
+
+
+@pytest.mark.parametrize("factor", [30.0, 1e3, 1e6, 1e12, 1e100])
+def test_far_clearances_are_answered_quickly_and_fall_to_the_floor(factor):
+    for constants in (OU, CHAIN, Constants(rate=0.3, sigma=1.0, dimension=6)):
+        begin = time.perf_counter()
+        got = bound_exit_probability(constants, horizon=4, clearance=factor)
+        assert time.perf_counter() - begin < 2.0
+        variance = make_schedule(constants, 4).nodes[1][-1] * make_schedule(constants, 4).unit ** 2
+        gaussian = factor**2 / (2 * float(variance) * math.log(10))
+        assert -1e12 <= got <= max(-1e12, -0.6 * gaussian)
+
+
+def test_levels_fall_with_the_clearance_without_a_gap():
+    levels = [bound_exit_probability(OU, horizon=5.0, clearance=float(r)) for r in np.geomspace(0.5, 1e4, 13)]
+    assert np.all(np.diff(levels) <= 1e-9)
+
+
+def test_a_start_in_the_middle_of_the_clearance_costs():
+    base = bound_exit_probability(OU, horizon=5.0, clearance=1.5)
+    offset = bound_exit_probability(OU, horizon=5.0, clearance=1.5, start=Start(offset=0.3))
+    assert base < offset < 0
+    tube = kummer_tube(OU, horizon=5.0, delta=1e-3, a=0.3, v0=0.1, start=Start(offset=0.3))
+    assert level(OU, 5.0, tube.maximum, a=0.3, v0=1.0, start=Start(offset=0.3)) <= -3 + 0.01
+
+
+@pytest.mark.parametrize(
+    ("clearance", "message"),
+    [
+        (0.0, "`clearance` must be positive everywhere"),
+        (-1.0, "`clearance` must be positive everywhere"),
+        (math.nan, "`clearance` must be positive everywhere"),
+        (lambda t: 1.0, "got a callable"),
+        (np.ones(3), r"a number or a pair \(times, values\), got shape \(3,\)"),
+        ((0.0, 1.0, 2.0), "got 3 entries"),
+        (((0.0, 2.0, 1.0, 5.0), (1.0, 1.0, 1.0)), "must rise strictly"),
+    ],
+)
+def test_clearances_that_make_no_sense_are_refused(clearance, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        bound_exit_probability(OU, horizon=5.0, clearance=clearance)
