@@ -135,9 +135,7 @@ def certify(
     return _record(model, norm, noise, np.array(found.upper), found.sampled, found.boxes, status, None)
 
 
-def _supremum(
-    model: Model, jacobian: StateJacobian, norm: Metric, tolerance: float, budget: int
-) -> Supremum:
+def _supremum(model: Model, jacobian: StateJacobian, norm: Metric, tolerance: float, budget: int) -> Supremum:
     quantity = norm.measure if model.continuous else norm.norm
     sampled = norm.sample_measure if model.continuous else norm.sample_norm
 
@@ -179,7 +177,9 @@ def _supremum(
     ceiling = _structural_bound(model, jacobian, norm) if close or many else np.inf
     if close:  # where the parameters vary independently, the affine set leaves no gap at all
         return search(budget=1, ceiling=ceiling) if ceiling < found.upper else found
-    return found if np.isinf(found.upper) and np.isinf(ceiling) else search(budget=budget, ceiling=ceiling)
+    if np.isinf(found.upper) and np.isinf(ceiling):
+        return found
+    return search(budget=budget, ceiling=ceiling, earlier=found)
 
 
 def _structural_bound(model: Model, jacobian: StateJacobian, norm: Metric) -> float:
@@ -253,9 +253,7 @@ def _record(
         gaussian=noise.gaussian,
         times=times,
     )
-    proof = Proof(
-        sampled=sampled, boxes=boxes, status=status, domain=model.domain_text, fingerprint=found.fingerprint
-    )
+    proof = Proof(sampled=sampled, boxes=boxes, status=status, domain=model.domain_text, fingerprint=found.fingerprint)
     return replace(found, proof=proof)
 
 
@@ -316,9 +314,7 @@ def constants_along(
     return _record(model, norm, noise, values, largest, count, "given metric", ends)
 
 
-def _piecewise(
-    model: Model, jacobian: StateJacobian, norm: Metric, boxes: Interval, refine: int
-) -> tuple[Array, int]:
+def _piecewise(model: Model, jacobian: StateJacobian, norm: Metric, boxes: Interval, refine: int) -> tuple[Array, int]:
     quantity = norm.measure if model.continuous else norm.norm
     owner = np.arange(len(boxes))
     parts = boxes
@@ -336,5 +332,3 @@ def _piecewise(
     values = np.full(len(boxes), -np.inf)
     np.maximum.at(values, owner, direct)
     return values, len(parts)
-
-

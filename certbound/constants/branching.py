@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 ROUND = 2048
 """Boxes split at a time."""
+FEWEST = 64
+"""Parts that a round ends with at least: a batch of so many costs hardly more than a batch of two."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,6 +36,10 @@ class Supremum:
         Boxes evaluated.
     worst : Interval, shape (k,)
         A box on which the upper bound is attained, to explain it.
+    settled : float
+        Bound over all boxes that need no further splitting.
+    rest : Interval, shape (N, k)
+        Boxes that could be split further, to go on from.
     """
 
     upper: float
@@ -41,6 +47,8 @@ class Supremum:
     point: Array
     boxes: int
     worst: Interval
+    settled: float
+    rest: Interval
 
 
 def bound_supremum(
@@ -52,6 +60,7 @@ def bound_supremum(
     budget: int = 60_000,
     ceiling: float = np.inf,
     starts: Interval | None = None,
+    earlier: Supremum | None = None,
 ) -> Supremum:
     """Bound sup value over a box, best boxes first.
 
@@ -75,18 +84,24 @@ def bound_supremum(
         An upper bound known beforehand.
     starts : Interval, shape (N, k), optional
         Boxes that together hold the supremum; the box itself when omitted.
+    earlier : Supremum, optional
+        A search of the same supremum that ran out of its budget, to go on from.
     """
     if not tolerance > 0:
         raise ValueError(f"`tolerance` must be positive, got {tolerance}.")
     rng = np.random.default_rng(0)
-    boxes = box.reshape(1, -1) if starts is None else starts
-    point = _centres(boxes)[0]
-    sampled, point = _sample(value, [_centres(boxes), random_points(rng, box, 2048)], -np.inf, point)
-    sampled, point = _climb(value, rng, box, sampled, point)
-    uppers, weights = bound(boxes, -np.inf)
+    retired, retired_box, count, rounds_unbounded = -np.inf, box, 0, 0
+    if earlier is None:
+        boxes = box.reshape(1, -1) if starts is None else starts
+        sampled, point = -np.inf, _centres(boxes)[0]
+        sampled, point = _sample(value, [_centres(boxes), random_points(rng, box, 2048)], sampled, point)
+        sampled, point = _climb(value, rng, box, sampled, point)
+    else:
+        boxes, sampled, point = earlier.rest, earlier.sampled, earlier.point
+        retired, retired_box, count = min(earlier.settled, ceiling), earlier.worst, earlier.boxes
+    uppers, weights = bound(boxes, -np.inf) if len(boxes) else (np.empty(0), np.empty((0, len(box))))
     uppers = np.minimum(uppers, ceiling)
-    retired, retired_box = -np.inf, box
-    count, rounds_unbounded = len(boxes), 0
+    count += len(boxes)
     while len(boxes):
         done = uppers <= sampled + tolerance
         done |= ~np.any(boxes.lo < boxes.hi, axis=1)
@@ -102,24 +117,22 @@ def bound_supremum(
             break
         order = np.argsort(-uppers, kind="stable")
         chosen, rest = order[:ROUND], order[ROUND:]
-        children = split_boxes(boxes[chosen], weights[chosen])
+        children, above = _parts(boxes[chosen], weights[chosen], uppers[chosen])
         new_uppers, new_weights = bound(children, sampled + tolerance)
-        new_uppers = np.minimum(new_uppers, np.concatenate([uppers[chosen]] * 2))
+        new_uppers = np.minimum(new_uppers, above)
         count += len(children)
         best = np.argsort(-new_uppers, kind="stable")[:256]
         points = [_centres(children[best]), _inside(rng, children[best])]
         sampled, point = _sample(value, points, sampled, point)
-        boxes = Interval(
-            np.concatenate([boxes.lo[rest], children.lo]), np.concatenate([boxes.hi[rest], children.hi])
-        )
+        boxes = Interval(np.concatenate([boxes.lo[rest], children.lo]), np.concatenate([boxes.hi[rest], children.hi]))
         uppers = np.concatenate([uppers[rest], new_uppers])
         weights = np.concatenate([weights[rest], new_weights])
     sampled, point = _climb(value, rng, box, sampled, point)
-    worst = retired_box
+    worst, settled = retired_box, retired
     if len(boxes) and uppers.max() > retired:
         first = int(np.argmax(uppers))
         retired, worst = float(uppers[first]), boxes[first]
-    return Supremum(upper=retired, sampled=sampled, point=point, boxes=count, worst=worst)
+    return Supremum(upper=retired, sampled=sampled, point=point, boxes=count, worst=worst, settled=settled, rest=boxes)
 
 
 def _centres(boxes: Interval) -> Array:
@@ -133,10 +146,27 @@ def _centres(boxes: Interval) -> Array:
     return np.clip(result, np.maximum(lo, -1e300), np.minimum(hi, 1e300))
 
 
+def _parts(boxes: Interval, weights: Array, uppers: Array) -> tuple[Interval, Array]:
+    """Halves of all boxes, halved again while they are few and bounded; and the bounds of what they come from."""
+    while True:
+        side = _heaviest(boxes, weights)
+        boxes, uppers = split_boxes(boxes, weights), np.concatenate([uppers, uppers])
+        if len(boxes) >= FEWEST or not np.isfinite(uppers).all() or not np.isfinite(boxes.hi - boxes.lo).all():
+            return boxes, uppers
+        weights = weights.copy()
+        weights[np.arange(len(weights)), side] /= 2
+        weights = np.concatenate([weights, weights])
+
+
+def _heaviest(boxes: Interval, weights: Array) -> NDArray[np.intp]:
+    wide = boxes.lo < boxes.hi
+    side: NDArray[np.intp] = np.argmax(np.where(wide, np.where(np.isnan(weights), np.inf, weights), -1.0), axis=1)
+    return side
+
+
 def split_boxes(boxes: Interval, weights: Array) -> Interval:
     """Halve each box along its heaviest side of positive width; first halves first."""
-    wide = boxes.lo < boxes.hi
-    side = np.argmax(np.where(wide, np.where(np.isnan(weights), np.inf, weights), -1.0), axis=1)
+    side = _heaviest(boxes, weights)
     rows = np.arange(len(boxes))
     cut = _centres(boxes)[rows, side]
     lo, hi = np.array(boxes.lo), np.array(boxes.hi)
@@ -184,9 +214,7 @@ def _climb(
     return sampled, point
 
 
-def _sample(
-    value: Callable[[Array], Array], groups: list[Array], sampled: float, point: Array
-) -> tuple[float, Array]:
+def _sample(value: Callable[[Array], Array], groups: list[Array], sampled: float, point: Array) -> tuple[float, Array]:
     points = np.concatenate(groups)
     with np.errstate(all="ignore"):
         found = value(points)

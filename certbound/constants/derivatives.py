@@ -119,9 +119,7 @@ class StateJacobian:
             return "no single entry"
         row, column = int(rows[0]), int(columns[0])
         states = [names[slot] for slot in self.columns]
-        where = ", ".join(
-            f"{names[slot]} in [{lo:.6g}, {hi:.6g}]" for slot, lo, hi in zip(self.active, box.lo, box.hi)
-        )
+        where = ", ".join(f"{names[slot]} in [{lo:.6g}, {hi:.6g}]" for slot, lo, hi in zip(self.active, box.lo, box.hi))
         entry = self.tape.describe(self.tape.outputs[row * self.dimension + column])
         return f"entry d f_{states[row]} / d {states[column]} = {entry} on {where}"
 
@@ -162,8 +160,6 @@ def _dependencies(tape: Tape) -> tuple[int, ...]:
         else:
             needed.update(node.args)
     return tuple(sorted(slots))
-
-
 
 
 def _folded(tape: Tape, ranges: Interval, active: Sequence[int]) -> Interval:

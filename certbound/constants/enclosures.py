@@ -32,9 +32,7 @@ class Refusal(NamedTuple):
     mask: Mask
 
 
-def enclose(
-    tape: Tape, inputs: Sequence[Interval], *, undefined: Literal["raise", "infinite"] = "raise"
-) -> Interval:
+def enclose(tape: Tape, inputs: Sequence[Interval], *, undefined: Literal["raise", "infinite"] = "raise") -> Interval:
     """Enclose the range of a traced function over boxes.
 
     Proves: the result contains f(z) for every z with z_i in inputs[i], member by member of the batch.
@@ -143,9 +141,7 @@ def _apply(node: Node, args: Sequence[Interval]) -> Interval:
     return ARITHMETIC[node.op](*args)
 
 
-def _jumps(
-    node: Node, args: Sequence[Interval], value: Interval, index: int, refusals: list[Refusal]
-) -> bool:
+def _jumps(node: Node, args: Sequence[Interval], value: Interval, index: int, refusals: list[Refusal]) -> bool:
     """Whether the node can jump; undecided members are added to the refusals."""
     if node.op not in JUMPS and node.op != "atan2":
         return False

@@ -186,7 +186,7 @@ def test_undefined_and_jumping_models_are_refused_by_name(f, expression):
 
 def test_constants_along_a_tube_follow_the_pieces():
     system = cb.ContinuousSystem(
-        lambda t, x: [-x[0] ** 3 - t * x[0], -x[1]], states=2, diffusion=lambda x: [[0.1 * x[0], 0], [0, 0.05]]
+        lambda t, x: [-(x[0] ** 3) - t * x[0], -x[1]], states=2, diffusion=lambda x: [[0.1 * x[0], 0], [0, 0.05]]
     )
     boxes = Interval([[1.0, 0.0], [2.0, 0.0]], [[2.0, 1.0], [3.0, 1.0]])
     k = constants_along(system, [0.0, 1.0, 2.0], boxes)

@@ -98,3 +98,26 @@ def test_halves_cover_the_box_and_random_points_stay_inside():
 def test_a_tolerance_must_be_positive():
     with pytest.raises(ValueError, match="`tolerance` must be positive"):
         bound_supremum(bound, value, Interval([0.0, 0.0], [1.0, 1.0]), tolerance=0.0)
+
+
+def hump(boxes: Interval, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+    x, y = boxes[:, 0], boxes[:, 1]
+    return (x * (1.0 - x) - x * y + y * (1.0 - y)).hi, boxes.width
+
+
+def height(points: np.ndarray) -> np.ndarray:
+    x, y = points.T
+    return x * (1 - x) - x * y + y * (1 - y)
+
+
+def test_a_search_that_ran_out_of_its_budget_goes_on_where_it_stopped():
+    box = Interval([-1.0, -1.0], [2.0, 2.0])  # largest at (1/3, 1/3): 1/3
+    first = bound_supremum(hump, height, box, tolerance=1e-3, budget=200)
+    assert first.upper > 1 / 3 + 0.1
+    assert max(first.settled, hump(first.rest, -np.inf)[0].max()) == first.upper
+    again = bound_supremum(hump, height, box, tolerance=1e-3, earlier=first)
+    assert first.sampled <= again.sampled <= 1 / 3 + 1e-15
+    assert 1 / 3 <= again.upper <= again.sampled + 1e-3
+    assert again.boxes > first.boxes
+    capped = bound_supremum(hump, height, box, tolerance=1e-3, budget=1, earlier=first, ceiling=0.34)
+    assert capped.upper == 0.34

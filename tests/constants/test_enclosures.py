@@ -107,7 +107,7 @@ def test_kinks_get_their_generalised_derivative():
 
 
 def test_infinite_boxes_are_legal():
-    tape = jacobian(trace(lambda x: [np.tanh(x[0]), -x[0] ** 3], {"x": ["a"]}))
+    tape = jacobian(trace(lambda x: [np.tanh(x[0]), -(x[0] ** 3)], {"x": ["a"]}))
     result = enclose(tape, [Interval([-np.inf], [np.inf])])
     assert result.contains(np.array([[[0.0], [0.0]]])).all()
     assert result.hi[0, 0, 0] < 1 + 1e-15
