@@ -48,7 +48,7 @@ TerminalOption = Annotated[
 ]
 FeedbackOption = Annotated[
     str | None,
-    typer.Option("--feedback", metavar="KIND", help="Ancillary feedback: riccati or lmi.", show_default=False),
+    typer.Option("--feedback", metavar="KIND", help="Ancillary feedback: riccati, lmi or [[K]].", show_default=False),
 ]
 StepsOption = Annotated[
     int | None,
@@ -102,6 +102,7 @@ def synthesize(
         raise InputError(f"`--closed-loop` must be at least 1, got {closed_loop}", "give a number of runs, like 3000")
     if seed is not None and seed < 0:
         raise InputError(f"`--seed` must not be negative, got {seed}", "give a whole number such as 1")
+    gain = _gain(feedback)
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
     import numpy as np
 
@@ -110,7 +111,7 @@ def synthesize(
 
     with _told() as tell:
         result = synthesize_plan(
-            subject, tube=tube, epsilon=epsilon, terminal=terminal, feedback=feedback, steps=steps,
+            subject, tube=tube, epsilon=epsilon, terminal=terminal, feedback=gain, steps=steps,
             find_delta=smallest_delta, progress=tell,
         )  # fmt: skip
         runs = None
@@ -127,6 +128,16 @@ def synthesize(
     else:
         _print(result, answer)
     raise typer.Exit(0 if result.feasible and result.status == "SAFE" else 1)
+
+
+def _gain(text: str | None) -> Any:
+    """A name as it is; rows of numbers in brackets as a matrix."""
+    if text is None or not text.lstrip().startswith("["):
+        return text
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"`--feedback` is not a matrix: {error}", "write its rows, like [[-4, -3]]") from error
 
 
 def plan_text(result: Synthesis) -> str:

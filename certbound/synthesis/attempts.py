@@ -51,8 +51,9 @@ class Attempts:
         self.planner, self.given, self.parameters, self.stated = planner, given, parameters, constants
         self.find_delta, self.tell = find_delta, tell
         self.delta = float(planner.problem.delta)
+        self.refused: dict[str, tuple[Constants | None, Solution]] = {}
 
-    def attempt(self, name: str, first: Solution, *, last: bool) -> Synthesis | None:
+    def attempt(self, name: str, first: Solution) -> Synthesis | None:
         """The best plan for one tube; None where the linear response cannot be computed."""
         self.tell(f"tube {name}: looking for the plan with the most room")
         if name == "linear":
@@ -68,7 +69,7 @@ class Attempts:
             verdict = self._verified(name, constants, widest, tightened)
             if verdict is not None and verdict.status == "SAFE":  # delta need not be split as the tightening does
                 return self._result(name, constants, widest, tightened, widest.scale, verdict, feasible=True)
-            return self._refused(name, constants, widest, tightened, explain=last)
+            return self._refused(name, constants, widest, tightened)
         solution, used, verdict = found
         delta = self._smallest(name, constants, widest) if self.find_delta else None
         result = self._result(name, constants, solution, used, widest.scale, verdict, feasible=True)
@@ -232,22 +233,27 @@ class Attempts:
     # ---- answers -----------------------------------------------------------------------------------------
 
     def _refused(
-        self, name: str, constants: Constants | None, widest: Solution, tightened: Tightened, *, explain: bool
+        self, name: str, constants: Constants | None, widest: Solution, tightened: Tightened
     ) -> Synthesis:
-        """The soft plan, with the reason why there is no better one."""
+        """The soft plan, with the obstacle to a better one; `explained` adds the rest."""
         self.tell(f"tube {name}: the plan that misses least")
         soft = self.planner.softest(tightened, widest.inputs)
         solution = soft if np.all(np.isfinite(soft.states)) else widest
         verdict = self._verified(name, constants, solution, tightened)
-        found = self._infeasible(name, constants, widest, tightened, explain=explain)
+        self.refused[name] = constants, widest
         result = self._result(name, constants, solution, tightened, widest.scale, verdict, feasible=False)
+        return replace(result, infeasibility=self._infeasible(name, widest, tightened))
+
+    def explained(self, result: Synthesis) -> Synthesis:
+        """A refusal with the smallest delta that would do, in words."""
+        assert result.infeasibility is not None
+        delta = self._smallest(result.method, *self.refused[result.method])
+        found = replace(result.infeasibility, smallest_delta=delta)
         unit = "t =" if self.planner.grid.continuous else "step"
         reason = f"{found.describe(unit)} The plan returned misses the tightened constraints by {result.softened:.3g}."
-        return replace(result, infeasibility=found, smallest_delta=found.smallest_delta, reason=reason)
+        return replace(result, infeasibility=found, smallest_delta=delta, reason=reason)
 
-    def _infeasible(
-        self, name: str, constants: Constants | None, widest: Solution, tightened: Tightened, *, explain: bool
-    ) -> Infeasibility:
+    def _infeasible(self, name: str, widest: Solution, tightened: Tightened) -> Infeasibility:
         planner = self.planner
         times, faces = planner.grid.times(), planner.faces
         point, face = np.unravel_index(int(np.argmax(widest.pressure)), widest.pressure.shape)
@@ -261,10 +267,9 @@ class Attempts:
                 bound = bound_scale(planner.problem, planner.grid, faces, tightened.erosion)
                 proved = bound < 1
                 kind = "no noise-free trajectory" if proved else kind
-        delta = self._smallest(name, constants, widest) if explain else None
         return Infeasibility(
             proved=proved, kind=kind, constraint=label, time=at, scale=widest.scale, scale_bound=bound,
-            smallest_delta=delta,
+            smallest_delta=None,
         )  # fmt: skip
 
     def _smallest(self, name: str, constants: Constants | None, widest: Solution) -> float | None:

@@ -112,7 +112,7 @@ def synthesize_plan(
     best: Synthesis | None = None
     for index, name in enumerate(names):
         try:
-            found = work.attempt(name, first, last=index == len(names) - 1)
+            found = work.attempt(name, first)
         except (InfeasibleError, EnclosureError) as error:
             if best is None and index == len(names) - 1:
                 raise
@@ -124,6 +124,8 @@ def synthesize_plan(
             break
     if best is None:
         raise InfeasibleError("no tube could be computed along any plan; lower the noise, or name a tube.")
+    if best.infeasibility is not None:
+        best = work.explained(best)
     return replace(best, seconds=time.perf_counter() - began)
 
 

@@ -82,6 +82,12 @@ def test_no_plan_is_exit_code_one(source: Path, capsys: pytest.CaptureFixture[st
         (["--closed-loop", "0"], "--closed-loop"),
         (["--seed", "-1"], "--seed"),
         (["--feedback", "nonsense"], "`feedback` must be"),
+        (["--feedback", "[[1, 1]]"], "`feedback` must stabilise"),
+        (["--feedback", "[[1]]"], "`feedback` must have shape"),
+        (["--feedback", "[[1,"], "`--feedback` is not a matrix"),
+        (["--terminal", "nonsense"], "`terminal` must be"),
+        (["--terminal", "contraction", "--tube", "linear"], "`terminal` from the contraction metric needs a gain < 1"),
+        (["--steps", "0"], "`steps` must be a positive integer"),
         (["--horizon", "0"], "horizon"),
     ],
 )
@@ -90,6 +96,18 @@ def test_bad_input_is_exit_code_two(
 ) -> None:
     assert run(["synthesize", str(source), *options]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_inputs_without_bounds_are_exit_code_two(source: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = TOML.replace("u = [-3, 3]", "u = [-inf, inf]").replace('v = "v + 0.1*u"', 'v = "v + 0.1*u*v"')
+    source.write_text(text)
+    assert run(["synthesize", str(source), "--tube", "kummer"]) == 2
+    assert "`inputs` must be bounded" in capsys.readouterr().err
+
+
+def test_a_matrix_serves_as_feedback(source: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["synthesize", str(source), "--tube", "linear", "--feedback", "[[-4, -3]]", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["status"] == "SAFE"
 
 
 def test_a_problem_without_inputs_is_exit_code_two(capsys: pytest.CaptureFixture[str]) -> None:

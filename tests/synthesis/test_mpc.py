@@ -85,6 +85,17 @@ def test_a_response_that_does_not_fit_is_no_proof() -> None:
     assert "not a proof" in found.reason
 
 
+def test_auto_says_what_it_looked_for() -> None:
+    found = cb.synthesize_plan(cart(std=0.07, horizon=12))
+    assert not found.feasible
+    assert found.infeasibility is not None
+    delta = found.smallest_delta
+    assert delta is not None
+    assert delta > found.source.delta
+    assert f"{delta:.4g}" in found.reason
+    assert cb.synthesize_plan(cart(std=0.07, horizon=12, delta=1.02 * delta), tube=found.method).feasible
+
+
 def test_a_given_tube_serves(problem: cb.Problem) -> None:
     constants = cb.Constants(gain=1.0, sigma=0.002, dimension=2)
     tube = cb.tune_tube(constants, horizon=20, delta=1e-3, method="thm4")
