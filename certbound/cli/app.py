@@ -34,8 +34,8 @@ app = typer.Typer(
 def _global_options(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Log the work to standard error.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print the answer's first line only.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Log the work to standard error (any place).")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print the answer's first line only (any place).")] = False,
 ) -> None:
     if version:
         sys.stdout.write(f"certbound {__version__}\n")

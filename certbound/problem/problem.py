@@ -142,7 +142,8 @@ class Problem(Shown):
     def summary(self) -> str:
         """The problem in one line."""
         unit = "s" if self.system.time == "continuous" else "steps"
-        what = f"{self.system.dimension} states, {len(self.safe)} constraints"
+        count = {"state": self.system.dimension, "constraint": len(self.safe)}
+        what = ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for word, number in count.items())
         return f"{self.name}, {what}, {self.horizon:g} {unit}, delta {self.delta:g}"
 
     def rows(self) -> list[tuple[str, str]]:

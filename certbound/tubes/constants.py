@@ -155,7 +155,8 @@ class Constants(Shown):
         name, unit = ("rate", "1/s") if self.continuous else ("gain", "per step")
         origin = "certified" if self.certified else "stated"
         value = span_text(self.rate if self.continuous else self.gain)
-        return f"{name} {value} {unit}, sigma {span_text(self.sigma)}, {self.dimension} states, {origin}"
+        states = "1 state" if self.dimension == 1 else f"{self.dimension} states"
+        return f"{name} {value} {unit}, sigma {span_text(self.sigma)}, {states}, {origin}"
 
     def rows(self) -> list[tuple[str, str]]:
         """Effective dimension, metric, and what the constants rest on."""

@@ -84,6 +84,7 @@ def test_the_lines_say_what_matters(results: dict[str, Any]) -> None:
     assert repr(results["constants"]) == "<Constants: rate -1 1/s, sigma 0.05, 2 states, certified>"
     assert repr(results["pieces"]) == "<Constants: gain 0.5 ... 0.9 per step, sigma 0.1, 2 states, stated>"
     assert repr(results["problem"]) == "<Problem: a <b> & c, 2 states, 2 constraints, 2 s, delta 0.001>"
+    assert cb.load("ou").summary() == "ou, 1 state, 1 constraint, 5 s, delta 0.001"
     assert results["verdict"].summary().startswith("SAFE  a <b> & c: P(leaving) <= ")
     assert results["tube"].summary().endswith("within 2 s, delta 1e-3, trajectory level")
     assert ("constraint", "-2 <= px <= 2, -2 <= py <= 2") in results["problem"].rows()
