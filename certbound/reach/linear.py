@@ -34,6 +34,7 @@ _PICARD = 12
 _HUGE = 1e6
 _TRIES = 12
 _WINDOW = 0.05
+_LIKELY = -4.0  # log of a probability from which on a product is worth more than a sum
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -81,6 +82,7 @@ class LinearRun:
                 np.diag(engine.radii[cell])[engine.radii[cell] > 0], continuous=engine.continuous,
             ))
         self.inner = self.rows.shape[2]
+        self.failed_at = engine.pieces
         self.memory: dict[int, dict[bytes, Any]] = {}
 
     def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
@@ -199,10 +201,13 @@ class LinearRun:
     def _cell(self, cell: int, bounds: tuple[Array, Array], events: Events, log_nonlinear: float) -> Outcome:
         rooms = self.rooms(cell, bounds)
         shared = log_nonlinear if len(self.engine.model.active) else events.shared_log
-        logs = [events.along(r.rows).log_exceedance(rooms[:, i]) for i, r in enumerate(self.requirements[cell])]
+        asked = self.requirements[cell]
+        logs = [events.along(r.rows).log_exceedance(rooms[:, i]) for i, r in enumerate(asked)]
+        total = logsumexp(np.array([shared, *logs]))
+        if total > _LIKELY and isinstance(events, StepEvents) and events.gaussian:
+            total = min(total, _correlated(events, asked, rooms, shared, logs))
         return Outcome(
-            log_probability=min(logsumexp(np.array([shared, *logs])), 0.0), log_nonlinear=log_nonlinear,
-            bounds=bounds, cell=cell, logs=tuple(logs),
+            log_probability=min(total, 0.0), log_nonlinear=log_nonlinear, bounds=bounds, cell=cell, logs=tuple(logs),
         )
 
     def tightest(self, outcome: Outcome) -> tuple[Requirement | None, int, float]:
@@ -224,6 +229,36 @@ class LinearRun:
 
     def _shared(self, outcome: Outcome) -> float:
         return outcome.log_nonlinear + float(np.log(0.1 if self.rows.shape[2] else 1.0))
+
+
+def _correlated(events: StepEvents, asked: list[Requirement], rooms: Array, shared: float, logs: list[float]) -> float:
+    """Logarithm of the probability of leaving, by the Gaussian correlation inequality.
+
+    Requirements along w and -w with equal rooms keep Z in a symmetric convex set, and so do the levels along the inner
+    rows: the probability of their intersection is at least the product of theirs (Royen, 2014). Requirements
+    without a partner are added by the union bound.
+    """
+    lone = dict(enumerate(asked))
+    stay, rest = np.log1p(-np.exp(min(shared, 0.0))), []
+    for i, requirement in enumerate(asked):
+        partner = next((j for j in lone if j > i and np.array_equal(asked[j].rows, -requirement.rows)), None)
+        if i not in lone:
+            continue
+        del lone[i]
+        if partner is None:
+            rest.append(logs[i])
+            continue
+        del lone[partner]
+        room = np.minimum(rooms[:, i], rooms[:, partner])
+        both = np.log(2.0) + events.along(requirement.rows).log_exceedance(room)
+        if both > logsumexp(np.array([logs[i], logs[partner], np.log(1e-3)])):
+            rest += [logs[i], logs[partner]]
+        elif both >= 0:
+            return 0.0
+        else:
+            stay += np.log1p(-np.exp(both) * (1 + 1e-14))
+    stay = stay * (1 + 1e-12) - 1e-300
+    return logsumexp(np.array([np.log(-np.expm1(stay)) + 1e-14, *rest])) if stay < 0 else logsumexp(np.array(rest))
 
 
 def level_scale(event: Event, shape: Array, target: float) -> float:

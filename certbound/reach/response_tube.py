@@ -28,6 +28,10 @@ Array = NDArray[np.float64]
 
 _SHARES = ((0.1, 1), (0.3, 2), (0.8, 3))
 _REFINEMENTS = 3
+_NOTHING = -0.1  # log of a probability that says nothing
+_LIKELIER = np.log([0.01, 0.05, 0.2])  # delta_N where nothing was proved near the target
+_PARTS = (2, 4, 8)  # cells along each side, tried one after the other
+_MOST_PIECES = 6000  # pieces of time times cells
 _LEAST = -1e12  # log10 of the smallest probability that is told apart from 0
 
 
@@ -99,6 +103,14 @@ class LinearAnswer:
         value = max(self.outcome.log_probability / np.log(10.0), _LEAST)
         return float(min(value + 1e-15 * abs(value), 0.0))
 
+    @property
+    def exact(self) -> bool:
+        """Whether the model is linear and its noise Gaussian: only the union over constraints and times is lost."""
+        system = self.run.engine.system
+        return not len(self.run.engine.model.active) and (
+            isinstance(system, ContinuousSystem) or bool(system.noise.gaussian)
+        )
+
     @cached_property
     def _tightest(self) -> tuple[Requirement | None, int, float]:
         return self.run.tightest(self.shown)
@@ -163,18 +175,20 @@ def linear_answer(problem: Problem, *, cells: int | None = None) -> LinearAnswer
     ----------
     problem : Problem
     cells : int, optional
-        Cells along each side of the initial set.
+        Cells along each side of the initial set; as few as serve when omitted.
     """
-    run = LinearRun(Linearisation.of(problem, cells=cells))
     target = float(np.log(problem.delta))
-    best: Outcome | None = None
-    effort = 1
-    for share, effort in _SHARES:
-        outcome = run.probability(target + np.log(share), effort)
-        best = outcome if best is None or outcome.log_probability < best.log_probability else best
+    run, best = _first(problem, cells, target + float(np.log(_SHARES[0][0])))
+    effort = _SHARES[0][1]
+    for share, effort in _SHARES[1:]:
         if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
             break
-    assert best is not None
+        best = _least(best, run.probability(target + np.log(share), effort))
+    if best.log_probability > _NOTHING and len(run.engine.model.active):
+        for log_nonlinear in _LIKELIER[target < _LIKELIER]:
+            best = _least(best, run.probability(float(log_nonlinear), 2))
+            if best.bounds is not None:
+                break
     shown = best
     if best.log_probability <= target and best.log_probability > best.log_nonlinear - 3.0:
         coupled = max((len(group[0]) for group in run.engine.model.blocks), default=1) > 1
@@ -184,6 +198,27 @@ def linear_answer(problem: Problem, *, cells: int | None = None) -> LinearAnswer
                 break
             best = outcome
     return LinearAnswer(run=run, outcome=best, shown=shown)
+
+
+def _first(problem: Problem, cells: int | None, log_nonlinear: float) -> tuple[LinearRun, Outcome]:
+    """The engine on as few cells as keep the remainder from feeding itself, or on the cells that were asked for."""
+    run = LinearRun(Linearisation.of(problem, cells=cells))
+    outcome = run.probability(log_nonlinear, _SHARES[0][1])
+    wide = int(np.count_nonzero(run.engine.radii[0]))
+    if cells is not None or wide == 0:
+        return run, outcome
+    for parts in _PARTS:
+        if outcome.bounds is not None or parts**wide * run.engine.pieces > _MOST_PIECES:
+            break
+        finer = LinearRun(Linearisation.of(problem, cells=parts))
+        found = finer.probability(log_nonlinear, _SHARES[0][1])
+        if found.bounds is not None or finer.failed_at > run.failed_at:
+            run, outcome = finer, found
+    return run, outcome
+
+
+def _least(first: Outcome, second: Outcome) -> Outcome:
+    return second if second.log_probability < first.log_probability else first
 
 
 def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = None) -> ReachTube:

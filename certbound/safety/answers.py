@@ -95,6 +95,8 @@ class EngineAnswer:
         What the answer rests on besides the problem (stated constants); empty when nothing.
     details : Any
         Whatever a certificate needs of the engine.
+    conclusive : bool
+        Whether no other engine can do much better: slow refinements of others may be left out.
     """
 
     log10_delta: float = 0.0
@@ -111,6 +113,7 @@ class EngineAnswer:
     certified: bool = True
     assumption: str = ""
     details: Any = None
+    conclusive: bool = False
 
 
 def is_at_most(log10_delta: float, target: float) -> bool:

@@ -89,7 +89,7 @@ def constants_engine(
     constants : Constants, optional
         Stated constants, used instead of certified ones.
     quick : bool
-        Leave out what is slow and seldom decides: proposed metrics and local constants.
+        Leave out what is slow and then seldom decides: proposed metrics and local constants.
 
     Raises
     ------

@@ -31,6 +31,7 @@ def linear_engine(problem: Problem, *, cells: int | None = None, **_: Any) -> En
         deviation=None if tube is None else _deviation(answer, tube),
         method="linear",
         details=answer,
+        conclusive=answer.exact,
     )
 
 

@@ -35,7 +35,7 @@ def _linear(problem: Problem, **options: Any) -> EngineAnswer:
 _ENGINES: dict[str, Callable[..., EngineAnswer]] = {"linear": _linear, "constants": _constants}
 """Engines in the order in which they are tried: name to function(problem, method=, cells=, constants=, quick=).
 
-``quick`` says that another engine has proved SAFE already: slow refinements may be left out."""
+``quick`` says that another engine has proved SAFE or been conclusive: slow refinements may be left out."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -188,7 +188,7 @@ def verify_safety(
     answers: dict[str, EngineAnswer] = {}
     for name in names:
         inner = "auto" if method in _ENGINES else method
-        quick = any(_is_safe(answer, problem) for answer in answers.values())
+        quick = any(_is_safe(answer, problem) or answer.conclusive for answer in answers.values())
         answers[name] = _ENGINES[name](problem, method=inner, cells=cells, constants=constants, quick=quick)
     return _verdict(problem, answers)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import multivariate_normal, norm
 
 import certbound as cb
 from certbound.reach.linear import LinearRun
@@ -26,9 +27,33 @@ def oscillator(sigma: float = 0.1, cubic: float = 0.3, **changes: object) -> cb.
 def test_a_linear_step_system_gets_its_exact_gaussian_probability() -> None:
     system = cb.linear_system([[0.5]], noise=cb.Gaussian(std=1.0))
     problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.HalfSpace([1.0], 4.0))], horizon=1, delta=1e-3)
-    from scipy.stats import norm
-
     assert linear_answer(problem).log10_delta == pytest.approx(norm.logsf(4.0) / np.log(10), abs=1e-9)
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_symmetric_constraints_multiply(steps: int) -> None:
+    n = 14
+    system = cb.linear_system(0.8 * np.eye(n), noise=cb.Gaussian(std=0.2))
+    safe = [cb.Inside(cb.Box([-0.5] * n, [0.5] * n))]
+    problem = cb.Problem(system, initial=np.zeros(n), safe=safe, horizon=steps, delta=0.01)
+    if steps == 1:
+        each = 1 - 2 * norm.sf(0.5 / 0.2)
+    else:
+        law = multivariate_normal(cov=0.04 * np.array([[1.0, 0.8], [0.8, 1.64]]))
+        low, high = np.full(2, -0.5), np.full(2, 0.5)
+        each = law.cdf(high, lower_limit=low)
+    found = 1 - 10 ** linear_answer(problem).log10_delta
+    assert each**n * (1 - 3e-3) < found < each**n + 1e-9
+
+
+def test_a_wide_initial_set_is_split_until_the_remainder_holds() -> None:
+    system = cb.ContinuousSystem(lambda x: -x - x**3, states=1, diffusion=[[0.05]])
+    safe = [cb.Inside(cb.Box([-2.0], [2.0]))]
+    problem = cb.Problem(system, initial=cb.Box([-1.2], [1.2]), safe=safe, horizon=2.0, delta=1e-3)
+    found = linear_answer(problem)
+    assert len(found.run.engine.centres) > 1
+    assert found.log10_delta <= -3
+    assert linear_answer(problem, cells=1).log10_delta == 0
 
 
 def test_the_tube_holds_the_deviations_of_simulated_paths() -> None:
