@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import typer
 
-from certbound.cli.describe import describe_constants
+from certbound.cli.describe import describe_constants, log10_text
 from certbound.cli.limits import Clock, OutOfTime, TimeLimitOption
 from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, examples, load_problem
 from certbound.cli.output import SETTINGS, console, print_json, spinner
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from certbound.problem.problem import Problem
     from certbound.tubes.constants import Constants
 
@@ -83,8 +85,6 @@ def _bound(subject: Problem, clock: Clock) -> tuple[Constants, list[Constants], 
 def _searched(subject: Problem) -> tuple[Constants, list[Constants], str]:
     from certbound.constants.bounds import bound_constants
     from certbound.constants.metrics import bound_metrics
-    from certbound.reach import bound_reach
-    from certbound.reach.local import local_constants
 
     try:
         constants = bound_constants(subject)
@@ -94,10 +94,35 @@ def _searched(subject: Problem) -> tuple[Constants, list[Constants], str]:
         if subject.domain is not None:
             raise
         _log.info("no constants hold everywhere: %s", error)
-    reach = bound_reach(subject, noise=False)
+    constants, where = _local(subject)
+    return constants, [], f"{where} (no constants hold on all of R^n)"
+
+
+def _local(subject: Problem) -> tuple[Constants, str]:
+    """Constants along the reach tube with noise (Thm K4), or without where none was proved; and where they hold."""
+    from certbound.constants.fitted import fitted_constants_along
+    from certbound.reach import bound_reach
+    from certbound.rigor.intervals import Interval
+
+    horizon = float(subject.horizon)
+    try:
+        reach = bound_reach(subject)
+        odds = f"left with probability at most {log10_text(reach.log10_delta)}"
+    except (ArithmeticError, InfeasibleError) as error:
+        _log.info("no tube with noise: %s", error)
+        reach = bound_reach(subject, noise=False)
+        odds = "with no room for the noise, for no tube with noise confirmed itself"
+    kind = "reach set + tube" if reach.noise else "noise-free reach set"
     unit = "s" if reach.curve.continuous else "steps"
-    where = f"the noise-free reach tube, up to {reach.end:g} {unit} (no constants hold on all of R^n)"
-    return local_constants(subject, reach), [], where
+    where = f"the {kind}, box by box in time, up to {reach.end:g} {unit}, {odds}"
+    if reach.end < horizon:
+        where += f"; it ends before {horizon:g} {unit}, where no guess of its size confirmed itself"
+    boxes, times = reach.hull, reach.curve.starts
+    if reach.curve.continuous:
+        times = np.append(times, reach.curve.ends[-1])
+    else:
+        boxes = Interval(boxes.lo[:-1], boxes.hi[:-1])
+    return fitted_constants_along(subject, times, boxes), where
 
 
 def _print(constants: Constants, result: dict[str, Any]) -> None:
@@ -113,16 +138,29 @@ def _print(constants: Constants, result: dict[str, Any]) -> None:
         screen.print(f"at most {constants.gap:.3g} above what sampling found")
     screen.print(f"holds on {result['domain']}", markup=False)
     if result["metrics"]:
-        from rich.table import Table
-
-        table = Table(box=None, pad_edge=False)
-        for heading in ("constraint", name, "sigma", "eff. dimension"):
-            table.add_column(heading)
-        for row in result["metrics"]:
-            numbers = (_range(row[name]), _range(row["sigma"]), f"{row['effective_dimension']:.4g}")
-            table.add_row(row["constraint"], *numbers)
-        screen.print(table)
+        screen.print(_table(name, [{"constraint": "all in one", **result}, *result["metrics"]]))
     screen.print(f"{result['seconds']:.2f} s")
+
+
+def _table(name: str, rows: list[dict[str, Any]]) -> Table:
+    """A row per metric: its norm, certified value and gap, noise, condition, and the constraint that it serves."""
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("serves", "norm", name, "gap", "sigma", "eff. dimension", "cond(P)"):
+        table.add_column(heading)
+    for row in rows:
+        metric, gap = row["metric"], row["gap"]
+        table.add_row(
+            row["constraint"],
+            "Euclidean" if metric is None else "weighted",
+            _range(row[name]),
+            "-" if gap is None else f"{gap:.2g}",
+            _range(row["sigma"]),
+            f"{row['effective_dimension']:.4g}",
+            "1" if metric is None else f"{np.linalg.cond(np.asarray(metric)):.3g}",
+        )
+    return table
 
 
 def _range(value: Any) -> str:

@@ -238,6 +238,7 @@ def _record(
     boxes: int,
     status: str,
     times: Array | None,
+    where: str | None = None,
 ) -> Constants:
     """The only place where a proof is attached to constants."""
     number: Any = float(value) if value.ndim == 0 else value
@@ -253,7 +254,9 @@ def _record(
         gaussian=noise.gaussian,
         times=times,
     )
-    proof = Proof(sampled=sampled, boxes=boxes, status=status, domain=model.domain_text, fingerprint=found.fingerprint)
+    proof = Proof(
+        sampled=sampled, boxes=boxes, status=status, domain=where or model.domain_text, fingerprint=found.fingerprint
+    )
     return replace(found, proof=proof)
 
 
@@ -311,7 +314,8 @@ def constants_along(
     sampled = norm.sample_measure(matrices) if model.continuous else norm.sample_norm(matrices)
     noise = bound_noise(model, norm, pieces)
     largest = float(sampled[np.argmax(values)])
-    return _record(model, norm, noise, values, largest, count, "given metric", ends)
+    where = f"the given boxes, one for each of {len(boxes)} time pieces up to {ends[-1]:g}"
+    return _record(model, norm, noise, values, largest, count, "given metric", ends, where)
 
 
 def _piecewise(model: Model, jacobian: StateJacobian, norm: Metric, boxes: Interval, refine: int) -> tuple[Array, int]:
