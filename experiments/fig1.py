@@ -92,6 +92,7 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
         "clearance": float(clearance.min()),
         "fits": bool(np.all(radii[1] < clearance)),
         "radii": [float(row.max()) for row in radii],
+        "growth": float(radii[-1].max() / radii[0].max()),
         "left": [int((deviations > row).any(axis=1).sum()) for row in radii],
     }
     return arrays, claims

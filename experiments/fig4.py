@@ -36,6 +36,7 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
         claims[f"{key}_left"] = int((deviations > radius).any(axis=1).sum())
     for key in ("thm2", "thm3", "kummer"):
         claims[f"{key}_ratio"] = claims[f"{key}_largest"] / claims["exact_largest"]
+    claims["thm2_over_thm3"] = claims["thm2_largest"] / claims["thm3_largest"]
     claims["growth_thm2"] = math.exp(0.5 * 10)
     claims["growth_thm3"] = math.exp(0.5 * 0.05) + math.sqrt(math.log(10 / 0.05))
     claims["root_log_1e6"] = math.sqrt(math.log(1e6))

@@ -86,11 +86,16 @@ def table(rows: Sequence[Row]) -> str:
     for row in rows:
         mark = "pass" if row.passed else "FAIL"
         lines.append(
-            f"{mark}  {row.name:<34} {row.place:<34} wanted {_show(row.expected):<38} "
-            f"found {_show(row.found):<26} {row.status}"
+            f"{mark}  {row.name:<34} {row.place:<34} wanted {show(row.expected):<38} "
+            f"found {show(row.found):<26} {row.status}"
         )
+    return "\n".join([*lines, summary(rows)])
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """How many passed and failed."""
     passed = sum(row.passed for row in rows)
-    return "\n".join([*lines, f"{passed} passed, {len(rows) - passed} failed"])
+    return f"{passed} passed, {len(rows) - passed} failed"
 
 
 def _goal(entry: Mapping[str, Any]) -> Any:
@@ -99,11 +104,12 @@ def _goal(entry: Mapping[str, Any]) -> Any:
     return ", ".join(f"{word} {entry[key]}" for key, word in (("at_least", ">="), ("at_most", "<=")) if key in entry)
 
 
-def _show(value: Any) -> str:
+def show(value: Any) -> str:
+    """A value in a few signs."""
     if isinstance(value, float):
         return f"{value:.5g}"
     if isinstance(value, list):
-        return " ".join(_show(item) for item in value)
+        return " ".join(show(item) for item in value)
     return str(value)
 
 

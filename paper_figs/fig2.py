@@ -39,7 +39,8 @@ def _panel(axes: Axes, data: Data, name: str) -> None:
     axes.plot(times, data[f"{name}_exact"], label="exact constant radius", **LINES["exact"])
     top = 1.12 * max(data[f"{name}_paper"].max(), data[f"{name}_exact"].max(), data[f"{name}_paths"].max())
     axes.set(xlim=(0, times[-1]), ylim=(0, top))
-    axes.locator_params(axis="both", nbins=4)
+    axes.locator_params(axis="y", nbins=4)
+    axes.locator_params(axis="x", nbins=2)
     axes.margins(x=0)
 
 

@@ -21,7 +21,7 @@ def draw(data: Data) -> Figure:
         label = r"Thm 2 per window, $\delta/2N$" if index == 0 else None
         panel.plot(start + data["inside"], arc, label=label, **arcs)
     panel.plot(data["times"], data["one_time"], label=r"Prop. 1 (one time), $\delta/2N$", **LINES["one time"])
-    panel.plot(data["starts"], data["at_starts"], "o", markersize=2.8, color=BLACK, zorder=5)
+    panel.plot(data["starts"], data["at_starts"], "o", markersize=2.8, color=BLACK, zorder=5, clip_on=False)
     panel.plot(data["times"], data["kummer"], label="Kummer tube (certbound)", **LINES["kummer"])
     panel.set(xlim=(0, data["times"][-1]), ylim=(0, 1.02 * data["thm2"].max()))
     panel.set(xlabel="time $t$ (s)", ylabel="deviation $|X_t-x_t|$")

@@ -24,7 +24,7 @@ def draw(data: Data) -> Figure:
 def _over_time(axes: Axes, data: Data) -> None:
     times = data["times"]
     for radius, window, color, dash in zip(data["left"], data["windows"], COLORS, DASHES):
-        axes.plot(times, radius, color=color, linestyle=dash, linewidth=1.2, label=rf"$\Delta t={window:g}$")
+        axes.plot(times, radius, color=color, linestyle=dash, linewidth=1.2, label=rf"$\Delta t={window:g}$ s")
     axes.plot(times, data["kummer"], label="Kummer", **LINES["kummer"])
     axes.plot(times, data["exact"], label="exact", **LINES["exact"])
     axes.set(xlim=(0, times[-1]), ylim=(0, None), xlabel="time $t$ (s)", ylabel="radius $r_t$")
@@ -36,10 +36,10 @@ def _over_window(axes: Axes, data: Data) -> None:
     for index, (instant, color, dash) in enumerate(zip(data["instants"], COLORS, DASHES)):
         axes.semilogx(steps, data["right"][index], color=color, linewidth=0.5, alpha=0.55)
         printed = data["right_printed"][index]
-        axes.semilogx(steps, printed, color=color, linestyle=dash, linewidth=1.2, label=f"$t={instant:g}$")
+        axes.semilogx(steps, printed, color=color, linestyle=dash, linewidth=1.2, label=f"$t={instant:g}$ s")
         best = int(np.argmin(printed))
         axes.plot(steps[best], printed[best], "v", color=color, markersize=3.5)
-    axes.axhline(data["kummer_instants"][-1], color=BLUE, linewidth=1.4, label="Kummer, $t=5$")
+    axes.axhline(data["kummer_instants"][-1], color=BLUE, linewidth=1.4, label="Kummer, $t=5$ s")
     axes.set(xlim=(steps[0], steps[-1]), ylim=(0, None), xlabel=r"window $\Delta t$ (s)")
     axes.legend(loc="lower right", handlelength=2.2, labelspacing=0.25, borderaxespad=0.1)
 

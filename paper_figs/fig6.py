@@ -25,6 +25,7 @@ def draw(data: Data) -> Figure:
         row[0].set_ylabel("radius $r_t$")
     for panel in axes[1]:
         panel.set_xlabel(r"window $\Delta t$ (steps)")
+    figure.align_ylabels(axes[:, 0])
     shared_legend(figure, axes.flat, columns=3)
     return figure
 
@@ -36,11 +37,11 @@ def _panel(axes: Axes, data: Data, side: str, reading: str) -> None:
         axes.plot(steps, proved[index], color=color, linewidth=0.5, alpha=0.5)
         axes.plot(steps, printed[index], color=color, linestyle=dash, linewidth=1.2, label=f"Thm 5, $t={instant:g}$")
     best = int(np.argmin(printed[-1]))
-    axes.plot(steps[best], printed[-1, best], "v", color=VERMILION, markersize=4)
+    axes.plot(steps[best], printed[-1, best], "v", color=VERMILION, markersize=4, clip_on=False, zorder=5)
     axes.annotate(
         rf"best $\Delta t={steps[best]}$",
         (steps[best], printed[-1, best]),
-        xytext=(8, -9),
+        xytext=(5, 8) if side == "left" else (10, -7),
         textcoords="offset points",
         fontsize=6.5,
         color=VERMILION,
@@ -48,8 +49,11 @@ def _panel(axes: Axes, data: Data, side: str, reading: str) -> None:
     if reading == "reading":
         axes.axhline(data[f"{side}_kummer"][-1], label="Kummer, $t=2000$", **LINES["kummer"])
         axes.axhline(data[f"{side}_exact"][-1], label="exact limit", **LINES["exact"])
-    axes.set_xlim(1, steps[-1])
-    axes.set_ylim(0, 1.05 * max(printed.max(), proved.max()))
+    if side == "right":
+        corner = {"transform": axes.transAxes, "ha": "right", "va": "bottom", "fontsize": 6.5}
+        axes.text(0.97, 0.05, "the three times coincide", **corner)
+    axes.set_xlim(0, steps[-1])
+    axes.set_ylim(0, 1.15 * max(printed.max(), proved.max()))
 
 
 if __name__ == "__main__":

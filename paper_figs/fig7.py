@@ -26,7 +26,7 @@ def _panel(axes: Axes, data: Data, side: str) -> None:
     axes.semilogx(inverse, data[f"{side}_exact"], label="exact limit", **LINES["exact"])
     dots = {"color": LINES["simulated"]["color"], "markerfacecolor": "none", "markersize": 2.6}
     axes.semilogx(inverse, data[f"{side}_simulated"], "o", label="simulated quantile", **dots)
-    axes.set(xlim=(10, 1e5), xlabel=r"$1/\delta$", ylim=(0.5, None))
+    axes.set(xlim=(8, 1.25e5), xlabel=r"$1/\delta$", ylim=(0.5, 1.65))
 
 
 if __name__ == "__main__":

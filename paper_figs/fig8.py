@@ -11,42 +11,46 @@ from matplotlib.patches import Circle, Patch, Rectangle
 
 from paper_figs.style import BLUE, COLUMN, Data, letter, main, panels
 
-OBSTACLE, RIM, BAND, NOMINAL, NOISY = "#D55E00", "#7a3500", "#F7EC8C", "#2b6da3", "#555555"
+OBSTACLE, RIM, BAND, EDGE, NOMINAL, NOISY = "#D55E00", "#7a3500", "#F7EC8C", "#8a7d00", "#2b6da3", "#555555"
+BOX = "#9cc8e8"
 TITLES = {"left": "$T=2$", "right": "$T=5$"}
 
 
 def draw(data: Data) -> Figure:
     """Three rows, two columns, one scale."""
-    figure, axes = panels(COLUMN, 4.15, 3, 2, sharex=True, sharey=True)
+    figure, axes = panels(COLUMN, 4.3, 3, 2, sharex=True, sharey=True)
     for column, side in enumerate(TITLES):
         for row in range(3):
             _scene(axes[row, column], data, side)
         _paths(axes[0, column], data[f"{side}_nominal"], NOMINAL)
         for low, high in data[f"{side}_boxes"]:
-            box = Rectangle(tuple(low), *(high - low), facecolor="#9cc8e8", edgecolor=BLUE, linewidth=0.7, alpha=0.8)
+            box = Rectangle(tuple(low), *(high - low), facecolor=BOX, edgecolor=BLUE, linewidth=0.7, alpha=0.8)
             axes[1, column].add_patch(box)
         _paths(axes[2, column], data[f"{side}_noisy"], NOISY)
     for row in range(3):
-        axes[row, 0].set_ylabel("$p_y$")
+        axes[row, 0].set_ylabel("$p_y$ (m)")
     for column in range(2):
-        axes[2, column].set_xlabel("$p_x$")
+        axes[2, column].set_xlabel("$p_x$ (m)")
     letter(
         axes.flat,
         [f"{name}, {title}" for name in ("noise-free", "reach boxes", "noisy") for title in TITLES.values()],
     )
     handles = [
         Patch(facecolor=OBSTACLE, edgecolor=RIM, hatch="////", label="obstacle"),
-        Patch(facecolor=BAND, label="eroded"),
-        Line2D([], [], color=NOMINAL, label="noise-free paths"),
-        Line2D([], [], color=NOISY, label="noisy paths"),
+        Patch(facecolor=BAND, edgecolor=EDGE, linewidth=0.5, label="eroded"),
+        Line2D([], [], color="black", marker="x", markersize=4, linestyle="none", label="goal"),
+        Line2D([], [], color=NOMINAL, label="noise-free path"),
+        Line2D([], [], color=NOISY, label="noisy path"),
+        Patch(facecolor=BOX, edgecolor=BLUE, linewidth=0.7, label="reachable box"),
     ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=4, columnspacing=1.0, handlelength=1.5)
+    figure.legend(handles=handles, loc="outside upper center", ncols=3, columnspacing=1.2, handlelength=1.5)
     return figure
 
 
 def _scene(axes: Axes, data: Data, side: str) -> None:
     for centre, radius in zip(data["centers"], data["radii"]):
-        axes.add_patch(Circle(tuple(centre), radius + float(data[f"{side}_band"]), facecolor=BAND, zorder=0.5))
+        band = radius + float(data[f"{side}_band"])
+        axes.add_patch(Circle(tuple(centre), band, facecolor=BAND, edgecolor=EDGE, linewidth=0.5, zorder=0.5))
         axes.add_patch(
             Circle(tuple(centre), radius, facecolor=OBSTACLE, edgecolor=RIM, hatch="////", linewidth=0.4, zorder=0.6)
         )

@@ -1,14 +1,14 @@
-"""Fig. 9: six panels of the chain: four constraints with the tube, input, cost."""
+"""Fig. 9: six panels of the chain: four constraints with both tubes, input, cost."""
 
 from __future__ import annotations
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from paper_figs.style import BLACK, BLUE, COLUMN, VERMILION, Data, letter, main, panels, paths, shared_legend
+from paper_figs.style import BLACK, COLUMN, LINES, Data, letter, main, panels, paths, shared_legend
 
-NAMES = {"p1": "$p_1$", "dp21": r"$\Delta p_{21}$", "dp32": r"$\Delta p_{32}$", "v3": "$v_3$"}
+NAMES = {"p1": "$p_1$ (m)", "dp21": r"$\Delta p_{21}$ (m)", "dp32": r"$\Delta p_{32}$ (m)", "v3": "$v_3$ (m/s)"}
 
 
 def draw(data: Data) -> Figure:
@@ -23,8 +23,8 @@ def draw(data: Data) -> Figure:
     axes[2, 1].plot(steps, data["cost"].mean(axis=0), color=BLACK, linewidth=1.0)
     axes[2, 1].set_ylim(0, None)
     for panel in axes[2]:
-        panel.set_xlabel("step")
-    letter(axes.flat, [*NAMES.values(), r"input $\|u\|_\infty$", "cost of the step"])
+        panel.set_xlabel("step (0.1 s)")
+    letter(axes.flat, [*NAMES.values(), r"input $\|u\|_\infty$ (N)", "cost of the step"])
     shared_legend(figure, [axes[0, 0]], columns=4)
     for panel in axes.flat:
         panel.set_xlim(0, data["steps"][-1])
@@ -35,16 +35,18 @@ def _constraint(axes: Axes, data: Data, name: str) -> None:
     steps, nominal, half = data["steps"], data[f"{name}_nominal"], data[f"{name}_bound"]
     paths(axes, steps, data[name])
     axes.plot(steps, nominal, color=BLACK, linewidth=1.0, label="nominal")
-    count = min(len(half), len(steps))
-    tube = {"color": BLUE, "linewidth": 1.2}
-    axes.plot(steps[:count], (nominal[:count] + half[:count]), label="tube (certbound)", **tube)
-    axes.plot(steps[:count], (nominal[:count] - half[:count]), **tube)
+    for width, label, look in (
+        (data[f"{name}_thm5"], r"Thm 5, $\varepsilon=15/16$", LINES["paper"]),
+        (half, "certbound", LINES["kummer"]),
+    ):
+        axes.plot(steps, (nominal + width), label=label, **look)
+        axes.plot(steps, (nominal - width), **look)
     limit = float(data[f"{name}_limit"])
-    axes.axhline(limit, color=VERMILION, linestyle=(0, (4, 1.5)), linewidth=1.2, label="limit")
+    axes.axhline(limit, color=BLACK, linestyle=(0, (1, 1)), linewidth=1.4, label="limit")
     low, high = axes.get_ylim()
     margin = 0.08 * (high - low)
     axes.set_ylim(min(low, limit - margin), max(high, limit + margin))
-    axes.set_yticks(np.unique(np.round(axes.get_yticks(), 6))[::2])
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10]))
 
 
 if __name__ == "__main__":

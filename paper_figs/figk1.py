@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from paper_figs.style import BLUE, COLUMN, GREEN, ORANGE, PURPLE, VERMILION, Data, main, shared_legend
+from paper_figs.style import BLUE, COLUMN, GREEN, ORANGE, VERMILION, Data, main, shared_legend
 
 LOOKS = {
     "reading": ("paper, $\\varepsilon=15/16$", ORANGE, "s", "--"),
@@ -15,7 +15,7 @@ LOOKS = {
     "auto": ("certbound's choice", GREEN, "|", (0, (1, 1))),
 }
 SWEEPS = {"n": "dimension $n$", "T": "horizon $T$ (s)", "delta": r"$1/\delta$"}
-TOP = 2.1
+TOP = 2.28
 
 
 def draw(data: Data) -> Figure:
@@ -40,10 +40,10 @@ def _chart(axes: Axes, data: Data) -> None:
         style = {"markersize": 10 if marker == "|" else 4.4, "markeredgewidth": 1.4, "zorder": 3 + place}
         axes.plot(data["table"][:, methods.index(method)], rows, marker, color=color, label=name, **style)
     for row, value in zip(rows, data["table"][:, methods.index("printed")]):
-        axes.text(TOP, row, f"{value:.0f} $\\rightarrow$", color=PURPLE, ha="right", va="center", fontsize=6.5)
-    axes.text(TOP, rows[0] + 0.75, "at $\\varepsilon=1/16$:", color=PURPLE, ha="right", va="center", fontsize=6.5)
+        axes.text(TOP, row, f"{value:.0f} $\\rightarrow$", ha="right", va="center", fontsize=6.5)
+    axes.text(TOP, rows[0] + 0.75, "at $\\varepsilon=1/16$:", ha="right", va="center", fontsize=6.5)
     axes.axvline(1.0, color="black", linewidth=0.9)
-    axes.set_yticks(rows, data.claims["cases"])
+    axes.set_yticks(rows, [case.replace("=-", "=\N{MINUS SIGN}") for case in data.claims["cases"]])
     axes.set(xlim=(0.97, TOP), ylim=(-0.6, len(rows)), xlabel="largest radius / exact limit")
     axes.set_title("(a)", loc="left", pad=3)
 

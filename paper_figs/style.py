@@ -104,10 +104,10 @@ def main(stem: str, draw: Callable[[Data], Figure]) -> None:
     data = read(stem, options.mode)
     folder = HERE / "out" / options.mode
     folder.mkdir(parents=True, exist_ok=True)
+    replace(folder / f"{stem}.md", caption(data).encode())
     with matplotlib.rc_context(RC):
         figure = draw(data)
         save(figure, folder / stem)
-    _replace(folder / f"{stem}.md", caption(data).encode())
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -119,9 +119,11 @@ def save(figure: Figure, path: Path) -> None:
         temporary = path.with_name(f".{path.name}.part{suffix}")
         figure.savefig(temporary, metadata=metadata)
         temporary.replace(path.with_name(path.name + suffix))
+        figure.set_layout_engine("none")  # what was laid out once stays there
 
 
-def _replace(path: Path, content: bytes) -> None:
+def replace(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all."""
     temporary = path.with_name(f".{path.name}.part")
     temporary.write_bytes(content)
     temporary.replace(path)

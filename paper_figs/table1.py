@@ -8,7 +8,7 @@ from paper_figs.style import COLUMN, Data, main
 
 HEADINGS = ("case", "paper", "example", r"$\varepsilon=\frac{15}{16}$", "best", "certbound", "limit")
 THEOREMS = {"thm2": "Thm 2", "thm3": "Thm 3", "thm4": "Thm 4*", "thm5": "Thm 5"}
-LEFT = (0.0, 0.245, 0.36, 0.585, 0.69, 0.79, 0.93)
+LEFT = (0.0, 0.235, 0.345, 0.56, 0.665, 0.765, 0.925)
 
 
 def draw(data: Data) -> Figure:
@@ -19,7 +19,7 @@ def draw(data: Data) -> Figure:
     for case, pick, example, method, radii in zip(
         claims["cases"], claims["picks"], claims["examples"], claims["methods"], claims["radii"]
     ):
-        reading, best, chosen, exact = (f"{value:.4g}" for value in radii)
+        reading, best, chosen, exact = (f"{value:#.4g}" for value in radii)
         lines.append((case, THEOREMS[pick], example, reading, best, f"{chosen} ({method[0].upper()})", exact))
     for row, line in enumerate(lines):
         for left, cell in zip(LEFT, line):
