@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 
 from paper_figs.style import BLACK, COLUMN, Data, main, panels
 
-WALL, BAND, DARK = "#9a9a9a", "#8fc1e3", "#3a3a3a"
+WALL, BAND, DARK = "#7f7f7f", "#8fc1e3", "#3a3a3a"
 TUBES = ("#d7e8f5", "#a3cae8", "#5f9fd3")
 
 
