@@ -34,12 +34,13 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
         "thm5": erosions(problem, common, rows, DELTA, method="thm5", epsilon=15 / 16, step=1),
         "kummer": erosions(problem, common, rows, DELTA, method="kummer"),
         "own": own_metrics(problem, rows),
-        "linear": [smallest_limit(problem, row, 9 if full else 7) for row in rows],
     }
     paths = 1_000_000 if full else 100_000
     measure = Measure(directions=rows)
     simulated = sup_deviation(problem, paths=paths, rng=np.random.default_rng(12), measure=measure)
     found["simulated"] = [simulated.quantile(1 - DELTA, row=index).value for index in range(len(rows))]
+    halvings = 6 if full else 3
+    found["linear"] = [smallest_limit(problem, *pair, halvings) for pair in zip(rows, found["simulated"])]
     table = np.array([found[method] for method in METHODS])
     claims: Claims = {method: [float(value) for value in row] for method, row in zip(METHODS, table)}
     claims["paths"] = paths
@@ -66,14 +67,19 @@ def own_metrics(problem: Problem, rows: np.ndarray) -> list[float]:
     return [erosions(problem, known, row[None], share, method="auto")[0] for row, known in zip(rows, metrics)]
 
 
-def smallest_limit(problem: Problem, row: np.ndarray, halvings: int) -> float:
-    """Smallest b for which row . x <= b alone is certified at delta by the linear response."""
-    low, high = 0.0, 1.0
+def smallest_limit(problem: Problem, row: np.ndarray, quantile: float, halvings: int) -> float:
+    """Smallest b for which row . x <= b alone is certified at delta by the linear response, sought above a quantile."""
+
+    def safe(bound: float) -> bool:
+        alone = problem.replace(safe=[cb.Inside(cb.HalfSpace(row, bound))])
+        return cb.verify_safety(alone, method="linear").status == "SAFE"
+
+    low, high = quantile, 1.25 * quantile
+    while not safe(high):
+        low, high = high, 1.25 * high
     for _ in range(halvings):
         middle = (low + high) / 2
-        safe = [cb.Inside(cb.HalfSpace(row, middle))]
-        verdict = cb.verify_safety(problem.replace(safe=safe), method="linear")
-        low, high = (low, middle) if verdict.status == "SAFE" else (middle, high)
+        low, high = (low, middle) if safe(middle) else (middle, high)
     return high
 
 
