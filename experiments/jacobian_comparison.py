@@ -7,8 +7,9 @@
   immrax 0.3.8 reads the operations of JAX 0.7; those that JAX 0.12 has added are reported as not supported.
 
 Boxes of width 0, 1e-6 and 0.1 lie at random in the domain of each model of `constants_suite`. The yardsticks are the
-hull of sampled Jacobians (sum of the entries' widths over that of the hull: nothing that encloses is below 1), and Jacobians at points of the boxes in 200-bit ball
-arithmetic: a box is enclosed if none of them lies outside. Operations that immrax lacks are named.
+hull of sampled Jacobians (sum of the entries' widths over that of the hull: nothing that encloses is below 1), and
+Jacobians at points of the boxes in 200-bit ball arithmetic: a box is enclosed if none of them lies outside. Operations
+that immrax lacks are named.
 """
 
 from __future__ import annotations
