@@ -49,6 +49,7 @@ def derive(
     result = {
         **describe_constants(constants),
         "domain": where,
+        "status": None if constants.proof is None else constants.proof.status,
         "metrics": [
             {"constraint": constraint.label, **describe_constants(one)}
             for constraint, one in zip(subject.safe, metrics)
@@ -137,6 +138,7 @@ def _print(constants: Constants, result: dict[str, Any]) -> None:
     if constants.gap is not None:
         screen.print(f"at most {constants.gap:.3g} above what sampling found")
     screen.print(f"holds on {result['domain']}", markup=False)
+    screen.print(f"proposed by: {result['status']}", markup=False)
     if result["metrics"]:
         screen.print(_table(name, [{"constraint": "all in one", **result}, *result["metrics"]]))
     screen.print(f"{result['seconds']:.2f} s")

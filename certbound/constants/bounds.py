@@ -131,7 +131,7 @@ def certify(
     found = _supremum(model, jacobian, norm, tolerance, budget)
     if not np.isfinite(found.upper):
         _refuse(model, jacobian, found)
-    noise = bound_noise(model, norm)
+    noise, status = bound_noise(model, norm), jacobian.remark(status)
     return _record(model, norm, noise, np.array(found.upper), found.sampled, found.boxes, status, None)
 
 
@@ -203,8 +203,9 @@ def _slope_weights(norm: Metric, spread: Any, fallback: Array) -> Array:
     size = spread.slopes.mag
     finite = np.isfinite(size).all(axis=(-1, -2, -3)) & np.isfinite(spread.reach).all(axis=-1)
     safe = np.where(finite[:, None, None, None], size, 0.0)
-    seen = np.abs(norm.transform(safe))
-    weights = np.where(finite[:, None], spread.reach, 0.0) * np.sqrt(np.sum(seen**2, axis=(-1, -2)))
+    with np.errstate(all="ignore"):  # weights only order the halving: an overflow is as good as any
+        seen = np.abs(norm.transform(safe))
+        weights = np.where(finite[:, None], spread.reach, 0.0) * np.sqrt(np.sum(seen**2, axis=(-1, -2)))
     result: Array = np.where(finite[:, None], weights, fallback)
     return result
 
@@ -315,7 +316,7 @@ def constants_along(
     noise = bound_noise(model, norm, pieces)
     largest = float(sampled[np.argmax(values)])
     where = f"the given boxes, one for each of {len(boxes)} time pieces up to {ends[-1]:g}"
-    return _record(model, norm, noise, values, largest, count, "given metric", ends, where)
+    return _record(model, norm, noise, values, largest, count, jacobian.remark("given metric"), ends, where)
 
 
 def _piecewise(model: Model, jacobian: StateJacobian, norm: Metric, boxes: Interval, refine: int) -> tuple[Array, int]:

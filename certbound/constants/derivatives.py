@@ -75,6 +75,12 @@ class StateJacobian:
         """State dimension n."""
         return len(self.columns)
 
+    def remark(self, status: str) -> str:
+        """``status``, and that the Jacobian is the generalised one where the model has kinks (abs, min, max)."""
+        if all(node.op != "kink" for node in self.tape.nodes):
+            return status
+        return f"{status}; generalised Jacobian at the kinks of abs, min, max"
+
     def enclose(self, boxes: Interval) -> Interval:
         """Jacobians over boxes of the active slots (N, k): shape (N, n, n), unbounded where refused."""
         return enclose(self.tape, self._inputs(boxes), undefined="infinite")

@@ -171,6 +171,7 @@ def test_unbounded_jacobians_are_refused_with_entry_and_cure():
     [
         (lambda x: [1 / x[0]], r"\(1 / q\)"),
         (lambda x: [np.log(x[0])], r"log\(q\)|1 / q"),
+        (lambda x: [np.sqrt(x[0])], r"sqrt\(q\).* q in \[-"),
         (lambda x: [np.sign(x[0])], r"sign\(q\)"),
         (lambda x: [np.where(x[0] > 0.3, 1.0, 0.0)], r"q"),
     ],
@@ -182,6 +183,31 @@ def test_undefined_and_jumping_models_are_refused_by_name(f, expression):
     with pytest.raises(InfeasibleError, match=expression):
         bound_constants(system, metric="euclidean")
     assert bound_constants(system, cb.Box([0.5], [1]), metric="euclidean").certified
+
+
+def test_kinks_are_bounded_by_the_generalised_jacobian_and_said():
+    bent = cb.ContinuousSystem(lambda x: [-x[0] + 0.5 * np.abs(x[0]), np.maximum(x[0], -x[1])], states=2)
+    k = bound_constants(bent, metric="euclidean")
+    jacobians = np.array([[[-1 + a / 2, 0], [b, b - 1]] for a in (-1, 1) for b in (0, 1)])  # at the kink: their hull
+    truth = np.linalg.eigvalsh(jacobians + jacobians.transpose(0, 2, 1)).max() / 2
+    assert truth <= k.rate <= truth + 0.01
+    assert "generalised Jacobian at the kinks" in k.proof.status
+    along = constants_along(bent, [0.0, 1.0], Interval([[-1.0, -1.0]], [[1.0, 1.0]]))
+    assert along.rate[0] >= truth
+    assert "generalised Jacobian at the kinks" in along.proof.status
+    smooth = bound_constants(cb.ContinuousSystem(lambda x: [-x[0]], states=1), metric="euclidean")
+    assert "generalised" not in smooth.proof.status
+
+
+def test_huge_slopes_raise_no_warning_and_stay_sound():
+    steep = cb.ContinuousSystem(lambda x: [np.exp(x[0]) * np.sin(x[1]), -x[1]], states=2)
+    k = bound_constants(steep, cb.Box([600, 0], [700, 6]), metric="euclidean", budget=200)
+    assert np.exp(699.9) * 0.99 <= k.rate < np.inf
+
+
+def test_an_empty_domain_is_refused():
+    with pytest.raises(ValueError, match="low"):
+        bound_constants(cb.linear_system(-np.eye(1)), cb.Box([1.0], [0.0]))
 
 
 def test_constants_along_a_tube_follow_the_pieces():
