@@ -108,14 +108,16 @@ def verify(
 
 def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> Verdict:
     """The verdict; with a limit, the best one of the engines that finished in time."""
-    from certbound.safety.verification import Verdict, verify_safety
+    from certbound.safety.verification import ENGINES, Verdict, verify_safety
 
     if clock.limit is None:
         return verify_safety(problem, method=method, cells=cells)
     best: Verdict | None = None
     over = f"The search was stopped after {clock.limit:g} s."
     try:
-        for engine in ("linear", "constants") if method == "auto" else (method,):
+        for engine in ENGINES if method == "auto" else (method,):
+            if engine == "barrier" and best is not None and best.status == "SAFE":
+                break
             with clock.running():
                 found = verify_safety(problem, method=engine, cells=cells)
             if best is None or (found.status != "SAFE", found.log10_delta) < (best.status != "SAFE", best.log10_delta):

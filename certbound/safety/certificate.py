@@ -103,6 +103,8 @@ def _writer(name: str) -> Callable[[Problem, EngineAnswer, int], Proof]:
         from certbound.safety.certificate_linear import linear_proof
 
         return linear_proof
+    if name == "barrier":
+        raise CertificateError("the format has no proofs by barriers; a verdict of another engine has one.")
     from certbound.safety.certificate_constants import constants_proof
 
     return constants_proof

@@ -14,6 +14,7 @@ from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.reach.tube import ReachTube
 from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, settled
+from certbound.safety.barrier import barrier_engine
 from certbound.safety.certificate import certificate_data, certificate_text
 from certbound.safety.contraction import constants_engine
 from certbound.safety.falsification import Violation, find_violation
@@ -21,7 +22,7 @@ from certbound.safety.linear import linear_engine
 from certbound.tubes.constants import Constants
 from certbound.tubes.tuning import METHODS
 
-__all__ = ["EngineAnswer", "Verdict", "verify_safety"]
+__all__ = ["ENGINES", "EngineAnswer", "Verdict", "verify_safety"]
 
 
 def _constants(problem: Problem, **options: Any) -> EngineAnswer:
@@ -32,10 +33,18 @@ def _linear(problem: Problem, **options: Any) -> EngineAnswer:
     return linear_engine(problem, **options)
 
 
-_ENGINES: dict[str, Callable[..., EngineAnswer]] = {"linear": _linear, "constants": _constants}
+def _barrier(problem: Problem, **options: Any) -> EngineAnswer:
+    return barrier_engine(problem, **options)
+
+
+_ENGINES: dict[str, Callable[..., EngineAnswer]] = {"linear": _linear, "constants": _constants, "barrier": _barrier}
 """Engines in the order in which they are tried: name to function(problem, method=, cells=, constants=, quick=).
 
 ``quick`` says that another engine has proved SAFE or been conclusive: slow refinements may be left out."""
+
+
+ENGINES = tuple(_ENGINES)
+"""Names of the engines, in the order in which they are tried."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -155,8 +164,9 @@ def verify_safety(
     problem : Problem
         With a plan if its system has inputs.
     method : str
-        "auto" runs every engine that fits and keeps the smallest probability; "constants" or "linear" runs one; a
-        tube method such as "kummer" or "thm3" runs the constants engine with that tube.
+        "auto" runs every engine that fits and keeps the smallest probability (the barrier engine only where the
+        others have not proved SAFE); "linear", "constants" or "barrier" runs one; a tube method such as "kummer" or
+        "thm3" runs the constants engine with that tube.
     cells : int, optional
         Parts along each side of the initial set.
     constants : Constants, optional

@@ -1,0 +1,103 @@
+"""Polynomial barriers: what is proved holds at every point, and the bound is above the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import certbound as cb
+from certbound.errors import CertificateError
+from certbound.safety.barrier import Barrier, barrier_engine
+
+
+def scalar(**changes: object) -> cb.Problem:
+    """Brownian motion with an inward drift in an interval."""
+    system = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=[[0.3]])
+    given = {"initial": [0.0], "safe": [cb.Inside(cb.Box([-1.0], [1.0]))], "horizon": 2.0, "delta": 1e-2}
+    return cb.Problem(system, **{**given, **changes})  # type: ignore[arg-type]
+
+
+def oscillator(sigma: float) -> cb.Problem:
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -x[0] - x[1] - 0.5 * x[0] ** 3], states=["x1", "x2"], diffusion=[[0.0], [sigma]]
+    )
+    return cb.Problem(
+        system, initial=cb.Box([-1, -1], [1, 1]), safe=[cb.Inside(cb.HalfSpace([0, 1], 2.25))], horizon=5.0,
+        delta=1e-3, domain=cb.Box([-3, -3], [3, 3]),
+    )  # fmt: skip
+
+
+def values(barrier: Barrier, x: np.ndarray) -> np.ndarray:
+    y = (x - barrier.center) / barrier.scale
+    return np.sum(barrier.coefficients * np.prod(y[:, None, :] ** barrier.exponents, axis=-1), axis=-1)
+
+
+def test_the_bound_is_above_the_probability_and_not_far_above() -> None:
+    found = barrier_engine(scalar())
+    exits = cb.simulate_exits(scalar(), paths=200_000, rng=1, steps=400)
+    assert 10**found.log10_delta >= exits.probability
+    stationary = 2 * norm.sf(1 / (0.3 / np.sqrt(2)))
+    assert 10**found.log10_delta < 100 * stationary
+
+
+def test_a_hardening_spring_is_certified_at_large_noise() -> None:
+    problem = oscillator(0.5)
+    verdict = cb.verify_safety(problem, method="barrier")
+    assert verdict.status == "SAFE"
+    assert verdict.method == "barrier"
+    barrier = verdict.answers["barrier"].details
+    rng = np.random.default_rng(3)
+    x = rng.uniform([-3, -3], [3, 2.25], (100_000, 2))
+    step = 1e-4
+    slope = np.stack([(values(barrier, x + e) - values(barrier, x - e)) / (2 * step) for e in step * np.eye(2)], axis=1)
+    up = np.array([0.0, step])
+    bend = (values(barrier, x + up) - 2 * values(barrier, x) + values(barrier, x - up)) / step**2
+    drift = np.stack([x[:, 1], -x[:, 0] - x[:, 1] - 0.5 * x[:, 0] ** 3], axis=1)
+    generator = np.sum(slope * drift, axis=1) + 0.125 * bend + 0.125 * slope[:, 1] ** 2
+    assert generator.max() <= barrier.growth + 1e-4
+    assert generator.max() > barrier.growth - 0.05
+    assert values(barrier, rng.uniform(-1, 1, (50_000, 2))).max() <= barrier.start
+    sides = np.concatenate([
+        np.stack([rng.uniform(-3, 3, 5000), np.full(5000, 2.25)], axis=1),
+        np.stack([np.full(5000, 3.0), rng.uniform(-3, 2.25, 5000)], axis=1),
+        np.stack([np.full(5000, -3.0), rng.uniform(-3, 2.25, 5000)], axis=1),
+        np.stack([rng.uniform(-3, 3, 5000), np.full(5000, -3.0)], axis=1),
+    ])  # fmt: skip
+    assert values(barrier, sides).min() >= barrier.boundary
+
+
+def test_noise_that_depends_on_the_state_a_disturbance_and_an_obstacle() -> None:
+    system = cb.ContinuousSystem(
+        lambda x, d: [-x[0] + d[0], -2 * x[1]], states=["a", "b"], disturbance=cb.Box([-0.1], [0.1]),
+        diffusion=lambda t, x: np.array([[0.1 + 0.1 * x[0] ** 2, 0.0], [0.0, 0.15]]),
+    )  # fmt: skip
+    problem = cb.Problem(
+        system, initial=cb.Ball([0.0, 0.0], 0.05), horizon=1.0, delta=0.05,
+        safe=[cb.Inside(cb.Box([-1, -1], [1, 1])), cb.Outside(cb.Ball([0.7, 0.7], 0.2))],
+    )  # fmt: skip
+    found = barrier_engine(problem)
+    exits = cb.simulate_exits(problem, paths=20_000, rng=1, steps=200)
+    assert found.log10_delta < -1.5
+    assert 10**found.log10_delta >= exits.lower
+
+
+@pytest.mark.parametrize(
+    ("problem", "why"),
+    [
+        (cb.load("chain"), "continuous time"),
+        (scalar(safe=[cb.Inside(cb.HalfSpace([1.0], 1.0))]), "bound every state"),
+        (scalar(safe=[cb.Inside(cb.Box([-1.0], [1.0]), during=(1.0, 2.0))]), "windows"),
+        (scalar(initial=cb.GaussianStart([0.0], [[0.01]])), "bounded initial set"),
+    ],
+)
+def test_what_it_does_not_treat_it_names(problem: cb.Problem, why: str) -> None:
+    found = barrier_engine(problem)
+    assert not found.applicable
+    assert why in found.reason
+
+
+def test_no_certificate_is_written_for_it() -> None:
+    verdict = cb.verify_safety(scalar(), method="barrier")
+    with pytest.raises(CertificateError, match="barrier"):
+        verdict.certificate_text(verdict.problem)
