@@ -26,7 +26,7 @@ def exit_level(
 
     The schedule must be cut at the ends of the clearance. On a piece I_t falls and v_t is monotone, so that the
     minimum over [s, e] is at least the value with I_e and max(v_s, v_e); pieces where v falls are halved until the
-    minimum is found within 1 %.
+    minimum is found within 2 %.
 
     Source: Thm K2, item 7.5 of docs/theory.md.
     """
@@ -120,7 +120,7 @@ class _Gain:
             e -= 1
         return (s, e) if s <= e else None
 
-    def least(self, gap: float = 0.01, budget: int = 64) -> arb:
+    def least(self, gap: float = 0.02, budget: int = 64) -> arb:
         """Lower bound of the minimum over the horizon, within ``gap`` where it is cheap."""
         items: list[tuple[float, int, float, float, arb]] = []
         attained = smallest = math.inf

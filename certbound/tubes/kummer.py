@@ -133,9 +133,14 @@ class KummerProfile:
             return upper(largest), lower(last)
 
     def rough(self, piece: int, start: float, end: float) -> float:
-        """The same with the largest z, that of the horizon."""
+        """The same with z at one of a few later nodes, where it is larger."""
+        count = len(self.schedule.lengths)
+        stride = max(1, count // 16)
+        node = min(count, (piece // stride + 1) * stride)
         with precision():
-            z = self._level(arb(0))
+            if node not in self._milestones:
+                self._milestones[node] = self._level(self.path.nodes[1][node])
+            z = self._milestones[node]
             ends = [self.path.at(piece, t)[0] for t in (start, end)]
             return upper(arb(self.schedule.unit) * (2 * arb.max(*ends) * z).sqrt())
 
@@ -149,6 +154,10 @@ class KummerProfile:
         """Ball of X."""
         with precision():
             return initial_ball(self.path, self.a, self.start)
+
+    @cached_property
+    def _milestones(self) -> dict[int, arb]:
+        return {}
 
     @cached_property
     def _known(self) -> dict[float, arb]:

@@ -93,16 +93,20 @@ class Schedule:
     @cached_property
     def nodes(self) -> tuple[Array, Array]:
         """(gain, variance) at the times: v = gain v_0 + variance."""
-        same = (np.diff(self.rates) == 0) & (np.diff(self.noise) == 0)
-        starts = np.flatnonzero(np.append(True, ~same))  # runs of equal data are closed forms
-        gain, variance = np.ones(len(self.times)), np.zeros(len(self.times))
+        changes = (np.diff(self.rates) != 0) | (np.diff(self.noise) != 0)
+        starts = np.flatnonzero(np.append(True, changes))  # runs of equal data are closed forms
+        run = np.append(0, np.cumsum(changes))
         with np.errstate(over="ignore", invalid="ignore"):
-            for first, last in zip(starts, np.append(starts[1:], len(self.lengths))):
-                rate, noise = self.rates[first], self.noise[first]
-                elapsed = self.times[first + 1 : last + 1] - self.times[first]
-                growth = np.exp(2 * rate * elapsed)
-                gain[first + 1 : last + 1] = gain[first] * growth
-                variance[first + 1 : last + 1] = variance[first] * growth + noise * integral(2 * rate, elapsed)
+            elapsed = self.times[1:] - self.times[starts][run]
+            growth = np.exp(2 * self.rates * elapsed)
+            forward = self.noise * integral(2 * self.rates, elapsed)
+            ends = np.append(starts[1:], len(run)) - 1
+            gains, variances = [1.0], [0.0]
+            for factor, part in zip(growth[ends].tolist(), forward[ends].tolist()):
+                gains.append(gains[-1] * factor)
+                variances.append(variances[-1] * factor + part)
+            gain = np.append(1.0, np.array(gains)[run] * growth)
+            variance = np.append(0.0, np.array(variances)[run] * growth + forward)
         return gain, np.nan_to_num(variance, nan=np.inf, posinf=np.inf)
 
     def refined(self, times: Array) -> Schedule:

@@ -18,7 +18,7 @@ from certbound.tubes.kummer import Start, log_initial, log_target
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.series import (
     log_excess,
-    log_excess_one,
+    log_excess_value,
     log_phi,
     log_phi_one,
     solve_excess,
@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 _POWERS = np.array([0.0, 0.2, 1.0, 6.0, 60.0])
 _SPREADS = np.log(10.0) * np.array([-3.0, -1.8, -0.9, -0.3, 0.0, 0.5, 1.5])
 _FEW = 16
-_DIGITS = 1e-11
+_DIGITS = 1e-8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -203,7 +203,7 @@ class Search:
         """log of phi(I) + e^{a I} E_a(z)."""
         if not z > 0:
             return -math.inf if info <= 0 else math.log(info) + log_phi_one(a * info)
-        excess = log_excess_one(a, self.half, z, bessel=self.bessel, digits=_DIGITS)[0] + a * info
+        excess = log_excess_value(a, self.half, z, bessel=self.bessel, digits=_DIGITS) + a * info
         return excess if info <= 0 else _log_add(math.log(info) + log_phi_one(a * info), excess)
 
     def scale(self, a: float, v0: float) -> float:

@@ -10,9 +10,11 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
+from scipy.special import gammaln, hyp0f1, hyp1f1
 
-__all__ = ["log_excess", "log_excess_one", "log_phi", "log_phi_one", "solve_excess", "solve_excess_one"]
+__all__ = [
+    "log_excess", "log_excess_one", "log_excess_value", "log_phi", "log_phi_one", "solve_excess", "solve_excess_one",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -154,6 +156,16 @@ def log_excess_one(a: float, b: float, z: float, *, bessel: bool = False, digits
         return math.log(total), moment / total
     value, slope = log_excess(np.asarray(a), b, np.asarray(z), bessel=bessel)
     return float(value), float(slope)
+
+
+def log_excess_value(a: float, b: float, z: float, *, bessel: bool = False, digits: float = 1e-17) -> float:
+    """The value of :func:`log_excess_one` alone, to 7 digits, from SciPy where that is quicker."""
+    if 0.1 <= b <= 50 and ((bessel and 1 <= a * z <= 1e4) or (not bessel and a <= 1e3 and 1 <= z <= 250)):
+        power = a if bessel else max(a, 1e-8)
+        value = float(hyp0f1(b, a * z) if bessel else hyp1f1(power, b, z))
+        if 1.00001 < value < 1e290:
+            return math.log((value - 1) / power)
+    return log_excess_one(a, b, z, bessel=bessel, digits=digits)[0]
 
 
 def _strided_one(a: float, b: float, z: float, bessel: bool) -> tuple[float, float]:

@@ -321,7 +321,7 @@ def bound_exit_probability(
     if np.max(cut.rates) >= 0:
         forms.append((scaled, True))
     for data, bessel in forms:
-        graded = data.graded(6)
+        graded = data.graded(4)
         search = Search(
             schedule=graded, kind="probability", weights=Objective(None, "scale", held).weights(graded), bessel=bessel,
             start=start,

@@ -12,6 +12,7 @@ from certbound.rigor.balls import bessel_excess, kummer_excess, precision
 from certbound.tubes.series import (
     log_excess,
     log_excess_one,
+    log_excess_value,
     log_phi,
     log_phi_one,
     solve_excess,
@@ -70,3 +71,23 @@ def test_log_phi_is_log_of_expm1_over_x(x):
         expected = float((arb(x).expm1() / arb(x)).log()) if x else 0.0
     assert log_phi_one(x) == pytest.approx(expected, rel=1e-12, abs=1e-14)
     assert log_phi(np.array([x]))[0] == pytest.approx(expected, rel=1e-12, abs=1e-14)
+
+
+def test_values_by_scipy_agree_with_the_series():
+    rng = np.random.default_rng(4)
+    for _ in range(400):
+        a, b, z = 10 ** rng.uniform(-7, 2.5), 10 ** rng.uniform(-1, 1.8), 10 ** rng.uniform(-1, 2.6)
+        a = 0.0 if a < 1e-6 else a
+        for bessel in (False, True)[: 1 + (a > 0)]:
+            expected = log_excess_one(a, b, z, bessel=bessel)[0]
+            assert log_excess_value(a, b, z, bessel=bessel) == pytest.approx(expected, abs=2e-7)
+
+
+def test_far_out_the_scalar_sum_agrees_with_the_array():
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        a, b, z = 10 ** rng.uniform(-2, 4), 10 ** rng.uniform(-1, 2.7), 10 ** rng.uniform(2.5, 7)
+        for bessel in (False, True):
+            value, slope = log_excess(np.asarray(a), b, np.asarray(z), bessel=bessel)
+            got = log_excess_one(a, b, z, bessel=bessel)
+            assert got == pytest.approx((float(value), float(slope)), rel=1e-6)
