@@ -118,19 +118,22 @@ class LinearTube(Tightening):
         after = np.clip(np.floor(place + 1e-9).astype(int), 0, engine.pieces - 1)
         return np.asarray(np.maximum(taken[before], taken[after]))
 
-
     def _levels(self, rows: Array, key: object) -> Array:
         """Levels of Z along rows (N, R, n): a factor times the standard deviation."""
         events = [self.events.along(rows[:, index]) for index in range(rows.shape[1])]
         shapes = np.stack([event.profile for event in events], axis=1)
         if isinstance(self.events, StepEvents):
-            factors = [level_scale(e, e.profile, self.log_share) if e.profile.max() > 0 else 0.0 for e in events]
-            return np.asarray(shapes * np.array(factors))
+            return np.asarray(shapes * np.array([self._factor(event) for event in events]))
         if key not in self.factors:
-            largest = events[int(np.argmax(shapes.max(axis=0)))]
-            quiet = largest.profile.max() <= 0
-            self.factors[key] = 0.0 if quiet else level_scale(largest, largest.profile, self.log_share)
+            self.factors[key] = self._factor(events[int(np.argmax(shapes.max(axis=0)))])
         return np.asarray(shapes * self.factors[key])
+
+    def _factor(self, event: Any) -> float:
+        """Standard deviations that a level takes; a guess (the union bound over the pieces) where none is proved."""
+        if event.profile.max() <= 0:
+            return 0.0
+        found = level_scale(event, event.profile, self.log_share)
+        return found if np.isfinite(found) else float(np.sqrt(2 * (np.log(2 * len(event.profile)) - self.log_share)))
 
 
 def tighten(tube: Tightening, faces: Sequence[Face], states: Array, times: Array) -> Array:

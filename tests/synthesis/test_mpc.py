@@ -96,6 +96,33 @@ def test_auto_says_what_it_looked_for() -> None:
     assert cb.synthesize_plan(cart(std=0.07, horizon=12, delta=1.02 * delta), tube=found.method).feasible
 
 
+@pytest.mark.parametrize("feedback", [None, [[-4.0, -3.0]]])
+def test_continuous_time_is_planned_and_proved(feedback: Any) -> None:
+    system = cb.ContinuousSystem(
+        lambda x, u: [x[1], u[0] - np.sin(x[0])], states=2, inputs=cb.Box([-6], [6]), diffusion=[[0], [0.02]]
+    )
+    safe = [cb.Inside(cb.Box([-0.2, -0.6], [1.2, 0.6])), cb.Inside(cb.Box([-0.2, -0.6], [0.8, 0.6]), during=(0.6, 0.6))]
+    problem = cb.Problem(system, initial=[1, 0], safe=safe, horizon=0.6, delta=1e-2)
+    found = cb.synthesize_plan(problem, tube="linear", steps=6, feedback=feedback)
+    assert found.status == "SAFE"
+    assert found.states[-1, 0] < 0.8
+    paths = cb.sample_paths(found.problem, paths=200, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(paths.mean(axis=0)[-1], found.states[-1], atol=0.02)
+
+
+@pytest.mark.slow
+def test_continuous_time_is_planned_around_an_obstacle() -> None:
+    system = cb.ContinuousSystem(
+        lambda x, u: [x[1], u[0] - np.sin(x[0])], states=2, inputs=cb.Box([-6], [6]), diffusion=[[0], [0.02]]
+    )
+    safe = [cb.Outside(cb.Ball([0.5, -0.8], 0.3)), cb.Inside(cb.Box([-0.2, -2], [1.2, 2]))]
+    end = cb.Inside(cb.Box([-0.2, -0.5], [0.2, 0.5]), during=(1.5, 1.5))
+    problem = cb.Problem(system, initial=[1, 0], safe=[*safe, end], horizon=1.5, delta=1e-2)
+    found = cb.synthesize_plan(problem, tube="linear", steps=12)
+    assert found.status == "SAFE"
+    assert np.linalg.norm(found.states - [0.5, -0.8], axis=1).min() > 0.3
+
+
 def test_a_given_tube_serves(problem: cb.Problem) -> None:
     constants = cb.Constants(gain=1.0, sigma=0.002, dimension=2)
     tube = cb.tune_tube(constants, horizon=20, delta=1e-3, method="thm4")
