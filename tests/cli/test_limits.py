@@ -118,10 +118,12 @@ def test_as_many_paths_are_simulated_as_fit(
 ) -> None:
     monkeypatch.setenv("CERTBOUND_CACHE", str(request.config.cache.mkdir("kernels")))  # type: ignore[union-attr]
     words = ("simulate", "ou", "--set", "radius=0.8", "--seed", "1")
+    assert run([*words, "--paths", "10"]) == 0  # compiles
+    capsys.readouterr()
     started = time.perf_counter()
     code, found = answer(capsys, *words, "--paths", "1e12", "--time-limit", "2")
     assert code == 0
-    assert 4000 < found["paths"] < 1e12 == found["asked"]
+    assert 2000 < found["paths"] < 1e12 == found["asked"]
     assert time.perf_counter() - started < 15
     assert found["lower"] < 0.136 < found["upper"]
     assert run([*words, "--paths", "1e12", "--time-limit", "1"]) == 0
