@@ -6,7 +6,7 @@ import logging
 import shlex
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -65,7 +65,9 @@ PlotOption = Annotated[
     Path | None,
     typer.Option("--plot", metavar="FILE", help="Draw tube, sets and sample paths.", show_default=False),
 ]
-ExplainOption = Annotated[bool, typer.Option("--explain", help="Show what each engine found.")]
+ExplainOption = Annotated[
+    bool, typer.Option("--explain", help="Show what each engine found, and for UNKNOWN what would be SAFE.")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -98,6 +100,8 @@ def verify(
     result = _result(subject, verdict, seconds)
     if explain:
         result["engines"] = _engines(verdict)
+        if verdict.status == "UNKNOWN":
+            result["limits"] = _limits(verdict, cells)
     _write(subject, verdict, certificate=certificate, report=report, plot=plot)
     if as_json:
         print_json(result)
@@ -159,6 +163,15 @@ def _engines(verdict: Verdict) -> list[dict[str, Any]]:
         found = {key: getattr(answer, key) for key in ("log10_delta", "margin", "constraint", "time", "reason")}
         rows.append({"engine": name, "method": answer.method, "applicable": answer.applicable, **found})
     return rows
+
+
+def _limits(verdict: Verdict, cells: int | None) -> dict[str, Any]:
+    """What would be SAFE, for --explain."""
+    from certbound.safety.limits import find_limits
+
+    with spinner("looking for what would be SAFE"):
+        found = find_limits(verdict, cells=cells)
+    return asdict(found) | {"summary": found.summary()}
 
 
 def _write(
@@ -245,3 +258,5 @@ def _print(problem: Problem, result: dict[str, Any]) -> None:
     for row in result.get("engines", ()):
         bound = f"<= {log10_text(row['log10_delta'])}" if row["applicable"] else "does not apply"
         screen.print(f"  {row['engine']} ({row['method']}): {bound}. {row['reason']}", markup=False)
+    if "limits" in result:
+        screen.print(result["limits"]["summary"], markup=False)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -299,7 +300,9 @@ class _Work:
         ]
         program = cp.Problem(cp.Minimize(top + growth * self.problem.horizon), rows)
         try:
-            program.solve(solver=cp.CLARABEL)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # an inaccurate proposal is a proposal
+                program.solve(solver=cp.CLARABEL)
         except cp.SolverError:
             return None, 0.0
         if c.value is None or not np.isfinite(program.value) or program.value >= 0:

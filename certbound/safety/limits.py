@@ -1,0 +1,190 @@
+"""What would be certified instead: the longest horizon, the strongest noise, the least widening of the safe set.
+
+For a problem that is UNKNOWN each is found by bisection with the engine that came nearest; every value that is
+returned was itself verified SAFE.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from certbound.errors import CertboundError
+from certbound.problem.problem import Problem
+from certbound.problem.regions import Ball, Box, HalfSpace, Polytope, Region
+from certbound.problem.sets import Inside, Outside
+from certbound.problem.systems import ContinuousSystem, System
+from certbound.problem.tape import Tape
+from certbound.problem.trace import substitute, trace
+from certbound.safety.verification import ENGINES, Verdict, verify_safety
+
+__all__ = ["Limits", "find_limits"]
+
+_HALVINGS = 5
+_WIDENINGS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Each with everything else as asked; None where nothing was found.
+
+    Parameters
+    ----------
+    delta : float or None
+        Probability that is certified as it stands.
+    horizon : float or None
+        A horizon that is SAFE.
+    noise : float or None
+        A factor on the noise with which the problem is SAFE.
+    widening : float or None
+        A distance by which every constraint would have to give way (Euclidean, in the states' units).
+    """
+
+    delta: float | None
+    horizon: float | None
+    noise: float | None
+    widening: float | None
+
+    def summary(self) -> str:
+        """One sentence."""
+        found = [
+            ("delta", self.delta, "delta = {:.3g}"),
+            ("horizon", self.horizon, "a horizon of {:.4g}"),
+            ("noise", self.noise, "noise {:.3g} times as large"),
+            ("widening", self.widening, "constraints moved outward by {:.3g}"),
+        ]
+        words = [text.format(value) for _, value, text in found if value is not None]
+        return f"SAFE would be: {', or '.join(words)}." if words else "Nothing near the problem was certified."
+
+
+def find_limits(verdict: Verdict, *, cells: int | None = None) -> Limits:
+    """Bisect for what would be SAFE.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        Not SAFE.
+    cells : int, optional
+        Parts along each side of the initial set.
+
+    Raises
+    ------
+    ValueError
+        If the verdict is SAFE or knows no problem.
+    """
+    problem = verdict.problem
+    if problem is None or verdict.status == "SAFE":
+        raise ValueError(f"`verdict` must be one that is not SAFE, of a problem; got {verdict.summary()}")
+    useful = [name for name in ENGINES if name in verdict.answers and verdict.answers[name].applicable]
+    engine = min(useful, key=lambda name: verdict.answers[name].log10_delta, default="auto")
+
+    def safe(changed: Callable[[], Problem]) -> bool:
+        try:
+            return verify_safety(changed(), method=engine, cells=cells).status == "SAFE"
+        except (CertboundError, ValueError, ArithmeticError):
+            return False
+
+    level = 10.0**verdict.log10_delta
+    return Limits(
+        delta=level if level < 1 else None,
+        horizon=_horizon(problem, safe),
+        noise=_largest(lambda factor: safe(lambda: _noisier(problem, factor)), 1e-3),
+        widening=_widening(problem, verdict, safe),
+    )
+
+
+def _horizon(problem: Problem, safe: Callable[[Callable[[], Problem]], bool]) -> float | None:
+    if problem.system.time == "continuous":
+        share = _largest(lambda factor: safe(lambda: problem.replace(horizon=factor * problem.horizon)), 1 / 64)
+        return None if share is None else share * problem.horizon
+    low, high = 0, int(problem.horizon)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if safe(lambda: problem.replace(horizon=middle)) else (low, middle)  # noqa: B023
+    return float(low) if low else None
+
+
+def _largest(holds: Callable[[float], bool], least: float) -> float | None:
+    """Nearly the largest factor in (least, 1) that holds, by bisection of its logarithm."""
+    low, high = math.log(least), 0.0
+    found = None
+    for _ in range(_HALVINGS + (low < -3)):
+        middle = (low + high) / 2
+        if holds(math.exp(middle)):
+            found, low = math.exp(middle), middle
+        else:
+            high = middle
+    return found
+
+
+def _noisier(problem: Problem, factor: float) -> Problem:
+    """The problem with its noise times ``factor``."""
+    system: System = copy.copy(problem.system)
+    if isinstance(system, ContinuousSystem):
+        value: Any = system.diffusion
+        if isinstance(value, Tape):
+            rows, columns = value.shape
+            names = [f"g {k}" for k in range(rows * columns)]
+            scaled = trace(lambda g: [[factor * g[i * columns + j] for j in range(columns)] for i in range(rows)],
+                           {"g": names})  # fmt: skip
+            value = substitute(scaled, value.inputs, {name: (value, k) for k, name in enumerate(names)})
+        else:
+            value = factor * value
+        object.__setattr__(system, "diffusion", value)
+    else:
+        object.__setattr__(system, "noise_matrix", factor * np.asarray(problem.system.noise_matrix))  # type: ignore[union-attr]
+    return problem.replace(system=system)
+
+
+def _widening(problem: Problem, verdict: Verdict, safe: Callable[[Callable[[], Problem]], bool]) -> float | None:
+    """Nearly the least distance, from the verdict's own margin on."""
+    missing = -verdict.margin if verdict.margin is not None and -math.inf < verdict.margin < 0 else None
+    if missing is None:
+        return None
+    low, high = 0.0, 1.05 * missing
+    for _ in range(_WIDENINGS):
+        if safe(lambda: _wider(problem, high)):  # noqa: B023
+            break
+        low, high = high, 2 * high
+    else:
+        return None
+    for _ in range(_HALVINGS - 2):
+        middle = (low + high) / 2
+        low, high = (low, middle) if safe(lambda: _wider(problem, middle)) else (middle, high)  # noqa: B023
+    return high
+
+
+def _wider(problem: Problem, distance: float) -> Problem:
+    """Every constraint and the domain moved outward by ``distance``."""
+    safe = [_moved(constraint, distance) for constraint in problem.safe]
+    domain = None if problem.domain is None else _grown(problem.domain, distance)
+    return problem.replace(safe=safe, domain=domain)
+
+
+def _moved(constraint: Inside, distance: float) -> Inside:
+    sign = -1.0 if isinstance(constraint, Outside) else 1.0
+    return replace(constraint, region=_grown(constraint.region, sign * distance))
+
+
+def _grown(region: Region, distance: float) -> Region:
+    """The region with its boundary moved outward by at most ``distance``.
+
+    Raises
+    ------
+    ValueError
+        If nothing is left, or the region is an ellipsoid.
+    """
+    if isinstance(region, Box):
+        return replace(region, low=region.low - distance, high=region.high + distance)
+    if isinstance(region, Ball):
+        return replace(region, radius=region.radius + distance)
+    if isinstance(region, HalfSpace):
+        return replace(region, bound=region.bound + distance * float(np.linalg.norm(region.normal)))
+    if isinstance(region, Polytope):
+        return replace(region, b=region.b + distance * np.linalg.norm(region.A, axis=1))
+    raise ValueError("an ellipsoid cannot be moved outward evenly.")

@@ -1,0 +1,55 @@
+"""What `find_limits` says would be SAFE is SAFE, and nearly the most that would be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.safety.limits import find_limits
+
+
+def walk(bound: float = 4.0, sigma: float = 1.0, steps: int = 16) -> cb.Problem:
+    """A random walk: over k steps its exit probability is close to 4 Q(bound / (sigma sqrt(k)))."""
+    system = cb.linear_system([[1.0]], noise=cb.Gaussian(std=sigma))
+    safe = [cb.Inside(cb.Box([-bound], [bound]))]
+    return cb.Problem(system, initial=[0.0], safe=safe, horizon=steps, delta=1e-3)
+
+
+def status(problem: cb.Problem) -> str:
+    return cb.verify_safety(problem, method="linear").status
+
+
+def test_limits_of_a_random_walk() -> None:
+    verdict = cb.verify_safety(walk(), method="linear")
+    assert verdict.status == "UNKNOWN"
+    found = find_limits(verdict)
+    assert found.delta == pytest.approx(10**verdict.log10_delta)
+    assert status(walk(steps=int(found.horizon))) == "SAFE"
+    assert status(walk(steps=int(found.horizon) + 1)) == "UNKNOWN"
+    assert status(walk(sigma=found.noise)) == "SAFE"
+    assert status(walk(sigma=1.3 * found.noise)) == "UNKNOWN"
+    assert status(walk(bound=4.0 + found.widening)) == "SAFE"
+    assert status(walk(bound=4.0 + 0.7 * found.widening)) == "UNKNOWN"
+    assert "SAFE would be: delta" in found.summary()
+
+
+def drift(factor: float = 1.0) -> cb.Problem:
+    system = cb.ContinuousSystem(
+        lambda x: -x, states=1, diffusion=lambda x: np.array([[factor * (0.5 + 0.1 * np.tanh(x[0]))]])
+    )
+    return cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1.0, delta=1e-2)
+
+
+@pytest.mark.slow
+def test_noise_that_depends_on_the_state_is_scaled() -> None:
+    verdict = cb.verify_safety(drift(), method="constants")
+    assert verdict.status == "UNKNOWN"
+    found = find_limits(verdict)
+    assert cb.verify_safety(drift(found.noise), method="constants").status == "SAFE"
+    assert cb.verify_safety(drift(1.3 * found.noise), method="constants").status == "UNKNOWN"
+
+
+def test_a_safe_verdict_is_refused() -> None:
+    with pytest.raises(ValueError, match="not SAFE"):
+        find_limits(cb.verify_safety(walk(bound=40.0), method="linear"))
