@@ -20,7 +20,8 @@ def draw(data: Data) -> Figure:
         claims["cases"], claims["picks"], claims["examples"], claims["methods"], claims["radii"]
     ):
         reading, best, chosen, exact = (f"{value:#.4g}" for value in radii)
-        lines.append((case, THEOREMS[pick], example, reading, best, f"{chosen} ({method[0].upper()})", exact))
+        result = f"{chosen} ({method[0].upper()})"
+        lines.append((case, THEOREMS[pick], example.replace("-", "\N{MINUS SIGN}"), reading, best, result, exact))
     for row, line in enumerate(lines):
         for left, cell in zip(LEFT, line):
             weight = "bold" if row == 0 else "normal"
