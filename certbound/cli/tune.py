@@ -6,7 +6,9 @@ import contextlib
 import logging
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -19,20 +21,32 @@ from certbound.cli.options import (
     JsonOption,
     ProblemArgument,
     SetOption,
+    check_picture,
+    check_writable,
     examples,
     load_problem,
 )
-from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
 from certbound.errors import SolverError
 
 if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
     from certbound.tubes.constants import Constants
     from certbound.tubes.tube import Tube
 
 __all__ = ["register"]
 
 SAMPLES = 513
-EXAMPLES = examples("certbound tune ou --json", "certbound tune chain_rest --delta 1e-6 --time-limit 30")
+PATHS = 60
+EXAMPLES = examples(
+    "certbound tune ou --json",
+    "certbound tune ou --plot tubes.png",
+    "certbound tune chain_rest --delta 1e-6 --time-limit 30",
+)
+PlotOption = Annotated[
+    Path | None,
+    typer.Option("--plot", metavar="FILE", help="Draw all the tubes with simulated paths.", show_default=False),
+]
 _log = logging.getLogger(__name__)
 
 
@@ -47,30 +61,56 @@ def tune(
     horizon: HorizonOption = None,
     delta: DeltaOption = None,
     time_limit: TimeLimitOption = None,
+    plot: PlotOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compute the probabilistic tube by every method that applies, and say which is smallest."""
+    check_writable(plot)
+    check_picture(plot)
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
     rows: list[dict[str, Any]] = []
+    tubes: dict[str, Tube] = {}
     constants: Constants | None = None
     with contextlib.suppress(OutOfTime), Clock(time_limit).running():
         from certbound.constants.bounds import bound_constants
 
         with spinner(f"bounding the constants of {subject.name}"):
             constants = bound_constants(subject)
-        for row in _rows(constants, subject.horizon, subject.delta):
+        for tube, row in _rows(constants, subject.horizon, subject.delta):
             rows.append(row)
+            tubes.setdefault(row["method"], tube)
     valid = [row for row in rows if row["level"] == "trajectory" and not row["method"].endswith("_as_printed")]
     if constants is None or not valid:
         raise SolverError(f"no tube was computed within {time_limit:g} s; give a larger --time-limit")
     best = min(valid, key=lambda row: row["maximum"])["method"]
+    if plot is not None:
+        _draw(subject, tubes, best, plot)
     if as_json:
         print_json({"method": best, "rows": rows})
     else:
         _print(best, rows, "" if constants.metric is None else " (radii in the norm of the certified metric)")
 
 
-def _rows(constants: Constants, horizon: float, delta: float) -> Iterator[dict[str, Any]]:
+def _draw(problem: Problem, tubes: dict[str, Tube], best: str, path: Path) -> None:
+    from certbound.plotting import draw_tubes
+    from certbound.simulation.paths import sample_paths
+
+    sizes = None
+    with spinner("drawing"):
+        try:
+            states = sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0), deviation=True)
+        except ValueError as error:
+            _log.info("no sample paths are drawn: %s", error)
+        else:
+            metric = tubes[best].constants.metric
+            weighted = states if metric is None else states @ np.linalg.cholesky(metric)
+            sizes = np.linalg.norm(weighted, axis=-1)
+        stream = BytesIO()
+        draw_tubes(tubes, best, sizes).savefig(stream, format=path.suffix.lstrip(".") or "png", dpi=150)
+        write_file(path, stream.getvalue())
+
+
+def _rows(constants: Constants, horizon: float, delta: float) -> Iterator[tuple[Tube, dict[str, Any]]]:
     """Every method whose hypotheses hold, its parameters tuned; the paper's windows also with its own ones."""
     from certbound.tubes.tuning import METHODS, tune_tube
 
@@ -85,7 +125,7 @@ def _rows(constants: Constants, horizon: float, delta: float) -> Iterator[dict[s
         except ValueError as error:
             _log.debug("%s does not apply: %s", method, error)
             continue
-        yield _row(tube, method, horizon, time.perf_counter() - started, constants.continuous)
+        yield tube, _row(tube, method, horizon, time.perf_counter() - started, constants.continuous)
 
 
 def _row(tube: Tube, method: str, horizon: float, seconds: float, continuous: bool) -> dict[str, Any]:
