@@ -55,7 +55,9 @@ def _sweep(axes: Axes, data: Data, name: str, label: str) -> None:
         ratios = data[f"{name}_ratios"][:, methods.index(method)]
         axes.semilogx(values, ratios, linestyle=dash, color=color, linewidth=1.4)
     axes.axhline(1.0, color="black", linewidth=0.9)
-    axes.set(ylim=(0.97, 2.4), xlabel=label)
+    shown = [methods.index(method) for method in LOOKS]
+    top = max(data[f"{sweep}_ratios"][:, shown].max() for sweep in SWEEPS)
+    axes.set(ylim=(0.97, 1.04 * top), xlabel=label)
     axes.minorticks_off()
 
 

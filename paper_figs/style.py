@@ -141,7 +141,7 @@ def paths(axes: Axes, times: np.ndarray, values: np.ndarray, *, color: str = GRE
     """Sample paths (path, time) as thin lines, drawn as pixels so that the PDF stays small."""
     segments = np.stack(np.broadcast_arrays(times[None, :], values), axis=-1)
     if alpha is None:
-        alpha = float(np.clip(25.0 / len(values), 0.03, 0.5))
+        alpha = float(np.clip(25.0 / len(values), 0.012, 0.5))
     lines = LineCollection(list(segments), colors=color, linewidths=0.4, alpha=alpha, rasterized=True, zorder=1)
     axes.add_collection(lines)
     axes.autoscale_view()
