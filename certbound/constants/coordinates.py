@@ -113,7 +113,7 @@ class Metric:
                 return eigenvalue_upper(jacobians)
         centre, finite = _bounded(jacobians)
         m = self.transform(centre.mid)
-        vectors = np.linalg.eigh((m + np.swapaxes(m, -1, -2)) / 2)[1]
+        vectors = np.linalg.eigh(_tame(m / 2 + np.swapaxes(m, -1, -2) / 2))[1]
         right = self.frame @ vectors if self.matrix is not None else vectors
         left = self._covector(right)
         t = _half_sum(matmul(matmul(left, centre), right))
@@ -137,7 +137,7 @@ class Metric:
         Proves: J^T P J <= L^2 P for every J in the member of the batch. Parameters and result as `measure`.
         """
         centre, finite = _bounded(jacobians)
-        u, _, vt = np.linalg.svd(self.transform(centre.mid))
+        u, _, vt = np.linalg.svd(_tame(self.transform(centre.mid)))
         first, right = self.frame @ u, self.frame @ np.swapaxes(vt, -1, -2)
         left, right_covector = self._covector(first), self._covector(right)
         entries = matmul(matmul(left, centre), right).mag
@@ -146,6 +146,8 @@ class Metric:
             finite = finite & usable
             terms = matmul(matmul(left[:, None], slopes), right[:, None]).mag
             entries = upper(entries + _weighted(terms, reach))
+        held = np.isfinite(entries).all(axis=(-1, -2))  # the product may overflow
+        finite, entries = finite & held, np.where(held[..., None, None], entries, 0.0)
         gram = matmul(np.swapaxes(entries, -1, -2), entries).hi
         square = np.maximum(perron_upper(np.maximum(gram, np.swapaxes(gram, -1, -2))), 0.0)
         f, g = self._defect(left, first), self._defect(right_covector, right)
@@ -186,6 +188,21 @@ def _bounded(x: Interval) -> tuple[Interval, NDArray[np.bool_]]:
     finite = np.asarray(np.isfinite(x.lo).all(axis=(-1, -2)) & np.isfinite(x.hi).all(axis=(-1, -2)))
     keep = finite[..., None, None]
     return Interval._raw(np.where(keep, x.lo, 0.0), np.where(keep, x.hi, 0.0)), finite
+
+
+def _tame(matrices: Array) -> Array:
+    """Matrices that LAPACK's iterations survive, with the same vectors: entries of size 1; 0 where not finite.
+
+    What the vectors are used for is proved for any vectors.
+    """
+    size = np.max(np.abs(matrices), axis=(-2, -1), keepdims=True)
+    wild = ~((size > 1e-100) & (size < 1e100))
+    if not wild.any():
+        return matrices
+    usable = np.isfinite(size) & (size > 0)
+    with np.errstate(all="ignore"):
+        scaled = matrices / np.where(usable, size, 1.0)
+    return np.where(wild, np.where(usable & np.isfinite(scaled), scaled, 0.0), matrices)
 
 
 def _bounded_spread(spread: Spread) -> tuple[Interval, Array, NDArray[np.bool_]]:

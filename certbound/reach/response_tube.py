@@ -31,7 +31,7 @@ _REFINEMENTS = 3
 _NOTHING = -0.1  # log of a probability that says nothing
 _LIKELIER = np.log([0.01, 0.05, 0.2])  # delta_N where nothing was proved near the target
 _PARTS = (2, 4, 8)  # cells along each side, tried one after the other
-_MOST_PIECES = 6000  # pieces of time times cells
+_MOST_PIECES = 4000  # pieces of time times cells
 _LEAST = -1e12  # log10 of the smallest probability that is told apart from 0
 
 
@@ -168,7 +168,7 @@ def refusal(problem: Problem) -> str | None:
     return None
 
 
-def linear_answer(problem: Problem, *, cells: int | None = None) -> LinearAnswer:
+def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool = True) -> LinearAnswer:
     """Bound the probability of leaving the safe set by the linear response (Thm K7').
 
     Parameters
@@ -176,15 +176,17 @@ def linear_answer(problem: Problem, *, cells: int | None = None) -> LinearAnswer
     problem : Problem
     cells : int, optional
         Cells along each side of the initial set; as few as serve when omitted.
+    thorough : bool
+        False: one cell when omitted, and no larger shares where nothing was proved.
     """
     target = float(np.log(problem.delta))
-    run, best = _first(problem, cells, target + float(np.log(_SHARES[0][0])))
+    run, best = _first(problem, 1 if cells is None and not thorough else cells, target + float(np.log(_SHARES[0][0])))
     effort = _SHARES[0][1]
     for share, effort in _SHARES[1:]:
         if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
             break
         best = _least(best, run.probability(target + np.log(share), effort))
-    if best.log_probability > _NOTHING and len(run.engine.model.active):
+    if thorough and best.log_probability > _NOTHING and len(run.engine.model.active):
         for log_nonlinear in _LIKELIER[target < _LIKELIER]:
             best = _least(best, run.probability(float(log_nonlinear), 2))
             if best.bounds is not None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,8 +77,11 @@ def constants_engine(
     cells: int | None = None,
     constants: Constants | None = None,
     quick: bool = False,
+    **_: Any,
 ) -> EngineAnswer:
     """The best answer from constants: global ones, or local ones along the reach tube where none are global.
+
+    Options of other engines are ignored.
 
     Parameters
     ----------

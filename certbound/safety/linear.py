@@ -13,12 +13,15 @@ from certbound.safety.answers import Deviation, EngineAnswer
 __all__ = ["linear_engine"]
 
 
-def linear_engine(problem: Problem, *, cells: int | None = None, **_: Any) -> EngineAnswer:
-    """Smallest probability that Thm K7' proves for the problem (options of other engines are ignored)."""
+def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool = True, **_: Any) -> EngineAnswer:
+    """Smallest probability that Thm K7' proves for the problem (options of other engines are ignored).
+
+    Without ``thorough`` the initial set is one cell unless ``cells`` says otherwise.
+    """
     refused = refusal(problem)
     if refused is not None:
         return EngineAnswer(applicable=False, reason=refused, method="linear")
-    answer = linear_answer(problem, cells=cells)
+    answer = linear_answer(problem, cells=cells, thorough=thorough)
     tube = answer.tube
     return EngineAnswer(
         log10_delta=answer.log10_delta,

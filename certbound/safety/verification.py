@@ -38,9 +38,10 @@ def _barrier(problem: Problem, **options: Any) -> EngineAnswer:
 
 
 _ENGINES: dict[str, Callable[..., EngineAnswer]] = {"linear": _linear, "constants": _constants, "barrier": _barrier}
-"""Engines in the order in which they are tried: name to function(problem, method=, cells=, constants=, quick=).
+"""Engines in the order in which they are tried: name to function(problem, **options).
 
-``quick`` says that another engine has proved SAFE or been conclusive: slow refinements may be left out."""
+``quick`` says that another engine has proved SAFE or been conclusive: slow refinements may be left out; without
+``thorough`` the linear engine takes the initial set as one cell, since it is asked again if no engine proves SAFE."""
 
 
 ENGINES = tuple(_ENGINES)
@@ -199,7 +200,13 @@ def verify_safety(
     for name in names:
         inner = "auto" if method in _ENGINES else method
         quick = any(_is_safe(answer, problem) or answer.conclusive for answer in answers.values())
-        answers[name] = _ENGINES[name](problem, method=inner, cells=cells, constants=constants, quick=quick)
+        answers[name] = _ENGINES[name](
+            problem, method=inner, cells=cells, constants=constants, quick=quick, thorough=method != "auto"
+        )
+    first = answers["linear"] if method == "auto" and cells is None else None
+    proved = any(_is_safe(answer, problem) for answer in answers.values())
+    if first is not None and first.applicable and not first.conclusive and not proved:
+        answers["linear"] = min(first, linear_engine(problem), key=lambda answer: answer.log10_delta)
     return _verdict(problem, answers)
 
 

@@ -102,3 +102,21 @@ def test_unbounded_jacobians_give_infinity_except_far_down_the_diagonal():
 def test_malformed_metrics_are_refused(matrix, message):
     with pytest.raises(ValueError, match=message):
         Metric(matrix, 2)
+
+
+@pytest.mark.parametrize("size", [1e-320, 1e-300, 1e200, 1.7e308])
+@pytest.mark.parametrize("shape", [[1.0, 1.0, 1.0], [1e-8, 1e-8, 1e-8], [1e-8, 1.0, 1e8]])
+@pytest.mark.parametrize("linear", [False, True])
+def test_entries_at_the_ends_of_the_floats_end_in_a_bound(size: float, shape: list[float], linear: bool) -> None:
+    rng = np.random.default_rng(0)
+    metric = Metric(np.diag(shape), 3)
+    jacobians = rng.uniform(-1, 1, (4, 3, 3)) * size
+    slopes = rng.uniform(-1, 1, (4, 2, 3, 3)) * size
+    spread = Spread(slopes=Interval.point(slopes), reach=np.ones((4, 2))) if linear else None
+    for bounds in (metric.measure(Interval.point(jacobians), spread), metric.norm(Interval.point(jacobians), spread)):
+        assert not np.isnan(bounds).any()
+    root = np.sqrt(np.array(shape))
+    with np.errstate(over="ignore"):
+        inner = jacobians * (root[:, None] / root)
+        least = np.abs(inner).max(axis=(1, 2))
+    assert np.all(metric.norm(Interval.point(jacobians)) >= least * (1 - 1e-12))
