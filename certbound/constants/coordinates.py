@@ -146,7 +146,7 @@ class Metric:
             finite = finite & usable
             terms = matmul(matmul(left[:, None], slopes), right[:, None]).mag
             entries = upper(entries + _weighted(terms, reach))
-        held = np.isfinite(entries).all(axis=(-1, -2))  # the product may overflow
+        held = np.asarray(np.isfinite(entries).all(axis=(-1, -2)))  # the product may overflow
         finite, entries = finite & held, np.where(held[..., None, None], entries, 0.0)
         gram = matmul(np.swapaxes(entries, -1, -2), entries).hi
         square = np.maximum(perron_upper(np.maximum(gram, np.swapaxes(gram, -1, -2))), 0.0)
