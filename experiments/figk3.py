@@ -29,7 +29,7 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
     for horizon in horizons:
         linear.append(largest(grid, lambda sigma, T=horizon: certified(sigma, T, "linear", cells=1)))
         if full or horizon < LOCAL:
-            tried = grid if horizon <= LOCAL else grid[:1]
+            tried = grid[: (len(grid) if horizon <= LOCAL else 1) if full else 3]
             local.append(largest(tried, lambda sigma, T=horizon: certified(sigma, T, "constants")))
         else:
             local.append(math.nan)
