@@ -20,6 +20,7 @@ from certbound.cli.options import (
     JsonOption,
     ProblemArgument,
     SetOption,
+    check_picture,
     check_writable,
     integer,
     load_problem,
@@ -98,6 +99,7 @@ def synthesize(
 ) -> None:
     """Find a plan of inputs under which the noisy system stays safe, and prove it."""
     check_writable(plan, plot)
+    check_picture(plot)
     if closed_loop is not None and closed_loop < 1:
         raise InputError(f"`--closed-loop` must be at least 1, got {closed_loop}", "give a number of runs, like 3000")
     if seed is not None and seed < 0:
