@@ -82,7 +82,6 @@ class LinearRun:
                 np.diag(engine.radii[cell])[engine.radii[cell] > 0], continuous=engine.continuous,
             ))
         self.inner = self.rows.shape[2]
-        self.failed_at = engine.pieces
         self.memory: dict[int, dict[bytes, Any]] = {}
 
     def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:

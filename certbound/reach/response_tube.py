@@ -180,12 +180,13 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
         False: one cell when omitted, and no larger shares where nothing was proved.
     """
     target = float(np.log(problem.delta))
-    run, best = _first(problem, 1 if cells is None and not thorough else cells, target + float(np.log(_SHARES[0][0])))
-    effort = _SHARES[0][1]
-    for share, effort in _SHARES[1:]:
-        if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
-            break
-        best = _least(best, run.probability(target + np.log(share), effort))
+    run = LinearRun(Linearisation.of(problem, cells=1 if cells is None else cells))
+    best, effort = _best(run, target)
+    if thorough and cells is None and best.bounds is None:
+        finer = _finer(problem, run, target + float(np.log(_SHARES[0][0])))
+        if finer is not None:
+            run = finer
+            best, effort = _best(run, target)
     if thorough and best.log_probability > _NOTHING and len(run.engine.model.active):
         for log_nonlinear in _LIKELIER[target < _LIKELIER]:
             best = _least(best, run.probability(float(log_nonlinear), 2))
@@ -202,21 +203,27 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
     return LinearAnswer(run=run, outcome=best, shown=shown)
 
 
-def _first(problem: Problem, cells: int | None, log_nonlinear: float) -> tuple[LinearRun, Outcome]:
-    """The engine on as few cells as keep the remainder from feeding itself, or on the cells that were asked for."""
-    run = LinearRun(Linearisation.of(problem, cells=cells))
-    outcome = run.probability(log_nonlinear, _SHARES[0][1])
+def _best(run: LinearRun, target: float) -> tuple[Outcome, int]:
+    """The least probability over a few shares of the target for delta_N, and the last effort."""
+    share, effort = _SHARES[0]
+    best = run.probability(target + float(np.log(share)), effort)
+    for share, effort in _SHARES[1:]:
+        if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
+            break
+        best = _least(best, run.probability(target + float(np.log(share)), effort))
+    return best, effort
+
+
+def _finer(problem: Problem, run: LinearRun, log_nonlinear: float) -> LinearRun | None:
+    """The engine on as few cells as keep the remainder from feeding itself; None where no number of them does."""
     wide = int(np.count_nonzero(run.engine.radii[0]))
-    if cells is not None or wide == 0:
-        return run, outcome
-    for parts in _PARTS:
-        if outcome.bounds is not None or parts**wide * run.engine.pieces > _MOST_PIECES:
+    for parts in _PARTS if wide else ():
+        if parts**wide * run.engine.pieces > _MOST_PIECES:
             break
         finer = LinearRun(Linearisation.of(problem, cells=parts))
-        found = finer.probability(log_nonlinear, _SHARES[0][1])
-        if found.bounds is not None or finer.failed_at > run.failed_at:
-            run, outcome = finer, found
-    return run, outcome
+        if finer.probability(log_nonlinear, _SHARES[0][1]).bounds is not None:
+            return finer
+    return None
 
 
 def _least(first: Outcome, second: Outcome) -> Outcome:
