@@ -264,10 +264,19 @@ def test_a_program_that_is_stopped_from_outside(tmp_path: Path) -> None:
     import time
 
     command = [sys.executable, "-m", "certbound.cli", "simulate", "ou", "--paths", "1e12", "--step", "0.005"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    # a program in the background of a shell inherits that Ctrl-C is ignored
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        process = subprocess.Popen(command, text=True, cwd=tmp_path, **pipes)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    try:
         time.sleep(2.5)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert process.returncode == 130
     assert out == ""
     assert len(err.splitlines()) == 3
