@@ -120,7 +120,15 @@ class Linearisation:
             for k in range(self.pieces):
                 x = self._advance(k, x) if self.continuous else self._evaluate(k, float(k), x)
                 states.append(x)
-        return np.stack(states, axis=1)
+        nodes = np.stack(states, axis=1)
+        lost = ~np.isfinite(nodes).all(axis=(0, 2))
+        if lost.any():
+            end = (int(np.argmax(lost)) - 1) * self.step
+            raise ValueError(
+                f"`horizon` must end before the noise-free trajectory is lost, after t = {end:.4g}; got "
+                f"{self.problem.horizon:g}: shorten it, or check the model."
+            )
+        return nodes
 
     def _advance(self, k: int, x: Array) -> Array:
         """Two steps of the classical Runge-Kutta method."""

@@ -167,3 +167,10 @@ def test_a_problem_without_constraints_has_a_reach_tube_all_the_same(discrete: b
     problem = cb.Problem(system, initial=[1.0], safe=[], horizon=2, delta=1e-2)
     assert linear_answer(problem).log10_delta <= -2
     assert linear_reach(problem).contains(2.0, [0.25 if discrete else np.exp(-1.0)])
+
+
+def test_a_trajectory_that_blows_up_is_named() -> None:
+    system = cb.ContinuousSystem(lambda x: x**2, states=1, diffusion=[[0.01]])
+    problem = cb.Problem(system, initial=cb.Box([1.0], [1.1]), safe=[], horizon=2.0)
+    with pytest.raises(ValueError, match=r"`horizon` must end before .* lost, after t = 0\.9"):
+        linear_answer(problem)
