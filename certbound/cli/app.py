@@ -89,7 +89,7 @@ def _shorter(command: str) -> str:
 def _report(error: Exception, command: str) -> int:
     known = [entry.name for entry in app.registered_commands if entry.name]
     if isinstance(error, _ClickException):
-        why = error.format_message().rstrip(".")  # type: ignore[attr-defined]
+        why = error.format_message().rstrip(".")  # type: ignore[attr-defined]  # which class it is, click and typer do not agree
         write_error("the command line was not understood", why, _usage_hint(command, known))
         return BAD_INPUT
     code, why, cure = explain(error, command)

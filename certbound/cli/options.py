@@ -149,7 +149,7 @@ def _as_input_error(cure: str, *, module: bool = False) -> Iterator[None]:
     except (ValueError, TypeError, ArithmeticError) as error:
         why, own = split_cure(str(error))
         raise InputError(why, own or cure) from error
-    except Exception as error:
+    except Exception as error:  # a user's module may raise anything; what is ours is raised again
         if not module:
             raise
         raise InputError(f"the module raised {type(error).__name__}: {' '.join(str(error).split())}", cure) from error

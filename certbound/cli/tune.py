@@ -121,7 +121,7 @@ def _rows(constants: Constants, horizon: float, delta: float) -> Iterator[tuple[
         started = time.perf_counter()
         try:
             with spinner(f"tuning {method}"):
-                tube = tune_tube(constants, horizon=horizon, delta=delta, method=method, **fixed)  # type: ignore[arg-type]
+                tube = tune_tube(constants, horizon=horizon, delta=delta, method=method, **fixed)  # type: ignore[arg-type]  # floats by name
         except ValueError as error:
             _log.debug("%s does not apply: %s", method, error)
             continue

@@ -162,7 +162,7 @@ class IntervalMatrixSet(AffineForm):
         return IntervalMatrixSet(low=mid - rad, high=mid + rad)
 
     @cached_property
-    def affine(self) -> AffineSet:  # type: ignore[override]
+    def affine(self) -> AffineSet:  # type: ignore[override]  # the base says property
         """The same set with one parameter per uncertain entry."""
         rows, columns = np.nonzero(self.box[1] > self.box[0])
         terms = np.zeros((len(rows), *self.box.shape[1:]))

@@ -125,7 +125,7 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
     for which in (0, 1):
         start = values(ranges.mid[None], which)
         scale = float(start[0]) if np.isfinite(start[0]) else 1.0
-        found = bound_supremum(
+        found = bound_supremum(  # mypy cannot type a lambda with a default
             lambda boxes, _, which=which: (levels(boxes)[which], _widths(boxes)),  # type: ignore[misc]
             lambda points, which=which: values(points, which),  # type: ignore[misc]
             ranges,

@@ -197,7 +197,7 @@ def _halfspaces(region: Any) -> tuple[Array, Array]:
         eye = np.eye(region.dimension)
         upper, lower = np.isfinite(region.high), np.isfinite(region.low)
         return np.concatenate([eye[upper], -eye[lower]]), np.concatenate([region.high[upper], -region.low[lower]])
-    return region.halfspaces()  # type: ignore[no-any-return]
+    return region.halfspaces()  # type: ignore[no-any-return]  # sets hold Any
 
 
 def _joined(targets: list[Target]) -> list[Target]:

@@ -161,7 +161,7 @@ def _load_module(text: str, parameters: Mapping[str, Any]) -> Problem:
                 f"{text!r} is a finished problem without parameters; make it a function of them."
             )
         return value
-    problem = value(**parameters) if isinstance(value, Callable) else None  # type: ignore[arg-type]
+    problem = value(**parameters) if isinstance(value, Callable) else None  # type: ignore[arg-type]  # Callable is no type to mypy
     if not isinstance(problem, Problem):
         raise TypeError(f"{text!r} must be a cb.Problem or a function that returns one, got {value!r}.")
     return problem

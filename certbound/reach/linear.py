@@ -238,7 +238,9 @@ def _correlated(events: StepEvents, asked: list[Requirement], rooms: Array, shar
     without a partner are added by the union bound.
     """
     lone = dict(enumerate(asked))
-    stay, rest = np.log1p(-np.exp(min(shared, 0.0))), []
+    if shared > -1e-6:
+        return 0.0
+    stay, rest = np.log1p(-np.exp(shared) * (1 + 1e-14)), []
     for i, requirement in enumerate(asked):
         partner = next((j for j in lone if j > i and np.array_equal(asked[j].rows, -requirement.rows)), None)
         if i not in lone:
@@ -252,12 +254,12 @@ def _correlated(events: StepEvents, asked: list[Requirement], rooms: Array, shar
         both = np.log(2.0) + events.along(requirement.rows).log_exceedance(room)
         if both > logsumexp(np.array([logs[i], logs[partner], np.log(1e-3)])):
             rest += [logs[i], logs[partner]]
-        elif both >= 0:
+        elif both > -1e-6:  # next to nothing is left, and its logarithm is lost in rounding
             return 0.0
         else:
             stay += np.log1p(-np.exp(both) * (1 + 1e-14))
     stay = stay * (1 + 1e-12) - 1e-300
-    return logsumexp(np.array([np.log(-np.expm1(stay)) + 1e-14, *rest])) if stay < 0 else logsumexp(np.array(rest))
+    return logsumexp(np.array([np.log(-np.expm1(stay)) + 1e-14, *rest]))
 
 
 def level_scale(event: Event, shape: Array, target: float) -> float:

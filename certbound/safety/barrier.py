@@ -3,7 +3,8 @@
 Let D be the set where no constraint is broken, and let V be twice differentiable with
     grad V . f + 1/2 tr(g g^T Hess V) + 1/2 |g^T grad V|^2 <= kappa   on [0, T] x D, for every disturbance.
 Then exp(V(X) - kappa t), stopped when X leaves D, is a supermartingale (Ito; it is positive), and a path that leaves
-does so on the boundary of D, where V >= u. So P(leaving within T) <= exp(max over X_0 of V - u + max(kappa, 0) T).
+does so on the boundary of D, where V >= u; X_0 lies in D, which is proved too. So
+    P(leaving within T) <= exp(max over X_0 of V - u + max(kappa, 0) T).
 The disturbance may see the noise.
 
 The condition is convex in V: for a polynomial each point of a grid gives a second-order cone, and the exponent is
@@ -27,13 +28,14 @@ from certbound.constants.branching import bound_supremum
 from certbound.constants.enclosures import enclose
 from certbound.problem.problem import Problem
 from certbound.problem.regions import Ball, Box, HalfSpace, Polytope
-from certbound.problem.sets import GaussianStart, Outside
+from certbound.problem.sets import GaussianStart
 from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian, substitute, trace
 from certbound.reach.cells import initial_cells
-from certbound.rigor.intervals import Interval, sq
+from certbound.rigor.intervals import Interval
 from certbound.safety.answers import EngineAnswer
+from certbound.safety.gaps import gaps_of, hull_of, lies_inside
 
 __all__ = ["Barrier", "barrier_engine"]
 
@@ -92,6 +94,11 @@ def barrier_engine(problem: Problem, *, quick: bool = False, **_: Any) -> Engine
         return EngineAnswer(applicable=False, reason=refused, method="barrier")
     assert isinstance(problem.system, ContinuousSystem)
     work = _Work(problem, problem.system)
+    if not lies_inside(work.gaps, work.start):
+        return EngineAnswer(
+            applicable=False, method="barrier",
+            reason="the box around the initial set was not proved to lie inside the safe set.",
+        )  # fmt: skip
     best: Barrier | None = None
     level = 0.0
     for degree in _DEGREES[work.n]:
@@ -126,73 +133,9 @@ def _refusal(problem: Problem) -> str | None:
         region = constraint.region
         if constraint.during is not None or region.moving or not isinstance(region, Ball | Box | HalfSpace | Polytope):
             return f"the barrier engine does not treat windows, moving sets and ellipsoids ('{constraint.label}')."
-    if not np.isfinite(_hull(_gaps(problem))).all():
+    if not np.isfinite(hull_of(gaps_of(problem))).all():
         return "the barrier engine needs safe sets or a domain that bound every state."
     return None
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Gap:
-    """A constraint as phi(x) <= 0; on its boundary phi = 0.
-
-    phi is max(rows x - bounds) or, ``round``, |x - bounds|^2 - radius^2 over the coordinates that ``rows`` picks; with
-    the other sign for an obstacle.
-    """
-
-    rows: Array
-    bounds: Array
-    outside: bool
-    radius: float | None = None
-
-    def over(self, boxes: Interval) -> Interval:
-        """phi over boxes: (N, n) to (N,)."""
-        values = (Interval.point(self.rows) * boxes[:, None, :]).sum(axis=-1) - self.bounds
-        if self.radius is not None:
-            value = sq(values).sum(axis=-1) - sq(Interval.point(self.radius))
-        else:
-            value = Interval(values.lo.max(axis=-1), values.hi.max(axis=-1))
-        return -value if self.outside else value
-
-
-def _gaps(problem: Problem) -> list[_Gap]:
-    n = problem.system.dimension
-    found = []
-    for constraint in problem.constraints:
-        region = constraint.region
-        places = list(range(n)) if region.coordinates is None else [int(place) for place in region.coordinates]
-        rows, bounds = (np.eye(len(places)), region.center_at()) if isinstance(region, Ball) else region.halfspaces()
-        full = np.zeros((len(rows), n))
-        full[:, places] = rows
-        found.append(_Gap(
-            rows=full, bounds=np.asarray(bounds), outside=isinstance(constraint, Outside),
-            radius=region.radius if isinstance(region, Ball) else None,
-        ))  # fmt: skip
-    return found
-
-
-def _hull(gaps: list[_Gap]) -> Array:
-    """A box that contains the safe set: shape (2, n), infinite where nothing bounds a state."""
-    n = gaps[0].rows.shape[1] if gaps else 1
-    low, high = np.full(n, -np.inf), np.full(n, np.inf)
-    for gap in gaps:
-        sign = -1.0 if gap.outside else 1.0
-        if gap.outside and (gap.radius is not None or len(gap.rows) > 1):
-            continue
-        for row, bound in zip(gap.rows, gap.bounds):
-            places = np.flatnonzero(row)
-            if len(places) != 1:
-                continue
-            place, factor = int(places[0]), sign * float(row[places[0]])
-            if gap.radius is not None:
-                ends = Interval.point(bound) + Interval(-gap.radius, gap.radius)
-                low[place], high[place] = max(low[place], float(ends.lo)), min(high[place], float(ends.hi))
-                continue
-            end = Interval.point(sign * bound) / Interval.point(factor)
-            if factor > 0:
-                high[place] = min(high[place], float(end.hi))
-            else:
-                low[place] = max(low[place], float(end.lo))
-    return np.array([low, high])
 
 
 class _Work:
@@ -201,8 +144,8 @@ class _Work:
     def __init__(self, problem: Problem, system: ContinuousSystem) -> None:
         self.problem, self.system = problem, system
         self.n = system.dimension
-        self.gaps = _gaps(problem)
-        low, high = _hull(self.gaps)
+        self.gaps = gaps_of(problem)
+        low, high = hull_of(self.gaps)
         self.hull = Interval(low, high)
         self.center, self.scale = (low + high) / 2, (high - low) / 2
         self.start = initial_cells(problem).boxes[0]

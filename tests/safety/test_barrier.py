@@ -8,7 +8,9 @@ from scipy.stats import norm
 
 import certbound as cb
 from certbound.errors import CertificateError
+from certbound.rigor.intervals import Interval
 from certbound.safety.barrier import Barrier, barrier_engine
+from certbound.safety.gaps import gaps_of, lies_inside
 
 
 def scalar(**changes: object) -> cb.Problem:
@@ -101,3 +103,27 @@ def test_no_certificate_is_written_for_it() -> None:
     verdict = cb.verify_safety(scalar(), method="barrier")
     with pytest.raises(CertificateError, match="barrier"):
         verdict.certificate_text(verdict.problem)
+
+
+def test_a_start_that_may_touch_the_obstacle_is_not_answered() -> None:
+    system = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=0.05 * np.eye(2))
+    corner = cb.Polytope([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]], [-0.5, 1.0, 1.0])  # {a + b >= .5}
+
+    def problem(width: float) -> cb.Problem:
+        return cb.Problem(
+            system, initial=cb.Box([-width] * 2, [width] * 2), horizon=0.5, delta=0.5,
+            safe=[cb.Inside(cb.Box([-1, -1], [1, 1])), cb.Outside(corner)],
+        )  # fmt: skip
+
+    found = gaps_of(problem(0.2))
+    assert lies_inside(found, Interval(np.full(2, -0.24), np.full(2, 0.24)))
+    assert not lies_inside(found, Interval(np.full(2, -0.26), np.full(2, 0.26)))
+    assert not lies_inside(found, Interval(np.full(2, 0.3), np.full(2, 0.3)))
+    assert lies_inside(found, Interval(np.zeros(2), np.zeros(2)))
+
+
+def test_an_initial_set_that_was_not_proved_safe_gets_no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("certbound.safety.barrier.lies_inside", lambda gaps, box: False)
+    found = barrier_engine(scalar())
+    assert not found.applicable
+    assert "initial set" in found.reason
