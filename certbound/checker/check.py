@@ -9,6 +9,7 @@ from typing import Any
 
 from flint import arb, ctx
 
+from certbound.checker.barrier import check_barrier
 from certbound.checker.comparison import first_difference
 from certbound.checker.constants import check_constants
 from certbound.checker.linear import check_linear
@@ -25,7 +26,12 @@ SECONDS = 300.0
 """Time that a check may take."""
 PRECISION = 128
 
-_ENGINES = {"linear": check_linear, "constants": check_constants}
+_ENGINES = {"linear": check_linear, "constants": check_constants, "barrier": check_barrier}
+_WORDS = {
+    "linear": "linear response (Thm K7)",
+    "constants": "contraction constants (Thms K2, K5)",
+    "barrier": "a barrier that is the exponential of a polynomial",
+}
 
 
 def check_file(
@@ -133,8 +139,7 @@ def _claim(model: Model, level: float, assumptions: list[str]) -> str:
 
 
 def _reason(record: Record, proved: float, compared: bool) -> str:
-    engine = {"linear": "linear response (Thm K7)", "constants": "contraction constants (Thms K2, K5)"}
-    words = engine[record["proof"]["engine"]]
+    words = _WORDS[record["proof"]["engine"]]
     same = ", and the certificate speaks of the given problem" if compared else ""
     bound = "no noise can break them" if proved <= -1e12 else f"the probability is at most 10^{proved:.6g}"
     return f"every inequality was proved again in ball arithmetic, by {words}: {bound}{same}"

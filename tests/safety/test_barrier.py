@@ -7,9 +7,13 @@ import pytest
 from scipy.stats import norm
 
 import certbound as cb
+from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
 from certbound.rigor.intervals import Interval
+from certbound.safety.answers import EngineAnswer
 from certbound.safety.barrier import Barrier, barrier_engine
+from certbound.safety.certificate import problem_data
+from certbound.safety.certificate_barrier import barrier_proof
 from certbound.safety.gaps import gaps_of, lies_inside
 
 
@@ -99,10 +103,39 @@ def test_what_it_does_not_treat_it_names(problem: cb.Problem, why: str) -> None:
     assert why in found.reason
 
 
-def test_no_certificate_is_written_for_it() -> None:
-    verdict = cb.verify_safety(scalar(), method="barrier")
-    with pytest.raises(CertificateError, match="barrier"):
-        verdict.certificate_text(verdict.problem)
+def test_its_certificate_is_proved_again_and_claims_little_less() -> None:
+    problem = scalar()
+    verdict = cb.verify_safety(problem, method="barrier")
+    data = parse(verdict.certificate_text(problem))
+    report = check_data(data, problem_data(problem))
+    assert report.valid, report.reason
+    assert verdict.log10_delta <= report.log10_delta <= verdict.log10_delta + 0.02
+    assert report.log10_delta <= np.log10(problem.delta)
+    assert "exponential of a polynomial" in report.reason
+    other = check_data(data, problem_data(scalar(horizon=2.5)))
+    assert not other.valid
+    assert "another problem" in other.reason
+
+
+def test_a_certificate_next_to_delta_still_says_safe() -> None:
+    """Of the room between the bound and delta at most half is given away to the checker."""
+    problem = scalar()
+    verdict = cb.verify_safety(problem, method="barrier")
+    close = problem.replace(delta=float(10 ** (verdict.log10_delta + 1e-3)))
+    data, log10, assumptions = barrier_proof(close, verdict.answers["barrier"])
+    assert verdict.log10_delta < log10 < verdict.log10_delta + 6e-4
+    assert assumptions == []
+    assert data["engine"] == "barrier"
+
+
+def test_a_barrier_without_room_has_no_certificate() -> None:
+    weak = Barrier(
+        exponents=np.array([[2]]), coefficients=np.ones(1), center=np.zeros(1), scale=np.ones(1), start=0.0,
+        boundary=1e-9, growth=0.0,
+    )  # fmt: skip
+    for details in (weak, None):
+        with pytest.raises(CertificateError, match="barrier"):
+            barrier_proof(scalar(), EngineAnswer(method="barrier", details=details))
 
 
 def test_a_start_that_may_touch_the_obstacle_is_not_answered() -> None:
