@@ -4,19 +4,20 @@ Per cell of the initial set the file gives a nominal curve p, slopes, boxes B fo
 for the Gaussian part Z along them, and directions that keep obstacles off. From B follow sets of the remainder's
 response R; with y (initial set and disturbance) and the levels they bound the deviation s = y + Z + R in a polytope.
 Proved here, piece by piece: beta lies in B over that polytope. Then, but for the event that Z leaves its levels, the
-constraints hold wherever Z stays below what y and R leave, and the probabilities of all these events are added.
+constraints hold wherever Z stays below what y and R leave, and the probabilities of all these events are joined
+(`families`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 from flint import arb, arb_mat, ctx
 
-from certbound.checker.demands import Demand, Grid, demands
+from certbound.checker.demands import Grid, demands
 from certbound.checker.events import Windows, chain, sub_gaussian
+from certbound.checker.families import Family, leaving
 from certbound.checker.matrices import column, identity, row_sums, upper
 from certbound.checker.model import Model
 from certbound.checker.partition import cells_of
@@ -33,12 +34,12 @@ from certbound.checker.response import (
     discrete_piece,
     supports,
 )
-from certbound.checker.structure import Structure, structure_of
+from certbound.checker.shared import Shared
+from certbound.checker.structure import structure_of
 from certbound.errors import CertificateError
 
 __all__ = ["check_linear"]
 
-MOST_PIECES = 4000
 MOST_ROWS = 64
 MOST_STATES = 100
 _BITS, _MOST_BITS = 128, 3000
@@ -64,7 +65,7 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     if model.continuous and model.dimension > MOST_STATES:
         raise Unproved(f"{model.dimension} states are too many for this proof in continuous time")
     structure = structure_of(model, budget)
-    shared = _Shared(model, structure, record)
+    shared = Shared(model, structure, record)
     boxes = cells_of(model, record)
     entries = record.items("cells", len(boxes), len(boxes))
     outputs = remainders(model, structure, budget)
@@ -75,67 +76,10 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     return upper(worst)
 
 
-class _Shared:
-    """What all cells have in common."""
-
-    def __init__(self, model: Model, structure: Structure, record: Record) -> None:
-        self.model, self.structure = model, structure
-        self.count = record.whole("pieces", 1, MOST_PIECES)
-        if not model.continuous and self.count != model.steps:
-            raise CertificateError("`proof.pieces` must be the number of steps.")
-        if model.continuous and model.plan is not None and self.count % len(model.plan):
-            raise CertificateError("`proof.pieces` must be a multiple of the plan's rows.")
-        for name, expected in (("varying", structure.varying), ("moving", structure.moving)):
-            given = [tuple(wholes(item, record.at(name), 0, 10**6)) for item in record.items(name)]
-            if given != expected:
-                raise Unproved(f"`proof.{name}` does not list the entries of the Jacobian that vary")
-        self.units = wholes(record["units"], record.at("units"), 0, model.dimension - 1)
-        if len(set(self.units)) != len(self.units):
-            raise CertificateError("`proof.units` must be different states.")
-        self.windows: list[int] = []
-        if model.continuous:
-            self.windows = wholes(record["windows"], record.at("windows"), 0, self.count - 1)
-            if self.windows[:1] != [0] or any(a >= b for a, b in pairwise(self.windows)):
-                raise CertificateError("`proof.windows` must rise from 0.")
-        elif record["windows"] is not None:
-            raise CertificateError("`proof.windows` must be null in discrete time.")
-
-    @property
-    def length(self) -> arb:
-        """Length of a piece."""
-        return arb(self.model.horizon) / self.count if self.model.continuous else arb(1)
-
-    def inputs(self, k: int) -> list[arb]:
-        """The plan's inputs on piece k."""
-        plan = self.model.plan
-        if plan is None:
-            return []
-        return [arb(x) for x in plan[k * len(plan) // self.count if self.model.continuous else k]]
-
-    def full(self, values: Sequence[float], *, gains: bool = False) -> arb_mat:
-        """A Jacobian from its varying entries and the model's own constant ones."""
-        structure, n = self.structure, self.model.dimension
-        columns = len(self.model.disturbance) if gains else n
-        entries = [arb(0)] * (n * columns)
-        for (i, j), fixed in (structure.held if gains else structure.fixed).items():
-            entries[i * columns + j] = fixed
-        for (i, j), value in zip(structure.moving if gains else structure.varying, values):
-            entries[i * columns + j] = arb(value)
-        return arb_mat(n, columns, entries)
-
-    def drift(self, values: Sequence[float]) -> arb_mat:
-        """The slope's rate of change: constant entries have none."""
-        n = self.model.dimension
-        entries = [arb(0)] * (n * n)
-        for (i, j), value in zip(self.structure.varying, values):
-            entries[i * n + j] = arb(value)
-        return arb_mat(n, n, entries)
-
-
 class _Cell:
     """One cell of the initial set."""
 
-    def __init__(self, shared: _Shared, record: Record, box: list[tuple[arb, arb]], budget: Budget) -> None:
+    def __init__(self, shared: Shared, record: Record, box: list[tuple[arb, arb]], budget: Budget) -> None:
         self.shared, self.model, self.budget = shared, shared.model, budget
         self.record = record
         model, n, count = shared.model, shared.model.dimension, shared.count
@@ -371,37 +315,33 @@ class _Cell:
     def _events(self, values: list[arb_mat], bounds: Supports) -> arb:
         """Probability that Z leaves its levels, or exceeds what the demands leave."""
         count, inner = self.shared.count, len(self.rows[0])
-        families: list[tuple[int, Demand]] = []
+        families = []
         for d in range(inner):
             rows = [self.rows[k][d] for k in range(count)]
-            levels: list[arb | None] = [self.levels[k][d] for k in range(count)]
-            families.append((2, Demand(label="", rows=rows, rooms=levels)))
+            levels = [level[d] for level in self.levels]
+            families.append(Family(label="the levels", rows=rows, levels=levels, both=True))
         for number_, demand in enumerate(self.demands):
             rooms: list[arb | None] = []
             for k, room in enumerate(demand.rooms):
                 place = number_ + (inner if k < count else 0)
                 used = bounds.reach[k][place] + bounds.high[k][place]
                 rooms.append(None if room is None else (room - used).lower())
-            families.append((1, Demand(label=demand.label, rows=demand.rows, rooms=rooms)))
-        total, exceedance = self._exceedance(values)
-        for weight, family in families:
-            found = exceedance(family)
-            if not found < 1:
-                raise Unproved(f"nothing is left for the noise by '{family.label or 'the levels'}'")
-            total += weight * found
-        return upper(total)
+            families.append(Family(label=demand.label, rows=demand.rows, levels=rooms))
+        return self._leaving(values, families)
 
-    def _exceedance(self, values: list[arb_mat]) -> tuple[arb, Any]:
-        """What is paid once, and the probability of one family as a function."""
+    def _leaving(self, values: list[arb_mat], families: list[Family]) -> arb:
+        """The probability of all families of events together."""
         model, budget = self.model, self.budget
-        transitions = [piece.transition for piece in self.pieces]
         if not model.continuous:
             if self.record["window_levels"] is not None:
                 raise CertificateError(f"`{self.record.at('window_levels')}` must be null in discrete time.")
-            if model.noise.gaussian:
-                return arb(0), lambda family: chain(family.rows, family.rooms, transitions, values, budget)
-            return arb(0), lambda family: sub_gaussian(family.rows, family.rooms, values)
+            if not model.noise.gaussian:
+                return leaving(families, lambda family: sub_gaussian(family.rows, family.levels, values))
+            moves = [piece.transition for piece in self.pieces]
+            return leaving(
+                families, lambda family: chain(family.rows, family.levels, moves, values, budget), normal=True
+            )
         given = self.record.array("window_levels", len(self.shared.windows), model.dimension)
-        levels = [[arb(x) for x in item] for item in given]
         windows = Windows(self.pieces, values, self.shared.windows, budget)
-        return windows.coordinates(levels), lambda family: windows.exceedance(family.rows, family.rooms)
+        paid = windows.coordinates([[arb(x) for x in item] for item in given])
+        return leaving(families, lambda family: windows.exceedance(family.rows, family.levels), paid=paid)

@@ -2,7 +2,8 @@
 
 The engine's search is run again on fewer pieces, since the checker is slower than NumPy; the boxes are widened by a few
 per cent, so that the checker needs few sub-boxes; and the events are those that the checker knows: first exceedances
-in discrete time, martingale windows in continuous time. The stated probability is what follows from exactly that.
+in discrete time, joined by the Gaussian correlation inequality, and martingale windows in continuous time. The stated
+probability is what follows from exactly that.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian
 from certbound.reach.events import StepEvents, WindowEvents, logsumexp
-from certbound.reach.linear import LinearRun, level_scale
+from certbound.reach.linear import LinearRun, _correlated, level_scale
 from certbound.reach.linearisation import Linearisation
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import Proof, exact, needs_direction
@@ -39,6 +40,7 @@ _PADS = (0.08, 0.15, 0.25)
 _ROUNDS = 8
 _WINDOW = 0.05
 _SLACK = 0.01
+_LIKELY = -2.0  # log10 of a probability of which a per cent matters
 _LOG10 = math.log(10.0)
 
 
@@ -50,6 +52,8 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     CertificateError
         If the remainder feeds itself once its boxes are widened.
     """
+    if isinstance(problem.system, ContinuousSystem) and isinstance(problem.system.diffusion, Tape):
+        raise CertificateError("the format states linear responses to constant noise only.")
     effort = min(attempt, len(_STEPS) - 1)
     found = answer.details
     engine: Linearisation = found.run.engine
@@ -68,7 +72,9 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     if best is None:
         raise CertificateError("the remainder feeds itself once its boxes are widened for the checker.")
     log10 = best.log_probability / _LOG10
-    return _data(problem, run, best), min(log10 + _SLACK * (1 + 0.1 * abs(log10)), 0.0), []
+    exact_sums = not engine.continuous and effort == 0 and log10 > _LIKELY
+    slack = _SLACK * (0.01 if exact_sums else 1 + 0.1 * abs(log10))
+    return _data(problem, run, best), min(log10 + slack, 0.0), []
 
 
 def _coarser(problem: Problem, engine: Linearisation, effort: int) -> Linearisation:
@@ -142,7 +148,11 @@ def _state(run: LinearRun, log_nonlinear: float, pad: float) -> _Stated | None:
     for cell, own in enumerate(events):
         rooms = run.rooms(cell, bounds)
         asked = [own.along(r.rows).log_exceedance(rooms[:, i]) for i, r in enumerate(run.requirements[cell])]
-        worst = max(worst, logsumexp(np.array([*spent[cell], *asked])))
+        total = logsumexp(np.array([*spent[cell], *asked]))
+        if isinstance(own, StepEvents) and own.gaussian:
+            shared = logsumexp(np.array(spent[cell]))
+            total = min(total, _correlated(own, run.requirements[cell], rooms, shared, asked))
+        worst = max(worst, total)
     return _Stated(levels=levels, bounds=bounds, events=events, log_probability=float(min(worst, 0.0)))
 
 
