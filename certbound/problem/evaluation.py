@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.problem.tape import Tape
 
-__all__ = ["NUMPY", "compile_numpy"]
+__all__ = ["NUMPY", "compile_numpy", "compile_scalar"]
 
 Array = NDArray[np.float64]
 
@@ -84,9 +84,8 @@ def compile_numpy(tape: Tape) -> Callable[..., Array]:
     array([[3., 1.],
            [6., 1.]])
     """
-    program, live, slots = _program(tape)
-    outputs = tuple(slots[output] for output in tape.outputs)
-    count, shape = len(tape.inputs), tape.shape
+    run = _runner(tape)
+    count, entries, shape = len(tape.inputs), len(tape.outputs), tape.shape
 
     def evaluate(*inputs: ArrayLike) -> Array:
         if len(inputs) != count:
@@ -95,21 +94,41 @@ def compile_numpy(tape: Tape) -> Callable[..., Array]:
             )
         arrays = [np.asarray(value, dtype=float)[()] for value in inputs]
         batch = np.broadcast_shapes(*(np.shape(array) for array in arrays))
-        values: list[Any] = [None] * live
+        result = np.empty((*batch, entries))
         with np.errstate(all="ignore"):
-            for target, function, args, number in program:
-                if function is None:
-                    values[target] = number if not args else arrays[args[0]]
-                elif number is None:
-                    values[target] = function(*[values[arg] for arg in args])
-                else:
-                    values[target] = function(values[args[0]], number)
-        result = np.empty((*batch, len(outputs)))
-        for position, output in enumerate(outputs):
-            result[..., position] = values[output]
+            for position, value in enumerate(run(arrays)):
+                result[..., position] = value
         return result.reshape((*batch, *shape))
 
     return evaluate
+
+
+@lru_cache(maxsize=256)
+def compile_scalar(tape: Tape) -> Callable[..., list[float]]:
+    """The same on one point: a function of numbers that returns the list of outputs, without the care for shapes.
+
+    It costs a few microseconds, and warns of undefined operations unless called under ``np.errstate``.
+    """
+    run = _runner(tape)
+    return lambda *inputs: run(inputs)
+
+
+def _runner(tape: Tape) -> Callable[[Sequence[Any]], list[Any]]:
+    program, live, slots = _program(tape)
+    outputs = [slots[output] for output in tape.outputs]
+
+    def run(inputs: Sequence[Any]) -> list[Any]:
+        values: list[Any] = [None] * live
+        for target, function, args, number in program:
+            if function is None:
+                values[target] = number if not args else inputs[args[0]]
+            elif number is None:
+                values[target] = function(*[values[arg] for arg in args])
+            else:
+                values[target] = function(values[args[0]], number)
+        return [values[output] for output in outputs]
+
+    return run
 
 
 _Step = tuple[int, Callable[..., Any] | None, tuple[int, ...], float | None]

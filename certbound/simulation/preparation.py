@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.trace import compile_numpy
+from certbound.problem.evaluation import compile_scalar
 from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
 from certbound.simulation.stepping import Scenario, StepModel, step_model
 
@@ -134,11 +134,11 @@ def nominal_path(setting: Setting, start: Array) -> Array:
     Only for models whose disturbance is fixed.
     """
     model = setting.model
-    drift = compile_numpy(model.drift)
-    path = np.empty((setting.steps + 1, model.dimension))
-    path[0] = start
-    for k in range(setting.steps):
-        inputs = model.table[k] if model.table.size else ()
-        value = drift(k * model.interval, *path[k], *inputs)
-        path[k + 1] = path[k] + model.step * value if model.step > 0.0 else value
-    return path
+    drift = compile_scalar(model.drift)
+    path = [np.asarray(start, dtype=float).tolist()]
+    inputs = model.table.tolist() if model.table.size else [()] * setting.steps
+    with np.errstate(all="ignore"):
+        for k in range(setting.steps):
+            value = drift(k * model.interval, *path[k], *inputs[k])
+            path.append([x + model.step * v for x, v in zip(path[k], value)] if model.step > 0.0 else value)
+    return np.array(path, dtype=float)
