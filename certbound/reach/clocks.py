@@ -124,7 +124,7 @@ class ClockEvents:
     Parameters
     ----------
     windows : WindowEvents
-    diffusion : ndarray, shape (n, m)
+    diffusion : ndarray, shape (n, m), or (N, n, m) where it differs from piece to piece
     memory : dict
         What was computed for this cell's response before; shared by events with other levels.
     """
@@ -161,6 +161,15 @@ class ClockEvents:
         return int(np.clip(np.ceil(size / _PART), 1, max(1, _MOST_PARTS // response.pieces)))
 
     @property
+    def by_parts(self) -> Array:
+        """The diffusion, on every part where it differs from piece to piece."""
+        return self.diffusion if self.diffusion.ndim == 2 else np.repeat(self.diffusion, self.parts, axis=0)
+
+    def _noise(self, first: int) -> Array:
+        """The diffusion as it holds from part ``first`` on."""
+        return self.diffusion if self.diffusion.ndim == 2 else self.by_parts[first:]
+
+    @property
     def fine(self) -> LinearResponse:
         """The same response on the parts."""
         if b"fine" not in self.memory:
@@ -178,7 +187,7 @@ class ClockEvents:
         error = 8 * _UNIT * (size + float(np.abs(response.drift).max(initial=0.0)) * response.step)
         drift = np.broadcast_to(response.drift[:, :, None], (1, response.pieces, parts, *shape[2:])).reshape(shape)
         return continuous_response(
-            slope.reshape(shape), drift, response.step / parts, self.diffusion, response.covariance[0, 0],
+            slope.reshape(shape), drift, response.step / parts, self.by_parts, response.covariance[0, 0],
             slope_error=error + self.slope_error,
         )
 
@@ -192,7 +201,8 @@ class ClockEvents:
         r = self.fine
         h, pick, weight = r.step * (1 + 1e-14), slice(first, None), np.abs(w)
         a, drift, dev = r.slope[0, pick], r.drift[0, pick], r.deviation[0, pick]
-        size_g = np.abs(self.diffusion) @ np.abs(self.diffusion).T * (1 + 1e-13)
+        noise = np.abs(self._noise(first))
+        size_g = noise @ np.swapaxes(noise, -1, -2) * (1 + 1e-13)
         v, v_next = r.covariance[0, first:-1], r.covariance[0, first + 1 :]
         traces = np.trace(r.covariance_error[0], axis1=1, axis2=2)
         spill = (traces[first:-1] + traces[first + 1 :])[:, None, None]
@@ -248,12 +258,13 @@ class ClockEvents:
         a, dev, f, phi = r.slope[0, pick], r.deviation[0, pick], r.transition[0, pick], r.transition_error[0, pick]
         v_next, count, variance, alpha = r.covariance[0, first + 1 :], len(a), m.variance, m.alpha
         grow = np.eye(len(w)) + dev
-        gram = self.diffusion @ self.diffusion.T
+        diffusion = self._noise(first)
+        gram, size_g = (g @ np.swapaxes(g, -1, -2) for g in (diffusion, np.abs(diffusion)))
         alpha2 = np.einsum("ki,kij->kj", alpha, a) + m.kappa
         second = np.maximum(dev - h * np.abs(a), 0.0) + 4e-16 * (1 + dev)
-        size_g = np.abs(self.diffusion) @ np.abs(self.diffusion).T
-        noise_value, noise_error = float(w @ gram @ w), 1e-13 * float(weight @ size_g @ weight)
-        noise = Interval(np.full(count, max(noise_value - noise_error, 0.0)), np.full(count, noise_value + noise_error))
+        noise_value = np.broadcast_to(w @ gram @ w, count)
+        noise_error = np.broadcast_to(1e-13 * (weight @ size_g @ weight), count)
+        noise = Interval(np.maximum(noise_value - noise_error, 0.0), noise_value + noise_error)
         # covariances of the times s <= t of one part
         cov_lo, cov_hi = np.full((count, count), -1.0), np.full((count, count), 1.0)
         run_lo, run_hi = np.zeros((count, count)), np.zeros((count, count))

@@ -89,9 +89,6 @@ def contraction_reach(problem: Problem, *, noise: bool = True, cells: int | None
 
 def response_reach(problem: Problem, *, noise: bool = True, cells: int | None = None) -> ReachTube:
     """Thm K7, loaded when it is first used."""
-    from certbound.reach.response_tube import linear_reach, refusal
+    from certbound.reach.response_tube import linear_reach
 
-    reason = refusal(problem)
-    if reason is not None:
-        raise InfeasibleError(f'{reason}; use method "contraction".')
     return linear_reach(problem, noise=noise, cells=cells)

@@ -21,12 +21,13 @@ from certbound.reach.directions import Requirement, requirements
 from certbound.reach.events import StepEvent, StepEvents, WindowEvent, WindowEvents, logsumexp
 from certbound.reach.inclusion import Supports
 from certbound.reach.linearisation import Linearisation
+from certbound.reach.martingales import SplitEvent, SplitEvents
 
-__all__ = ["LinearRun", "Outcome", "level_scale"]
+__all__ = ["Events", "LinearRun", "Outcome", "level_scale"]
 
 Array = NDArray[np.float64]
-Event = StepEvent | WindowEvent | SteadyEvent
-Events = StepEvents | ClockEvents
+Event = StepEvent | WindowEvent | SteadyEvent | SplitEvent
+Events = StepEvents | ClockEvents | SplitEvents
 _LOG = logging.getLogger(__name__)
 
 _GUESSES = 30

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
 from certbound.problem.systems import ContinuousSystem
+from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy
 from certbound.reach.cells import initial_cells
 from certbound.reach.directions import NominalPieces
@@ -191,11 +192,19 @@ class Linearisation:
         """Entrywise bound of |Jhat - its floats|: the model's constant entries need not be floats."""
         return float(self.model.constant_slope.rad.max(initial=0.0))
 
-    @property
+    @cached_property
     def diffusion(self) -> Array:
-        """g of a continuous-time problem (0 without noise)."""
+        """g of a continuous-time problem (0 without noise); along the nominal, (B, N, n, m), where it is a function."""
         assert isinstance(self.system, ContinuousSystem)
-        return np.asarray(self.system.diffusion, dtype=float) * (1.0 if self.noise else 0.0)
+        g = self.system.diffusion
+        if isinstance(g, Tape):
+            shape = (len(self.centres), self.pieces, *g.shape)
+            middle = (self.nodes[:, :-1] + self.nodes[:, 1:]) / 2
+            time = np.broadcast_to((self.times[:-1] + self.times[1:]) / 2, shape[:2])
+            with np.errstate(all="ignore"):
+                g = np.broadcast_to(compile_numpy(g)(time, *np.moveaxis(middle, -1, 0)), shape)
+            g = np.where(np.isfinite(g), g, 0.0)
+        return np.asarray(g, dtype=float) * (1.0 if self.noise else 0.0)
 
     @cached_property
     def response(self) -> LinearResponse:
@@ -317,6 +326,8 @@ class Linearisation:
         _, vectors = np.linalg.eigh(np.swapaxes(root, -1, -2)[:, :, None] @ hessians @ root[:, :, None])
         chosen = np.swapaxes(vectors, -1, -2)[..., [0, -1], :] @ inverse[:, :, None]
         rows = chosen.reshape(cells, self.pieces, -1, count)
+        # what the remainder does not depend on must not help to cull its boxes
+        rows[..., np.setdiff1d(np.arange(count), self.model.blocks[0][0])] = 0.0
         # the sign of an eigenvector is free: keep it from flipping between neighbours
         flips = np.einsum("bkda,bkac,bkdc->bkd", rows[:, 1:], spread[:, 1:], rows[:, :-1])
         sign = np.cumprod(np.where(flips < 0, -1.0, 1.0), axis=1)

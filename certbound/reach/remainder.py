@@ -134,7 +134,7 @@ class Remainder:
         set_(self, "_entries", [divmod(e, n) for e in entries])
         set_(self, "_second_index", [(o // (n + 1), o % (n + 1) - 1) for o in kept])
         touched = {e % n for e in entries} | {o % (n + 1) - 1 for o in kept if o % (n + 1)}
-        set_(self, "active", np.array(sorted(touched), dtype=np.intp))
+        set_(self, "active", np.array(sorted(touched | self._stirring()), dtype=np.intp))
         set_(self, "_value", tape)
         set_(self, "_varying", varying)
         set_(self, "_second", _select(second, kept))
@@ -143,6 +143,15 @@ class Remainder:
         set_(self, "_time2", jacobian(_select(time, timed), [0]) if timed else None)
         set_(self, "_gain", jacobian(tape, slots) if q else None)
         set_(self, "blocks", self._colours())
+
+    def _stirring(self) -> set[int]:
+        """States that the diffusion depends on: they ask for bounds, though not of beta."""
+        diffusion = getattr(self.problem.system, "diffusion", None)
+        if not isinstance(diffusion, Tape):
+            return set()
+        slopes = jacobian(diffusion, list(range(1, len(diffusion.inputs))))
+        n = len(diffusion.inputs) - 1
+        return {output % n for output in range(len(slopes.outputs)) if not _is_zero(slopes, output)}
 
     def _colours(self) -> list[list[list[int]]]:
         """Blocks of coupled active coordinates, grouped so that no output meets two blocks of one group."""
@@ -160,11 +169,13 @@ class Remainder:
             outputs[position[j]].add(i)
             if state >= 0:
                 parent[root(position[state])] = root(position[j])
+                outputs[position[state]].add(i)
         for i, j in self._entries:  # type: ignore[attr-defined]
             outputs[position[j]].add(i)
         blocks: dict[int, list[int]] = {}
         for a in range(len(self.active)):
-            blocks.setdefault(root(a), []).append(a)
+            if outputs[a]:
+                blocks.setdefault(root(a), []).append(a)
         groups: list[tuple[int, set[int], list[list[int]]]] = []
         for block in blocks.values():
             touched = set().union(*(outputs[a] for a in block))

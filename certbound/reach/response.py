@@ -178,14 +178,15 @@ def continuous_response(
 ) -> LinearResponse:
     """Linear data in continuous time: dZ = (A + tau K) Z dt + g dW on every piece.
 
+    ``diffusion`` is g (n, m), or one matrix a cell and piece, (B, N, n, m).
     ``slope_error`` bounds entrywise how far the exact slope (the model's constants) is from its floats.
     """
     transition, error, deviation = _transition(slope, drift, step, slope_error)
-    gram = diffusion @ diffusion.T
+    gram = diffusion @ _transposed(diffusion)
     noise, noise_error = _noise_covariance(slope, drift, step, gram)
     noise_error = noise_error + 4 * slope.shape[-1] * step * slope_error * np.abs(noise).sum(axis=(-1, -2))
-    noise_error = noise_error + _gamma(diffusion.shape[1]) * 4 * step * float(
-        (np.abs(diffusion) @ np.abs(diffusion).T).max(initial=0.0)
+    noise_error = noise_error + _gamma(diffusion.shape[-1]) * 4 * step * float(
+        (np.abs(diffusion) @ _transposed(np.abs(diffusion))).max(initial=0.0)
     )
     v, w = _propagate(transition, error, noise, noise_error, start)
     return LinearResponse(

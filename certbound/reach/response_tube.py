@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
-from certbound.problem.tape import Tape
 from certbound.reach.curve import Curve
+from certbound.reach.diffusion import DiffusionRun, depends_on_state
 from certbound.reach.directions import Requirement
 from certbound.reach.events import logsumexp
 from certbound.reach.inclusion import Supports
@@ -162,9 +162,9 @@ class LinearAnswer:
 
 
 def refusal(problem: Problem) -> str | None:
-    """Why the engine does not apply to ``problem``; None where it does."""
-    if isinstance(problem.system, ContinuousSystem) and isinstance(problem.system.diffusion, Tape):
-        return "the linear-response engine needs a constant diffusion matrix"
+    """Why the deviation's law does not follow from the plan alone, as synthesis needs it; None where it does."""
+    if depends_on_state(problem):
+        return "the noise depends on the state, and the linear response to it on the plan's own tube"
     return None
 
 
@@ -180,7 +180,7 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
         False: one cell when omitted, and no larger shares where nothing was proved.
     """
     target = float(np.log(problem.delta))
-    run = LinearRun(Linearisation.of(problem, cells=1 if cells is None else cells))
+    run = _run(problem, cells=1 if cells is None else cells)
     best, effort = _best(run, target)
     if thorough and cells is None and best.bounds is None:
         finer = _finer(problem, run, target + float(np.log(_SHARES[0][0])))
@@ -203,6 +203,12 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
     return LinearAnswer(run=run, outcome=best, shown=shown)
 
 
+def _run(problem: Problem, *, cells: int | None, noise: bool = True) -> LinearRun:
+    """The engine for the problem's noise."""
+    engine = Linearisation.of(problem, cells=cells, noise=noise)
+    return DiffusionRun(engine) if noise and depends_on_state(problem) else LinearRun(engine)
+
+
 def _best(run: LinearRun, target: float) -> tuple[Outcome, int]:
     """The least probability over a few shares of the target for delta_N, and the last effort."""
     share, effort = _SHARES[0]
@@ -220,7 +226,7 @@ def _finer(problem: Problem, run: LinearRun, log_nonlinear: float) -> LinearRun 
     for parts in _PARTS if wide else ():
         if parts**wide * run.engine.pieces > _MOST_PIECES:
             break
-        finer = LinearRun(Linearisation.of(problem, cells=parts))
+        finer = _run(problem, cells=parts)
         if finer.probability(log_nonlinear, _SHARES[0][1]).bounds is not None:
             return finer
     return None
@@ -238,7 +244,7 @@ def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = No
     ArithmeticError
         If the remainder feeds itself before the horizon ends.
     """
-    run = LinearRun(Linearisation.of(problem, cells=cells, noise=noise))
+    run = _run(problem, cells=cells, noise=noise)
     outcome = run.probability(float(np.log(problem.delta / 2)))
     if outcome.bounds is None:
         raise ArithmeticError(LinearAnswer(run=run, outcome=outcome, shown=outcome).reason)

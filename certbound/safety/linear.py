@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from certbound.problem.problem import Problem
-from certbound.reach.response_tube import DeviationTube, LinearAnswer, linear_answer, refusal
+from certbound.reach.diffusion import ASSUMPTION, depends_on_state
+from certbound.reach.response_tube import DeviationTube, LinearAnswer, linear_answer
 from certbound.safety.answers import Deviation, EngineAnswer
 
 __all__ = ["linear_engine"]
@@ -18,9 +19,6 @@ def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool 
 
     Without ``thorough`` the initial set is one cell unless ``cells`` says otherwise.
     """
-    refused = refusal(problem)
-    if refused is not None:
-        return EngineAnswer(applicable=False, reason=refused, method="linear")
     answer = linear_answer(problem, cells=cells, thorough=thorough)
     tube = answer.tube
     return EngineAnswer(
@@ -35,6 +33,7 @@ def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool 
         method="linear",
         details=answer,
         conclusive=answer.exact,
+        assumption=ASSUMPTION if depends_on_state(problem) else "",
     )
 
 

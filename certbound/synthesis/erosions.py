@@ -19,10 +19,9 @@ from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian
-from certbound.reach.clocks import ClockEvents
 from certbound.reach.events import StepEvents
 from certbound.reach.inclusion import Supports
-from certbound.reach.linear import LinearRun, level_scale
+from certbound.reach.linear import Events, LinearRun, level_scale
 from certbound.reach.linearisation import Linearisation
 from certbound.synthesis.faces import Face
 from certbound.synthesis.plant import Grid, Plant
@@ -94,7 +93,7 @@ class LinearTube(Tightening):
 
     run: LinearRun
     bounds: tuple[Array, Array]
-    events: StepEvents | ClockEvents
+    events: Events
     log_share: float
     factors: dict[object, float]
 
