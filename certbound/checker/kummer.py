@@ -11,6 +11,7 @@ start of proxy s^2 in P's norm enters through X (item 7.4 of docs/theory.md).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -24,6 +25,7 @@ __all__ = ["Kummer", "exit_probability"]
 MOST_POWER = 1e5
 _LARGEST = arb(10) ** 7
 _CLOSE, _MOST_PARTS = 0.998, 1024
+_TERMS = 3000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -160,11 +162,29 @@ def _excess(data: Kummer) -> Callable[[arb], arb]:
 
 
 def _partial(data: Kummer, z: arb) -> arb:
-    """Terms 1, 2, ... of the series of E_a: all positive."""
+    """Some of the terms of the series of E_a, which are all positive: the first ones, and those about the largest."""
+    first = _terms(data, z, 1, z / data.half)
+    if not z > 0:
+        return first
+    a, b = float(data.a), float(data.half)
+    x = float(z)
+    peak = math.sqrt(a * x) if data.bessel else (x - b + math.sqrt((x - b) ** 2 + 4 * a * x)) / 2
+    k = int(peak) - _TERMS // 2
+    if k <= 1:
+        return first
+    log = k * z.log() - (arb(k) + 1).lgamma() - (data.half + k).lgamma() + data.half.lgamma()
+    if data.bessel:
+        log += (k - 1) * data.a.log()
+    else:
+        log += (data.a + k).lgamma() - (data.a + 1).lgamma()
+    return arb.max(first, _terms(data, z, k, log.exp()))
+
+
+def _terms(data: Kummer, z: arb, start: int, first: arb) -> arb:
+    """Lower bound of the sum of terms from number ``start`` on, the first of which is given."""
     a, b = data.a, data.half
-    term = z / b
-    total = term
-    for k in range(1, 3000):
+    total = term = first
+    for k in range(start, start + _TERMS):
         term = term * z / ((b + k) * (k + 1))
         term = term * a if data.bessel else term * (a + k)
         total += term

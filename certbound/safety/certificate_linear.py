@@ -36,7 +36,8 @@ Events = StepEvents | WindowEvents
 
 _STEPS = (0.25, 0.12, 0.06)
 _FEWEST, _MOST = 40, (160, 320, 640)
-_PADS = (0.08, 0.15, 0.25)
+_PADS = ((0.08, 0.03, 0.01), (0.15, 0.05, 0.02), (0.25, 0.1, 0.03))  # a smaller one where a larger does not close
+_NEARLY = 1.3
 _ROUNDS = 8
 _WINDOW = 0.05
 _SLACK = 0.01
@@ -61,13 +62,17 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
         raise CertificateError("the linear response bounds nothing here.")
     target = math.log(problem.delta)
     tried = [found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]
-    run = LinearRun(_coarser(problem, engine, effort))
+    own = _coarser(problem, engine, effort)
+    run = found.run if own is engine else LinearRun(own)
     best: _Stated | None = None
-    for log_nonlinear in dict.fromkeys(tried):
-        stated = _state(run, log_nonlinear, _PADS[effort])
-        if stated is not None and (best is None or stated.log_probability < best.log_probability):
-            best = stated
-        if best is not None and best.log_probability <= target:
+    for pad in _PADS[effort]:
+        for log_nonlinear in dict.fromkeys(tried):
+            stated = _state(run, log_nonlinear, pad)
+            if stated is not None and (best is None or stated.log_probability < best.log_probability):
+                best = stated
+            if best is not None and best.log_probability <= target:
+                break
+        if best is not None:
             break
     if best is None:
         raise CertificateError("the remainder feeds itself once its boxes are widened for the checker.")
@@ -83,6 +88,8 @@ def _coarser(problem: Problem, engine: Linearisation, effort: int) -> Linearisat
         return engine
     size = float(np.linalg.norm(np.nan_to_num(engine.slopes[0]), axis=(-2, -1)).max())
     pieces = int(np.clip(np.ceil(problem.horizon * size / _STEPS[effort]), _FEWEST, _MOST[effort]))
+    if pieces <= engine.pieces <= _NEARLY * pieces:
+        return engine
     along = _cells_along(engine)
     return Linearisation(problem, cells=along if along > 1 else None, pieces=pieces)
 
