@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,36 +63,36 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
         raise CertificateError("the linear response bounds nothing here.")
     target = math.log(problem.delta)
     tried = [found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]
-    own = _coarser(problem, engine, effort)
-    run = found.run if own is engine else LinearRun(own)
-    best: _Stated | None = None
-    for pad in _PADS[effort]:
+    best: tuple[LinearRun, _Stated] | None = None
+    for run in _runs(problem, found.run, effort):
         for log_nonlinear in dict.fromkeys(tried):
-            stated = _state(run, log_nonlinear, pad)
-            if stated is not None and (best is None or stated.log_probability < best.log_probability):
-                best = stated
-            if best is not None and best.log_probability <= target:
+            stated = _state(run, log_nonlinear, _PADS[effort])
+            if stated is not None and (best is None or stated.log_probability < best[1].log_probability):
+                best = run, stated
+            if best is not None and best[1].log_probability <= target:
                 break
         if best is not None:
             break
     if best is None:
         raise CertificateError("the remainder feeds itself once its boxes are widened for the checker.")
-    log10 = best.log_probability / _LOG10
+    log10 = best[1].log_probability / _LOG10
     exact_sums = not engine.continuous and effort == 0 and log10 > _LIKELY
     slack = _SLACK * (0.01 if exact_sums else 1 + 0.1 * abs(log10))
-    return _data(problem, run, best), min(log10 + slack, 0.0), []
+    return _data(problem, *best), min(log10 + slack, 0.0), []
 
 
-def _coarser(problem: Problem, engine: Linearisation, effort: int) -> Linearisation:
-    """The same cells on a grid for the checker."""
-    if not engine.continuous:
-        return engine
-    size = float(np.linalg.norm(np.nan_to_num(engine.slopes[0]), axis=(-2, -1)).max())
-    pieces = int(np.clip(np.ceil(problem.horizon * size / _STEPS[effort]), _FEWEST, _MOST[effort]))
-    if pieces <= engine.pieces <= _NEARLY * pieces:
-        return engine
-    along = _cells_along(engine)
-    return Linearisation(problem, cells=along if along > 1 else None, pieces=pieces)
+def _runs(problem: Problem, given: LinearRun, effort: int) -> Iterator[LinearRun]:
+    """The same cells on a grid for the checker; then, should the remainder feed itself there, on the engine's own."""
+    engine = given.engine
+    if engine.continuous:
+        size = float(np.linalg.norm(np.nan_to_num(engine.slopes[0]), axis=(-2, -1)).max())
+        pieces = int(np.clip(np.ceil(problem.horizon * size / _STEPS[effort]), _FEWEST, _MOST[effort]))
+        if not pieces <= engine.pieces <= _NEARLY * pieces:
+            along = _cells_along(engine)
+            yield LinearRun(Linearisation(problem, cells=along if along > 1 else None, pieces=pieces))
+        if pieces > engine.pieces:
+            return
+    yield given
 
 
 def _edges(engine: Linearisation) -> list[list[float]]:
@@ -130,7 +131,7 @@ def _events(run: LinearRun, cell: int, shared: float) -> Events:
     return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
 
 
-def _state(run: LinearRun, log_nonlinear: float, pad: float) -> _Stated | None:
+def _state(run: LinearRun, log_nonlinear: float, pads: Sequence[float]) -> _Stated | None:
     """Levels that cost exp(log_nonlinear), boxes that prove themselves with room to spare, the probability."""
     cells, pieces, count = run.rows.shape[:3]
     levels = np.zeros((cells, pieces, count))
@@ -148,7 +149,11 @@ def _state(run: LinearRun, log_nonlinear: float, pad: float) -> _Stated | None:
         spent.append(logs)
     if not np.isfinite(levels).all():
         return None
-    bounds = _boxes(run, levels, pad)
+    found = run.include(levels, 2)
+    if found is None:
+        return None
+    closed = (_boxes(run, levels, found, pad) for pad in pads)
+    bounds = next((item for item in closed if item is not None), None)
     if bounds is None:
         return None
     worst = -np.inf
@@ -163,13 +168,9 @@ def _state(run: LinearRun, log_nonlinear: float, pad: float) -> _Stated | None:
     return _Stated(levels=levels, bounds=bounds, events=events, log_probability=float(min(worst, 0.0)))
 
 
-def _boxes(run: LinearRun, levels: Array, pad: float) -> tuple[Array, Array] | None:
+def _boxes(run: LinearRun, levels: Array, found: tuple[Array, Array], pad: float) -> tuple[Array, Array] | None:
     """Boxes B of beta such that beta over what B implies lies in B with a margin of half the padding."""
-    engine = run.engine
-    found = run.include(levels, 2)
-    if found is None:
-        return None
-    shape = found[0].shape
+    engine, shape = run.engine, found[0].shape
     extra = run.extra.reshape(shape[0] * shape[1], *run.extra.shape[2:])
     low, high = _padded(found, pad)
     for _ in range(_ROUNDS):
