@@ -12,6 +12,7 @@ from certbound.tubes.kummer import Start, excess_function, initial_ball, phi_bal
 from certbound.tubes.objective import Clearance
 from certbound.tubes.paper import golden
 from certbound.tubes.schedule import Schedule
+from certbound.tubes.search import log_gain
 from certbound.tubes.series import log_excess_one, log_phi_one
 
 __all__ = ["exit_level", "union_level"]
@@ -96,7 +97,8 @@ class _Gain:
         self.schedule, self.path = schedule, ball_path(schedule, v0, bessel=bessel)
         self.radii = clearance.at(schedule.times[:-1]).tolist()
         self.power, self.unit = arb(a), arb(schedule.unit)
-        self.excess = excess_function(a, schedule.nu / 2, bessel)
+        self.half, self.bessel = schedule.nu / 2, bessel
+        self.excess = excess_function(a, self.half, bessel)
         self.initial = initial_ball(self.path, a, start)
         self.first = 0.0 if schedule.continuous or start.sigma > 0 else 1.0
 
@@ -130,8 +132,7 @@ class _Gain:
             info, z, z_end = self.stretch(piece, s, e)
             smallest = min(smallest, upper(z))
             bound = self.value(info, z)
-            value = bound if s == e else self.value(info, z_end)
-            attained = min(attained, upper(value.log()))
+            attained = min(attained, log_gain(float(self.power), self.half, float(info), float(z_end), self.bessel))
             items.append((lower(bound.log()), piece, s, e, bound))
 
         for piece in range(len(self.schedule.lengths) - 1, -1, -1):

@@ -68,11 +68,11 @@ def log_initial(schedule: Schedule, a: float, v0: float, info: float, start: Sta
 
 
 def log_target(a: Any, info: Any, log_x: Any, log_delta: float) -> Any:
-    """log of e^{-a I_t} (X/delta - phi(I_t)) in floating point."""
+    """log of e^{-a I_t} (X/delta - phi(I_t)) in floating point; X >= phi(I_0) >= phi(I_t), whatever rounding says."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         level = log_x - log_delta
         spent = np.log(info) + log_phi(a * info) - level
-        return level + np.log1p(-np.exp(np.minimum(spent, 0.0))) - a * info
+        return level + np.log1p(-np.exp(np.minimum(spent, log_delta))) - a * info
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -176,18 +176,17 @@ class MixtureProgram:
         cap = 1e4 if self.schedule.any_power else self.schedule.nu / 2 * (1 - 1e-9)
         live = dual > 0
 
-        def point(p: Array) -> Pair:
-            if bessel:
-                return math.exp(float(p[0])), v0, True
-            return min(math.expm1(max(float(p[0]), 0.0)), cap), math.exp(float(p[1])), False
+        def point(p: Sequence[float]) -> Pair:
+            return (math.exp(p[0]), v0, True) if bessel else (math.expm1(p[0]), math.exp(p[1]), False)
 
-        def worth(p: Array) -> float:
+        def worth(p: Sequence[float]) -> float:
             columns = self.columns(point(p), scale)[:, asked][:, live]
             with np.errstate(over="ignore"):
                 return -float(np.max(np.exp(np.minimum(columns, 700.0)) @ dual[live]))
 
-        start = np.array([math.log(a)]) if bessel else np.array([math.log1p(a), math.log(v0)])
-        value, best = simplex(worth, start, 0.3, tolerance=1e-4, budget=40)
+        start = [math.log(a)] if bessel else [math.log1p(a), math.log(v0)]
+        ends = (-650.0 if bessel else 0.0, -650.0), (650.0 if bessel else math.log1p(cap), 650.0)
+        value, best = simplex(worth, start, 0.3, tolerance=1e-4, budget=40, low=ends[0], high=ends[1])
         return point(best) if value < -1 - 1e-3 and not np.allclose(best, start, atol=1e-4) else None
 
 

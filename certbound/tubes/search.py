@@ -1,18 +1,19 @@
 """Floating-point search for the Kummer parameters (a, v_0): it proposes, ball arithmetic certifies.
 
-The unknowns are x = log(1 + a) and y = log v_0 (Bessel form: log a alone). A coarse grid gives the start, the
-simplex method of Nelder and Mead the end.
+The unknowns are log(1 + a) and log(v_0/(1 + a)) (Bessel form: log a alone): a large a wants a large v_0. A coarse
+grid gives the start, the simplex method of Nelder and Mead the end.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from certbound.tubes.kummer import Start, log_initial, log_target
 from certbound.tubes.schedule import Schedule
@@ -25,9 +26,10 @@ from certbound.tubes.series import (
     solve_excess_one,
 )
 
-__all__ = ["Search", "simplex"]
+__all__ = ["Search", "log_gain", "simplex"]
 
 Array = NDArray[np.float64]
+Point = tuple[float, ...]
 
 _POWERS = np.array([0.0, 0.2, 1.0, 6.0, 60.0])
 _SPREADS = np.log(10.0) * np.array([-3.0, -1.8, -0.9, -0.3, 0.0, 0.5, 1.5])
@@ -134,19 +136,18 @@ class Search:
         return lambda a, v0: self.log_probability(a, v0, scale)
 
     def _minimise(
-        self, point: Array, function: Callable[[float, float], float], step: float, tolerance: float
-    ) -> tuple[float, Array]:
-        def objective(p: Array) -> float:
-            outside = p[0] > self.cap or abs(p[-1]) > 660
-            return math.inf if outside else function(*self._parameters(p))
+        self, point: Point, function: Callable[[float, float], float], step: float, tolerance: float
+    ) -> tuple[float, Point]:
+        return simplex(
+            lambda p: function(*self._parameters(p)), point, step, tolerance=tolerance,
+            low=(-650.0 if self.bessel else 0.0, -650.0), high=(self.cap, 650.0),
+        )  # fmt: skip
 
-        return simplex(objective, point, step, tolerance=tolerance)
-
-    def _parameters(self, point: Array) -> tuple[float, float]:
+    def _parameters(self, point: Point) -> tuple[float, float]:
         """(a, v_0) of a point of the search: the Bessel form has one free parameter."""
         if self.bessel:
-            return math.exp(float(point[0])), self.reference
-        return math.expm1(max(float(point[0]), 0.0)), math.exp(float(point[1]))
+            return math.exp(point[0]), self.reference
+        return math.expm1(point[0]), math.exp(point[0] + point[1])
 
     def log_probability(self, a: float, v0: float, scale: float) -> float:
         """Logarithm of Thm K2's bound for the clearance ``scale`` times ``weights``."""
@@ -165,6 +166,9 @@ class Search:
             base = np.log(left) + log_phi(a * left)
         excess = log_excess(np.asarray(a), self.half, z, bessel=self.bessel)[0] + a * left
         return log_x - float(np.min(np.logaddexp(base, excess)))
+
+    def _log_gain(self, a: float, info: float, z: float) -> float:
+        return log_gain(a, self.half, info, z, self.bessel)
 
     @cached_property
     def _pieces(self) -> list[tuple[float, float, float, float, float]]:
@@ -199,15 +203,10 @@ class Search:
         log_x = log_initial(self.schedule, a, v0, info, self.start, self.bessel)
         return log_x - least if math.isfinite(log_x) else math.inf
 
-    def _log_gain(self, a: float, info: float, z: float) -> float:
-        """log of phi(I) + e^{a I} E_a(z)."""
-        if not z > 0:
-            return -math.inf if info <= 0 else math.log(info) + log_phi_one(a * info)
-        excess = log_excess_value(a, self.half, z, bessel=self.bessel, digits=_DIGITS) + a * info
-        return excess if info <= 0 else _log_add(math.log(info) + log_phi_one(a * info), excess)
-
     def scale(self, a: float, v0: float) -> float:
         """Least scale (or mean radius) of Thm K1's tube for stated parameters."""
+        if self.kind != "mean" and len(self._pieces) <= _FEW:
+            return self._short_scale(a, v0)
         v, info = self.schedule.path(np.asarray(v0), bessel=self.bessel)
         log_x = log_initial(self.schedule, a, v0, float(info[0]), self.start, self.bessel)
         if not math.isfinite(log_x):
@@ -225,6 +224,25 @@ class Search:
             if self.kind == "mean":
                 return self._mean(size * self.schedule.unit)
             return float(np.max(size / np.sqrt(self._squares[chosen]))) / self._norm
+
+    def _short_scale(self, a: float, v0: float) -> float:
+        """The same for few pieces: the scale at which Thm K2 gives delta."""
+
+        def excess(x: float) -> float:
+            return self._short(a, v0, math.exp(x)) - self.log_delta
+
+        low = high = math.log(self._typical() * self._norm) if math.isfinite(self._short(a, v0, 1.0)) else math.nan
+        for _ in range(40):
+            if excess(high) <= 0:
+                break
+            low, high = high, high + 1.0
+        for _ in range(40):
+            if not excess(low) <= 0:
+                break
+            low -= 1.0
+        if not (excess(low) >= 0 >= excess(high)):
+            return math.inf
+        return math.exp(float(brentq(excess, low, high, xtol=1e-10))) / self._norm
 
     def _mean(self, radius: Array) -> float:
         times = self.schedule.times
@@ -244,16 +262,17 @@ class Search:
         return np.flatnonzero(keep & (ratio > 0)) + first
 
     @cached_property
-    def _point(self) -> Array:
+    def _point(self) -> Point:
         """Best point of a coarse grid, judged by Thm K2 at a typical scale."""
         if self.bessel:
-            points = np.linspace(-3.0, 7.0, 9)[:, None]
+            points: list[Point] = [(x,) for x in np.linspace(-3.0, 7.0, 9).tolist()]
         else:
-            powers = np.unique(np.minimum(np.log1p(_POWERS), self.cap - 1e-3))
-            points = np.array([(x, y) for x in powers for y in math.log(self.reference) + _SPREADS])
+            powers = np.unique(np.minimum(np.log1p(_POWERS), self.cap - 1e-3)).tolist()
+            logs = (math.log(self.reference) + _SPREADS).tolist()
+            points = [(x, y - min(x, math.log(2.0))) for x in powers for y in logs]
         scale = 1.0 if self.kind == "probability" else self._typical()
         scores = [self.log_probability(*self._parameters(point), scale) for point in points]
-        return np.asarray(points[int(np.argmin(np.nan_to_num(scores, nan=np.inf)))])
+        return points[int(np.argmin(np.nan_to_num(scores, nan=np.inf)))]
 
     def _typical(self) -> float:
         """A scale of the right size: Gaussian tail at the node of the largest variance."""
@@ -264,51 +283,71 @@ class Search:
         return float(size * math.sqrt(2 * self.half + 2 * math.sqrt(2 * self.half * tail) + 2 * tail))
 
 
+def log_gain(a: float, half: float, info: float, z: float, bessel: bool) -> float:
+    """log of phi(I) + e^{a I} E_a(z), to 7 digits."""
+    if not z > 0:
+        return -math.inf if info <= 0 else math.log(info) + log_phi_one(a * info)
+    excess = log_excess_value(a, half, z, bessel=bessel, digits=_DIGITS) + a * info
+    return excess if info <= 0 else _log_add(math.log(info) + log_phi_one(a * info), excess)
+
+
 def _log_add(x: float, y: float) -> float:
     top, low = (x, y) if x > y else (y, x)
     return top + math.log1p(math.exp(low - top)) if top > -math.inf else top
 
 
 def simplex(
-    function: Callable[[Array], float], start: Array, step: float, *, tolerance: float, budget: int = 160
-) -> tuple[float, Array]:
-    """Least value found and its place (Nelder-Mead; the objectives are smooth near their minimum)."""
+    function: Callable[[Point], float],
+    start: Sequence[float],
+    step: float,
+    *,
+    tolerance: float,
+    low: Sequence[float],
+    high: Sequence[float],
+    budget: int = 160,
+) -> tuple[float, Point]:
+    """Least value found in a box, and its place (Nelder-Mead; points beyond the box are moved to its edge).
+
+    The objectives are smooth near their minimum. Plain numbers: for one or two unknowns they are quicker than arrays.
+    """
     size = len(start)
-    points = [np.array(start, dtype=float)]
-    for i in range(size):
-        other = points[0].copy()
-        other[i] += step
-        points.append(other)
-    pairs = sorted(((function(p), p) for p in points), key=lambda pair: pair[0])
+
+    def inside(point: Iterable[float]) -> Point:
+        return tuple(min(max(x, a), b) for x, a, b in zip(point, low, high))
+
+    def beyond(factor: float) -> tuple[float, Point]:
+        point = inside(x + factor * (x - y) for x, y in zip(centre, worst))
+        return function(point), point
+
+    points = [inside(start)]
+    for i, x in enumerate(points[0]):
+        moved = x + step if x + step <= high[i] else x - step
+        points.append((*points[0][:i], moved, *points[0][i + 1 :]))
+    pairs = sorted((function(p), p) for p in points)
     used = size + 1
     while used < budget:
-        low, high = pairs[0][0], pairs[-1][0]
-        if not math.isfinite(low):
+        (least, best), (most, worst) = pairs[0], pairs[-1]
+        if not math.isfinite(least):
             break
-        spread = max(float(np.max(np.abs(p - pairs[0][1]))) for _, p in pairs[1:])
-        if (high - low <= tolerance and spread < 0.05) or spread < 1e-7:
+        spread = max(abs(x - y) for _, p in pairs[1:] for x, y in zip(p, best))
+        if (most - least <= tolerance and spread < 0.05) or spread < 1e-7:
             break
-        centre = sum((p for _, p in pairs[:-1]), np.zeros(size)) / size
-        worst = pairs[-1][1]
-        reflected = centre + (centre - worst)
-        value = function(reflected)
+        centre = [sum(column) / size for column in zip(*(p for _, p in pairs[:-1]))]
+        pair = beyond(1.0)
         used += 1
-        if value < low:
-            expanded = centre + 2 * (centre - worst)
-            trial = function(expanded)
+        if pair[0] < least:
+            pairs[-1] = min(pair, beyond(2.0))
             used += 1
-            pairs[-1] = (trial, expanded) if trial < value else (value, reflected)
-        elif value < pairs[-2][0]:
-            pairs[-1] = (value, reflected)
+        elif pair[0] < pairs[-2][0]:
+            pairs[-1] = pair
         else:
-            inside = centre + (0.5 if value < high else -0.5) * (centre - worst)
-            trial = function(inside)
+            nearer = beyond(0.5 if pair[0] < most else -0.5)
             used += 1
-            if trial < min(value, high):
-                pairs[-1] = (trial, inside)
+            if nearer[0] < min(pair[0], most):
+                pairs[-1] = nearer
             else:
-                best = pairs[0][1]
-                pairs[1:] = [(function(q), q) for q in (best + 0.5 * (p - best) for _, p in pairs[1:])]
+                halved = [tuple((x + y) / 2 for x, y in zip(p, best)) for _, p in pairs[1:]]
+                pairs[1:] = [(function(p), p) for p in halved]
                 used += size
-        pairs.sort(key=lambda pair: pair[0])
+        pairs.sort()
     return pairs[0]

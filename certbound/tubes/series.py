@@ -160,7 +160,7 @@ def log_excess_one(a: float, b: float, z: float, *, bessel: bool = False, digits
 
 def log_excess_value(a: float, b: float, z: float, *, bessel: bool = False, digits: float = 1e-17) -> float:
     """The value of :func:`log_excess_one` alone, to 7 digits, from SciPy where that is quicker."""
-    if 0.1 <= b <= 50 and ((bessel and 1 <= a * z <= 1e4) or (not bessel and a <= 1e3 and 1 <= z <= 250)):
+    if 0.1 <= b <= 50 and ((bessel and 1 <= a * z <= 1e4) or (not bessel and a <= 1e4 and 1e-4 <= z <= 250)):
         power = a if bessel else max(a, 1e-8)
         value = float(hyp0f1(b, a * z) if bessel else hyp1f1(power, b, z))
         if 1.00001 < value < 1e290:
