@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from certbound.constants.bounds import bound_constants
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
@@ -16,8 +18,13 @@ __all__ = ["bound_reach"]
 _ENGINES = ("linear", "contraction")
 """Names of the engines, in the order in which "auto" tries them."""
 
+_STATISTICAL = ("sampled", "learned")
+"""Names of the methods that rest on samples; "auto" never takes them."""
 
-def bound_reach(problem: Problem, *, noise: bool = True, cells: int | None = None, method: str = "auto") -> ReachTube:
+
+def bound_reach(
+    problem: Problem, *, noise: bool = True, cells: int | None = None, method: str = "auto", **sampling: Any
+) -> ReachTube:
     """A tube that contains the state at every time up to its ``end``.
 
     Proves, for ``noise=False``: every noise-free trajectory from the initial set, under every disturbance, lies in
@@ -32,8 +39,12 @@ def bound_reach(problem: Problem, *, noise: bool = True, cells: int | None = Non
         Whether the stochastic deviation is included.
     cells : int, optional
         Parts along each side of the initial set; the tube is the union over the cells.
-    method : {"auto", "linear", "contraction"}
-        Thm K7, or Thms K5 and K4; "auto" takes the first that reaches the horizon.
+    method : {"auto", "linear", "contraction", "sampled", "learned"}
+        Thm K7, or Thms K5 and K4; "auto" takes the first that reaches the horizon. "sampled" and "learned" prove
+        nothing: they give a statistical statement about sampled trajectories (`certbound.reach.sampled`,
+        `certbound.reach.learned`), marked as such, with ``certified`` False.
+    **sampling
+        Only for the statistical methods: ``epsilon``, ``confidence``, ``pieces``, ``rng`` (and ``points``).
 
     Returns
     -------
@@ -43,14 +54,20 @@ def bound_reach(problem: Problem, *, noise: bool = True, cells: int | None = Non
     Raises
     ------
     ValueError
-        If the method is unknown, the system has inputs and no plan, or the nominal is lost before the horizon.
+        If the method is unknown or does not take an argument, the system has inputs and no plan, or the nominal is lost
+        before the horizon.
     ArithmeticError, InfeasibleError
         If no engine proved anything.
 
     Source: Thms K4, K5, K7 of theory.
     """
+    if method in _STATISTICAL:
+        return statistical_reach(problem, method, noise=noise, cells=cells, **sampling)
     if method not in ("auto", *_ENGINES):
-        raise ValueError(f"`method` must be one of auto, {', '.join(_ENGINES)}, got {method!r}.")
+        raise ValueError(f"`method` must be one of auto, {', '.join((*_ENGINES, *_STATISTICAL))}, got {method!r}.")
+    if sampling:
+        name = next(iter(sampling))
+        raise ValueError(f"`{name}` must be left out for the method {method!r}; it belongs to 'sampled' and 'learned'.")
     best: ReachTube | None = None
     failure: ArithmeticError | InfeasibleError | None = None
     for name in _ENGINES if method == "auto" else (method,):
@@ -92,3 +109,23 @@ def response_reach(problem: Problem, *, noise: bool = True, cells: int | None = 
     from certbound.reach.response_tube import linear_reach
 
     return linear_reach(problem, noise=noise, cells=cells)
+
+
+def statistical_reach(
+    problem: Problem, method: str, *, noise: bool, cells: int | None = None, **sampling: Any
+) -> ReachTube:
+    """A tube around samples, not certified; loaded when it is first used."""
+    from certbound.reach.learned import estimate_reach_by_classifier
+    from certbound.reach.sampled import estimate_reach
+
+    if cells is not None:
+        raise ValueError(f"`cells` must be left out for the method {method!r}, which does not split, got {cells!r}.")
+    known = ("epsilon", "confidence", "pieces", "rng", *(("points",) if method == "learned" else ()))
+    for name in sampling:
+        if name not in known:
+            raise ValueError(f"`{name}` must be one of {', '.join(known)} for the method {method!r}.")
+    if method == "sampled":
+        return estimate_reach(problem, noise=noise, **sampling)
+    if noise:
+        raise ValueError("`noise` must be False for the method 'learned', which runs the model backwards, got True.")
+    return estimate_reach_by_classifier(problem, **sampling)

