@@ -72,6 +72,7 @@ def check_data(
     if record["version"] != VERSION:
         raise CertificateError(f"`certificate.version` must be {VERSION}; use the certbound that wrote the file.")
     claim = Record(record["claim"], "claim", ("log10_delta", "method", "assumptions"))
+    claim.text("method", 100)
     level = claim.number("log10_delta")
     if not level <= 0:
         raise CertificateError(f"`claim.log10_delta` must not be positive, got {level:g}.")

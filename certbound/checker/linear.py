@@ -65,6 +65,7 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     if model.continuous and model.dimension > MOST_STATES:
         raise Unproved(f"{model.dimension} states are too many for this proof in continuous time")
     structure = structure_of(model, budget)
+    structure.refuse_hidden_jumps(model)
     shared = Shared(model, structure, record)
     boxes = cells_of(model, record)
     entries = record.items("cells", len(boxes), len(boxes))

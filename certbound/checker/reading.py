@@ -20,6 +20,7 @@ __all__ = ["Record", "number", "numbers", "parse", "read", "text", "whole", "who
 
 LARGEST_FILE = 16 * 2**20
 """Bytes."""
+MOST_ENTRIES = 2_000_000
 _LONGEST_WHOLE = 9
 _NUMBER = re.compile(r"-?0x[01]\.[0-9a-f]{1,13}p[+-][0-9]{1,4}\Z")
 
@@ -50,7 +51,8 @@ def parse(content: str | bytes) -> dict[str, Any]:
     Raises
     ------
     CertificateError
-        If it is longer than 16 MiB, no JSON, nested too deeply, not finite, or no object.
+        If it is longer than 16 MiB, has more than two million entries, is no JSON, nested too deeply, not finite, or
+        no object.
 
     Examples
     --------
@@ -59,6 +61,8 @@ def parse(content: str | bytes) -> dict[str, Any]:
     """
     if len(content) > LARGEST_FILE:
         raise CertificateError(f"the certificate is longer than {LARGEST_FILE // 2**20} MiB.")
+    if content.count(b"," if isinstance(content, bytes) else ",") > MOST_ENTRIES:  # type: ignore[arg-type]
+        raise CertificateError(f"the certificate has more than {MOST_ENTRIES} entries.")
     try:
         text_ = content.decode("utf-8") if isinstance(content, bytes) else content
         value = json.loads(

@@ -1,7 +1,8 @@
 """What the dynamics look like to first order: which entries of its Jacobians are constant, which states matter.
 
 Where an entry of D_x f depends on nothing, the linearisation uses the model's own (exact) value: the remainder does
-not depend on that state through that entry, whatever the floats of the certificate say.
+not depend on that state through that entry, whatever the floats of the certificate say. That is false where f jumps
+(the derivative of a step is 0) or is not defined, so that whatever decides a jump must be a variable of the remainder.
 """
 
 from __future__ import annotations
@@ -13,9 +14,12 @@ from flint import arb
 from certbound.checker.graph import Graph
 from certbound.checker.model import Model
 from certbound.checker.program import Program
-from certbound.checker.report import Budget
+from certbound.checker.report import Budget, Unproved
+from certbound.problem.tape import JUMPS
 
 __all__ = ["Structure", "structure_of"]
+
+_PARTIAL = {"sqrt", "log", "tan", "asin", "acos", "atan2", "div", "pow"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -44,6 +48,27 @@ class Structure:
         """Disturbances on which the remainder of an output may depend."""
         return [j for i, j in self.moving if i == output]
 
+    def refuse_hidden_jumps(self, model: Model) -> None:
+        """Every state and disturbance that decides a jump, or whether f is defined, is one of the remainder's.
+
+        Raises
+        ------
+        Unproved
+        """
+        names, n = model.dynamics.inputs, model.dimension
+        first = len(names) - len(model.disturbance)
+        asked = sum(1 << slot for slot in [*range(1, n + 1), *range(first, len(names))])
+        for i, output in enumerate(self.outputs):
+            seen = sum(1 << 1 + j for j in self.active_states(i))
+            seen |= sum(1 << first + j for j in self.active_disturbances(i))
+            for index in self.graph.reachable([output]):
+                hidden = _deciding(self.graph, index) & asked & ~seen
+                if hidden:
+                    raise Unproved(
+                        f"`{self.graph.node(index).op}` may jump with {names[hidden.bit_length() - 1]}, in which the "
+                        f"dynamics of {model.states[i]} is linear otherwise"
+                    )
+
 
 def structure_of(model: Model, budget: Budget) -> Structure:
     """Differentiate the model once."""
@@ -61,6 +86,18 @@ def structure_of(model: Model, budget: Budget) -> Structure:
         graph=graph, outputs=outputs, state_nodes=by_state, disturbance_nodes=by_disturbance, varying=varying,
         moving=moving, fixed=_values(graph, by_state), held=_values(graph, by_disturbance),
     )  # fmt: skip
+
+
+def _deciding(graph: Graph, index: int) -> int:
+    """The inputs that decide on which side of a jump an operation is, or whether it is defined."""
+    op, args, value = graph.node(index)
+    if op == "if_else_zero":
+        return graph.masks[args[0]]
+    if op == "div":
+        return graph.masks[args[1]]
+    if op == "pow" and value >= 0 and value == int(value):
+        return 0
+    return graph.masks[index] if op in JUMPS or op in _PARTIAL else 0
 
 
 def _derivatives(graph: Graph, outputs: list[int], slots: range, budget: Budget) -> dict[tuple[int, int], int]:

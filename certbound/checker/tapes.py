@@ -31,7 +31,7 @@ def read_tape(value: object, path: str, inputs: tuple[str, ...], shape: tuple[in
             nodes.append(Node("const", (), number(rest[0], place)))
         elif op == "pow" and len(rest) == 2:
             nodes.append(Node("pow", (whole(rest[0], place, 0, index - 1),), number(rest[1], place)))
-        elif isinstance(op, str) and op not in ("const", "pow"):
+        elif isinstance(op, str) and op not in ("const", "pow", "kink"):  # a kink is part of a derivative only
             nodes.append(Node(op, tuple(whole(arg, place, 0, 10**6) for arg in rest)))
         else:
             raise CertificateError(f"`{place}` is no operation.")

@@ -72,6 +72,19 @@ def contraction() -> cb.Problem:
     return cb.Problem(system, initial=cb.Box([0.1, 0.1], [0.2, 0.2]), safe=safe, horizon=1.0, delta=1e-2)
 
 
+def spring() -> cb.Problem:
+    """Continuous time, for the barrier: a hardening spring, a wall that the velocity must not reach, a domain."""
+
+    def rate(x: Any) -> Any:
+        return [x[1], -x[0] - x[1] - 0.5 * x[0] ** 3]
+
+    system = cb.ContinuousSystem(rate, states=["x1", "x2"], diffusion=[[0.0], [0.5]])
+    return cb.Problem(
+        system, initial=cb.Box([-1, -1], [1, 1]), safe=[cb.Inside(cb.HalfSpace([0, 1], 2.25))], horizon=5.0,
+        domain=cb.Box([-3, -3], [3, 3]),
+    )  # fmt: skip
+
+
 @pytest.fixture(autouse=True)
 def precise() -> Iterator[None]:
     """The working precision of a check."""
@@ -92,3 +105,8 @@ def flowing() -> Case:
 @pytest.fixture(scope="session")
 def contracting() -> Case:
     return Case(contraction(), "constants")
+
+
+@pytest.fixture(scope="session")
+def springing() -> Case:
+    return Case(spring(), "barrier")

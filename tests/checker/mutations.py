@@ -147,8 +147,8 @@ def moved_nominal(data: Data, rng: random.Random) -> str | None:
     """A nominal point that the dynamics does not reach."""
     nominal = rng.choice(data["proof"]["cells"])["nominal"]
     point = nominal[_pick(nominal, rng)]
-    while isinstance(point[0], list):
-        point = point[_pick(point, rng)]
+    if isinstance(point[0], list):  # a power of the time within a short piece may change without any effect
+        point = point[0 if data["proof"]["engine"] == "constants" else _pick(point, rng)]
     place = _pick(point, rng)
     point[place] = _scaled(point[place], 1.0, rng.choice((-1, 1)) * rng.uniform(0.5, 2.0))
     return "nominal"
@@ -287,6 +287,67 @@ CONSTANTS: list[Change] = [
 ]  # fmt: skip
 
 
+# ---- the barrier -------------------------------------------------------------------------------------------
+
+
+def tighter(name: str, sign: int) -> Change:
+    """A level of the barrier moved by more than the room it was written with, to the side that proves more."""
+
+    def change(data: Data, rng: random.Random) -> str | None:
+        proof = data["proof"]
+        value, horizon = float.fromhex(proof[name]), float.fromhex(data["problem"]["horizon"])
+        step = rng.uniform(0.1, 2.0) + 0.01 * abs(value)
+        if name == "growth":
+            step /= horizon
+            if value < step:
+                return None
+        proof[name] = (value + sign * step).hex()
+        return name
+
+    return change
+
+
+def other_coefficient(data: Data, rng: random.Random) -> str | None:
+    """A coefficient of the polynomial that matters, changed by more than the levels leave."""
+    values = data["proof"]["coefficients"]
+    largest = max(abs(float.fromhex(value)) for value in values)
+    place = _pick(values, rng)
+    step = rng.choice((-1, 1)) * rng.uniform(0.1, 0.5) * largest
+    values[place] = _scaled(values[place], 1.0, step)
+    return "coefficient"
+
+
+def other_monomial(data: Data, rng: random.Random) -> str | None:
+    """Another power of a state in a term that matters."""
+    proof = data["proof"]
+    largest = max(abs(float.fromhex(value)) for value in proof["coefficients"])
+    place = _pick(proof["exponents"], rng)
+    if abs(float.fromhex(proof["coefficients"][place])) < 0.05 * largest:
+        return None
+    power = proof["exponents"][place]
+    state = _pick(power, rng)
+    power[state] += 1
+    return "monomial"
+
+
+def other_frame(data: Data, rng: random.Random) -> str | None:
+    """A moved centre or another scale of the polynomial."""
+    proof = data["proof"]
+    place = _pick(proof["center"], rng)
+    if rng.random() < 0.5:
+        step = rng.choice((-1, 1)) * rng.uniform(0.2, 0.6) * float.fromhex(proof["scale"][place])
+        proof["center"][place] = _scaled(proof["center"][place], 1.0, step)
+    else:
+        proof["scale"][place] = _scaled(proof["scale"][place], rng.choice((0.6, 1.6)))
+    return "frame"
+
+
+BARRIER: list[Change] = [
+    other_problem, other_dynamics, tighter("growth", -1), tighter("start", -1), tighter("boundary", 1),
+    other_coefficient, other_monomial, other_frame,
+]  # fmt: skip
+
+
 # ---- changes that do no harm -------------------------------------------------------------------------------
 
 
@@ -322,6 +383,10 @@ def weaker_claim(data: Data, rng: random.Random) -> str | None:
 
 def wider(data: Data, rng: random.Random) -> str | None:
     """A little more of a number that may grow."""
+    if data["proof"]["engine"] == "barrier":
+        name = rng.choice(("growth", "start"))
+        data["proof"][name] = _scaled(data["proof"][name], 1.0, 1e-9)
+        return "wider"
     cell = rng.choice(data["proof"]["cells"])
     names = [name for name in ("eta", "radius", "remainder_high", "levels") if name in cell]
     values = cell[rng.choice(names)]

@@ -39,10 +39,33 @@ def test_a_huge_file_is_refused_by_its_size(tmp_path) -> None:
     huge = tmp_path / "huge.json"
     with huge.open("wb") as stream:
         stream.truncate(100_000_000)
+    started = time.perf_counter()
     with pytest.raises(CertificateError, match="95 MiB"):
         read(huge)
+    assert time.perf_counter() - started < 2.0
     with pytest.raises(CertificateError, match="longer than 16 MiB"):
         parse(" " * (17 * 2**20))
+
+
+HUGE = {
+    "numbers": '{"a":[' + "0," * 8_000_000 + "0]}",
+    "lists": b'{"a":[' + b"[]," * 5_000_000 + b"[]]}",
+    "objects": '{"a":[' + "{}," * 1_900_000 + "{}]}",
+    "digits": '{"a":' + "9" * 16_000_000 + "}",
+    "decimals": '{"a":0.' + "9" * 16_000_000 + "}",
+    "text": '{"a":"' + "x" * 16_000_000 + '"}',
+    "depth": '{"a":' * 300_000,
+}
+
+
+@pytest.mark.parametrize("kind", HUGE)
+def test_whatever_fits_into_16_mib_is_refused_in_time(kind: str) -> None:
+    started = time.process_time()
+    with pytest.raises(CertificateError) as caught:
+        check_data(parse(HUGE[kind]))
+    assert time.process_time() - started < 2.0
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 200
 
 
 @pytest.mark.parametrize("written", ["1.5", "inf", "nan", "0x1.8", "0x1p+0", "1e3", 1, None, "0x1.0p+99999"])
