@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import random
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +14,8 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
-from tests.checker.mutations import CONSTANTS, HARMLESS, LINEAR, mutated, rejected, stronger_claim
+from tests.checker.conftest import contraction
+from tests.checker.mutations import BARRIER, CONSTANTS, HARMLESS, LINEAR, mutated, rejected, stronger_claim
 
 
 def survivors(data: Any, problem: Any, changes: Any, count: int, seed: int) -> list[str]:
@@ -25,7 +27,8 @@ def survivors(data: Any, problem: Any, changes: Any, count: int, seed: int) -> l
 
 
 @pytest.mark.parametrize(
-    ("name", "changes", "count"), [("stepping", LINEAR, 55), ("flowing", LINEAR, 11), ("contracting", CONSTANTS, 14)]
+    ("name", "changes", "count"),
+    [("stepping", LINEAR, 55), ("flowing", LINEAR, 11), ("contracting", CONSTANTS, 14), ("springing", BARRIER, 27)],
 )
 def test_what_weakens_the_support_of_a_claim_is_rejected(
     name: str, changes: Any, count: int, request: pytest.FixtureRequest
@@ -34,7 +37,7 @@ def test_what_weakens_the_support_of_a_claim_is_rejected(
     assert survivors(case.data, case.given, changes, count, seed=1) == []
 
 
-@pytest.mark.parametrize(("name", "count"), [("stepping", 12), ("contracting", 4)])
+@pytest.mark.parametrize(("name", "count"), [("stepping", 12), ("contracting", 4), ("springing", 8)])
 def test_harmless_changes_crash_nothing(name: str, count: int, request: pytest.FixtureRequest) -> None:
     case = request.getfixturevalue(name)
     for kind, altered in mutated(case.data, HARMLESS, count, seed=2):
@@ -60,7 +63,7 @@ def anything_anywhere(data: Any, rng: random.Random) -> str | None:
             return "anything"
 
 
-@pytest.mark.parametrize(("name", "count"), [("stepping", 120), ("contracting", 12)])
+@pytest.mark.parametrize(("name", "count"), [("stepping", 120), ("contracting", 12), ("springing", 40)])
 def test_anything_anywhere_ends_in_a_report_or_a_refusal(
     name: str, count: int, request: pytest.FixtureRequest
 ) -> None:
@@ -70,30 +73,49 @@ def test_anything_anywhere_ends_in_a_report_or_a_refusal(
         rejected(altered, case.given)
 
 
-BUNDLED = [
-    ("chain", "linear", LINEAR, 200),
-    ("chain_rest", "linear", LINEAR, 100),
+BENCHMARKS = Path(__file__).resolve().parents[2] / "experiments" / "benchmarks"
+WEAKENED = [
+    ("chain", "linear", LINEAR, 100),
+    ("chain_rest", "linear", LINEAR, 60),
     ("pendulum", "linear", LINEAR, 40),
-    ("unicycle", "linear", LINEAR, 40),
-    ("ou", "constants", CONSTANTS, 120),
+    ("unicycle", "linear", LINEAR, 30),
+    ("contraction_14d", "linear", LINEAR, 40),
+    ("ou", "constants", CONSTANTS, 50),
+    ("chain_rest", "constants", CONSTANTS, 50),
+    ("room_3d", "constants", CONSTANTS, 20),
+    ("disturbed", "constants", CONSTANTS, 40),
+    ("oscillator_cubic", "barrier", BARRIER, 70),
 ]
+UNHARMED = [
+    ("chain", "linear", 30), ("pendulum", "linear", 10), ("ou", "constants", 20), ("chain_rest", "constants", 20),
+    ("oscillator_cubic", "barrier", 20),
+]  # fmt: skip
+
+
+def stated(name: str, method: str) -> tuple[cb.Problem, str]:
+    """A bundled problem, a benchmark or the one with a disturbance, and its certificate."""
+    path = BENCHMARKS / f"{name}.toml"
+    problem = contraction() if name == "disturbed" else cb.load(str(path) if path.exists() else name)
+    return problem, certificate_text(problem, verify_safety(problem, method=method))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "method", "changes", "count"), BUNDLED)
-def test_500_weakening_changes_of_the_bundled_problems_are_rejected(
-    name: str, method: str, changes: Any, count: int
-) -> None:
-    problem = cb.load(name)
-    data = parse(certificate_text(problem, verify_safety(problem, method=method)))
+@pytest.mark.parametrize(("name", "method", "changes", "count"), WEAKENED)
+def test_500_weakening_changes_are_rejected(name: str, method: str, changes: Any, count: int) -> None:
+    problem, text = stated(name, method)
     given = json.loads(json.dumps(problem_data(problem)))
-    assert survivors(data, given, changes, count, seed=3) == []
+    assert check_data(parse(text), given).valid
+    assert survivors(parse(text), given, changes, count, seed=3) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "method", "count"), [("chain", "linear", 60), ("ou", "constants", 40)])
-def test_100_harmless_changes_of_the_bundled_problems_crash_nothing(name: str, method: str, count: int) -> None:
-    problem = cb.load(name)
-    data = parse(certificate_text(problem, verify_safety(problem, method=method)))
-    for kind, altered in mutated(data, HARMLESS, count, seed=4):
-        assert check_data(altered).valid or kind == "wider"
+@pytest.mark.parametrize(("name", "method", "count"), UNHARMED)
+def test_100_harmless_changes_crash_nothing(name: str, method: str, count: int) -> None:
+    problem, text = stated(name, method)
+    for kind, altered in mutated(parse(text), HARMLESS, count, seed=4):
+        assert check_data(altered, problem_data(problem)).valid or kind == "wider"
+
+
+def test_the_lists_hold_500_and_100_changes() -> None:
+    assert sum(count for *_, count in WEAKENED) == 500
+    assert sum(count for *_, count in UNHARMED) == 100
