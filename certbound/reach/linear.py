@@ -161,13 +161,16 @@ class LinearRun:
         engine = self.engine
         if isinstance(engine.system, ContinuousSystem):
             windows = WindowEvents(engine.response, cell, max(1, round(_WINDOW / engine.step)), shared_log)
-            return ClockEvents(windows, engine.diffusion, self.memory.setdefault(cell, {}))
+            diffusion = engine.diffusion if engine.diffusion.ndim == 2 else engine.diffusion[cell]
+            return ClockEvents(windows, diffusion, self.memory.setdefault(cell, {}))
         return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
 
     def levels(self, log_nonlinear: float) -> tuple[Array, list[Events]]:
-        """Levels of |Z| along the inner rows that together cost exp(log_nonlinear): (B, N, D)."""
+        """Levels of |Z| along the inner rows costing exp(log_nonlinear) together: (B, N, D). No events if noise-free."""
         cells, pieces, count = self.rows.shape[:3]
         result = np.zeros((cells, pieces, count))
+        if not self.engine.noise:
+            return result, []
         share = log_nonlinear + np.log(0.9 / (2 * max(count, 1)))
         found = []
         for cell in range(cells):
@@ -185,6 +188,8 @@ class LinearRun:
         bounds = self.include(levels, effort)
         if bounds is None:
             return Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None)
+        if not events:  # the noise-free reachable set alone
+            return Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=bounds)
         outcomes = [self._cell(cell, bounds, events[cell], log_nonlinear) for cell in range(len(self.supports))]
         return max(outcomes, key=lambda outcome: outcome.log_probability)
 

@@ -245,7 +245,7 @@ def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = No
         If the remainder feeds itself before the horizon ends.
     """
     run = _run(problem, cells=cells, noise=noise)
-    outcome = run.probability(float(np.log(problem.delta / 2)))
+    outcome = run.probability(float(np.log(problem.delta / 2)), 2 if noise else 1)
     if outcome.bounds is None:
         raise ArithmeticError(LinearAnswer(run=run, outcome=outcome, shown=outcome).reason)
     if noise:
