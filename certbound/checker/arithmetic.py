@@ -1,7 +1,8 @@
 """The operations of a tape on balls: enclosures, and a refusal wherever a jump is not decided.
 
-A ball whose branch is undecided raises `Undecided`; a point outside an operation's domain gives a ball that is not
-finite. Increasing functions are evaluated at both ends, and a square is never negative, so that wide balls lose little.
+A ball whose branch is undecided raises `Undecided`; a point outside an operation's domain gives what is not a number,
+which no operation takes for one. Increasing functions are evaluated at both ends, and a square is never negative, so
+that wide balls lose little.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ def _increasing(function: Callable[[arb], arb]) -> Callable[[arb], arb]:
 
 
 def _between(function: Callable[[arb], arb], size: Callable[[], arb]) -> Callable[[arb], arb]:
-    """An increasing function with values in [-size, size], also on unbounded balls."""
+    """An increasing function with values in [-size, size], also on unbounded balls (but not of what is undefined)."""
 
     def evaluate(x: arb) -> arb:
         if not x.is_finite():
-            return arb(0, 1) * size()
+            return x if x.is_nan() else arb(0, 1) * size()
         return function(x.lower()).union(function(x.upper())) if is_wide(x) else function(x)
 
     return evaluate
@@ -50,7 +51,7 @@ def _square(x: arb) -> arb:
 
 def _wave(function: Callable[[arb], arb]) -> Callable[[arb], arb]:
     def evaluate(x: arb) -> arb:
-        return function(x) if x.is_finite() else arb(0, 1)
+        return function(x) if x.is_finite() else x if x.is_nan() else arb(0, 1)
 
     return evaluate
 
@@ -77,6 +78,8 @@ def kink(x: arb) -> arb:
 
 def generalised_kink(x: arb) -> arb:
     """The slope of |x|, all of [-1, 1] where x may be 0."""
+    if x.is_nan():
+        return x
     return arb(1) if x > 0 else arb(-1) if x < 0 else arb(0, 1)
 
 
@@ -143,6 +146,8 @@ def _hypot(x: arb, y: arb) -> arb:
 
 def power(x: arb, exponent: float) -> arb:
     """x ** exponent for a constant exponent: any base where it is a whole number, else a positive one."""
+    if x.is_nan():
+        return x
     whole = exponent == int(exponent) and abs(exponent) <= 10_000
     if not whole:
         return _power_of_positive(x, exponent) if x > 0 else arb.nan()

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
 import numpy as np
 import pytest
+from flint import arb
 
 import certbound as cb
 from certbound.checker import check_data, parse
+from certbound.checker.arithmetic import BALLS, Undecided, generalised_kink, power
 from certbound.errors import CertificateError
-from certbound.safety.certificate import certificate_text
+from certbound.problem.tape import JUMPS, UNARY
+from certbound.safety.certificate import certificate_text, exact, problem_data
 from certbound.safety.verification import verify_safety
 from tests.checker.mutations import rejected
 
@@ -259,3 +263,36 @@ def test_objects_nested_deeply_inside_a_valid_frame_are_refused(chain_data: Data
             chain_data[part][name] = inner
             assert rejected(chain_data)
             chain_data[part][name] = kept
+
+
+@pytest.mark.parametrize("op", sorted(UNARY - {"kink"}))
+def test_no_operation_makes_a_number_of_what_is_undefined(op: str) -> None:
+    for undefined in (arb.nan(), arb(0, 1).log(), 1 / arb(0, 1)):
+        try:
+            assert BALLS[op](undefined).is_nan()
+        except Undecided:
+            assert op in JUMPS
+    assert all(power(arb.nan(), exponent).is_nan() for exponent in (0.0, 1.0, 2.0, -1.0, 0.5))
+    assert generalised_kink(arb.nan()).is_nan()
+    for second in ("add", "sub", "mul", "div", "hypot", "min", "max"):
+        assert BALLS[second](arb.nan(), arb(1)).is_nan()
+        assert BALLS[second](arb(0), arb.nan()).is_nan()
+    assert BALLS["atan2"](arb.nan(), arb(1)).is_nan()
+
+
+@pytest.mark.parametrize("rate", [lambda x: np.tanh(np.log(x)), lambda x: np.sin(np.sqrt(x - 0.05))])
+def test_what_is_bounded_but_undefined_is_not_proved_over(rate: Any) -> None:
+    """tanh and sine are bounded whatever they are given, but not where nothing is given to them."""
+    system = cb.ContinuousSystem(lambda x: [-x[0] + 1e-9 * rate(x[0])], states=["x"], diffusion=[[0.3]])
+    problem = cb.Problem(system, initial=cb.Box([0.1], [0.2]), safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1.0)
+    data = {
+        "format": "certbound certificate", "version": 1, "problem": problem_data(problem),
+        "claim": {"log10_delta": (-1.0).hex(), "method": "barrier", "assumptions": []},
+        "proof": {
+            "engine": "barrier", "center": exact([0.0]), "scale": exact([1.0]), "exponents": [[2]],
+            "coefficients": exact([8.0]), "growth": exact(0.8), "start": exact(0.4), "boundary": exact(7.9),
+        },
+    }  # fmt: skip
+    report = check_data(parse(json.dumps(data)))
+    assert not report.valid
+    assert "grow as slowly" in report.reason
