@@ -22,6 +22,7 @@ from certbound.reach.events import StepEvent, StepEvents, WindowEvent, WindowEve
 from certbound.reach.inclusion import Supports
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.martingales import SplitEvent, SplitEvents
+from certbound.reach.samples import sampled_range
 
 __all__ = ["Events", "LinearRun", "Outcome", "level_scale"]
 
@@ -34,6 +35,7 @@ _GUESSES = 30
 _PICARD = 12
 _HUGE = 1e6
 _TRIES = 12
+_PADS = (0.15, 0.1, 0.06, 0.04)  # how much wider than the sampled range the first guess is, by effort
 _WINDOW = 0.05
 _LIKELY = -4.0  # log of a probability from which on a product is worth more than a sum
 
@@ -64,22 +66,29 @@ class Outcome:
 
 
 class LinearRun:
-    """One evaluation of the engine: supports of all cells, the inclusion for the remainder, the events."""
+    """One evaluation of the engine: supports of all cells, the inclusion for the remainder, the events.
 
-    def __init__(self, engine: Linearisation) -> None:
+    Parameters
+    ----------
+    engine : Linearisation
+    asked : bool
+        Whether the constraints' rows are wanted.
+    """
+
+    def __init__(self, engine: Linearisation, *, asked: bool = True) -> None:
         self.engine = engine
         self.rows, self.extra = engine.directions()
         cells = range(len(engine.centres))
-        self.requirements = [requirements(engine.problem, engine.nominal(cell)) for cell in cells]
+        self.requirements = [requirements(engine.problem, engine.nominal(cell)) if asked else [] for cell in cells]
         self.supports: list[Supports] = []
         for cell in cells:
             nothing = np.zeros((engine.nodes.shape[1] - engine.continuous, 0, engine.n))
-            asked = np.concatenate([nothing, *(r.rows[:, None] for r in self.requirements[cell])], axis=1)
+            outer = np.concatenate([nothing, *(r.rows[:, None] for r in self.requirements[cell])], axis=1)
             inner = self.rows[cell]
             if not engine.continuous:
                 inner = np.concatenate([inner, np.zeros((1, *inner.shape[1:]))])
             self.supports.append(Supports(
-                engine.response, engine.gathering.of_cell(cell), cell, np.concatenate([inner, asked], axis=1),
+                engine.response, engine.gathering.of_cell(cell), cell, np.concatenate([inner, outer], axis=1),
                 np.diag(engine.radii[cell])[engine.radii[cell] > 0], continuous=engine.continuous,
             ))
         self.inner = self.rows.shape[2]
@@ -101,41 +110,62 @@ class LinearRun:
         """beta's bounds (B, N, n) that prove themselves, or None (``failed_at`` then names a piece)."""
         engine = self.engine
         shape = (len(engine.centres), engine.pieces, engine.n)
-        extra = self.extra.reshape(shape[0] * shape[1], *self.extra.shape[2:])
         self.failed_at = engine.pieces - 1
         below = above = np.full(shape, 1e-12)  # what the proof needs beyond the sampled range
         low, high = np.zeros(shape), np.zeros(shape)
         for attempt in range(_PICARD):
-            # a guess: the fixed point of the sampled range, widened by what the last proof needed
-            share = 0.15 if attempt == 0 else 0.02
-            for _ in range(_GUESSES):
-                polytope = self._deviations(levels, low, high)
-                if polytope is None:
-                    return None
-                old = low, high
-                sample = [b.reshape(shape) for b in engine.model.estimate(engine.frame, *polytope, extra)]
-                pad = share * (sample[1] - sample[0])
-                low, high = sample[0] - below - pad, sample[1] + above + pad
-                if not self._all_finite(low, high):
-                    return None
-                change = max(float(np.max(old[0] - low)), float(np.max(high - old[1])))
-                if change <= 1e-3 * float(np.max(high - low)):
-                    break
+            guess = self.guess(levels, (low, high), (below, above), _PADS[effort] if attempt == 0 else 0.02)
+            if guess is None:
+                return None
             # the proof: beta over what the guess implies must lie in the guess
+            low, high = guess
             polytope = self._deviations(levels, low, high)
             if polytope is None:
                 return None
-            b_low, b_high = (b.reshape(shape) for b in engine.model.bound(engine.frame, *polytope, extra, effort))
+            flat = low.reshape(-1, engine.n), high.reshape(-1, engine.n)
+            found = engine.model.bound(engine.frame, *polytope, self.flat_extra, effort, flat)
+            b_low, b_high = (b.reshape(shape) for b in found)
             if not self._all_finite(b_low, b_high):
                 return None
             if np.all((b_low >= low) & (b_high <= high)):
                 return b_low, b_high
             _LOG.debug("inclusion %d: widths %s, beyond the guess by %.3g", attempt, (b_high - b_low).max(
                 axis=(0, 2))[:: max(1, engine.pieces // 8)].round(4), max(np.max(low - b_low), np.max(b_high - high)))
-            sample = [b.reshape(shape) for b in engine.model.estimate(engine.frame, *polytope, extra)]
+            sample = self.sampled(polytope)
             below = np.maximum(1.02 * (sample[0] - b_low), 0.0) + 1e-12
             above = np.maximum(1.02 * (b_high - sample[1]), 0.0) + 1e-12
         return None
+
+    def guess(
+        self, levels: Array, start: tuple[Array, Array], widening: tuple[Array, Array], share: float
+    ) -> tuple[Array, Array] | None:
+        """The fixed point of the sampled range of beta, widened by ``share`` of itself and by what a proof needed."""
+        low, high = start
+        for _ in range(_GUESSES):
+            polytope = self._deviations(levels, low, high)
+            if polytope is None:
+                return None
+            old = low, high
+            sample = self.sampled(polytope)
+            pad = share * (sample[1] - sample[0])
+            low, high = sample[0] - widening[0] - pad, sample[1] + widening[1] + pad
+            if not self._all_finite(low, high):
+                return None
+            change = max(float(np.max(old[0] - low)), float(np.max(high - old[1])))
+            if change <= 1e-3 * float(np.max(high - low)):
+                break
+        return low, high
+
+    @property
+    def flat_extra(self) -> Array:
+        """The extra rows over the active coordinates, cells and pieces in one batch."""
+        return self.extra.reshape(self.extra.shape[0] * self.extra.shape[1], *self.extra.shape[2:])
+
+    def sampled(self, polytope: tuple[Array, Array]) -> list[Array]:
+        """Range of beta over sample points: two arrays (B, N, n)."""
+        engine = self.engine
+        found = sampled_range(engine.model, engine.frame, *polytope, self.flat_extra)
+        return [b.reshape(len(engine.centres), engine.pieces, engine.n) for b in found]
 
     def _all_finite(self, low: Array, high: Array) -> bool:
         """Whether all bounds are finite; if not, ``failed_at`` names the first piece."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from functools import cached_property
 
@@ -15,8 +16,9 @@ from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy
 from certbound.reach.cells import initial_cells
 from certbound.reach.directions import NominalPieces
+from certbound.reach.frame import Frame
 from certbound.reach.inclusion import Gathering
-from certbound.reach.remainder import Frame, Remainder
+from certbound.reach.remainder import Remainder
 from certbound.reach.response import LinearResponse, continuous_response, discrete_response
 from certbound.rigor.intervals import Interval
 
@@ -48,6 +50,7 @@ class Linearisation:
         self, problem: Problem, *, cells: int | None = None, pieces: int | None = None, noise: bool = True,
     ) -> None:
         self.problem, self.noise = problem, noise
+        self.correction: Array | None = None
         self.system = problem.system
         self.continuous = self.system.time == "continuous"
         self.n = self.system.dimension
@@ -162,9 +165,42 @@ class Linearisation:
         """The nominal curve of one cell."""
         return NominalPieces(times=self.times, controls=self.controls[cell], continuous=self.continuous)
 
+    def on_grid(self, pieces: int) -> Linearisation:
+        """The same cells and correction on another grid of pieces (continuous time)."""
+        along = max(len(np.unique(self.centres[:, j])) for j in range(self.n))
+        other = Linearisation(self.problem, cells=along if along > 1 else None, pieces=pieces, noise=self.noise)
+        if self.correction is None:
+            return other
+        place = np.clip(other.times / self.step, 0.0, self.pieces)
+        left = np.minimum(place.astype(int), self.pieces - 1)
+        weight = (place - left)[:, None, None]
+        return other.corrected((1 - weight) * self.correction[:, left] + weight * self.correction[:, left + 1])
+
+    def corrected(self, correction: Array) -> Linearisation:
+        """The same with ``correction`` added to the slope: (B, N + 1, n, n) at the nodes, linear in between.
+
+        In discrete time the last node counts for nothing.
+        """
+        other = copy.copy(self)
+        for name in ("slopes", "response", "frame", "gathering"):
+            vars(other).pop(name, None)
+        other.correction = correction
+        return other
+
     @cached_property
     def slopes(self) -> tuple[Array, Array, Array]:
         """A, K and E of every piece: shapes (B, N, n, n), (B, N, n, n), (B, N, n, q)."""
+        first, drift, gain = self.tangents
+        extra = self.correction
+        if extra is None:
+            return first, drift, gain
+        if not self.continuous:
+            return first + extra[:, :-1], drift, gain
+        return first + extra[:, :-1], drift + (extra[:, 1:] - extra[:, :-1]) / self.step, gain
+
+    @cached_property
+    def tangents(self) -> tuple[Array, Array, Array]:
+        """The same without the correction: derivatives along the nominal curve."""
         cells = len(self.centres)
         x = self.nodes
         inputs = np.broadcast_to(self.inputs, (cells, *self.inputs.shape))

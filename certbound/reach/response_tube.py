@@ -16,6 +16,7 @@ from certbound.reach.curve import Curve
 from certbound.reach.diffusion import DiffusionRun, depends_on_state
 from certbound.reach.directions import Requirement
 from certbound.reach.events import logsumexp
+from certbound.reach.fit import fitted
 from certbound.reach.inclusion import Supports
 from certbound.reach.linear import LinearRun, Outcome, level_scale
 from certbound.reach.linearisation import Linearisation
@@ -27,6 +28,7 @@ __all__ = ["DeviationTube", "LinearAnswer", "linear_answer", "linear_reach", "re
 Array = NDArray[np.float64]
 
 _SHARES = ((0.1, 1), (0.3, 2), (0.8, 3))
+_FITTED = 0.3  # share of delta whose deviations the slopes are fitted over
 _REFINEMENTS = 3
 _NOTHING = -0.1  # log of a probability that says nothing
 _LIKELIER = np.log([0.01, 0.05, 0.2])  # delta_N where nothing was proved near the target
@@ -205,7 +207,7 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
 
 def _run(problem: Problem, *, cells: int | None, noise: bool = True) -> LinearRun:
     """The engine for the problem's noise."""
-    engine = Linearisation.of(problem, cells=cells, noise=noise)
+    engine = fitted(Linearisation.of(problem, cells=cells, noise=noise), float(np.log(problem.delta * _FITTED)))
     return DiffusionRun(engine) if noise and depends_on_state(problem) else LinearRun(engine)
 
 

@@ -64,7 +64,7 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     target = math.log(problem.delta)
     tried = [found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]
     best: tuple[LinearRun, _Stated] | None = None
-    for run in _runs(problem, found.run, effort):
+    for run in _runs(found.run, effort):
         for log_nonlinear in dict.fromkeys(tried):
             stated = _state(run, log_nonlinear, _PADS[effort])
             if stated is not None and (best is None or stated.log_probability < best[1].log_probability):
@@ -81,15 +81,14 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     return _data(problem, *best), min(log10 + slack, 0.0), []
 
 
-def _runs(problem: Problem, given: LinearRun, effort: int) -> Iterator[LinearRun]:
+def _runs(given: LinearRun, effort: int) -> Iterator[LinearRun]:
     """The same cells on a grid for the checker; then, should the remainder feed itself there, on the engine's own."""
     engine = given.engine
     if engine.continuous:
         size = float(np.linalg.norm(np.nan_to_num(engine.slopes[0]), axis=(-2, -1)).max())
-        pieces = int(np.clip(np.ceil(problem.horizon * size / _STEPS[effort]), _FEWEST, _MOST[effort]))
+        pieces = int(np.clip(np.ceil(engine.problem.horizon * size / _STEPS[effort]), _FEWEST, _MOST[effort]))
         if not pieces <= engine.pieces <= _NEARLY * pieces:
-            along = _cells_along(engine)
-            yield LinearRun(Linearisation(problem, cells=along if along > 1 else None, pieces=pieces))
+            yield LinearRun(engine.on_grid(pieces))
         if pieces > engine.pieces:
             return
     yield given
@@ -105,10 +104,6 @@ def _edges(engine: Linearisation) -> list[list[float]]:
         first, last = low[:, j].min(), high[:, j].max()
         result.append([float(first), *((centres[1:] + centres[:-1]) / 2).tolist(), float(last)])
     return result
-
-
-def _cells_along(engine: Linearisation) -> int:
-    return max(len(np.unique(engine.centres[:, j])) for j in range(engine.n))
 
 
 # ---- the proof's numbers -----------------------------------------------------------------------------------

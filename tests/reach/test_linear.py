@@ -49,7 +49,7 @@ def test_symmetric_constraints_multiply(steps: int) -> None:
 def test_a_wide_initial_set_is_split_until_the_remainder_holds() -> None:
     system = cb.ContinuousSystem(lambda x: -x - x**3, states=1, diffusion=[[0.05]])
     safe = [cb.Inside(cb.Box([-2.0], [2.0]))]
-    problem = cb.Problem(system, initial=cb.Box([-1.2], [1.2]), safe=safe, horizon=2.0, delta=1e-3)
+    problem = cb.Problem(system, initial=cb.Box([-1.6], [1.6]), safe=safe, horizon=2.0, delta=1e-3)
     found = linear_answer(problem)
     assert len(found.run.engine.centres) > 1
     assert found.log10_delta <= -3

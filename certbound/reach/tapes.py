@@ -1,0 +1,68 @@
+"""Tapes of derivatives, cut down to what is needed, and what their outputs depend on."""
+
+from __future__ import annotations
+
+from certbound.problem.tape import Node, Tape
+
+__all__ = ["is_zero", "selected", "sources", "varying_outputs", "watched"]
+
+
+def selected(tape: Tape, outputs: list[int], function: Tape | None) -> Tape:
+    """Some outputs of a derivative of ``function``: its own nodes, those that are needed, and no node twice.
+
+    Without ``function`` only what the outputs need is kept: jumps elsewhere are no longer seen.
+    """
+    base = 0 if function is None else len(function.nodes)
+    needed = [index < base for index in range(len(tape.nodes))]
+    for output in outputs:
+        needed[tape.outputs[output]] = True
+    for index in range(len(tape.nodes) - 1, -1, -1):
+        node = tape.nodes[index]
+        if needed[index] and node.op != "input":
+            for arg in node.args:
+                needed[arg] = True
+    moved: dict[int, int] = {}
+    seen: dict[tuple[str, tuple[int, ...], str], int] = {}
+    nodes: list[Node] = []
+    for index, node in enumerate(tape.nodes):
+        if not needed[index]:
+            continue
+        args = node.args if node.op == "input" else tuple(moved[arg] for arg in node.args)
+        if node.op in ("add", "mul"):
+            args = tuple(sorted(args))
+        key = (node.op, args, float(node.value).hex() if node.op in ("const", "pow") else "")
+        if index < base or key not in seen:
+            seen.setdefault(key, len(nodes))
+            moved[index] = len(nodes)
+            nodes.append(Node(node.op, args, node.value))
+        else:
+            moved[index] = seen[key]
+    return Tape(inputs=tape.inputs, nodes=tuple(nodes), outputs=tuple(moved[tape.outputs[o]] for o in outputs),
+                shape=(len(outputs),))
+
+
+def watched(tape: Tape) -> Tape:
+    """The tape with its first node as one more output, which is infinite where the tape is refused."""
+    outputs = (*tape.outputs, 0)
+    return Tape(inputs=tape.inputs, nodes=tape.nodes, outputs=outputs, shape=(len(outputs),))
+
+
+def varying_outputs(tape: Tape) -> list[bool]:
+    """Whether each output depends on any input."""
+    depends: list[bool] = []
+    for node in tape.nodes:
+        depends.append(node.op == "input" or any(depends[arg] for arg in node.args))
+    return [depends[output] for output in tape.outputs]
+
+
+def sources(tape: Tape) -> list[set[int]]:
+    """Input slots that each output depends on."""
+    found: list[set[int]] = []
+    for node in tape.nodes:
+        found.append({node.args[0]} if node.op == "input" else set().union(*(found[arg] for arg in node.args)))
+    return [found[output] for output in tape.outputs]
+
+
+def is_zero(tape: Tape, output: int) -> bool:
+    node = tape.nodes[tape.outputs[output]]
+    return node.op == "const" and node.value == 0
