@@ -88,6 +88,7 @@ class Contraction:
         if 2 ** len(wide) > MOST_VERTICES:
             raise Unproved(f"the Jacobian has {len(wide)} independent parts, too many to try every vertex")
         for choice in itertools.product((0, 1), repeat=len(wide)):
+            self.budget.check()
             jacobian = base
             for place, pair in zip(choice, wide):
                 jacobian = jacobian + pair[place]
