@@ -196,7 +196,7 @@ class LinearRun:
         return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
 
     def levels(self, log_nonlinear: float) -> tuple[Array, list[Events]]:
-        """Levels of |Z| along the inner rows costing exp(log_nonlinear) together: (B, N, D). No events if noise-free."""
+        """Levels of |Z| along the inner rows costing exp(log_nonlinear) together (B, N, D); no events without noise."""
         cells, pieces, count = self.rows.shape[:3]
         result = np.zeros((cells, pieces, count))
         if not self.engine.noise:

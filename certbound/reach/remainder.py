@@ -139,9 +139,12 @@ class Remainder:
         diffusion = getattr(self.problem.system, "diffusion", None)
         if not isinstance(diffusion, Tape):
             return set()
-        slopes = jacobian(diffusion, list(range(1, len(diffusion.inputs))))
-        n = len(diffusion.inputs) - 1
-        return {output % n for output in range(len(slopes.outputs)) if not is_zero(slopes, output)}
+        # by what the operations read, not by derivatives: a jump has none
+        reads: list[set[int]] = []
+        for node in diffusion.nodes:
+            own = {node.args[0] - 1} if node.op == "input" else set().union(*(reads[arg] for arg in node.args))
+            reads.append(own)
+        return set().union(*(reads[output] for output in diffusion.outputs)) - {-1}
 
     def _colours(self) -> list[list[list[int]]]:
         """Blocks of coupled active coordinates, grouped so that no output meets two blocks of one group."""

@@ -147,6 +147,16 @@ def test_noise_that_is_undefined_on_the_tube_proves_nothing() -> None:
         linear_reach(problem)
 
 
+def test_noise_that_jumps_on_the_tube_is_not_taken_for_constant() -> None:
+    system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=lambda t, x: [[np.where(x[0] > 0.1, 0.4, 0.05)]])
+    safe = [cb.Inside(cb.HalfSpace([1.0], 0.5))]
+    problem = cb.Problem(system, initial=[0.0], safe=safe, horizon=2.0, delta=1e-2)
+    assert list(Linearisation.of(problem).model.active) == [0]
+    assert linear_answer(problem).log10_delta == 0  # a path that meets the jump: nothing is proved
+    far = problem.replace(initial=[-0.5], safe=[cb.Inside(cb.HalfSpace([1.0], 0.05))], horizon=0.5)
+    assert linear_answer(far).log10_delta < -2  # beyond reach of the jump
+
+
 def test_a_diffusion_of_time_alone_is_bounded_as_well() -> None:
     system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=lambda t, x: [[0.1 + 0.05 * np.sin(t)]])
     problem = growing().replace(system=system)
