@@ -62,7 +62,8 @@ class Supersolution:
     target : float
         Probability of interest: it sets the mesh and what small corrections may cost.
     inflation : float
-        Relative room left in H, which widens the radius for a given probability by about as much.
+        Relative room left in H, which widens the radius for a given probability by about as much; for probabilities
+        below 1e-3 it grows with the square of their logarithm.
     coarseness : float
         Factor on the mesh widths and steps.
     """
@@ -98,7 +99,17 @@ class Supersolution:
     @cached_property
     def _fineness(self) -> float:
         """Relative mesh width: the tail of size ``target`` is steeper the smaller it is."""
-        return self.coarseness * 0.015 * math.sqrt(7 / max(7.0, -math.log(self.target)))
+        return self.coarseness * 0.015 / self._depth
+
+    @cached_property
+    def _depth(self) -> float:
+        """How far out the tail is, 1 for probabilities that are not small."""
+        return max(1.0, -math.log(self.target) / 7)
+
+    @cached_property
+    def _room(self) -> float:
+        """Relative room left in H: the deeper the tail, the larger the defects beside its values."""
+        return self.inflation * self._depth**2
 
     @cached_property
     def mesh(self) -> Array:
@@ -136,8 +147,8 @@ class Supersolution:
     def _operator(self, piece: int, state: Array) -> Array:
         """Inflated H of the basis at the Gauss points, with the controls that are best for ``state``."""
         _, drift, bend, slope = self._basis
-        kappa, noise = self.pieces[piece][1], 1 + self.inflation
-        kappa -= self.inflation * abs(kappa)
+        kappa, noise = self.pieces[piece][1], 1 + self._room
+        kappa -= self._room * abs(kappa)
         local = _local(state[0::2], state[1::2])
         options = [-kappa * drift + noise * (2 * r * bend + (r + t) * slope) for r, t in self.controls]
         if len(options) == 1:
@@ -151,7 +162,7 @@ class Supersolution:
         """Banded mass and operator matrices of the unknowns (u_0, m_0, u_1, m_1, ...)."""
         mass, flow = _banded(self._basis[0]), _banded(self._operator(piece, state))
         mass[2, 0] = 1.0
-        flow[1, 1] = (1 + self.inflation) * max(r + t for r, t in self.controls)
+        flow[1, 1] = (1 + self._room) * max(r + t for r, t in self.controls)
         mass[3, -2] = 1.0  # the last row holds u_N at 1
         return mass, flow
 
