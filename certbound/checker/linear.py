@@ -65,7 +65,6 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     if model.continuous and model.dimension > MOST_STATES:
         raise Unproved(f"{model.dimension} states are too many for this proof in continuous time")
     structure = structure_of(model, budget)
-    structure.refuse_hidden_jumps(model)
     shared = Shared(model, structure, record)
     boxes = cells_of(model, record)
     entries = record.items("cells", len(boxes), len(boxes))
@@ -284,8 +283,14 @@ class _Cell:
             size = bounds.reach[k][d] + level
             low.append(bounds.low[k][d] - size)
             high.append(bounds.high[k][d] + size)
+        sides = {unit: (low[d], high[d]) for d, unit in enumerate(self.shared.units)}
         for i, output in enumerate(outputs):
             output.prepare(data)
+            hidden = self.shared.hidden[i]
+            bounded = all(slot > self.model.dimension or slot - 1 in sides for slot in hidden)
+            if hidden and not (bounded and output.is_decided(sides)):
+                names = ", ".join(self.model.dynamics.inputs[slot] for slot in hidden)
+                raise Unproved(f"{self.model.states[i]} may jump with {names}, in which it is linear otherwise")
             polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=self.frames[i])
             if not output.prove(polytope, arb(self.low[k][i]), arb(self.high[k][i]), self.budget):
                 name = self.model.states[i]

@@ -14,7 +14,7 @@ A model with kinks (abs, min, max) has no Hessian there: value and generalised s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from flint import arb, arb_mat
@@ -31,6 +31,8 @@ __all__ = ["OutputRemainder", "PieceData", "Polytope", "remainders"]
 
 _MOST_BOXES = 4000
 _RISKY = JUMPS | {"kink", "atan2"}
+
+Side = tuple[arb, arb]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -158,7 +160,8 @@ class OutputRemainder:
         risky = {index for index in graph.reachable([*gradient, *hessian]) if graph.node(index).op in _RISKY}
         self.thin = Program(graph, [node, *gradient], [value], variables=count)
         self.wide = Program(graph, hessian, risky | {value}, variables=count)
-        self.programs = [self.thin, self.wide]
+        self.plain = Program(graph, [], [value], variables=count)
+        self.programs = [self.thin, self.wide, self.plain]
         self.kinked: tuple[Program, Program] | None = None
         if any(graph.node(index).op == "kink" for index in graph.reachable(gradient)):
             self.kinked = (
@@ -195,6 +198,23 @@ class OutputRemainder:
                 return False
             stack.extend(parts)
         return not stack
+
+    def is_decided(self, sides: Mapping[int, Side]) -> bool:
+        """Whether the output is defined, and on one side of every jump, for all d and s within ``sides`` and at s = 0.
+
+        States without a side are kept at s = 0.
+        """
+        inputs = [arb(0)] * self.count
+        inputs[0] = arb(0, self.piece.half)
+        for j, (low, high) in sides.items():
+            inputs[1 + j] = low.union(high).union(arb(0))
+        for j, (value, size) in enumerate(zip(self.piece.disturbance, self.piece.disturbance_radius)):
+            inputs[1 + self.dimension + j] = value + arb(0, size)
+        try:
+            self.plain.run(inputs)
+        except Undecided:
+            return False
+        return True
 
     def _inputs(self, frame: _Frame, box: _Box) -> tuple[list[arb], list[arb]]:
         """The centre and the whole box as inputs of the programs."""

@@ -35,6 +35,7 @@ class Shared:
         self.units = wholes(record["units"], record.at("units"), 0, model.dimension - 1)
         if len(set(self.units)) != len(self.units):
             raise CertificateError("`proof.units` must be different states.")
+        self.hidden = [structure.hidden(model, output) for output in range(model.dimension)]
         self.windows: list[int] = []
         if model.continuous:
             self.windows = wholes(record["windows"], record.at("windows"), 0, self.count - 1)

@@ -2,7 +2,7 @@
 
 Where an entry of D_x f depends on nothing, the linearisation uses the model's own (exact) value: the remainder does
 not depend on that state through that entry, whatever the floats of the certificate say. That is false where f jumps
-(the derivative of a step is 0) or is not defined, so that whatever decides a jump must be a variable of the remainder.
+(the derivative of a step is 0) or is not defined: what decides that must be seen apart.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from flint import arb
 from certbound.checker.graph import Graph
 from certbound.checker.model import Model
 from certbound.checker.program import Program
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import Budget
 from certbound.problem.tape import JUMPS
 
 __all__ = ["Structure", "structure_of"]
@@ -48,26 +48,17 @@ class Structure:
         """Disturbances on which the remainder of an output may depend."""
         return [j for i, j in self.moving if i == output]
 
-    def refuse_hidden_jumps(self, model: Model) -> None:
-        """Every state and disturbance that decides a jump, or whether f is defined, is one of the remainder's.
-
-        Raises
-        ------
-        Unproved
-        """
-        names, n = model.dynamics.inputs, model.dimension
-        first = len(names) - len(model.disturbance)
-        asked = sum(1 << slot for slot in [*range(1, n + 1), *range(first, len(names))])
-        for i, output in enumerate(self.outputs):
-            seen = sum(1 << 1 + j for j in self.active_states(i))
-            seen |= sum(1 << first + j for j in self.active_disturbances(i))
-            for index in self.graph.reachable([output]):
-                hidden = _deciding(self.graph, index) & asked & ~seen
-                if hidden:
-                    raise Unproved(
-                        f"`{self.graph.node(index).op}` may jump with {names[hidden.bit_length() - 1]}, in which the "
-                        f"dynamics of {model.states[i]} is linear otherwise"
-                    )
+    def hidden(self, model: Model, output: int) -> list[int]:
+        """Inputs that decide a jump of an output, or whether it is defined, and are none of its remainder's."""
+        count, n = len(model.dynamics.inputs), model.dimension
+        first = count - len(model.disturbance)
+        asked = sum(1 << slot for slot in [*range(1, n + 1), *range(first, count)])
+        asked &= ~sum(1 << 1 + j for j in self.active_states(output))
+        asked &= ~sum(1 << first + j for j in self.active_disturbances(output))
+        deciding = 0
+        for index in self.graph.reachable([self.outputs[output]]):
+            deciding |= _deciding(self.graph, index)
+        return [slot for slot in range(count) if deciding & asked & 1 << slot]
 
 
 def structure_of(model: Model, budget: Budget) -> Structure:

@@ -58,6 +58,25 @@ def test_a_jump_in_a_disturbance_that_enters_linearly_is_not_proved_over() -> No
     assert "may jump with d" in report.reason
 
 
+def test_a_step_far_from_the_tube_is_decided_where_its_state_has_bounds() -> None:
+    """y enters the first row linearly but for a step at 1, and the second row nonlinearly."""
+    system = cb.DiscreteSystem(
+        lambda x: [0.5 * x[0] + 0.1 * x[1] + np.where(x[1] > 1.0, 2.0, 0.0), 0.5 * np.sin(x[1])], states=["x", "y"],
+        noise=cb.Gaussian(std=0.05),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-0.9, -0.9], [0.9, 0.9]))]
+    problem = cb.Problem(system, initial=[0.1, 0.1], safe=safe, horizon=3)
+    verdict = verify_safety(problem, method="linear")
+    assert verdict.status == "SAFE"
+    data = parse(certificate_text(problem, verdict))
+    assert check_data(data).valid
+    edge = data["problem"]["dynamics"]["nodes"].index(["const", (1.0).hex()])
+    data["problem"]["dynamics"]["nodes"][edge][1] = (0.25).hex()
+    report = check_data(data)
+    assert not report.valid
+    assert "may jump with y" in report.reason
+
+
 def test_a_function_that_is_undefined_where_it_cancels_is_not_proved_over() -> None:
     data = linear()
     tape = data["problem"]["dynamics"]
