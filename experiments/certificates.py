@@ -68,6 +68,7 @@ def subjects() -> dict[str, cb.Problem]:
     found["unicycle, 5 s"] = cb.load("unicycle").replace(horizon=5.0)
     for path in sorted(FOLDER.glob("*.toml")):
         found[path.stem] = cb.load(str(path))
+    found["van_der_pol_dt, near 0"] = found["van_der_pol_dt"].replace(initial=cb.Box([-0.5, -0.5], [0.5, 0.5]))
     found["contraction_14d, 2 steps"] = found["contraction_14d"].replace(horizon=2)
     for noise in NOISES:
         found[f"oscillator_cubic, {noise}"] = cb.load(str(FOLDER / "oscillator_cubic.toml"), sigma=noise)

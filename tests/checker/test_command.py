@@ -75,3 +75,31 @@ def test_a_verdict_without_a_bound_writes_no_file(tmp_path, capsys: pytest.Captu
     assert run([*words, "--certificate", str(path)]) == 1
     assert "no certificate was written" in capsys.readouterr().err
     assert not path.exists()
+
+
+def test_a_barrier_is_written_and_checked(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
+    problem, path = tmp_path / "pull.toml", tmp_path / "pull.json"
+    problem.write_text(
+        'name = "pull"\ntime = "continuous"\nhorizon = 1\nstates = ["x"]\ndelta = 1e-2\n[dynamics]\nx = "-x - x**3"\n'
+        '[noise]\ndiffusion = [[0.3]]\n[initial]\npoint = [0]\n[[stay]]\nbox = { x = [-1, 1] }\n'
+    )
+    words = ["verify", str(problem), "--method", "barrier", "--certificate", str(path), "--quiet"]
+    assert run(words) == 0
+    assert run(["check", str(path), "--problem", str(problem)]) == 0
+    assert "exponential of a polynomial" in capsys.readouterr().out.replace("\n", " ")
+    assert run(["check", str(path), "--problem", str(problem), "--horizon", "2"]) == 1
+
+
+def test_the_table_of_certificates_has_a_row_a_problem() -> None:
+    import certbound as cb
+    from experiments.certificates import row, subjects, table
+
+    assert {"ou", "unicycle", "chain", "chain_rest", "pendulum", "oscillator_cubic", "two_tanks"} <= set(subjects())
+    found = row("chain, 5 steps", cb.load("chain").replace(horizon=5))
+    assert (found.status, found.check, found.quick) == ("SAFE", "valid", True)
+    assert abs(found.log10_delta - found.claimed) < 1
+    assert found.size > 1000
+    unproved = row("loud", cb.load("chain", sigma=300.0).replace(horizon=2))
+    assert unproved.check.startswith("none: ")
+    lines = list(table([["a", "b"], found.cells()[:2]]))
+    assert lines[1].startswith("chain, 5 steps  SAFE")
