@@ -17,6 +17,7 @@ from certbound.tubes.radial import estimate_exit_probability, estimate_radius
 from certbound.tubes.recursion import Recursion, _legendre
 from certbound.tubes.supersolution import Supersolution
 from certbound.tubes.tuning import bound_exit_probability, tune_tube
+from experiments.limits import exact_radius
 
 SLOW = pytest.mark.slow
 
@@ -142,7 +143,15 @@ def test_the_exact_tube_is_within_one_percent_of_the_limit(constants, horizon, d
     assert tube.parameters["probability"] <= delta
 
 
-@pytest.mark.slow
+@SLOW
+@pytest.mark.parametrize(("n", "horizon", "delta"), [(1, 1.0, 1e-6), (3, 1.0, 1e-6), (1, 5.0, 1e-9)])
+def test_far_out_in_the_tail_as_well(n, horizon, delta):
+    constants = isotropic(n, rate=-0.5)
+    tube = tune_tube(constants, horizon=horizon, delta=delta, method="exact")
+    assert 1 - 1e-6 < tube.maximum / exact_radius(rate=-0.5, n=n, horizon=horizon, delta=delta) < 1.006
+
+
+@SLOW
 @pytest.mark.parametrize(("rate", "n", "horizon"), [(1.0, 1, 2.0), (1.0, 1, 5.0), (1.0, 3, 2.0), (0.3, 1, 5.0)])
 def test_in_expanding_systems_as_well(rate, n, horizon):
     tube = tune_tube(isotropic(n, rate=rate), horizon=horizon, delta=1e-3, method="exact")
