@@ -106,8 +106,12 @@ def contraction_reach(problem: Problem, *, noise: bool = True, cells: int | None
 
 def response_reach(problem: Problem, *, noise: bool = True, cells: int | None = None) -> ReachTube:
     """Thm K7, loaded when it is first used."""
+    from certbound.reach.jumps import hidden_jump
     from certbound.reach.response_tube import linear_reach
 
+    hidden = hidden_jump(problem)
+    if hidden is not None:
+        raise ArithmeticError(hidden)
     return linear_reach(problem, noise=noise, cells=cells)
 
 

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from certbound.problem.problem import Problem
-from certbound.problem.tape import JUMPS, Tape
-from certbound.problem.trace import jacobian
 from certbound.reach.diffusion import ASSUMPTION, depends_on_state
+from certbound.reach.jumps import hidden_jump
 from certbound.reach.response_tube import DeviationTube, LinearAnswer, linear_answer
 from certbound.safety.answers import Deviation, EngineAnswer
 
@@ -21,7 +20,7 @@ def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool 
 
     Without ``thorough`` the initial set is one cell unless ``cells`` says otherwise.
     """
-    hidden = _hidden_jump(problem)
+    hidden = hidden_jump(problem)
     if hidden is not None:
         return EngineAnswer(applicable=False, reason=hidden, method="linear")
     answer = linear_answer(problem, cells=cells, thorough=thorough)
@@ -40,40 +39,6 @@ def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool 
         conclusive=answer.exact,
         assumption=ASSUMPTION if depends_on_state(problem) else "",
     )
-
-
-def _hidden_jump(problem: Problem) -> str | None:
-    """Why the engine would not see a jump: its remainder depends only on states in which the Jacobian varies.
-
-    The derivative of a step is 0, so that a state that decides a jump may enter linearly otherwise.
-    """
-    tape, n = problem.closed_loop, problem.system.dimension
-    if not any(node.op in JUMPS for node in tape.nodes):
-        return None
-    slopes = jacobian(tape, list(range(1, n + 1)))
-    varying = _dependence(slopes)
-    seen = {output % n for output, node in enumerate(slopes.outputs) if varying[node]}
-    depends = _dependence(tape)
-    for index, node in enumerate(tape.nodes):
-        if node.op not in JUMPS:
-            continue
-        deciding = depends[node.args[0]] if node.op == "if_else_zero" else depends[index]
-        for state in sorted(deciding):
-            if 1 <= state <= n and state - 1 not in seen:
-                return (
-                    f"the dynamics may jump where `{tape.describe(index)}` does, with {tape.inputs[state]}, which "
-                    "enters linearly otherwise: a linear response does not see that."
-                )
-    return None
-
-
-def _dependence(tape: Tape) -> list[frozenset[int]]:
-    """The inputs that every node depends on."""
-    found: list[frozenset[int]] = []
-    for node in tape.nodes:
-        own = node.args if node.op == "input" else ()
-        found.append(frozenset(own).union(*(found[arg] for arg in node.args if node.op != "input")))
-    return found
 
 
 def _deviation(answer: LinearAnswer, tube: DeviationTube) -> Deviation:

@@ -52,3 +52,10 @@ def test_a_jump_in_time_is_answered() -> None:
     verdict = cb.verify_safety(problem, method="linear")
     assert verdict.status == "SAFE"
     assert check_data(parse(certificate_text(problem, verdict))).valid
+
+
+def test_reach_tubes_do_not_overlook_it_either() -> None:
+    problem = stepping(JUMPS["step"])
+    for noise in (True, False):
+        with pytest.raises(ArithmeticError, match="may jump"):
+            cb.bound_reach(problem, noise=noise, method="linear")
