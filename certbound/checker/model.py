@@ -256,7 +256,7 @@ def _initial(value: object, path: str, n: int) -> Initial:
         reach, shape = [arb(radius)] * n, None
     else:
         rows: Any = _symmetric(record, "shape", n)
-        if any(not rows[i][i] > 0 for i in range(n)):
+        if not is_positive_definite(matrix(rows)):
             raise CertificateError(f"`{path}.shape` must be positive definite.")
         reach, shape, radius = [arb(rows[i][i]).sqrt() for i in range(n)], matrix(rows), 0.0
     return Initial(

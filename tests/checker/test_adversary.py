@@ -272,6 +272,13 @@ def test_a_barrier_about_a_smaller_safe_set_or_start_is_bound_to_the_problem(spr
     assert rejected(altered("constraints", "bound", 0.9))
 
 
+def test_an_initial_ellipsoid_that_is_none_is_refused(chain_data: Data) -> None:
+    shape = exact([[1e-4, 1.0], [1.0, 1e-4]])
+    chain_data["problem"]["initial"] = {"kind": "ellipsoid", "center": exact([0.25, 0.15]), "shape": shape}
+    with pytest.raises(CertificateError, match="positive definite"):
+        check_data(chain_data)
+
+
 def test_objects_nested_deeply_inside_a_valid_frame_are_refused(chain_data: Data) -> None:
     inner: Any = []
     for _ in range(900):
