@@ -85,9 +85,21 @@ class StepEvents:
     def __init__(self, response: LinearResponse, cell: int, gaussian: bool) -> None:
         self.response, self.cell, self.gaussian = _one(response, cell), cell, gaussian
         self.shared_log = -np.inf
+        self.found: dict[bytes, StepEvent] = {}
 
     def along(self, rows: Array) -> StepEvent:
         """The event along ``rows`` (nodes, n)."""
+        key = rows.tobytes()
+        if key not in self.found:
+            self.found[key] = self._along(rows)
+        return self.found[key]
+
+    @cached_property
+    def sizes(self) -> Array:
+        """Bounds of the standard deviation along any row with entries in [-1, 1], at all nodes."""
+        return _size(self.response, _numbers(self.response.pieces + 1))
+
+    def _along(self, rows: Array) -> StepEvent:
         nodes = _numbers(len(rows))
         variances = [v[0] for v in self.response.variance(rows[None], nodes)]
         if not self.gaussian:
@@ -99,7 +111,7 @@ class StepEvents:
         scale = np.sqrt(np.maximum(high[:-1], 0) * np.maximum(high[1:], 0)) * _ROUND
         low_scale = np.sqrt(np.maximum(low[:-1], 0) * np.maximum(low[1:], 0)) / _ROUND
         size = np.einsum("ti,tij->t", np.abs(rows[1:]), np.abs(self.response.transition[0, : len(rows) - 1]))
-        loss = size * _product_rounding(rows.shape[1]) * _size(self.response, nodes[:-1])
+        loss = size * _product_rounding(rows.shape[1]) * self.sizes[: len(rows) - 1]
         cross = cross_lo[0] - loss * np.sqrt(np.maximum(high[:-1], 0)) * _ROUND
         with np.errstate(divide="ignore", invalid="ignore"):
             correlation = np.where(cross >= 0, cross / scale, cross / low_scale)

@@ -16,6 +16,7 @@ from certbound.reach.response import LinearResponse, RowResponse
 __all__ = ["Gathering", "Supports"]
 
 Array = NDArray[np.float64]
+Nodes = NDArray[np.int64]
 
 _ROUND = 1 + 1e-13
 _UNIT = 2.0**-53
@@ -58,11 +59,13 @@ class Supports:
         Zonotope of the initial set about the nominal start.
     step : float
     continuous : bool
+    outputs : ndarray of int, optional
+        States that the remainder or the disturbance moves by more than a rounding error (discrete time).
     """
 
     def __init__(
         self, response: LinearResponse, gathering: Gathering, cell: int, rows: Array, generators: Array,
-        *, continuous: bool,
+        *, continuous: bool, outputs: Nodes | None = None,
     ) -> None:
         self.gathering, self.continuous, self.step = gathering, continuous, response.step
         self.rows = rows
@@ -76,7 +79,7 @@ class Supports:
             f, phi = response.transition[cell], response.transition_error[cell]
             parts.append(_padded(rows @ f, nodes))
             self.end_error = phi[:, None] + 2 * (self.n + 2) * _UNIT * np.abs(f).max(axis=(1, 2))[:, None]
-        self.response = RowResponse(response, cell, np.concatenate(parts, axis=1))
+        self.response = RowResponse(response, cell, np.concatenate(parts, axis=1), None if continuous else outputs)
         main = (self.response.start(generators) + self.response.segments(gathering.generators)
                 + self.response.boxes(gathering.box))
         total = self._with_errors(main, np.zeros_like(main))[1]

@@ -89,10 +89,11 @@ class LinearRun:
                 inner = np.concatenate([inner, np.zeros((1, *inner.shape[1:]))])
             self.supports.append(Supports(
                 engine.response, engine.gathering.of_cell(cell), cell, np.concatenate([inner, outer], axis=1),
-                np.diag(engine.radii[cell])[engine.radii[cell] > 0], continuous=engine.continuous,
+                np.diag(engine.radii[cell])[engine.radii[cell] > 0], continuous=engine.continuous, outputs=engine.moved,
             ))
         self.inner = self.rows.shape[2]
         self.memory: dict[int, dict[bytes, Any]] = {}
+        self.steps: dict[int, StepEvents] = {}
 
     def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
         """Bounds of s = y + Z + R along the inner rows over all pieces: (B N, D)."""
@@ -193,7 +194,9 @@ class LinearRun:
             windows = WindowEvents(engine.response, cell, max(1, round(_WINDOW / engine.step)), shared_log)
             diffusion = engine.diffusion if engine.diffusion.ndim == 2 else engine.diffusion[cell]
             return ClockEvents(windows, diffusion, self.memory.setdefault(cell, {}))
-        return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
+        if cell not in self.steps:
+            self.steps[cell] = StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
+        return self.steps[cell]
 
     def levels(self, log_nonlinear: float) -> tuple[Array, list[Events]]:
         """Levels of |Z| along the inner rows costing exp(log_nonlinear) together (B, N, D); no events without noise."""

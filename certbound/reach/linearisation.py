@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 _FEWEST_PIECES, _MOST_PIECES = 50, 2000
 _STEP = 0.1  # ||J|| h of a piece
 _ROUND = 1 + 1e-13
+_LARGE = 40  # states
 
 
 class Linearisation:
@@ -330,6 +331,14 @@ class Linearisation:
             curve=h * h / 8 * (bend @ (identity + response.deviation)) * _ROUND,
             generators=np.swapaxes(generators, -1, -2), box=(box + rounding)[..., 0] * _ROUND, size=size_e * _ROUND,
         )
+
+    @cached_property
+    def moved(self) -> NDArray[np.int64] | None:
+        """States that the remainder or a disturbance moves by more than a rounding error; None for all."""
+        if self.continuous or self.n < _LARGE:
+            return None
+        found = {i for i, _ in self.model.entries} | set(np.flatnonzero((self.slopes[2] != 0).any(axis=(0, 1, 3))))
+        return np.array(sorted(found), dtype=np.int64)
 
     def directions(self) -> tuple[Array, Array]:
         """Rows along which the remainder needs bounds: (B, N, D, n), and the extra ones over active coordinates."""

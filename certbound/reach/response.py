@@ -10,6 +10,7 @@ Discrete time is the case K = 0, F = A, h = 1.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ Nodes = NDArray[np.int64]
 _UNIT = 2.0**-53
 _TINY = 1e-300
 _TERMS = 24
+_LARGE, _SPARSE = 40, 0.1  # states and share of nonzero entries from which on products are sparse
 
 
 def _gamma(count: int) -> float:
@@ -86,10 +88,15 @@ class LinearResponse:
 
     def covariance_of(self, first: Array, second: Array, nodes: Nodes) -> tuple[Array, Array]:
         """Bounds of cov(first Z, second Z) at ``nodes``; rows (B, M, n)."""
-        v = self.covariance[:, nodes]
-        w = self.covariance_error[:, nodes]
-        value = np.einsum("bmi,bmij,bmj->bm", first, v, second)
         n = first.shape[-1]
+        used = np.flatnonzero((first != 0).any(axis=(0, 1)) | (second != 0).any(axis=(0, 1)))
+        if 2 * len(used) < n:  # zero entries add nothing
+            first, second = first[..., used], second[..., used]
+            place = np.ix_(np.arange(len(self.covariance)), nodes, used, used)
+            v, w = self.covariance[place], self.covariance_error[place]
+        else:
+            v, w = self.covariance[:, nodes], self.covariance_error[:, nodes]
+        value = np.einsum("bmi,bmij,bmj->bm", first, v, second)
         rounding = 2 * _gamma(n * n) * np.einsum("bmi,bmij,bmj->bm", abs(first), abs(v), abs(second))
         own = [np.einsum("bmi,bmij,bmj->bm", r, w, r) + _gamma(n * n) * 2 * np.einsum(
             "bmi,bmij,bmj->bm", abs(r), abs(w), abs(r)) for r in (first, second)]
@@ -222,57 +229,95 @@ class RowResponse:
     cell : int
     rows : ndarray, shape (M, D, n)
         Rows at nodes 0 .. M - 1 (M <= N + 1).
+    columns : ndarray of int, optional
+        States that b_j is expected to move; what it does to the others is bounded coarsely (all when omitted).
     """
 
-    def __init__(self, response: LinearResponse, cell: int, rows: Array) -> None:
-        self.nodes, self.count, self.dimension = rows.shape
+    def __init__(self, response: LinearResponse, cell: int, rows: Array, columns: Nodes | None = None) -> None:
+        self.nodes, asked, self.dimension = rows.shape
         n = self.dimension
-        f = response.transition[cell]
-        loss = _gamma(n) * 2 * np.abs(f) + response.transition_error[cell][:, None, None]
-        current = np.array(rows)
+        places: dict[bytes, int] = {}
+        self.place = np.array([places.setdefault(rows[:, d].tobytes(), len(places)) for d in range(asked)], dtype=int)
+        first = np.array([int(np.argmax(self.place == d)) for d in range(len(places))], dtype=int)
+        self.count = len(places)
+        self.transition, self.error = response.transition[cell], response.transition_error[cell]
+        self.columns = np.arange(n) if columns is None else np.asarray(columns)
+        self.others = np.setdiff1d(np.arange(n), self.columns)
+        current = np.array(rows[:, first])
         self.coefficients: list[Array] = [np.empty(0)] * (self.nodes - 1)
-        self.losses: list[Array] = [np.empty(0)] * (self.nodes - 1)
+        self.rest: list[Array] = [np.empty(0)] * (self.nodes - 1)  # row sums over the other columns
         for j in range(self.nodes - 2, -1, -1):
             later = current[j + 1 :].reshape(-1, n).copy()
-            self.coefficients[j] = later
-            self.losses[j] = np.abs(later) @ loss[j] * (1 + 1e-12) + _TINY
-            current[j + 1 :] = (later @ f[j]).reshape(-1, self.count, n)
+            self.coefficients[j] = np.ascontiguousarray(later[:, self.columns])
+            if len(self.others):
+                self.rest[j] = np.abs(later[:, self.others]).sum(axis=1) * (1 + 1e-12)
+            current[j + 1 :] = _times(later, self.transition[j]).reshape(-1, self.count, n)
         self.initial = current
 
-    def _gather(self, parts: list[Array]) -> Array:
+    def _gather(self, parts: Iterator[Array]) -> Array:
         """Sum over j of the contributions of step j to all later nodes: shape (M, D)."""
         total = np.zeros((self.nodes, self.count))
         for j, part in enumerate(parts):
             total[j + 1 :] += part.reshape(-1, self.count)
-        return total
+        return total[:, self.place]
+
+    def _sizes(self, bounds: Array) -> Array:
+        """Sum over j of |coefficients| ``bounds``_j: shape (M, D), not rounded."""
+        few = bool(len(self.others))
+        return self._gather(
+            np.abs(c) @ bounds[j, self.columns] + (self.rest[j] * bounds[j, self.others].max() if few else 0.0)
+            for j, c in enumerate(self.coefficients)
+        )
 
     def errors(self, sizes: Array) -> Array:
         """Effect of the rounded adjoint rows for states with |s_j| <= ``sizes`` (N + 1, n): shape (M, D)."""
-        return self._gather([loss @ sizes[j] for j, loss in enumerate(self.losses)]) * (1 + 1e-12)
+        steps = self.nodes - 1
+        own = np.einsum("jab,jb->ja", np.abs(self.transition[:steps]), sizes[:steps]) * (2 * _gamma(self.dimension))
+        own = own + (self.error[:steps] * sizes[:steps].sum(axis=1))[:, None]
+        return self._sizes(own * (1 + 1e-12) + _TINY) * (1 + 1e-12)
 
     def start(self, generators: Array) -> Array:
         """Support of the zonotope of ``generators`` (G, n) at node 0, carried to every node: shape (M, D)."""
         if not len(generators):
-            return np.zeros((self.nodes, self.count))
+            return np.zeros((self.nodes, len(self.place)))
         value = np.abs(self.initial @ generators.T).sum(-1)
         slack = _gamma(self.dimension + len(generators)) * 2
-        return np.asarray(value + slack * (np.abs(self.initial) @ np.abs(generators.T)).sum(-1) + _TINY)
+        size = (np.abs(self.initial) @ np.abs(generators.T)).sum(-1)
+        return np.asarray(value + slack * size + _TINY)[:, self.place]
 
     def boxes(self, radii: Array) -> Array:
         """Support of the sum of the boxes |b_j| <= ``radii`` (N, n): shape (M, D)."""
-        total = self._gather([np.abs(c) @ radii[j] for j, c in enumerate(self.coefficients)])
-        return np.asarray(total * (1 + _gamma(2 * self.nodes + self.dimension) * 2))
+        return np.asarray(self._sizes(radii) * (1 + _gamma(2 * self.nodes + self.dimension) * 2 + 1e-12))
 
     def centres(self, values: Array) -> tuple[Array, Array]:
-        """The response to b_j = ``values`` (N, n), and a bound of its rounding error."""
-        total = self._gather([c @ values[j] for j, c in enumerate(self.coefficients)])
-        size = self._gather([np.abs(c) @ np.abs(values[j]) for j, c in enumerate(self.coefficients)])
-        return total, size * _gamma(2 * self.nodes + self.dimension) * 2 + _TINY
+        """The response to b_j = ``values`` (N, n), and a bound of its rounding error and of the other columns."""
+        total = self._gather(c @ values[j, self.columns] for j, c in enumerate(self.coefficients))
+        size = np.abs(values)
+        slack = self._sizes(size) * (_gamma(2 * self.nodes + self.dimension) * 2) + _TINY
+        if len(self.others):
+            slack = slack + self._gather(
+                rest * size[j, self.others].max() for j, rest in enumerate(self.rest)) * (1 + 1e-12)
+        return total, slack
 
     def segments(self, generators: Array) -> Array:
         """Support of the sum over j of the zonotopes of ``generators`` (N, G, n): shape (M, D)."""
-        parts = []
-        for j, c in enumerate(self.coefficients):
-            size = np.abs(c) @ np.abs(generators[j]).sum(0) * _gamma(self.dimension) * 2
-            parts.append(np.abs(c @ generators[j].T).sum(-1) + size)
-        return self._gather(parts) * (1 + _gamma(2 * self.nodes + generators.shape[1]) * 2)
+
+        def part(j: int, c: Array) -> Array:
+            own, count = generators[j][:, self.columns], generators.shape[1]
+            size = np.abs(generators[j]).sum(axis=0)
+            found = np.abs(c @ own.T).sum(-1) + np.abs(c) @ size[self.columns] * (_gamma(self.dimension + count) * 2)
+            return np.asarray(found + (self.rest[j] * size[self.others].max() if len(self.others) else 0.0))
+
+        if not generators.size:
+            return np.zeros((self.nodes, len(self.place)))
+        total = self._gather(part(j, c) for j, c in enumerate(self.coefficients))
+        return np.asarray(total * (1 + _gamma(2 * self.nodes + generators.shape[1]) * 2 + 1e-12))
+
+
+def _times(rows: Array, matrix: Array) -> Array:
+    """``rows`` @ ``matrix``, by a sparse product where that pays."""
+    if len(matrix) < _LARGE or np.count_nonzero(matrix) > matrix.size * _SPARSE:
+        return rows @ matrix
+    from scipy.sparse import csr_array
+
+    return np.ascontiguousarray((csr_array(matrix.T) @ rows.T).T)

@@ -28,8 +28,10 @@ __all__ = ["DeviationTube", "LinearAnswer", "linear_answer", "linear_reach", "re
 Array = NDArray[np.float64]
 
 _SHARES = ((0.1, 1), (0.3, 2), (0.8, 3))
+_LINEAR_SHARES = ((0.02, 1), (0.2, 1))  # where only windows ask for it
 _FITTED = 0.3  # share of delta whose deviations the slopes are fitted over
 _REFINEMENTS = 3
+_MANY = 20  # nonlinear coordinates beyond which a probability below the target is not refined
 _NOTHING = -0.1  # log of a probability that says nothing
 _LIKELIER = np.log([0.01, 0.05, 0.2])  # delta_N where nothing was proved near the target
 _PARTS = (2, 4, 8)  # cells along each side, tried one after the other
@@ -197,7 +199,7 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
     shown = best
     if best.log_probability <= target and best.log_probability > best.log_nonlinear - 3.0:
         coupled = max((len(group[0]) for group in run.engine.model.blocks), default=1) > 1
-        for _ in range(0 if coupled else _REFINEMENTS):
+        for _ in range(0 if coupled or len(run.engine.model.active) > _MANY else _REFINEMENTS):
             outcome = run.probability(2 * best.log_nonlinear, effort)
             if outcome.log_probability >= best.log_probability:
                 break
@@ -213,9 +215,10 @@ def _run(problem: Problem, *, cells: int | None, noise: bool = True) -> LinearRu
 
 def _best(run: LinearRun, target: float) -> tuple[Outcome, int]:
     """The least probability over a few shares of the target for delta_N, and the last effort."""
-    share, effort = _SHARES[0]
+    shares = _SHARES if len(run.engine.model.active) else _LINEAR_SHARES
+    share, effort = shares[0]
     best = run.probability(target + float(np.log(share)), effort)
-    for share, effort in _SHARES[1:]:
+    for share, effort in shares[1:]:
         if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
             break
         best = _least(best, run.probability(target + float(np.log(share)), effort))
@@ -265,7 +268,7 @@ def _coordinates(run: LinearRun, cell: int) -> Supports:
     radii = engine.radii[cell]
     return Supports(
         engine.response, engine.gathering.of_cell(cell), cell, rows, np.diag(radii)[radii > 0],
-        continuous=engine.continuous,
+        continuous=engine.continuous, outputs=engine.moved,
     )
 
 

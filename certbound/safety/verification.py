@@ -44,6 +44,8 @@ _ENGINES: dict[str, Callable[..., EngineAnswer]] = {"linear": _linear, "constant
 ``thorough`` the linear engine takes the initial set as one cell, since it is asked again if no engine proves SAFE."""
 
 
+_LARGE = 60  # states beyond which no other engine is asked once one has proved SAFE
+
 ENGINES = tuple(_ENGINES)
 """Names of the engines, in the order in which they are tried."""
 
@@ -200,6 +202,8 @@ def verify_safety(
     for name in names:
         inner = "auto" if method in _ENGINES else method
         quick = any(_is_safe(answer, problem) or answer.conclusive for answer in answers.values())
+        if quick and problem.system.dimension > _LARGE:
+            continue
         answers[name] = _ENGINES[name](
             problem, method=inner, cells=cells, constants=constants, quick=quick, thorough=method != "auto"
         )
