@@ -25,7 +25,8 @@ __all__ = ["ClockBound", "ClockEvents", "RateBound", "SteadyEvent"]
 
 Array = NDArray[np.float64]
 
-_PART = 0.02  # ||J|| times the length of a part
+_PART = 0.01  # ||J|| times the length of a part
+_LIMITS = (0.35, 3.0)  # of -log corr in a block: short blocks have a slower clock, long ones add fewer probabilities
 _MOST_PARTS = 1200
 _BAND = 400  # pairs of parts farther apart are not compared
 _EARLY = 20  # one piece in so many at the start is left to the windows
@@ -36,9 +37,9 @@ _LN10 = float(np.log(10.0))
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClockBound:
-    """A rough row: its clock after the first ``early`` pieces, and upper bounds of its variance per part."""
+    """A rough row: its clocks after the first ``early`` pieces, and upper bounds of its variance per part."""
 
-    clock: Clock
+    clocks: tuple[Clock, ...]
     variance: Array
     parts: int
     early: int
@@ -48,7 +49,7 @@ class ClockBound:
         first = np.where(np.arange(len(levels)) < self.early, levels, np.inf)
         late = np.repeat(levels[self.early :], self.parts)
         normal = np.where(np.isinf(late), np.inf, late / np.sqrt(self.variance) * (1 - 1e-14))
-        crossing = clock_crossing(self.clock, normal) * _LN10
+        crossing = min(clock_crossing(clock, normal) for clock in self.clocks) * _LN10
         return logsumexp(np.array([windows.log_exceedance(first), crossing + 1e-13 * abs(crossing)]))
 
 
@@ -312,5 +313,5 @@ class ClockEvents:
         rates = decorrelation_rates(variance, noise, (cov_lo, cov_hi), (run_lo, run_hi))
         if not np.all(np.isfinite(np.diagonal(rates))):
             return None
-        clock = markov_clock(np.full(count, h), rates)
-        return ClockBound(clock=clock, variance=variance.hi, parts=self.parts, early=early)
+        clocks = tuple(markov_clock(np.full(count, h), rates, limit=limit) for limit in _LIMITS)
+        return ClockBound(clocks=clocks, variance=variance.hi, parts=self.parts, early=early)

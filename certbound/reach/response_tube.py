@@ -197,7 +197,8 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
             if best.bounds is not None:
                 break
     shown = best
-    if best.log_probability <= target and best.log_probability > best.log_nonlinear - 3.0:
+    above = best.log_probability - best.log_nonlinear
+    if best.log_probability <= target and above > -3.0 and (above < 2.0 or len(run.engine.model.active)):
         coupled = max((len(group[0]) for group in run.engine.model.blocks), default=1) > 1
         for _ in range(0 if coupled or len(run.engine.model.active) > _MANY else _REFINEMENTS):
             outcome = run.probability(2 * best.log_nonlinear, effort)
