@@ -208,10 +208,11 @@ class Problem(Shown):
     def _check_window(self, place: int, window: tuple[float, float]) -> None:
         if window[1] > self.horizon:
             raise ValueError(
-                f"`safe[{place}]` must have `during` within [0, {self.horizon:g}], got {list(window)}."
+                f"`safe[{place}]` must have `during` within [0, {self.horizon:g}], got {list(window)}; "
+                "change the window or the horizon."
             )
         if self.system.time == "discrete" and any(end != int(end) for end in window):
-            raise ValueError(f"`safe[{place}]` must have whole steps in `during`, got {list(window)}.")
+            raise ValueError(f"`safe[{place}]` must have whole steps in `during`, got {list(window)}; round them.")
 
     def _domain(self) -> Box | None:
         if self.domain is None:
@@ -299,10 +300,14 @@ def _check_dimension(name: str, region: Any, dimension: int) -> None:
     if region.coordinates is not None:
         if max(region.coordinates) >= dimension:
             raise ValueError(
-                f"`{name}` must use state indices below {dimension}, got coordinates {region.coordinates}."
+                f"`{name}` must use state indices below {dimension}, got coordinates {region.coordinates}; "
+                "the first state has index 0."
             )
     elif region.dimension != dimension:
-        raise ValueError(f"`{name}` must have dimension {dimension} (the states), got {region.dimension}.")
+        raise ValueError(
+            f"`{name}` must have dimension {dimension} (the states), got {region.dimension}; a set in some of the "
+            "states names them by `coordinates`."
+        )
 
 
 def _start(value: Any, dimension: int) -> Box | Ball | Ellipsoid | GaussianStart:

@@ -81,7 +81,8 @@ class System:
         self._set("inputs", _signal_box("inputs", options["inputs"], "u"))
         self._set("disturbance", _signal_box("disturbance", options["disturbance"], "d"))
         if self.disturbance is not None and not self.disturbance.bounded:
-            raise ValueError("`disturbance` must be a bounded box, got infinite sides.")
+            ends = ", ".join(f"[{low:g}, {high:g}]" for low, high in zip(self.disturbance.low, self.disturbance.high))
+            raise ValueError(f"`disturbance` must be a bounded box, got the sides {ends}; give each finite ends.")
         input_names = _signal_names("input_names", options["input_names"], self.inputs, "u", self.states)
         self._set("input_names", input_names)
         taken = (*self.states, *input_names)

@@ -87,8 +87,8 @@ def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
                 label=label, constraint=number, rows=rows, room=np.where(needed, room, np.inf)
             ))
     if problem.domain is not None:
-        for label, rows, room in _constraint(Inside(problem.domain), curve):
-            found.append(Requirement(label=f"domain: {label}", constraint=-1, rows=rows, room=room))
+        for label, rows, room in _constraint(Inside(problem.domain, label="the model's domain"), curve):
+            found.append(Requirement(label=label, constraint=-1, rows=rows, room=room))
     return found
 
 

@@ -128,7 +128,10 @@ class Linearisation:
         nodes = np.stack(states, axis=1)
         lost = ~np.isfinite(nodes).all(axis=(0, 2))
         if lost.any():
-            end = (int(np.argmax(lost)) - 1) * self.step
+            last, sizes = int(np.argmax(lost)) - 1, np.abs(nodes).max(axis=(0, 2))
+            while last > 0 and sizes[last] > 100 * (1 + sizes[last - 1]):  # finite, but no longer meant
+                last -= 1
+            end = last * self.step
             raise ValueError(
                 f"`horizon` must end before the noise-free trajectory is lost, after t = {end:.4g}; got "
                 f"{self.problem.horizon:g}: shorten it, or check the model."
