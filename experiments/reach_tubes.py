@@ -161,7 +161,8 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
         }  # fmt: skip
         print(
             f"{label:30} {tube.method:12} outside {found.outside} of {found.trajectories}, "
-            f"width {found.mean_ratio:.3f} times the hull on average, at most {found.largest_ratio:.3f}  ({spent:.1f} s + {found.seconds:.1f} s)",
+            f"width {found.mean_ratio:.3f} times the hull on average, at most "
+            f"{found.largest_ratio:.3f}  ({spent:.1f} s + {found.seconds:.1f} s)",
             flush=True,
         )
     ratios = [row["mean_ratio"] for row in table.values()]

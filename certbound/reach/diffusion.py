@@ -188,6 +188,10 @@ class DiffusionRun(LinearRun):
         self.outcomes[log_nonlinear] = best
         return best
 
+    def promise(self, log_nonlinear: float, effort: int) -> float:
+        """What `probability` finds, in logarithms: nothing can be guessed before a tube has closed."""
+        return self.probability(log_nonlinear, effort).log_probability
+
     def _close(
         self, reference: Reference, log_nonlinear: float, effort: int
     ) -> tuple[Accepted, tuple[Array, Array], float] | None:
