@@ -8,7 +8,7 @@ schema is docs/certificate.md.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from certbound.problem.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 from certbound.problem.sets import GaussianStart, Inside, Outside
 from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
-from certbound.safety.answers import EngineAnswer
+from certbound.safety.answers import EngineAnswer, is_at_most
 
 if TYPE_CHECKING:
     from certbound.safety.verification import Verdict
@@ -54,7 +54,8 @@ def certificate_text(problem: Problem, verdict: Verdict, *, attempt: int = 0) ->
 def certificate_data(problem: Problem, verdict: Verdict, *, attempt: int = 0) -> dict[str, Any]:
     """The certificate of a verdict: P(some constraint is broken) <= 10**claim, with what proves it.
 
-    The claim rests on inequalities that the checker knows, and may be weaker than the verdict's ``log10_delta``.
+    The claim rests on inequalities that the checker knows, and may be weaker than the verdict's ``log10_delta``. Where
+    it would be weaker than SAFE, other engines are tried.
 
     Parameters
     ----------
@@ -69,14 +70,20 @@ def certificate_data(problem: Problem, verdict: Verdict, *, attempt: int = 0) ->
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
-    refusals = []
-    for name in _in_order(verdict):
-        answer = verdict.answers[name]
+    refusals: list[str] = []
+    best: tuple[str, Proof] | None = None
+    for name, answer in _answers(problem, verdict):
         try:
-            proof, log10, assumptions = _writer(name)(problem, answer, attempt)
+            found = _writer(name)(problem, answer, attempt)
         except CertificateError as error:
             refusals.append(f"{name}: {error}")
             continue
+        if best is None or found[1] < best[1][1]:
+            best = name, found
+        if verdict.status != "SAFE" or is_at_most(min(best[1][1], 0.0), problem.delta):
+            break
+    if best is not None:
+        name, (proof, log10, assumptions) = best
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -88,14 +95,25 @@ def certificate_data(problem: Problem, verdict: Verdict, *, attempt: int = 0) ->
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
 
 
-def _in_order(verdict: Verdict) -> list[str]:
-    """Engines that bounded a probability, the best first."""
+def _answers(problem: Problem, verdict: Verdict) -> Iterator[tuple[str, EngineAnswer]]:
+    """Engines that bounded a probability, the best first; then a barrier, where that was not asked for.
+
+    What a certificate states can be weaker than what its engine proved, so that another engine's may be needed.
+    """
 
     def rank(name: str) -> tuple[bool, float]:
         return not verdict.answers[name].certified, verdict.answers[name].log10_delta
 
     useful = [name for name, answer in verdict.answers.items() if answer.applicable and answer.log10_delta < 0]
-    return sorted(useful, key=rank)
+    for name in sorted(useful, key=rank):
+        yield name, verdict.answers[name]
+    asked = verdict.answers.get("barrier")
+    if verdict.status == "SAFE" and asked is not None and not asked.applicable:
+        from certbound.safety.barrier import barrier_engine
+
+        answer = barrier_engine(problem)
+        if answer.applicable and answer.log10_delta < 0:
+            yield "barrier", answer
 
 
 def _writer(name: str) -> Callable[[Problem, EngineAnswer, int], Proof]:

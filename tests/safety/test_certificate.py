@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
+from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import certificate_data, certificate_text, exact, problem_data
 from certbound.safety.verification import verify_safety
 
@@ -123,3 +125,24 @@ def _bundled(name: str, method: str) -> None:
     assert report.valid, report.reason
     assert report.log10_delta <= np.log10(problem.delta)
     assert time.perf_counter() - started < max(10 * proving, 20.0)
+
+
+def test_a_barrier_states_what_the_linear_response_proved_by_sharper_events() -> None:
+    """The linear response proves SAFE with events that certificates do not know; theirs alone leave delta behind."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -x[0] - x[1] - 0.5 * x[0] ** 3], states=["x1", "x2"], diffusion=[[0.0], [0.2]]
+    )
+    problem = cb.Problem(
+        system, initial=cb.Box([-0.2, -0.2], [0.2, 0.2]), horizon=1.0, delta=1e-4,
+        safe=[cb.Inside(cb.HalfSpace([0, 1], 1.1))], domain=cb.Box([-2, -2], [2, 2]),
+    )  # fmt: skip
+    answer = EngineAnswer(log10_delta=-4.5, method="linear", details=None)
+    quick = EngineAnswer(applicable=False, reason="another engine is enough.", method="barrier")
+    verdict = verify_safety(problem, method="linear")
+    assert verdict.status == "SAFE"
+    weak = replace(verdict, answers={"linear": answer, "barrier": quick})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("certbound.safety.certificate_linear.linear_proof", lambda *_: ({}, -2.0, []))
+        data = certificate_data(problem, weak)
+    assert data["claim"]["method"] == "barrier"
+    assert float.fromhex(data["claim"]["log10_delta"]) < -4
