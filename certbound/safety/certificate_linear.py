@@ -65,12 +65,7 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     tried = [found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]
     best: tuple[LinearRun, _Stated] | None = None
     for run in _runs(found.run, effort):
-        for log_nonlinear in dict.fromkeys(tried):
-            stated = _state(run, log_nonlinear, _PADS[effort])
-            if stated is not None and (best is None or stated.log_probability < best[1].log_probability):
-                best = run, stated
-            if best is not None and best[1].log_probability <= target:
-                break
+        best = _search(run, list(dict.fromkeys(tried)), _PADS[effort], target)
         if best is not None:
             break
     if best is None:
@@ -126,8 +121,45 @@ def _events(run: LinearRun, cell: int, shared: float) -> Events:
     return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
 
 
-def _state(run: LinearRun, log_nonlinear: float, pads: Sequence[float]) -> _Stated | None:
-    """Levels that cost exp(log_nonlinear), boxes that prove themselves with room to spare, the probability."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Levels:
+    """Levels of the inner rows, what they cost cell by cell, and the bounds of beta that the engine proves for them."""
+
+    levels: Array
+    events: list[Events]
+    spent: list[list[float]]
+    found: tuple[Array, Array]
+
+
+def _search(
+    run: LinearRun, shares: list[float], pads: Sequence[float], target: float
+) -> tuple[LinearRun, _Stated] | None:
+    """The first proof that reaches the target with the widest boxes that close, or the best one found with them.
+
+    Wide boxes are quick to check.
+    """
+    known: dict[float, _Levels | None] = {}
+    best: _Stated | None = None
+    for pad in pads:
+        for share in shares:
+            if share not in known:
+                known[share] = _levels(run, share)
+            given = known[share]
+            bounds = None if given is None else _boxes(run, given.levels, given.found, pad)
+            if given is None or bounds is None:
+                continue
+            stated = _stated(run, given, bounds)
+            if best is None or stated.log_probability < best.log_probability:
+                best = stated
+            if best.log_probability <= target:
+                return run, best
+        if best is not None:
+            return run, best
+    return None
+
+
+def _levels(run: LinearRun, log_nonlinear: float) -> _Levels | None:
+    """Levels that cost exp(log_nonlinear); None where the remainder feeds itself."""
     cells, pieces, count = run.rows.shape[:3]
     levels = np.zeros((cells, pieces, count))
     share = log_nonlinear + math.log(0.9 / (2 * max(count, 1)))
@@ -145,22 +177,23 @@ def _state(run: LinearRun, log_nonlinear: float, pads: Sequence[float]) -> _Stat
     if not np.isfinite(levels).all():
         return None
     found = run.include(levels, 2)
-    if found is None:
-        return None
-    closed = (_boxes(run, levels, found, pad) for pad in pads)
-    bounds = next((item for item in closed if item is not None), None)
-    if bounds is None:
-        return None
+    return None if found is None else _Levels(levels=levels, events=events, spent=spent, found=found)
+
+
+def _stated(run: LinearRun, given: _Levels, bounds: tuple[Array, Array]) -> _Stated:
+    """What the levels and the boxes prove."""
     worst = -np.inf
-    for cell, own in enumerate(events):
+    for cell, own in enumerate(given.events):
         rooms = run.rooms(cell, bounds)
         asked = [own.along(r.rows).log_exceedance(rooms[:, i]) for i, r in enumerate(run.requirements[cell])]
-        total = logsumexp(np.array([*spent[cell], *asked]))
+        total = logsumexp(np.array([*given.spent[cell], *asked]))
         if isinstance(own, StepEvents) and own.gaussian:
-            shared = logsumexp(np.array(spent[cell]))
+            shared = logsumexp(np.array(given.spent[cell]))
             total = min(total, _correlated(own, run.requirements[cell], rooms, shared, asked))
         worst = max(worst, total)
-    return _Stated(levels=levels, bounds=bounds, events=events, log_probability=float(min(worst, 0.0)))
+    return _Stated(
+        levels=given.levels, bounds=bounds, events=given.events, log_probability=float(min(worst, 0.0))
+    )
 
 
 def _boxes(run: LinearRun, levels: Array, found: tuple[Array, Array], pad: float) -> tuple[Array, Array] | None:
