@@ -36,6 +36,7 @@ _PICARD = 12
 _HUGE = 1e6
 _TRIES = 12
 _PADS = (0.15, 0.1, 0.06, 0.04)  # how much wider than the sampled range the first guess is, by effort
+_MARGIN = 2.0  # times that width is what a proof is expected to need
 _WINDOW = 0.05
 _LIKELY = -4.0  # log of a probability from which on a product is worth more than a sum
 
@@ -94,6 +95,7 @@ class LinearRun:
         self.inner = self.rows.shape[2]
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
+        self.kept: dict[float, tuple[Array, list[Events]]] = {}
 
     def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
         """Bounds of s = y + Z + R along the inner rows over all pieces: (B N, D)."""
@@ -112,7 +114,8 @@ class LinearRun:
         engine = self.engine
         shape = (len(engine.centres), engine.pieces, engine.n)
         self.failed_at = engine.pieces - 1
-        below = above = np.full(shape, 1e-12)  # what the proof needs beyond the sampled range
+        # what the proof needs beyond the sampled range
+        below = above = engine.model.defect(engine.frame).reshape(shape) * 1.05 + 1e-12
         low, high = np.zeros(shape), np.zeros(shape)
         for attempt in range(_PICARD):
             guess = self.guess(levels, (low, high), (below, above), _PADS[effort] if attempt == 0 else 0.02)
@@ -200,6 +203,8 @@ class LinearRun:
 
     def levels(self, log_nonlinear: float) -> tuple[Array, list[Events]]:
         """Levels of |Z| along the inner rows costing exp(log_nonlinear) together (B, N, D); no events without noise."""
+        if log_nonlinear in self.kept:
+            return self.kept[log_nonlinear]
         cells, pieces, count = self.rows.shape[:3]
         result = np.zeros((cells, pieces, count))
         if not self.engine.noise:
@@ -213,7 +218,19 @@ class LinearRun:
                 event = events.along(self.rows[cell, :, d])
                 if event.profile.max() > 0:
                     result[cell, :, d] = level_scale(event, event.profile, share) * event.profile
+        self.kept[log_nonlinear] = result, found
         return result, found
+
+    def promise(self, log_nonlinear: float, effort: int) -> float:
+        """What `probability` is likely to find, in logarithms: from a guess of the remainder that is not proved."""
+        shape = (len(self.engine.centres), self.engine.pieces, self.engine.n)
+        levels, events = self.levels(log_nonlinear)
+        nothing = np.zeros(shape), np.zeros(shape)
+        guess = self.guess(levels, nothing, nothing, _MARGIN * _PADS[effort])
+        if guess is None:
+            return 0.0
+        cells = range(len(self.supports))
+        return max(self._cell(cell, guess, events[cell], log_nonlinear).log_probability for cell in cells)
 
     def probability(self, log_nonlinear: float, effort: int = 2) -> Outcome:
         """Thm K7' with delta_N = exp(log_nonlinear): the outcome of the worst cell."""

@@ -36,7 +36,8 @@ Target = tuple[Array, Array]
 
 _GRID = {1: 16, 2: 6, 3: 4}
 _MOST = 300  # boxes per piece that one round may cut
-_EFFORT = ((0, np.inf), (5, 0.5), (8, 0.2), (10, 0.08))  # rounds of bisection, tolerated excess over the range
+_STALLED = 0.995  # cutting a box must make it exceed less
+_EFFORT = ((0, np.inf), (8, 0.5), (12, 0.2), (20, 0.08))  # rounds of bisection, tolerated excess over the range
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,6 +271,13 @@ class Remainder:
             lower, upper = total.lo, total.hi
         return lower, upper
 
+    def defect(self, frame: Frame) -> Array:
+        """What no cutting of boxes takes off a bound of beta, on either side: its motion over the piece, (M, n)."""
+        origin = np.zeros((len(frame), len(self.active)))
+        expansion = Expansion(self, frame)
+        lower, upper = expansion.plain_range(expansion.boxes(np.arange(len(frame)), origin, origin), origin)
+        return np.nan_to_num((upper - lower) / 2, nan=0.0, posinf=0.0)
+
     def _disturbance(self, frame: Frame, low: Array, high: Array) -> Interval:
         """(D_d f - E)(d - d0) over the whole polytope's box."""
         n, q = frame.spread.shape[1], len(frame.disturbance_middle)
@@ -324,11 +332,13 @@ class Remainder:
         rounds, tolerance = _EFFORT[effort]
         bound = (low[:, count:], high[:, count:], rows)
         curbed = alone and rows.shape[1] > 0
+        before = np.full(len(items), np.inf)  # by how much the box that a box was cut from exceeded
         for step in range(rounds + 1):
             inside = np.ones(len(items), dtype=bool)
             if curbed:
                 keep, inside = cull(items, centre, radius, *bound)
                 items, centre, radius, inside = items[keep], centre[keep], radius[keep], inside[keep]
+                before = before[keep]
             if not len(items):
                 break
             parts = expansion.boxes(items, centre, radius)
@@ -347,9 +357,10 @@ class Remainder:
                 span = np.maximum(target[1] - target[0], 1e-300)[items]
                 excess = np.maximum(hi - target[1][items], target[0][items] - lo) / span
             excess = np.where(np.isfinite(excess) | (excess < 0), excess, np.inf)
-            worst = excess.max(axis=1) > 0
+            largest = excess.max(axis=1)
+            worst = (largest > 0) & ((largest < _STALLED * before) | np.isinf(before))
             if worst.sum() > _MOST * m:
-                worst = excess.max(axis=1) > np.partition(excess.max(axis=1), -_MOST * m)[-_MOST * m]
+                worst &= largest > np.partition(largest, -_MOST * m)[-_MOST * m]
             done = ~worst
             np.minimum.at(lower, items[done], lo[done])
             np.maximum.at(upper, items[done], hi[done])
@@ -357,6 +368,7 @@ class Remainder:
                 break
             along = _costliest(expansion, parts, radius, excess)[worst]
             items, centre, radius = halve(items[worst], centre[worst], radius[worst], along)
+            before = np.tile(largest[worst], 2)
         # a polytope without any box left is empty: nothing can leave it, and 0 stands for the empty set
         empty = lower > upper
         return np.where(empty, 0.0, lower), np.where(empty, 0.0, upper)

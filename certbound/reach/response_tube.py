@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.curve import Curve
+from certbound.reach.deviation_tube import DeviationTube
 from certbound.reach.diffusion import DiffusionRun, depends_on_state
 from certbound.reach.directions import Requirement
 from certbound.reach.events import logsumexp
@@ -30,64 +29,15 @@ Array = NDArray[np.float64]
 _SHARES = ((0.1, 1), (0.3, 2), (0.8, 3))
 _LINEAR_SHARES = ((0.02, 1), (0.2, 1))  # where only windows ask for it
 _FITTED = 0.3  # share of delta whose deviations the slopes are fitted over
+_GUESSED = ((0.1, 1), (0.1, 3), (0.3, 3), (0.6, 3), (0.85, 3))
 _REFINEMENTS = 3
+_FEW = 20  # states up to which each has an event of its own in the deviation tube
 _MANY = 20  # nonlinear coordinates beyond which a probability below the target is not refined
 _NOTHING = -0.1  # log of a probability that says nothing
 _LIKELIER = np.log([0.01, 0.05, 0.2])  # delta_N where nothing was proved near the target
 _PARTS = (2, 4, 8)  # cells along each side, tried one after the other
 _MOST_PIECES = 4000  # pieces of time times cells
 _LEAST = -1e12  # log10 of the smallest probability that is told apart from 0
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DeviationTube:
-    """Bounds, coordinate by coordinate, of the deviation X - x from every associated trajectory.
-
-    Proves: with probability at least 1 - 10**log10_delta, |X_t - x_t|_i <= ``half_widths[k, i]`` for every state i
-    and every t in [times[k], times[k + 1]), whatever the start and the disturbance. Source: Thm K7.
-
-    Parameters
-    ----------
-    times : ndarray, shape (K + 1,)
-    half_widths : ndarray, shape (K, n)
-    log10_delta : float
-    """
-
-    times: Array
-    half_widths: Array
-    log10_delta: float
-    method: str = "linear"
-    level: str = "trajectory"
-    certified: bool = True
-    parameters: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def horizon(self) -> float:
-        """Last time that the tube covers."""
-        return float(self.times[-1])
-
-    @cached_property
-    def radii(self) -> Array:
-        """Euclidean bound of the deviation on each piece."""
-        return np.asarray(np.linalg.norm(self.half_widths, axis=1) * (1 + 1e-14))
-
-    def _piece(self, t: ArrayLike) -> NDArray[np.intp]:
-        index = np.searchsorted(self.times, np.asarray(t, dtype=float), side="right") - 1
-        return np.clip(index, 0, len(self.half_widths) - 1)
-
-    def radius(self, t: ArrayLike) -> Any:
-        """Euclidean bound of the deviation at times ``t``."""
-        value = self.radii[self._piece(t)]
-        return float(value) if np.ndim(t) == 0 else value
-
-    def bound(self, t0: float, t1: float) -> float:
-        """Supremum of the radius over [t0, t1]."""
-        return float(self.radii[int(self._piece(t0)) : int(self._piece(t1)) + 1].max())
-
-    def extent(self, directions: ArrayLike, t: ArrayLike) -> Any:
-        """Bound of a . (X_t - x_t) for directions a of shape (..., n)."""
-        value = np.abs(np.asarray(directions, dtype=float)) @ self.half_widths[self._piece(t)].T * (1 + 1e-14)
-        return float(value) if np.ndim(value) == 0 else value
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -149,6 +99,38 @@ class LinearAnswer:
         """Deviation tube at the problem's delta (None when nothing was proved)."""
         bounds = self.shown.bounds
         return None if bounds is None else _deviation_tube(self.run, self.shown, bounds)
+
+    def extent_along(self, direction: ArrayLike) -> Array:
+        """Bounds of |a . (X_t - x_t)| over every piece for one direction a alone: shape (K,).
+
+        They hold for all pieces at once with probability at least 1 - delta, the whole of delta spent on this direction
+        and on the remainder; `tube` holds for all states at once.
+
+        Raises
+        ------
+        ArithmeticError
+            If the remainder feeds itself, or was bounded at the whole of delta or more only.
+        """
+        run, outcome, bounds = self.run, self.shown, self.shown.bounds
+        left = run.engine.problem.delta - np.exp(outcome.log_nonlinear) * (1 + 1e-12)
+        if bounds is None or left <= 0:
+            raise ArithmeticError(self.reason)
+        engine = run.engine
+        count = engine.pieces if engine.continuous else engine.pieces + 1
+        rows = np.broadcast_to(np.asarray(direction, dtype=float), (count, engine.n))
+        log_nonlinear = outcome.log_nonlinear
+        share = float(np.log(0.49 * left))
+        silent, result = _silent(run), np.zeros(count)
+        _, events = run.levels(log_nonlinear)
+        for cell in range(len(engine.centres)):
+            event = events[cell].along(rows)
+            level = np.zeros(count)
+            if event.profile.max() > 0:
+                level = np.where(event.profile > 0, level_scale(event, event.profile, share) * event.profile, 0.0)
+            support = _coordinates(run, cell, rows)
+            found = level + _apart(support, cell, bounds, silent)[:, 0]
+            result = np.maximum(result, found * (1 + 1e-15))
+        return result
 
     @cached_property
     def reach(self) -> ReachTube | None:
@@ -215,14 +197,23 @@ def _run(problem: Problem, *, cells: int | None, noise: bool = True) -> LinearRu
 
 
 def _best(run: LinearRun, target: float) -> tuple[Outcome, int]:
-    """The least probability over a few shares of the target for delta_N, and the last effort."""
-    shares = _SHARES if len(run.engine.model.active) else _LINEAR_SHARES
-    share, effort = shares[0]
-    best = run.probability(target + float(np.log(share)), effort)
-    for share, effort in shares[1:]:
+    """The least probability over a few shares of the target for delta_N, and the last effort.
+
+    Where a guess of the remainder tells which of them has a chance, only those are proved, and the last one if none.
+    """
+    guessed = bool(len(run.engine.model.active)) and not isinstance(run, DiffusionRun)
+    shares = _GUESSED if guessed else _SHARES if len(run.engine.model.active) else _LINEAR_SHARES
+    best: Outcome | None = None
+    for share, effort in shares:
+        log_nonlinear = target + float(np.log(share))
+        last = (share, effort) == shares[-1]
+        if guessed and not (last and best is None) and run.promise(log_nonlinear, effort) > target:
+            continue
+        found = run.probability(log_nonlinear, effort)
+        best = found if best is None else _least(best, found)
         if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
             break
-        best = _least(best, run.probability(target + float(np.log(share)), effort))
+    assert best is not None
     return best, effort
 
 
@@ -261,11 +252,11 @@ def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = No
     return _reach_tube(run, outcome.bounds, -np.inf, None)
 
 
-def _coordinates(run: LinearRun, cell: int) -> Supports:
-    """Supports along the coordinates over every piece."""
+def _coordinates(run: LinearRun, cell: int, row: Array | None = None) -> Supports:
+    """Supports along the coordinates over every piece, or along one row (K, n)."""
     engine = run.engine
     count = engine.pieces if engine.continuous else engine.pieces + 1
-    rows = np.broadcast_to(np.eye(engine.n), (count, engine.n, engine.n))
+    rows = np.broadcast_to(np.eye(engine.n), (count, engine.n, engine.n)) if row is None else row[:, None]
     radii = engine.radii[cell]
     return Supports(
         engine.response, engine.gathering.of_cell(cell), cell, rows, np.diag(radii)[radii > 0],
@@ -281,41 +272,63 @@ def _levels_of_coordinates(run: LinearRun, outcome: Outcome) -> tuple[list[Array
     active = [int(state) for state in engine.model.active]
     log_nonlinear = outcome.log_nonlinear if active else float(np.log(engine.problem.delta / 10))
     levels, events = run.levels(log_nonlinear)
-    rest = [i for i in range(n) if i not in active]
-    share = float(np.log(engine.problem.delta * 0.5 / (2 * max(len(rest), 1))))
+    left = engine.problem.delta - np.exp(log_nonlinear)
+    again = n <= _FEW and left >= 0.5 * engine.problem.delta  # room for events of the active states alone
+    rest = [i for i in range(n) if again or i not in active]
+    budget = 0.99 * left if again else 0.5 * engine.problem.delta
+    share = float(np.log(budget / (2 * max(len(rest), 1))))
     result, worst = [], -np.inf
     for cell in range(cells):
         values, logs = np.zeros((count, n)), [log_nonlinear]
         for i in range(n):
-            rows = np.broadcast_to(np.eye(n)[i], (count, n))
-            event = events[cell].along(rows)
-            shape = event.profile
-            if i in active:
-                kept = levels[cell, :, active.index(i)]
-                if len(kept) < count:  # the last step does not enter the dynamics: an event of its own
-                    values[:-1, i] = kept
-                    last = np.where(np.arange(count) == count - 1, 0.0, np.inf)
-                    factor = level_scale(event, np.where(np.isinf(last), np.inf, shape), share)
-                    values[-1, i] = factor * shape[-1]
-                    logs.append(share + np.log(2.0))
-                else:
-                    values[:, i] = kept
-            elif shape.max() > 0:
-                values[:, i] = level_scale(event, shape, share) * shape
+            event = events[cell].along(np.broadcast_to(np.eye(n)[i], (count, n)))
+            own = np.full(count, np.inf)
+            kept = levels[cell, :, active.index(i)] if i in active else own[:0]
+            if event.profile.max() <= 0:
+                own = np.zeros(count)
+            elif i in rest:
+                factor = level_scale(event, event.profile, share)
+                own = np.where(event.profile > 0, factor, 0.0) * event.profile if np.isfinite(factor) else own
                 logs.append(share + np.log(2.0))
+            elif len(kept) < count:  # the last step does not enter the dynamics: an event of its own
+                last = np.where(np.arange(count) == count - 1, event.profile, np.inf)
+                own[-1] = level_scale(event, last, share) * event.profile[-1]
+                logs.append(share + np.log(2.0))
+            own[: len(kept)] = np.minimum(own[: len(kept)], kept)
+            values[:, i] = own
         result.append(values * (1 + 1e-15))
         worst = max(worst, logsumexp(np.array(logs)))
     return result, worst
 
 
-def _deviation_tube(run: LinearRun, outcome: Outcome, bounds: tuple[Array, Array]) -> DeviationTube:
-    """|X - x|_i <= level of |Z_i| plus the width of R's set, which holds both remainders."""
+def _silent(run: LinearRun) -> tuple[Array, Array] | None:
+    """Bounds of the remainder of the associated trajectory from a fixed start without disturbance: next to nothing."""
     engine = run.engine
+    alone = not engine.radii.any() and not engine.d_radius.any() and len(engine.model.active)
+    return run.include(np.zeros(run.rows.shape[:3]), 1) if alone else None
+
+
+def _apart(support: Supports, cell: int, bounds: tuple[Array, Array], silent: tuple[Array, Array] | None) -> Array:
+    """How far the remainders of X and of x may be apart, along the rows of ``support`` over every piece.
+
+    Both lie in R's set; where x has one of its own, that counts.
+    """
+    low, high, _ = support.remainder(bounds[0][cell], bounds[1][cell])
+    wide = high - low
+    if silent is not None:
+        still = support.remainder(silent[0][cell], silent[1][cell])
+        wide = np.minimum(wide, np.maximum(high - still[0], still[1] - low))
+    return np.asarray(np.maximum(wide, 0.0) * (1 + 1e-15))
+
+
+def _deviation_tube(run: LinearRun, outcome: Outcome, bounds: tuple[Array, Array]) -> DeviationTube:
+    """|X - x|_i <= level of |Z_i| plus how far both remainders may be apart."""
+    engine = run.engine
+    silent = _silent(run)
     levels, log_probability = _levels_of_coordinates(run, outcome)
     half = np.zeros_like(levels[0])
     for cell, level in enumerate(levels):
-        low, high, _ = _coordinates(run, cell).remainder(bounds[0][cell], bounds[1][cell])
-        half = np.maximum(half, level + np.maximum(high - low, 0.0) * (1 + 1e-15))
+        half = np.maximum(half, (level + _apart(_coordinates(run, cell), cell, bounds, silent)) * (1 + 1e-15))
     count = len(half)
     times = engine.times if engine.continuous else np.arange(count + 1.0)
     log10 = min(max(log_probability / np.log(10.0), _LEAST) * (1 - 1e-15), 0.0)

@@ -11,6 +11,7 @@ import certbound as cb
 from certbound.reach.linear import LinearRun
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.response_tube import linear_answer, linear_reach
+from certbound.simulation.deviations import Measure, sup_deviation
 
 Array = NDArray[np.float64]
 
@@ -174,3 +175,24 @@ def test_a_trajectory_that_blows_up_is_named() -> None:
     problem = cb.Problem(system, initial=cb.Box([1.0], [1.1]), safe=[], horizon=2.0)
     with pytest.raises(ValueError, match=r"`horizon` must end before .* lost, after t = 0\.9"):
         linear_answer(problem)
+
+
+def test_one_direction_alone_is_narrower_than_all_at_once_and_still_holds_its_paths() -> None:
+    problem = oscillator()
+    answer = linear_answer(problem)
+    tube, alone = answer.tube, answer.extent_along([0.0, 1.0])
+    assert tube is not None
+    assert np.all(alone[1:] <= tube.half_widths[1:, 1] * (1 + 1e-9))
+    assert alone.max() < 0.97 * tube.half_widths[:, 1].max()
+    engine = answer.run.engine
+    times = np.linspace(0.0, 3.0, 1001)
+    profile = alone[np.clip(np.searchsorted(engine.times, times, side="right") - 1, 0, engine.pieces - 1)]
+    measure = Measure(directions=[[0.0, 1.0], [0.0, -1.0]], profile=profile)
+    spread = sup_deviation(problem, paths=20_000, rng=np.random.default_rng(5), measure=measure)
+    beyond = sum(spread.exceedance(1.0, row=row).value for row in (0, 1))
+    assert 0.0005 < beyond <= problem.delta
+
+
+def test_a_direction_alone_needs_a_proof() -> None:
+    with pytest.raises(ArithmeticError, match="feeds itself"):
+        linear_answer(oscillator(3.0, cubic=2.0)).extent_along([1.0, 0.0])
