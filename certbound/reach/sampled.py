@@ -163,7 +163,7 @@ def estimate_reach(
     >>> import certbound as cb
     >>> tube = estimate_reach(cb.load("pendulum"), epsilon=0.1, confidence=0.9, pieces=5, rng=0)
     >>> tube.samples, tube.certified, tube.contains(0.0, [0.5, 0.0])
-    (258, False, True)
+    (256, False, True)
     """
     flow = Flow(problem)
     grid = time_grid(flow, pieces)
