@@ -22,6 +22,7 @@ __all__ = ["compute", "erosions", "largest_multiple", "quantiles"]
 
 DELTA = 0.002
 SHARES = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2)
+FIT = 0.01  # the slopes are fitted over deviations of this probability: the likely ones count most here
 SIGMA = 0.43
 
 
@@ -42,7 +43,7 @@ def erosions(problem: Problem) -> tuple[list[str], np.ndarray]:
     best: np.ndarray | None = None
     for share in SHARES:
         log_nonlinear = float(np.log(problem.delta * share))
-        run = LinearRun(fitted(Linearisation.of(problem), log_nonlinear))
+        run = LinearRun(fitted(Linearisation.of(problem), float(np.log(FIT))))
         bounds = run.include(run.levels(log_nonlinear)[0], 3)
         if bounds is None:
             continue

@@ -10,6 +10,7 @@ from scipy.optimize import linprog
 import certbound as cb
 from certbound.reach.boxes import Expansion
 from certbound.reach.fit import fitted
+from certbound.reach.linear import LinearRun
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.polytope import linear_range
 from certbound.reach.remainder import Remainder
@@ -201,3 +202,18 @@ def test_kinks_couple_coordinates_without_a_second_derivative(width: float) -> N
     assert np.all(beta.max(axis=0) <= upper[0])
     assert np.all(beta.min(axis=0) >= lower[0])
     assert np.all(upper[0] <= beta.max(axis=0) + 0.12 * width)
+
+
+def test_boxes_are_not_cut_where_cutting_does_not_help(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = cb.load("pendulum").replace(horizon=1.0)
+    engine = Linearisation.of(problem)
+    run = LinearRun(engine)
+    original, seen = Expansion.boxes, [0]
+
+    def counted(self: Expansion, items: Array, centre: Array, radius: Array) -> object:
+        seen[0] += len(items)
+        return original(self, items, centre, radius)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Expansion, "boxes", counted)
+    assert run.include(run.levels(float(np.log(1e-4)))[0], 3) is not None
+    assert seen[0] < 60 * engine.pieces
