@@ -115,6 +115,8 @@ class Expansion:
         wide = model.slots(f.span[items], thin + Interval(-reach, reach), f.inputs[items], f.disturbance_middle)
         value = enclose(model.value, slots, undefined="infinite").broadcast_to((count, n))
         bad = _infinite(value)
+        if model.jumping:  # no derivative shows a jump: it must be decided over the whole box and piece
+            bad = bad | _infinite(enclose(model.value, wide, undefined="infinite").broadcast_to((count, n)))
         first = second = None
         if entries:
             where = slots if order == 2 else wide

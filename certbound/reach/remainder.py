@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from certbound.constants.enclosures import enclose
 from certbound.problem.problem import Problem
-from certbound.problem.tape import Tape
+from certbound.problem.tape import JUMPS, Tape
 from certbound.problem.trace import jacobian
 from certbound.reach.boxes import Expansion, Parts
 from certbound.reach.frame import Frame
@@ -147,6 +147,24 @@ class Remainder:
             reads.append(own)
         return set().union(*(reads[output] for output in diffusion.outputs)) - {-1}
 
+    @property
+    def jumping(self) -> bool:
+        """Whether the dynamics may jump."""
+        return any(node.op in JUMPS for node in self.value.nodes)
+
+    def _deciding(self) -> list[list[int]]:
+        """The states that decide every jump."""
+        n = self.problem.system.dimension
+        reads: list[set[int]] = []
+        found = []
+        for node in self.value.nodes:
+            own = {node.args[0]} if node.op == "input" else set().union(*(reads[arg] for arg in node.args))
+            if node.op in JUMPS:
+                deciding = reads[node.args[0]] if node.op == "if_else_zero" else own
+                found.append(sorted(slot - 1 for slot in deciding if 1 <= slot <= n))
+            reads.append(own)
+        return [states for states in found if states]
+
     def _colours(self) -> list[list[list[int]]]:
         """Blocks of coupled active coordinates, grouped so that no output meets two blocks of one group."""
         position = {int(state): a for a, state in enumerate(self.active)}
@@ -163,6 +181,11 @@ class Remainder:
             for state in states:  # not only where a second derivative shows it: a kink couples too
                 parent[root(position[state])] = root(position[j])
                 outputs[position[state]].add(i)
+        for states in self._deciding():  # a jump couples what decides it, and no derivative shows that
+            own = [position[state] for state in states if state in position]
+            for a in own:
+                parent[root(a)] = root(own[0])
+                outputs[a] |= set(range(len(self.value.outputs)))
         blocks: dict[int, list[int]] = {}
         for a in range(len(self.active)):
             if outputs[a]:

@@ -71,8 +71,13 @@ class LinearAnswer:
 
     @property
     def margin(self) -> float:
-        """Room left at the problem's delta, in the units of the tightest constraint."""
-        return self._tightest[2]
+        """Room left at the problem's delta, in the units of the tightest constraint.
+
+        It is not negative where that delta is proved: the tube shares delta evenly between the constraints, the
+        probability does not need to.
+        """
+        left = self._tightest[2]
+        return max(left, 0.0) if self.log10_delta <= np.log10(self.run.engine.problem.delta) else left
 
     @property
     def time(self) -> float:
@@ -88,9 +93,12 @@ class LinearAnswer:
     def reason(self) -> str:
         """Why nothing smaller was proved, in words."""
         if self.outcome.bounds is None:
+            what = "the remainder of the linearisation feeds itself"
+            if self.run.engine.model.jumping:
+                what = f"the dynamics may jump inside the tube, or {what},"
             return (
-                f"the remainder of the linearisation feeds itself from t = {self.time:.4g} on; split the initial set "
-                "(cells), shorten the horizon or lower the noise"
+                f"{what} from t = {self.time:.4g} on; split the initial set (cells), shorten the horizon or lower "
+                "the noise"
             )
         return f"the room of '{self.constraint}' at t = {self.time:.4g} is {self.margin:.4g}"
 
