@@ -22,7 +22,7 @@ __all__ = ["compute", "erosions", "largest_multiple", "quantiles"]
 
 DELTA = 0.002
 SHARES = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2)
-FIT = 0.01  # the slopes are fitted over deviations of this probability: the likely ones count most here
+FIT = 0.02  # the slopes are fitted over deviations of this probability: the likely ones count most here
 SIGMA = 0.43
 
 
