@@ -91,7 +91,8 @@ def simulated(problem: cb.Problem, paths: int) -> tuple[float, float, float]:
 def compute(full: bool) -> tuple[Arrays, Claims]:
     """Ratios and seconds of every problem.
 
-    An obstacle that is a corner (two_tanks, room_3d) is kept off by one of its faces: its ratio tells what that costs.
+    An obstacle that is a box (two_tanks, room_3d) is kept off by a half-space: where the noise is as large as the box,
+    that costs most of the ratio.
     """
     paths = 1_000_000 if full else 100_000
     rows: Claims = {}

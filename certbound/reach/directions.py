@@ -17,6 +17,7 @@ from certbound.constants.enclosures import enclose
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
 from certbound.problem.tape import Tape
+from certbound.reach.separation import polyhedral_weights
 from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
 
@@ -36,11 +37,17 @@ class NominalPieces:
     times : ndarray, shape (N + 1,) in continuous time, (N,) steps in discrete time
     controls : ndarray, shape (N, C, n)
     continuous : bool
+    covariance : ndarray, shape (N, n, n), optional
+        About that of the deviation: where an obstacle is a corner, it decides how its faces are mixed.
+    extent : ndarray, shape (N, n), optional
+        About how far the state lies from the curve without noise.
     """
 
     times: Array
     controls: Array
     continuous: bool
+    covariance: Array | None = None
+    extent: Array | None = None
 
     @property
     def pieces(self) -> int:
@@ -116,7 +123,7 @@ def _constraint(constraint: Inside, curve: NominalPieces) -> Rows:
 
 
 def _outside_facet(region: Box | Polytope, label: str, curve: NominalPieces) -> tuple[str, Array, Array]:
-    """The facet that the piece keeps farthest away from."""
+    """The facet that the piece keeps farthest away from; for a box a mixture of facets, weighed by the noise."""
     a, b = _facets(region, curve)
     if not len(a):
         raise ValueError(f"`safe` must not keep outside all states ({label}); give the box a finite side.")
@@ -124,7 +131,30 @@ def _outside_facet(region: Box | Polytope, label: str, curve: NominalPieces) -> 
     middle = curve.controls.mean(axis=1)
     best = np.argmax((middle @ a.T - b.mid) / norms, axis=1)
     rows = -a[best]
-    return label, rows, curve.least(rows, -b[np.arange(curve.pieces), best])
+    if isinstance(region, Box) and curve.covariance is not None and len(a) > 1:
+        taken = 0.0 if curve.extent is None else curve.extent @ np.abs(a).T
+        mixed = _mixed(middle, a, b.mid + taken, curve.covariance)
+        rows = np.where(np.isfinite(mixed).all(axis=1, keepdims=True), mixed, rows)
+    weights = np.maximum(-rows @ a.T, 0.0) if isinstance(region, Box) else np.eye(len(a))[best]
+    return label, rows, curve.least(rows, -(b * weights).sum(axis=1))
+
+
+def _mixed(points: Array, faces: Array, bounds: Array, covariance: Array) -> Array:
+    """Rows (N, n) that keep off a box's corner with the most standard deviations to spare.
+
+    Every face reads one state, so that a row tells the weight of each face without rounding.
+    """
+    size = np.trace(covariance, axis1=1, axis2=2)[:, None, None]
+    spread = covariance + (1e-9 * size + 1e-280) * np.eye(covariance.shape[1])
+    scores, options = [], []
+    with np.errstate(all="ignore"):
+        for weights in polyhedral_weights(points, faces, bounds, spread):
+            row = weights @ faces
+            deviation = np.sqrt(np.einsum("ki,kij,kj->k", row, spread, row))
+            scores.append(np.sum(weights * (points @ faces.T - bounds), axis=1) / deviation)
+            options.append(-row)
+    best = np.nanargmax(np.where(np.isfinite(scores), scores, -1e300), axis=0)
+    return np.asarray(np.stack(options)[best, np.arange(len(points))])
 
 
 def _facets(region: Box | HalfSpace | Polytope, curve: NominalPieces) -> tuple[Array, Interval]:

@@ -166,8 +166,17 @@ class Linearisation:
         ], axis=2)
 
     def nominal(self, cell: int) -> NominalPieces:
-        """The nominal curve of one cell."""
-        return NominalPieces(times=self.times, controls=self.controls[cell], continuous=self.continuous)
+        """The nominal curve of one cell, with about the spread of the noise and of the initial set along it."""
+        count = len(self.controls[cell])
+        extent, reached = np.empty((count, self.n)), np.diag(self.radii[cell])
+        for k in range(count):
+            extent[k] = np.abs(reached).sum(axis=1)
+            reached = self.response.transition[cell, min(k, self.pieces - 1)] @ reached
+        covariance = self.response.covariance[cell, self.continuous :][:count]
+        return NominalPieces(
+            times=self.times, controls=self.controls[cell], continuous=self.continuous, covariance=covariance,
+            extent=extent,
+        )  # fmt: skip
 
     def on_grid(self, pieces: int) -> Linearisation:
         """The same cells and correction on another grid of pieces (continuous time)."""

@@ -46,13 +46,14 @@ def polyhedral_weights(points: Array, faces: Array, bounds: Array, matrix: Array
     """Weights lam >= 0 (..., m): the direction faces^T lam keeps the point off {faces y <= bounds}.
 
     Two proposals: the single best face, and the direction to the nearest point by Hildreth's dual coordinate
-    ascent on max_{lam >= 0} lam.(faces q - bounds) - lam^T G lam / 2, G = faces Q faces^T.
+    ascent on max_{lam >= 0} lam.(faces q - bounds) - lam^T G lam / 2, G = faces Q faces^T. ``bounds`` (..., m) and
+    ``matrix`` (..., n, n) may differ from point to point.
     """
     if len(faces) == 0:
         return []
     excess = points @ faces.T - bounds
     gram = faces @ matrix @ faces.T
-    diagonal = np.maximum(np.diag(gram), 1e-300)
+    diagonal = np.maximum(np.diagonal(gram, axis1=-2, axis2=-1), 1e-300)
     single = np.zeros(excess.shape)
     best = np.argmax(excess / np.sqrt(diagonal), axis=-1)
     np.put_along_axis(single, best[..., None], 1.0, axis=-1)
@@ -61,8 +62,8 @@ def polyhedral_weights(points: Array, faces: Array, bounds: Array, matrix: Array
     weights = np.zeros(excess.shape)
     for _ in range(SWEEPS):
         for i in range(len(faces)):
-            residual = excess[..., i] - weights @ gram[:, i] + weights[..., i] * gram[i, i]
-            weights[..., i] = np.maximum(residual / diagonal[i], 0.0)
+            spent = np.sum(weights * gram[..., :, i], axis=-1) - weights[..., i] * gram[..., i, i]
+            weights[..., i] = np.maximum((excess[..., i] - spent) / diagonal[..., i], 0.0)
     total = np.sum(weights, axis=-1, keepdims=True)
     return [single, np.where(total > 0, weights / np.where(total > 0, total, 1.0), single)]
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
-from certbound.problem.regions import Ball, Ellipsoid, Region
+from certbound.problem.regions import Ball, Box, Ellipsoid, Region
 from certbound.problem.sets import Inside
 from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
@@ -361,5 +361,7 @@ def _separation(constraint: Inside, rows: Array) -> Any:
     if isinstance(region, (Ball, Ellipsoid)):
         return exact(-rows[:, states])
     faces, _ = region.halfspaces()
+    if isinstance(region, Box):  # every face reads one state: the row tells their weights
+        return [exact(row) for row in np.maximum(-rows[:, states] @ faces.T, 0.0)]
     distance = np.abs(faces[None] + rows[:, None, states]).sum(axis=-1)
     return [int(face) for face in np.argmin(distance, axis=1)]

@@ -44,6 +44,27 @@ def test_the_best_facet_of_a_moving_obstacle_is_chosen_where_the_obstacle_is() -
     np.testing.assert_allclose(found.room, 1 - 0.2 * TIMES[1:], atol=1e-9)
 
 
+def test_a_corner_is_kept_off_by_a_mixture_of_its_faces() -> None:
+    rng = np.random.default_rng(3)
+    corner = cb.Box([1, 2], [4, np.inf], coordinates=(2, 0))  # x3 >= 1 and x1 >= 2
+    problem = cb.Problem(SYSTEM, initial=[0, 0, 0], safe=[cb.Outside(corner)], horizon=2)
+    root = rng.normal(size=(20, 3, 3))
+    covariance = root @ root.transpose(0, 2, 1)
+    points = rng.normal(size=(20, 3)) * 0.3
+    curve = NominalPieces(times=TIMES, controls=points[:, None], continuous=True, covariance=covariance)
+    (found,) = requirements(problem, curve)
+    deviation = np.sqrt(np.einsum("ki,kij,kj->k", found.rows, covariance, found.rows))
+    for state, bound in ((2, 1.0), (0, 2.0)):  # never worse than a single face, often better
+        single = (bound - points[:, state]) / np.sqrt(covariance[:, state, state])
+        assert np.all(found.room / deviation > single - 1e-9)
+    assert np.mean(np.count_nonzero(found.rows, axis=1) == 2) > 0.2
+    inside = np.stack([rng.uniform(2, 9, 500), rng.normal(size=500), rng.uniform(1, 4, 500)], axis=1)
+    reached = np.einsum("ki,ksi->ks", found.rows, inside[None] - points[:, None])
+    assert np.all(reached >= found.room[:, None] - 1e-9)
+    # on the boundary of the half-space lies a point of the obstacle
+    assert np.all((found.rows @ np.array([2.0, 0.0, 1.0]) - np.sum(found.rows * points, axis=1)) < found.room + 1e-9)
+
+
 def test_keeping_outside_all_states_is_refused() -> None:
     box = cb.Box([-np.inf] * 3, [np.inf] * 3)
     problem = cb.Problem(SYSTEM, initial=[0, 0, 0], safe=[cb.Outside(box, during=(1, 2))], horizon=2)
