@@ -90,7 +90,7 @@ def tune_tube(
     >>> constants = Constants(rate=-0.5, sigma=0.1**0.5, dimension=1)
     >>> tube = tune_tube(constants, horizon=5.0, delta=1e-3)
     >>> tube.certified, round(tube.maximum, 4)
-    (True, 1.3398)
+    (True, 1.3396)
     """
     delta = check_delta(delta)
     if method not in METHODS:
