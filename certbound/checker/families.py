@@ -61,10 +61,10 @@ def leaving(
     total = upper(sum(single, arb(0) if paid is None else paid))
     if not normal or not total > _LIKELY:
         return total
-    return arb.min(total, _correlated(families, single, exceedance))
+    return arb.min(total, correlated(families, single, exceedance))
 
 
-def _correlated(families: Sequence[Family], single: Sequence[arb], exceedance: Callable[[Family], arb]) -> arb:
+def correlated(families: Sequence[Family], single: Sequence[arb], exceedance: Callable[[Family], arb]) -> arb:
     """1 minus the product over the symmetric events, and the sum of the others."""
     stay, rest = arb(1), arb(0)
     open_ = list(range(len(families)))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from certbound.problem.problem import Problem
-from certbound.problem.tape import JUMPS, Tape
 from certbound.problem.trace import jacobian
+from certbound.reach.tapes import deciding, varying_outputs
 
 __all__ = ["hidden_jump"]
 
@@ -26,29 +26,16 @@ def hidden_jump(problem: Problem) -> str | None:
     'the dynamics may jump where `(0.2 < x)` does, with x'
     """
     tape, n = problem.closed_loop, problem.system.dimension
-    if not any(node.op in JUMPS for node in tape.nodes):
+    jumps = deciding(tape)
+    if not jumps:
         return None
-    slopes = jacobian(tape, list(range(1, n + 1)))
-    varying = _dependence(slopes)
-    seen = {output % n for output, node in enumerate(slopes.outputs) if varying[node]}
-    depends = _dependence(tape)
-    for index, node in enumerate(tape.nodes):
-        if node.op not in JUMPS:
-            continue
-        deciding = depends[node.args[0]] if node.op == "if_else_zero" else depends[index]
-        for state in sorted(deciding):
+    varying = varying_outputs(jacobian(tape, list(range(1, n + 1))))
+    seen = {output % n for output, varies in enumerate(varying) if varies}
+    for index, slots in jumps.items():
+        for state in sorted(slots):
             if 1 <= state <= n and state - 1 not in seen:
                 return (
                     f"the dynamics may jump where `{tape.describe(index)}` does, with {tape.inputs[state]}, which "
                     "enters linearly otherwise: a linear response does not see that."
                 )
     return None
-
-
-def _dependence(tape: Tape) -> list[frozenset[int]]:
-    """The inputs that every node depends on."""
-    found: list[frozenset[int]] = []
-    for node in tape.nodes:
-        own = node.args if node.op == "input" else ()
-        found.append(frozenset(own).union(*(found[arg] for arg in node.args if node.op != "input")))
-    return found

@@ -24,7 +24,7 @@ from certbound.reach.linearisation import Linearisation
 from certbound.reach.martingales import SplitEvent, SplitEvents
 from certbound.reach.samples import sampled_range
 
-__all__ = ["Events", "LinearRun", "Outcome", "level_scale"]
+__all__ = ["Events", "LinearRun", "Outcome", "correlated", "level_scale"]
 
 Array = NDArray[np.float64]
 Event = StepEvent | WindowEvent | SteadyEvent | SplitEvent
@@ -260,7 +260,7 @@ class LinearRun:
         logs = [events.along(r.rows).log_exceedance(rooms[:, i]) for i, r in enumerate(asked)]
         total = logsumexp(np.array([shared, *logs]))
         if total > _LIKELY and isinstance(events, StepEvents) and events.gaussian:
-            total = min(total, _correlated(events, asked, rooms, shared, logs))
+            total = min(total, correlated(events, asked, rooms, shared, logs))
         return Outcome(
             log_probability=min(total, 0.0), log_nonlinear=log_nonlinear, bounds=bounds, cell=cell, logs=tuple(logs),
         )
@@ -286,7 +286,7 @@ class LinearRun:
         return outcome.log_nonlinear + float(np.log(0.1 if self.rows.shape[2] else 1.0))
 
 
-def _correlated(events: StepEvents, asked: list[Requirement], rooms: Array, shared: float, logs: list[float]) -> float:
+def correlated(events: StepEvents, asked: list[Requirement], rooms: Array, shared: float, logs: list[float]) -> float:
     """Logarithm of the probability of leaving, by the Gaussian correlation inequality.
 
     Requirements along w and -w with equal rooms keep Z in a symmetric convex set, and so do the levels along the inner

@@ -25,7 +25,7 @@ from certbound.problem.trace import jacobian
 from certbound.reach.boxes import Expansion, Parts
 from certbound.reach.frame import Frame
 from certbound.reach.polytope import cull, grid, halve
-from certbound.reach.tapes import is_zero, selected, sources, varying_outputs, watched
+from certbound.reach.tapes import deciding, is_zero, selected, sources, varying_outputs, watched
 from certbound.rigor.intervals import Interval
 
 __all__ = ["Remainder"]
@@ -141,29 +141,12 @@ class Remainder:
         if not isinstance(diffusion, Tape):
             return set()
         # by what the operations read, not by derivatives: a jump has none
-        reads: list[set[int]] = []
-        for node in diffusion.nodes:
-            own = {node.args[0] - 1} if node.op == "input" else set().union(*(reads[arg] for arg in node.args))
-            reads.append(own)
-        return set().union(*(reads[output] for output in diffusion.outputs)) - {-1}
+        return {slot - 1 for slot in set().union(*sources(diffusion)) if slot > 0}
 
     @property
     def jumping(self) -> bool:
         """Whether the dynamics may jump."""
         return any(node.op in JUMPS for node in self.value.nodes)
-
-    def _deciding(self) -> list[list[int]]:
-        """The states that decide every jump."""
-        n = self.problem.system.dimension
-        reads: list[set[int]] = []
-        found = []
-        for node in self.value.nodes:
-            own = {node.args[0]} if node.op == "input" else set().union(*(reads[arg] for arg in node.args))
-            if node.op in JUMPS:
-                deciding = reads[node.args[0]] if node.op == "if_else_zero" else own
-                found.append(sorted(slot - 1 for slot in deciding if 1 <= slot <= n))
-            reads.append(own)
-        return [states for states in found if states]
 
     def _colours(self) -> list[list[list[int]]]:
         """Blocks of coupled active coordinates, grouped so that no output meets two blocks of one group."""
@@ -181,8 +164,8 @@ class Remainder:
             for state in states:  # not only where a second derivative shows it: a kink couples too
                 parent[root(position[state])] = root(position[j])
                 outputs[position[state]].add(i)
-        for states in self._deciding():  # a jump couples what decides it, and no derivative shows that
-            own = [position[state] for state in states if state in position]
+        for slots in deciding(self.value).values():  # a jump couples what decides it, and no derivative shows that
+            own = [position[slot - 1] for slot in slots if slot - 1 in position]
             for a in own:
                 parent[root(a)] = root(own[0])
                 outputs[a] |= set(range(len(self.value.outputs)))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from certbound.problem.tape import Node, Tape
+from certbound.problem.tape import JUMPS, Node, Tape
 
-__all__ = ["is_zero", "selected", "sources", "varying_outputs", "watched"]
+__all__ = ["deciding", "is_zero", "selected", "sources", "varying_outputs", "watched"]
 
 
 def selected(tape: Tape, outputs: list[int], function: Tape | None) -> Tape:
@@ -55,12 +55,27 @@ def varying_outputs(tape: Tape) -> list[bool]:
     return [depends[output] for output in tape.outputs]
 
 
-def sources(tape: Tape) -> list[set[int]]:
-    """Input slots that each output depends on."""
+def reads(tape: Tape) -> list[set[int]]:
+    """Input slots that each node depends on."""
     found: list[set[int]] = []
     for node in tape.nodes:
         found.append({node.args[0]} if node.op == "input" else set().union(*(found[arg] for arg in node.args)))
+    return found
+
+
+def sources(tape: Tape) -> list[set[int]]:
+    """Input slots that each output depends on."""
+    found = reads(tape)
     return [found[output] for output in tape.outputs]
+
+
+def deciding(tape: Tape) -> dict[int, set[int]]:
+    """The nodes that may jump, and the input slots that decide whether they do."""
+    found = reads(tape)
+    return {
+        index: found[node.args[0]] if node.op == "if_else_zero" else found[index]
+        for index, node in enumerate(tape.nodes) if node.op in JUMPS
+    }  # fmt: skip
 
 
 def is_zero(tape: Tape, output: int) -> bool:

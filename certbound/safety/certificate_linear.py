@@ -25,8 +25,9 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian
 from certbound.reach.events import StepEvents, WindowEvents, logsumexp
-from certbound.reach.linear import LinearRun, _correlated, level_scale
+from certbound.reach.linear import LinearRun, correlated, level_scale
 from certbound.reach.linearisation import Linearisation
+from certbound.reach.tapes import varying_outputs
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import Proof, exact, needs_direction
 
@@ -189,7 +190,7 @@ def _stated(run: LinearRun, given: _Levels, bounds: tuple[Array, Array]) -> _Sta
         total = logsumexp(np.array([*given.spent[cell], *asked]))
         if isinstance(own, StepEvents) and own.gaussian:
             shared = logsumexp(np.array(given.spent[cell]))
-            total = min(total, _correlated(own, run.requirements[cell], rooms, shared, asked))
+            total = min(total, correlated(own, run.requirements[cell], rooms, shared, asked))
         worst = max(worst, total)
     return _Stated(
         levels=given.levels, bounds=bounds, events=given.events, log_probability=float(min(worst, 0.0))
@@ -285,11 +286,8 @@ def _varying(tape: Tape, columns: range) -> list[tuple[int, int]]:
     """Entries of the derivative that depend on an input, row by row."""
     if not columns:
         return []
-    derivative = jacobian(tape, list(columns))
-    depends: list[bool] = []
-    for node in derivative.nodes:
-        depends.append(node.op == "input" or any(depends[arg] for arg in node.args))
-    return [divmod(o, len(columns)) for o, node in enumerate(derivative.outputs) if depends[node]]
+    varying = varying_outputs(jacobian(tape, list(columns)))
+    return [divmod(o, len(columns)) for o, varies in enumerate(varying) if varies]
 
 
 def _frames(
