@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from certbound.reach.martingales import Martingales, quantile
+from certbound.reach.martingales import MartingaleEvent, Martingales, quantile
 from certbound.reach.response import LinearResponse, continuous_response
 from certbound.rigor.intervals import Interval
 
@@ -61,6 +61,15 @@ def test_the_event_bounds_a_rotating_martingale() -> None:
     assert event.log_exceedance(level) <= np.log(0.01)
     assert level.max() < 3 * float(np.quantile(top, 0.99))
     assert event.log_exceedance(np.full(pieces, -0.1)) == 0.0
+
+
+def test_every_window_costs_the_tail_of_a_reflected_brownian_motion() -> None:
+    event = MartingaleEvent(
+        kappa=np.array([1.0, 0.5]), window=np.repeat([0, 1], 3), starts=np.array([0, 3]), cost=np.zeros(6)
+    )
+    found = event.log_exceedance(np.full(6, 3.0))
+    assert found == pytest.approx(np.log(2 * norm.sf(3.0) + 2 * norm.sf(6.0)), abs=1e-9)
+    assert event.log_exceedance(event.level(-9.0)) <= -9.0
 
 
 def test_without_excess_nothing_is_exceeded() -> None:
