@@ -18,14 +18,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import (
-    LinAlgWarning,
-    cho_factor,
-    cho_solve,
-    eigh,
-    solve_continuous_lyapunov,
-    solve_discrete_lyapunov,
-)
 
 from certbound.constants.blocks import Sector, contraction_value, lmi_blocks, transformed
 from certbound.constants.jacobians import JacobianSet
@@ -82,6 +74,8 @@ class _Block:
 
     def smallest_value(self, P: Array, multipliers: Array) -> float:
         """The infimum of the values with F >= 0 at the given P and multipliers (inf when there is none)."""
+        from scipy.linalg import cho_factor, cho_solve, eigh
+
         F = self.matrix(0.0, P, multipliers)
         n, corner = self.n, F[self.n :, self.n :]
         schur = F[:n, :n]
@@ -188,6 +182,8 @@ def lyapunov_metric(matrix: Array, share: float, *, continuous: bool) -> Array:
     numpy.linalg.LinAlgError
         If the equation is singular in floating point (a Jordan block on the stability limit).
     """
+    from scipy.linalg import LinAlgWarning, solve_continuous_lyapunov, solve_discrete_lyapunov
+
     n = len(matrix)
     eigenvalues = np.linalg.eigvals(matrix)
     if continuous:
@@ -279,6 +275,8 @@ def _recenter(
     pairs: _Pairs | None,
 ) -> tuple[Array, list[Array], int]:
     """Damped Newton steps to the analytic centre of {F > 0, floor < P < I} at a fixed value."""
+    from scipy.linalg import cho_factor, cho_solve
+
     for step in range(1, min(budget, 30) + 1):
         try:
             gradient, hessian = _derivatives(blocks, P, multipliers, value, pairs)
@@ -381,5 +379,7 @@ def _derivatives(
 
 
 def _inverse(matrix: Array) -> Array:
+    from scipy.linalg import cho_factor, cho_solve
+
     inverse = cho_solve(cho_factor(matrix), np.eye(len(matrix)))
     return np.asarray((inverse + inverse.T) / 2)

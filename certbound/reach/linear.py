@@ -212,7 +212,7 @@ class LinearRun:
         share = log_nonlinear + np.log(0.9 / (2 * max(count, 1)))
         found = []
         for cell in range(cells):
-            events = self.events(cell, log_nonlinear + float(np.log(0.1 if count else 1.0)))
+            events = self.events(cell, self._shared(log_nonlinear))
             found.append(events)
             for d in range(count):
                 event = events.along(self.rows[cell, :, d])
@@ -272,7 +272,9 @@ class LinearRun:
         asked = self.requirements[outcome.cell]
         if not asked:
             return None, 0, np.inf
-        rooms, events = self.rooms(outcome.cell, outcome.bounds), self.events(outcome.cell, self._shared(outcome))
+        rooms = self.rooms(outcome.cell, outcome.bounds)
+        kept = self.kept.get(outcome.log_nonlinear, (None, []))[1]
+        events = kept[outcome.cell] if kept else self.events(outcome.cell, self._shared(outcome.log_nonlinear))
         target = float(np.log(self.engine.problem.delta / len(asked)))
         left = np.empty_like(rooms)
         for index, requirement in enumerate(asked):
@@ -282,8 +284,9 @@ class LinearRun:
         piece, tightest = divmod(int(np.argmin(left)), len(asked))
         return asked[tightest], piece, float(left[piece, tightest])
 
-    def _shared(self, outcome: Outcome) -> float:
-        return outcome.log_nonlinear + float(np.log(0.1 if self.rows.shape[2] else 1.0))
+    def _shared(self, log_nonlinear: float) -> float:
+        """The log probability that all events share: a tenth of exp(log_nonlinear) if levels take the rest."""
+        return log_nonlinear + float(np.log(0.1 if self.rows.shape[2] else 1.0))
 
 
 def correlated(events: StepEvents, asked: list[Requirement], rooms: Array, shared: float, logs: list[float]) -> float:

@@ -108,9 +108,7 @@ class Linearisation:
         return np.asarray(np.arange(self.pieces + 1) * self.step, dtype=float)
 
     def _evaluate(self, k: int, time: float, state: Array) -> Array:
-        values = [time, *state.T, *self.inputs[k], *self.d_middle]
-        count = len(state)
-        return np.asarray(self._compiled(*(np.broadcast_to(np.asarray(v, dtype=float), (count,)) for v in values)))
+        return self._compiled(time, *state.T, *self.inputs[k], *self.d_middle)
 
     @cached_property
     def _compiled(self) -> Callable[..., Array]:
@@ -147,7 +145,7 @@ class Linearisation:
             k2 = self._evaluate(k, t + h / 2, x + h / 2 * k1)
             k3 = self._evaluate(k, t + h / 2, x + h / 2 * k2)
             k4 = self._evaluate(k, t + h, x + h * k3)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            x = x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
         return x
 
     @cached_property
@@ -156,14 +154,11 @@ class Linearisation:
         x = self.nodes
         if not self.continuous:
             return x[:, :, None, :]
-        slopes = np.empty((x.shape[0], self.pieces, 2, self.n))
-        for k in range(self.pieces):
-            slopes[:, k, 0] = self._evaluate(k, self.times[k], x[:, k])
-            slopes[:, k, 1] = self._evaluate(k, self.times[k + 1], x[:, k + 1])
+        start, end = (
+            self._compiled(t, *np.moveaxis(ends, -1, 0), *self.inputs.T, *self.d_middle)
+            for t, ends in ((self.times[:-1], x[:, :-1]), (self.times[1:], x[:, 1:])))
         third = self.step / 3
-        return np.stack([
-            x[:, :-1], x[:, :-1] + third * slopes[:, :, 0], x[:, 1:] - third * slopes[:, :, 1], x[:, 1:],
-        ], axis=2)
+        return np.stack([x[:, :-1], x[:, :-1] + third * start, x[:, 1:] - third * end, x[:, 1:]], axis=2)
 
     def nominal(self, cell: int) -> NominalPieces:
         """The nominal curve of one cell, with about the spread of the noise and of the initial set along it."""

@@ -16,7 +16,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.integrate import solve_ivp
 
 from certbound.problem.problem import Problem
 from certbound.reach.curve import Curve
@@ -194,6 +193,8 @@ def _through(flow: Flow, grid: Array, states: Array) -> Curve:
 
 
 def _node_states(flow: Flow, grid: Array, states: Array) -> Array:
+    from scipy.integrate import solve_ivp
+
     count, n = states.shape
     nodes = np.empty((count, len(grid), n))
     nodes[:, 0] = states

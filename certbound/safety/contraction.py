@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ SHARES = (1.15, 1.6, 2.4, 4.0)
 """Room tried with local constants, in units of the tube at the target probability."""
 NEAR_MISS = 2.0
 """Metrics of their own for the constraints are tried where the tube takes at most so many times the room."""
-QUICK_BUDGET = 1000
+QUICK_BUDGET = 250
 """Boxes spent on global constants when another engine has proved SAFE already."""
 
 
@@ -154,9 +155,13 @@ class _Work:
     def __init__(self, problem: Problem, method: str, cells: int | None) -> None:
         self.problem, self.method, self.cells = problem, method, cells
         self.flow = Flow(problem)
-        self.curve: Curve = nominal_curve(self.flow, initial_cells(problem, cells).centres)
         self.name = "kummer" if method == "auto" else method
         self.segments = SEGMENTS if method in BY_CLEARANCE else SEGMENTS_BY_NAME
+
+    @cached_property
+    def curve(self) -> Curve:
+        """The nominal curves, one a cell."""
+        return nominal_curve(self.flow, initial_cells(self.problem, self.cells).centres)
 
     def global_answer(self, constants: Constants) -> EngineAnswer:
         """With constants that hold everywhere, or on the domain."""

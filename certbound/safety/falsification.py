@@ -17,7 +17,6 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, GaussianStart, Inside, Outside
 from certbound.reach.clearance import constraint_clearance
 from certbound.reach.flow import Flow
-from certbound.reach.local import local_contraction_tube
 from certbound.reach.norms import Norm
 from certbound.reach.tube import ReachTube
 
@@ -117,6 +116,8 @@ def _proved(
     problem: Problem, start: Array, signal: Array, time: float, constraint: Inside, depth: float
 ) -> Violation | None:
     """The violation, if the enclosed trajectory shows it."""
+    from certbound.reach.local import local_contraction_tube
+
     try:
         flow = Flow(problem.replace(initial=start), only=signal)
         reach = local_contraction_tube(flow)

@@ -7,25 +7,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from certbound.display import Shown, log10_text
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.reach.tube import ReachTube
 from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, settled
-from certbound.safety.barrier import barrier_engine
-from certbound.safety.certificate import certificate_data, certificate_text
-from certbound.safety.contraction import constants_engine
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.linear import linear_engine
-from certbound.tubes.constants import Constants
-from certbound.tubes.tuning import METHODS
+
+if TYPE_CHECKING:
+    from certbound.tubes.constants import Constants
 
 __all__ = ["ENGINES", "EngineAnswer", "Verdict", "verify_safety"]
 
 
 def _constants(problem: Problem, **options: Any) -> EngineAnswer:
+    from certbound.safety.contraction import constants_engine
+
     return constants_engine(problem, **options)
 
 
@@ -34,6 +34,8 @@ def _linear(problem: Problem, **options: Any) -> EngineAnswer:
 
 
 def _barrier(problem: Problem, **options: Any) -> EngineAnswer:
+    from certbound.safety.barrier import barrier_engine
+
     return barrier_engine(problem, **options)
 
 
@@ -102,6 +104,8 @@ class Verdict(Shown):
         """
         if self.problem is None:
             return None
+        from certbound.safety.certificate import certificate_data
+
         try:
             return certificate_data(self.problem, self)
         except CertificateError:
@@ -115,6 +119,8 @@ class Verdict(Shown):
         CertificateError
             If no probability was bounded that a certificate could state.
         """
+        from certbound.safety.certificate import certificate_text
+
         return certificate_text(problem, self, attempt=attempt)
 
     def summary(self) -> str:
@@ -223,6 +229,8 @@ def _chosen(method: str) -> tuple[str, ...]:
         return tuple(_ENGINES)
     if method in _ENGINES:
         return (method,)
+    from certbound.tubes.tuning import METHODS
+
     if method in METHODS:
         return ("constants",)
     known = ", ".join(["auto", *_ENGINES, *(name for name in METHODS if name != "auto")])

@@ -18,7 +18,6 @@ from typing import Any, ClassVar
 import numpy as np
 from flint import arb
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from certbound.errors import SolverError
 from certbound.rigor.balls import lower, precision, upper
@@ -146,6 +145,8 @@ class MixtureProgram:
 
     def _program(self, columns: Array) -> tuple[float, Array, Array]:
         """min sum u s.t. sum_i u_i g_i/X_i >= 1 on every row, in the unit of the best single column."""
+        from scipy.optimize import linprog
+
         with np.errstate(over="ignore"):
             worst = columns.min(axis=1)
         unit = float(np.max(np.where(np.isfinite(worst), worst, -np.inf)))

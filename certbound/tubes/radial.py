@@ -14,8 +14,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_banded
-from scipy.special import gammaln, ive, xlogy
 
 from certbound.tubes.constants import Constants
 from certbound.tubes.schedule import Schedule, make_schedule
@@ -113,6 +111,7 @@ def _volumes(
     faces: Array, centres: Array, h: float, rate: float, noise: float, dimension: int
 ) -> tuple[Array, Array, Array, Array]:
     """Tridiagonal generator; the volume of each cell by Simpson's rule on the weight."""
+    from scipy.special import xlogy
 
     def log_weight(s: Array) -> Array:
         return np.asarray(xlogy(dimension - 1, s) + rate / noise * s**2)
@@ -133,6 +132,8 @@ def _volumes(
 
 def _theta_step(p: Array, lower: Array, diag: Array, upper: Array, source: Array, step: float, theta: float) -> Array:
     """One step of (I - theta k A) p' = (I + (1 - theta) k A) p + k source."""
+    from scipy.linalg import solve_banded
+
     right = p + step * source
     if theta < 1:
         moved = diag * p
@@ -145,6 +146,8 @@ def _theta_step(p: Array, lower: Array, diag: Array, upper: Array, source: Array
 
 def chi_kernel(start: Array, end: Array, dimension: int) -> Array:
     """Density at ``end`` of ||start e_1 + N(0, I)||, on the outer grid."""
+    from scipy.special import gammaln, ive
+
     x, y = start[:, None], end[None, :]
     if dimension == 1:
         return (np.exp(-((y - x) ** 2) / 2) + np.exp(-((y + x) ** 2) / 2)) / math.sqrt(2 * math.pi)

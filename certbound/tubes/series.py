@@ -10,7 +10,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, hyp0f1, hyp1f1
 
 __all__ = [
     "log_excess", "log_excess_one", "log_excess_value", "log_phi", "log_phi_one", "solve_excess", "solve_excess_one",
@@ -95,6 +94,8 @@ def _direct(a: Array, b: float, z: Array, peak: Array, width: Array, terms: int,
 
 def _strided(a: Array, b: float, z: Array, peak: Array, width: Array, terms: int, bessel: bool) -> tuple[Array, Array]:
     """Sum the bell around the largest term on a coarser grid (Poisson summation: the error is e^{-2 pi^2 w^2})."""
+    from scipy.special import gammaln
+
     stride = width / 3
     start = np.maximum(peak - 30 * stride, 1.0)
     k = start[:, None] + stride[:, None] * np.arange(terms)
@@ -161,6 +162,8 @@ def log_excess_one(a: float, b: float, z: float, *, bessel: bool = False, digits
 def log_excess_value(a: float, b: float, z: float, *, bessel: bool = False, digits: float = 1e-17) -> float:
     """The value of :func:`log_excess_one` alone, to 7 digits, from SciPy where that is quicker."""
     if 0.1 <= b <= 50 and ((bessel and 1 <= a * z <= 1e4) or (not bessel and a <= 1e4 and 1e-4 <= z <= 250)):
+        from scipy.special import hyp0f1, hyp1f1
+
         power = a if bessel else max(a, 1e-8)
         value = float(hyp0f1(b, a * z) if bessel else hyp1f1(power, b, z))
         if 1.00001 < value < 1e290:

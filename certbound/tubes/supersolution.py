@@ -26,8 +26,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_banded
-from scipy.special import erfc
 
 from certbound.tubes.paper import golden
 
@@ -168,6 +166,8 @@ class Supersolution:
 
     def _terminal(self) -> Array:
         """erfc of the distance to R, bent so that H vanishes at R as u_t does there."""
+        from scipy.special import erfc
+
         s = np.sqrt(self.mesh)
         width = math.sqrt(2 * self.first)
         spread = max(rho + tangential for rho, tangential in self.controls) - 1
@@ -381,6 +381,8 @@ def _times(bands: Array, x: Array) -> Array:
 
 def _radau(mass: Array, flow: Array, state: Array, step: float) -> tuple[Array, Array]:
     """Stages at 1/3 and 1 of u' = mass^-1 flow u by the two-stage Radau IIA method, from one complex solve."""
+    from scipy.linalg import solve_banded
+
     pole = 2 + 1j * math.sqrt(2)
     solution = solve_banded((2, 2), step * flow - pole * mass, _times(mass, state) + 0j, check_finite=False)
     stage: Array = 2 * np.real((6 - 2 * pole) / (2j * math.sqrt(2)) * solution)
