@@ -10,57 +10,21 @@ sum_i |b - r|_i z_i. The event that some coordinate exceeds z_i is paid once, fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certbound.reach.response import LinearResponse
+from certbound.reach.windows import ROUND, Course, Windows, logsumexp, ratio_down, ratio_up, spread_of
 from certbound.tubes.gaussian_normal import log_below_above, log_tail
 
 __all__ = ["StepEvents", "WindowEvents", "logsumexp"]
 
 Array = NDArray[np.float64]
 Nodes = NDArray[np.int64]
-
-_ROUND = 1 + 1e-14
-
-
-def logsumexp(values: Array) -> float:
-    """Upper bound of log sum exp(values)."""
-    values = np.asarray(values, dtype=float).ravel()
-    top = float(values.max(initial=-np.inf))
-    if not np.isfinite(top):
-        return top
-    total = np.log(np.exp(values - top).sum() * (1 + 1e-13 + 2e-16 * len(values))) + top
-    return float(total + 4e-16 * (abs(top) + 1))
-
-
-def _ratio_down(level: Array, variance_hi: Array) -> Array:
-    """level / standard deviation, rounded down; +inf for a variance of 0 and a level that is not negative."""
-    sd = np.sqrt(np.maximum(variance_hi, 0.0)) * _ROUND
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        value = level / sd
-        value = np.where(sd > 0, value - np.abs(value) * 4e-16, np.where(level >= 0, np.inf, -np.inf))
-    return np.where(level == np.inf, np.inf, value)
-
-
-def _ratio_up(level: Array, variance_lo: Array) -> Array:
-    """level / standard deviation, rounded up."""
-    sd = np.sqrt(np.maximum(variance_lo, 0.0)) / _ROUND
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        value = level / sd
-        value = np.where(sd > 0, value + np.abs(value) * 4e-16, np.inf)
-    return np.where(level == np.inf, np.inf, value)
-
-
-def _spread(difference_hi: Array, scale: Array) -> Array:
-    """Upper bound of sqrt((1 - rho)/(1 + rho)) from 1 - rho <= difference_hi / scale."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gap = np.where(scale > 0, difference_hi / scale, 2.0) * _ROUND
-        gap = np.clip(gap, 0.0, 2.0)
-        return np.sqrt(gap / np.maximum(2.0 - gap, 0.0)) * _ROUND
 
 
 def _numbers(count: int) -> Nodes:
@@ -108,11 +72,11 @@ class StepEvents:
         following = np.einsum("ti,tij->tj", rows[1:], self.response.transition[0, : len(rows) - 1])
         # the row at t + 1 seen from t is w F up to the rounding of this product
         cross_lo, _ = self.response.covariance_of(following[None], rows[None, :-1], nodes[:-1])
-        scale = np.sqrt(np.maximum(high[:-1], 0) * np.maximum(high[1:], 0)) * _ROUND
-        low_scale = np.sqrt(np.maximum(low[:-1], 0) * np.maximum(low[1:], 0)) / _ROUND
+        scale = np.sqrt(np.maximum(high[:-1], 0) * np.maximum(high[1:], 0)) * ROUND
+        low_scale = np.sqrt(np.maximum(low[:-1], 0) * np.maximum(low[1:], 0)) / ROUND
         size = np.einsum("ti,tij->t", np.abs(rows[1:]), np.abs(self.response.transition[0, : len(rows) - 1]))
         loss = size * _product_rounding(rows.shape[1]) * self.sizes[: len(rows) - 1]
-        cross = cross_lo[0] - loss * np.sqrt(np.maximum(high[:-1], 0)) * _ROUND
+        cross = cross_lo[0] - loss * np.sqrt(np.maximum(high[:-1], 0)) * ROUND
         with np.errstate(divide="ignore", invalid="ignore"):
             correlation = np.where(cross >= 0, cross / scale, cross / low_scale)
         correlation = np.where(np.isfinite(correlation), np.clip(correlation - 1e-14, -1.0, 1.0), -1.0)
@@ -136,13 +100,13 @@ class StepEvent:
         """Upper bound of log P(exists t: rows[t] . Z_t > levels[t])."""
         if np.any(levels < 0):
             return 0.0
-        above = _ratio_down(levels, self.high)
+        above = ratio_down(levels, self.high)
         if self.correlation is None:
             with np.errstate(over="ignore"):
                 exponent = -0.5 * np.minimum(above, 1e150) ** 2
             return min(logsumexp(np.where(above == np.inf, -np.inf, exponent * (1 - 1e-15))), 0.0)
         single = log_tail(above)
-        joint = log_below_above(_ratio_up(levels, self.low)[:-1], above[1:], self.correlation)
+        joint = log_below_above(ratio_up(levels, self.low)[:-1], above[1:], self.correlation)
         return min(logsumexp(np.concatenate([single[:1], np.minimum(joint, single[1:])])), 0.0)
 
 
@@ -158,12 +122,15 @@ class WindowEvents:
         Pieces per window.
     shared_log : float
         Log probability granted to the event that some coordinate of M leaves its level in some window.
+    memory : dict
+        What does not depend on ``shared_log``; events with other shares may share it.
     """
 
     response: LinearResponse
     cell: int
     length: int
     shared_log: float
+    memory: dict[Any, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "response", _one(self.response, self.cell))
@@ -173,9 +140,16 @@ class WindowEvents:
         """Window borders: node numbers from 0 to N."""
         return np.append(np.arange(0, self.response.pieces, self.length, dtype=np.int64), self.response.pieces)
 
-    @cached_property
+    @property
     def back(self) -> tuple[Array, Array]:
-        """Phi(t_{k+1}, t_e)^{-1 of the forward map}: G_k of the row b = w G_k, and an entrywise error bound.
+        """Phi(t_{k+1}, t_e)^{-1 of the forward map}: G_k of the row b = w G_k, and an entrywise error bound."""
+        if "back" not in self.memory:
+            self.memory["back"] = self._back()
+        found: tuple[Array, Array] = self.memory["back"]
+        return found
+
+    def _back(self) -> tuple[Array, Array]:
+        """See `back`.
 
         G_k approximates Phi(t_e, t_{k+1})^{-1}; the error also covers the motion inside piece k.
         """
@@ -201,9 +175,16 @@ class WindowEvents:
                 forward, slack = _longer(forward, slack, f[k], float(phi[k]))
         return g, error
 
-    @cached_property
+    @property
     def starts(self) -> tuple[Array, Array]:
         """Phi(t_e, t_a) of every window in floats, and an entrywise error bound (one number a window)."""
+        if "starts" not in self.memory:
+            self.memory["starts"] = self._starts()
+        found: tuple[Array, Array] = self.memory["starts"]
+        return found
+
+    def _starts(self) -> tuple[Array, Array]:
+        """See `starts`."""
         f, phi = self.response.transition[0], self.response.transition_error[0]
         n = f.shape[-1]
         result, errors = [], []
@@ -215,40 +196,65 @@ class WindowEvents:
             errors.append(slack)
         return np.array(result), np.array(errors)
 
+    @property
+    def coordinates(self) -> tuple[Array, list[Windows]]:
+        """Upper bounds of the standard deviations of M at the windows' ends (W, n), and the windows of each M_i."""
+        if "coordinates" not in self.memory:
+            n, count = self.response.slope.shape[-1], len(self.bounds) - 1
+            rows = [np.broadcast_to(row, (count, n)) for row in np.eye(n)]
+            variance = np.stack([self.response.variance(r[None], self.bounds[1:])[1][0] for r in rows], axis=1)
+            sd = np.sqrt(np.maximum(variance, 0.0)) * ROUND
+            self.memory["coordinates"] = sd, [self._windows(r) for r in rows]
+        found: tuple[Array, list[Windows]] = self.memory["coordinates"]
+        return found
+
     @cached_property
     def coordinate_levels(self) -> Array:
-        """z_i of every window: the levels of |M_i| that together cost exp(shared_log)."""
-        n = self.response.slope.shape[-1]
-        variance = np.stack([
-            self.response.variance(np.broadcast_to(np.eye(n)[i], (1, len(self.bounds) - 1, n)), self.bounds[1:])[1][0]
-            for i in range(n)
-        ], axis=1)
-        sd = np.sqrt(np.maximum(variance, 0.0)) * _ROUND
-        active = [i for i in range(n) if sd[:, i].max() > 0]
-        low, high = 1.0, 60.0
-        events = [self._windows(np.broadcast_to(row, (len(self.bounds) - 1, n))) for row in np.eye(n)]
-        for _ in range(24):
-            factor = (low + high) / 2
-            total = logsumexp(np.array([events[i].log_exceedance(factor * sd[:, i]) + np.log(2.0) for i in active]))
-            low, high = (low, factor) if total <= self.shared_log else (factor, high)
+        """z_i of every window: the levels of |M_i| that together cost exp(shared_log).
+
+        Proves: the sum over i of twice the one-sided exceedances is at most exp(shared_log) at the factor returned;
+        at the first one tried by 4 Q(q) <= 2 exp(-q^2/2) for every window and coordinate (Levy's inequality). ln of
+        the sum falls by about q dq, which gives the next factor.
+        """
+        sd, events = self.coordinates
+        moving = [i for i in range(sd.shape[1]) if sd[:, i].max() > 0]
+        target, low, log = self.shared_log, 0.0, 0.0
+        count = float(np.log(4.0 * max(len(moving), 1) * len(sd)))
+        high = factor = min(float(np.sqrt(2 * max(count - target, 0.5))) * ROUND, 1e150)
+        for _ in range(24 if moving else 0):
+            logs = np.array([events[i].log_exceedance(factor * sd[:, i]) + np.log(2.0) for i in moving])
+            log = logsumexp(logs)
+            low, high = (low, min(high, factor)) if log <= target else (factor, high)
+            if high - low <= 1e-6 or target - 2e-3 <= log <= target or not np.isfinite(target):
+                break
+            step = float(np.sqrt(max(factor**2 + 2 * (log - target + 1e-3), 0.0))) if log < -0.1 else 0.0
+            factor = step if low < step < high else (low + high) / 2
         return np.asarray(high * sd)
 
     def along(self, rows: Array) -> WindowEvent:
         """The event along ``rows`` (pieces, n)."""
+        key = "along", rows.tobytes()
+        if key not in self.memory:
+            self.memory[key] = self._course(rows)
+        return WindowEvent(course=self.memory[key], owner=self)
+
+    def _course(self, rows: Array) -> Course:
+        """What the event along ``rows`` needs, whatever the share."""
         g, error = self.back
         exact = np.einsum("ki,kij->kj", rows, g)
         slack = np.einsum("ki,kij->kj", np.abs(rows), error) + 1e-14 * np.abs(exact)
         starts = self.bounds[:-1]
         directions = (np.maximum.reduceat(exact, starts) + np.minimum.reduceat(exact, starts)) / 2
         window = np.repeat(_numbers(len(starts)), np.diff(self.bounds))
-        off = np.abs(exact - directions[window]) + slack
-        cost = np.einsum("ki,ki->k", off, self.coordinate_levels[window]) * (1 + 1e-13)
         nodes = _numbers(self.response.pieces)
         ends = [self.response.variance(rows[None], nodes + shift)[1][0] for shift in (0, 1)]
         deviation = np.sqrt(np.maximum(np.maximum(*ends), 0.0))
         early = max(1, len(rows) // 5)
-        profile = np.maximum(deviation, np.where(nodes < early, deviation[early - 1], 0.0))
-        return WindowEvent(windows=self._windows(directions), starts=starts, cost=cost, profile=profile)
+        return Course(
+            windows=self._windows(directions), starts=starts, window=window,
+            off=np.abs(exact - directions[window]) + slack,
+            profile=np.maximum(deviation, np.where(nodes < early, deviation[early - 1], 0.0)),
+        )
 
     def _windows(self, directions: Array) -> Windows:
         """Second moments of one martingale direction per window."""
@@ -262,11 +268,11 @@ class WindowEvents:
         loss = norms * (slack + 2 * len(first[0]) * 2.0**-53 * np.abs(forward).max(axis=(1, 2)))
         loss = loss * _size(self.response, begins) * (1 + 1e-12)
         change = 2 * np.sqrt(np.maximum(begin_high, 0)) * loss + loss**2
-        begin_low = np.maximum(begin_low - change * _ROUND, 0.0)
-        begin_high = np.minimum(begin_high + change * _ROUND, end_high)
-        roots = (np.sqrt(begin_low) + np.sqrt(np.maximum(end_low, 0))) / _ROUND
+        begin_low = np.maximum(begin_low - change * ROUND, 0.0)
+        begin_high = np.minimum(begin_high + change * ROUND, end_high)
+        roots = (np.sqrt(begin_low) + np.sqrt(np.maximum(end_low, 0))) / ROUND
         with np.errstate(divide="ignore", invalid="ignore"):
-            spread = np.sqrt(np.maximum(end_high - begin_low, 0.0)) / roots * _ROUND
+            spread = np.sqrt(np.maximum(end_high - begin_low, 0.0)) / roots * ROUND
         # from one window's direction to the next one's, at their common time
         previous, own = directions[:-1], first[1:]
         p_low, p_high = (v[0] for v in self.response.variance(previous[None], begins[1:]))
@@ -282,55 +288,57 @@ class WindowEvents:
         return Windows(
             end_high=end_high, begin_low=begin_low, begin_high=begin_high,
             spread=np.where(roots > 0, spread, 1.0), previous_low=p_low,
-            turn=np.where(usable, _spread(gap, np.where(usable, scale, 1.0)), 1e6),
+            turn=np.where(usable, spread_of(gap, np.where(usable, scale, 1.0)), 1e6),
         )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Windows:
-    """Bounds of the variances of r . M at the ends of every window, and spreads sqrt((1 - rho)/(1 + rho)).
-
-    ``spread`` belongs to a window's start and end; ``turn`` to the previous window's direction and the window's own,
-    at their common time.
-    """
-
-    end_high: Array
-    begin_low: Array
-    begin_high: Array
-    spread: Array
-    previous_low: Array
-    turn: Array
-
-    def log_exceedance(self, levels: Array) -> float:
-        """Upper bound of log P(some window's r . M exceeds its level)."""
-        if np.any(levels < 0):
-            return 0.0
-        above, below = _ratio_down(levels, self.end_high), _ratio_up(levels, self.begin_low)
-        inside = log_below_above(below, above, spread=self.spread) + np.log(2.0)
-        # at a window's start: the previous window kept its own direction below its level
-        start_above = _ratio_down(levels, self.begin_high)
-        start = log_tail(start_above)
-        joint = log_below_above(_ratio_up(levels[:-1], self.previous_low), start_above[1:], spread=self.turn)
-        start[1:] = np.minimum(start[1:], joint)
-        return min(logsumexp(np.concatenate([inside, start])), 0.0)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class WindowEvent:
-    """The event along one family of rows; ``cost`` is what a level loses to the coordinates, piece by piece.
+    """The event along one family of rows, beside the coordinates' levels that all rows share or with its own."""
 
-    ``profile`` shapes levels: the standard deviation, but in the first fifth at least that at its end, since a rough
-    process at once leaves a band that vanishes with the standard deviation at t = 0.
-    """
+    course: Course
+    owner: WindowEvents
 
-    windows: Windows
-    starts: Nodes
-    cost: Array
-    profile: Array
+    @property
+    def profile(self) -> Array:
+        """Shape of levels (see `Course`)."""
+        return self.course.profile
+
+    @cached_property
+    def cost(self) -> Array:
+        """What a level loses to the coordinates, piece by piece."""
+        return self._cost(self.owner.coordinate_levels)
+
+    def _cost(self, coordinates: Array) -> Array:
+        found = np.einsum("ki,ki->k", self.course.off, coordinates[self.course.window]) * (1 + 1e-13)
+        return np.asarray(found)
+
+    def _log(self, levels: Array) -> float:
+        return self.course.windows.log_exceedance(np.minimum.reduceat(levels, self.course.starts))
 
     def log_exceedance(self, levels: Array) -> float:
         """Upper bound of log P(exists t: rows[k] . Z_t > levels[k] on piece k, no coordinate above its level)."""
-        return self.windows.log_exceedance(np.minimum.reduceat(levels - self.cost, self.starts))
+        return self._log(levels - self.cost)
+
+    def log_at_best(self, levels: Array) -> float:
+        """What `log_exceedance` and `log_alone` cannot fall below: nothing lost to the coordinates (no bound)."""
+        return self._log(levels)
+
+    def log_alone(self, levels: Array, log_share: float) -> float:
+        """Upper bound of log P(exists t: rows[k] . Z_t > levels[k] on piece k), with coordinates' levels of its own.
+
+        Proves: P(sup over a window of |M_i| > q s_i) <= 4 Q(q), s_i the standard deviation of M_i at the window's end
+        (Levy's inequality on both sides); for all coordinates and all windows that ask for anything these add up to
+        about exp(log_share).
+        """
+        sd, _ = self.owner.coordinates
+        asked = np.minimum.reduceat(levels, self.course.starts) < np.inf
+        count = 4.0 * int(np.count_nonzero(asked)) * int(np.count_nonzero(sd.max(axis=0)))
+        if count == 0:
+            return self._log(levels)
+        factor = float(np.sqrt(2 * max(np.log(count) - log_share, 0.0)))
+        lost = float(log_tail(factor)) + float(np.log(count)) + 1e-14
+        return logsumexp(np.array([lost, self._log(levels - self._cost(factor * sd))]))
 
 
 def _longer(forward: Array, slack: float, transition: Array, error: float) -> tuple[Array, float]:

@@ -6,13 +6,13 @@ probability of the whole event. Every event is one-sided; the two-sided one cost
 (`double`). Leading axes are a batch (directions, trial scales).
 
 Discrete time: `exceedance_chain`, `union`. Continuous time: `log_window` (martingale windows),
-`crossing_rate` (smooth directions), `markov_clock` with `clock_crossing` (rough directions). Scales:
+`crossing_rate` (smooth directions), `markov_clock` or `node_clock` with `clock_crossing` (rough directions). Scales:
 `least_scale`, `split_levels`. A scalar linear equation: `linear_radius`.
 """
 
 from __future__ import annotations
 
-from certbound.tubes.gaussian_clock import Clock, clock_crossing, decorrelation_rates, markov_clock
+from certbound.tubes.gaussian_clock import Clock, clock_crossing, decorrelation_rates, markov_clock, node_clock
 from certbound.tubes.gaussian_crossing import log_line_crossing, log_polygon_crossing
 from certbound.tubes.gaussian_linear import linear_exceedance, linear_radius
 from certbound.tubes.gaussian_normal import log_below_above, log_between, log_tail
@@ -32,6 +32,6 @@ from certbound.tubes.gaussian_scale import least_scale, split_levels
 __all__ = [
     "Bounds", "Clock", "clock_crossing", "crossing_rate", "decorrelation_rates", "double", "exceedance_chain",
     "least_scale", "linear_exceedance", "linear_radius", "log_below_above", "log_between", "log_line_crossing",
-    "log_pair", "log_polygon_crossing", "log_tail", "log_window", "markov_clock", "split_levels", "total",
+    "log_pair", "log_polygon_crossing", "log_tail", "log_window", "markov_clock", "node_clock", "split_levels", "total",
     "total_symmetric", "union",
 ]  # fmt: skip

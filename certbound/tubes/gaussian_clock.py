@@ -19,7 +19,7 @@ from certbound.tubes.gaussian_crossing import log_polygon_crossing
 from certbound.tubes.gaussian_normal import EPS, lift, log_tail
 from certbound.tubes.gaussian_pair import Bounds, ends, total
 
-__all__ = ["Clock", "Windows", "clock_crossing", "decorrelation_rates", "group_windows", "markov_clock"]
+__all__ = ["Clock", "Windows", "clock_crossing", "decorrelation_rates", "group_windows", "markov_clock", "node_clock"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -157,6 +157,61 @@ def markov_clock(durations: ArrayLike, rates: ArrayLike, *, limit: float = 0.35)
             block = j
         needed = clock[block + 1 : j + 1] + debt[block:j]
         ahead = float(np.max(needed)) - clock[j] if j > block else 0.0
+        increments[j] = max(increments[j], ahead + 8 * EPS * (1 + abs(clock[j])))
+        clock[j + 1] = clock[j] + increments[j]
+    return Clock(increments=_frozen(increments), starts=np.asarray(starts, dtype=np.intp))
+
+
+def node_clock(durations: ArrayLike, near: ArrayLike, needs: ArrayLike, *, limit: float = 0.35) -> Clock:
+    """The least clock that decorrelations at the nodes allow, by a forward maximum over them.
+
+    Proves: clock(t) - clock(s) >= psi(s, t) for all s < t in one block, given that for s < t in one part k, and for s
+    in part k - 1 and t in part k, d psi/dt <= near[k]; and that for s in part i and t in part j >= i + 2 psi(s, t)
+    is at most the bilinear interpolation of ``needs`` at the four corners (t_i or t_{i+1}, t_j or t_{j+1}). The
+    clock is linear on each part, so clock(t) - clock(s) is such an interpolation itself: it suffices that it is at
+    least ``needs`` at the nodes, and grows by near[k] h_k on part k (the integral of d psi/dt from s on).
+
+    Parameters
+    ----------
+    durations : array_like, shape (K,)
+        Lengths h of the parts, > 0.
+    near : array_like, shape (K,)
+        Finite upper bounds as above.
+    needs : array_like, shape (K + 1, K + 1)
+        Entries a < b are read; +inf allowed beyond the first upper diagonal: no block goes that far.
+    limit : float
+        A new block begins at the part at whose end a need exceeds it.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, a duration is not positive, or a near rate or a need of neighbours is not finite.
+
+    Examples
+    --------
+    >>> needs = [[0, 0.5, 0.9], [0, 0, 0.5], [0, 0, 0]]
+    >>> node_clock([0.5, 0.5], [1.0, 1.0], needs, limit=1.0).increments.round(9).tolist()
+    [0.5, 0.5]
+    """
+    h, rate = (np.atleast_1d(np.asarray(v, dtype=np.float64)) for v in (durations, near))
+    need = np.asarray(needs, dtype=np.float64)
+    count = len(h)
+    if h.ndim != 1 or not np.all((h > 0) & (h < np.inf)):
+        raise ValueError("`durations` must be a row of positive numbers.")
+    if rate.shape != (count,) or need.shape != (count + 1, count + 1):
+        raise ValueError(f"`near` and `needs` must have shapes ({count},) and ({count + 1}, {count + 1}).")
+    if not (np.all(np.isfinite(rate)) and np.all(np.isfinite(np.diagonal(need, 1))) and not np.any(np.isnan(need))):
+        raise ValueError("`near` and the `needs` of neighbours must be finite; take shorter parts.")
+    increments = np.maximum(rate, 0.0) * h * (1 + 2 * EPS)
+    clock = np.zeros(count + 1)
+    starts, block = [0], 0
+    for j in range(count):
+        asked = need[block : j + 1, j + 1]
+        if j > block and not np.all(asked <= limit):
+            starts.append(j)
+            block = j
+            asked = asked[-1:]
+        ahead = float(np.max(clock[block : j + 1] + asked)) - clock[j]
         increments[j] = max(increments[j], ahead + 8 * EPS * (1 + abs(clock[j])))
         clock[j + 1] = clock[j] + increments[j]
     return Clock(increments=_frozen(increments), starts=np.asarray(starts, dtype=np.intp))

@@ -9,6 +9,7 @@ from certbound.tubes.gaussian import (
     decorrelation_rates,
     log_tail,
     markov_clock,
+    node_clock,
 )
 from certbound.tubes.gaussian_clock import group_windows
 
@@ -176,3 +177,30 @@ def test_malformed_clocks_are_refused_by_name():
         decorrelation_rates([1.0], [1.0], np.ones((2, 2)), np.ones((2, 2)))
     with pytest.raises(ValueError, match="positive within each piece"):
         decorrelation_rates([1.0], [1.0], np.zeros((1, 1)), np.ones((1, 1)))
+
+
+def test_a_clock_at_the_nodes_is_the_least_that_serves() -> None:
+    rng = np.random.default_rng(7)
+    count = 30
+    nodes = np.concatenate([[0.0], np.cumsum(rng.uniform(0.01, 0.1, count))])
+    needs = nodes - nodes[:, None] + 0.02 * rng.random((count + 1, count + 1))
+    near = 0.3 * rng.random(count)
+    for limit in (0.2, 0.7, 5.0):
+        clock = node_clock(np.full(count, 0.1), near, needs, limit=limit)
+        time = np.concatenate([[0.0], np.cumsum(clock.increments)])
+        blocks = np.append(clock.starts, count)
+        for start, stop in zip(blocks[:-1], blocks[1:], strict=True):
+            for b in range(start + 1, stop + 1):
+                room = time[b] - time[start:b] - needs[start:b, b]
+                least = min(room.min(), clock.increments[b - 1] - 0.1 * near[b - 1])
+                assert 0 <= least < 1e-13
+            assert np.all(needs[start, start + 2 : stop + 1] <= limit)
+
+
+def test_malformed_needs_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="`durations`"):
+        node_clock([0.0], [1.0], np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="`near` and `needs` must have shapes"):
+        node_clock([1.0], [1.0], np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="must be finite"):
+        node_clock([1.0], [1.0], [[0, np.inf], [0, 0]])
