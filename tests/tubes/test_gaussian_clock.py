@@ -1,5 +1,7 @@
 """Slepian clocks: they dominate, and the probabilities they give are close."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -189,7 +191,7 @@ def test_a_clock_at_the_nodes_is_the_least_that_serves() -> None:
         clock = node_clock(np.full(count, 0.1), near, needs, limit=limit)
         time = np.concatenate([[0.0], np.cumsum(clock.increments)])
         blocks = np.append(clock.starts, count)
-        for start, stop in zip(blocks[:-1], blocks[1:], strict=True):
+        for start, stop in itertools.pairwise(blocks):
             for b in range(start + 1, stop + 1):
                 room = time[b] - time[start:b] - needs[start:b, b]
                 least = min(room.min(), clock.increments[b - 1] - 0.1 * near[b - 1])
