@@ -105,9 +105,22 @@ class StepEvent:
             with np.errstate(over="ignore"):
                 exponent = -0.5 * np.minimum(above, 1e150) ** 2
             return min(logsumexp(np.where(above == np.inf, -np.inf, exponent * (1 - 1e-15))), 0.0)
+        return min(logsumexp(self.log_steps(levels)), 0.0)
+
+    def log_steps(self, levels: Array) -> Array:
+        """Upper bounds of log P(xi_0 > z_0) and log P(xi_{t-1} <= z_{t-1}, xi_t > z_t): (nodes,); levels >= 0.
+
+        Raises
+        ------
+        ValueError
+            If the noise is not Gaussian: then this is no bound of what it says.
+        """
+        if self.correlation is None:
+            raise ValueError("`levels` along sub-Gaussian noise have no joint law; use log_exceedance.")
+        above = ratio_down(levels, self.high)
         single = log_tail(above)
         joint = log_below_above(ratio_up(levels, self.low)[:-1], above[1:], self.correlation)
-        return min(logsumexp(np.concatenate([single[:1], np.minimum(joint, single[1:])])), 0.0)
+        return np.concatenate([single[:1], np.minimum(joint, single[1:])])
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from certbound.reach.events import StepEvent, StepEvents, WindowEvent, WindowEve
 from certbound.reach.inclusion import Supports
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.martingales import SplitEvent, SplitEvents
+from certbound.reach.overlaps import log_any_exceedance
 from certbound.reach.samples import sampled_range
 
 __all__ = ["Events", "LinearRun", "Outcome", "correlated", "level_scale"]
@@ -38,6 +39,7 @@ _TRIES = 12
 _PADS = (0.15, 0.1, 0.06, 0.04)  # how much wider than the sampled range the first guess is, by effort
 _MARGIN = 2.0  # times that width is what a proof is expected to need
 _WINDOW = 0.05
+_OVERLAPPING = -8.0  # from which on constraints that are broken together are counted once
 _LIKELY = -4.0  # log of a probability from which on a product is worth more than a sum
 
 
@@ -261,6 +263,9 @@ class LinearRun:
         total = logsumexp(np.array([shared, *logs]))
         if total > _LIKELY and isinstance(events, StepEvents) and events.gaussian:
             total = min(total, correlated(events, asked, rooms, shared, logs))
+        if total > _OVERLAPPING and isinstance(events, StepEvents) and events.gaussian and asked:
+            joined = log_any_exceedance(events, [r.rows for r in asked], list(rooms.T))
+            total = min(total, logsumexp(np.array([shared, joined])))
         return Outcome(
             log_probability=min(total, 0.0), log_nonlinear=log_nonlinear, bounds=bounds, cell=cell, logs=tuple(logs),
         )

@@ -5,9 +5,10 @@ return upper bounds: functions named ``log_...`` natural logarithms entry by ent
 probability of the whole event. Every event is one-sided; the two-sided one costs at most twice as much
 (`double`). Leading axes are a batch (directions, trial scales).
 
-Discrete time: `exceedance_chain`, `union`. Continuous time: `log_window` (martingale windows),
-`crossing_rate` (smooth directions), `markov_clock` or `node_clock` with `clock_crossing` (rough directions). Scales:
-`least_scale`, `split_levels`. A scalar linear equation: `linear_radius`.
+Discrete time: `exceedance_chain`, `union`, `triple_below` (overlaps). Continuous time: `log_window`
+(martingale windows), `crossing_rate` (smooth directions), `markov_clock` or `node_clock` with
+`clock_crossing` (rough directions). Scales: `least_scale`, `split_levels`. A scalar linear equation:
+`linear_radius`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 from certbound.tubes.gaussian_clock import Clock, clock_crossing, decorrelation_rates, markov_clock, node_clock
 from certbound.tubes.gaussian_crossing import log_line_crossing, log_polygon_crossing
 from certbound.tubes.gaussian_linear import linear_exceedance, linear_radius
-from certbound.tubes.gaussian_normal import log_below_above, log_between, log_tail
+from certbound.tubes.gaussian_normal import log_below_above, log_between, log_tail, log_tail_below
 from certbound.tubes.gaussian_pair import (
     Bounds,
     double,
@@ -28,10 +29,11 @@ from certbound.tubes.gaussian_pair import (
 )
 from certbound.tubes.gaussian_rate import crossing_rate
 from certbound.tubes.gaussian_scale import least_scale, split_levels
+from certbound.tubes.gaussian_triple import triple_below
 
 __all__ = [
     "Bounds", "Clock", "clock_crossing", "crossing_rate", "decorrelation_rates", "double", "exceedance_chain",
     "least_scale", "linear_exceedance", "linear_radius", "log_below_above", "log_between", "log_line_crossing",
-    "log_pair", "log_polygon_crossing", "log_tail", "log_window", "markov_clock", "node_clock", "split_levels", "total",
-    "total_symmetric", "union",
+    "log_pair", "log_polygon_crossing", "log_tail", "log_tail_below", "log_window", "markov_clock", "node_clock",
+    "split_levels", "total", "total_symmetric", "triple_below", "union",
 ]  # fmt: skip

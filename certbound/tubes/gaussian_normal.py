@@ -15,7 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.rigor.rounding import quiet
 
-__all__ = ["gauss_rule", "lift", "log_below_above", "log_between", "log_tail", "mills", "mills_deficit"]
+__all__ = [
+    "gauss_rule", "lift", "log_below_above", "log_between", "log_tail", "log_tail_below", "mills", "mills_deficit",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -141,6 +143,24 @@ def log_tail(x: ArrayLike) -> Array:
     result = np.where(x >= 0, value + error, below)
     result = np.where(x == np.inf, -np.inf, result)
     return np.where(np.isnan(x), 0.0, result)
+
+
+@quiet
+def log_tail_below(x: ArrayLike) -> Array:
+    """Lower bound of log Q(x), as near as `log_tail` is from above.
+
+    Examples
+    --------
+    >>> bool(0 <= log_tail(3.0) - log_tail_below(3.0) < 1e-12)
+    True
+    """
+    x = np.asarray(x, dtype=np.float64)
+    value, error = _log_right_tail(np.atleast_1d(np.minimum(np.abs(x), 1e150)))
+    value, error = value.reshape(x.shape), error.reshape(x.shape)
+    over = np.minimum(np.exp(np.minimum(value + error, -0.5)) * (1 + 16 * EPS), 1.0)
+    below = np.log1p(-over) * (1 + 16 * EPS) - 1e-300
+    result = np.where(x >= 0, value - error, below)
+    return np.where(np.isnan(x) | (x > 1e150), -np.inf, result)
 
 
 @quiet
