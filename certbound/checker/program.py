@@ -74,7 +74,11 @@ class Program:
         for number, slot in self._inputs:
             if slot >= self.variables:
                 values[number] = parameters[slot - self.variables]
-        _execute(self._early, values)
+        for step in self._early:
+            try:
+                _execute([step], values)
+            except Undecided:
+                values[step[0]] = arb.nan()
         self._template = values
 
     def run(self, variables: Sequence[arb]) -> list[arb]:

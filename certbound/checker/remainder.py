@@ -4,12 +4,12 @@ On a piece with middle time t_m, nominal p, slope J(tau), gain E and reference d
 
     beta(tau, s, d) = f(t_m + tau, p + s, d) - p' - J s - E (d - d0).
 
-It is built as one expression over (tau, s, d) with the piece's data as parameters, and differentiated twice. On a box
-around (0, c, d_c) it lies in beta + grad . delta + delta^T H delta / 2, the value and gradient at the centre and the
-Hessian H over the whole box. The boxes of s are taken in coordinates sigma = M s that the certificate names for every
-output (rows of its polytope), in which the Hessian is nearly diagonal; boxes outside the polytope are dropped.
+It is built as one expression over (tau, s, d) with the piece's data as parameters. On a box it is a quadratic
+polynomial up to an error (Taylor models), and boxes are cut until the polynomials stay in the box of beta that the
+certificate states. The boxes of s are taken in coordinates sigma = M s that the certificate names for every output
+(rows of its polytope); what lies outside the polytope is dropped.
 
-A model with kinks (abs, min, max) has no Hessian there: value and generalised slopes over the box bound it instead.
+A model with kinks (abs, min, max) has no such polynomial there: value and generalised slopes over the box bound it.
 """
 
 from __future__ import annotations
@@ -20,17 +20,19 @@ from dataclasses import dataclass
 from flint import arb, arb_mat
 
 from certbound.checker.arithmetic import Undecided
+from certbound.checker.expansion import Expansion
 from certbound.checker.graph import Graph
 from certbound.checker.model import Model
 from certbound.checker.program import Program
+from certbound.checker.quadratic import Cut, Quadratic
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.structure import Structure
-from certbound.problem.tape import JUMPS
 
 __all__ = ["OutputRemainder", "PieceData", "Polytope", "remainders"]
 
 _MOST_BOXES = 4000
-_RISKY = JUMPS | {"kink", "atan2"}
+_MOST_PARTS = 8
+_ENOUGH = 0.1  # of the width of a box of the remainder: an error that may leave room for a proof
 
 Side = tuple[arb, arb]
 
@@ -61,16 +63,6 @@ class _Box:
 
     centre: list[arb]
     radius: list[arb]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Found:
-    """Value at a box's centre, bounds over the box, and how much each coordinate contributes to their distance."""
-
-    value: arb
-    low: arb
-    high: arb
-    smear: list[arb]
 
 
 def remainders(model: Model, structure: Structure, budget: Budget) -> list[OutputRemainder]:
@@ -140,7 +132,7 @@ def _rate(graph: Graph, c: list[int]) -> list[int]:
 
 
 class OutputRemainder:
-    """The remainder of one output: programs for value, gradient and Hessian, and the branch and bound."""
+    """The remainder of one output: its program over Taylor models, and the branch and bound."""
 
     def __init__(
         self, graph: Graph, node: int, value: int, *, count: int, time: bool, states: list[int],
@@ -149,21 +141,15 @@ class OutputRemainder:
         self.count, self.dimension, self.states, self.disturbances = count, dimension, states, disturbances
         self.time = time
         self.slots = [*([0] if time else []), *(1 + j for j in states), *(1 + dimension + j for j in disturbances)]
-        gradient = [graph.derivative(node, slot) for slot in self.slots]
-        pairs = [(a, b) for a in range(len(gradient)) for b in range(a, len(gradient))]
-        second = {}
-        for a, b in pairs:
-            budget.check()
-            second[a, b] = graph.derivative(gradient[a], self.slots[b])
-        self.pairs = [pair for pair, index in second.items() if not graph.is_const(index, 0.0)]
-        hessian = [second[pair] for pair in self.pairs]
-        risky = {index for index in graph.reachable([*gradient, *hessian]) if graph.node(index).op in _RISKY}
-        self.thin = Program(graph, [node, *gradient], [value], variables=count)
-        self.wide = Program(graph, hessian, risky | {value}, variables=count)
+        self.expansion = Expansion(graph, node, value, variables=count)
         self.plain = Program(graph, [], [value], variables=count)
-        self.programs = [self.thin, self.wide, self.plain]
+        self.programs: list[Expansion | Program] = [self.expansion, self.plain]
         self.kinked: tuple[Program, Program] | None = None
-        if any(graph.node(index).op == "kink" for index in graph.reachable(gradient)):
+        if any(graph.node(index).op in ("abs", "min", "max", "kink") for index in graph.reachable([node])):
+            gradient = []
+            for slot in self.slots:
+                budget.check()
+                gradient.append(graph.derivative(node, slot))
             self.kinked = (
                 Program(graph, [node], [value], variables=count),
                 Program(graph, gradient, [value], variables=count, generalised=True),
@@ -187,13 +173,14 @@ class OutputRemainder:
             box = stack.pop()
             if not frame.meets(box):
                 continue
-            found = self._bound(frame, box)
-            if found is not None:
-                if found.low >= low and found.high <= high:
-                    continue
-                if (found.value > high or found.value < low) and frame.holds_centre(box):
-                    return False
-            parts = _halves(box, None if found is None else found.smear)
+            form = self._form(frame, box)
+            stays = None if form is None else form.stays(low, high, frame.cuts_at(box))
+            if stays is False:
+                return False
+            if stays:
+                continue
+            smear = None if form is None else form.smear
+            parts = _parts(box, smear, _ENOUGH * (high - low))
             if parts is None:
                 return False
             stack.extend(parts)
@@ -216,65 +203,46 @@ class OutputRemainder:
             return False
         return True
 
-    def _inputs(self, frame: _Frame, box: _Box) -> tuple[list[arb], list[arb]]:
-        """The centre and the whole box as inputs of the programs."""
+    def _form(self, frame: _Frame, box: _Box) -> Quadratic | None:
+        """The remainder as a polynomial in xi, the box being |xi| <= 1; None where undecided."""
+        inputs: list[tuple[arb, dict[int, arb]]] = [(arb(0), {})] * self.count
+        for j, value in enumerate(self.piece.disturbance):
+            inputs[1 + self.dimension + j] = value, {}
+        centre, rows = frame.unturned(box)
+        for slot, value, row in zip(self.slots, centre, rows):
+            inputs[slot] = value, row
+        try:
+            return self.expansion.run(inputs, len(self.slots))
+        except Undecided:
+            return self._kinked_form(frame, box) if self.kinked is not None else None
+
+    def _kinked_form(self, frame: _Frame, box: _Box) -> Quadratic | None:
+        """The same to first order, with generalised slopes over the box."""
+        assert self.kinked is not None
         thin = [arb(0)] * self.count
         for j, value in enumerate(self.piece.disturbance):
             thin[1 + self.dimension + j] = value
         wide = list(thin)
-        centre, reach = frame.unturned(box)
-        for slot, value, size in zip(self.slots, centre, reach):
+        centre, rows = frame.unturned(box)
+        for slot, value, row in zip(self.slots, centre, rows):
+            size = sum((abs(x) for x in row.values()), arb(0))
             thin[slot], wide[slot] = value, value + arb(0, size)
-        return thin, wide
-
-    def _bound(self, frame: _Frame, box: _Box) -> _Found | None:
-        """Bounds on a box; None where undecided."""
-        thin, wide = self._inputs(frame, box)
-        try:
-            value, *gradient = self.thin.run(thin)
-            second = self.wide.run(wide)
-        except Undecided:
-            return self._kinked_bound(frame, box, thin, wide)
-        size = len(self.slots)
-        hessian = [[arb(0)] * size for _ in range(size)]
-        for (a, b), entry in zip(self.pairs, second):
-            hessian[a][b] = hessian[b][a] = entry
-        gradient = frame.turned(gradient)
-        if not frame.straight:
-            hessian = [frame.turned(row) for row in hessian]
-            hessian = [list(row) for row in zip(*[frame.turned(list(column)) for column in zip(*hessian)])]
-        radius = box.radius
-        low = high = spread = arb(0)
-        smear = []
-        for a in range(size):
-            share = abs(gradient[a])
-            spread += share * radius[a]
-            for b in range(size):
-                if b != a:
-                    cross = abs(hessian[a][b]) * radius[b]
-                    share += cross
-                    if b > a:
-                        spread += cross * radius[a]
-            square, own = radius[a] * radius[a] / 2, hessian[a][a]
-            high += arb.max(own.upper(), arb(0)) * square
-            low += arb.min(own.lower(), arb(0)) * square
-            smear.append(((share + abs(own) * radius[a]) * radius[a]).upper())
-        return _Found(
-            value=value, low=(value - spread + low).lower(), high=(value + spread + high).upper(), smear=smear
-        )
-
-    def _kinked_bound(self, frame: _Frame, box: _Box, thin: list[arb], wide: list[arb]) -> _Found | None:
-        """The same to first order, with generalised slopes over the box."""
-        if self.kinked is None:
-            return None
         try:
             (value,) = self.kinked[0].run(thin)
             slopes = self.kinked[1].run(wide)
         except Undecided:
             return None
-        smear = [(abs(g) * r).upper() for g, r in zip(frame.turned(slopes), box.radius)]
-        spread = sum(smear, arb(0))
-        return _Found(value=value, low=(value - spread).lower(), high=(value + spread).upper(), smear=smear)
+        count = len(slopes)
+        turned = [arb(0)] * count
+        for slope, row in zip(slopes, rows):
+            for a, x in row.items():
+                turned[a] += slope * x
+        zero = [arb(0)] * count
+        smear = [abs(x).upper() for x in turned]
+        return Quadratic(
+            value=value, gradient=zero, hessian=[zero] * count, radius=[arb(1)] * count,
+            error=sum(smear, arb(0)).upper(), smear=smear,
+        )
 
 
 class _Frame:
@@ -335,53 +303,68 @@ class _Frame:
                 return False
         return True
 
-    def holds_centre(self, box: _Box) -> bool:
-        """Whether the box's centre surely lies in the polytope."""
+    def cuts_at(self, box: _Box) -> list[Cut]:
+        """The cuts in the coordinates xi of the box."""
+        result: list[Cut] = []
+        size, start = len(box.centre), self.start
         for form, low, high in self.cuts:
-            value = sum((factor * box.centre[self.start + place] for place, factor in enumerate(form)), arb(0))
-            if not (value >= low and value <= high):
-                return False
-        return True
+            whole = [arb(0)] * size
+            value = arb(0)
+            for i, factor in enumerate(form, start):
+                whole[i] = factor * box.radius[i]
+                value += factor * box.centre[i]
+            result.append((whole, low - value, high - value))
+        return result
 
-    def unturned(self, box: _Box) -> tuple[list[arb], list[arb]]:
-        """Centre and reach of the box in (tau, s, d)."""
+    def unturned(self, box: _Box) -> tuple[list[arb], list[dict[int, arb]]]:
+        """(tau, s, d) over the box: the centre, and the coefficients of xi."""
+        rows = [{} if size.is_zero() else {a: size} for a, size in enumerate(box.radius)]
         if self.straight:
-            return box.centre, box.radius
+            return box.centre, rows
         m, start = len(self.map), self.start
-        centre, reach = list(box.centre), list(box.radius)
+        centre = list(box.centre)
         for i, row in enumerate(self.map):
             centre[start + i] = sum((row[a] * box.centre[start + a] for a in range(m)), arb(0))
-            reach[start + i] = sum((abs(row[a]) * box.radius[start + a] for a in range(m)), arb(0))
-        return centre, reach
-
-    def turned(self, gradient: list[arb]) -> list[arb]:
-        """A form over (tau, s, d) as one over (tau, sigma, d)."""
-        if self.straight:
-            return gradient
-        m, start = len(self.map), self.start
-        result = list(gradient)
-        for a in range(m):
-            result[start + a] = sum((gradient[start + i] * self.map[i][a] for i in range(m)), arb(0))
-        return result
+            scaled = {start + a: row[a] * box.radius[start + a] for a in range(m)}
+            rows[start + i] = {a: x for a, x in scaled.items() if not x.is_zero()}
+        return centre, rows
 
 
 def _lives_in(row: Sequence[arb], states: list[int]) -> bool:
     return all(value.is_zero() or j in states for j, value in enumerate(row))
 
 
-def _halves(box: _Box, smear: list[arb] | None) -> list[_Box] | None:
-    """The box cut in two where that helps most; None for a point."""
-    sizes = box.radius if smear is None else smear
-    best = -1
-    for place, size in enumerate(sizes):
-        if box.radius[place] > 0 and (best < 0 or size > sizes[best]):
-            best = place
-    if best < 0:
-        return None
-    half = box.radius[best] / 2
-    parts = []
+def _parts(box: _Box, smear: list[arb] | None, enough: arb) -> list[_Box] | None:
+    """The box cut where that helps most, into two or, should the error be large, more; None for a point."""
+    parts = _halves(box, None if smear is None else _largest(smear))
+    if parts is None or smear is None:
+        return parts
+    sizes = [float(x) for x in smear]
+    goal = float(enough)
+    while len(parts) < _MOST_PARTS:
+        best = _largest(sizes)
+        sizes = [x / 4 if a == best else x / 2 for a, x in enumerate(sizes)]
+        if not sum(sizes) > goal:
+            break
+        finer = [_halves(part, _largest(sizes)) for part in parts]
+        parts = [half for pair in finer for half in pair or []]
+    return parts
+
+
+def _largest(sizes: Sequence[arb] | Sequence[float]) -> int:
+    return max(range(len(sizes)), key=lambda a: float(sizes[a]))
+
+
+def _halves(box: _Box, place: int | None) -> list[_Box] | None:
+    """The box cut in two along a coordinate (the widest one, if none is named or it has no width); None for a point."""
+    if place is None or not box.radius[place] > 0:
+        place = _largest(box.radius)
+        if not box.radius[place] > 0:
+            return None
+    half = box.radius[place] / 2
+    found = []
     for sign in (-1, 1):
         centre, radius = list(box.centre), list(box.radius)
-        centre[best], radius[best] = centre[best] + sign * half, half
-        parts.append(_Box(centre=centre, radius=radius))
-    return parts
+        centre[place], radius[place] = centre[place] + sign * half, half
+        found.append(_Box(centre=centre, radius=radius))
+    return found
