@@ -4,8 +4,9 @@ About the centre c of a box and the middle t_m of a piece,
 
     beta = beta(t_m, c) + (J(t_m, c) - J_m) . d + d . H d / 2 + (motion over the piece),     |d| <= e,
 
-with the interval Hessian H over the box and the piece. Values at points are enclosed by intervals; everything that is
-a radius is summed in floats and widened by a bound of the rounding errors.
+with the interval Hessian H over the box and the piece. In continuous time the motion is that of beta's difference from
+what it is at s = 0, which `certbound.reach.still` encloses apart. Values at points are enclosed by intervals;
+everything that is a radius is summed in floats and widened by a bound of the rounding errors.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from certbound.constants.enclosures import enclose
 from certbound.reach.polytope import linear_range
+from certbound.reach.still import Still
 from certbound.rigor.intervals import Interval
 
 if TYPE_CHECKING:
@@ -83,10 +85,7 @@ class Expansion:
             i, a = self.entries[entry]
             b = -1 if state < 0 else position[state]
             self.second.append((column, entry, b, number.get((i, b), -1) if model.folded(entry, state) else -1))
-        if frame.half:
-            constant = model.constant_slope
-            self.rate = _product(constant, frame.middle_velocity) - frame.middle_acceleration
-            self.curve = (_product(constant, frame.acceleration) - frame.jerk).mag
+        self.still = Still(model, frame) if frame.half else None
 
     def boxes(self, items: Indices, centre: Array, radius: Array) -> Parts:
         """The expansions on boxes centre + [-radius, radius] (Q, active) of the pieces ``items``.
@@ -127,7 +126,8 @@ class Expansion:
             second = enclose(model.second, wide, undefined="infinite").broadcast_to((count, columns))
             bad = bad | _infinite(second)
         with np.errstate(invalid="ignore", over="ignore"):
-            lower, upper, middle = self._values(items, centre, value)
+            base, rest = self._base(items, order)
+            lower, upper, middle = self._values(items, centre, value, base, rest)
             gradient, blur = self._gradients(items, first)
             spend = np.zeros((count, n, len(self.active)))
             if order == 1:
@@ -135,7 +135,7 @@ class Expansion:
             else:
                 self._second_order(items, centre, radius, reach, first, second, lower, upper, blur, spend)
                 if f.half and model.timed:
-                    self._explicit_time(items, slots, thin, lower, upper)
+                    self._explicit_time(items, slots, wide, lower, upper)
         return Parts(lower=lower, upper=upper, gradient=gradient, blur=blur * _WIDE + _LEAST, middle=middle,
                      spend=spend, bad=bad)
 
@@ -166,15 +166,26 @@ class Expansion:
             upper[:, i] += motion + 8 * _UNIT * (np.abs(upper[:, i]) + motion)
         blur += half * np.abs(drift[:, self.chosen])
 
-    def _values(self, items: Indices, centre: Array, value: Interval) -> tuple[Array, Array, Array]:
-        """beta(t_m, c) = f - p' - J_m c: bounds and floats."""
+    def _base(self, items: Indices, order: int) -> tuple[Interval, Interval | None]:
+        """What beta is counted from at the middle of a piece, and beta itself there over the piece."""
+        if self.still is None or order == 1:
+            return self.frame.middle_velocity[items], None
+        return self.still.value[items], self.still.defect[items]
+
+    def _values(
+        self, items: Indices, centre: Array, value: Interval, base: Interval, rest: Interval | None
+    ) -> tuple[Array, Array, Array]:
+        """beta(t_m, c) = f - base - J_m c, and the ``rest`` that it has at s = 0: bounds and floats."""
         product = self.slope[items] * centre[:, self.columns]
         moved, size = product @ self.gather, np.abs(product) @ self.gather
         blur = (self.slope_rad[items] * np.abs(centre[:, self.columns])) @ self.gather
-        speed = self.frame.middle_velocity[items]
-        slack = self.relative * (size + value.mag + speed.mag) + blur * _WIDE + _LEAST
-        middle = (value.lo + value.hi - speed.lo - speed.hi) / 2 - moved
-        return value.lo - speed.hi - moved - slack, value.hi - speed.lo - moved + slack, middle
+        slack = self.relative * (size + value.mag + base.mag) + blur * _WIDE + _LEAST
+        middle = (value.lo + value.hi - base.lo - base.hi) / 2 - moved
+        lower, upper = value.lo - base.hi - moved - slack, value.hi - base.lo - moved + slack
+        if rest is None:
+            return lower, upper, middle
+        total = Interval(lower, upper) + rest
+        return total.lo, total.hi, middle
 
     def _gradients(self, items: Indices, first: Interval | None) -> tuple[Array, Array]:
         """J(t_m, c) - J_m entry by entry: floats and radii."""
@@ -200,6 +211,8 @@ class Expansion:
             pace = np.abs(velocity) + shake
             turn, blurred, swell = (np.zeros(blur.shape) for _ in range(3))  # dJ/dt: floats, radii; |J - J(c)|
             bend = np.zeros((count, n))
+            assert self.still is not None
+            beside = self.still.second[items]
         for column, entry, b, other in self.second:
             assert second is not None
             lo, hi = second.lo[:, column], second.hi[:, column]
@@ -219,20 +232,22 @@ class Expansion:
             if not half:
                 continue
             centre_h, radius_h = (lo + hi) / 2, (hi - lo) / 2 + 4 * _UNIT * size
+            change = np.maximum(hi - beside.lo[:, column], beside.hi[:, column] - lo)
+            change = change + 4 * _UNIT * (size + np.maximum(-beside.lo[:, column], beside.hi[:, column]))
             pairs = [(entry, b)] if other < 0 else [(entry, b), (other, a)]
             for target, along in pairs:
                 if along < 0:
                     turn[:, target] += centre_h
                     blurred[:, target] += radius_h
                     swell[:, target] += half * size
-                    bend[:, i] += 2 * size * pace[:, self.active[a]]
+                    bend[:, i] += 2 * change * pace[:, self.active[a]]
                     continue
                 state = self.active[along]
                 turn[:, target] += centre_h * velocity[:, state]
                 blurred[:, target] += radius_h * pace[:, state] + size * (shake[:, state] + 16 * (
                     len(self.active) + 4) * _UNIT * pace[:, state])
                 swell[:, target] += size * reach[:, state]
-                bend[:, i] += size * pace[:, self.active[self.of_state[target]]] * pace[:, state]
+                bend[:, i] += change * pace[:, self.active[self.of_state[target]]] * pace[:, state]
         if half:
             drift = self.drift[items]
             if self.entries:
@@ -250,16 +265,22 @@ class Expansion:
     def _motion(
         self, items: Indices, centre: Array, drift: Array, first: Interval | None, swell: Array, bend: Array
     ) -> Array:
-        """half |d beta/dt at (t_m, c)| + half^2/2 |d^2 beta/dt^2 at c|, without explicit time: (Q, n)."""
-        f, half = self.frame, self.frame.half
-        rate = self.rate[items]
+        """half |d gamma/dt at (t_m, c)| + half^2/2 |d^2 gamma/dt^2 at c|, without explicit time: (Q, n).
+
+        gamma is beta less what it is at s = 0.
+        """
+        f, half, still = self.frame, self.frame.half, self.still
+        assert still is not None
+        rate = still.rate[items]
         turned = drift * centre[:, self.columns]
-        value, error = rate.mid - turned @ self.gather, rate.rad
+        value, error = -rate.mid - turned @ self.gather, rate.rad
         size = np.abs(rate.mid) + np.abs(turned) @ self.gather
-        curve = self.curve[items] + bend
+        curve = still.curve[items] + bend
         if first is not None:
             speed, acceleration = f.middle_velocity[items], f.acceleration[items].mag
             middle, radius = first.mid, first.rad
+            beside = still.first_over[items]
+            change = np.maximum(first.hi - beside.lo, beside.hi - first.lo) + 4 * _UNIT * (first.mag + beside.mag)
             for entry, (i, a) in enumerate(self.entries):
                 j = self.active[a]
                 v, r = speed.lo[:, j] / 2 + speed.hi[:, j] / 2, (speed.hi[:, j] - speed.lo[:, j]) / 2
@@ -267,21 +288,20 @@ class Expansion:
                 size[:, i] += np.abs(middle[:, entry] * v)
                 error[:, i] += radius[:, entry] * (np.abs(v) + r) + np.abs(middle[:, entry]) * (
                     r + 4 * _UNIT * np.abs(v))
-                curve[:, i] += (first.mag[:, entry] + swell[:, entry]) * acceleration[:, j]
+                curve[:, i] += (change[:, entry] + swell[:, entry]) * acceleration[:, j]
         return half * (np.abs(value) + error + self.relative * size) + half * half / 2 * curve
 
     def _explicit_time(
-        self, items: Indices, slots: list[Interval], thin: Interval, lower: Array, upper: Array
+        self, items: Indices, slots: list[Interval], wide: list[Interval], lower: Array, upper: Array
     ) -> None:
-        """Add the derivatives by explicit time."""
-        f, model, half = self.frame, self.model, self.frame.half
-        spread = f.spread[items] * (1 + 1e-15)
-        wide = model.slots(f.span[items], thin + Interval(-spread, spread), f.inputs[items], f.disturbance_middle)
+        """Add the derivatives by explicit time, less what they are at s = 0."""
+        model, half, still = self.model, self.frame.half, self.still
+        assert still is not None
         shape = (len(items), len(model.timed))
-        once = enclose(model.time, slots, undefined="infinite").broadcast_to(shape).mag
-        twice = enclose(model.time2, wide, undefined="infinite").reshape(shape).mag
+        once = enclose(model.time, slots, undefined="infinite").broadcast_to(shape) - still.once[items]
+        twice = enclose(model.time2, wide, undefined="infinite").reshape(shape) - still.twice[items]
         for column, i in enumerate(model.timed):
-            motion = (half * once[:, column] + half * half / 2 * twice[:, column]) * _WIDE
+            motion = (half * once.mag[:, column] + half * half / 2 * twice.mag[:, column]) * _WIDE
             upper[:, i] = (upper[:, i] + motion) + 4 * _UNIT * (np.abs(upper[:, i]) + motion)
             lower[:, i] = (lower[:, i] - motion) - 4 * _UNIT * (np.abs(lower[:, i]) + motion)
 

@@ -23,10 +23,11 @@ from certbound.problem.tape import Tape
 from certbound.reach.clocks import ClockEvents
 from certbound.reach.directions import Requirement
 from certbound.reach.events import WindowEvents
-from certbound.reach.linear import LinearRun, Outcome, level_scale
+from certbound.reach.linear import LinearRun, Outcome, level_along
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.martingales import Martingales, SplitEvents, Windowed
 from certbound.reach.response import LinearResponse, continuous_response
+from certbound.reach.rows import WINDOW
 from certbound.rigor.intervals import Interval
 
 __all__ = ["ASSUMPTION", "DiffusionRun", "depends_on_state"]
@@ -34,7 +35,6 @@ __all__ = ["ASSUMPTION", "DiffusionRun", "depends_on_state"]
 Array = NDArray[np.float64]
 
 ASSUMPTION = "the initial state and the disturbance do not anticipate the noise (it depends on the state)"
-_WINDOW = 0.05
 _ROUNDS = 12
 _SETTLE = 6
 _GROWTH = 0.03
@@ -123,7 +123,7 @@ class DiffusionRun(LinearRun):
         if reference.gaussian:
             share = shared_log + _HALF
             if (cell, share) not in reference.events:
-                windows = WindowEvents(reference.response, cell, max(1, round(_WINDOW / engine.step)), share)
+                windows = WindowEvents(reference.response, cell, max(1, round(WINDOW / engine.step)), share)
                 found = ClockEvents(windows, reference.value[cell], reference.memory.setdefault(cell, {}))
                 reference.events[cell, share] = found
             gaussian = reference.events[cell, share]
@@ -156,7 +156,7 @@ class DiffusionRun(LinearRun):
             event = None if events.gaussian is None else events.gaussian.along(self.rows[cell, :, d])
             found[key] = np.zeros(self.rows.shape[1])
             if event is not None and event.profile.max() > 0:
-                found[key] = level_scale(event, event.profile, share) * event.profile
+                found[key] = level_along(event, share)
         return found[key]
 
     def tightest(self, outcome: Outcome) -> tuple[Requirement | None, int, float]:

@@ -18,7 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.reach.response import LinearResponse
-from certbound.reach.windows import ROUND, Course, Windows, logsumexp, ratio_down, ratio_up, spread_of
+from certbound.reach.windows import (
+    ROUND,
+    Course,
+    Windows,
+    inverse_of,
+    logsumexp,
+    longer,
+    ratio_down,
+    ratio_up,
+    spread_of,
+)  # fmt: skip
 from certbound.tubes.gaussian_normal import log_below_above, log_tail
 
 __all__ = ["StepEvents", "WindowEvents", "logsumexp"]
@@ -174,19 +184,41 @@ class WindowEvents:
         for start, end in zip(self.bounds[:-1], self.bounds[1:], strict=True):
             forward, slack = np.eye(n), 0.0
             for k in range(end - 1, start - 1, -1):
-                inverse = np.linalg.inv(forward)
-                size = float(np.abs(inverse).sum(1).max())
-                norm = float(np.abs(forward).sum(1).max())
-                residual = float(np.abs(np.eye(n) - inverse @ forward).sum(1).max())
-                residual += size * (n * slack + (n + 2) * 4e-16 * norm)
-                if residual >= 0.5:
-                    raise ValueError("`length` of a window is too large for this system; take shorter windows.")
-                offset = 2 * residual * size
+                inverse, offset = inverse_of(forward, slack)
                 deviation = self.response.deviation[0, k]
                 g[k] = inverse
                 error[k] = (deviation @ (np.abs(inverse) + offset) + offset) * (1 + 1e-13)
-                forward, slack = _longer(forward, slack, f[k], float(phi[k]))
+                forward, slack = longer(forward, slack, f[k], float(phi[k]))
         return g, error
+
+    @property
+    def chords(self) -> tuple[Array, Array, Array]:
+        """G at the end and at the start of every piece, for the row b_t = w G_t of w at time t, and a bound E.
+
+        Proves: at every t of the piece b_t lies between w G at its start and at its end, up to |w| E, entry by entry.
+        """
+        if "chords" not in self.memory:
+            self.memory["chords"] = self._chords()
+        found: tuple[Array, Array, Array] = self.memory["chords"]
+        return found
+
+    def _chords(self) -> tuple[Array, Array, Array]:
+        """See `chords`. G_t = Phi(t_e, t)^{-1} obeys G'' = (K + Jhat^2) G: it leaves its chord by h^2/8 sup |G''|."""
+        response, h = self.response, self.response.step * ROUND
+        n, f, phi = response.slope.shape[-1], response.transition[0], response.transition_error[0]
+        drift = np.abs(response.drift[0])
+        size = np.abs(response.slope[0]) + response.slope_error + h * drift
+        bend = h * h / 8 * ((drift + size @ size) @ (np.eye(n) + response.deviation[0])) * (1 + 1e-12)
+        last, first, error = (np.zeros((response.pieces, n, n)) for _ in range(3))
+        for start, end in zip(self.bounds[:-1], self.bounds[1:], strict=True):
+            forward, slack = np.eye(n), 0.0
+            inverse, offset = inverse_of(forward, slack)
+            for k in range(end - 1, start - 1, -1):
+                last[k], error[k] = inverse, bend[k] @ (np.abs(inverse) + offset) + offset
+                forward, slack = longer(forward, slack, f[k], float(phi[k]))
+                inverse, offset = inverse_of(forward, slack)
+                first[k], error[k] = inverse, (error[k] + offset) * (1 + 1e-13)
+        return last, first, error
 
     @property
     def starts(self) -> tuple[Array, Array]:
@@ -204,7 +236,7 @@ class WindowEvents:
         for start, end in zip(self.bounds[:-1], self.bounds[1:], strict=True):
             forward, slack = np.eye(n), 0.0
             for k in range(end - 1, start - 1, -1):
-                forward, slack = _longer(forward, slack, f[k], float(phi[k]))
+                forward, slack = longer(forward, slack, f[k], float(phi[k]))
             result.append(forward)
             errors.append(slack)
         return np.array(result), np.array(errors)
@@ -253,19 +285,21 @@ class WindowEvents:
 
     def _course(self, rows: Array) -> Course:
         """What the event along ``rows`` needs, whatever the share."""
-        g, error = self.back
-        exact = np.einsum("ki,kij->kj", rows, g)
-        slack = np.einsum("ki,kij->kj", np.abs(rows), error) + 1e-14 * np.abs(exact)
+        last, first, error = self.chords
+        ends = [np.einsum("ki,kij->kj", rows, g) for g in (first, last)]
+        low, high = np.minimum(*ends), np.maximum(*ends)
+        slack = np.einsum("ki,kij->kj", np.abs(rows), error)
+        slack += 1e-14 * np.einsum("ki,kij->kj", np.abs(rows), np.maximum(np.abs(first), np.abs(last)))
         starts = self.bounds[:-1]
-        directions = (np.maximum.reduceat(exact, starts) + np.minimum.reduceat(exact, starts)) / 2
+        directions = (np.maximum.reduceat(high, starts) + np.minimum.reduceat(low, starts)) / 2
         window = np.repeat(_numbers(len(starts)), np.diff(self.bounds))
         nodes = _numbers(self.response.pieces)
-        ends = [self.response.variance(rows[None], nodes + shift)[1][0] for shift in (0, 1)]
-        deviation = np.sqrt(np.maximum(np.maximum(*ends), 0.0))
+        sizes = [self.response.variance(rows[None], nodes + shift)[1][0] for shift in (0, 1)]
+        deviation = np.sqrt(np.maximum(np.maximum(*sizes), 0.0))
         early = max(1, len(rows) // 5)
         return Course(
             windows=self._windows(directions), starts=starts, window=window,
-            off=np.abs(exact - directions[window]) + slack,
+            off=np.maximum(high - directions[window], directions[window] - low) + slack,
             profile=np.maximum(deviation, np.where(nodes < early, deviation[early - 1], 0.0)),
         )
 
@@ -352,15 +386,6 @@ class WindowEvent:
         factor = float(np.sqrt(2 * max(np.log(count) - log_share, 0.0)))
         lost = float(log_tail(factor)) + float(np.log(count)) + 1e-14
         return logsumexp(np.array([lost, self._log(levels - self._cost(factor * sd))]))
-
-
-def _longer(forward: Array, slack: float, transition: Array, error: float) -> tuple[Array, float]:
-    """The product with one more transition matrix, and its entrywise error bound."""
-    n = len(forward)
-    norm, size = float(np.abs(forward).sum(1).max()), float(np.abs(transition).max())
-    column = float(np.abs(transition).sum(0).max())
-    slack = slack * (column + n * error) + norm * error + (n + 2) * 4e-16 * norm * size
-    return forward @ transition, slack * (1 + 1e-13)
 
 
 def _one(response: LinearResponse, cell: int) -> LinearResponse:

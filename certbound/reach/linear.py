@@ -23,9 +23,10 @@ from certbound.reach.inclusion import Supports
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.martingales import SplitEvent, SplitEvents
 from certbound.reach.overlaps import log_any_exceedance
+from certbound.reach.rows import WINDOW
 from certbound.reach.samples import sampled_range
 
-__all__ = ["Events", "LinearRun", "Outcome", "correlated", "level_scale"]
+__all__ = ["Events", "LinearRun", "Outcome", "correlated", "level_along", "level_scale"]
 
 Array = NDArray[np.float64]
 Event = StepEvent | WindowEvent | SteadyEvent | SplitEvent
@@ -38,7 +39,6 @@ _HUGE = 1e6
 _TRIES = 12
 _PADS = (0.15, 0.1, 0.06, 0.04)  # how much wider than the sampled range the first guess is, by effort
 _MARGIN = 2.0  # times that width is what a proof is expected to need
-_WINDOW = 0.05
 _OVERLAPPING = -8.0  # from which on constraints that are broken together are counted once
 _LIKELY = -4.0  # log of a probability from which on a product is worth more than a sum
 
@@ -196,7 +196,7 @@ class LinearRun:
         """Scalar events of one cell; ``shared_log`` is the log probability that they may share."""
         engine = self.engine
         if isinstance(engine.system, ContinuousSystem):
-            windows = WindowEvents(engine.response, cell, max(1, round(_WINDOW / engine.step)), shared_log)
+            windows = WindowEvents(engine.response, cell, max(1, round(WINDOW / engine.step)), shared_log)
             diffusion = engine.diffusion if engine.diffusion.ndim == 2 else engine.diffusion[cell]
             return ClockEvents(windows, diffusion, self.memory.setdefault(cell, {}))
         if cell not in self.steps:
@@ -219,7 +219,7 @@ class LinearRun:
             for d in range(count):
                 event = events.along(self.rows[cell, :, d])
                 if event.profile.max() > 0:
-                    result[cell, :, d] = level_scale(event, event.profile, share) * event.profile
+                    result[cell, :, d] = level_along(event, share)
         self.kept[log_nonlinear] = result, found
         return result, found
 
@@ -259,8 +259,12 @@ class LinearRun:
         rooms = self.rooms(cell, bounds)
         shared = log_nonlinear if len(self.engine.model.active) else events.shared_log
         asked = self.requirements[cell]
-        logs = [events.along(r.rows).log_exceedance(rooms[:, i]) for i, r in enumerate(asked)]
+        along = [events.along(r.rows) for r in asked]
+        logs = [event.log_exceedance(rooms[:, i]) for i, event in enumerate(along)]
         total = logsumexp(np.array([shared, *logs]))
+        steady = [event for event in along if isinstance(event, SteadyEvent)]
+        if asked and not len(self.engine.model.active) and len(steady) == len(along):
+            total = min(total, logsumexp(np.array([e.log_unshared(rooms[:, i]) for i, e in enumerate(steady)])))
         if total > _LIKELY and isinstance(events, StepEvents) and events.gaussian:
             total = min(total, correlated(events, asked, rooms, shared, logs))
         if total > _OVERLAPPING and isinstance(events, StepEvents) and events.gaussian and asked:
@@ -284,8 +288,7 @@ class LinearRun:
         left = np.empty_like(rooms)
         for index, requirement in enumerate(asked):
             event = events.along(requirement.rows)
-            factor = level_scale(event, event.profile, target) if event.profile.max() > 0 else 0.0
-            left[:, index] = rooms[:, index] - np.where(event.profile > 0, factor * event.profile, 0.0)
+            left[:, index] = rooms[:, index] - (level_along(event, target) if event.profile.max() > 0 else 0.0)
         piece, tightest = divmod(int(np.argmin(left)), len(asked))
         return asked[tightest], piece, float(left[piece, tightest])
 
@@ -326,15 +329,29 @@ def correlated(events: StepEvents, asked: list[Requirement], rooms: Array, share
     return logsumexp(np.array([np.log(-np.expm1(stay)) + 1e-14, *rest]))
 
 
-def level_scale(event: Event, shape: Array, target: float) -> float:
-    """Factor q, nearly the least, with P(exists t: row . Z > q shape) <= exp(target); inf if none is found.
+def level_along(event: Event, target: float) -> Array:
+    """Levels z, piece by piece, with P(exists t: row . Z > z) <= exp(target); inf if none are found.
+
+    They follow the standard deviation. Where windows pay for a turning row, what it costs there is added there, lest
+    the piece with the fastest turn raise the levels of all.
+    """
+    if not isinstance(event, WindowEvent):
+        return np.asarray(np.where(event.profile > 0, level_scale(event, event.profile, target), 0.0) * event.profile)
+    deviation = np.sqrt(np.maximum(event.course.windows.end_high, 0.0))[event.course.window]
+    shape = np.maximum(event.profile, deviation)
+    factor = level_scale(event, shape, target, event.cost)
+    return factor * shape + event.cost * (1 + 1e-15) if np.isfinite(factor) else np.full(len(shape), np.inf)
+
+
+def level_scale(event: Event, shape: Array, target: float, offset: Array | float = 0.0) -> float:
+    """Factor q, nearly the least, with P(exists t: row . Z > q shape + offset) <= exp(target); inf if none is found.
 
     log P falls by about q dq, which gives the next q; the last one tried that is proved counts.
     """
     q = float(np.sqrt(2 * max(-target, 0.0) + 2.0))
     best, low = np.inf, 0.0
     for _ in range(_TRIES):
-        log = event.log_exceedance(q * shape)
+        log = event.log_exceedance(q * shape + offset)
         if log <= target:
             best = q
             if log > target - 0.02:

@@ -20,6 +20,7 @@ from certbound.reach.frame import Frame
 from certbound.reach.inclusion import Gathering
 from certbound.reach.remainder import Remainder
 from certbound.reach.response import LinearResponse, continuous_response, discrete_response
+from certbound.reach.rows import inner_rows
 from certbound.rigor.intervals import Interval
 
 __all__ = ["Linearisation"]
@@ -349,56 +350,7 @@ class Linearisation:
 
     def directions(self) -> tuple[Array, Array]:
         """Rows along which the remainder needs bounds: (B, N, D, n), and the extra ones over active coordinates."""
-        active, cells = self.model.active, len(self.centres)
-        unit = np.zeros((len(active), self.n))
-        unit[np.arange(len(active)), active] = 1.0
-        rows = np.broadcast_to(unit, (cells, self.pieces, *unit.shape))
-        extra = self._curved_directions()
-        full = np.zeros((cells, self.pieces, extra.shape[2], self.n))
-        full[..., active] = extra
-        return np.concatenate([rows, full], axis=2), extra
-
-    def _curved_directions(self) -> Array:
-        """Extreme eigen-directions of the Hessians in the metric of the deviation's spread (any rows are valid)."""
-        active, cells = self.model.active, len(self.centres)
-        count = len(active)
-        nothing = np.zeros((cells, self.pieces, 0, count))
-        if not 2 <= count <= 6 or len(self.model.blocks) != 1 or len(self.model.blocks[0]) != 1:
-            return nothing
-        hessians = self.model.reference_hessians(self.frame).reshape(cells, self.pieces, -1, count, count)
-        if not hessians.shape[2]:
-            return nothing
-        node = slice(1, None) if self.continuous else slice(0, -1)
-        spread = 16 * self.response.covariance[:, node] + self._spread()[:, node]
-        spread = spread[..., active, :][..., active]
-        trace = np.trace(spread, axis1=-2, axis2=-1)[..., None, None]
-        spread = spread + (1e-9 * trace + 1e-30) * np.eye(count)
-        root = np.linalg.cholesky(spread)
-        inverse = np.linalg.inv(root)
-        _, vectors = np.linalg.eigh(np.swapaxes(root, -1, -2)[:, :, None] @ hessians @ root[:, :, None])
-        chosen = np.swapaxes(vectors, -1, -2)[..., [0, -1], :] @ inverse[:, :, None]
-        rows = chosen.reshape(cells, self.pieces, -1, count)
-        # what the remainder does not depend on must not help to cull its boxes
-        rows[..., np.setdiff1d(np.arange(count), self.model.blocks[0][0])] = 0.0
-        # the sign of an eigenvector is free: keep it from flipping between neighbours
-        flips = np.einsum("bkda,bkac,bkdc->bkd", rows[:, 1:], spread[:, 1:], rows[:, :-1])
-        sign = np.cumprod(np.where(flips < 0, -1.0, 1.0), axis=1)
-        rows[:, 1:] *= sign[..., None]
-        return rows
-
-    def _spread(self) -> Array:
-        """Rough second moment of y at the nodes (floats; it only shapes directions)."""
-        cells, n = self.centres.shape
-        gram = np.zeros((cells, self.pieces + 1, n, n))
-        own = 2 * self.radii[:, :, None] ** 2 * np.eye(n)
-        drift = np.zeros((cells, n, len(self.d_radius)))
-        gram[:, 0] = own
-        for k in range(self.pieces):
-            f = self.response.transition[:, k]
-            own = f @ own @ np.swapaxes(f, -1, -2)
-            drift = f @ drift + np.swapaxes(self.gathering.generators[:, k], -1, -2)
-            gram[:, k + 1] = own + drift @ np.swapaxes(drift, -1, -2)
-        return gram
+        return inner_rows(self)
 
 
 def _square(a: Array) -> Array:

@@ -81,6 +81,7 @@ class Remainder:
     time: Tape = field(init=False)
     time2: Tape = field(init=False)
     gain: Tape | None = field(init=False)
+    recent: list[tuple[Frame, Expansion]] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         tape = self.problem.closed_loop
@@ -259,7 +260,7 @@ class Remainder:
             Infinite where the dynamics is not defined on the whole polytope.
         """
         m, count = len(frame), len(self.active)
-        expansion = Expansion(self, frame)
+        expansion = self._expansion(frame)
         extra = self._disturbance(frame, low[:, :count], high[:, :count]) if self.gain is not None else None
         if target is not None and extra is not None:
             target = target[0] - extra.lo, target[1] - extra.hi
@@ -280,9 +281,15 @@ class Remainder:
     def defect(self, frame: Frame) -> Array:
         """What no cutting of boxes takes off a bound of beta, on either side: its motion over the piece, (M, n)."""
         origin = np.zeros((len(frame), len(self.active)))
-        expansion = Expansion(self, frame)
+        expansion = self._expansion(frame)
         lower, upper = expansion.plain_range(expansion.boxes(np.arange(len(frame)), origin, origin), origin)
         return np.nan_to_num((upper - lower) / 2, nan=0.0, posinf=0.0)
+
+    def _expansion(self, frame: Frame) -> Expansion:
+        """The expansions over ``frame``; those of the last frame are kept."""
+        if not self.recent or self.recent[0][0] is not frame:
+            self.recent[:] = [(frame, Expansion(self, frame))]
+        return self.recent[0][1]
 
     def _disturbance(self, frame: Frame, low: Array, high: Array) -> Interval:
         """(D_d f - E)(d - d0) over the whole polytope's box."""

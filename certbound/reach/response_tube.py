@@ -17,7 +17,7 @@ from certbound.reach.directions import Requirement
 from certbound.reach.events import logsumexp
 from certbound.reach.fit import fitted
 from certbound.reach.inclusion import Supports
-from certbound.reach.linear import LinearRun, Outcome, level_scale
+from certbound.reach.linear import LinearRun, Outcome, level_along, level_scale
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.tube import ReachTube
 from certbound.rigor.intervals import Interval
@@ -132,9 +132,7 @@ class LinearAnswer:
         _, events = run.levels(log_nonlinear)
         for cell in range(len(engine.centres)):
             event = events[cell].along(rows)
-            level = np.zeros(count)
-            if event.profile.max() > 0:
-                level = np.where(event.profile > 0, level_scale(event, event.profile, share) * event.profile, 0.0)
+            level = level_along(event, share) if event.profile.max() > 0 else np.zeros(count)
             support = _coordinates(run, cell, rows)
             found = level + _apart(support, cell, bounds, silent)[:, 0]
             result = np.maximum(result, found * (1 + 1e-15))

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from certbound.tubes.gaussian_normal import log_below_above, log_tail
 
-__all__ = ["ROUND", "Course", "Windows", "logsumexp", "ratio_down", "ratio_up", "spread_of"]
+__all__ = [
+    "ROUND", "Course", "Windows", "inverse_of", "logsumexp", "longer", "ratio_down", "ratio_up", "spread_of",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Nodes = NDArray[np.int64]
@@ -51,6 +53,33 @@ def spread_of(difference_hi: Array, scale: Array) -> Array:
         gap = np.where(scale > 0, difference_hi / scale, 2.0) * ROUND
         gap = np.clip(gap, 0.0, 2.0)
         return np.sqrt(gap / np.maximum(2.0 - gap, 0.0)) * ROUND
+
+
+def inverse_of(forward: Array, slack: float) -> tuple[Array, float]:
+    """The inverse in floats and an entrywise bound of its error, where every entry of ``forward`` is off by ``slack``.
+
+    Raises
+    ------
+    ValueError
+        If it may be singular.
+    """
+    n = len(forward)
+    inverse = np.asarray(np.linalg.inv(forward), dtype=float)
+    size, norm = float(np.abs(inverse).sum(1).max()), float(np.abs(forward).sum(1).max())
+    residual = float(np.abs(np.eye(n) - inverse @ forward).sum(1).max())
+    residual += size * (n * slack + (n + 2) * 4e-16 * norm)
+    if residual >= 0.5:
+        raise ValueError("`length` of a window is too large for this system; take shorter windows.")
+    return inverse, 2 * residual * size
+
+
+def longer(forward: Array, slack: float, transition: Array, error: float) -> tuple[Array, float]:
+    """The product with one more transition matrix, and its entrywise error bound."""
+    n = len(forward)
+    norm, size = float(np.abs(forward).sum(1).max()), float(np.abs(transition).max())
+    column = float(np.abs(transition).sum(0).max())
+    slack = slack * (column + n * error) + norm * error + (n + 2) * 4e-16 * norm * size
+    return forward @ transition, slack * (1 + 1e-13)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
