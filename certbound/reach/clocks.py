@@ -132,11 +132,7 @@ class SteadyEvent:
             whole = self.windows.log_exceedance(levels)
             if whole < _ENOUGH:
                 return whole
-        key = levels.tobytes()
-        if key not in self.known:
-            bound = self.owner.bound(self.row)
-            self.known[key] = 0.0 if bound is None else bound.log_exceedance(levels, self.windows)
-        sharp = self.known[key]
+        sharp = self.log_unshared(levels)
         clear = sharp < -_INFORMATIVE
         if clear and (self.beaten or sharp <= self.windows.log_at_best(levels)):
             self.beaten.add(True)
@@ -145,6 +141,16 @@ class SteadyEvent:
         if clear and sharp < whole - _CLEARLY:
             self.beaten.add(True)
         return min(sharp, whole)
+
+    def log_unshared(self, levels: Array) -> float:
+        """Upper bound of log P(exists t: w . Z_t > levels[k] on piece k) alone, whatever the coordinates do."""
+        if np.any(levels < 0):
+            return 0.0
+        key = levels.tobytes()
+        if key not in self.known:
+            bound = self.owner.bound(self.row)
+            self.known[key] = 0.0 if bound is None else bound.log_exceedance(levels, self.windows)
+        return self.known[key]
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ __all__ = ["log_any_exceedance"]
 Array = NDArray[np.float64]
 Nodes = NDArray[np.int64]
 
-_MOST = 4000  # pairs of (step, row) that are looked at
+_MOST = 4000  # pairs of (step, row) looked at; where there are more, the rows' own events are added
 _WORTH = 1e-3  # share of its fair part of the whole that an overlap must promise
 _UNIT = 2.0**-53
 
@@ -47,12 +47,14 @@ def log_any_exceedance(events: StepEvents, rows: Sequence[Array], levels: Sequen
     if any(np.any(z < 0) for z in levels):
         return 0.0
     z = np.stack(levels, axis=1)
-    steps = np.stack([events.along(r).log_steps(v) for r, v in zip(rows, levels, strict=True)], axis=1)
-    whole = logsumexp(steps)
     count, number = z.shape
     reach = min(_MOST // max(count * number * number, 1), count) - 1
-    if reach < 1 or whole == -np.inf:
-        return min(whole, 0.0)
+    if reach < 1:
+        return logsumexp(np.array([events.along(r).log_exceedance(v) for r, v in zip(rows, levels, strict=True)]))
+    steps = np.stack([events.along(r).log_steps(v) for r, v in zip(rows, levels, strict=True)], axis=1)
+    whole = logsumexp(steps)
+    if whole == -np.inf:
+        return whole
     carried = _Carried.of(events.response, np.stack(rows, axis=1), reach)
     variance = [np.stack([getattr(events.along(r), end) for r in rows], axis=1) for end in ("low", "high")]
     chosen = _choice(carried, z, variance[1], np.exp(steps), np.exp(whole) * _WORTH / steps.size)

@@ -15,9 +15,11 @@ from certbound.errors import CertboundError
 from certbound.problem.distances import clearance
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, GaussianStart, Inside, Outside
+from certbound.problem.trace import compile_numpy
 from certbound.reach.clearance import constraint_clearance
 from certbound.reach.flow import Flow
 from certbound.reach.norms import Norm
+from certbound.reach.tapes import varying_outputs
 from certbound.reach.tube import ReachTube
 
 __all__ = ["Violation", "find_violation"]
@@ -27,6 +29,7 @@ Array = NDArray[np.float64]
 PATHS = 64
 STEPS = 400
 ATTEMPTS = 3
+_WHOLE = 4_000_000  # numbers of all paths up to which affine dynamics are followed at once
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,14 +57,12 @@ def find_violation(problem: Problem) -> Violation | None:
     times, paths = _follow(flow, starts, signals)
     deepest: dict[int, tuple[float, float, Inside]] = {}
     for constraint in problem.safe:
-        first, last = (0.0, flow.horizon) if constraint.during is None else constraint.during
-        for k, t in enumerate(times):
-            if first <= t <= last:
-                usable = np.all(np.isfinite(paths[:, k]), axis=-1)
-                room = clearance(constraint, np.where(usable[:, None], paths[:, k], 0.0), None, float(t))
-                for path in np.flatnonzero(usable & (room < 0)).tolist():
-                    if room[path] < deepest.get(path, (0.0,))[0]:
-                        deepest[path] = (float(room[path]), float(t), constraint)
+        room = _rooms(constraint, flow, times, paths)
+        when = np.argmin(room, axis=1)
+        for path in np.flatnonzero(room.min(axis=1) < 0).tolist():
+            depth = float(room[path, when[path]])
+            if depth < deepest.get(path, (0.0,))[0]:
+                deepest[path] = (depth, float(times[when[path]]), constraint)
     order = sorted(deepest, key=lambda path: deepest[path][0])
     for path in order[:ATTEMPTS]:
         depth, time, constraint = deepest[path]
@@ -69,6 +70,18 @@ def find_violation(problem: Problem) -> Violation | None:
         if violation is not None:
             return violation
     return None
+
+
+def _rooms(constraint: Inside, flow: Flow, times: Array, paths: Array) -> Array:
+    """Signed distances of every path to the constraint at every time: (paths, K + 1), inf where nothing is asked."""
+    first, last = (0.0, flow.horizon) if constraint.during is None else constraint.during
+    usable = np.all(np.isfinite(paths), axis=-1) & (times >= first) & (times <= last)
+    states = np.where(usable[..., None], paths, 0.0)
+    if constraint.region.moving:
+        room = np.stack([clearance(constraint, states[:, k], None, float(t)) for k, t in enumerate(times)], axis=1)
+    else:
+        room = clearance(constraint, states)
+    return np.where(usable, room, np.inf)
 
 
 def _candidates(problem: Problem, flow: Flow, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -98,6 +111,11 @@ def _follow(flow: Flow, starts: Array, signals: Array) -> tuple[Array, Array]:
     paths = np.empty((len(starts), steps + 1, flow.dimension))
     paths[:, 0] = x = starts
     with np.errstate(all="ignore"):
+        if paths.size <= _WHOLE and not any(varying_outputs(flow.state_jacobian)):
+            advance, pushes = _affine(flow, times, rows, signals)
+            for k in range(steps):
+                paths[:, k + 1] = x = x @ advance.T + pushes[:, k]
+            return times, paths
         for k in range(steps):
             t, h = float(times[k]), float(times[k + 1] - times[k])
             if flow.continuous:
@@ -110,6 +128,24 @@ def _follow(flow: Flow, starts: Array, signals: Array) -> tuple[Array, Array]:
                 x = flow.value(t, x, rows[k], signals)
             paths[:, k + 1] = x
     return times, paths
+
+
+def _affine(flow: Flow, times: Array, rows: Array, signals: Array) -> tuple[Array, Array]:
+    """The same steps where f(t, x) = A x + b(t): x becomes R x + c, R (n, n) and c (paths, K, n)."""
+    tape, n = flow.state_jacobian, flow.dimension
+    a = compile_numpy(tape)(*np.zeros(len(tape.inputs)))
+    origin, pushed = np.zeros((len(signals), 1, n)), signals[:, None]
+    start = flow.value(times[:-1], origin, rows, pushed)
+    if not flow.continuous:
+        return a, start
+    h = float(times[1] - times[0])
+    middle, end = (flow.value(times[:-1] + share * h, origin, rows, pushed) for share in (0.5, 1.0))
+    two = middle + h / 2 * start @ a.T
+    three = middle + h / 2 * two @ a.T
+    four = end + h * three @ a.T
+    whole = h * a
+    powers = np.eye(n) + whole @ (np.eye(n) + whole @ (np.eye(n) + whole @ (np.eye(n) + whole / 4) / 3) / 2)
+    return powers, h / 6 * (start + 2 * two + 2 * three + four)
 
 
 def _proved(

@@ -9,6 +9,8 @@ from certbound.problem.noise import Gaussian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, GaussianStart, HalfSpace, Inside, Outside
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
+from certbound.reach.flow import Flow
+from certbound.safety import falsification
 from certbound.safety.falsification import find_violation
 
 
@@ -103,3 +105,25 @@ def test_a_wrong_proposal_is_not_believed(monkeypatch):
     monkeypatch.setattr(falsification, "_follow", lying)
     assert find_violation(drift([Inside(HalfSpace([1.0, 0.0], 2.5))])) is None
     assert calls
+
+
+@pytest.mark.parametrize("time", ["continuous", "discrete"])
+def test_affine_dynamics_are_followed_as_step_by_step(time: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def motion(t, x, u, d):
+        return [0.9 * x[1] + np.cos(t) + u[0], -0.5 * x[0] - 0.3 * x[1] + d[0] * t]
+
+    build = ContinuousSystem if time == "continuous" else DiscreteSystem
+    noise = {"diffusion": 0.01 * np.eye(2)} if time == "continuous" else {"noise": Gaussian(std=0.01)}
+    system = build(motion, states=2, inputs=Box([-1.0], [1.0]), disturbance=Box([-0.2], [0.3]), **noise)
+    plan = np.linspace(-1, 1, 6)[:, None]
+    problem = Problem(
+        system, initial=Box([-1, -1], [1, 0]), safe=[Inside(Box([-90, -90], [90, 90]))], horizon=6, plan=plan
+    )
+    flow = Flow(problem)
+    starts, signals = falsification._candidates(problem, flow, np.random.default_rng(0))
+    times, whole = falsification._follow(flow, starts, signals)
+    monkeypatch.setattr(falsification, "_WHOLE", -1)
+    again, single = falsification._follow(flow, starts, signals)
+    assert np.array_equal(times, again)
+    assert np.abs(single).max() > 1
+    assert np.allclose(whole, single, rtol=1e-12, atol=1e-12)
