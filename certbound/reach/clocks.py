@@ -134,7 +134,8 @@ class SteadyEvent:
                 return whole
         sharp = self.log_unshared(levels)
         clear = sharp < -_INFORMATIVE
-        if clear and (self.beaten or sharp <= self.windows.log_at_best(levels)):
+        smooth = isinstance(self.owner.bound(self.row), RateBound)  # up-crossings are next to exact
+        if clear and (smooth or self.beaten or sharp <= self.windows.log_at_best(levels)):
             self.beaten.add(True)
             return sharp
         whole = self.windows.log_exceedance(levels)

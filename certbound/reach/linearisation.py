@@ -91,7 +91,8 @@ class Linearisation:
         trial = cls(problem, noise=noise)
         size = float(np.linalg.norm(np.nan_to_num(trial.slopes[0]), axis=(-2, -1)).max())
         pieces = int(np.clip(np.ceil(problem.horizon * size / _STEP), _FEWEST_PIECES, _MOST_PIECES))
-        return cls(problem, cells=cells, pieces=pieces, noise=noise)
+        alike = (cells is None or cells == 1) and trial._pieces(pieces) == trial.pieces
+        return trial if alike else cls(problem, cells=cells, pieces=pieces, noise=noise)
 
     # ---- nominal data ------------------------------------------------------------------------------------
 

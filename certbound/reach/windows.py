@@ -102,12 +102,15 @@ class Windows:
         if np.any(levels < 0):
             return 0.0
         above, below = ratio_down(levels, self.end_high), ratio_up(levels, self.begin_low)
-        inside = log_below_above(below, above, spread=self.spread) + np.log(2.0)
         # at a window's start: the previous window kept its own direction below its level
         start_above = ratio_down(levels, self.begin_high)
         start = log_tail(start_above)
-        joint = log_below_above(ratio_up(levels[:-1], self.previous_low), start_above[1:], spread=self.turn)
-        start[1:] = np.minimum(start[1:], joint)
+        joint = log_below_above(
+            np.concatenate([below, ratio_up(levels[:-1], self.previous_low)]),
+            np.concatenate([above, start_above[1:]]), spread=np.concatenate([self.spread, self.turn]),
+        )
+        inside = joint[: len(levels)] + np.log(2.0)
+        start[1:] = np.minimum(start[1:], joint[len(levels) :])
         return min(logsumexp(np.concatenate([inside, start])), 0.0)
 
 

@@ -29,7 +29,7 @@ __all__ = ["log_line_crossing", "log_polygon_crossing"]
 
 Array = NDArray[np.float64]
 
-_EDGES, _NODES = np.array([0.0, 0.12, 0.28, 0.55, 1.0]), 16  # panels, as parts of the range; nodes in each
+_EDGES, _NODES = np.array([0.0, 0.2, 0.5, 1.0]), 16  # panels, as parts of the range; nodes in each
 _ELLIPSES = np.array([1.3, 1.7, 2.2, 3.0, 4.5, 7.0])
 _DROP = 26.0
 _ERROR = 64.0 / 15.0
@@ -67,9 +67,10 @@ def log_line_crossing(start: ArrayLike, stop: ArrayLike, span: ArrayLike) -> Arr
     loose = 2 * slack + 32 * EPS * (size + np.abs(beta))
     shift = shift + slack * (4 * np.abs(beta) + 2 * np.abs(q0)) + 16 * EPS * (np.abs(shift) + beta * beta)
     spread = np.sqrt(np.tanh(0.5 * d)) * (1 + 64 * EPS)
-    direct = log_below_above(q0, q1, spread=spread)
-    reflected = log_below_above(below + loose, above - loose, spread=spread) + shift
-    value = np.logaddexp(direct, reflected)
+    direct, reflected = log_below_above(
+        np.stack([q0, below + loose]), np.stack([q1, above - loose]), spread=np.stack([spread, spread])
+    )
+    value = np.logaddexp(direct, reflected + shift)
     result: Array = np.minimum(lift(value, 16), 0.0)
     return result
 
@@ -94,7 +95,7 @@ def _log_excluding(prior: tuple[Array, Array, Array], after: tuple[Array, Array,
     Proves: at the common node U = x splits the past from the future, and the reversed past is an OU process
     under a line too; the probability is at most P(n < U <= p) plus int_0^inf phi(m - s) (1 - L_prior(p - m
     + s)) L_next(n - m + s) ds, with p, n the ends of the two lines at the node and m = min(p, n). Gauss's
-    rule on four panels; the remainder from the Bernstein ellipse, on which |phi(w)| <= phi(Re w)
+    rule on three panels; the remainder from the Bernstein ellipse, on which |phi(w)| <= phi(Re w)
     exp(Im(w)^2/2) and likewise for Q; the tail from L(a) <= exp(-(a + beta C)^2/(2C)), true for a >= |beta|
     C. +inf where no useful bound results.
     """

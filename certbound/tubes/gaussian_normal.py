@@ -80,13 +80,13 @@ def mills(x: Array) -> Array:
     on: x R = 1 - y + 3y^2 - ... up to y^10 with y = 1/x^2; the series envelops R, its next term is below
     1e-15. Horner's rule on these rapidly falling coefficients loses less than 8 eps.
     """
-    near = np.clip(np.where(np.isnan(x), 0.0, x), 0.0, _FAR * (1 - EPS))
+    near = np.fmin(np.fmax(x, 0.0), _FAR * (1 - EPS))  # NaN as 0
     cell = (near * _CELLS).astype(np.intp)
     table = _mills_table()
     u = near - (cell + 0.5) / _CELLS
-    value = table[_DEGREE][cell]
+    value = table[_DEGREE].take(cell)
     for k in range(_DEGREE - 1, -1, -1):
-        value = value * u + table[k][cell]
+        value = value * u + table[k].take(cell)
     far = x >= _FAR
     if np.any(far):
         large = x[far]
