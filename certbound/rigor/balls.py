@@ -18,6 +18,7 @@ __all__ = [
     "ball",
     "bessel_excess",
     "excess_floor",
+    "excess_tangent",
     "kummer_excess",
     "log_bessel0f1",
     "log_expm1",
@@ -149,11 +150,9 @@ def excess_floor(a: arb, b: arb, z: arb, *, bessel: bool = False) -> arb:
     x = a * z if bessel else z
     if x.is_zero():
         return arb(0)
-    if bessel or not a.is_zero():
-        small = x / b if bessel else a * z / b
-        value = _sharpened(lambda: ((x.hypgeom_0f1(b) if bessel else z.hypgeom_1f1(a, b)) - 1) / a, small)
-        if value is not None:
-            return value
+    value = _library_excess(a, b, z, bessel)
+    if value is not None:
+        return value
     peak = _peak(float(a), float(b), float(x), bessel=bessel)
     if peak <= _SUMMED:
         return _series(None, b, x) / a if bessel else _series(a, b, z)
@@ -170,6 +169,32 @@ def excess_floor(a: arb, b: arb, z: arb, *, bessel: bool = False) -> arb:
             term = term * (a + first - 1)
         total += term
     return total
+
+
+def _library_excess(a: arb, b: arb, z: arb, bessel: bool) -> arb | None:
+    """Ball of E_a(z) or of its Bessel companion by the library's functions; None beyond their reach."""
+    if a.is_zero() and not bessel:
+        return None
+    x = a * z
+    return _sharpened(lambda: ((x.hypgeom_0f1(b) if bessel else z.hypgeom_1f1(a, b)) - 1) / a, x / b)
+
+
+def excess_tangent(a: arb, b: arb, z: arb, *, bessel: bool = False) -> tuple[arb, arb | None]:
+    """(E_a(z), d log E_a/d log z) as balls; beyond the library's reach (:func:`excess_floor`, None).
+
+    Examples
+    --------
+    >>> from flint import arb
+    >>> value, slope = excess_tangent(arb(0.5), arb(0.5), arb(2))  # E = 2 (e^z - 1)
+    >>> bool(abs(slope - 2 * arb(2).exp() / (arb(2).exp() - 1)) < 1e-12)
+    True
+    """
+    value = _library_excess(a, b, z, bessel)
+    if value is None:
+        return excess_floor(a, b, z, bessel=bessel), None
+    above = (a * z).hypgeom_0f1(b + 1) if bessel else z.hypgeom_1f1(a + 1, b + 1)
+    slope = z / b * above / value
+    return value, slope if slope.is_finite() and slope.rel_accuracy_bits() >= 30 else None
 
 
 def _peak(a: float, b: float, x: float, *, bessel: bool) -> float:

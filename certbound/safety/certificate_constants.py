@@ -180,7 +180,7 @@ def _candidates(cut: Schedule, held: Clearance, start: Start) -> Iterator[tuple[
     graded = cut.graded(6)
     weights = Objective(None, "scale", held).weights(graded)
     for bessel in (False, True) if np.max(cut.rates) >= 0 and cut.any_power else (False,):
-        a, v0, _ = Search(schedule=graded, kind="probability", weights=weights, bessel=bessel, start=start).solve()
+        a, v0 = Search(schedule=graded, kind="probability", weights=weights, bessel=bessel, start=start).solve()
         yield bessel, a, v0
     limit = math.inf if cut.any_power else cut.nu / 2 * (1 - 1e-9)
     scale = float(np.max(np.where(np.isfinite(cut.nodes[1]), cut.nodes[1], 0.0))) or 1.0

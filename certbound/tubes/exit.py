@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import math
+from dataclasses import dataclass
 
 from flint import arb
 
-from certbound.rigor.balls import excess_floor, lower, precision, upper
+from certbound.rigor.balls import excess_floor, excess_tangent, lower, precision, upper
 from certbound.tubes.ballpath import ball_path
-from certbound.tubes.kummer import Start, excess_function, initial_ball, phi_ball
+from certbound.tubes.kummer import Start, initial_ball, phi_ball
 from certbound.tubes.objective import Clearance
 from certbound.tubes.paper import golden
 from certbound.tubes.schedule import Schedule
@@ -18,6 +21,7 @@ from certbound.tubes.series import log_excess_one, log_phi_one
 __all__ = ["exit_level", "union_level"]
 
 _MOST_UNIONS = 128
+_LOSS = 1e-3  # of a logarithm, from a tangent instead of the function
 
 
 def exit_level(
@@ -27,7 +31,7 @@ def exit_level(
 
     The schedule must be cut at the ends of the clearance. On a piece I_t falls and v_t is monotone, so that the
     minimum over [s, e] is at least the value with I_e and max(v_s, v_e); pieces where v falls are halved until the
-    minimum is found within 2 %.
+    minimum is found within .5 %.
 
     Source: Thm K2, item 7.5 of docs/theory.md.
     """
@@ -88,6 +92,33 @@ def best_power(half: float, x: float) -> float:
     return math.exp(golden(level, middle - 2.5, middle + 0.5, 1e-2))
 
 
+class _Tangents:
+    """Lower bounds of E_a by tangents of log E_a over log z: convex, since the series has no negative coefficient."""
+
+    def __init__(self, a: arb, half: float, bessel: bool) -> None:
+        self.a, self.half, self.bessel = a, arb(half), bessel
+        self.touched: list[tuple[float, arb, arb, arb | None]] = []
+
+    def touch(self, z: arb) -> bool:
+        """Add the tangent at z; False where nothing is known there."""
+        value, slope = excess_tangent(self.a, self.half, z, bessel=self.bessel)
+        if not (value > 0 and value.is_finite() and z.is_finite()):
+            return False
+        self.touched.append((float(z.log()), z.log(), value.log(), slope))
+        return True
+
+    def floor(self, z: arb) -> tuple[arb, float]:
+        """(ball below E_a(z), about how much its logarithm loses there); (0, inf) without a tangent."""
+        log_z = z.log()
+        place = float(log_z)
+        near = min(self.touched, key=lambda tangent: abs(tangent[0] - place), default=None)
+        if near is None or (near[3] is None and near[0] > place):
+            return arb(0), math.inf
+        slope = 1 if near[3] is None else near[3]
+        loss = float(slope) * (near[0] - place) ** 2 if near[3] is not None or near[0] == place else math.inf
+        return (near[2] + slope * (log_z - near[1])).exp(), loss
+
+
 class _Gain:
     """phi(I_t) + e^{a I_t} E_a(r_t^2/(2 v_t)) along a schedule."""
 
@@ -98,21 +129,28 @@ class _Gain:
         self.radii = clearance.at(schedule.times[:-1]).tolist()
         self.power, self.unit = arb(a), arb(schedule.unit)
         self.half, self.bessel = schedule.nu / 2, bessel
-        self.excess = excess_function(a, self.half, bessel)
+        self._states: dict[tuple[int, float], tuple[arb, arb]] = {}
+        self.tangents = _Tangents(self.power, self.half, bessel)
         self.initial = initial_ball(self.path, a, start)
         self.first = 0.0 if schedule.continuous or start.sigma > 0 else 1.0
 
-    def stretch(self, piece: int, s: float, e: float) -> tuple[arb, arb, arb]:
-        """(I_e, least z on [s, e], z_e)."""
-        radius = self.radii[piece]
-        v_end, info = self.path.at(piece, e)
-        square = (arb(radius) / self.unit) ** 2 / 2
-        v_start = self.path.at(piece, s)[0] if s < e else v_end
-        return info, square / arb.max(v_start, v_end), square / v_end
+    def stretch(self, piece: int, s: float, e: float) -> _Stretch:
+        """The part [s, e] of a piece; v is monotone on it."""
+        v_end, info = self._state(piece, e)
+        square = (arb(self.radii[piece]) / self.unit) ** 2 / 2
+        v_start = self._state(piece, s)[0]
+        return _Stretch(piece, s, e, info, square / arb.max(v_start, v_end), square / v_end)
 
-    def value(self, info: arb, z: arb) -> arb:
-        """The gain at a given I and z."""
-        return phi_ball(self.power, info) + (self.power * info).exp() * self.excess(z)
+    def _state(self, piece: int, t: float) -> tuple[arb, arb]:
+        """(v, I) at a time of a piece; halves share their ends."""
+        if (piece, t) not in self._states:
+            self._states[piece, t] = self.path.at(piece, t)
+        return self._states[piece, t]
+
+    def bound(self, item: _Stretch) -> tuple[arb, float]:
+        """(lower bound of the gain on a stretch, about how much its logarithm loses to the tangent)."""
+        excess, loss = self.tangents.floor(item.z)
+        return phi_ball(self.power, item.info) + (self.power * item.info).exp() * excess, loss
 
     def steps(self, piece: int) -> tuple[float, float] | None:
         """Ends of a piece; in DT the whole steps whose clearance is this piece's."""
@@ -122,32 +160,60 @@ class _Gain:
             e -= 1
         return (s, e) if s <= e else None
 
-    def least(self, gap: float = 0.02, budget: int = 64) -> arb:
-        """Lower bound of the minimum over the horizon, within ``gap`` where it is cheap."""
-        items: list[tuple[float, int, float, float, arb]] = []
-        attained = smallest = math.inf
+    def least(self) -> arb:
+        """Lower bound of the minimum over the horizon: a cover found in floats, proved by tangents."""
+        proved = arb.pos_inf()
+        for item in self._cover():
+            bound, loss = self.bound(item)
+            if loss > 0 and not bound >= proved:
+                if loss > _LOSS and not self.tangents.touch(item.z):
+                    return arb.nan()
+                bound = self.bound(item)[0]
+            proved = arb.min(proved, bound)
+        return proved
 
-        def push(piece: int, s: float, e: float) -> None:
-            nonlocal attained, smallest
-            info, z, z_end = self.stretch(piece, s, e)
-            smallest = min(smallest, upper(z))
-            bound = self.value(info, z)
-            attained = min(attained, log_gain(float(self.power), self.half, float(info), float(z_end), self.bessel))
-            items.append((lower(bound.log()), piece, s, e, bound))
+    def _cover(self, gap: float = 0.01, budget: int = 64) -> list[_Stretch]:
+        """Stretches that cover the horizon, the one with the least gain first; halved until it is near the minimum."""
+        heap: list[tuple[float, int, _Stretch]] = []
+        attained = smallest = math.inf
+        number = itertools.count()
+
+        def gain(item: _Stretch, z: arb) -> float:
+            return log_gain(float(self.power), self.half, float(item.info), float(z), self.bessel)
+
+        def push(item: _Stretch) -> None:
+            nonlocal attained
+            attained = min(attained, gain(item, item.z_end))
+            heapq.heappush(heap, (gain(item, item.z), next(number), item))
 
         for piece in range(len(self.schedule.lengths) - 1, -1, -1):
             ends = self.steps(piece)
             if ends is None or not math.isfinite(self.radii[piece]):
                 continue
+            item = self.stretch(piece, *ends)
             # I falls with time: a later stretch with a smaller z has the smaller gain
-            if lower(self.stretch(piece, *ends)[1]) < smallest:
-                push(piece, *ends)
-        while items:
-            low, piece, s, e, bound = min(items, key=lambda item: item[0])
+            if lower(item.z) < smallest:
+                smallest = min(smallest, upper(item.z))
+                push(item)
+        for _ in range(budget if heap else 0):
+            low, _, item = heap[0]
+            s, e = item.start, item.end
             middle = (s + e) / 2 if self.schedule.continuous else math.floor((s + e) / 2)
-            if low >= attained - gap or len(items) > budget + len(self.radii) or not s <= middle < e:
-                return bound
-            items.remove((low, piece, s, e, bound))
-            push(piece, s, middle)
-            push(piece, middle if self.schedule.continuous else middle + 1, e)
-        return arb.pos_inf()
+            if not low < attained - gap or not s <= middle < e:
+                break
+            heapq.heappop(heap)
+            push(self.stretch(item.piece, s, middle))
+            push(self.stretch(item.piece, middle if self.schedule.continuous else middle + 1, e))
+        return [item for _, _, item in sorted(heap)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Stretch:
+    """Part [start, end] of a piece: I at its end, least z on it, z at its end."""
+
+    piece: int
+    start: float
+    end: float
+    info: arb
+    z: arb
+    z_end: arb

@@ -147,13 +147,14 @@ class Schedule:
         return replace(data, slopes=slopes)
 
     def graded(self, count: int = 32) -> Schedule:
-        """Refined inside the pieces, more densely after their starts, to about ``count`` pieces or more."""
+        """Refined inside the pieces, more densely after their starts, to about ``count`` pieces or more.
+
+        In discrete time step 1 is a node: nothing is asked of step 0, and v may be largest right after it.
+        """
         each = max(1, -(-count // len(self.lengths)))
-        if each == 1:
-            return self
         fraction = (np.arange(1, each) / each) ** 2
         extra = (self.times[:-1, None] + self.lengths[:, None] * fraction).ravel()
-        return self.refined(extra if self.continuous else np.unique(np.append(np.ceil(extra), 1.0)))
+        return self.refined(extra if self.continuous else np.append(np.ceil(extra), 1.0))
 
     def locate(self, t: Array) -> NDArray[np.intp]:
         """Piece that holds each time."""

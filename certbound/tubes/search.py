@@ -13,17 +13,15 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from certbound.tubes.kummer import Start, log_initial, log_target
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.series import (
-    log_excess,
     log_excess_value,
+    log_excess_values,
     log_phi,
     log_phi_one,
     solve_excess,
-    solve_excess_one,
 )
 
 __all__ = ["Search", "log_gain", "simplex"]
@@ -31,8 +29,8 @@ __all__ = ["Search", "log_gain", "simplex"]
 Array = NDArray[np.float64]
 Point = tuple[float, ...]
 
-_POWERS = np.array([0.0, 0.2, 1.0, 6.0, 60.0])
-_SPREADS = np.log(10.0) * np.array([-3.0, -1.8, -0.9, -0.3, 0.0, 0.5, 1.5])
+_POWERS = np.array([0.1, 1.5, 20.0])
+_SPREADS = np.log(10.0) * np.array([-2.0, -0.9, -0.2, 0.6])
 _FEW = 16
 _DIGITS = 1e-8
 
@@ -95,25 +93,25 @@ class Search:
     def _squares(self) -> Array:
         return (self.weights / self.schedule.unit / self._norm) ** 2
 
-    def solve(self) -> tuple[float, float, float]:
-        """(a, v_0, objective): the objective is a radius, a scale, or log P."""
+    def solve(self) -> tuple[float, float]:
+        """The best (a, v_0) found."""
         if self.kind == "probability":
-            value, point = self._minimise(self._point, self._at(1.0), 0.5, 1e-4)
-            return *self._parameters(point), value
-        point, step = self._point, 0.5
-        if self.kind != "mean":
-            # the best parameters for a scale s are those that make P least there: alternate, s falls
-            for tolerance in (1e-2, 1e-6):
-                scale = self.scale(*self._parameters(point))
-                if not math.isfinite(scale):
-                    break
-                point = self._minimise(point, self._at(scale), step, tolerance)[1]
-                step = 0.05
-            return self._snapped(*self._parameters(point))
-        value, point = self._minimise(point, self.scale, step, 1e-9)
-        return *self._parameters(point), value
+            return self._parameters(self._minimise(self._starts, self._at(1.0), 0.5, 1e-3))
+        if self.kind == "mean":
+            return self._parameters(self._minimise(self._starts, self.scale, 0.5, 1e-9))
+        # the best parameters for a scale s are those that make P least there: alternate, s falls
+        points, step, scale = self._starts, 0.5, self._typical()
+        for tolerance in (1e-2, 1e-6 if self._constant else 1e-3):
+            scale = self.scale(*self._parameters(points[0]), guess=scale)
+            if not math.isfinite(scale):
+                return self._parameters(points[0])
+            points = [self._minimise(points, self._at(scale), step, tolerance)]
+            step = 0.05
+        if not self._constant:  # where several nodes decide, s falls too slowly
+            points = [self._minimise(points, lambda a, v0: self.scale(a, v0, guess=scale) / scale, 0.1, 1e-6)]
+        return self._snapped(*self._parameters(points[0]), scale)
 
-    def _snapped(self, a: float, v0: float) -> tuple[float, float, float]:
+    def _snapped(self, a: float, v0: float, scale: float) -> tuple[float, float]:
         """The corners where the objective has kinks are tried as well: a = 0 and the constant v."""
         rate, noise = float(self.schedule.rates[0]), float(self.schedule.noise[0])
         pairs = [(a, v0)]
@@ -121,27 +119,34 @@ class Search:
             pairs.insert(0, (0.0, v0))
             if rate < 0 and noise > 0 and np.all(self.schedule.rates == rate) and np.all(self.schedule.noise == noise):
                 pairs = [(0.0, noise / (-2 * rate)), (a, noise / (-2 * rate)), *pairs]
-        values = [self.scale(*pair) for pair in pairs]
-        # between nodes a falling v costs more than the nodes show: a corner wins a near tie
-        least = min((value for value in values if value == value), default=math.inf)
-        return next(
-            ((*pair, value) for pair, value in zip(pairs, values) if value <= least * (1 + 1e-5)), (a, v0, least)
-        )
+        scale = self.scale(a, v0, guess=scale)
+        if not math.isfinite(scale):
+            return a, v0
+        # between nodes a falling v costs more than the nodes show: a corner wins a near tie, of 1e-5 in the scale
+        values = [self.log_probability(*pair, scale) for pair in pairs]
+        tie = min(values) + 2e-5 * max(1.0, -self.log_delta)
+        return next(pair for pair, value in zip(pairs, values) if value <= tie)
 
-    def first_look(self) -> float:
-        """Objective at the best point of the grid."""
-        return self.scale(*self._parameters(self._point))
+    def worse_than(self, value: float) -> bool:
+        """Whether the best point of the grid exceeds an objective."""
+        a, v0 = self._parameters(self._starts[0])
+        if self.kind == "mean":
+            return self.scale(a, v0) > value
+        return self.log_probability(a, v0, value) > self.log_delta
 
     def _at(self, scale: float) -> Callable[[float, float], float]:
         return lambda a, v0: self.log_probability(a, v0, scale)
 
     def _minimise(
-        self, point: Point, function: Callable[[float, float], float], step: float, tolerance: float
-    ) -> tuple[float, Point]:
-        return simplex(
-            lambda p: function(*self._parameters(p)), point, step, tolerance=tolerance,
-            low=(-650.0 if self.bessel else 0.0, -650.0), high=(self.cap, 650.0),
-        )  # fmt: skip
+        self, starts: list[Point], function: Callable[[float, float], float], step: float, tolerance: float
+    ) -> Point:
+        return min(
+            simplex(
+                lambda p: function(*self._parameters(p)), start, step, tolerance=tolerance,
+                width=0.2 if tolerance >= 1e-3 else 0.05, low=(-650.0 if self.bessel else 0.0, -650.0),
+                high=(self.cap, 650.0),
+            ) for start in starts
+        )[1]  # fmt: skip
 
     def _parameters(self, point: Point) -> tuple[float, float]:
         """(a, v_0) of a point of the search: the Bessel form has one free parameter."""
@@ -164,7 +169,7 @@ class Search:
             return log_x - min(self._log_gain(a, i, x) for i, x in zip(left.tolist(), z.tolist()))
         with np.errstate(divide="ignore"):
             base = np.log(left) + log_phi(a * left)
-        excess = log_excess(np.asarray(a), self.half, z, bessel=self.bessel)[0] + a * left
+        excess = log_excess_values(a, self.half, z, bessel=self.bessel) + a * left
         return log_x - float(np.min(np.logaddexp(base, excess)))
 
     def _log_gain(self, a: float, info: float, z: float) -> float:
@@ -203,53 +208,46 @@ class Search:
         log_x = log_initial(self.schedule, a, v0, info, self.start, self.bessel)
         return log_x - least if math.isfinite(log_x) else math.inf
 
-    def scale(self, a: float, v0: float) -> float:
+    def scale(self, a: float, v0: float, guess: float | None = None) -> float:
         """Least scale (or mean radius) of Thm K1's tube for stated parameters."""
-        if self.kind != "mean" and len(self._pieces) <= _FEW:
-            return self._short_scale(a, v0)
+        if self.kind == "mean":
+            return self._mean(a, v0)
+        # Thm K2 gives delta there: secants inside a bracket, on a value that does not explode
+        guess = guess or self._typical()
+        x, low, high, reach = (math.log(guess) if guess > 0 else 0.0), -math.inf, math.inf, 1.0
+        slope, before = 2 * min(self.log_delta, -1.0), (math.nan, math.nan)
+        for _ in range(80):
+            excess = self.log_probability(a, v0, math.exp(x)) - self.log_delta
+            if not (math.isfinite(excess) and -650 < x < 650):
+                return math.inf
+            low, high = (x, high) if excess > 0 else (low, x)
+            value = math.asinh(excess)
+            change = (value - before[1]) / (x - before[0])
+            before = x, value
+            if change > -0.01:  # flat
+                reach *= 4
+                step = math.copysign(reach, value)
+            else:
+                slope = slope if math.isnan(change) else change
+                step = min(max(-value / slope, -reach), reach)
+            if abs(step) < 1e-7 and abs(excess) < 1e-2:
+                return math.exp(x + step)
+            x = x + step if low < x + step < high else (low + high) / 2
+        return math.inf
+
+    def _mean(self, a: float, v0: float) -> float:
+        """Mean radius of Thm K1's tube."""
         v, info = self.schedule.path(np.asarray(v0), bessel=self.bessel)
         log_x = log_initial(self.schedule, a, v0, float(info[0]), self.start, self.bessel)
         if not math.isfinite(log_x):
             return math.inf
-        chosen = np.arange(len(v)) if self.kind == "mean" else self._active(v)
-        if not len(chosen):
-            return math.inf
-        target = log_target(a, info[chosen], log_x, self.log_delta)
         with np.errstate(over="ignore", invalid="ignore"):
-            if len(chosen) == 1:
-                z = np.array([solve_excess_one(a, self.half, float(target[0]), bessel=self.bessel)])
-            else:
-                z = solve_excess(np.asarray(a), self.half, target, bessel=self.bessel)
-            size = np.sqrt(2 * v[chosen] * z)
-            if self.kind == "mean":
-                return self._mean(size * self.schedule.unit)
-            return float(np.max(size / np.sqrt(self._squares[chosen]))) / self._norm
-
-    def _short_scale(self, a: float, v0: float) -> float:
-        """The same for few pieces: the scale at which Thm K2 gives delta."""
-
-        def excess(x: float) -> float:
-            return self._short(a, v0, math.exp(x)) - self.log_delta
-
-        low = high = math.log(self._typical() * self._norm) if math.isfinite(self._short(a, v0, 1.0)) else math.nan
-        for _ in range(40):
-            if excess(high) <= 0:
-                break
-            low, high = high, high + 1.0
-        for _ in range(40):
-            if not excess(low) <= 0:
-                break
-            low -= 1.0
-        if not (excess(low) >= 0 >= excess(high)):
-            return math.inf
-        return math.exp(float(brentq(excess, low, high, xtol=1e-10))) / self._norm
-
-    def _mean(self, radius: Array) -> float:
+            z = solve_excess(np.asarray(a), self.half, log_target(a, info, log_x, self.log_delta), bessel=self.bessel)
+            radius = np.sqrt(2 * v * z) * self.schedule.unit
         times = self.schedule.times
         if self.schedule.continuous:
             return float(np.trapezoid(radius, times) / times[-1])
-        steps = np.arange(1.0, times[-1] + 1)
-        return float(np.mean(np.interp(steps, times, radius)))
+        return float(np.mean(np.interp(np.arange(1.0, times[-1] + 1), times, radius)))
 
     def _active(self, v: Array) -> NDArray[np.intp]:
         """Nodes that no later node dominates: z_t rises in t, so only records of v/clearance^2 from the end count."""
@@ -262,17 +260,27 @@ class Search:
         return np.flatnonzero(keep & (ratio > 0)) + first
 
     @cached_property
-    def _point(self) -> Point:
-        """Best point of a coarse grid, judged by Thm K2 at a typical scale."""
+    def _starts(self) -> list[Point]:
+        """Best points of a coarse grid, judged by Thm K2 at a typical scale: one per power, the best first.
+
+        Constant data has one valley, and one start is enough.
+        """
         if self.bessel:
-            points: list[Point] = [(x,) for x in np.linspace(-3.0, 7.0, 9).tolist()]
+            lines: list[list[Point]] = [[(x,) for x in np.linspace(-3.0, 7.0, 9).tolist()]]
         else:
             powers = np.unique(np.minimum(np.log1p(_POWERS), self.cap - 1e-3)).tolist()
             logs = (math.log(self.reference) + _SPREADS).tolist()
-            points = [(x, y - min(x, math.log(2.0))) for x in powers for y in logs]
-        scale = 1.0 if self.kind == "probability" else self._typical()
-        scores = [self.log_probability(*self._parameters(point), scale) for point in points]
-        return points[int(np.argmin(np.nan_to_num(scores, nan=np.inf)))]
+            lines = [[(x, y - min(x, math.log(2.0))) for y in logs] for x in powers]
+        judge = self._at(1.0 if self.kind == "probability" else self._typical())
+        best = [min((judge(*self._parameters(point)), point) for point in line) for line in lines]
+        best = sorted((value if value == value else math.inf, point) for value, point in best)
+        return [point for _, point in best[: 1 if self._constant else None]]
+
+    @cached_property
+    def _constant(self) -> bool:
+        """Constant data and clearance."""
+        data, squares = self.schedule, self._squares
+        return all(bool(np.all(column == column[0])) for column in (data.rates, data.noise, squares))
 
     def _typical(self) -> float:
         """A scale of the right size: Gaussian tail at the node of the largest variance."""
@@ -304,9 +312,12 @@ def simplex(
     tolerance: float,
     low: Sequence[float],
     high: Sequence[float],
+    width: float = 0.05,
     budget: int = 160,
 ) -> tuple[float, Point]:
     """Least value found in a box, and its place (Nelder-Mead; points beyond the box are moved to its edge).
+
+    Ends when the values agree within ``tolerance`` and the points within ``width``.
 
     The objectives are smooth near their minimum. Plain numbers: for one or two unknowns they are quicker than arrays.
     """
@@ -330,7 +341,7 @@ def simplex(
         if not math.isfinite(least):
             break
         spread = max(abs(x - y) for _, p in pairs[1:] for x, y in zip(p, best))
-        if (most - least <= tolerance and spread < 0.05) or spread < 1e-7:
+        if (most - least <= tolerance and spread < width) or spread < 1e-7:
             break
         centre = [sum(column) / size for column in zip(*(p for _, p in pairs[:-1]))]
         pair = beyond(1.0)

@@ -7,12 +7,15 @@ former for large a at fixed a z. All terms are positive, so that sums lose no di
 from __future__ import annotations
 
 import math
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "log_excess", "log_excess_one", "log_excess_value", "log_phi", "log_phi_one", "solve_excess", "solve_excess_one",
+    "log_excess", "log_excess_one", "log_excess_value", "log_excess_values", "log_phi", "log_phi_one", "solve_excess",
+    "solve_excess_one",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -159,16 +162,40 @@ def log_excess_one(a: float, b: float, z: float, *, bessel: bool = False, digits
     return float(value), float(slope)
 
 
+@cache
+def _scipy() -> tuple[Any, Any]:
+    """0F1 and 1F1, imported when first asked for."""
+    from scipy.special import hyp0f1, hyp1f1
+
+    return hyp0f1, hyp1f1
+
+
 def log_excess_value(a: float, b: float, z: float, *, bessel: bool = False, digits: float = 1e-17) -> float:
     """The value of :func:`log_excess_one` alone, to 7 digits, from SciPy where that is quicker."""
     if 0.1 <= b <= 50 and ((bessel and 1 <= a * z <= 1e4) or (not bessel and a <= 1e4 and 1e-4 <= z <= 250)):
-        from scipy.special import hyp0f1, hyp1f1
-
+        hyp0f1, hyp1f1 = _scipy()
         power = a if bessel else max(a, 1e-8)
         value = float(hyp0f1(b, a * z) if bessel else hyp1f1(power, b, z))
         if 1.00001 < value < 1e290:
             return math.log((value - 1) / power)
     return log_excess_one(a, b, z, bessel=bessel, digits=digits)[0]
+
+
+def log_excess_values(a: float, b: float, z: Array, *, bessel: bool = False) -> Array:
+    """:func:`log_excess_value` for an array of z."""
+    value = np.zeros_like(z)
+    power = a if bessel else max(a, 1e-8)
+    if 0.1 <= b <= 50 and (bessel or a <= 1e4):
+        hyp0f1, hyp1f1 = _scipy()
+        x = a * z if bessel else z
+        usable = (x >= 1) & (x <= 1e4) if bessel else (x >= 1e-4) & (x <= 250)
+        value[usable] = hyp0f1(b, x[usable]) if bessel else hyp1f1(power, b, x[usable])
+    good = (value > 1.00001) & (value < 1e290)
+    result = np.empty_like(z)
+    result[good] = np.log((value[good] - 1) / power)
+    if not np.all(good):
+        result[~good] = log_excess(np.asarray(a), b, z[~good], bessel=bessel)[0]
+    return result
 
 
 def _strided_one(a: float, b: float, z: float, bessel: bool) -> tuple[float, float]:

@@ -253,9 +253,9 @@ def _family_tube(
     if np.max(schedule.sigmas) == 0:
         a, v0 = (1.0 if bessel else 0.0), 1.0
     else:
-        if search.first_look() > 1.3 * unless:
+        if unless < math.inf and search.worse_than(1.3 * unless):
             return None
-        a, v0, _ = search.solve()
+        a, v0 = search.solve()
     check_power(schedule, a, bessel=bessel)
     profile = KummerProfile(schedule=schedule, a=a, v0=v0, delta=delta, bessel=bessel, start=start)
     parameters = {"a": a, "v0": v0 * unit**2, **({"idle": idle} if idle > 0 else {})}
@@ -330,7 +330,7 @@ def bound_exit_probability(
         farthest = float(np.max(np.sqrt(graded.nodes[1]) * (schedule.unit / search.weights)))
         if 0 < farthest < _FAR:
             search = replace(search, weights=search.weights * (farthest / _FAR))
-        a, v0, _ = search.solve()
+        a, v0 = search.solve()
         best = min(best, exit_level(data, held, a=a, v0=v0, bessel=bessel, start=start))
         if not bessel:
             pair = (a, v0, False)

@@ -15,6 +15,7 @@ from scipy.special import gammaln, hyp1f1, log_ndtr, logsumexp
 from certbound.rigor.balls import (
     bessel_excess,
     excess_floor,
+    excess_tangent,
     kummer_excess,
     log_bessel0f1,
     log_expm1,
@@ -180,3 +181,22 @@ def test_the_floor_answers_at_any_size():
                 assert lower(excess_floor(arb(a), arb(0.15), arb(z)).log()) > 0.99 * min(z, 1e14)
                 if a > 0:
                     assert excess_floor(arb(a), arb(0.15), arb(z), bessel=True).log() > 0
+
+
+@pytest.mark.parametrize("bessel", [False, True])
+@pytest.mark.parametrize("a", [0.0, 0.3, 40.0, 1e4])
+@pytest.mark.parametrize("place", [1e-3, 2.0, 30.0, 1e5, 1e16])
+def test_a_tangent_of_the_logarithms_never_rises_above_the_function(a, place, bessel):
+    if bessel and a == 0:
+        pytest.skip("the Bessel form has a > 0")
+    power, half, z = arb(a), arb(1.5), arb(place)
+    with precision(300):
+        value, slope = excess_tangent(power, half, z, bessel=bessel)
+        assert value > 0
+        factors = (0.5, 0.9, 0.999, 1.001, 1.1, 2.0)
+        for factor in factors if slope is not None else [x for x in factors if x > 1]:
+            line = value.log() + (arb(1) if slope is None else slope) * arb(factor).log()
+            exact = excess_floor(power, half, z * arb(factor), bessel=bessel).log()
+            if place < 1e5:
+                assert line < exact + arb(2) ** -40
+                assert slope is None or exact < line + slope * (arb(factor) - 1) ** 2 * (place + 1) * 3

@@ -12,10 +12,11 @@ from scipy.special import gamma, hyp1f1, iv
 
 from certbound.tubes.constants import Constants
 from certbound.tubes.exit import exit_level, union_level
-from certbound.tubes.kummer import Start, kummer_tube
+from certbound.tubes.kummer import Start, kummer_tube, log_initial
 from certbound.tubes.objective import read_clearance
 from certbound.tubes.radial import estimate_exit_probability
 from certbound.tubes.schedule import make_schedule
+from certbound.tubes.search import log_gain
 from certbound.tubes.tuning import bound_exit_probability, tune_tube
 
 OU = Constants(rate=-0.5, sigma=0.1**0.5, dimension=1)
@@ -43,6 +44,29 @@ def test_the_level_is_the_formula_of_the_theorem_on_a_dense_grid_of_times():
     expected = math.log10(math.expm1(a * info(0)) / (min(gain) - 1))
     got = level(OU, horizon, ((0.0, 2.0, 5.0), (0.9, 1.4)), a=a, v0=v0)
     assert expected - 1e-3 < got < expected + 0.02
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_level_lies_above_every_point_of_a_grid_and_near_the_worst(seed):
+    rng = np.random.default_rng(seed)
+    pieces, bessel = int(rng.integers(1, 5)), seed % 3 == 0
+    times = np.arange(pieces + 1) * 6.0
+    data = {"sigma": rng.uniform(0.2, 1.5, pieces), "dimension": int(rng.integers(1, 5)), "times": times}
+    if seed % 2:
+        constants = Constants(gain=rng.uniform(0.5, 1.1, pieces), **data)
+    else:
+        constants = Constants(rate=rng.uniform(-1.0, 0.2, pieces), **data)
+    a, v0 = float(rng.uniform(0.05, 9)), float(np.exp(rng.uniform(-2, 3)))
+    schedule = make_schedule(constants, times[-1])
+    t = np.arange(1.0, times[-1] + 1) if seed % 2 else np.linspace(0, times[-1], 2000)
+    v, info = schedule.path_at(v0, t, bessel=bessel)
+    radius = float(np.sqrt(np.max(v) * schedule.unit**2) * rng.uniform(2, 4))
+    start = Start(offset=0.01) if bessel else Start()
+    gain = [log_gain(a, schedule.nu / 2, i, (radius / schedule.unit) ** 2 / (2 * w), bessel) for w, i in zip(v, info)]
+    whole = float(schedule.path(np.asarray(v0), bessel=bessel)[1][0])
+    expected = (log_initial(schedule, a, v0, whole, start, bessel) - min(gain)) / math.log(10)
+    got = level(constants, times[-1], radius, a=a, v0=v0, bessel=bessel, start=start)
+    assert min(0.0, expected) - 1e-6 <= got <= min(0.0, expected) + 0.008
 
 
 def test_a_tube_at_delta_leaves_at_most_about_delta_as_clearance():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from certbound.tubes.constants import Constants
-from certbound.tubes.kummer import Start
+from certbound.tubes.kummer import Start, kummer_tube
 from certbound.tubes.objective import make_objective
 from certbound.tubes.search import Search
 from certbound.tubes.tuning import METHODS, applicable_methods, bound_exit_probability, tube_objective, tune_tube
@@ -45,10 +45,37 @@ def test_the_kummer_search_is_optimal_against_a_dense_grid(constants):
         schedule=schedule.graded(6), kind="scale", weights=np.ones(len(schedule.graded(6).times)),
         log_delta=math.log(1e-3),
     )  # fmt: skip
-    _, _, found = search.solve()
+    found = search.scale(*search.solve())
     powers = np.concatenate([[0.0], np.geomspace(1e-2, 20, 12)])
     dense = min(search.scale(float(a), float(v)) for a in powers for v in np.geomspace(1e-2, 20, 16))
     assert found <= dense * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_several_deciding_nodes_do_not_stop_the_search_early(seed):
+    rng = np.random.default_rng(seed)
+    pieces, horizon = 6, 30.0
+    constants = Constants(
+        gain=rng.uniform(0.3, 1.1, pieces), sigma=rng.uniform(0.1, 2.0, pieces), dimension=int(rng.integers(1, 6)),
+        times=np.linspace(0.0, horizon, pieces + 1),
+    )  # fmt: skip
+    goal = make_objective(((0.0, 8.0, 21.0, horizon), tuple(rng.uniform(0.8, 2.5, 3))), horizon)
+    tube = tune_tube(constants, horizon=horizon, delta=1e-3, method="kummer", objective=goal.given)
+    found = tube_objective(tube, goal)
+    a, v0 = tube.parameters["a"], tube.parameters["v0"]
+    near = [
+        kummer_tube(constants, horizon=horizon, delta=1e-3, a=math.expm1(math.log1p(a) * x), v0=v0 * y)
+        for x in (0.8, 0.9, 0.97, 1.0, 1.03, 1.1, 1.2)
+        for y in (0.7, 0.9, 0.97, 1.0, 1.03, 1.1, 1.4)
+    ]
+    assert found <= min(tube_objective(other, goal) for other in near) * (1 + 1e-3)
+
+
+def test_the_step_after_the_start_is_not_forgotten():
+    # judged at the ends of long pieces alone, a huge v_0 costs nothing
+    constants = Constants(gain=[0.3] * 6, sigma=[1.0] + [0.2] * 5, dimension=2, times=np.arange(7) * 10.0)
+    tube = tune_tube(constants, horizon=60, delta=1e-3, method="kummer", objective=((0.0, 10.0, 60.0), (1.0, 0.5)))
+    assert tube.maximum <= 12.0
 
 
 @pytest.mark.parametrize("horizon", [2.0, 50.0, 330.0, 1000.0, 1e6])
