@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.reach.response import LinearResponse
+from certbound.reach.steps import StepEvent, StepEvents
 from certbound.reach.windows import (
     ROUND,
     Course,
@@ -25,112 +26,17 @@ from certbound.reach.windows import (
     inverse_of,
     logsumexp,
     longer,
-    ratio_down,
-    ratio_up,
+    numbers,
+    one_cell,
+    size_of,
     spread_of,
 )  # fmt: skip
-from certbound.tubes.gaussian_normal import log_below_above, log_tail
+from certbound.tubes.gaussian_normal import log_tail
 
-__all__ = ["StepEvents", "WindowEvents", "logsumexp"]
+__all__ = ["StepEvent", "StepEvents", "WindowEvent", "WindowEvents", "logsumexp"]
 
 Array = NDArray[np.float64]
 Nodes = NDArray[np.int64]
-
-
-def _numbers(count: int) -> Nodes:
-    return np.arange(count, dtype=np.int64)
-
-
-def _product_rounding(n: int) -> float:
-    """Relative rounding error of a sum of n products."""
-    return 1.02 * (n + 2) * 2.0**-53
-
-
-def _size(response: LinearResponse, nodes: Nodes) -> Array:
-    """Bound of the standard deviation along any row with entries in [-1, 1], at ``nodes``."""
-    total = np.abs(response.covariance[0, nodes]).sum(axis=(1, 2)) + np.abs(
-        response.covariance_error[0, nodes]).sum(axis=(1, 2))
-    return np.asarray(np.sqrt(total) * (1 + 1e-12))
-
-
-class StepEvents:
-    """Discrete time. ``gaussian`` noise: first exceedances; any other sub-Gaussian law: the union bound."""
-
-    def __init__(self, response: LinearResponse, cell: int, gaussian: bool) -> None:
-        self.response, self.cell, self.gaussian = _one(response, cell), cell, gaussian
-        self.shared_log = -np.inf
-        self.found: dict[bytes, StepEvent] = {}
-
-    def along(self, rows: Array) -> StepEvent:
-        """The event along ``rows`` (nodes, n)."""
-        key = rows.tobytes()
-        if key not in self.found:
-            self.found[key] = self._along(rows)
-        return self.found[key]
-
-    @cached_property
-    def sizes(self) -> Array:
-        """Bounds of the standard deviation along any row with entries in [-1, 1], at all nodes."""
-        return _size(self.response, _numbers(self.response.pieces + 1))
-
-    def _along(self, rows: Array) -> StepEvent:
-        nodes = _numbers(len(rows))
-        variances = [v[0] for v in self.response.variance(rows[None], nodes)]
-        if not self.gaussian:
-            return StepEvent(variances[0], variances[1], None)
-        low, high = variances
-        following = np.einsum("ti,tij->tj", rows[1:], self.response.transition[0, : len(rows) - 1])
-        # the row at t + 1 seen from t is w F up to the rounding of this product
-        cross_lo, _ = self.response.covariance_of(following[None], rows[None, :-1], nodes[:-1])
-        scale = np.sqrt(np.maximum(high[:-1], 0) * np.maximum(high[1:], 0)) * ROUND
-        low_scale = np.sqrt(np.maximum(low[:-1], 0) * np.maximum(low[1:], 0)) / ROUND
-        size = np.einsum("ti,tij->t", np.abs(rows[1:]), np.abs(self.response.transition[0, : len(rows) - 1]))
-        loss = size * _product_rounding(rows.shape[1]) * self.sizes[: len(rows) - 1]
-        cross = cross_lo[0] - loss * np.sqrt(np.maximum(high[:-1], 0)) * ROUND
-        with np.errstate(divide="ignore", invalid="ignore"):
-            correlation = np.where(cross >= 0, cross / scale, cross / low_scale)
-        correlation = np.where(np.isfinite(correlation), np.clip(correlation - 1e-14, -1.0, 1.0), -1.0)
-        return StepEvent(low, high, correlation)
-
-
-@dataclass(frozen=True, eq=False)
-class StepEvent:
-    """One row's variances (lower and upper bounds) and lower bounds of its correlations from step to step."""
-
-    low: Array
-    high: Array
-    correlation: Array | None
-
-    @property
-    def profile(self) -> Array:
-        """Shape of levels: the standard deviation."""
-        return np.asarray(np.sqrt(np.maximum(self.high, 0.0)))
-
-    def log_exceedance(self, levels: Array) -> float:
-        """Upper bound of log P(exists t: rows[t] . Z_t > levels[t])."""
-        if np.any(levels < 0):
-            return 0.0
-        above = ratio_down(levels, self.high)
-        if self.correlation is None:
-            with np.errstate(over="ignore"):
-                exponent = -0.5 * np.minimum(above, 1e150) ** 2
-            return min(logsumexp(np.where(above == np.inf, -np.inf, exponent * (1 - 1e-15))), 0.0)
-        return min(logsumexp(self.log_steps(levels)), 0.0)
-
-    def log_steps(self, levels: Array) -> Array:
-        """Upper bounds of log P(xi_0 > z_0) and log P(xi_{t-1} <= z_{t-1}, xi_t > z_t): (nodes,); levels >= 0.
-
-        Raises
-        ------
-        ValueError
-            If the noise is not Gaussian: then this is no bound of what it says.
-        """
-        if self.correlation is None:
-            raise ValueError("`levels` along sub-Gaussian noise have no joint law; use log_exceedance.")
-        above = ratio_down(levels, self.high)
-        single = log_tail(above)
-        joint = log_below_above(ratio_up(levels, self.low)[:-1], above[1:], self.correlation)
-        return np.concatenate([single[:1], np.minimum(joint, single[1:])])
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +62,7 @@ class WindowEvents:
     memory: dict[Any, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "response", _one(self.response, self.cell))
+        object.__setattr__(self, "response", one_cell(self.response, self.cell))
 
     @cached_property
     def bounds(self) -> Nodes:
@@ -292,8 +198,8 @@ class WindowEvents:
         slack += 1e-14 * np.einsum("ki,kij->kj", np.abs(rows), np.maximum(np.abs(first), np.abs(last)))
         starts = self.bounds[:-1]
         directions = (np.maximum.reduceat(high, starts) + np.minimum.reduceat(low, starts)) / 2
-        window = np.repeat(_numbers(len(starts)), np.diff(self.bounds))
-        nodes = _numbers(self.response.pieces)
+        window = np.repeat(numbers(len(starts)), np.diff(self.bounds))
+        nodes = numbers(self.response.pieces)
         sizes = [self.response.variance(rows[None], nodes + shift)[1][0] for shift in (0, 1)]
         deviation = np.sqrt(np.maximum(np.maximum(*sizes), 0.0))
         early = max(1, len(rows) // 5)
@@ -313,7 +219,7 @@ class WindowEvents:
         # the row at the window's start is known up to its rounding: r V r moves by 2 sqrt(r V r) e + e^2
         norms = np.abs(directions).sum(axis=1)
         loss = norms * (slack + 2 * len(first[0]) * 2.0**-53 * np.abs(forward).max(axis=(1, 2)))
-        loss = loss * _size(self.response, begins) * (1 + 1e-12)
+        loss = loss * size_of(self.response, begins) * (1 + 1e-12)
         change = 2 * np.sqrt(np.maximum(begin_high, 0)) * loss + loss**2
         begin_low = np.maximum(begin_low - change * ROUND, 0.0)
         begin_high = np.minimum(begin_high + change * ROUND, end_high)
@@ -388,12 +294,3 @@ class WindowEvent:
         return logsumexp(np.array([lost, self._log(levels - self._cost(factor * sd))]))
 
 
-def _one(response: LinearResponse, cell: int) -> LinearResponse:
-    """The response of a single cell."""
-    chosen = slice(cell, cell + 1)
-    return LinearResponse(
-        step=response.step, slope=response.slope[chosen], drift=response.drift[chosen],
-        transition=response.transition[chosen], transition_error=response.transition_error[chosen],
-        deviation=response.deviation[chosen], covariance=response.covariance[chosen],
-        covariance_error=response.covariance_error[chosen], slope_error=response.slope_error,
-    )

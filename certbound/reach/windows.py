@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.reach.response import LinearResponse
 from certbound.tubes.gaussian_normal import log_below_above, log_tail
 
 __all__ = [
-    "ROUND", "Course", "Windows", "inverse_of", "logsumexp", "longer", "ratio_down", "ratio_up", "spread_of",
+    "ROUND", "Course", "Windows", "inverse_of", "logsumexp", "longer", "numbers", "one_cell", "ratio_down", "ratio_up",
+    "size_of", "spread_of",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -127,3 +129,26 @@ class Course:
     window: Nodes
     off: Array
     profile: Array
+
+
+def numbers(count: int) -> Nodes:
+    """0, 1, ..., count - 1."""
+    return np.arange(count, dtype=np.int64)
+
+
+def size_of(response: LinearResponse, nodes: Nodes) -> Array:
+    """Bound of the standard deviation along any row with entries in [-1, 1], at ``nodes``."""
+    total = np.abs(response.covariance[0, nodes]).sum(axis=(1, 2)) + np.abs(
+        response.covariance_error[0, nodes]).sum(axis=(1, 2))
+    return np.asarray(np.sqrt(total) * (1 + 1e-12))
+
+
+def one_cell(response: LinearResponse, cell: int) -> LinearResponse:
+    """The response of a single cell."""
+    chosen = slice(cell, cell + 1)
+    return LinearResponse(
+        step=response.step, slope=response.slope[chosen], drift=response.drift[chosen],
+        transition=response.transition[chosen], transition_error=response.transition_error[chosen],
+        deviation=response.deviation[chosen], covariance=response.covariance[chosen],
+        covariance_error=response.covariance_error[chosen], slope_error=response.slope_error,
+    )
