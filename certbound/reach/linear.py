@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.clocks import ClockEvents, SteadyEvent
 from certbound.reach.directions import Requirement, requirements
-from certbound.reach.events import StepEvent, StepEvents, WindowEvent, WindowEvents, logsumexp
+from certbound.reach.events import StepEvents, WindowEvents, logsumexp
 from certbound.reach.inclusion import Supports
+from certbound.reach.levels import level_along, level_scale
 from certbound.reach.linearisation import Linearisation
-from certbound.reach.martingales import SplitEvent, SplitEvents
+from certbound.reach.martingales import SplitEvents
 from certbound.reach.overlaps import log_any_exceedance
 from certbound.reach.rows import WINDOW
 from certbound.reach.samples import sampled_range
@@ -29,15 +30,15 @@ from certbound.reach.samples import sampled_range
 __all__ = ["Events", "LinearRun", "Outcome", "correlated", "level_along", "level_scale"]
 
 Array = NDArray[np.float64]
-Event = StepEvent | WindowEvent | SteadyEvent | SplitEvent
 Events = StepEvents | ClockEvents | SplitEvents
 _LOG = logging.getLogger(__name__)
 
 _GUESSES = 30
 _PICARD = 12
 _HUGE = 1e6
-_TRIES = 12
 _PADS = (0.15, 0.1, 0.06, 0.04)  # how much wider than the sampled range the first guess is, by effort
+_REPAIRS, _REPAIRED = 4, 0.03  # times that pieces are tried again, each with so much more room
+_WIDER = 0.05  # of the remainder's share in a polytope
 _MARGIN = 2.0  # times that width is what a proof is expected to need
 _OVERLAPPING = -8.0  # from which on constraints that are broken together are counted once
 _LIKELY = -4.0  # log of a probability from which on a product is worth more than a sum
@@ -123,17 +124,16 @@ class LinearRun:
             guess = self.guess(levels, (low, high), (below, above), _PADS[effort] if attempt == 0 else 0.02)
             if guess is None:
                 return None
-            # the proof: beta over what the guess implies must lie in the guess
             low, high = guess
-            polytope = self._deviations(levels, low, high)
-            if polytope is None:
+            implied = self._deviations(levels, low, high)
+            if implied is None:
                 return None
-            flat = low.reshape(-1, engine.n), high.reshape(-1, engine.n)
-            found = engine.model.bound(engine.frame, *polytope, self.flat_extra, effort, flat)
-            b_low, b_high = (b.reshape(shape) for b in found)
-            if not self._all_finite(b_low, b_high):
+            polytope = self._wider(levels, implied)
+            found = self._closed(levels, polytope, guess, effort)
+            if found is None:
                 return None
-            if np.all((b_low >= low) & (b_high <= high)):
+            closed, b_low, b_high = found
+            if closed:
                 return b_low, b_high
             _LOG.debug("inclusion %d: widths %s, beyond the guess by %.3g", attempt, (b_high - b_low).max(
                 axis=(0, 2))[:: max(1, engine.pieces // 8)].round(4), max(np.max(low - b_low), np.max(b_high - high)))
@@ -141,6 +141,45 @@ class LinearRun:
             below = np.maximum(1.02 * (sample[0] - b_low), 0.0) + 1e-12
             above = np.maximum(1.02 * (b_high - sample[1]), 0.0) + 1e-12
         return None
+
+    def _closed(
+        self, levels: Array, polytope: tuple[Array, Array], hoped: tuple[Array, Array], effort: int
+    ) -> tuple[bool, Array, Array] | None:
+        """Bounds of beta over a polytope, and whether what they imply lies in it: then they prove themselves.
+
+        Pieces on which it does not are tried again over a larger part. None where a bound is infinite.
+        """
+        engine, shape = self.engine, hoped[0].shape
+        (p_low, p_high), target = polytope, [b.reshape(-1, engine.n) for b in hoped]
+        low, high = (np.zeros(shape).reshape(-1, engine.n) for _ in range(2))
+        again = np.arange(len(p_low))
+        for _ in range(_REPAIRS):
+            found = engine.model.bound(
+                engine.frame, p_low, p_high, self.flat_extra, effort, (target[0], target[1]), again)
+            low[again], high[again] = found[0][again], found[1][again]
+            b_low, b_high = low.reshape(shape), high.reshape(shape)
+            implied = self._deviations(levels, b_low, b_high) if self._all_finite(b_low, b_high) else None
+            if implied is None:
+                return None
+            again = np.flatnonzero(((implied[0] < p_low) | (implied[1] > p_high)).any(axis=1))
+            if not len(again):
+                return True, b_low, b_high
+            if 2 * len(again) > len(p_low):
+                break
+            wider = self._wider(levels, implied)
+            p_low, p_high = p_low.copy(), p_high.copy()
+            p_low[again], p_high[again] = wider[0][again], wider[1][again]
+            room = _REPAIRED * (high - low)
+            target = [low - room, high + room]
+        return False, b_low, b_high
+
+    def _wider(self, levels: Array, implied: tuple[Array, Array]) -> tuple[Array, Array]:
+        """A polytope with the remainder's share enlarged a little: room for bounds that differ a little."""
+        nothing = np.zeros((len(self.supports), self.engine.pieces, self.engine.n))
+        base = self._deviations(levels, nothing, nothing)
+        if base is None:
+            return implied
+        return implied[0] - _WIDER * np.abs(implied[0] - base[0]), implied[1] + _WIDER * np.abs(implied[1] - base[1])
 
     def guess(
         self, levels: Array, start: tuple[Array, Array], widening: tuple[Array, Array], share: float
@@ -327,37 +366,3 @@ def correlated(events: StepEvents, asked: list[Requirement], rooms: Array, share
             stay += np.log1p(-np.exp(both) * (1 + 1e-14))
     stay = stay * (1 + 1e-12) - 1e-300
     return logsumexp(np.array([np.log(-np.expm1(stay)) + 1e-14, *rest]))
-
-
-def level_along(event: Event, target: float) -> Array:
-    """Levels z, piece by piece, with P(exists t: row . Z > z) <= exp(target); inf if none are found.
-
-    They follow the standard deviation. Where windows pay for a turning row, what it costs there is added there, lest
-    the piece with the fastest turn raise the levels of all.
-    """
-    if not isinstance(event, WindowEvent):
-        return np.asarray(np.where(event.profile > 0, level_scale(event, event.profile, target), 0.0) * event.profile)
-    deviation = np.sqrt(np.maximum(event.course.windows.end_high, 0.0))[event.course.window]
-    shape = np.maximum(event.profile, deviation)
-    factor = level_scale(event, shape, target, event.cost)
-    return factor * shape + event.cost * (1 + 1e-15) if np.isfinite(factor) else np.full(len(shape), np.inf)
-
-
-def level_scale(event: Event, shape: Array, target: float, offset: Array | float = 0.0) -> float:
-    """Factor q, nearly the least, with P(exists t: row . Z > q shape + offset) <= exp(target); inf if none is found.
-
-    log P falls by about q dq, which gives the next q; the last one tried that is proved counts.
-    """
-    q = float(np.sqrt(2 * max(-target, 0.0) + 2.0))
-    best, low = np.inf, 0.0
-    for _ in range(_TRIES):
-        log = event.log_exceedance(q * shape + offset)
-        if log <= target:
-            best = q
-            if log > target - 0.02:
-                break
-        else:
-            low = q
-        step = np.sqrt(max(q * q + 2 * (log - target + 0.01), 0.0)) if log < -0.1 else 1.3 * q
-        q = float(step if low < step < best else (low + best) / 2 if np.isfinite(best) else 1.3 * q)
-    return best

@@ -25,7 +25,7 @@ from certbound.problem.trace import jacobian
 from certbound.reach.boxes import Expansion, Parts
 from certbound.reach.frame import Frame
 from certbound.reach.polytope import cull, grid, halve
-from certbound.reach.tapes import deciding, is_zero, selected, sources, varying_outputs, watched
+from certbound.reach.tapes import adds_plainly, deciding, is_zero, selected, sources, varying_outputs, watched
 from certbound.rigor.intervals import Interval
 
 __all__ = ["Remainder"]
@@ -239,7 +239,8 @@ class Remainder:
         return slots
 
     def bound(
-        self, frame: Frame, low: Array, high: Array, rows: Array, effort: int = 2, target: Target | None = None
+        self, frame: Frame, low: Array, high: Array, rows: Array, effort: int = 2, target: Target | None = None,
+        only: Indices | None = None,
     ) -> tuple[Array, Array]:
         """Enclosure of beta over every piece of ``frame``.
 
@@ -253,6 +254,8 @@ class Remainder:
             0 (one grid of boxes) to 3 (the boxes that matter are cut in many rounds).
         target : (ndarray, ndarray), shape (M, n), optional
             Bounds hoped for: boxes are cut no further than it takes to prove them.
+        only : ndarray of int, optional
+            The pieces asked for; what is returned for the others means nothing.
 
         Returns
         -------
@@ -265,13 +268,13 @@ class Remainder:
         if target is not None and extra is not None:
             target = target[0] - extra.lo, target[1] - extra.hi
         if len(self.blocks) == 1:
-            lower, upper = self._group(expansion, self.blocks[0], low, high, rows, effort, target)
+            lower, upper = self._group(expansion, self.blocks[0], low, high, rows, effort, target, only)
         else:
             origin = np.zeros((m, count))
             base = Interval(*expansion.plain_range(expansion.boxes(np.arange(m), origin, origin), origin))
             total = base
             for group in self.blocks:
-                total = total + (Interval(*self._group(expansion, group, low, high, rows, effort, None)) - base)
+                total = total + (Interval(*self._group(expansion, group, low, high, rows, effort, None, only)) - base)
             lower, upper = total.lo, total.hi
         if extra is not None:
             total = Interval(lower, upper) + extra
@@ -295,7 +298,7 @@ class Remainder:
         """(D_d f - E)(d - d0) over the whole polytope's box."""
         n, q = frame.spread.shape[1], len(frame.disturbance_middle)
         assert self.gain is not None
-        if self._plain_disturbance():
+        if adds_plainly(self.value, self.gain, q):
             point = [Interval.point(np.zeros(1))] * len(self.value.inputs)
             gain = enclose(selected(self.gain, list(range(n * q)), None), point).reshape(1, n, q)
         else:
@@ -310,25 +313,9 @@ class Remainder:
         reach = Interval(frame.disturbance_low, frame.disturbance_high) - frame.disturbance_middle
         return ((gain - frame.input_gain) * reach[None, None, :]).sum(axis=-1)
 
-    def _plain_disturbance(self) -> bool:
-        """Whether f is a sum of a function without d and a constant matrix times d, node by node.
-
-        A constant derivative alone does not say so: that of a jump is 0.
-        """
-        if self.gain is None or any(varying_outputs(self.gain)):
-            return False
-        first = len(self.value.inputs) - len(self.problem.system.disturbance_names)
-        depends: list[bool] = []
-        for node in self.value.nodes:
-            own = node.args[0] >= first if node.op == "input" else any(depends[arg] for arg in node.args)
-            if own and node.op not in ("input", "add", "sub", "neg", "mul"):
-                return False
-            depends.append(own)
-        return True
-
     def _group(
         self, expansion: Expansion, group: list[list[int]], low: Array, high: Array, rows: Array, effort: int,
-        target: Target | None,
+        target: Target | None, only: Indices | None,
     ) -> tuple[Array, Array]:
         """Bounds over the boxes of one group of blocks, displaced together."""
         m, count, n = len(low), len(self.active), expansion.frame.spread.shape[1]
@@ -340,6 +327,9 @@ class Remainder:
         for block in group:
             centre[..., block], radius[..., block] = grid(low[:, :count], high[:, :count], block, divisions)
         centre, radius = centre.reshape(-1, count), radius.reshape(-1, count)
+        if only is not None:
+            chosen = np.isin(items, only)
+            items, centre, radius = items[chosen], centre[chosen], radius[chosen]
         lower, upper = np.full((m, n), np.inf), np.full((m, n), -np.inf)
         inner_lo, inner_hi = lower.copy(), upper.copy()
         rounds, tolerance = _EFFORT[effort]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from certbound.problem.tape import JUMPS, Node, Tape
 
-__all__ = ["deciding", "is_zero", "selected", "sources", "varying_outputs", "watched"]
+__all__ = ["adds_plainly", "deciding", "is_zero", "selected", "sources", "varying_outputs", "watched"]
 
 
 def selected(tape: Tape, outputs: list[int], function: Tape | None) -> Tape:
@@ -76,6 +76,23 @@ def deciding(tape: Tape) -> dict[int, set[int]]:
         index: found[node.args[0]] if node.op == "if_else_zero" else found[index]
         for index, node in enumerate(tape.nodes) if node.op in JUMPS
     }  # fmt: skip
+
+
+def adds_plainly(tape: Tape, gain: Tape, count: int) -> bool:
+    """Whether a function is one without its last ``count`` inputs plus a constant matrix times them, node by node.
+
+    That ``gain``, its derivative by them, is constant does not say so alone: that of a jump is 0.
+    """
+    if any(varying_outputs(gain)):
+        return False
+    first = len(tape.inputs) - count
+    depends: list[bool] = []
+    for node in tape.nodes:
+        own = node.args[0] >= first if node.op == "input" else any(depends[arg] for arg in node.args)
+        if own and node.op not in ("input", "add", "sub", "neg", "mul"):
+            return False
+        depends.append(own)
+    return True
 
 
 def is_zero(tape: Tape, output: int) -> bool:

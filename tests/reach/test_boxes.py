@@ -15,6 +15,7 @@ from certbound.reach.linearisation import Linearisation
 from certbound.reach.polytope import linear_range
 from certbound.reach.remainder import Remainder
 from certbound.reach.samples import sampled_range
+from certbound.reach.tapes import adds_plainly
 
 Array = NDArray[np.float64]
 
@@ -176,7 +177,8 @@ def test_only_a_plain_sum_with_the_disturbance_needs_no_look_at_the_states(dynam
     )
     problem = cb.Problem(system, initial=[0.1], safe=[], horizon=1.0, delta=1e-2)
     engine = Linearisation(problem, pieces=5)
-    assert engine.model._plain_disturbance() is plain
+    assert engine.model.gain is not None
+    assert adds_plainly(engine.model.value, engine.model.gain, 1) is plain
     lower, upper = engine.model.bound(engine.frame, -np.ones((5, 1)), np.ones((5, 1)), np.zeros((5, 0, 1)))
     if plain:
         assert np.all(np.abs(upper) < 1)

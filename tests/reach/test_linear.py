@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -196,3 +198,49 @@ def test_one_direction_alone_is_narrower_than_all_at_once_and_still_holds_its_pa
 def test_a_direction_alone_needs_a_proof() -> None:
     with pytest.raises(ArithmeticError, match="feeds itself"):
         linear_answer(oscillator(3.0, cubic=2.0)).extent_along([1.0, 0.0])
+
+
+@pytest.mark.parametrize("effort", [0, 1, 2])
+def test_bounds_of_the_remainder_prove_themselves(effort: int) -> None:
+    run = LinearRun(Linearisation.of(cb.load("unicycle").replace(horizon=1.0)), asked=False)
+    levels, _ = run.levels(float(np.log(1e-4)))
+    bounds = run.include(levels, effort)
+    assert bounds is not None
+    implied = run._deviations(levels, *bounds)
+    assert implied is not None
+    sample = run.sampled(implied)
+    assert np.all(sample[0] >= bounds[0])
+    assert np.all(sample[1] <= bounds[1])
+    target = bounds[0].reshape(-1, 3), bounds[1].reshape(-1, 3)
+    again = run.engine.model.bound(run.engine.frame, *implied, run.flat_extra, 3, target)
+    little = 0.02 * (target[1] - target[0])  # other boxes, other bounds
+    assert np.all(again[0] >= target[0] - little)
+    assert np.all(again[1] <= target[1] + little)
+
+
+def test_a_piece_that_needs_more_is_tried_again_alone() -> None:
+    run = LinearRun(Linearisation.of(cb.load("unicycle").replace(horizon=1.0)), asked=False)
+    levels, _ = run.levels(float(np.log(1e-4)))
+    bounds = run.include(levels, 1)
+    assert bounds is not None
+    implied = run._deviations(levels, *bounds)
+    assert implied is not None
+    low, high = (b.copy() for b in run._wider(levels, implied))
+    middle = (low[20] + high[20]) / 2
+    low[20], high[20] = middle - 1e-3, middle + 1e-3  # what is bounded there first says too little
+    asked: list[int] = []
+    whole = run.engine.model.bound
+
+    def counted(*arguments: Any) -> Any:
+        asked.append(len(arguments[-1]))
+        return whole(*arguments)
+
+    object.__setattr__(run.engine.model, "bound", counted)
+    found = run._closed(levels, (low, high), bounds, 1)
+    assert found is not None
+    assert found[0]
+    assert asked[0] == run.engine.pieces
+    assert 1 <= max(asked[1:]) < run.engine.pieces / 2
+    sample = run.sampled(run._deviations(levels, *found[1:]) or implied)
+    assert np.all(sample[0] >= found[1])
+    assert np.all(sample[1] <= found[2])
