@@ -63,4 +63,5 @@ def test_an_event_is_found_once() -> None:
     events = StepEvents(response, 0, True)
     rows = np.ones((5, 1))
     assert events.along(rows) is events.along(rows.copy())
-    assert events.along(-rows) is not events.along(rows)
+    assert events.along(-rows) is events.along(rows)  # the same law
+    assert events.along(2 * rows) is not events.along(rows)
