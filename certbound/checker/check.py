@@ -16,7 +16,9 @@ from certbound.checker.linear import check_linear
 from certbound.checker.model import Model, read_model
 from certbound.checker.reading import Record, read, text
 from certbound.checker.report import Budget, Report, Unproved
+from certbound.checker.stopped import ASSUMPTION
 from certbound.errors import CertificateError
+from certbound.problem.tape import Tape
 
 __all__ = ["SECONDS", "VERSION", "check_data", "check_file"]
 
@@ -82,6 +84,8 @@ def check_data(
         proof = record["proof"]
         if isinstance(proof, dict) and proof.get("assumed") is True:
             named.append("the stated constants hold")
+        if isinstance(proof, dict) and proof.get("engine") == "linear" and isinstance(model.noise.diffusion, Tape):
+            named.append(ASSUMPTION)
         words = _claim(model, level, named)
         proved = None
         try:

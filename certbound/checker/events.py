@@ -129,6 +129,7 @@ class Windows:
         self.starts = list(starts)
         self.ends = [*self.starts[1:], len(pieces)]
         self.n = pieces[0].transition.nrows()
+        self.levels: Sequence[Sequence[arb]] = [[]] * len(self.starts)
         self.forward: list[arb_mat] = []
         self.back: list[arb_mat] = []
         self.before: list[arb_mat] = []
@@ -163,28 +164,38 @@ class Windows:
 
     def exceedance(self, rows: Sequence[Sequence[arb]], levels: Sequence[Level]) -> arb:
         """P(rows[k] . Z_t > levels[k] for some t in some piece k, and no coordinate beyond its level)."""
-        directions: list[list[arb]] = []
+        directions, costs = self.spans(rows, [level is not None for level in levels])
         tops: list[Level] = []
+        for start, end in zip(self.starts, self.ends):
+            least: Level = None
+            for k in range(start, end):
+                level = levels[k]
+                if level is not None:
+                    value = (level - costs[k]).lower()
+                    least = value if least is None else arb.min(least, value)
+            tops.append(least)
+        nothing = [arb(0)] * self.n
+        return self._chain([nothing if direction is None else direction for direction in directions], tops)
+
+    def spans(
+        self, rows: Sequence[Sequence[arb]], asked: Sequence[bool]
+    ) -> tuple[list[list[arb] | None], dict[int, arb]]:
+        """A direction for every window (None: nothing is asked in it), and what the rows on its pieces lose to it."""
+        directions: list[list[arb] | None] = []
+        costs: dict[int, arb] = {}
         for window, (start, end) in enumerate(zip(self.starts, self.ends)):
-            asked = [k for k in range(start, end) if levels[k] is not None]
-            if not asked:
-                directions.append([arb(0)] * self.n)
-                tops.append(None)
+            ends = {k: self._ends(rows[k], k) for k in range(start, end) if asked[k]}
+            if not ends:
+                directions.append(None)
                 continue
-            ends = {k: self._ends(rows[k], k) for k in asked}
             seen = [value for pair in ends.values() for value in pair]
             direction = [
                 ((_largest([v[i] for v in seen]) - _largest([-v[i] for v in seen])) / 2).mid() for i in range(self.n)
             ]
-            least: Level = None
-            for k in asked:
-                level = levels[k]
-                assert level is not None
-                value = (level - self._cost(rows[k], k, direction, ends[k], window)).lower()
-                least = value if least is None else arb.min(least, value)
+            for k, pair in ends.items():
+                costs[k] = self._cost(rows[k], k, direction, pair, window)
             directions.append(direction)
-            tops.append(least)
-        return self._chain(directions, tops)
+        return directions, costs
 
     def _ends(self, row: Sequence[arb], k: int) -> tuple[list[arb], list[arb]]:
         flat = arb_mat(1, self.n, list(row))

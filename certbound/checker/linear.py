@@ -5,7 +5,7 @@ for the Gaussian part Z along them, and directions that keep obstacles off. From
 response R; with y (initial set and disturbance) and the levels they bound the deviation s = y + Z + R in a polytope.
 Proved here, piece by piece: beta lies in B over that polytope. Then, but for the event that Z leaves its levels, the
 constraints hold wherever Z stays below what y and R leave, and the probabilities of all these events are joined
-(`families`).
+(`families`). Noise that depends on the state adds a martingale M with levels of its own (`stopped`).
 """
 
 from __future__ import annotations
@@ -32,11 +32,14 @@ from certbound.checker.response import (
     continuous_piece,
     covariances,
     discrete_piece,
+    over_piece,
     supports,
 )
 from certbound.checker.shared import Shared
+from certbound.checker.stopped import Along, Asked, StateNoise, Stopped
 from certbound.checker.structure import structure_of
 from certbound.errors import CertificateError
+from certbound.problem.tape import Tape
 
 __all__ = ["check_linear"]
 
@@ -71,7 +74,7 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     outputs = remainders(model, structure, budget)
     worst = arb(0)
     for index, (entry, box) in enumerate(zip(entries, boxes)):
-        cell = _Cell(shared, Record(entry, f"proof.cells[{index}]", _CELL), box, budget)
+        cell = _Cell(shared, Record(entry, f"proof.cells[{index}]", _CELL, ("stopped",)), box, budget)
         worst = arb.max(worst, cell.probability(outputs))
     return upper(worst)
 
@@ -105,7 +108,14 @@ class _Cell:
         self.reach = [
             arb.max(arb(high) - m, m - arb(low)) for (low, high), m in zip(model.disturbance, self.middle)
         ]
-        self.demands = demands(model, self._grid(), record.items("separations"), record.at("separations"))
+        self.grid = self._grid()
+        self.demands = demands(model, self.grid, record.items("separations"), record.at("separations"))
+        self.state: StateNoise | None = None
+        if record["stopped"] is not None or isinstance(model.noise.diffusion, Tape):
+            self.state = StateNoise(
+                model, record["stopped"], record.at("stopped"), pieces=count, units=len(shared.units),
+                rows=len(self.rows[0]), demands=len(self.demands),
+            )
 
     def _rows(self) -> tuple[list[list[list[arb]]], list[list[arb]]]:
         """Rows of Z's levels on every piece (unit rows first), over all states, and the levels."""
@@ -172,15 +182,37 @@ class _Cell:
         start = model.initial.covariance if model.initial.covariance is not None else identity(n) * 0
         values = covariances(self.pieces, start, budget)
         bounds = self._supports()
+        rooms = self._rooms(bounds)
+        found = None if self.state is None else self._stopped(self.state, rooms)
+        inner = len(self.rows[0])
         for k in range(self.shared.count):
-            self._check_remainder(k, bounds, outputs)
-        return self._events(values, bounds)
+            levels = self.levels[k]
+            if found is not None:
+                levels = [level + part.at(k) for level, part in zip(levels, found[1][:inner])]
+            self._check_remainder(k, bounds, levels, outputs)
+        return self._events(values, rooms, found)
+
+    def _stopped(self, state: StateNoise, rooms: list[list[arb | None]]) -> tuple[arb, list[Along]]:
+        """What the coordinates of M cost, and its levels along the rows of levels and along the demands."""
+        excess = state.excess(self.shared.units, self.grid.times, self.grid.hulls, self.budget)
+        found = Stopped(Windows(self.pieces, [], state.windows, self.budget), excess, state.coordinates, self.budget)
+        count = self.shared.count
+        asked = [
+            Asked(rows=[self.rows[k][d] for k in range(count)], levels=[arb(0)] * count, factors=factors)
+            for d, factors in enumerate(state.rows)
+        ]
+        for number_, demand in enumerate(self.demands):
+            factors = None if state.rooms is None else state.rooms[number_]
+            asked.append(Asked(rows=demand.rows, levels=rooms[number_], factors=factors))
+        return found.paid, found.along(asked)
 
     def _pieces(self) -> list[Piece]:
-        shared, noise = self.shared, self.model.noise.covariance()
+        shared, state = self.shared, self.state
+        fixed = identity(self.model.dimension) * 0 if state is not None else self.model.noise.covariance()
         result = []
-        for slopes, drifts in zip(self.slopes, self.drifts):
+        for k, (slopes, drifts) in enumerate(zip(self.slopes, self.drifts)):
             self.budget.check()
+            noise = fixed if state is None else state.noise(k)
             slope = shared.full(slopes)
             if self.model.continuous:
                 result.append(continuous_piece(slope, shared.drift(drifts), shared.length, noise))
@@ -210,7 +242,8 @@ class _Cell:
             return found
         low, high, reach = [], [], []
         for k in range(count):
-            parts = self._over_piece(k, asked[k], found)
+            gain = self._gain(k)
+            parts = over_piece(self.pieces[k], asked[k], found, k, self._box(k), None if gain is None else gain[1])
             low.append(parts[0])
             high.append(parts[1])
             reach.append(parts[2])
@@ -249,40 +282,18 @@ class _Cell:
             box = ((piece.size * (h * h / 4) + piece.second * h) * column(gain[1])).entries()
         return Load(centre=piece.gathered * column(middle), radius=spread, generators=generators, box=box)
 
-    def _over_piece(
-        self, k: int, rows: list[list[arb]], found: Supports
-    ) -> tuple[list[arb], list[arb], list[arb]]:
-        """From the piece's start to all of it: the chord between both ends, its bulge, and what the piece adds."""
-        piece, n, count = self.pieces[k], self.model.dimension, len(rows)
-        h, one = piece.length, identity(n)
-        whole = piece.size + piece.drift * h
-        bend = (piece.drift + whole * whole) * (one + piece.deviation) * (h * h / 8)
-        middle, radius = self._box(k)
-        sizes = [arb.max(abs(a), abs(b)) for a, b in zip(found.low[k][:n], found.high[k][:n])]
-        gain = self._gain(k)
-        added_r = (piece.deviation * column([abs(m) + r for m, r in zip(middle, radius)]) + column(radius)) * h
-        columns = [bend * column(sizes) + added_r, bend * column(found.reach[k][:n])]
-        if gain is not None:
-            columns[1] = columns[1] + (one + piece.deviation) * column(gain[1]) * h
-        low, high, reach = [], [], []
-        for i, row in enumerate(rows):
-            weights = arb_mat(1, n, [x.abs_upper() for x in row])
-            rest, spread = ((weights * item)[0, 0] for item in columns)
-            linear = (arb_mat(1, n, row) * column(middle))[0, 0] * h
-            first, last = n + i, n + count + i
-            low.append((arb.min(found.low[k][first], found.low[k][last]) + arb.min(linear, arb(0)) - rest).lower())
-            high.append((arb.max(found.high[k][first], found.high[k][last]) + arb.max(linear, arb(0)) + rest).upper())
-            reach.append((arb.max(found.reach[k][first], found.reach[k][last]) + spread).upper())
-        return low, high, reach
-
-    def _check_remainder(self, k: int, bounds: Supports, outputs: Sequence[OutputRemainder]) -> None:
-        """beta lies in B on piece k."""
+    def _check_remainder(
+        self, k: int, bounds: Supports, levels: Sequence[arb], outputs: Sequence[OutputRemainder]
+    ) -> None:
+        """beta lies in B on piece k, where Z and M keep to their levels; s lies in H."""
         data = self._data(k)
         low, high = [], []
-        for d, level in enumerate(self.levels[k]):
+        for d, level in enumerate(levels):
             size = bounds.reach[k][d] + level
             low.append(bounds.low[k][d] - size)
             high.append(bounds.high[k][d] + size)
+        if self.state is not None and not self.state.holds(k, low, high):
+            raise Unproved(f"the state was not shown to stay in the set over which its noise is bounded on piece {k}")
         sides = {unit: (low[d], high[d]) for d, unit in enumerate(self.shared.units)}
         for i, output in enumerate(outputs):
             output.prepare(data)
@@ -318,22 +329,39 @@ class _Cell:
         values += [*map(arb, self.gains[k]), *self.middle, *shared.inputs(k)]
         return PieceData(values=values, half=h / 2, disturbance=self.middle, disturbance_radius=self.reach)
 
-    def _events(self, values: list[arb_mat], bounds: Supports) -> arb:
-        """Probability that Z leaves its levels, or exceeds what the demands leave."""
+    def _rooms(self, bounds: Supports) -> list[list[arb | None]]:
+        """What y and R leave of every demand, piece by piece."""
         count, inner = self.shared.count, len(self.rows[0])
-        families = []
-        for d in range(inner):
-            rows = [self.rows[k][d] for k in range(count)]
-            levels = [level[d] for level in self.levels]
-            families.append(Family(label="the levels", rows=rows, levels=levels, both=True))
+        result: list[list[arb | None]] = []
         for number_, demand in enumerate(self.demands):
             rooms: list[arb | None] = []
             for k, room in enumerate(demand.rooms):
                 place = number_ + (inner if k < count else 0)
                 used = bounds.reach[k][place] + bounds.high[k][place]
                 rooms.append(None if room is None else (room - used).lower())
-            families.append(Family(label=demand.label, rows=demand.rows, levels=rooms))
-        return self._leaving(values, families)
+            result.append(rooms)
+        return result
+
+    def _events(
+        self, values: list[arb_mat], rooms: list[list[arb | None]], found: tuple[arb, list[Along]] | None
+    ) -> arb:
+        """Probability that Z or M leave their levels, or exceed what the demands leave."""
+        count, inner = self.shared.count, len(self.rows[0])
+        families = []
+        for d in range(inner):
+            rows = [self.rows[k][d] for k in range(count)]
+            levels = [level[d] for level in self.levels]
+            families.append(Family(label="the levels", rows=rows, levels=levels, both=True))
+        for number_, (demand, left) in enumerate(zip(self.demands, rooms)):
+            if found is not None:
+                part = found[1][inner + number_]
+                left = [None if room is None else (room - part.at(k)).lower() for k, room in enumerate(left)]
+            families.append(Family(label=demand.label, rows=demand.rows, levels=left))
+        total = self._leaving(values, families)
+        if found is None:
+            return total
+        sizes = [part.probability * (2 if d < inner else 1) for d, part in enumerate(found[1])]
+        return upper(sum(sizes, total + found[0]))
 
     def _leaving(self, values: list[arb_mat], families: list[Family]) -> arb:
         """The probability of all families of events together."""

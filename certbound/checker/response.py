@@ -17,10 +17,12 @@ from dataclasses import dataclass
 
 from flint import arb, arb_mat
 
-from certbound.checker.matrices import identity, magnitude, row_sums
+from certbound.checker.matrices import column, identity, magnitude, row_sums
 from certbound.checker.report import Budget, Unproved
 
-__all__ = ["Load", "Piece", "Supports", "continuous_piece", "covariances", "discrete_piece", "supports"]
+__all__ = [
+    "Load", "Piece", "Supports", "continuous_piece", "covariances", "discrete_piece", "over_piece", "supports",
+]  # fmt: skip
 
 _TERMS = 60
 _SMALL = arb(2) ** -100
@@ -203,3 +205,47 @@ def supports(
         high[node].append((centre[i] + radius[i]).upper())
         size[node].append(reach[i].upper())
     return Supports(low=low, high=high, reach=size)
+
+
+def over_piece(
+    piece: Piece, rows: Sequence[Sequence[arb]], found: Supports, k: int, box: tuple[list[arb], list[arb]],
+    gain: list[arb] | None,
+) -> tuple[list[arb], list[arb], list[arb]]:
+    """From a piece's start to all of it: the chord between both ends, its bulge, and what the piece adds.
+
+    Parameters
+    ----------
+    piece : Piece
+    rows : sequence of rows
+    found : Supports
+        At node k: along the unit rows, ``rows``, and ``rows`` times the transition matrix.
+    k : int
+    box : (list, list) of arb
+        Middle and radius of the remainder's box.
+    gain : list of arb, optional
+        Bound of |E (d - d0)|.
+
+    Returns
+    -------
+    low, high, reach : list of arb
+    """
+    n, count = piece.transition.nrows(), len(rows)
+    h, one = piece.length, identity(n)
+    whole = piece.size + piece.drift * h
+    bend = (piece.drift + whole * whole) * (one + piece.deviation) * (h * h / 8)
+    middle, radius = box
+    sizes = [arb.max(abs(a), abs(b)) for a, b in zip(found.low[k][:n], found.high[k][:n])]
+    added_r = (piece.deviation * column([abs(m) + r for m, r in zip(middle, radius)]) + column(radius)) * h
+    columns = [bend * column(sizes) + added_r, bend * column(found.reach[k][:n])]
+    if gain is not None:
+        columns[1] = columns[1] + (one + piece.deviation) * column(gain) * h
+    low, high, reach = [], [], []
+    for i, row in enumerate(rows):
+        weights = arb_mat(1, n, [x.abs_upper() for x in row])
+        rest, spread = ((weights * item)[0, 0] for item in columns)
+        linear = (arb_mat(1, n, list(row)) * column(middle))[0, 0] * h
+        first, last = n + i, n + count + i
+        low.append((arb.min(found.low[k][first], found.low[k][last]) + arb.min(linear, arb(0)) - rest).lower())
+        high.append((arb.max(found.high[k][first], found.high[k][last]) + arb.max(linear, arb(0)) + rest).upper())
+        reach.append((arb.max(found.reach[k][first], found.reach[k][last]) + spread).upper())
+    return low, high, reach

@@ -111,7 +111,7 @@ class Martingales:
         found = [self.variation(np.broadcast_to(row, (count, n))) for row in np.eye(n)]
         kappa = np.stack([kappa for kappa, _ in found], axis=1)
         losses = np.stack([loss for _, loss in found], axis=1)
-        factor = quantile(self.shared_log - float(np.log(4.0 * max(int(np.count_nonzero(kappa)), 1))) - 1e-12)
+        factor = self._factor(int(np.count_nonzero(kappa)))
         base = factor * kappa * _ROUND
         levels = base * (1 + 1e-9) + _TINY
         for _ in range(20):
@@ -120,6 +120,14 @@ class Martingales:
                 return levels
             levels = needed * (1 + 1e-6) + _TINY
         return np.full_like(levels, np.inf)
+
+    def _factor(self, count: int) -> float:
+        return quantile(self.shared_log - float(np.log(4.0 * max(count, 1))) - 1e-12)
+
+    @property
+    def factor(self) -> float:
+        """The levels of the coordinates in units of their kappa."""
+        return self._factor(self.frame.basis.shape[-1] * len(self.frame.ends))
 
     def _rounding(self, losses: Array, levels: Array) -> Array:
         """What jumps of the rows add: losses (W, ..., N, n) times |M| at the nodes, where the coordinates hold."""
@@ -202,10 +210,14 @@ class MartingaleEvent:
         """Shape of levels: kappa, and the cost as it stands to a level of a few kappa."""
         return np.asarray(self.kappa[self.window] + self.cost / 4.0)
 
+    def factor(self, log_probability: float) -> float:
+        """About the number of kappas that are exceeded in some window with probability exp(log_probability)."""
+        count = max(int(np.count_nonzero(self.kappa)), 1)
+        return quantile(log_probability - float(np.log(2.0 * count)))
+
     def level(self, log_probability: float) -> Array:
         """Levels per piece that are exceeded with probability of at most exp(log_probability)."""
-        count = max(int(np.count_nonzero(self.kappa)), 1)
-        factor = quantile(log_probability - float(np.log(2.0 * count)))
+        factor = self.factor(log_probability)
         for wider in (1e-9, 1e-6, 1e-3):
             level = (factor * (1 + wider) * self.kappa)[self.window] + self.cost * (1 + wider)
             if self.log_exceedance(level) <= log_probability:
@@ -240,27 +252,33 @@ class SplitEvent:
 
     def log_exceedance(self, levels: Array) -> float:
         """Upper bound of log P(exists t: rows[k] . (Z + M)_t > levels[k] on piece k), the best of a few splits."""
+        return self.split(levels)[0]
+
+    def split(self, levels: Array) -> tuple[float, float]:
+        """That bound, and log of the probability granted to M in the best split (0 where all the room is M's)."""
         if self.gaussian is None:
-            return self.martingale.log_exceedance(levels)
-        base = best = self.gaussian.log_exceedance(levels)
+            return self.martingale.log_exceedance(levels), 0.0
+        base = self.gaussian.log_exceedance(levels)
         if not np.any(self.martingale.kappa) and not np.any(self.martingale.cost):
-            return base
-        best = 0.0
+            return base, 0.0
+        best, granted = 0.0, 0.0
         for less in _SPLITS:
             share = max(base - less, -1e8)
             part = self.martingale.level(share)
             base = self.gaussian.log_exceedance(levels - part * _ROUND)
             if base >= 0.0:
                 break
-            best = min(best, logsumexp(np.array([base, self.martingale.log_exceedance(part)])))
-        return best
+            total = logsumexp(np.array([base, self.martingale.log_exceedance(part)]))
+            if total < best:
+                best, granted = total, share
+        return best, granted
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SplitEvents:
     """Events of Z + M: the Gaussian ones of Z (None where Z = 0) and the martingales of M."""
 
-    gaussian: ClockEvents | None
+    gaussian: ClockEvents | WindowEvents | None
     martingales: Martingales
 
     @property

@@ -24,6 +24,7 @@ from certbound.problem.sets import Inside
 from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian
+from certbound.reach.diffusion import depends_on_state
 from certbound.reach.events import StepEvents, WindowEvents, logsumexp
 from certbound.reach.linear import LinearRun, correlated, level_scale
 from certbound.reach.linearisation import Linearisation
@@ -31,18 +32,19 @@ from certbound.reach.tapes import varying_outputs
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import Proof, exact, needs_direction
 
-__all__ = ["linear_proof"]
+__all__ = ["EFFORTS", "PADS", "SLACK", "WINDOW", "Stated", "grids", "linear_proof", "proof_data", "widened"]
 
 Array = NDArray[np.float64]
 Events = StepEvents | WindowEvents
 
 _STEPS = (0.25, 0.12, 0.06)
 _FEWEST, _MOST = 40, (160, 320, 640)
-_PADS = ((0.08, 0.03, 0.01), (0.15, 0.05, 0.02), (0.25, 0.1, 0.03))  # a smaller one where a larger does not close
+EFFORTS = len(_STEPS)
+PADS = ((0.08, 0.03, 0.01), (0.15, 0.05, 0.02), (0.25, 0.1, 0.03))  # a smaller one where a larger does not close
 _NEARLY = 1.3
 _ROUNDS = 8
-_WINDOW = 0.05
-_SLACK = 0.01
+WINDOW = 0.05
+SLACK = 0.01
 _LIKELY = -2.0  # log10 of a probability of which a per cent matters
 _LOG10 = math.log(10.0)
 
@@ -55,39 +57,41 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     CertificateError
         If the remainder feeds itself once its boxes are widened.
     """
-    if isinstance(problem.system, ContinuousSystem) and isinstance(problem.system.diffusion, Tape):
-        raise CertificateError("the format states linear responses to constant noise only.")
-    effort = min(attempt, len(_STEPS) - 1)
+    effort = min(attempt, EFFORTS - 1)
     found = answer.details
     engine: Linearisation = found.run.engine
     if not engine.pieces or found.outcome.bounds is None:
         raise CertificateError("the linear response bounds nothing here.")
+    if depends_on_state(problem):
+        from certbound.safety.certificate_diffusion import diffusion_proof
+
+        return diffusion_proof(problem, answer, attempt)
     target = math.log(problem.delta)
     tried = [found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]
-    best: tuple[LinearRun, _Stated] | None = None
-    for run in _runs(found.run, effort):
-        best = _search(run, list(dict.fromkeys(tried)), _PADS[effort], target)
+    best: tuple[LinearRun, Stated] | None = None
+    for grid in grids(engine, effort):
+        run = found.run if grid is engine else LinearRun(grid)
+        best = _search(run, list(dict.fromkeys(tried)), PADS[effort], target)
         if best is not None:
             break
     if best is None:
         raise CertificateError("the remainder feeds itself once its boxes are widened for the checker.")
     log10 = best[1].log_probability / _LOG10
     exact_sums = not engine.continuous and effort == 0 and log10 > _LIKELY
-    slack = _SLACK * (0.01 if exact_sums else 1 + 0.1 * abs(log10))
-    return _data(problem, *best), min(log10 + slack, 0.0), []
+    slack = SLACK * (0.01 if exact_sums else 1 + 0.1 * abs(log10))
+    return proof_data(problem, *best), min(log10 + slack, 0.0), []
 
 
-def _runs(given: LinearRun, effort: int) -> Iterator[LinearRun]:
+def grids(engine: Linearisation, effort: int) -> Iterator[Linearisation]:
     """The same cells on a grid for the checker; then, should the remainder feed itself there, on the engine's own."""
-    engine = given.engine
     if engine.continuous:
         size = float(np.linalg.norm(np.nan_to_num(engine.slopes[0]), axis=(-2, -1)).max())
         pieces = int(np.clip(np.ceil(engine.problem.horizon * size / _STEPS[effort]), _FEWEST, _MOST[effort]))
         if not pieces <= engine.pieces <= _NEARLY * pieces:
-            yield LinearRun(engine.on_grid(pieces))
+            yield engine.on_grid(pieces)
         if pieces > engine.pieces:
             return
-    yield given
+    yield engine
 
 
 def _edges(engine: Linearisation) -> list[list[float]]:
@@ -106,19 +110,26 @@ def _edges(engine: Linearisation) -> list[list[float]]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Stated:
-    """Levels of the inner rows, boxes of the remainder, and what they prove."""
+class Stated:
+    """Levels of the inner rows, boxes of the remainder, and what they prove.
+
+    Where the noise depends on the state, ``gaussian`` are the levels of Z alone, ``window_levels`` those of its
+    martingale's coordinates, and ``stopped`` what is stated of M, cell by cell.
+    """
 
     levels: Array
     bounds: tuple[Array, Array]
     events: list[Events]
     log_probability: float
+    gaussian: Array | None = None
+    window_levels: list[Array] | None = None
+    stopped: list[dict[str, Any]] | None = None
 
 
 def _events(run: LinearRun, cell: int, shared: float) -> Events:
     engine = run.engine
     if isinstance(engine.system, ContinuousSystem):
-        return WindowEvents(engine.response, cell, max(1, round(_WINDOW / engine.step)), shared)
+        return WindowEvents(engine.response, cell, max(1, round(WINDOW / engine.step)), shared)
     return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
 
 
@@ -134,19 +145,19 @@ class _Levels:
 
 def _search(
     run: LinearRun, shares: list[float], pads: Sequence[float], target: float
-) -> tuple[LinearRun, _Stated] | None:
+) -> tuple[LinearRun, Stated] | None:
     """The first proof that reaches the target with the widest boxes that close, or the best one found with them.
 
     Wide boxes are quick to check.
     """
     known: dict[float, _Levels | None] = {}
-    best: _Stated | None = None
+    best: Stated | None = None
     for pad in pads:
         for share in shares:
             if share not in known:
                 known[share] = _levels(run, share)
             given = known[share]
-            bounds = None if given is None else _boxes(run, given.levels, given.found, pad)
+            bounds = None if given is None else widened(run, given.levels, given.found, pad)
             if given is None or bounds is None:
                 continue
             stated = _stated(run, given, bounds)
@@ -181,7 +192,7 @@ def _levels(run: LinearRun, log_nonlinear: float) -> _Levels | None:
     return None if found is None else _Levels(levels=levels, events=events, spent=spent, found=found)
 
 
-def _stated(run: LinearRun, given: _Levels, bounds: tuple[Array, Array]) -> _Stated:
+def _stated(run: LinearRun, given: _Levels, bounds: tuple[Array, Array]) -> Stated:
     """What the levels and the boxes prove."""
     worst = -np.inf
     for cell, own in enumerate(given.events):
@@ -192,12 +203,12 @@ def _stated(run: LinearRun, given: _Levels, bounds: tuple[Array, Array]) -> _Sta
             shared = logsumexp(np.array(given.spent[cell]))
             total = min(total, correlated(own, run.requirements[cell], rooms, shared, asked))
         worst = max(worst, total)
-    return _Stated(
+    return Stated(
         levels=given.levels, bounds=bounds, events=given.events, log_probability=float(min(worst, 0.0))
     )
 
 
-def _boxes(run: LinearRun, levels: Array, found: tuple[Array, Array], pad: float) -> tuple[Array, Array] | None:
+def widened(run: LinearRun, levels: Array, found: tuple[Array, Array], pad: float) -> tuple[Array, Array] | None:
     """Boxes B of beta such that beta over what B implies lies in B with a margin of half the padding."""
     engine, shape = run.engine, found[0].shape
     extra = run.extra.reshape(shape[0] * shape[1], *run.extra.shape[2:])
@@ -228,7 +239,7 @@ def _padded(bounds: tuple[Array, Array], pad: float) -> tuple[Array, Array]:
 # ---- the data ----------------------------------------------------------------------------------------------
 
 
-def _data(problem: Problem, run: LinearRun, stated: _Stated) -> dict[str, Any]:
+def proof_data(problem: Problem, run: LinearRun, stated: Stated) -> dict[str, Any]:
     engine, tape = run.engine, problem.closed_loop
     q = len(engine.d_middle)
     varying = _varying(tape, range(1, engine.n + 1))
@@ -252,7 +263,7 @@ def _data(problem: Problem, run: LinearRun, stated: _Stated) -> dict[str, Any]:
 def _cell(
     problem: Problem,
     run: LinearRun,
-    stated: _Stated,
+    stated: Stated,
     cell: int,
     *,
     varying: list[tuple[int, int]],
@@ -263,6 +274,10 @@ def _cell(
     events = stated.events[cell]
     active = engine.model.active
     extra = run.rows[cell][:, len(active) :][..., active]
+
+    windows = events.coordinate_levels if isinstance(events, WindowEvents) else None
+    if stated.window_levels is not None:
+        windows = stated.window_levels[cell]
 
     def chosen(matrices: Array, entries: list[tuple[int, int]]) -> Any:
         return exact([[float(m[i, j]) for i, j in entries] for m in matrices])
@@ -275,10 +290,11 @@ def _cell(
         "remainder_low": exact(stated.bounds[0][cell]),
         "remainder_high": exact(stated.bounds[1][cell]),
         "rows": exact(extra),
-        "levels": exact(stated.levels[cell]),
-        "window_levels": exact(events.coordinate_levels) if isinstance(events, WindowEvents) else None,
+        "levels": exact((stated.levels if stated.gaussian is None else stated.gaussian)[cell]),
+        "window_levels": None if windows is None else exact(windows),
         "frames": _frames(problem, run, stated, cell, varying),
         "separations": _separations(problem, run, cell),
+        **({} if stated.stopped is None else {"stopped": stated.stopped[cell]}),
     }
 
 
@@ -291,7 +307,7 @@ def _varying(tape: Tape, columns: range) -> list[tuple[int, int]]:
 
 
 def _frames(
-    problem: Problem, run: LinearRun, stated: _Stated, cell: int, varying: list[tuple[int, int]]
+    problem: Problem, run: LinearRun, stated: Stated, cell: int, varying: list[tuple[int, int]]
 ) -> list[list[int] | None]:
     """Rows in which each output's Hessian costs least as they stand (None: the coordinates themselves)."""
     engine = run.engine
@@ -326,7 +342,7 @@ def _cost(rows: Array, hessian: Array, width: Array) -> float:
     return float(np.einsum("kab,ka,kb->", turned, width, width))
 
 
-def _widths(run: LinearRun, stated: _Stated, cell: int) -> Array:
+def _widths(run: LinearRun, stated: Stated, cell: int) -> Array:
     reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(run.supports, *stated.bounds, strict=True)]
     low, high = run.polytope(stated.levels, reach)
     pieces = run.engine.pieces

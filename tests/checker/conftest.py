@@ -85,6 +85,16 @@ def spring() -> cb.Problem:
     )  # fmt: skip
 
 
+def stirred() -> cb.Problem:
+    """Continuous time, noise that grows with the state, near enough to its nominal value for a Gaussian part."""
+    system = cb.ContinuousSystem(
+        lambda x: [-x[0] + 0.1 * np.sin(x[0])], states=1, diffusion=lambda t, x: [[0.1 * (1 + 0.02 * np.sin(x[0]))]]
+    )
+    return cb.Problem(
+        system, initial=cb.Box([0.4], [0.5]), safe=[cb.Inside(cb.HalfSpace([-1.0], 0.15))], horizon=1.0, delta=1e-2
+    )
+
+
 @pytest.fixture(autouse=True)
 def precise() -> Iterator[None]:
     """The working precision of a check."""
@@ -110,3 +120,8 @@ def contracting() -> Case:
 @pytest.fixture(scope="session")
 def springing() -> Case:
     return Case(spring(), "barrier")
+
+
+@pytest.fixture(scope="session")
+def stirring() -> Case:
+    return Case(stirred(), "linear")

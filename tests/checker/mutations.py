@@ -225,6 +225,82 @@ LINEAR: list[Change] = [
 ]  # fmt: skip
 
 
+# ---- noise that depends on the state -----------------------------------------------------------------------
+
+
+def smaller_set(data: Data, rng: random.Random) -> str | None:
+    """A set over which the noise is bounded, and which the state may leave."""
+    stopped = rng.choice(data["proof"]["cells"])["stopped"]
+    piece = _pick(stopped["low"], rng)
+    place = _pick(stopped["low"][piece], rng)
+    low, high = (float.fromhex(stopped[name][piece][place]) for name in ("low", "high"))
+    if rng.random() < 0.5:
+        stopped["low"][piece][place] = (low + rng.uniform(0.2, 2.0) * (high - low)).hex()
+    else:
+        stopped["high"][piece][place] = (high - rng.uniform(0.2, 2.0) * (high - low)).hex()
+    return "set"
+
+
+def other_reference(data: Data, rng: random.Random) -> str | None:
+    """A diffusion matrix far from the noise on some piece."""
+    reference = rng.choice(data["proof"]["cells"])["stopped"]["reference"]
+    if reference is None:
+        return None
+    rows = reference[_pick(reference, rng)]
+    row = rows[_pick(rows, rng)]
+    place = _pick(row, rng)
+    row[place] = _scaled(row[place], 1.0, rng.choice((-1, 1)) * rng.uniform(5.0, 50.0))
+    return "reference"
+
+
+def no_reference(data: Data, rng: random.Random) -> str | None:
+    """All noise in the martingale, whose levels were written for a part of it."""
+    stopped = rng.choice(data["proof"]["cells"])["stopped"]
+    if stopped["reference"] is None:
+        return None
+    stopped["reference"] = None
+    return "no reference"
+
+
+def lower_factor(data: Data, rng: random.Random) -> str | None:
+    """A level of the martingale that it exceeds far more often."""
+    stopped = rng.choice(data["proof"]["cells"])["stopped"]
+    name = rng.choice(("coordinates", "rows", "rooms"))
+    if stopped[name] is None:
+        return None
+    holder, key = stopped, name
+    while isinstance(holder[key], list):
+        holder, key = holder[key], _pick(holder[key], rng)
+    holder[key] = _scaled(holder[key], rng.uniform(0.05, 0.3))
+    return name
+
+
+def dropped_row(data: Data, rng: random.Random) -> str | None:
+    """A row, a demand, a window or a piece left out of what is said of the martingale."""
+    stopped = rng.choice(data["proof"]["cells"])["stopped"]
+    name = rng.choice(("rows", "rooms", "windows", "low", "high", "reference"))
+    if not stopped[name]:
+        return None
+    del stopped[name][_pick(stopped[name], rng)]
+    return f"dropped {name}"
+
+
+def nothing_stated(data: Data, rng: random.Random) -> str | None:
+    """Noise that depends on the state, treated as if it did not."""
+    cell = rng.choice(data["proof"]["cells"])
+    if rng.random() < 0.5:
+        del cell["stopped"]
+    else:
+        cell["stopped"] = None
+    return "nothing"
+
+
+STATE: list[Change] = [
+    other_problem, other_dynamics, lower_level, lower_window_level, missing_box, smaller_set, other_reference,
+    no_reference, lower_factor, dropped_row, nothing_stated,
+]  # fmt: skip
+
+
 # ---- the constants -----------------------------------------------------------------------------------------
 
 

@@ -15,7 +15,7 @@ from certbound.checker import check_data, parse
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
 from tests.checker.conftest import contraction
-from tests.checker.mutations import BARRIER, CONSTANTS, HARMLESS, LINEAR, mutated, rejected, stronger_claim
+from tests.checker.mutations import BARRIER, CONSTANTS, HARMLESS, LINEAR, STATE, mutated, rejected, stronger_claim
 
 
 def survivors(data: Any, problem: Any, changes: Any, count: int, seed: int) -> list[str]:
@@ -28,7 +28,8 @@ def survivors(data: Any, problem: Any, changes: Any, count: int, seed: int) -> l
 
 @pytest.mark.parametrize(
     ("name", "changes", "count"),
-    [("stepping", LINEAR, 55), ("flowing", LINEAR, 11), ("contracting", CONSTANTS, 14), ("springing", BARRIER, 27)],
+    [("stepping", LINEAR, 55), ("flowing", LINEAR, 11), ("contracting", CONSTANTS, 14), ("springing", BARRIER, 27),
+     ("stirring", STATE, 44)],
 )
 def test_what_weakens_the_support_of_a_claim_is_rejected(
     name: str, changes: Any, count: int, request: pytest.FixtureRequest
@@ -63,7 +64,9 @@ def anything_anywhere(data: Any, rng: random.Random) -> str | None:
             return "anything"
 
 
-@pytest.mark.parametrize(("name", "count"), [("stepping", 120), ("contracting", 12), ("springing", 40)])
+@pytest.mark.parametrize(
+    ("name", "count"), [("stepping", 120), ("contracting", 12), ("springing", 40), ("stirring", 40)]
+)
 def test_anything_anywhere_ends_in_a_report_or_a_refusal(
     name: str, count: int, request: pytest.FixtureRequest
 ) -> None:
