@@ -1,7 +1,7 @@
 """Floating-point search for the Kummer parameters (a, v_0): it proposes, ball arithmetic certifies.
 
-The unknowns are log(1 + a) and log(v_0/(1 + a)) (Bessel form: log a alone): a large a wants a large v_0. A coarse
-grid gives the start, the simplex method of Nelder and Mead the end.
+The unknowns are 2/(1 + a) and log(v_0/(1 + a)) (Bessel form: log a alone): a large a wants a large v_0, and an
+infinite one is an edge of the box. A coarse grid gives the start, the simplex method of Nelder and Mead the end.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ Point = tuple[float, ...]
 
 _POWERS = np.array([0.1, 1.5, 20.0])
 _SPREADS = np.log(10.0) * np.array([-2.0, -0.9, -0.2, 0.6])
+_SPAN = 2.0  # of the first unknown
+_LARGEST = 1e4  # power a
 _FEW = 16
 _DIGITS = 1e-8
 
@@ -74,9 +76,9 @@ class Search:
         return max(top, 1e-290)
 
     @cached_property
-    def cap(self) -> float:
-        """Largest x = log(1 + a) that Thm K1 allows."""
-        return math.log(1e4) if self.schedule.any_power else math.log1p(self.schedule.nu / 2 * (1 - 1e-9))
+    def _least(self) -> float:
+        """First unknown at the largest a that Thm K1 allows."""
+        return _SPAN / (_LARGEST if self.schedule.any_power else 1 + self.schedule.nu / 2 * (1 - 1e-9))
 
     @cached_property
     def half(self) -> float:
@@ -143,8 +145,8 @@ class Search:
         return min(
             simplex(
                 lambda p: function(*self._parameters(p)), start, step, tolerance=tolerance,
-                width=0.2 if tolerance >= 1e-3 else 0.05, low=(-650.0 if self.bessel else 0.0, -650.0),
-                high=(self.cap, 650.0),
+                width=0.2 if tolerance >= 1e-3 else 0.05, low=(-650.0 if self.bessel else self._least, -650.0),
+                high=(math.log(_LARGEST) if self.bessel else _SPAN, 650.0),
             ) for start in starts
         )[1]  # fmt: skip
 
@@ -152,7 +154,8 @@ class Search:
         """(a, v_0) of a point of the search: the Bessel form has one free parameter."""
         if self.bessel:
             return math.exp(point[0]), self.reference
-        return math.expm1(point[0]), math.exp(point[0] + point[1])
+        over = _SPAN / point[0]
+        return over - 1, over * math.exp(point[1])
 
     def log_probability(self, a: float, v0: float, scale: float) -> float:
         """Logarithm of Thm K2's bound for the clearance ``scale`` times ``weights``."""
@@ -233,6 +236,8 @@ class Search:
             if abs(step) < 1e-7 and abs(excess) < 1e-2:
                 return math.exp(x + step)
             x = x + step if low < x + step < high else (low + high) / 2
+            if x == before[0]:  # no floats are left between the ends
+                return math.exp(x)
         return math.inf
 
     def _mean(self, a: float, v0: float) -> float:
@@ -268,9 +273,9 @@ class Search:
         if self.bessel:
             lines: list[list[Point]] = [[(x,) for x in np.linspace(-3.0, 7.0, 9).tolist()]]
         else:
-            powers = np.unique(np.minimum(np.log1p(_POWERS), self.cap - 1e-3)).tolist()
+            powers = np.unique(np.maximum(_SPAN / (1 + _POWERS), self._least * 1.001)).tolist()
             logs = (math.log(self.reference) + _SPREADS).tolist()
-            lines = [[(x, y - min(x, math.log(2.0))) for y in logs] for x in powers]
+            lines = [[(x, y - min(math.log(_SPAN / x), math.log(2.0))) for y in logs] for x in powers]
         judge = self._at(1.0 if self.kind == "probability" else self._typical())
         best = [min((judge(*self._parameters(point)), point) for point in line) for line in lines]
         best = sorted((value if value == value else math.inf, point) for value, point in best)
