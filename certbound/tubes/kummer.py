@@ -174,7 +174,11 @@ class KummerProfile:
         known = self._known.get(key)
         excess = excess_function(self.a, self.schedule.nu / 2, self.bessel)
         if known is None or not (excess(known) >= target):
-            guess = solve_excess_one(self.a, self.schedule.nu / 2, float(target.log()), bessel=self.bessel)
+            near = self._known.get(min(self._known, key=lambda other: abs(other - key), default=key))
+            guess = solve_excess_one(
+                self.a, self.schedule.nu / 2, float(target.log()), bessel=self.bessel,
+                guess=0.0 if near is None else float(near),
+            )  # fmt: skip
             known = arb(solve_upward(excess, target, guess))
             self._known[key] = known
         return known
