@@ -35,6 +35,8 @@ __all__ = ["KummerProfile", "Start", "check_delta", "kummer_tube", "log_initial"
 
 Array = NDArray[np.float64]
 
+_LARGEST_EXPONENT = 1e8
+
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
@@ -102,10 +104,13 @@ class KummerProfile:
         }  # fmt: skip
 
     def radius(self, t: Array) -> Array:
-        """Floating-point radius."""
+        """Floating-point radius; in balls where a I_0 is so large that floats lose the difference of exponents."""
         data = self.schedule
-        v, info = data.path_at(self.v0, t, bessel=self.bessel)
         whole = float(data.path(np.asarray(self.v0), bessel=self.bessel)[1][0])
+        if not self.a * whole < _LARGEST_EXPONENT:
+            places = zip(data.locate(t).ravel().tolist(), t.ravel().tolist())
+            return np.array([self.stretch(piece, s, s)[0] for piece, s in places]).reshape(t.shape)
+        v, info = data.path_at(self.v0, t, bessel=self.bessel)
         log_x = log_initial(data, self.a, self.v0, whole, self.start, self.bessel)
         target = log_target(self.a, info, log_x, math.log(self.delta))
         z = solve_excess(np.asarray(self.a), data.nu / 2, target, bessel=self.bessel)

@@ -217,3 +217,10 @@ def test_a_random_start_needs_the_full_dimension():
 def test_questions_out_of_range_are_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call(tube())
+
+
+def test_a_power_beyond_all_floats_gives_wide_radii_not_zero():
+    constants = Constants(gain=0.46, sigma=0.61, dimension=2)
+    tube = kummer_tube(constants, horizon=31, delta=0.03, a=1.5e22, v0=4e20, bessel=True)
+    assert tube.radius(0.0) == 0
+    assert np.all(tube.radius(np.arange(1.0, 5.0)) > 2.0)
