@@ -209,24 +209,41 @@ def _stated(run: LinearRun, given: _Levels, bounds: tuple[Array, Array]) -> Stat
 
 
 def widened(run: LinearRun, levels: Array, found: tuple[Array, Array], pad: float) -> tuple[Array, Array] | None:
-    """Boxes B of beta such that beta over what B implies lies in B with a margin of half the padding."""
+    """Boxes B of beta with a margin of half the padding around beta over what B implies.
+
+    Beta is bounded over the polytope P that wider boxes imply; boxes around these bounds are right once what they imply
+    lies in P.
+    """
     engine, shape = run.engine, found[0].shape
     extra = run.extra.reshape(shape[0] * shape[1], *run.extra.shape[2:])
-    low, high = _padded(found, pad)
+    boxes = _padded(found, pad)
     for _ in range(_ROUNDS):
-        reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(run.supports, low, high, strict=True)]
-        if not all(np.isfinite(part).all() for pair in reach for part in pair):
+        held = _implied(run, levels, _padded(boxes, pad / 2))
+        if held is None:
             return None
-        bound = engine.model.bound(engine.frame, *run.polytope(levels, reach), extra, 2)
+        wanted = [part.reshape(-1, engine.n) for part in _padded(found, pad / 2)]
+        bound = engine.model.bound(engine.frame, *held, extra, 2, (wanted[0], wanted[1]))
         inner = bound[0].reshape(shape), bound[1].reshape(shape)
         if not all(np.isfinite(part).all() for part in inner):
             return None
-        needed = _padded(inner, pad / 2)
-        if np.all(needed[0] >= low) and np.all(needed[1] <= high):
-            return low, high
-        wider = _padded(inner, pad)
-        low, high = np.minimum(low, wider[0]), np.maximum(high, wider[1])
+        boxes = _padded(inner, pad / 2)
+        implied = _implied(run, levels, boxes)
+        if implied is None:
+            return None
+        if np.all(implied[0] >= held[0]) and np.all(implied[1] <= held[1]):
+            return boxes
+        found = inner
     return None
+
+
+def _implied(run: LinearRun, levels: Array, boxes: tuple[Array, Array]) -> tuple[Array, Array] | None:
+    """The polytope of deviations that boxes of beta imply; None where it is not bounded."""
+    reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(run.supports, *boxes, strict=True)]
+    if not all(np.isfinite(part).all() for pair in reach for part in pair):
+        return None
+    low, high = run.polytope(levels, reach)
+    slack = 1e-12 * (high - low)
+    return low - slack, high + slack
 
 
 def _padded(bounds: tuple[Array, Array], pad: float) -> tuple[Array, Array]:
