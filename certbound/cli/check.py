@@ -84,7 +84,7 @@ def _stated(
 
 
 def proved_certificate(problem: Problem, verdict: Verdict) -> str:
-    """The text of a verdict's certificate, which the checker has proved again.
+    """The text of a verdict's certificate, which the checker has proved again; it claims what was proved.
 
     Raises
     ------
@@ -94,14 +94,14 @@ def proved_certificate(problem: Problem, verdict: Verdict) -> str:
         If the checker did not prove what was written, at any effort.
     """
     from certbound.checker import check_data, parse
-    from certbound.safety.certificate import problem_data
+    from certbound.safety.certificate import problem_data, restated
 
     reason = ""
     for attempt in range(ATTEMPTS):
         text = verdict.certificate_text(problem, attempt=attempt)
         report = check_data(parse(text), problem_data(problem))
-        if report.valid:
-            return text
+        if report.valid and report.log10_proved is not None:
+            return restated(text, report.log10_proved)
         reason = report.reason
     raise SolverError(f"the certificate could not be proved again by the checker: {reason}")
 

@@ -25,10 +25,14 @@ from certbound.safety.answers import EngineAnswer, is_at_most
 if TYPE_CHECKING:
     from certbound.safety.verification import Verdict
 
-__all__ = ["FORMAT", "VERSION", "certificate_data", "certificate_text", "exact", "needs_direction", "problem_data"]
+__all__ = [
+    "FORMAT", "VERSION", "certificate_data", "certificate_text", "exact", "needs_direction", "problem_data",
+    "restated",
+]  # fmt: skip
 
 FORMAT = "certbound certificate"
 VERSION = 1
+_ROUNDING = 1e-6  # other versions of the ball arithmetic may round otherwise
 
 Proof = tuple[dict[str, Any], float, list[str]]
 
@@ -49,6 +53,20 @@ def exact(value: Any) -> Any:
 def certificate_text(problem: Problem, verdict: Verdict, *, attempt: int = 0) -> str:
     """The certificate of a verdict as the text of a JSON file; see `certificate_data`."""
     return json.dumps(certificate_data(problem, verdict, attempt=attempt), separators=(",", ":")) + "\n"
+
+
+def restated(text: str, log10_proved: float) -> str:
+    """The certificate claiming what the checker proved of it, where that is less than it claimed.
+
+    The writer leaves itself room, and its own bounds of the events are coarser in places than the checker's.
+    """
+    data = json.loads(text)
+    claimed = float.fromhex(data["claim"]["log10_delta"])
+    proved = log10_proved + _ROUNDING * (1.0 + abs(log10_proved))
+    if not proved < claimed:
+        return text
+    data["claim"]["log10_delta"] = exact(proved)
+    return json.dumps(data, separators=(",", ":")) + "\n"
 
 
 def certificate_data(problem: Problem, verdict: Verdict, *, attempt: int = 0) -> dict[str, Any]:

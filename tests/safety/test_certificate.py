@@ -14,7 +14,7 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
 from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificate import certificate_data, certificate_text, exact, problem_data
+from certbound.safety.certificate import certificate_data, certificate_text, exact, problem_data, restated
 from certbound.safety.verification import verify_safety
 
 
@@ -50,6 +50,21 @@ def test_a_certificate_claims_no_more_than_the_verdict(method: str) -> None:
     data = certificate_data(problem, verdict)
     assert float.fromhex(data["claim"]["log10_delta"]) >= verdict.log10_delta
     assert check_data(parse(json.dumps(data))).valid
+
+
+def test_a_certificate_restated_claims_what_was_proved_of_it() -> None:
+    problem = small()
+    text = certificate_text(problem, verify_safety(problem, method="linear"))
+    proved = check_data(parse(text)).log10_proved
+    assert proved is not None
+    data = parse(restated(text, proved))
+    claim = float.fromhex(data["claim"]["log10_delta"])
+    assert proved < claim <= float.fromhex(parse(text)["claim"]["log10_delta"])
+    assert claim == pytest.approx(proved, rel=1e-5)
+    assert check_data(data).valid
+    assert restated(text, 0.0) == text
+    data["claim"]["log10_delta"] = (claim - 1e-4).hex()
+    assert not check_data(data).valid
 
 
 def test_an_unsafe_nominal_has_no_certificate() -> None:
