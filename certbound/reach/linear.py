@@ -23,6 +23,7 @@ from certbound.reach.inclusion import Supports
 from certbound.reach.levels import level_along, level_scale
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.martingales import SplitEvents
+from certbound.reach.occupancy import log_occupancy
 from certbound.reach.overlaps import log_any_exceedance
 from certbound.reach.rows import WINDOW
 from certbound.reach.samples import sampled_range
@@ -300,6 +301,8 @@ class LinearRun:
         asked = self.requirements[cell]
         along = [events.along(r.rows) for r in asked]
         logs = [event.log_exceedance(rooms[:, i]) for i, event in enumerate(along)]
+        if isinstance(events, StepEvents) and events.gaussian:
+            logs = [self._entered(cell, r, log, bounds) for r, log in zip(asked, logs, strict=True)]
         total = logsumexp(np.array([shared, *logs]))
         steady = [event for event in along if isinstance(event, SteadyEvent)]
         if asked and not len(self.engine.model.active) and len(steady) == len(along):
@@ -312,6 +315,17 @@ class LinearRun:
         return Outcome(
             log_probability=min(total, 0.0), log_nonlinear=log_nonlinear, bounds=bounds, cell=cell, logs=tuple(logs),
         )
+
+    def _entered(self, cell: int, asked: Requirement, log: float, bounds: tuple[Array, Array]) -> float:
+        """What a requirement costs, or the time spent in its obstacle, if that is less and the cost is too much."""
+        engine, constraints = self.engine, self.engine.problem.constraints
+        if log <= float(np.log(engine.problem.delta)) or not 0 <= asked.constraint < len(constraints):
+            return log
+        support = self.supports[cell]
+        remainder = support.remainder(bounds[0][cell], bounds[1][cell])[2]
+        return min(log, log_occupancy(
+            constraints[asked.constraint], engine.response, cell, nominal=engine.nodes[cell], moved=support.y_nodes,
+            remainder=remainder, disturbed=bool(np.any(engine.d_radius))))
 
     def tightest(self, outcome: Outcome) -> tuple[Requirement | None, int, float]:
         """The requirement with the least room at the problem's delta (shared evenly), its piece, and that room."""

@@ -5,7 +5,7 @@ return upper bounds: functions named ``log_...`` natural logarithms entry by ent
 probability of the whole event. Every event is one-sided; the two-sided one costs at most twice as much
 (`double`). Leading axes are a batch (directions, trial scales).
 
-Discrete time: `exceedance_chain`, `union`, `triple_below` (overlaps). Continuous time: `log_window`
+Discrete time: `exceedance_chain`, `union`, `triple_below` (overlaps), `log_rectangle`. Continuous time: `log_window`
 (martingale windows), `crossing_rate` (smooth directions), `markov_clock` or `node_clock` with
 `clock_crossing` (rough directions). Scales: `least_scale`, `split_levels`. A scalar linear equation:
 `linear_radius`.
@@ -13,6 +13,7 @@ Discrete time: `exceedance_chain`, `union`, `triple_below` (overlaps). Continuou
 
 from __future__ import annotations
 
+from certbound.tubes.gaussian_box import log_rectangle
 from certbound.tubes.gaussian_clock import Clock, clock_crossing, decorrelation_rates, markov_clock, node_clock
 from certbound.tubes.gaussian_crossing import log_line_crossing, log_polygon_crossing
 from certbound.tubes.gaussian_linear import linear_exceedance, linear_radius
@@ -34,6 +35,6 @@ from certbound.tubes.gaussian_triple import triple_below
 __all__ = [
     "Bounds", "Clock", "clock_crossing", "crossing_rate", "decorrelation_rates", "double", "exceedance_chain",
     "least_scale", "linear_exceedance", "linear_radius", "log_below_above", "log_between", "log_line_crossing",
-    "log_pair", "log_polygon_crossing", "log_tail", "log_tail_below", "log_window", "markov_clock", "node_clock",
-    "split_levels", "total", "total_symmetric", "triple_below", "union",
+    "log_pair", "log_polygon_crossing", "log_rectangle", "log_tail", "log_tail_below", "log_window", "markov_clock",
+    "node_clock", "split_levels", "total", "total_symmetric", "triple_below", "union",
 ]  # fmt: skip
