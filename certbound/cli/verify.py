@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shlex
 import sys
@@ -44,6 +45,7 @@ EXAMPLES = examples(
     "certbound verify unicycle --horizon 2 --plot tube.png",
     "certbound verify my_system.toml --set sigma=0.1 --delta 1e-6 --json",
     "certbound verify chain --certificate chain.json --report chain.html",
+    "certbound verify unicycle --smallest --time-limit 60",
 )
 _log = logging.getLogger(__name__)
 
@@ -68,6 +70,9 @@ PlotOption = Annotated[
 ExplainOption = Annotated[
     bool, typer.Option("--explain", help="Show what each engine found, and for UNKNOWN what would be SAFE.")
 ]
+SmallestOption = Annotated[
+    bool, typer.Option("--smallest", help="Once SAFE, go on to the smallest probability that can be proved.")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -86,6 +91,7 @@ def verify(
     report: ReportOption = None,
     plot: PlotOption = None,
     explain: ExplainOption = False,
+    smallest: SmallestOption = False,
     time_limit: TimeLimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -95,7 +101,10 @@ def verify(
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
     started = time.perf_counter()
     with spinner(f"verifying {subject.name}"):
-        verdict = _verdict(subject, method, cells, Clock(time_limit))
+        clock = Clock(time_limit)
+        verdict = _verdict(subject, method, cells, clock)
+        if smallest and verdict.status == "SAFE":
+            verdict = _smallest(verdict, method, cells, clock)
     seconds = time.perf_counter() - started
     result = _result(subject, verdict, seconds)
     if explain:
@@ -138,6 +147,16 @@ def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> 
         status="UNKNOWN", log10_delta=0.0, margin=None, time=None, constraint=None, reason=f"{over} {cure}",
         method=method, problem=problem,
     )  # fmt: skip
+
+
+def _smallest(verdict: Verdict, method: str, cells: int | None, clock: Clock) -> Verdict:
+    """The last of ever smaller probabilities that time allows."""
+    from certbound.safety.limits import smaller_verdicts
+
+    with contextlib.suppress(OutOfTime), clock.running():
+        for found in smaller_verdicts(verdict, method=method, cells=cells):
+            verdict = found
+    return verdict
 
 
 def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any]:

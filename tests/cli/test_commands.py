@@ -61,6 +61,23 @@ def test_verify_prints_the_keys_of_the_contract(capsys: pytest.CaptureFixture[st
     assert all(len(row) == 1 for row in tube["extent"])
 
 
+def test_the_smallest_probability_goes_into_the_answer_and_the_certificate(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    first = answer(capsys, "verify", "chain_rest")[1]
+    file = tmp_path / "c.json"
+    code, found = answer(capsys, "verify", "chain_rest", "--smallest", "--certificate", str(file))
+    assert code == 0
+    assert found.keys() == VERIFY_KEYS
+    assert found["delta"] == first["delta"] == 0.002
+    assert found["log10_delta"] < 2 * first["log10_delta"]
+    code, checked = answer(capsys, "check", str(file), "--problem", "chain_rest")
+    assert (code, checked["valid"]) == (0, True)
+    assert "10^-6" in checked["claim"]
+    stopped = answer(capsys, "verify", "chain_rest", "--smallest", "--time-limit", "0.9")[1]
+    assert stopped["log10_delta"] <= 0
+
+
 def test_an_answer_that_is_not_safe_exits_with_one(capsys: pytest.CaptureFixture[str]) -> None:
     code, found = answer(capsys, "verify", "ou", "--method", "kummer", "--set", "radius=0.5")
     assert code == 1
