@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -172,13 +173,18 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
         False: one cell when omitted, and no larger shares where nothing was proved.
     """
     target = float(np.log(problem.delta))
+    first = target + float(np.log(_SHARES[0][0]))
     run = _run(problem, cells=1 if cells is None else cells)
     best, effort = _best(run, target)
-    if thorough and cells is None and best.bounds is None:
-        finer = _finer(problem, run, target + float(np.log(_SHARES[0][0])))
-        if finer is not None:
-            run = finer
-            best, effort = _best(run, target)
+    closes = best.bounds is not None
+    guessed = len(run.engine.model.active) > 0 and not isinstance(run, DiffusionRun)
+    if thorough and cells is None and best.log_probability > target and (guessed or not closes):
+        for finer in _splits(problem, run):
+            if _promising(finer, target) if closes else finer.probability(first, _SHARES[0][1]).bounds is not None:
+                other = _best(finer, target)
+                if not closes or other[0].log_probability < best.log_probability:
+                    run, (best, effort) = finer, other
+                break
     if thorough and best.log_probability > _NOTHING and len(run.engine.model.active):
         for log_nonlinear in _LIKELIER[target < _LIKELIER]:
             best = _least(best, run.probability(float(log_nonlinear), 2))
@@ -223,16 +229,18 @@ def _best(run: LinearRun, target: float) -> tuple[Outcome, int]:
     return best, effort
 
 
-def _finer(problem: Problem, run: LinearRun, log_nonlinear: float) -> LinearRun | None:
-    """The engine on as few cells as keep the remainder from feeding itself; None where no number of them does."""
+def _splits(problem: Problem, run: LinearRun) -> Iterator[LinearRun]:
+    """Engines on more and more cells of the initial set, as long as they are not too many."""
     wide = int(np.count_nonzero(run.engine.radii[0]))
     for parts in _PARTS if wide else ():
         if parts**wide * run.engine.pieces > _MOST_PIECES:
-            break
-        finer = _run(problem, cells=parts)
-        if finer.probability(log_nonlinear, _SHARES[0][1]).bounds is not None:
-            return finer
-    return None
+            return
+        yield _run(problem, cells=parts)
+
+
+def _promising(run: LinearRun, target: float) -> bool:
+    """Whether a guess of the remainder says that the target is within reach."""
+    return any(run.promise(target + float(np.log(share)), effort) <= target for share, effort in _GUESSED)
 
 
 def _least(first: Outcome, second: Outcome) -> Outcome:

@@ -244,3 +244,14 @@ def test_a_piece_that_needs_more_is_tried_again_alone() -> None:
     sample = run.sampled(run._deviations(levels, *found[1:]) or implied)
     assert np.all(sample[0] >= found[1])
     assert np.all(sample[1] <= found[2])
+
+
+def test_more_cells_are_taken_where_one_proves_too_little() -> None:
+    problem = oscillator(sigma=0.06, cubic=1.0, initial=cb.Box([0.9, -0.3], [1.5, 0.3]), horizon=2.0, delta=1e-3,
+                         safe=[cb.Inside(cb.HalfSpace([0.0, -1.0], 1.7))])
+    once = linear_answer(problem, cells=1)
+    assert once.outcome.bounds is not None
+    assert once.log10_delta > -3
+    several = linear_answer(problem)
+    assert len(several.run.engine.centres) > 1
+    assert several.log10_delta <= -3
