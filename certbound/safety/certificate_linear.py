@@ -45,6 +45,7 @@ _NEARLY = 1.3
 _ROUNDS = 8
 WINDOW = 0.05
 SLACK = 0.01
+_NEAR = 0.9  # of the logarithm that the engine proved
 _LIKELY = -2.0  # log10 of a probability of which a per cent matters
 _LOG10 = math.log(10.0)
 
@@ -68,11 +69,15 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
         return diffusion_proof(problem, answer, attempt)
     target = math.log(problem.delta)
     tried = [found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]
+    if not len(engine.model.active):  # only windows ask for a share
+        tried.insert(0, found.outcome.log_probability + math.log(0.02))
     best: tuple[LinearRun, Stated] | None = None
     for grid in grids(engine, effort):
         run = found.run if grid is engine else LinearRun(grid)
-        best = _search(run, list(dict.fromkeys(tried)), PADS[effort], target)
-        if best is not None:
+        stated = _search(run, list(dict.fromkeys(tried)), PADS[effort], target)
+        if stated is not None and (best is None or stated.log_probability < best[1].log_probability):
+            best = run, stated
+        if best is not None and best[1].log_probability <= _NEAR * found.outcome.log_probability:
             break
     if best is None:
         raise CertificateError("the remainder feeds itself once its boxes are widened for the checker.")
@@ -143,31 +148,26 @@ class _Levels:
     found: tuple[Array, Array]
 
 
-def _search(
-    run: LinearRun, shares: list[float], pads: Sequence[float], target: float
-) -> tuple[LinearRun, Stated] | None:
-    """The first proof that reaches the target with the widest boxes that close, or the best one found with them.
+def _search(run: LinearRun, shares: list[float], pads: Sequence[float], target: float) -> Stated | None:
+    """The first share's proof that reaches the target, or the best one found, with the widest boxes that close.
 
     Wide boxes are quick to check.
     """
-    known: dict[float, _Levels | None] = {}
     best: Stated | None = None
-    for pad in pads:
-        for share in shares:
-            if share not in known:
-                known[share] = _levels(run, share)
-            given = known[share]
-            bounds = None if given is None else widened(run, given.levels, given.found, pad)
-            if given is None or bounds is None:
-                continue
-            stated = _stated(run, given, bounds)
-            if best is None or stated.log_probability < best.log_probability:
-                best = stated
-            if best.log_probability <= target:
-                return run, best
-        if best is not None:
-            return run, best
-    return None
+    for share in shares:
+        given = _levels(run, share)
+        if given is None:
+            continue
+        closed = (widened(run, given.levels, given.found, pad) for pad in pads)
+        bounds = next((found for found in closed if found is not None), None)
+        if bounds is None:
+            continue
+        stated = _stated(run, given, bounds)
+        if best is None or stated.log_probability < best.log_probability:
+            best = stated
+        if best.log_probability <= target:
+            break
+    return best
 
 
 def _levels(run: LinearRun, log_nonlinear: float) -> _Levels | None:

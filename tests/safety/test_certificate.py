@@ -161,3 +161,12 @@ def test_a_barrier_states_what_the_linear_response_proved_by_sharper_events() ->
         data = certificate_data(problem, weak)
     assert data["claim"]["method"] == "barrier"
     assert float.fromhex(data["claim"]["log10_delta"]) < -4
+
+
+def test_windows_of_a_linear_flow_cost_little_of_a_small_probability() -> None:
+    system = cb.ContinuousSystem(lambda x: [-x[0]], states=1, diffusion=[[0.1**0.5]])
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.4], [1.4]))], horizon=2.0)
+    verdict = verify_safety(problem, method="linear")
+    claim = float.fromhex(certificate_data(problem, verdict)["claim"]["log10_delta"])
+    assert verdict.log10_delta < -7
+    assert claim < 0.85 * verdict.log10_delta
