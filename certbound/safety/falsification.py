@@ -116,16 +116,17 @@ def _follow(flow: Flow, starts: Array, signals: Array) -> tuple[Array, Array]:
             for k in range(steps):
                 paths[:, k + 1] = x = x @ advance.T + pushes[:, k]
             return times, paths
+        function, pushed = compile_numpy(flow.tape), signals.T
         for k in range(steps):
-            t, h = float(times[k]), float(times[k + 1] - times[k])
+            t, h, row = float(times[k]), float(times[k + 1] - times[k]), rows[k]
+            k1 = function(t, *x.T, *row, *pushed)
             if flow.continuous:
-                k1 = flow.value(t, x, rows[k], signals)
-                k2 = flow.value(t + h / 2, x + h / 2 * k1, rows[k], signals)
-                k3 = flow.value(t + h / 2, x + h / 2 * k2, rows[k], signals)
-                k4 = flow.value(t + h, x + h * k3, rows[k], signals)
+                k2 = function(t + h / 2, *(x + h / 2 * k1).T, *row, *pushed)
+                k3 = function(t + h / 2, *(x + h / 2 * k2).T, *row, *pushed)
+                k4 = function(t + h, *(x + h * k3).T, *row, *pushed)
                 x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             else:
-                x = flow.value(t, x, rows[k], signals)
+                x = k1
             paths[:, k + 1] = x
     return times, paths
 
