@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import importlib.util
 import sys
 import time
@@ -74,9 +73,10 @@ def _extras() -> dict[str, bool]:
 def _requirements() -> dict[str, str]:
     """Distribution name -> version specifier of what the plain install needs."""
     import re
+    from importlib.metadata import requires
 
     found = {}
-    for line in importlib.metadata.requires("certbound") or []:
+    for line in requires("certbound") or []:
         if "extra ==" in line:
             continue
         match = re.match(r"([A-Za-z0-9._-]+)\s*(\(?[^;]*)", line)
@@ -87,9 +87,11 @@ def _requirements() -> dict[str, str]:
 
 def _version_of(distribution: str) -> Callable[[], str]:
     def check() -> str:
+        from importlib.metadata import version as version_of
+
         module = {"python-flint": "flint"}.get(distribution, distribution.replace("-", "_"))
         importlib.import_module(module)
-        version = importlib.metadata.version(distribution)
+        version = version_of(distribution)
         needed = _requirements()[distribution]
         if not _satisfies(version, needed):
             raise RuntimeError(f"version {version} is installed, {needed} is needed; pip install -U {distribution}")
