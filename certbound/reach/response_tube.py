@@ -37,6 +37,7 @@ _MANY = 20  # nonlinear coordinates beyond which a probability below the target 
 _NOTHING = -0.1  # log of a probability that says nothing
 _LIKELIER = np.log([0.01, 0.05, 0.2])  # delta_N where nothing was proved near the target
 _PARTS = (2, 4, 8)  # cells along each side, tried one after the other
+_NEAR = 3.5  # log of how many times the target one cell may prove for more cells to be tried
 _MOST_PIECES = 4000  # pieces of time times cells
 _LEAST = -1e12  # log10 of the smallest probability that is told apart from 0
 
@@ -177,8 +178,8 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
     run = _run(problem, cells=1 if cells is None else cells)
     best, effort = _best(run, target)
     closes = best.bounds is not None
-    guessed = len(run.engine.model.active) > 0 and not isinstance(run, DiffusionRun)
-    if thorough and cells is None and best.log_probability > target and (guessed or not closes):
+    near = best.log_probability < target + _NEAR and len(run.engine.model.active) and not isinstance(run, DiffusionRun)
+    if thorough and cells is None and best.log_probability > target and (near or not closes):
         for finer in _splits(problem, run):
             if _promising(finer, target) if closes else finer.probability(first, _SHARES[0][1]).bounds is not None:
                 other = _best(finer, target)
