@@ -184,7 +184,7 @@ class Stopped:
         unit = [[one[i, j] for j in range(windows.n)] for i in range(windows.n)]
         kappa = self.kappas([unit] * len(windows.starts))
         windows.levels = [[factor * value for value in row] for row in kappa]
-        count = sum(1 for row in kappa for value in row if value > 0)
+        count = sum(1 for row in kappa for value in row if not value.is_zero())
         self.paid = upper(4 * count * tail(factor))
 
     def kappas(self, directions: Sequence[Sequence[Sequence[arb]]]) -> list[list[arb]]:
@@ -235,7 +235,7 @@ class Stopped:
                     total += _beyond(item.levels, costs, pieces, kappa)
                     continue
                 factor = item.factors[w]
-                total += 2 * tail(factor) if kappa > 0 else arb(0)
+                total += arb(0) if kappa.is_zero() else 2 * tail(factor)
                 for k in pieces:
                     levels[k] = (factor * kappa + costs[k]).upper()
             result.append(Along(levels=levels, probability=upper(total)))
@@ -251,7 +251,7 @@ def _beyond(levels: Sequence[arb | None], costs: dict[int, arb], pieces: Sequenc
             least = arb.min(least, (level - costs[k]).lower())
     if not least >= 0:
         return arb(1)
-    return 2 * tail(least / kappa) if kappa > 0 else arb(0)
+    return arb(0) if kappa.is_zero() else 2 * tail(least / kappa)
 
 
 def _squares(values: arb_mat) -> list[arb]:

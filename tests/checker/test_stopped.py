@@ -167,6 +167,27 @@ def test_windows_must_rise_from_the_first_piece(stirring: Any) -> None:
             check_data(data)
 
 
+def filled(value: Any, number: float) -> Any:
+    return [filled(item, number) for item in value] if isinstance(value, list) else number.hex()
+
+
+@pytest.mark.parametrize("number", [1e308, 1e200, 5e-324, 0.0])
+def test_huge_and_tiny_numbers_prove_nothing(stirring: Any, number: float) -> None:
+    for name in ("reference", "coordinates", "rows", "rooms"):
+        data = stirring.data
+        stopped = data["proof"]["cells"][0]["stopped"]
+        stopped[name] = filled(stopped[name], number)
+        assert not check_data(data).valid
+    data = stirring.data
+    stopped = data["proof"]["cells"][0]["stopped"]
+    stopped["low"], stopped["high"] = filled(stopped["low"], -number), filled(stopped["high"], number)
+    assert not check_data(data).valid  # sine is bounded on all numbers, but by more than near the nominal
+    data = parse(certificate_text(growth(), verify_safety(growth(), method="linear")))
+    stopped = data["proof"]["cells"][0]["stopped"]
+    stopped["low"], stopped["high"] = filled(stopped["low"], -number), filled(stopped["high"], number)
+    assert not check_data(data).valid  # and this noise is not
+
+
 # ---- kappa -------------------------------------------------------------------------------------------------
 
 
