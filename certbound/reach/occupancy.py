@@ -25,7 +25,7 @@ __all__ = ["log_occupancy"]
 Array = NDArray[np.float64]
 
 _SIDES, _STEPS = 3, 200  # sides looked at, most steps
-_PARTS, _MOST = (1, 16, 8, 4), 4000  # cells of y along each side, by their number; cells and steps in all
+_PARTS, _MOST = (1, 16, 16, 4), 4000  # cells of y along each side, by their number; cells and steps in all
 _ROUND = 1e-14
 
 
