@@ -13,6 +13,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.cli.check import ATTEMPTS
@@ -70,9 +72,20 @@ def subjects() -> dict[str, cb.Problem]:
         found[path.stem] = cb.load(str(path))
     found["van_der_pol_dt, near 0"] = found["van_der_pol_dt"].replace(initial=cb.Box([-0.5, -0.5], [0.5, 0.5]))
     found["contraction_14d, 2 steps"] = found["contraction_14d"].replace(horizon=2)
+    found["noise in the state"] = stirred()
     for noise in NOISES:
         found[f"oscillator_cubic, {noise}"] = cb.load(str(FOLDER / "oscillator_cubic.toml"), sigma=noise)
     return found
+
+
+def stirred() -> cb.Problem:
+    """A damped pendulum whose noise grows with its velocity."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -np.sin(x[0]) - 0.5 * x[1]], states=["angle", "velocity"],
+        diffusion=lambda t, x: [[0.0], [0.05 * (1 + 0.5 * np.tanh(x[1]))]],
+    )  # fmt: skip
+    safe = [cb.Inside(cb.HalfSpace([-1.0, 0.0], 0.3))]
+    return cb.Problem(system, initial=cb.Box([0.38, -0.02], [0.4, 0.02]), safe=safe, horizon=2.0, name="stirred")
 
 
 def row(name: str, problem: cb.Problem) -> Row:
