@@ -97,26 +97,29 @@ class _Tangents:
 
     def __init__(self, a: arb, half: float, bessel: bool) -> None:
         self.a, self.half, self.bessel = a, arb(half), bessel
-        self.touched: list[tuple[float, arb, arb, arb | None]] = []
+        self.touched: list[tuple[arb, float, arb, arb, arb | None]] = []
 
     def touch(self, z: arb) -> bool:
         """Add the tangent at z; False where nothing is known there."""
         value, slope = excess_tangent(self.a, self.half, z, bessel=self.bessel)
         if not (value > 0 and value.is_finite() and z.is_finite()):
             return False
-        self.touched.append((float(z.log()), z.log(), value.log(), slope))
+        self.touched.append((z, float(z.log()), z.log(), value.log(), slope))
         return True
 
     def floor(self, z: arb) -> tuple[arb, float]:
         """(ball below E_a(z), about how much its logarithm loses there); (0, inf) without a tangent."""
         log_z = z.log()
         place = float(log_z)
-        near = min(self.touched, key=lambda tangent: abs(tangent[0] - place), default=None)
-        if near is None or (near[3] is None and near[0] > place):
+        near = min(self.touched, key=lambda tangent: (tangent[0] is not z, abs(tangent[1] - place)), default=None)
+        if near is None:
             return arb(0), math.inf
-        slope = 1 if near[3] is None else near[3]
-        loss = float(slope) * (near[0] - place) ** 2 if near[3] is not None or near[0] == place else math.inf
-        return (near[2] + slope * (log_z - near[1])).exp(), loss
+        own, there, log_there, value, slope = near
+        if own is z:
+            return value.exp(), 0.0
+        if slope is None:  # log E rises by log z at least; places that floats cannot tell apart have no order
+            return ((value + log_z - log_there).exp(), math.inf) if log_z >= log_there else (arb(0), math.inf)
+        return (value + slope * (log_z - log_there)).exp(), float(slope) * (there - place) ** 2
 
 
 class _Gain:

@@ -7,11 +7,13 @@ import time
 
 import numpy as np
 import pytest
+from flint import arb
 from scipy.integrate import quad
 from scipy.special import gamma, hyp1f1, iv
 
+from certbound.rigor.balls import excess_floor, precision
 from certbound.tubes.constants import Constants
-from certbound.tubes.exit import exit_level, union_level
+from certbound.tubes.exit import _Tangents, exit_level, union_level
 from certbound.tubes.kummer import Start, kummer_tube, log_initial
 from certbound.tubes.objective import read_clearance
 from certbound.tubes.radial import estimate_exit_probability
@@ -173,3 +175,16 @@ def test_a_start_in_the_middle_of_the_clearance_costs():
 def test_clearances_that_make_no_sense_are_refused(clearance, message):
     with pytest.raises((ValueError, TypeError), match=message):
         bound_exit_probability(OU, horizon=5.0, clearance=clearance)
+
+
+def test_a_floor_without_a_slope_is_not_carried_to_places_that_only_balls_tell_from_it():
+    with precision():
+        tangents, touched = _Tangents(arb(0), 1.0, False), arb(1e12)
+        assert tangents.touch(touched)
+        before = touched * (1 - arb(2) ** -56)
+        assert float(before.log()) == float(touched.log())
+        truth = excess_floor(arb(0), arb(1), before)
+        assert tangents.floor(before)[0] <= truth < tangents.floor(touched)[0]
+        assert tangents.floor(touched)[1] == 0.0
+        assert tangents.touch(before)
+        assert 0 < tangents.floor(before)[0] < tangents.floor(touched)[0]
