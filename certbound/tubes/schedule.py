@@ -187,8 +187,8 @@ class Schedule:
             part = backward / v[..., :-1]
             if not bessel:
                 part = np.where(part < 1, np.log1p(part), np.log(v[..., 1:] / v[..., :-1]) - drift)
-        info = np.zeros_like(v)
-        info[..., :-1] = np.cumsum(part[..., ::-1], axis=-1)[..., ::-1]
+            info = np.zeros_like(v)
+            info[..., :-1] = np.cumsum(part[..., ::-1], axis=-1)[..., ::-1]
         return v, info
 
     def path_at(self, start: float, t: Array, *, bessel: bool = False) -> tuple[Array, Array]:

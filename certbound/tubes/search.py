@@ -35,6 +35,7 @@ _SPAN = 2.0  # of the first unknown
 _LARGEST = 1e4  # power a
 _FEW = 16
 _DIGITS = 1e-8
+_OVERFLOWING = 1e300  # variance beyond which nothing is looked for
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -163,6 +164,8 @@ class Search:
         if len(self._pieces) <= _FEW:
             return self._short(a, v0, scale)
         v, info = self.schedule.path(np.asarray(v0), bessel=self.bessel)
+        if not np.max(v) < _OVERFLOWING:
+            return math.inf
         log_x = log_initial(self.schedule, a, v0, float(info[0]), self.start, self.bessel)
         if not math.isfinite(log_x):
             return math.inf
@@ -220,8 +223,10 @@ class Search:
         x, low, high, reach = (math.log(guess) if guess > 0 else 0.0), -math.inf, math.inf, 1.0
         slope, before = 2 * min(self.log_delta, -1.0), (math.nan, math.nan)
         for _ in range(80):
+            if not -650 < x < 650:
+                return math.inf
             excess = self.log_probability(a, v0, math.exp(x)) - self.log_delta
-            if not (math.isfinite(excess) and -650 < x < 650):
+            if not math.isfinite(excess):
                 return math.inf
             low, high = (x, high) if excess > 0 else (low, x)
             value = math.asinh(excess)

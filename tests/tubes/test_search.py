@@ -49,3 +49,12 @@ def _long(search):
     search = Search(**{name: getattr(search, name) for name in search.__dataclass_fields__})
     vars(search)["_pieces"] = [None] * 100
     return search
+
+
+def test_gains_that_leave_no_trace_of_the_noise_before_them_end_the_search_without_a_tube():
+    constants = cb.Constants(
+        gain=[1.0, 0.002, 1.0, 0.91, 0.24], sigma=[4.3, 42.6, 68.4, 18.4, 4.7], dimension=5,
+        times=[0.0, 8.0, 50.0, 99.0, 124.0, 300.0],
+    )
+    assert cb.tune_tube(constants, horizon=300, delta=1e-3, method="bessel").maximum == math.inf
+    assert cb.tune_tube(constants, horizon=300, delta=1e-3).maximum < 1e4
