@@ -169,6 +169,8 @@ class Search:
         log_x = log_initial(self.schedule, a, v0, float(info[0]), self.start, self.bessel)
         if not math.isfinite(log_x):
             return math.inf
+        if scale * scale == math.inf:
+            return -math.inf
         active = self._active(v)
         z, left = scale**2 * self._squares[active] / (2 * v[active]), info[active]
         if len(active) <= _FEW:

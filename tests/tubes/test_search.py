@@ -58,3 +58,9 @@ def test_gains_that_leave_no_trace_of_the_noise_before_them_end_the_search_witho
     )
     assert cb.tune_tube(constants, horizon=300, delta=1e-3, method="bessel").maximum == math.inf
     assert cb.tune_tube(constants, horizon=300, delta=1e-3).maximum < 1e4
+
+
+def test_scales_whose_squares_are_no_floats_any_more_are_answered():
+    schedule = make_schedule(cb.Constants(rate=-0.5, sigma=1.0, dimension=2), 5.0).graded(32)
+    search = Search(schedule=schedule, kind="scale", weights=np.ones(len(schedule.times)), log_delta=-7.0)
+    assert search.log_probability(0.5, 1.0, 1e200) == -math.inf
