@@ -44,7 +44,7 @@ def log_rectangle(low: Array, high: Array, covariance: Interval) -> Array:
     Examples
     --------
     >>> value = log_rectangle(-np.ones((1, 2)), np.ones((1, 2)), Interval.point(np.eye(2)[None]))
-    >>> bool(0 <= np.exp(value[0]) - 0.68269**2 < 1e-3)
+    >>> bool(0 <= np.exp(value[0]) - 0.682689**2 < 1e-3)
     True
     """
     sides = low.shape[-1]
