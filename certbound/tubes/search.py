@@ -111,7 +111,8 @@ class Search:
             points = [self._minimise(points, self._at(scale), step, tolerance)]
             step = 0.05
         if not self._constant:  # where several nodes decide, s falls too slowly
-            points = [self._minimise(points, lambda a, v0: self.scale(a, v0, guess=scale) / scale, 0.1, 1e-6)]
+            fine = 1e-6 if len(self._pieces) <= _FEW else 1e-4
+            points = [self._minimise(points, lambda a, v0: self.scale(a, v0, guess=scale) / scale, 0.1, fine)]
         return self._snapped(*self._parameters(points[0]), scale)
 
     def _snapped(self, a: float, v0: float, scale: float) -> tuple[float, float]:
