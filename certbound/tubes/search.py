@@ -78,8 +78,11 @@ class Search:
 
     @cached_property
     def _least(self) -> float:
-        """First unknown at the largest a that Thm K1 allows."""
-        return _SPAN / (_LARGEST if self.schedule.any_power else 1 + self.schedule.nu / 2 * (1 - 1e-9))
+        """First unknown at the largest a that Thm K1 allows; a probability hardly gains from the last decade."""
+        largest = 1 + self.schedule.nu / 2 * (1 - 1e-9)
+        if self.schedule.any_power:
+            largest = _LARGEST / 10 if self.kind == "probability" else _LARGEST
+        return _SPAN / largest
 
     @cached_property
     def half(self) -> float:
