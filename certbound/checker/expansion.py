@@ -71,6 +71,7 @@ class Expansion:
             If a jump is undecided or something is undefined somewhere in the box.
         """
         if self._last != inputs[0]:  # most boxes share the time
+            self._last = None  # should a jump in time stop here, what is half done serves nobody
             self._execute(self._first, self._template, inputs)
             self._last = inputs[0]
         values = self._template.copy()

@@ -133,3 +133,20 @@ def test_cuts_count_and_points_beyond_them_do_not() -> None:
     assert polynomial().stays(arb(-0.1), arb(0.1), [cut]) is False
     assert polynomial(bend=-1.0).stays(arb(-1), arb(0.01), [cut]) is not True  # x y - ... = -(x - y)^2/2 goes to -2
     assert math.isclose(float(value_at(polynomial(), [1.0, 1.0])), 2.0)
+
+
+def test_a_jump_in_time_leaves_nothing_behind_for_the_next_box() -> None:
+    graph = Graph()
+    time, state = graph.input(0), graph.input(1)
+    growth = graph.apply("exp", time)
+    jump = graph.apply("sign", graph.sub(graph.apply("sq", time), graph.const(4.0)))
+    node = graph.mul(graph.mul(state, growth), jump)
+    program = Expansion(graph, node, node, variables=2)
+    program.prepare([])
+    early = [(arb(1), {0: arb(0.125)}), (arb(3), {1: arb(0.5)})]
+    first = program.run(early, 2)
+    with pytest.raises(Undecided):
+        program.run([(arb(2), {0: arb(0.125)}), early[1]], 2)
+    again = program.run(early, 2)
+    assert abs(again.value - first.value) < 1e-20
+    assert abs(again.gradient[1] - first.gradient[1]) < 1e-20
