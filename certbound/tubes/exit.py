@@ -18,7 +18,7 @@ from certbound.tubes.schedule import Schedule
 from certbound.tubes.search import log_gain
 from certbound.tubes.series import log_excess_one, log_phi_one
 
-__all__ = ["exit_level", "union_level"]
+__all__ = ["exit_level", "union_level", "union_may_help"]
 
 _MOST_UNIONS = 128
 _LOSS = 1e-3  # of a logarithm, from a tangent instead of the function
@@ -77,6 +77,21 @@ def union_level(schedule: Schedule, clearance: Clearance) -> float:
             return -1e12
         level = total.log() / arb(10).log()
         return min(0.0, upper(level)) if level.is_finite() else 0.0
+
+
+def union_may_help(schedule: Schedule, clearance: Clearance, level: float) -> bool:
+    """Whether :func:`union_level` may lie below ``level``, in floats.
+
+    It counts each step of the last piece by no less than the chance that Gaussian noise is outside at the end.
+    """
+    from scipy.special import gammaincc
+
+    variance = float(schedule.nodes[1][-1]) * schedule.unit**2
+    radius = float(clearance.values[-1])
+    if not (variance > 0 and radius < 1e150):
+        return True
+    chance = float(gammaincc(schedule.nu / 2, radius**2 / (2 * variance)))
+    return float(schedule.lengths[-1]) * chance < 10.0**level
 
 
 def best_power(half: float, x: float) -> float:

@@ -112,6 +112,8 @@ class Schedule:
     def refined(self, times: Array) -> Schedule:
         """The same data on a finer grid: the union of ``times`` (inside the horizon) and the old ones."""
         inside = times[(times > 0) & (times < self.horizon)]
+        if not len(inside):
+            return self
         merged = np.union1d(self.times, inside)
         piece = np.searchsorted(self.times, merged[:-1], side="right") - 1
         return Schedule(

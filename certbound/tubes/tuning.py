@@ -14,7 +14,7 @@ from certbound.tubes.almost_sure import AlmostSureProfile
 from certbound.tubes.baselines import BASELINES, baseline_tube
 from certbound.tubes.constants import Constants
 from certbound.tubes.exact import bound_exact_exit, bound_worst_exit, first_passage_tube
-from certbound.tubes.exit import exit_level, union_level
+from certbound.tubes.exit import exit_level, union_level, union_may_help
 from certbound.tubes.kummer import KummerProfile, Start, check_delta, check_power, check_start
 from certbound.tubes.mixing import mixture_level, mixture_tube
 from certbound.tubes.objective import Clearance, Objective, make_objective, read_clearance
@@ -334,7 +334,7 @@ def bound_exit_probability(
         best = min(best, exit_level(data, held, a=a, v0=v0, bessel=bessel, start=start))
         if not bessel:
             pair = (a, v0, False)
-    if start == Start():
+    if start == Start() and not scaled.continuous and union_may_help(scaled, held, best):
         best = min(best, union_level(scaled, held))
     if thorough and start == Start():
         best = min(best, _thorough_level(constants, cut, held, pair, best))

@@ -13,7 +13,7 @@ from scipy.special import gamma, hyp1f1, iv
 
 from certbound.rigor.balls import excess_floor, precision
 from certbound.tubes.constants import Constants
-from certbound.tubes.exit import _Tangents, exit_level, union_level
+from certbound.tubes.exit import _Tangents, exit_level, union_level, union_may_help
 from certbound.tubes.kummer import Start, kummer_tube, log_initial
 from certbound.tubes.objective import read_clearance
 from certbound.tubes.radial import estimate_exit_probability
@@ -188,3 +188,20 @@ def test_a_floor_without_a_slope_is_not_carried_to_places_that_only_balls_tell_f
         assert tangents.floor(touched)[1] == 0.0
         assert tangents.touch(before)
         assert 0 < tangents.floor(before)[0] < tangents.floor(touched)[0]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_union_is_left_out_only_where_it_would_not_help(seed):
+    rng = np.random.default_rng(seed)
+    pieces = int(rng.integers(1, 7))
+    times = np.cumsum(np.append(0, rng.integers(1, 12, pieces))).astype(float)
+    constants = Constants(
+        gain=rng.uniform(0.1, 1.05, pieces), sigma=rng.uniform(0.2, 1.5, pieces), dimension=int(rng.integers(1, 6)),
+        times=times,
+    )  # fmt: skip
+    schedule = make_schedule(constants, times[-1])
+    held = read_clearance((times, rng.uniform(1.5, 9.0, pieces)), times[-1])
+    cut = schedule.refined(held.ends(schedule))
+    found = union_level(cut, held)
+    assert union_may_help(cut, held, found + 1e-9) or found == 0
+    assert not union_may_help(cut, held, -300.0) or found < -250
