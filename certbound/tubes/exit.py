@@ -91,7 +91,7 @@ def union_may_help(schedule: Schedule, clearance: Clearance, level: float) -> bo
     if not (variance > 0 and radius < 1e150):
         return True
     chance = float(gammaincc(schedule.nu / 2, radius**2 / (2 * variance)))
-    return float(schedule.lengths[-1]) * chance < 10.0**level
+    return bool(float(schedule.lengths[-1]) * chance < 10.0**level)
 
 
 def best_power(half: float, x: float) -> float:
