@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.problem.checks import frozen, positive_definite, vector
 
-__all__ = ["Bounded", "Gaussian", "Law", "Rademacher", "SubGaussian", "Uniform"]
+__all__ = ["Bounded", "Gaussian", "Law", "Rademacher", "SubGaussian", "Uniform", "check_law"]
 
 Array = NDArray[np.float64]
 
@@ -299,3 +299,20 @@ class Bounded(_Box):
 
     def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
         return _signs(rng, size, self.halfwidth)
+
+
+def check_law(law: Law, task: str) -> None:
+    """Refuse a law that is not exactly one of this module's: a class made from one of them may draw otherwise.
+
+    Raises
+    ------
+    TypeError
+        If the law is of any other class, a subclass included; ``task`` says what it was wanted for.
+    """
+    known = (Gaussian, Uniform, Rademacher, Bounded, SubGaussian)
+    if type(law) not in known:
+        names = ", ".join(f"cb.{one.__name__}" for one in known)
+        raise TypeError(
+            f"`noise` must be exactly one of {names} to {task}, got the class {type(law).__name__}: what it draws is "
+            "not known; state what it keeps by cb.Bounded(halfwidth=...) or cb.SubGaussian(proxy_std=...)."
+        )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from certbound.display import Shown
 from certbound.problem.checks import frozen, nearest, number, positive_definite, vector
 from certbound.problem.initial import check_start
-from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, Inside
+from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, Inside, Outside
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 from certbound.problem.tape import Tape
 from certbound.problem.trace import substitute, trace
@@ -197,8 +197,8 @@ class Problem(Shown):
             raise TypeError(f"`safe` must be a list of cb.Inside and cb.Outside, got {safe!r}.")
         result = []
         for place, constraint in enumerate(safe):
-            if not isinstance(constraint, Inside):
-                raise TypeError(f"`safe[{place}]` must be cb.Inside or cb.Outside, got {constraint!r}.")
+            if type(constraint) not in (Inside, Outside):
+                raise TypeError(f"`safe[{place}]` must be cb.Inside or cb.Outside itself, got {constraint!r}.")
             _check_dimension(f"safe[{place}]", constraint.region, self.system.dimension)
             if constraint.during is not None:
                 self._check_window(place, constraint.during)
@@ -311,8 +311,9 @@ def _check_dimension(name: str, region: Any, dimension: int) -> None:
 
 
 def _start(value: Any, dimension: int) -> Box | Ball | Ellipsoid | GaussianStart:
-    if not isinstance(value, (Box, Ball, Ellipsoid, GaussianStart)):
-        if isinstance(value, (Mapping, str)) or hasattr(value, "halfspaces"):
+    starts = (Box, Ball, Ellipsoid, GaussianStart)
+    if not isinstance(value, starts) or type(value) not in starts:
+        if isinstance(value, (*starts, Mapping, str)) or hasattr(value, "halfspaces"):
             kinds = "point, Box, Ball, Ellipsoid or GaussianStart"
             raise TypeError(f"`initial` must be a {kinds}, got {value!r}.")
         point = vector("initial", value, dimension)

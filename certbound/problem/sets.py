@@ -53,9 +53,9 @@ class Inside:
     word: ClassVar[str] = "inside"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.region, Region):
+        if type(self.region) not in (Box, Ball, Ellipsoid, HalfSpace, Polytope):  # own classes may differ
             kinds = "Box, Ball, Ellipsoid, HalfSpace or Polytope"
-            raise TypeError(f"`region` must be a {kinds}, got {self.region!r}.")
+            raise TypeError(f"`region` must be a {kinds} itself, got {self.region!r}; compose your set from these.")
         window = None
         if self.during is not None:
             ends = vector("during", self.during, 2)

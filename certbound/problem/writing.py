@@ -10,6 +10,7 @@ import numpy as np
 
 from certbound.problem import sets
 from certbound.problem.formulas import formulas
+from certbound.problem.noise import check_law
 from certbound.problem.problem import Problem
 from certbound.problem.reading import LEVELS, RESERVED
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
@@ -119,6 +120,7 @@ class _Writer:
             texts, columns = self.texts(system.diffusion), system.diffusion.shape[1]
             return {"diffusion": [texts[k : k + columns] for k in range(0, len(texts), columns)]}
         assert isinstance(system, DiscreteSystem)
+        check_law(system.noise, "be written")
         given = {level: getattr(system.noise, level, None) for level in LEVELS}
         table: dict[str, Any] = {"law": system.noise.name}
         table |= {level: value.tolist() for level, value in given.items() if value is not None}
@@ -146,7 +148,9 @@ class _Writer:
         if isinstance(region, sets.HalfSpace):
             normal = {name: value for name, value in zip(self.states, region.normal.tolist()) if value}
             return {"halfspace": {"normal": normal, "bound": region.bound}}
-        return {"polytope": {"A": _rows(region.A), "b": region.b.tolist()}}
+        if isinstance(region, sets.Polytope):
+            return {"polytope": {"A": _rows(region.A), "b": region.b.tolist()}}
+        raise TypeError(f"a {type(region).__name__} cannot be written; use a set of this package.")
 
     def constraint(self, constraint: sets.Inside) -> dict[str, Any]:
         table = self.region(constraint.region)

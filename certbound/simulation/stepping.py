@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.problem.noise import Gaussian, Uniform
+from certbound.problem.noise import Bounded, Gaussian, Law, Rademacher, Uniform, check_law
 from certbound.problem.tape import Node, Tape
 from certbound.problem.trace import compile_numpy, jacobian, trace
 from certbound.simulation.expressions import live_nodes
@@ -137,6 +137,8 @@ def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
     ------
     ValueError
         If the noise has no law, or the scheme does not fit the system.
+    TypeError
+        If the noise's law is of a class that is not known.
     """
     system = problem.system
     tape: Tape = problem.closed_loop
@@ -165,11 +167,16 @@ def _table(rows: Array, steps: int) -> Array:
     return np.asarray(rows, dtype=float)[(np.arange(steps) * pieces) // steps]
 
 
-def _unit_variates(law: Any) -> tuple[Literal["normal", "uniform", "sign"], Array]:
+def _unit_variates(law: Law) -> tuple[Literal["normal", "uniform", "sign"], Array]:
+    check_law(law, "be simulated")
     if isinstance(law, Gaussian):
         return "normal", law.factor
     law.sample(np.random.default_rng(0), 1)  # refuses noise without a law
-    return ("uniform" if isinstance(law, Uniform) else "sign"), np.diag(law.bound)
+    if isinstance(law, Uniform):
+        return "uniform", np.diag(law.bound)
+    if isinstance(law, Rademacher | Bounded):
+        return "sign", np.diag(law.bound)
+    raise TypeError(f"`noise` must be a law that the simulator knows, got {type(law).__name__}.")
 
 
 def _disturbance(system: Any, count: int, steps: int, scenario: Scenario) -> dict[str, Any]:

@@ -268,3 +268,19 @@ def test_a_problem_travels_to_another_process():
     np.testing.assert_array_equal(copy.system.noise.proxy, base.system.noise.proxy)
     point = (1.0, 2.0, 3.0)
     np.testing.assert_array_equal(compile_numpy(copy.closed_loop)(*point), compile_numpy(base.closed_loop)(*point))
+
+
+def test_classes_made_from_sets_or_constraints_are_refused_since_they_may_mean_something_else():
+    class Ring(Ball):
+        def contains(self, x, t=0.0):
+            return super().contains(x, t) & (np.linalg.norm(self.local(x), axis=-1) > 0.5)
+
+    class Mostly(Inside):
+        pass
+
+    with pytest.raises(TypeError, match=r"`region` must be a Box, Ball.* itself"):
+        Inside(Ring([0, 0], 1))
+    with pytest.raises(TypeError, match=r"`safe\[0\]` must be cb.Inside or cb.Outside itself"):
+        problem(safe=[Mostly(Ball([0, 0], 1))])
+    with pytest.raises(TypeError, match="`initial` must be a point, Box"):
+        problem(initial=Ring([0, 0], 0.9))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
+from certbound.problem.noise import Law
 from certbound.simulation.blocks import BLOCK
 from certbound.simulation.montecarlo import simulate_exits
 from certbound.simulation.stepping import Scenario
@@ -152,3 +153,43 @@ def test_the_bundled_problems_are_as_safe_as_certified():
     for name, paths in (("ou", 1_000_000), ("unicycle", 200_000), ("chain", 1_000_000), ("chain_rest", 1_000_000)):
         subject = cb.load(name)
         assert not simulate_exits(subject, paths=paths, rng=1, confidence=1 - 2e-6).refutes(subject.delta)
+
+
+class Triangular(cb.Uniform):
+    """Draws from the triangular law on [-h, h], which the simulator does not know."""
+
+    def sample(self, rng, size):
+        return super().sample(rng, size) * rng.uniform(size=1)
+
+
+class SmallNormal(cb.Gaussian):
+    """A class made from a law that the simulator does know."""
+
+
+class Own(Law):
+    """A law of one's own from the base class."""
+
+    def resolve(self, dimension):
+        return self
+
+    @property
+    def proxy(self):
+        return np.eye(1)
+
+    @property
+    def bound(self):
+        return np.ones(1)
+
+    def sample(self, rng, size):
+        return rng.triangular(-1.0, 0.0, 1.0, (size, 1))
+
+
+@pytest.mark.parametrize("law", [Triangular(halfwidth=1.0), SmallNormal(std=0.1), Own()])
+def test_a_law_of_an_unknown_class_is_refused_not_taken_for_another(law):
+    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=1, noise=law)
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.9], [1.9]))], horizon=5)
+    message = f"one of cb.Gaussian.* to be simulated, got the class {type(law).__name__}.*state what it keeps by"
+    with pytest.raises(TypeError, match=message):
+        simulate_exits(problem, paths=100, rng=1)
+    with pytest.raises(TypeError, match="to be written"):
+        problem.to_dict()
