@@ -14,15 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.constants.enclosures import enclose
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart
+from certbound.problem.sets import Box, Ellipsoid, GaussianStart
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian
+from certbound.reach.cells import initial_cells
 from certbound.reach.events import StepEvents
 from certbound.reach.inclusion import Supports
 from certbound.reach.linear import Events, LinearRun, level_scale
 from certbound.reach.linearisation import Linearisation
+from certbound.reach.norms import Norm
+from certbound.rigor.intervals import Interval
 from certbound.synthesis.faces import Face
 from certbound.synthesis.plant import Grid, Plant
 from certbound.tubes.constants import Constants
@@ -44,6 +48,8 @@ __all__ = [
 Array = NDArray[np.float64]
 Rows = Callable[[Array, Array], Array]
 
+CORNERS = 8
+"""Most disturbances whose boxes are looked at corner by corner."""
 NONLINEAR_SHARE = 0.1
 """Part of delta that the linear response spends on the coordinates that enter nonlinearly."""
 
@@ -204,22 +210,14 @@ def nominal_spread(
     problem: Problem, plant: Plant, grid: Grid, constants: Constants, states: Array, inputs: Array
 ) -> Array:
     """rho (points + 1,) with ||x_t - z_t||_P <= rho for every start and disturbance (Thm K5, in floating point)."""
-    n = plant.dimension
-    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric)
-    root = np.asarray(np.linalg.cholesky(metric).T, dtype=float)
+    norm = Norm(plant.dimension, constants.metric)
     slope = float(np.max(np.asarray(constants.rate if constants.continuous else constants.gain)))
-    box = problem.system.disturbance
     step = grid.step / grid.substeps
-    found = [_start_radius(problem.initial, root)]
+    start = np.atleast_2d(initial_center(problem.initial))
+    found = [float(initial_cells(problem).radii(norm, Interval.point(start))[0])]
     held = np.repeat(inputs, grid.substeps, axis=0)
     for k in range(grid.points):
-        push = 0.0
-        if box is not None:
-            corners = np.array(list(itertools.islice(itertools.product(*zip(box.low, box.high)), 256)))
-            t = k * step
-            base = plant.evaluate(t, *states[k], *held[k], *plant.disturbance)
-            moved = np.array([plant.evaluate(t, *states[k], *held[k], *corner) for corner in corners])
-            push = float(np.max(np.linalg.norm((moved - base) @ root.T, axis=1)))
+        push = _push(norm, problem.system.disturbance, plant, np.array([k * step, *states[k], *held[k]]))
         if grid.continuous:
             growth = np.expm1(slope * step) / slope if abs(slope) > 1e-12 else step
             found.append(float(np.exp(slope * step) * found[-1] + growth * push))
@@ -228,20 +226,18 @@ def nominal_spread(
     return np.array(found)
 
 
-def _start_radius(initial: Any, root: Array) -> float:
-    if isinstance(initial, GaussianStart):
+def _push(norm: Norm, box: Box | None, plant: Plant, point: Array) -> float:
+    """||f(point, d) - f(point, d0)||_P at most: over all corners of the disturbance's box, over its image if many."""
+    if box is None:
         return 0.0
-    if isinstance(initial, Box):
-        half = (initial.high - initial.low) / 2
-        if not np.any(half):
-            return 0.0
-        wide = np.flatnonzero(half)
-        signs = itertools.islice(itertools.product((-1.0, 1.0), repeat=len(wide)), 4096)
-        corners = np.array([np.bincount(wide, np.array(sign) * half[wide], len(half)) for sign in signs])
-        return float(np.max(np.linalg.norm(corners @ root.T, axis=1)))
-    shape = initial.shape if isinstance(initial, Ellipsoid) else np.eye(initial.dimension) * initial.radius**2
-    assert isinstance(initial, Ball | Ellipsoid)
-    return float(np.sqrt(np.linalg.eigvalsh(root @ np.asarray(shape) @ root.T)[-1]))
+    base = plant.evaluate(*point, *plant.disturbance)
+    if box.dimension <= CORNERS:
+        corners = np.array(list(itertools.product(*zip(box.low, box.high))))
+        moved = Interval.point(plant.evaluate(*point, *corners.T))
+    else:
+        slots = Interval(np.concatenate([point, box.low]), np.concatenate([point, box.high]))
+        moved = enclose(plant.dynamics, [slots[k] for k in range(len(slots))], undefined="infinite").reshape(1, -1)
+    return float(np.max(norm.length(moved - base)))
 
 
 def ball_tube(tube: Tube, grid: Grid, spread: Array) -> BallTube:
