@@ -14,6 +14,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from certbound.constants.matching import check_constants
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.regions import Region
@@ -83,7 +84,8 @@ def synthesize_plan(
     ------
     ValueError
         If the system has no inputs, K does not stabilise, the inputs have no bounds where the tube needs them, the
-        terminal set leaves the tightened constraints, or the method is unknown.
+        terminal set leaves the tightened constraints, the method is unknown, or the tube or the constants are of
+        another problem.
     InfeasibleError
         If no noise-free trajectory exists to begin with.
 
@@ -107,6 +109,9 @@ def synthesize_plan(
         parameters={name: value for name, value in (("epsilon", epsilon), ("step", step)) if value is not None},
         constants=constants, find_delta=find_delta, tell=progress or (lambda text: _LOG.info("%s", text)),
     )  # fmt: skip
+    for name, given in (("tube", tube.constants if isinstance(tube, Tube) else None), ("constants", constants)):
+        if given is not None:
+            check_constants(work.planner.nominal, given, name)
     work.tell("looking for the plan with the most room")
     first = work.planner.first_plan()
     best: Synthesis | None = None

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.constants.matching import check_constants
 from certbound.problem.problem import Problem
 from certbound.safety.verification import Verdict, verify_safety
 from certbound.synthesis.costs import cost_of
@@ -132,6 +133,8 @@ class PredictiveController:
         assert self.plan is not None
         if self.plan.feedback is not None or len(self.plan.plan) != self.planner.grid.steps:
             raise ValueError("`plan` must be one of this problem, without a feedback and on the same pieces.")
+        if plan is not None and plan.constants is not None:
+            check_constants(self.planner.nominal, plan.constants, "plan")
         self.erosion = self.plan.erosion * (1 + 1e-6)
         grid = replace(self.planner.grid, steps=int(horizon))
         ends = self._terminal(terminal)
