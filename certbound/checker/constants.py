@@ -100,7 +100,10 @@ class _Proof:
             raise Unproved("the pieces do not cover the horizon")
         self.count = len(times) - 1
         self.ends = [(arb(a), arb(b)) for a, b in pairwise(times)]
-        self.middles = [arb(x) for x in record.array("middles", self.count)]
+        middles = record.array("middles", self.count)
+        if not all(a <= x <= b for (a, b), x in zip(pairwise(times), middles)):
+            raise Unproved("a nominal polynomial is written about a time outside its piece, where nothing bounds its rest")
+        self.middles = [arb(x) for x in middles]
 
     @property
     def steps(self) -> int:
@@ -162,9 +165,8 @@ class _Proof:
             for k, (left, length) in enumerate(zip(rooms, lengths)):
                 if left is None:
                     continue
-                room = self.rooms[k]
-                if room is None and not self.model.continuous and k == 0 and not random:
-                    room = arb(0)
+                certain = not self.model.continuous and k == 0 and not random  # nothing has deviated from the tube yet
+                room = arb(0) if certain else self.rooms[k]
                 if room is None:
                     raise Unproved(f"`proof.rooms` states nothing on piece {k}, where '{label}' is asked")
                 if not (radii[k] + room) * length <= left:
