@@ -42,7 +42,7 @@ class _Pair:
     def tail(self) -> arb:
         """P(Y > above), the simple bound."""
         variance = self.above_variance.upper()
-        if not variance > 0:
+        if variance.is_zero():
             return arb(0) if self.above >= 0 else arb(1)
         return self.weight * upper(tail(self.above / variance.sqrt()))
 
@@ -60,7 +60,7 @@ def union_of_pairs(pairs: Sequence[_Pair], budget: Budget) -> arb:
     """Upper bound of the sum: the joint probability where it matters, the plain tail elsewhere."""
     tails = [pair.tail() for pair in pairs]
     total = sum(tails, arb(0))
-    if not total > 0:
+    if total.is_zero():
         return arb(0)
     result = arb(0)
     for pair, value in zip(pairs, tails):
@@ -81,9 +81,9 @@ def chain(
     previous: tuple[arb_mat, Level, arb] | None = None
     for k, (row, level) in enumerate(zip(rows, levels)):
         flat = arb_mat(1, len(row), list(row))
-        variance = quadratic(flat, covariances[k], flat)
+        variance = _variance(flat, covariances[k])
         if level is not None:
-            if level < 0:
+            if not level >= 0:
                 return arb(1)
             below, own, cross = None, arb(0), arb(0)
             if previous is not None and previous[1] is not None:
@@ -101,10 +101,10 @@ def sub_gaussian(rows: Sequence[Sequence[arb]], levels: Sequence[Level], proxies
         if level is None:
             continue
         flat = arb_mat(1, len(row), list(row))
-        variance = quadratic(flat, proxies[k], flat).upper()
-        if level < 0:
+        variance = _variance(flat, proxies[k]).upper()
+        if not level >= 0:
             return arb(1)
-        if variance > 0:
+        if not variance.is_zero():
             total += (-level * level / (2 * variance)).exp()
     return upper(total)
 
@@ -220,11 +220,11 @@ class Windows:
             flat = arb_mat(1, self.n, list(direction))
             first, last = flat * self.forward[window], self.covariances[self.ends[window]]
             begin = self.covariances[self.starts[window]]
-            end_variance = quadratic(flat, last, flat)
+            end_variance = _variance(flat, last)
             if level is not None:
-                if level < 0:
+                if not level >= 0:
                     return arb(1)
-                variance = quadratic(first, begin, first)
+                variance = _variance(first, begin)
                 below, own, cross = None, arb(0), arb(0)
                 if previous is not None and previous[1] is not None:
                     below, own = previous[1], previous[2]
@@ -233,6 +233,20 @@ class Windows:
                 pairs.append(_Pair(level, level, variance, end_variance, variance, 2))
             previous = flat, level, end_variance
         return union_of_pairs(pairs, self.budget)
+
+
+def _variance(row: arb_mat, covariance: arb_mat) -> arb:
+    """row covariance row^T, which is not negative.
+
+    Raises
+    ------
+    Unproved
+        If it is, or is not a number: then there is no such noise.
+    """
+    value = quadratic(row, covariance, row)
+    if not value.upper() >= 0:
+        raise Unproved("a variance is negative or not a number")
+    return value
 
 
 def _bend(piece: Piece, after: arb_mat) -> arb_mat:

@@ -7,7 +7,7 @@ from typing import Any
 
 from flint import arb, arb_mat
 
-from certbound.checker.matrices import diagonal, is_positive_definite, matrix, row_sums
+from certbound.checker.matrices import diagonal, is_positive_definite, matrix
 from certbound.checker.reading import Record, number, numbers, text
 from certbound.checker.reading import entries as listed
 from certbound.checker.regions import Constraint, read_constraint
@@ -19,6 +19,8 @@ __all__ = ["Initial", "Model", "Noise", "read_model"]
 
 MOST_STATES = 400
 MOST_STEPS = 100_000
+_SLACK = arb(2) ** -39
+"""How far a covariance may miss semidefiniteness where every variance is 1."""
 _FIELDS = (
     "name", "time", "horizon", "delta", "states", "inputs", "disturbances", "dynamics", "plan", "disturbance_set",
     "noise", "initial", "constraints", "domain",
@@ -224,12 +226,24 @@ def _proxy(record: Record, m: int) -> arb_mat:
 
 
 def _semidefinite(a: arb_mat, path: str) -> arb_mat:
-    """The matrix, which must be positive semidefinite but for rounding."""
+    """A covariance that is positive semidefinite but for rounding; what is missing is added in proportion to variances.
+
+    It is judged in units in which every variance is 1, so that a large one hides nothing of a small one.
+    """
     n = a.nrows()
-    slack = row_sums(a) * arb(2) ** -40 + arb(2) ** -1000
-    if not is_positive_definite(a + diagonal([slack] * n)):
+    variances = [a[i, i] for i in range(n)]
+    if not all(value >= 0 for value in variances):
+        raise CertificateError(f"`{path}` must not have a negative variance.")
+    kept = [i for i, value in enumerate(variances) if value > 0]
+    if len(kept) < n and any(not a[i, j].is_zero() for i in range(n) if variances[i].is_zero() for j in range(n)):
+        raise CertificateError(f"`{path}` must be positive semidefinite: what has no variance has no covariance.")
+    scales = {i: 1 / variances[i].sqrt() for i in kept}
+    scaled = matrix([[a[i, j] * scales[i] * scales[j] for j in kept] for i in kept])
+    if is_positive_definite(scaled):
+        return a
+    if not is_positive_definite(scaled + diagonal([_SLACK] * len(kept))):
         raise CertificateError(f"`{path}` must be positive semidefinite.")
-    return a
+    return a + diagonal([value * _SLACK for value in variances])
 
 
 def _initial(value: object, path: str, n: int) -> Initial:
