@@ -80,6 +80,7 @@ def chain(
     pairs: list[_Pair] = []
     previous: tuple[arb_mat, Level, arb] | None = None
     for k, (row, level) in enumerate(zip(rows, levels)):
+        budget.check()
         flat = arb_mat(1, len(row), list(row))
         variance = _variance(flat, covariances[k])
         if level is not None:
@@ -94,10 +95,13 @@ def chain(
     return union_of_pairs(pairs, budget)
 
 
-def sub_gaussian(rows: Sequence[Sequence[arb]], levels: Sequence[Level], proxies: Sequence[arb_mat]) -> arb:
+def sub_gaussian(
+    rows: Sequence[Sequence[arb]], levels: Sequence[Level], proxies: Sequence[arb_mat], budget: Budget
+) -> arb:
     """Discrete time, sub-Gaussian noise: sum of exp(-z^2/(2 r V r^T))."""
     total = arb(0)
     for k, (row, level) in enumerate(zip(rows, levels)):
+        budget.check()
         if level is None:
             continue
         flat = arb_mat(1, len(row), list(row))
@@ -129,6 +133,7 @@ class Windows:
         self.starts = list(starts)
         self.ends = [*self.starts[1:], len(pieces)]
         self.n = pieces[0].transition.nrows()
+        budget.hold(3 * len(pieces) * self.n**2)
         self.levels: Sequence[Sequence[arb]] = [[]] * len(self.starts)
         self.forward: list[arb_mat] = []
         self.back: list[arb_mat] = []
@@ -184,6 +189,7 @@ class Windows:
         directions: list[list[arb] | None] = []
         costs: dict[int, arb] = {}
         for window, (start, end) in enumerate(zip(self.starts, self.ends)):
+            self.budget.check()
             ends = {k: self._ends(rows[k], k) for k in range(start, end) if asked[k]}
             if not ends:
                 directions.append(None)
@@ -198,6 +204,7 @@ class Windows:
         return directions, costs
 
     def _ends(self, row: Sequence[arb], k: int) -> tuple[list[arb], list[arb]]:
+        self.budget.check()
         flat = arb_mat(1, self.n, list(row))
         return (flat * self.before[k]).entries(), (flat * self.back[k]).entries()
 
@@ -217,6 +224,7 @@ class Windows:
         pairs = []
         previous: tuple[arb_mat, Level, arb] | None = None
         for window, (direction, level) in enumerate(zip(directions, levels)):
+            self.budget.check()
             flat = arb_mat(1, self.n, list(direction))
             first, last = flat * self.forward[window], self.covariances[self.ends[window]]
             begin = self.covariances[self.starts[window]]

@@ -16,6 +16,7 @@ from flint import arb, arb_mat
 
 from certbound.checker.matrices import identity, is_positive_definite, matrix
 from certbound.checker.reading import Record, entries, number, numbers, text, whole, wholes
+from certbound.checker.report import Budget
 from certbound.checker.tapes import read_tape
 from certbound.errors import CertificateError
 from certbound.problem.tape import Tape
@@ -156,7 +157,7 @@ def _sides(low: list[float | None], high: list[float | None]) -> tuple[list[list
     return faces, bounds
 
 
-def read_constraint(value: object, path: str, dimension: int, horizon: float) -> Constraint:
+def read_constraint(value: object, path: str, dimension: int, horizon: float, budget: Budget) -> Constraint:
     """One constraint of a certificate.
 
     Raises
@@ -173,7 +174,7 @@ def read_constraint(value: object, path: str, dimension: int, horizon: float) ->
         if not 0 <= first <= last <= horizon:
             raise CertificateError(f"`{path}.during` must lie within the horizon and rise.")
         during = (first, last)
-    region = _region(record["region"], record.at("region"), dimension)
+    region = _region(record["region"], record.at("region"), dimension, budget)
     return Constraint(
         inside=record["kind"] == "inside", region=region, during=during,
         label=text(record["label"], record.at("label"), 1000),
@@ -189,7 +190,7 @@ _KINDS = {
 }
 
 
-def _region(value: object, path: str, dimension: int) -> Region:
+def _region(value: object, path: str, dimension: int, budget: Budget) -> Region:
     kind = value.get("kind") if isinstance(value, dict) else None
     if not isinstance(kind, str) or kind not in _KINDS:
         raise CertificateError(f"`{path}.kind` must be one of {', '.join(_KINDS)}.")
@@ -224,7 +225,7 @@ def _region(value: object, path: str, dimension: int) -> Region:
         return Region(kind=kind, coordinates=coordinates, center=center, faces=[], bounds=[], radius=radius)
     rows: Any = record.array("shape", k, k)
     shape = matrix(rows)
-    if any(rows[i][j] != rows[j][i] for i in range(k) for j in range(i)) or not is_positive_definite(shape):
+    if any(rows[i][j] != rows[j][i] for i in range(k) for j in range(i)) or not is_positive_definite(shape, budget):
         raise CertificateError(f"`{path}.shape` must be symmetric and positive definite.")
     return Region(kind=kind, coordinates=coordinates, center=center, faces=[], bounds=[], shape=shape)
 
