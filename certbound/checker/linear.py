@@ -112,7 +112,7 @@ class _Cell:
             arb.max(arb(high) - m, m - arb(low)) for (low, high), m in zip(model.disturbance, self.middle)
         ]
         self.grid = self._grid()
-        self.demands = demands(model, self.grid, record.items("separations"), record.at("separations"))
+        self.demands = demands(model, self.grid, record.items("separations"), record.at("separations"), budget)
         self.state: StateNoise | None = None
         if record["stopped"] is not None or isinstance(model.noise.diffusion, Tape):
             self.state = StateNoise(

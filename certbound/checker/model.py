@@ -128,6 +128,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         for index, item in enumerate(record.items("constraints", 0, 1000))
     ]
     if domain is not None:
+        budget.hold(n * n // 4 + 1)
         constraints.append(Constraint.of_domain(domain))
     return Model(
         name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
