@@ -396,7 +396,9 @@ def _stopped(data: Data) -> Data:
     return found
 
 
-@forges("the state stays inside the set of its noise", "stirred", "stopped.py", "StateNoise.holds", "to stay in the set")
+@forges(
+    "the state stays inside the set of its noise", "stirred", "stopped.py", "StateNoise.holds", "to stay in the set"
+)
 def _(data: Data) -> None:
     _scale(_stopped(data)["high"], 20, 0.5)
 
@@ -453,7 +455,9 @@ def _(data: Data) -> None:
     data["problem"]["horizon"] = exact(2.0)
 
 
-@forges("a polynomial is written about a time in its piece", "rising", "constants.py", "_Proof._read_times", "outside its")
+@forges(
+    "a polynomial is written about a time in its piece", "rising", "constants.py", "_Proof._read_times", "outside its"
+)
 def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["bound"] = exact(1.0)
     data["proof"]["middles"] = exact([-10.0, -10.0])  # there the velocity is -10
@@ -491,7 +495,9 @@ def _(data: Data) -> None:
     _from(data, [0.1, 0.1], [0.3, 0.2])
 
 
-@forges("the reach tube grows as its equation says", "contraction", "tube.py", "Tube.prove", "stated radius on piece 60")
+@forges(
+    "the reach tube grows as its equation says", "contraction", "tube.py", "Tube.prove", "stated radius on piece 60"
+)
 def _(data: Data) -> None:
     _scale(_cell(data)["radius"], 60, 0.99)
 
@@ -512,7 +518,9 @@ def _(data: Data) -> None:
     _scale(data["proof"]["rooms"], 2, 1.01)
 
 
-@forges("a room is stated where a constraint is asked", "still", "constants.py", "_Proof._check_rooms", "states nothing")
+@forges(
+    "a room is stated where a constraint is asked", "still", "constants.py", "_Proof._check_rooms", "states nothing"
+)
 def _(data: Data) -> None:
     data["proof"]["rooms"][2] = None
 
@@ -528,7 +536,9 @@ def _(data: Data) -> None:
     _claim(data, -10.0)
 
 
-@forges("a start lies in the domain of the constants", "still", "constants.py", "_Proof._check_rooms", "domain.*piece 0")
+@forges(
+    "a start lies in the domain of the constants", "still", "constants.py", "_Proof._check_rooms", "domain.*piece 0"
+)
 def _(data: Data) -> None:
     _from(data, [1.95], [2.1])
     data["problem"]["constraints"][0]["during"] = exact([1.0, 3.0])
@@ -597,7 +607,9 @@ def _(data: Data) -> None:
     data["proof"]["nu"] = exact(1.5)
 
 
-@forges("the spread of a random start is bounded", "random", "constants.py", "_Proof._check_start", "random start was not")
+@forges(
+    "the spread of a random start is bounded", "random", "constants.py", "_Proof._check_start", "random start was not"
+)
 def _(data: Data) -> None:
     _scale(data["problem"]["initial"]["covariance"][0], 0, 1.01)
 
@@ -625,7 +637,9 @@ def _(data: Data) -> None:
     _scale(data["proof"], "start", 1.0, -0.0005)
 
 
-@forges("the barrier is above its level at the boundary", "barrier", "safe_set.py", "SafeSet.boundary", "constraint breaks")
+@forges(
+    "the barrier is above its level at the boundary", "barrier", "safe_set.py", "SafeSet.boundary", "constraint breaks"
+)
 def _(data: Data) -> None:
     _scale(data["proof"], "boundary", 1.0, 0.0015)
 
