@@ -337,8 +337,8 @@ def _lives_in(row: Sequence[arb], states: list[int]) -> bool:
 
 def _parts(box: _Box, smear: list[arb] | None, enough: arb) -> list[_Box] | None:
     """The box cut where that helps most, into two or, should the error be large, more; None for a point."""
-    parts = _halves(box, None if smear is None else _largest(smear))
-    if parts is None or smear is None:
+    parts = _halves(box, _largest(smear) if smear else None)
+    if parts is None or not smear:
         return parts
     sizes = [float(x) for x in smear]
     goal = float(enough)

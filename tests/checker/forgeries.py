@@ -281,6 +281,7 @@ def _(data: Data) -> None:
 @forges("the remainder lies in its box at every step", "steps", "remainder.py", "OutputRemainder.prove", "in its box")
 def _(data: Data) -> None:
     _scale(_cell(data)["slopes"][2], 0, 1.0, 0.3)
+    _claim(data, -3.9)
 
 
 @forges("the remainder lies in its box over a piece", "flow", "remainder.py", "OutputRemainder.prove", "in its box")
@@ -291,6 +292,7 @@ def _(data: Data) -> None:
 @forges("a kinked remainder lies in its box", "bent", "remainder.py", "OutputRemainder._kinked_form", "in its box")
 def _(data: Data) -> None:
     _scale(_cell(data)["slopes"][0], 0, 1.0, 1.0)
+    _claim(data, -23.0)
 
 
 @forges("the series of a piece converge", "flow", "response.py", "continuous_piece", "too long for the slope")
@@ -406,6 +408,7 @@ def _(data: Data) -> None:
 @forges("the excess of the noise is bounded over its set", "stirred", "stopped.py", "StateNoise.excess", "in its box")
 def _(data: Data) -> None:
     _scale(_stopped(data), "reference", 0.95)  # more is M's, whose levels widen what the remainder must hold on
+    _claim(data, -4.0)
 
 
 @forges("the noise depends on states with bounds only", "growth", "stopped.py", "StateNoise.excess", "noise depends on")
@@ -646,7 +649,11 @@ def _(data: Data) -> None:
 
 @forges("the initial set lies in the safe set", "barrier", "safe_set.py", "SafeSet.contains", "lie in the safe set")
 def _(data: Data) -> None:
-    data["problem"]["initial"] |= {"low": exact([0.999]), "high": exact([1.001])}
+    data["problem"]["initial"] |= {"low": exact([1.99]), "high": exact([2.01])}
+    proof = data["proof"]  # 8 x^2 - 2 x^4 is small again out there
+    proof |= {"exponents": [[2], [4]], "coefficients": exact([8.0, -2.0])}
+    proof |= {"start": exact(0.9), "boundary": exact(5.999)}
+    _claim(data, -1.9)
 
 
 @forges("the constraints bound every state", "barrier", "safe_set.py", "SafeSet", "bounds x|no constraint that")
@@ -654,12 +661,16 @@ def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["low"] = [None]
 
 
-@forges("a negative growth gains nothing", "barrier", "barrier.py", "check_barrier", "grow as slowly|more than")
+@forges("a negative growth gains nothing", "barrier", "barrier.py", "check_barrier", MORE)
 def _(data: Data) -> None:
-    data["proof"] |= {"coefficients": exact([-8.0]), "growth": exact(-0.7), "start": exact(0.0)}
-    data["proof"]["boundary"] = exact(-8.001)
-    data["problem"]["noise"]["diffusion"] = exact([[0.3]])
-    _claim(data, -0.1)
+    problem = data["problem"]  # without noise every path falls below 1, and x^2 with it
+    problem["constraints"][0]["region"] |= {"low": exact([1.0]), "high": exact([2.0])}
+    problem["initial"] |= {"low": exact([1.5]), "high": exact([1.6])}
+    problem["noise"]["diffusion"] = exact([[0.0]])
+    data["proof"] |= {
+        "coefficients": exact([1.0]), "growth": exact(-3.99), "start": exact(2.57), "boundary": exact(0.999)
+    }
+    _claim(data, -1.0)
 
 
 @forges("the barrier's units are positive", "barrier", "barrier.py", "_Expressions._polynomial", "scale")
