@@ -47,7 +47,7 @@ def check_barrier(model: Model, value: object, budget: Budget) -> arb:
     record = Record(value, "proof", _PROOF)
     _refuse(model)
     growth, start, boundary = (arb(record.number(name)) for name in ("growth", "start", "boundary"))
-    expressions = _Expressions(model, record)
+    expressions = _Expressions(model, record, budget)
     safe = SafeSet(model)
     initial = [(low.lower(), high.upper()) for low, high in zip(model.initial.low, model.initial.high)]
     if not safe.contains(initial, budget):
@@ -102,8 +102,8 @@ class _Expressions:
         The dynamics and the diffusion themselves, which must exist wherever the generator is bounded.
     """
 
-    def __init__(self, model: Model, record: Record) -> None:
-        self.graph = graph = Graph()
+    def __init__(self, model: Model, record: Record, budget: Budget) -> None:
+        self.graph = graph = Graph(budget)
         n = model.dimension
         self.count = len(model.dynamics.inputs)
         slots = [graph.input(slot) for slot in range(self.count)]

@@ -80,7 +80,10 @@ def check_data(
         raise CertificateError(f"`claim.log10_delta` must not be positive, got {level:g}.")
     named = [text(item, "claim.assumptions", 1000) for item in claim.items("assumptions", 0, 20)]
     with ctx.workprec(PRECISION):
-        model = read_model(record["problem"])
+        try:
+            model = read_model(record["problem"], budget)
+        except Unproved as error:
+            raise CertificateError(f"`problem` cannot be read: {error}.") from error
         proof = record["proof"]
         if isinstance(proof, dict) and proof.get("assumed") is True:
             named.append("the stated constants hold")

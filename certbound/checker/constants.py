@@ -70,7 +70,7 @@ class _Proof:
         rows = None if record["metric"] is None else record.array("metric", n, n)
         if rows is not None and any(rows[i][j] != rows[j][i] for i in range(n) for j in range(i)):
             raise CertificateError("`proof.metric` must be symmetric.")
-        self.norm = Norm(identity(n) if rows is None else matrix(rows))
+        self.norm = Norm(identity(n) if rows is None else matrix(rows), budget)
         self._read_times()
         self.rate, self.sigma = arb(record.number("rate")), arb(record.number("sigma", least=0.0))
         if not model.continuous and not self.rate > 0:
@@ -100,7 +100,10 @@ class _Proof:
             raise Unproved("the pieces do not cover the horizon")
         self.count = len(times) - 1
         self.ends = [(arb(a), arb(b)) for a, b in pairwise(times)]
-        self.middles = [arb(x) for x in record.array("middles", self.count)]
+        middles = record.array("middles", self.count)
+        if not all(a <= x <= b for (a, b), x in zip(pairwise(times), middles)):
+            raise Unproved("a nominal polynomial is written about a time outside its piece: nothing bounds its rest")
+        self.middles = [arb(x) for x in middles]
 
     @property
     def steps(self) -> int:
@@ -116,14 +119,15 @@ class _Proof:
         items = record.items("cells", len(boxes), len(boxes))
         self.structure = structure_of(model, self.budget)
         for index, (item, box) in enumerate(zip(items, boxes)):
-            self._check_cell(Record(item, f"proof.cells[{index}]", _CELL), box, whole=len(boxes) == 1)
+            with self.budget.passing():
+                self._check_cell(Record(item, f"proof.cells[{index}]", _CELL), box, whole=len(boxes) == 1)
         if not record.flag("assumed"):
             self._check_constants()
         return exit_probability(self._kummer(), self.budget)
 
     def _check_cell(self, cell: Record, box: Box, *, whole: bool) -> None:
         """Reach tube and rooms of one cell."""
-        n, count = self.model.dimension, self.count
+        n, count, budget = self.model.dimension, self.count, self.budget
         nominal = cell.array("nominal", count, None, n)
         if any(not 1 <= len(item) <= MOST_DEGREE + 1 for item in nominal):
             raise CertificateError(f"`{cell.at('nominal')}` must hold polynomials of degree at most {MOST_DEGREE}.")
@@ -137,34 +141,44 @@ class _Proof:
             raise CertificateError(f"`{cell.at('nominal')}` must hold points in discrete time.")
         eta = [arb(x) for x in cell.array("eta", self.steps)]
         radii = [arb(x) for x in cell.array("radius", count)]
-        tube = Tube(self.model, self.structure, self.norm, pieces, self.budget)
+        tube = Tube(self.model, self.structure, self.norm, pieces, budget)
         first = pieces[0].at(pieces[0].start)
         start = self.norm.start(self.model, [a for a, _ in box], [b for _, b in box], first, whole)
         tube.prove(start, self.rate, eta, radii)
+        hulls = []
+        for piece in pieces:
+            budget.check()
+            budget.hold(len(piece.coefficients) * n)
+            hulls.append(piece.hull())
         grid = Grid(
-            times=self.ends, hulls=[piece.hull() for piece in pieces],
+            times=self.ends, hulls=hulls,
             part=lambda k, first, last: replace(pieces[k], start=first, end=last).hull(),
         )  # fmt: skip
         self._check_rooms(cell, grid, radii)
 
     def _check_rooms(self, cell: Record, grid: Grid, radii: Sequence[arb]) -> None:
         """Every constraint leaves the stated room around the reach tube."""
-        given = demands(self.model, grid, cell.items("separations"), cell.at("separations"), polygons=False)
+        given = demands(
+            self.model, grid, cell.items("separations"), cell.at("separations"), self.budget, polygons=False
+        )
         asked: list[tuple[str, list[arb | None], list[arb]]] = []
         for demand in given:
             duals: dict[int, arb] = {}
-            lengths = [duals.setdefault(id(row), self.norm.dual(row)) for row in demand.rows]
-            asked.append((demand.label, demand.rooms, lengths))
-        for ball in round_demands(self.model, grid):
+            self.budget.hold(2 * len(demand.rows))
+            for row in demand.rows:
+                if id(row) not in duals:
+                    duals[id(row)] = self.norm.dual(row)
+            asked.append((demand.label, demand.rooms, [duals[id(row)] for row in demand.rows]))
+        for ball in round_demands(self.model, grid, self.budget):
             asked.append((ball.label, ball.rooms, [self.norm.section(ball.image)] * self.count))
         random = self.model.initial.covariance is not None
         for label, rooms, lengths in asked:
+            self.budget.check()
             for k, (left, length) in enumerate(zip(rooms, lengths)):
                 if left is None:
                     continue
-                room = self.rooms[k]
-                if room is None and not self.model.continuous and k == 0 and not random:
-                    room = arb(0)
+                certain = not self.model.continuous and k == 0 and not random  # nothing has deviated from the tube yet
+                room = arb(0) if certain else self.rooms[k]
                 if room is None:
                     raise Unproved(f"`proof.rooms` states nothing on piece {k}, where '{label}' is asked")
                 if not (radii[k] + room) * length <= left:
@@ -229,7 +243,8 @@ class _Proof:
     def _check_start(self, covariance: arb_mat, sigma: arb) -> None:
         """The random start's covariance is at most sigma^2 P^-1."""
         n = self.model.dimension
-        root = cholesky(self.norm.metric)
-        if not is_positive_definite(identity(n) * (sigma * sigma) - root.transpose() * covariance * root):
+        root = cholesky(self.norm.metric, self.budget)
+        rest = identity(n) * (sigma * sigma) - root.transpose() * covariance * root
+        if not is_positive_definite(rest, self.budget):
             raise Unproved("the random start was not shown to have the stated spread")
 

@@ -52,7 +52,10 @@ class Contraction:
             constant, parts = _affine(graph, node)
             self.fixed[i][j] = constant
             for atom, factor in parts.items():
-                forms.setdefault(atom, [[arb(0)] * n for _ in range(n)])[i][j] = factor
+                if atom not in forms:
+                    budget.hold(n * n)
+                    forms[atom] = [[arb(0)] * n for _ in range(n)]
+                forms[atom][i][j] = factor
         self.atoms = sorted(forms)
         self.forms = [matrix(forms[atom]) for atom in self.atoms]
         risky = [k for k in graph.reachable(structure.outputs) if graph.node(k).op in _PARTIAL]
@@ -85,8 +88,8 @@ class Contraction:
                 base = base + form * value
             else:
                 wide.append((form * value.lower(), form * value.upper()))
-        if 2 ** len(wide) > MOST_VERTICES:
-            raise Unproved(f"the Jacobian has {len(wide)} independent parts, too many to try every vertex")
+            if 2 ** len(wide) > MOST_VERTICES:
+                raise Unproved(f"the Jacobian has {len(wide)} independent parts or more, too many to try every vertex")
         for choice in itertools.product((0, 1), repeat=len(wide)):
             self.budget.check()
             jacobian = base
@@ -99,8 +102,8 @@ class Contraction:
     def _vertex(self, jacobian: arb_mat, bound: arb) -> bool:
         metric, turned = self.metric, self.metric * jacobian
         if self.model.continuous:
-            return is_positive_definite(metric * (2 * bound) - turned - turned.transpose())
-        return is_positive_definite(metric * (bound * bound) - jacobian.transpose() * turned)
+            return is_positive_definite(metric * (2 * bound) - turned - turned.transpose(), self.budget)
+        return is_positive_definite(metric * (bound * bound) - jacobian.transpose() * turned, self.budget)
 
 
 def _affine(graph: Graph, node: int) -> tuple[arb, dict[int, arb]]:
@@ -110,6 +113,7 @@ def _affine(graph: Graph, node: int) -> tuple[arb, dict[int, arb]]:
     stack = [(node, arb(1))]
     count = 0
     while stack:
+        graph.budget.check()
         index, factor = stack.pop()
         op, args, _ = graph.node(index)
         count += 1
@@ -135,12 +139,13 @@ def _affine(graph: Graph, node: int) -> tuple[arb, dict[int, arb]]:
 
 
 def _constant(graph: Graph, index: int) -> arb:
-    program = Program(graph, [index], variables=0)
-    program.prepare([])
-    try:
-        return program.run([])[0]
-    except Undecided as error:
-        raise Unproved("a constant of the model is not defined") from error
+    with graph.budget.passing():
+        program = Program(graph, [index], variables=0)
+        program.prepare([])
+        try:
+            return program.run([])[0]
+        except Undecided as error:
+            raise Unproved("a constant of the model is not defined") from error
 
 
 def _everywhere(box: Box, holds: Callable[[Box], bool], relevant: int, budget: Budget) -> bool:
@@ -198,12 +203,12 @@ class Spread:
 
     def __init__(self, model: Model, metric: arb_mat, budget: Budget) -> None:
         self.model, self.metric, self.budget = model, metric, budget
-        self.root = cholesky(metric)
+        self.root = cholesky(metric, budget)
         self.program: Program | None = None
         self.relevant = 0
         diffusion = model.noise.diffusion
         if isinstance(diffusion, Tape):
-            graph = Graph()
+            graph = Graph(budget)
             nodes = graph.include(diffusion, [graph.input(slot) for slot in range(len(diffusion.inputs))])
             outputs = [nodes[output] for output in diffusion.outputs]
             self.program = Program(graph, outputs, variables=len(diffusion.inputs))
@@ -226,7 +231,8 @@ class Spread:
         if covariance is None:
             return False
         n, square = self.model.dimension, sigma * sigma
-        bounded = is_positive_definite(identity(n) * square - self.root.transpose() * covariance * self.root)
+        rest = identity(n) * square - self.root.transpose() * covariance * self.root
+        bounded = is_positive_definite(rest, self.budget)
         return bool(bounded and (self.metric * covariance).trace() <= nu * square)
 
     def _covariance(self, box: Box) -> arb_mat | None:

@@ -13,7 +13,7 @@ from certbound.checker.matrices import column
 from certbound.checker.model import Model
 from certbound.checker.program import Program
 from certbound.checker.regions import Constraint, Region
-from certbound.checker.report import Unproved
+from certbound.checker.report import Budget, Unproved
 from certbound.errors import CertificateError
 from certbound.problem.tape import Tape
 
@@ -57,7 +57,9 @@ class Grid:
         return [not (end < first or start > last) for start, end in self.times]
 
 
-def demands(model: Model, grid: Grid, separations: list[object], path: str, *, polygons: bool = True) -> list[Demand]:
+def demands(
+    model: Model, grid: Grid, separations: list[object], path: str, budget: Budget, *, polygons: bool = True
+) -> list[Demand]:
     """Every constraint of the model as demands along a nominal curve (without ``polygons``: but for round safe sets).
 
     Raises
@@ -70,42 +72,58 @@ def demands(model: Model, grid: Grid, separations: list[object], path: str, *, p
     result: list[Demand] = []
     for number, (constraint, given) in enumerate(zip(model.constraints, separations)):
         if polygons or not (constraint.inside and constraint.region.round):
-            result += _demand(model, grid, constraint, given, f"{path}[{number}]")
+            result += _demand(model, grid, constraint, given, f"{path}[{number}]", budget)
     return result
 
 
-def _demand(model: Model, grid: Grid, constraint: Constraint, given: object, path: str) -> list[Demand]:
+def _demand(
+    model: Model, grid: Grid, constraint: Constraint, given: object, path: str, budget: Budget
+) -> list[Demand]:
     """The rows of one constraint: fixed ones, or one a piece where the certificate names them."""
     region, count = constraint.region, len(grid.times)
+    budget.check()
     families: list[list[tuple[list[arb], arb]]]
     if constraint.separated:
-        pairs = constraint.read_separation(given, path, count)
-        families = [[([-x for x in row], -height - _STRICT) for row, height in pairs]]
+        pairs = constraint.read_separation(given, path, count, budget)
+        away = {id(row): [-x for x in row] for row, _ in pairs}
+        families = [[(away[id(row)], -height - _STRICT) for row, height in pairs]]
     elif given is not None:
         raise CertificateError(f"`{path}` must be null: that constraint needs no directions.")
     elif not constraint.inside:
-        away = [-arb(x) for x in region.faces[0]]
-        families = [[(away, -arb(region.bounds[0]) - _STRICT)] * count]
+        face = [-x for x in region.face(0)]
+        families = [[(face, -arb(region.bounds[0]) - _STRICT)] * count]
     elif region.round:
         families = [[pair] * count for pair in region.inscribed()]
     else:
         families = [
-            [([arb(x) for x in face], arb(b))] * count for face, b in zip(region.faces, region.bounds)
+            [(region.face(number), arb(b))] * count for number, b in enumerate(region.bounds)
         ]
-    centres = _centres(region, grid)
+    centres = _centres(region, grid, budget)
     asked = grid.asked(constraint.during)
     found = []
     for family in families:
-        rows = [region.lift(row, model.dimension) for row, _ in family]
-        rooms: list[arb | None] = []
-        for k, (row, bound) in enumerate(family):
-            if not asked[k]:
-                rooms.append(None)
-                continue
+        budget.hold(2 * count)
+        found.append(Demand(label=constraint.label, rows=_lifted(region, family, model.dimension, budget), rooms=[]))
+    for k in range(count):
+        points = grid.points(k, constraint.during) if asked[k] else []
+        for family, demand in zip(families, found):
+            budget.check()
+            row, bound = family[k]
             offset = bound + _dot(row, centres[k])
-            rooms.append(min_of([offset - _dot(rows[k], point) for point in grid.points(k, constraint.during)]).lower())
-        found.append(Demand(label=constraint.label, rows=rows, rooms=rooms))
+            rooms = [offset - _dot(demand.rows[k], point) for point in points]
+            demand.rooms.append(min_of(rooms).lower() if rooms else None)
     return found
+
+
+def _lifted(region: Region, family: list[tuple[list[arb], arb]], dimension: int, budget: Budget) -> list[list[arb]]:
+    """The rows over all states; one that comes again is the same."""
+    known: dict[int, list[arb]] = {}
+    for row, _ in family:
+        if id(row) not in known:
+            budget.check()
+            budget.hold(dimension // 8 + 1)  # most of it is the same 0
+            known[id(row)] = region.lift(row, dimension)
+    return [known[id(row)] for row, _ in family]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -117,7 +135,7 @@ class RoundDemand:
     rooms: list[arb | None]
 
 
-def round_demands(model: Model, grid: Grid) -> list[RoundDemand]:
+def round_demands(model: Model, grid: Grid, budget: Budget) -> list[RoundDemand]:
     """The round safe sets."""
     result = []
     for constraint in model.constraints:
@@ -125,9 +143,11 @@ def round_demands(model: Model, grid: Grid) -> list[RoundDemand]:
         if not (constraint.inside and region.round):
             continue
         image, bound = region.image(model.dimension)
-        asked, centres = grid.asked(constraint.during), _centres(region, grid)
+        asked, centres = grid.asked(constraint.during), _centres(region, grid, budget)
+        budget.hold(len(grid.times))
         rooms: list[arb | None] = []
         for k in range(len(grid.times)):
+            budget.check()
             if not asked[k]:
                 rooms.append(None)
                 continue
@@ -153,11 +173,12 @@ def _dot(row: Sequence[arb], point: Sequence[arb]) -> arb:
     return sum((a * b for a, b in zip(row, point) if not a.is_zero()), arb(0))
 
 
-def _centres(region: Region, grid: Grid) -> list[list[arb]]:
+def _centres(region: Region, grid: Grid, budget: Budget) -> list[list[arb]]:
     """Enclosures of the centre on every piece."""
     if not isinstance(region.center, Tape):
         return [[arb(x) for x in region.center]] * len(grid.times)
-    graph = Graph()
+    budget.hold(len(grid.times) * len(region.coordinates))
+    graph = Graph(budget)
     nodes = graph.include(region.center, [graph.input(0)])
     program = Program(graph, [nodes[output] for output in region.center.outputs], variables=1)
     program.prepare([])

@@ -5,14 +5,14 @@ from __future__ import annotations
 from flint import arb, arb_mat
 
 from certbound.checker.matrices import identity, is_positive_definite, matrix, row_sums
-from certbound.checker.report import Unproved
+from certbound.checker.report import Budget, Unproved
 
 __all__ = ["cholesky", "largest_eigenvalue"]
 
 _HALVINGS = 60
 
 
-def cholesky(a: arb_mat) -> arb_mat:
+def cholesky(a: arb_mat, budget: Budget | None = None) -> arb_mat:
     """Lower triangular L with L L^T = a, for every symmetric matrix in the ball matrix.
 
     Raises
@@ -23,6 +23,8 @@ def cholesky(a: arb_mat) -> arb_mat:
     n = a.nrows()
     low = [[arb(0)] * n for _ in range(n)]
     for j in range(n):
+        if budget is not None:
+            budget.check()
         pivot = a[j, j] - sum((x * x for x in low[j][:j]), arb(0))
         if not pivot > 0:
             raise Unproved("a matrix is not positive definite")
@@ -33,7 +35,7 @@ def cholesky(a: arb_mat) -> arb_mat:
     return matrix(low)
 
 
-def largest_eigenvalue(a: arb_mat) -> arb:
+def largest_eigenvalue(a: arb_mat, budget: Budget | None = None) -> arb:
     """Upper bound of the largest eigenvalue of a symmetric matrix, close to it; at least 0.
 
     Examples
@@ -51,7 +53,7 @@ def largest_eigenvalue(a: arb_mat) -> arb:
         if high - low <= high * arb(2) ** -40:
             break
         middle = ((low + high) / 2).mid()
-        if is_positive_definite(one * middle - a):
+        if is_positive_definite(one * middle - a, budget):
             high = middle
         else:
             low = middle

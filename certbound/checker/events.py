@@ -42,7 +42,7 @@ class _Pair:
     def tail(self) -> arb:
         """P(Y > above), the simple bound."""
         variance = self.above_variance.upper()
-        if not variance > 0:
+        if variance.is_zero():
             return arb(0) if self.above >= 0 else arb(1)
         return self.weight * upper(tail(self.above / variance.sqrt()))
 
@@ -60,7 +60,7 @@ def union_of_pairs(pairs: Sequence[_Pair], budget: Budget) -> arb:
     """Upper bound of the sum: the joint probability where it matters, the plain tail elsewhere."""
     tails = [pair.tail() for pair in pairs]
     total = sum(tails, arb(0))
-    if not total > 0:
+    if total.is_zero():
         return arb(0)
     result = arb(0)
     for pair, value in zip(pairs, tails):
@@ -80,10 +80,11 @@ def chain(
     pairs: list[_Pair] = []
     previous: tuple[arb_mat, Level, arb] | None = None
     for k, (row, level) in enumerate(zip(rows, levels)):
+        budget.check()
         flat = arb_mat(1, len(row), list(row))
-        variance = quadratic(flat, covariances[k], flat)
+        variance = _variance(flat, covariances[k])
         if level is not None:
-            if level < 0:
+            if not level >= 0:
                 return arb(1)
             below, own, cross = None, arb(0), arb(0)
             if previous is not None and previous[1] is not None:
@@ -94,17 +95,20 @@ def chain(
     return union_of_pairs(pairs, budget)
 
 
-def sub_gaussian(rows: Sequence[Sequence[arb]], levels: Sequence[Level], proxies: Sequence[arb_mat]) -> arb:
+def sub_gaussian(
+    rows: Sequence[Sequence[arb]], levels: Sequence[Level], proxies: Sequence[arb_mat], budget: Budget
+) -> arb:
     """Discrete time, sub-Gaussian noise: sum of exp(-z^2/(2 r V r^T))."""
     total = arb(0)
     for k, (row, level) in enumerate(zip(rows, levels)):
+        budget.check()
         if level is None:
             continue
         flat = arb_mat(1, len(row), list(row))
-        variance = quadratic(flat, proxies[k], flat).upper()
-        if level < 0:
+        variance = _variance(flat, proxies[k]).upper()
+        if not level >= 0:
             return arb(1)
-        if variance > 0:
+        if not variance.is_zero():
             total += (-level * level / (2 * variance)).exp()
     return upper(total)
 
@@ -129,6 +133,7 @@ class Windows:
         self.starts = list(starts)
         self.ends = [*self.starts[1:], len(pieces)]
         self.n = pieces[0].transition.nrows()
+        budget.hold(3 * len(pieces) * self.n**2)
         self.levels: Sequence[Sequence[arb]] = [[]] * len(self.starts)
         self.forward: list[arb_mat] = []
         self.back: list[arb_mat] = []
@@ -184,6 +189,7 @@ class Windows:
         directions: list[list[arb] | None] = []
         costs: dict[int, arb] = {}
         for window, (start, end) in enumerate(zip(self.starts, self.ends)):
+            self.budget.check()
             ends = {k: self._ends(rows[k], k) for k in range(start, end) if asked[k]}
             if not ends:
                 directions.append(None)
@@ -198,6 +204,7 @@ class Windows:
         return directions, costs
 
     def _ends(self, row: Sequence[arb], k: int) -> tuple[list[arb], list[arb]]:
+        self.budget.check()
         flat = arb_mat(1, self.n, list(row))
         return (flat * self.before[k]).entries(), (flat * self.back[k]).entries()
 
@@ -217,14 +224,15 @@ class Windows:
         pairs = []
         previous: tuple[arb_mat, Level, arb] | None = None
         for window, (direction, level) in enumerate(zip(directions, levels)):
+            self.budget.check()
             flat = arb_mat(1, self.n, list(direction))
             first, last = flat * self.forward[window], self.covariances[self.ends[window]]
             begin = self.covariances[self.starts[window]]
-            end_variance = quadratic(flat, last, flat)
+            end_variance = _variance(flat, last)
             if level is not None:
-                if level < 0:
+                if not level >= 0:
                     return arb(1)
-                variance = quadratic(first, begin, first)
+                variance = _variance(first, begin)
                 below, own, cross = None, arb(0), arb(0)
                 if previous is not None and previous[1] is not None:
                     below, own = previous[1], previous[2]
@@ -233,6 +241,20 @@ class Windows:
                 pairs.append(_Pair(level, level, variance, end_variance, variance, 2))
             previous = flat, level, end_variance
         return union_of_pairs(pairs, self.budget)
+
+
+def _variance(row: arb_mat, covariance: arb_mat) -> arb:
+    """row covariance row^T, which is not negative.
+
+    Raises
+    ------
+    Unproved
+        If it is, or is not a number: then there is no such noise.
+    """
+    value = quadratic(row, covariance, row)
+    if not value.upper() >= 0:
+        raise Unproved("a variance is negative or not a number")
+    return value
 
 
 def _bend(piece: Piece, after: arb_mat) -> arb_mat:

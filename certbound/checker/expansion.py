@@ -14,6 +14,8 @@ from certbound.checker.taylor import Model, applied, constant
 __all__ = ["Expansion"]
 
 _ZERO = arb(0)
+_MANY = 100
+"""Terms whose time and memory are worth counting."""
 
 _Step = tuple[str, tuple[int, ...], float]
 
@@ -32,8 +34,10 @@ class Expansion:
     """
 
     def __init__(self, graph: Graph, node: int, guard: int, *, variables: int) -> None:
-        self.variables = variables
+        self.variables, self._budget = variables, graph.budget
         order = graph.reachable([node, guard])
+        self._budget.check()
+        self._budget.hold(4 * len(order))
         place = {index: number for number, index in enumerate(order)}
         below = (1 << variables) - 1
         self._nodes: list[_Step] = []
@@ -50,6 +54,7 @@ class Expansion:
 
     def prepare(self, parameters: Sequence[arb]) -> None:
         """Set the parameters (inputs ``variables``, ``variables + 1``, ...)."""
+        self._budget.check()
         values: list[Model | None] = [None] * len(self._nodes)
         for number in self._early:
             op, args, value = self._nodes[number]
@@ -69,7 +74,14 @@ class Expansion:
         ------
         Undecided
             If a jump is undecided or something is undefined somewhere in the box.
+        Unproved
+            If the budget of the graph is used up.
         """
+        with self._budget.passing():
+            return self._run(inputs, size)
+
+    def _run(self, inputs: Sequence[tuple[arb, dict[int, arb]]], size: int) -> Quadratic:
+        self._budget.check()
         if self._last != inputs[0]:  # most boxes share the time
             self._last = None  # should a jump in time stop here, what is half done serves nobody
             self._execute(self._first, self._template, inputs)
@@ -89,7 +101,7 @@ class Expansion:
         smear = [arb(found.blame.get(a, 0.0)) for a in range(size)]
         return Quadratic(
             value=found.value, gradient=gradient, hessian=hessian, radius=[arb(1)] * size, error=found.error.upper(),
-            smear=smear,
+            smear=smear, budget=self._budget,
         )
 
     def _execute(
@@ -101,7 +113,10 @@ class Expansion:
                 centre, linear = inputs[args[0]]
                 values[number] = Model(centre, linear, {}, _ZERO, {})
             else:
-                values[number] = _value(op, args, value, values)
+                found = values[number] = _value(op, args, value, values)
+                if found is not None and len(found.squares) > _MANY:
+                    self._budget.check()
+                    self._budget.hold(3 * len(found.squares))
 
 
 def _value(op: str, args: tuple[int, ...], value: float, values: list[Model | None]) -> Model | None:

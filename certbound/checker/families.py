@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from flint import arb
 
 from certbound.checker.matrices import upper
-from certbound.checker.report import Unproved
+from certbound.checker.report import Budget, Unproved
 
 __all__ = ["Family", "leaving"]
 
@@ -33,7 +33,8 @@ class Family:
 
 
 def leaving(
-    families: Sequence[Family], exceedance: Callable[[Family], arb], *, paid: arb | None = None, normal: bool = False
+    families: Sequence[Family], exceedance: Callable[[Family], arb], budget: Budget, *, paid: arb | None = None,
+    normal: bool = False,
 ) -> arb:
     """Upper bound of the probability that some event happens.
 
@@ -42,6 +43,7 @@ def leaving(
     families : sequence of Family
     exceedance : callable
         P(rows[k] . Z_k > levels[k] for some k) of a family.
+    budget : Budget
     paid : arb, optional
         What is paid once, for all families together.
     normal : bool
@@ -61,10 +63,12 @@ def leaving(
     total = upper(sum(single, arb(0) if paid is None else paid))
     if not normal or not total > _LIKELY:
         return total
-    return arb.min(total, correlated(families, single, exceedance))
+    return arb.min(total, correlated(families, single, exceedance, budget))
 
 
-def correlated(families: Sequence[Family], single: Sequence[arb], exceedance: Callable[[Family], arb]) -> arb:
+def correlated(
+    families: Sequence[Family], single: Sequence[arb], exceedance: Callable[[Family], arb], budget: Budget
+) -> arb:
     """1 minus the product over the symmetric events, and the sum of the others."""
     stay, rest = arb(1), arb(0)
     open_ = list(range(len(families)))
@@ -74,7 +78,7 @@ def correlated(families: Sequence[Family], single: Sequence[arb], exceedance: Ca
         if first.both:
             stay *= arb.max(1 - single[i], arb(0)).lower()
             continue
-        j = next((j for j in open_ if not families[j].both and _opposite(first.rows, families[j].rows)), None)
+        j = next((j for j in open_ if not families[j].both and _opposite(first.rows, families[j].rows, budget)), None)
         if j is None:
             rest += single[i]
             continue
@@ -88,8 +92,9 @@ def correlated(families: Sequence[Family], single: Sequence[arb], exceedance: Ca
     return upper(1 - stay + rest)
 
 
-def _opposite(first: Sequence[Sequence[arb]], second: Sequence[Sequence[arb]]) -> bool:
+def _opposite(first: Sequence[Sequence[arb]], second: Sequence[Sequence[arb]], budget: Budget) -> bool:
     """Whether the rows are exactly opposite, entry by entry."""
+    budget.check()
     return all(a == -b for one, other in zip(first, second) for a, b in zip(one, other))
 
 

@@ -7,18 +7,26 @@ the tape has it, lest a simplification hide where it is undefined.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
-from certbound.checker.report import Unproved
+from certbound.checker.report import Budget, Unproved
 from certbound.problem.tape import JUMPS, Node, Tape
 
 __all__ = ["Graph"]
 
 MOST_NODES = 400_000
+_NODE = 6
+"""Memory of a node, in balls."""
 
 
 class Graph:
     """A growing set of expressions over numbered inputs.
+
+    Parameters
+    ----------
+    budget : Budget, optional
+        Limits on what is built and on what runs over it.
 
     Attributes
     ----------
@@ -37,7 +45,8 @@ class Graph:
     True
     """
 
-    def __init__(self) -> None:
+    def __init__(self, budget: Budget | None = None) -> None:
+        self.budget = Budget(math.inf) if budget is None else budget
         self.nodes: list[Node] = []
         self.masks: list[int] = []
         self._numbers: dict[tuple[str, tuple[int, ...], str], int] = {}
@@ -58,6 +67,7 @@ class Graph:
         if op != "input":
             for arg in args:
                 mask |= self.masks[arg]
+        self.budget.hold(_NODE + mask.bit_length() // 512)
         self.masks.append(mask)
         self._numbers[key] = len(self.nodes) - 1
         return len(self.nodes) - 1
@@ -154,6 +164,8 @@ class Graph:
         known = self._derivatives
         for place in self.reachable([index]):
             if self.masks[place] & bit and (place, slot) not in known:
+                self.budget.check()
+                self.budget.hold(2)
                 known[place, slot] = self._rule(place, slot)
         return known[index, slot]
 

@@ -57,6 +57,7 @@ def exit_probability(data: Kummer, budget: Budget) -> arb:
     v: list[arb] = [data.v0]
     steps: list[arb] = []
     for slope, sigma, length in zip(data.slopes, data.sigmas, data.lengths):
+        budget.check()
         after, step = _advance(data, v[-1], slope, sigma, length)
         v.append(after)
         steps.append(step)
@@ -64,7 +65,7 @@ def exit_probability(data: Kummer, budget: Budget) -> arb:
     for step in reversed(steps):
         info.append(info[-1] + step)
     info.reverse()
-    found = _least_continuous(data, v, info, budget) if data.continuous else _least_discrete(data, v, info)
+    found = _least_continuous(data, v, info, budget) if data.continuous else _least_discrete(data, v, info, budget)
     if found is None:
         return arb(0)
     first = _initial(data, info[0])
@@ -73,11 +74,12 @@ def exit_probability(data: Kummer, budget: Budget) -> arb:
     return upper(arb.min(first / found, arb(1)))
 
 
-def _least_discrete(data: Kummer, v: list[arb], info: list[arb]) -> arb | None:
+def _least_discrete(data: Kummer, v: list[arb], info: list[arb], budget: Budget) -> arb | None:
     """Lower bound of the least gain over the steps; None where nothing is asked."""
     least: arb | None = None
     excess = _excess(data)
     for k, radius in enumerate(data.radii):
+        budget.check()
         if radius is None:
             continue
         value = _gain(data, excess, info[k], radius * radius / (2 * v[k])) if radius > 0 else arb(0)
@@ -95,7 +97,7 @@ def _least_continuous(data: Kummer, v: list[arb], info: list[arb], budget: Budge
             continue
         if not radius > 0:
             return arb(0)
-        bounds[k] = _least_on(data, excess, radius, (v[k], v[k + 1]), (info[k], info[k + 1]), k, 1)
+        bounds[k] = _least_on(data, excess, radius, (v[k], v[k + 1]), (info[k], info[k + 1]), k, 1, budget)
         value = _gain(data, excess, info[k + 1], radius * radius / (2 * v[k + 1]))
         attained = value if attained is None else arb.min(attained, value)
     if attained is None:
@@ -106,7 +108,7 @@ def _least_continuous(data: Kummer, v: list[arb], info: list[arb], budget: Budge
         assert radius is not None
         while bound < attained * _CLOSE and parts < _MOST_PARTS:
             parts *= 4
-            bound = _least_on(data, excess, radius, (v[k], v[k + 1]), (info[k], info[k + 1]), k, parts)
+            bound = _least_on(data, excess, radius, (v[k], v[k + 1]), (info[k], info[k + 1]), k, parts, budget)
         bounds[k] = bound
     values = list(bounds.values())
     least = values[0]
@@ -200,7 +202,7 @@ def _gain(data: Kummer, excess: Callable[[arb], arb], info: arb, z: arb) -> arb:
 
 def _least_on(
     data: Kummer, excess: Callable[[arb], arb], radius: arb, ends: tuple[arb, arb], info: tuple[arb, arb], k: int,
-    parts: int,
+    parts: int, budget: Budget,
 ) -> arb:
     """Lower bound over a piece that is cut into equal parts."""
     square = radius * radius / 2
@@ -208,6 +210,7 @@ def _least_on(
     v, rest = ends[0], info[0]
     best: arb | None = None
     for _ in range(parts):
+        budget.check()
         after, step = _advance(data, v, slope, sigma, length)
         rest = rest - step
         value = _gain(data, excess, arb.max(rest, info[1]), square / arb.max(v, after))

@@ -10,6 +10,7 @@ constraints hold wherever Z stays below what y and R leave, and the probabilitie
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -74,8 +75,9 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     outputs = remainders(model, structure, budget)
     worst = arb(0)
     for index, (entry, box) in enumerate(zip(entries, boxes)):
-        cell = _Cell(shared, Record(entry, f"proof.cells[{index}]", _CELL, ("stopped",)), box, budget)
-        worst = arb.max(worst, cell.probability(outputs))
+        with budget.passing():
+            cell = _Cell(shared, Record(entry, f"proof.cells[{index}]", _CELL, ("stopped",)), box, budget)
+            worst = arb.max(worst, cell.probability(outputs))
     return upper(worst)
 
 
@@ -83,6 +85,7 @@ class _Cell:
     """One cell of the initial set."""
 
     def __init__(self, shared: Shared, record: Record, box: list[tuple[arb, arb]], budget: Budget) -> None:
+        budget.check()
         self.shared, self.model, self.budget = shared, shared.model, budget
         self.record = record
         model, n, count = shared.model, shared.model.dimension, shared.count
@@ -109,7 +112,7 @@ class _Cell:
             arb.max(arb(high) - m, m - arb(low)) for (low, high), m in zip(model.disturbance, self.middle)
         ]
         self.grid = self._grid()
-        self.demands = demands(model, self.grid, record.items("separations"), record.at("separations"))
+        self.demands = demands(model, self.grid, record.items("separations"), record.at("separations"), budget)
         self.state: StateNoise | None = None
         if record["stopped"] is not None or isinstance(model.noise.diffusion, Tape):
             self.state = StateNoise(
@@ -123,10 +126,14 @@ class _Cell:
         given = record.items("rows", self.shared.count, self.shared.count)
         extra = len(listed(given[0], record.at("rows"), 0, MOST_ROWS))
         rows = []
+        zero, one = arb(0), arb(1)
+        self.budget.hold((len(units) + self.shared.count * extra) * (n // 8 + 1))  # of the same 0
+        fixed = [[one if j == unit else zero for j in range(n)] for unit in units]
         for item in numbers(given, record.at("rows"), self.shared.count, extra, len(units)):
-            whole = [[arb(1 if j == unit else 0) for j in range(n)] for unit in units]
+            self.budget.check()
+            whole = list(fixed)
             for row in item:
-                full = [arb(0)] * n
+                full = [zero] * n
                 for unit, value in zip(units, row):
                     full[unit] = arb(value)
                 whole.append(full)
@@ -172,6 +179,8 @@ class _Cell:
         growth = sum(max(0.0, float(row_sums(p.transition).log() / arb.const_log2())) for p in self.pieces)
         if growth <= 20:
             return self._probability(outputs)
+        if not growth < math.inf:
+            raise Unproved("the slopes are not finite")
         with ctx.workprec(int(min(_BITS + growth, _MOST_BITS))):
             self.pieces = self._pieces()
             return self._probability(outputs)
@@ -209,6 +218,7 @@ class _Cell:
     def _pieces(self) -> list[Piece]:
         shared, state = self.shared, self.state
         fixed = identity(self.model.dimension) * 0 if state is not None else self.model.noise.covariance()
+        self.budget.hold(self.shared.count * self.model.dimension**2 * (8 if self.model.continuous else 4))
         result = []
         for k, (slopes, drifts) in enumerate(zip(self.slopes, self.drifts)):
             self.budget.check()
@@ -226,9 +236,12 @@ class _Cell:
         one = identity(n)
         unit = [[one[i, j] for j in range(n)] for i in range(n)]
         asked = [self._asked(k) for k in range(count if continuous else count + 1)]
+        if continuous:
+            self.budget.hold(n * sum(map(len, asked)))
         loads = [self._load(k) for k in range(count)]
         nodes: list[list[list[arb]]] = []
         for k in range(count + 1):
+            self.budget.check()
             own = asked[k] if k < len(asked) else []
             if not continuous:
                 nodes.append(own)
@@ -242,6 +255,7 @@ class _Cell:
             return found
         low, high, reach = [], [], []
         for k in range(count):
+            self.budget.check()
             gain = self._gain(k)
             parts = over_piece(self.pieces[k], asked[k], found, k, self._box(k), None if gain is None else gain[1])
             low.append(parts[0])
@@ -334,6 +348,7 @@ class _Cell:
         count, inner = self.shared.count, len(self.rows[0])
         result: list[list[arb | None]] = []
         for number_, demand in enumerate(self.demands):
+            self.budget.check()
             rooms: list[arb | None] = []
             for k, room in enumerate(demand.rooms):
                 place = number_ + (inner if k < count else 0)
@@ -370,12 +385,14 @@ class _Cell:
             if self.record["window_levels"] is not None:
                 raise CertificateError(f"`{self.record.at('window_levels')}` must be null in discrete time.")
             if not model.noise.gaussian:
-                return leaving(families, lambda family: sub_gaussian(family.rows, family.levels, values))
+                return leaving(
+                    families, lambda family: sub_gaussian(family.rows, family.levels, values, budget), budget
+                )
             moves = [piece.transition for piece in self.pieces]
             return leaving(
-                families, lambda family: chain(family.rows, family.levels, moves, values, budget), normal=True
+                families, lambda family: chain(family.rows, family.levels, moves, values, budget), budget, normal=True
             )
         given = self.record.array("window_levels", len(self.shared.windows), model.dimension)
         windows = Windows(self.pieces, values, self.shared.windows, budget)
         paid = windows.coordinates([[arb(x) for x in item] for item in given])
-        return leaving(families, lambda family: windows.exceedance(family.rows, family.levels), paid=paid)
+        return leaving(families, lambda family: windows.exceedance(family.rows, family.levels), budget, paid=paid)

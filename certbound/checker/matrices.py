@@ -7,6 +7,8 @@ from typing import Any
 
 from flint import arb, arb_mat
 
+from certbound.checker.report import Budget
+
 __all__ = [
     "column", "diagonal", "identity", "is_positive_definite", "magnitude", "matrix", "quadratic", "row_sums", "upper",
 ]  # fmt: skip
@@ -62,7 +64,7 @@ def quadratic(first: arb_mat, form: arb_mat, second: arb_mat) -> arb:
     return (first * form * second.transpose())[0, 0]
 
 
-def is_positive_definite(a: arb_mat) -> bool:
+def is_positive_definite(a: arb_mat, budget: Budget | None = None) -> bool:
     """Whether every symmetric matrix in the ball matrix is positive definite (Cholesky on balls).
 
     Examples
@@ -73,6 +75,8 @@ def is_positive_definite(a: arb_mat) -> bool:
     n = a.nrows()
     rows = [[a[i, j] for j in range(i + 1)] for i in range(n)]
     for j in range(n):
+        if budget is not None:
+            budget.check()
         pivot = rows[j][j]
         if not pivot > 0:
             return False

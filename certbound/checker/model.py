@@ -7,10 +7,11 @@ from typing import Any
 
 from flint import arb, arb_mat
 
-from certbound.checker.matrices import diagonal, is_positive_definite, matrix, row_sums
+from certbound.checker.matrices import diagonal, is_positive_definite, matrix
 from certbound.checker.reading import Record, number, numbers, text
 from certbound.checker.reading import entries as listed
 from certbound.checker.regions import Constraint, read_constraint
+from certbound.checker.report import Budget
 from certbound.checker.tapes import read_tape
 from certbound.errors import CertificateError
 from certbound.problem.tape import Tape
@@ -19,6 +20,8 @@ __all__ = ["Initial", "Model", "Noise", "read_model"]
 
 MOST_STATES = 400
 MOST_STEPS = 100_000
+_SLACK = arb(2) ** -39
+"""How far a covariance may miss semidefiniteness where every variance is 1."""
 _FIELDS = (
     "name", "time", "horizon", "delta", "states", "inputs", "disturbances", "dynamics", "plan", "disturbance_set",
     "noise", "initial", "constraints", "domain",
@@ -95,13 +98,15 @@ def _names(record: Record, name: str, least: int) -> tuple[str, ...]:
     return found
 
 
-def read_model(value: object, path: str = "problem") -> Model:
+def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     """The problem in a certificate.
 
     Raises
     ------
     CertificateError
         If a field is missing, has the wrong size, or makes no sense.
+    Unproved
+        If it is too large for the budget.
     """
     record = Record(value, path, _FIELDS)
     time = record["time"]
@@ -119,17 +124,19 @@ def read_model(value: object, path: str = "problem") -> Model:
     dynamics = read_tape(record["dynamics"], record.at("dynamics"), ("t", *states, *inputs, *disturbances), (n,))
     domain = _ranges(record["domain"], record.at("domain"), n) if record["domain"] is not None else None
     constraints = [
-        read_constraint(item, f"{path}.constraints[{index}]", n, horizon)
+        read_constraint(item, f"{path}.constraints[{index}]", n, horizon, budget)
         for index, item in enumerate(record.items("constraints", 0, 1000))
     ]
     if domain is not None:
+        budget.hold(n * n // 4 + 1)
         constraints.append(Constraint.of_domain(domain))
     return Model(
         name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
         plan=_plan(record, len(inputs), continuous, horizon), states=states,
         disturbance=_disturbance(record, len(disturbances)),
-        noise=_noise(record["noise"], path + ".noise", states, time),
-        initial=_initial(record["initial"], path + ".initial", n), constraints=tuple(constraints), domain=domain,
+        noise=_noise(record["noise"], path + ".noise", states, time, budget),
+        initial=_initial(record["initial"], path + ".initial", n, budget), constraints=tuple(constraints),
+        domain=domain,
     )
 
 
@@ -165,7 +172,7 @@ def _disturbance(record: Record, count: int) -> list[tuple[float, float]]:
     return result
 
 
-def _noise(value: object, path: str, states: tuple[str, ...], time: str) -> Noise:
+def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget: Budget) -> Noise:
     n = len(states)
     if time == "continuous":
         record = Record(value, path, ("law", "diffusion"))
@@ -185,16 +192,16 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str) -> Nois
     record = Record(value, path, ("law", "level", "values", "matrix"), ("independent",))
     rows = _same_length(record.array("matrix", n, None), path)
     m = len(rows[0])
-    return Noise(diffusion=matrix(rows), proxy=_proxy(record, m), gaussian=record["law"] == "gaussian")
+    return Noise(diffusion=matrix(rows), proxy=_proxy(record, m, budget), gaussian=record["law"] == "gaussian")
 
 
 def _same_length(rows: list[list[float]], path: str) -> list[list[float]]:
-    if not rows[0] or any(len(row) != len(rows[0]) for row in rows):
-        raise CertificateError(f"`{path}` must hold a matrix.")
+    if not 1 <= len(rows[0]) <= MOST_STATES or any(len(row) != len(rows[0]) for row in rows):
+        raise CertificateError(f"`{path}` must hold a matrix of at most {MOST_STATES} columns.")
     return rows
 
 
-def _proxy(record: Record, m: int) -> arb_mat:
+def _proxy(record: Record, m: int, budget: Budget) -> arb_mat:
     """The variance proxy that a law has by its name (Hoeffding's lemma for bounded ones)."""
     law, level = record.text("law"), record.text("level")
     levels = {
@@ -210,7 +217,7 @@ def _proxy(record: Record, m: int) -> arb_mat:
         rows = record.array("values", m, m)
         if any(rows[i][j] != rows[j][i] for i in range(m) for j in range(i)):
             raise CertificateError(f"`{record.at('values')}` must be symmetric.")
-        return _semidefinite(matrix(rows), record.at("values"))
+        return _semidefinite(matrix(rows), record.at("values"), budget)
     values = [arb(number(item, record.at("values"), least=0.0)) for item in record.items("values", m, m)]
     if level == "variance":
         return diagonal(values)
@@ -223,16 +230,28 @@ def _proxy(record: Record, m: int) -> arb_mat:
     return diagonal(squares)
 
 
-def _semidefinite(a: arb_mat, path: str) -> arb_mat:
-    """The matrix, which must be positive semidefinite but for rounding."""
+def _semidefinite(a: arb_mat, path: str, budget: Budget) -> arb_mat:
+    """A covariance that is positive semidefinite but for rounding; what is missing is added in proportion to variances.
+
+    It is judged in units in which every variance is 1, so that a large one hides nothing of a small one.
+    """
     n = a.nrows()
-    slack = row_sums(a) * arb(2) ** -40 + arb(2) ** -1000
-    if not is_positive_definite(a + diagonal([slack] * n)):
+    variances = [a[i, i] for i in range(n)]
+    if not all(value >= 0 for value in variances):
+        raise CertificateError(f"`{path}` must not have a negative variance.")
+    kept = [i for i, value in enumerate(variances) if value > 0]
+    if len(kept) < n and any(not a[i, j].is_zero() for i in range(n) if variances[i].is_zero() for j in range(n)):
+        raise CertificateError(f"`{path}` must be positive semidefinite: what has no variance has no covariance.")
+    scales = {i: 1 / variances[i].sqrt() for i in kept}
+    scaled = matrix([[a[i, j] * scales[i] * scales[j] for j in kept] for i in kept])
+    if is_positive_definite(scaled, budget):
+        return a
+    if not is_positive_definite(scaled + diagonal([_SLACK] * len(kept)), budget):
         raise CertificateError(f"`{path}` must be positive semidefinite.")
-    return a
+    return a + diagonal([value * _SLACK for value in variances])
 
 
-def _initial(value: object, path: str, n: int) -> Initial:
+def _initial(value: object, path: str, n: int, budget: Budget) -> Initial:
     kinds = {
         "box": ("low", "high"), "ball": ("center", "radius"), "ellipsoid": ("center", "shape"),
         "gaussian": ("mean", "covariance"),
@@ -249,14 +268,14 @@ def _initial(value: object, path: str, n: int) -> Initial:
     centre = record.array("mean" if kind == "gaussian" else "center", n)
     points = [arb(x) for x in centre]
     if kind == "gaussian":
-        covariance = _semidefinite(matrix(_symmetric(record, "covariance", n)), record.at("covariance"))
+        covariance = _semidefinite(matrix(_symmetric(record, "covariance", n)), record.at("covariance"), budget)
         return Initial(kind=kind, low=tuple(points), high=tuple(points), covariance=covariance, centre=tuple(centre))
     if kind == "ball":
         radius = record.number("radius", least=0.0)
         reach, shape = [arb(radius)] * n, None
     else:
         rows: Any = _symmetric(record, "shape", n)
-        if not is_positive_definite(matrix(rows)):
+        if not is_positive_definite(matrix(rows), budget):
             raise CertificateError(f"`{path}.shape` must be positive definite.")
         reach, shape, radius = [arb(rows[i][i]).sqrt() for i in range(n)], matrix(rows), 0.0
     return Initial(

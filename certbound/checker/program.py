@@ -36,11 +36,13 @@ class Program:
         self, graph: Graph, outputs: Sequence[int], guards: Iterable[int] = (), *, variables: int,
         generalised: bool = False, unbounded: bool = False,
     ) -> None:
-        self._unbounded = unbounded
+        self._unbounded, self._budget = unbounded, graph.budget
         self.variables = variables
         self._operations = BALLS | {"kink": generalised_kink} if generalised else BALLS
         watched = sorted(set(guards))
         order = graph.reachable([*outputs, *watched])
+        self._budget.check()
+        self._budget.hold(4 * len(order))
         place = {index: number for number, index in enumerate(order)}
         below = (1 << variables) - 1
         self._inputs: list[tuple[int, int]] = []
@@ -68,6 +70,7 @@ class Program:
 
     def prepare(self, parameters: Sequence[arb]) -> None:
         """Set the parameters (inputs ``variables``, ``variables + 1``, ...)."""
+        self._budget.check()
         values: list[arb] = [arb(0)] * self._size
         for number, constant in self._constants:
             values[number] = constant
@@ -88,7 +91,10 @@ class Program:
         ------
         Undecided
             If a jump is undecided or something is undefined somewhere in the balls.
+        Unproved
+            If the time of the graph's budget is used up.
         """
+        self._budget.check()
         values = self._template.copy()
         for number, slot in self._inputs:
             if slot < self.variables:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 from flint import arb
 
+from certbound.checker.report import Budget
+
 __all__ = ["Cut", "Quadratic"]
 
 _MOST = 60
@@ -25,7 +27,7 @@ Cut = tuple[Sequence[arb], arb, arb]
 class Quadratic:
     """value + gradient . x + x^T hessian x / 2 for |x_a| <= radius_a, up to ``error``.
 
-    ``smear`` guesses how much each coordinate contributes to the error.
+    ``smear`` guesses how much each coordinate contributes to the error; ``budget`` limits the time.
     """
 
     value: arb
@@ -34,6 +36,7 @@ class Quadratic:
     radius: Point
     error: arb
     smear: Point
+    budget: Budget | None = None
 
     def stays(self, low: arb, high: arb, cuts: Sequence[Cut]) -> bool | None:
         """Whether the function lies in [low, high] wherever every cut has form . x in its range.
@@ -49,6 +52,8 @@ class Quadratic:
         for _ in range(_MOST):
             if not stack:
                 return True
+            if self.budget is not None:
+                self.budget.check()
             centre, radius = stack.pop()
             if not _meets(centre, radius, cuts):
                 continue
@@ -76,6 +81,8 @@ class Quadratic:
                 return None
             if (value > top or value < bottom) and _holds(centre, cuts):
                 return False if value > high + self.error or value < low - self.error else None
+            if not any(size > 0 for size in radius):
+                return None
             for a, size in enumerate(radius):
                 if a not in active:
                     shares[a] = abs(slope[a]) * size

@@ -16,6 +16,7 @@ from flint import arb, arb_mat
 
 from certbound.checker.matrices import identity, is_positive_definite, matrix
 from certbound.checker.reading import Record, entries, number, numbers, text, whole, wholes
+from certbound.checker.report import Budget
 from certbound.checker.tapes import read_tape
 from certbound.errors import CertificateError
 from certbound.problem.tape import Tape
@@ -25,6 +26,7 @@ __all__ = ["POLYGON", "Constraint", "Region", "read_constraint"]
 POLYGON = 24
 
 Row = list[arb]
+_ZERO = arb(0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -47,9 +49,13 @@ class Region:
         """Whether it is a ball or an ellipsoid."""
         return self.kind in ("ball", "ellipsoid")
 
+    def face(self, number: int) -> Row:
+        """The direction of a face."""
+        return [_ZERO if x == 0.0 else arb(x) for x in self.faces[number]]
+
     def lift(self, row: Sequence[arb], dimension: int) -> Row:
         """A direction of the region's coordinates as one of the whole state."""
-        full = [arb(0)] * dimension
+        full = [_ZERO] * dimension
         for place, value in zip(self.coordinates, row):
             full[place] = value
         return full
@@ -123,21 +129,37 @@ class Constraint:
         """Whether the certificate names a direction for every piece."""
         return not self.inside and self.region.kind != "halfspace"
 
-    def read_separation(self, value: object, path: str, count: int) -> list[tuple[Row, arb]]:
+    def read_separation(self, value: object, path: str, count: int, budget: Budget) -> list[tuple[Row, arb]]:
         """Per piece a row a and an upper bound of a . y over the obstacle moved to the origin."""
         region = self.region
+        budget.hold(2 * count)
         if region.round:
             rows = numbers(value, path, count, len(region.coordinates))
-            exact = [[arb(x) for x in row] for row in rows]
-            return [(row, region.support(row)) for row in exact]
-        return [self._mixed(item, f"{path}[{k}]") for k, item in enumerate(entries(value, path, count, count))]
+            budget.hold(count * len(region.coordinates))
+            exact = []
+            for row in rows:
+                budget.check()
+                turned = [arb(x) for x in row]
+                exact.append((turned, region.support(turned)))
+            return exact
+        faces: dict[int, tuple[Row, arb]] = {}
+        found = []
+        for k, item in enumerate(entries(value, path, count, count)):
+            budget.check()
+            place = f"{path}[{k}]"
+            if isinstance(item, list):
+                found.append(self._mixed(item, place, budget))
+                continue
+            face = whole(item, place, 0, len(region.bounds) - 1)
+            if face not in faces:
+                faces[face] = region.face(face), arb(region.bounds[face])
+            found.append(faces[face])
+        return found
 
-    def _mixed(self, value: object, path: str) -> tuple[Row, arb]:
-        """One face by its number, or a combination of all faces by weights that are not negative."""
+    def _mixed(self, value: object, path: str, budget: Budget) -> tuple[Row, arb]:
+        """A combination of all faces by weights that are not negative."""
         region, faces = self.region, len(self.region.bounds)
-        if not isinstance(value, list):
-            face = whole(value, path, 0, faces - 1)
-            return [arb(x) for x in region.faces[face]], arb(region.bounds[face])
+        budget.hold(len(region.coordinates))
         weights = [arb(number(x, path, least=0.0)) for x in entries(value, path, faces, faces)]
         row = [
             sum((w * face[i] for w, face in zip(weights, region.faces) if face[i]), arb(0))
@@ -156,7 +178,7 @@ def _sides(low: list[float | None], high: list[float | None]) -> tuple[list[list
     return faces, bounds
 
 
-def read_constraint(value: object, path: str, dimension: int, horizon: float) -> Constraint:
+def read_constraint(value: object, path: str, dimension: int, horizon: float, budget: Budget) -> Constraint:
     """One constraint of a certificate.
 
     Raises
@@ -173,7 +195,7 @@ def read_constraint(value: object, path: str, dimension: int, horizon: float) ->
         if not 0 <= first <= last <= horizon:
             raise CertificateError(f"`{path}.during` must lie within the horizon and rise.")
         during = (first, last)
-    region = _region(record["region"], record.at("region"), dimension)
+    region = _region(record["region"], record.at("region"), dimension, budget)
     return Constraint(
         inside=record["kind"] == "inside", region=region, during=during,
         label=text(record["label"], record.at("label"), 1000),
@@ -189,7 +211,7 @@ _KINDS = {
 }
 
 
-def _region(value: object, path: str, dimension: int) -> Region:
+def _region(value: object, path: str, dimension: int, budget: Budget) -> Region:
     kind = value.get("kind") if isinstance(value, dict) else None
     if not isinstance(kind, str) or kind not in _KINDS:
         raise CertificateError(f"`{path}.kind` must be one of {', '.join(_KINDS)}.")
@@ -217,6 +239,7 @@ def _region(value: object, path: str, dimension: int) -> Region:
                 for name in ("low", "high")]
         if any(a is not None and b is not None and a > b for a, b in zip(*ends)):
             raise CertificateError(f"`{path}.low` must not exceed `high`.")
+        budget.hold(k * k // 4 + 1)
         faces, bounds = _sides(ends[0], ends[1])
         return Region(kind=kind, coordinates=coordinates, center=center, faces=faces, bounds=bounds)
     if kind == "ball":
@@ -224,7 +247,7 @@ def _region(value: object, path: str, dimension: int) -> Region:
         return Region(kind=kind, coordinates=coordinates, center=center, faces=[], bounds=[], radius=radius)
     rows: Any = record.array("shape", k, k)
     shape = matrix(rows)
-    if any(rows[i][j] != rows[j][i] for i in range(k) for j in range(i)) or not is_positive_definite(shape):
+    if any(rows[i][j] != rows[j][i] for i in range(k) for j in range(i)) or not is_positive_definite(shape, budget):
         raise CertificateError(f"`{path}.shape` must be symmetric and positive definite.")
     return Region(kind=kind, coordinates=coordinates, center=center, faces=[], bounds=[], shape=shape)
 

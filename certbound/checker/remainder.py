@@ -73,7 +73,7 @@ def remainders(model: Model, structure: Structure, budget: Budget) -> list[Outpu
     entries of A; those of K (continuous time); the varying entries of E; d0; the inputs of the plan.
     """
     n, q = model.dimension, len(model.disturbance)
-    graph = Graph()
+    graph = Graph(budget)
     tau = graph.input(0)
     s = [graph.input(1 + j) for j in range(n)]
     d = [graph.input(1 + n + j) for j in range(q)]
@@ -112,6 +112,7 @@ def remainders(model: Model, structure: Structure, budget: Budget) -> list[Outpu
         values[i] = graph.sub(values[i], graph.mul(e, offsets[j]))
     result = []
     for i in range(n):
+        budget.check()
         result.append(OutputRemainder(
             graph, graph.sub(values[i], velocities[i]), nodes[model.dynamics.outputs[i]], count=count,
             time=model.continuous, states=structure.active_states(i), disturbances=structure.active_disturbances(i),
@@ -336,8 +337,8 @@ def _lives_in(row: Sequence[arb], states: list[int]) -> bool:
 
 def _parts(box: _Box, smear: list[arb] | None, enough: arb) -> list[_Box] | None:
     """The box cut where that helps most, into two or, should the error be large, more; None for a point."""
-    parts = _halves(box, None if smear is None else _largest(smear))
-    if parts is None or smear is None:
+    parts = _halves(box, _largest(smear) if smear else None)
+    if parts is None or not smear:
         return parts
     sizes = [float(x) for x in smear]
     goal = float(enough)
@@ -346,8 +347,8 @@ def _parts(box: _Box, smear: list[arb] | None, enough: arb) -> list[_Box] | None
         sizes = [x / 4 if a == best else x / 2 for a, x in enumerate(sizes)]
         if not sum(sizes) > goal:
             break
-        finer = [_halves(part, _largest(sizes)) for part in parts]
-        parts = [half for pair in finer for half in pair or []]
+        finer = [_halves(part, _largest(sizes)) or [part] for part in parts]
+        parts = [half for pair in finer for half in pair]
     return parts
 
 
@@ -357,6 +358,8 @@ def _largest(sizes: Sequence[arb] | Sequence[float]) -> int:
 
 def _halves(box: _Box, place: int | None) -> list[_Box] | None:
     """The box cut in two along a coordinate (the widest one, if none is named or it has no width); None for a point."""
+    if not box.radius:
+        return None
     if place is None or not box.radius[place] > 0:
         place = _largest(box.radius)
         if not box.radius[place] > 0:

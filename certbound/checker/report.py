@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+
+from flint import ctx
 
 from certbound.errors import CertboundError
 
 __all__ = ["Budget", "Report", "Unproved"]
+
+MOST_BALLS = 16_000_000
+"""About a gigabyte."""
 
 
 class Unproved(CertboundError):
@@ -43,18 +50,20 @@ class Report:
 
 
 class Budget:
-    """Limits on the checker's own time and number of boxes.
+    """Limits on the checker's own time, number of boxes and memory.
 
     Parameters
     ----------
     seconds : float
     boxes : int
         Sub-boxes over all pieces together.
+    balls : int
+        Balls of 128 bits held at a time, each some 50 to 100 bytes.
     """
 
-    def __init__(self, seconds: float, boxes: int = 2_000_000) -> None:
+    def __init__(self, seconds: float, boxes: int = 2_000_000, balls: int = MOST_BALLS) -> None:
         self.started = time.monotonic()
-        self.seconds, self.boxes = seconds, boxes
+        self.seconds, self.boxes, self.balls = seconds, boxes, balls
 
     @property
     def elapsed(self) -> float:
@@ -81,5 +90,24 @@ class Budget:
         self.boxes -= 1
         if self.boxes < 0:
             raise Unproved("the check needs more sub-boxes than its limit")
-        if self.boxes % 64 == 0:
-            self.check()
+        self.check()
+
+    def hold(self, count: int) -> None:
+        """Take the memory of so many balls, before they are made.
+
+        Raises
+        ------
+        Unproved
+        """
+        self.balls -= count * ctx.prec // 128
+        if self.balls < 0:
+            raise Unproved("the check needs more memory than its limit")
+
+    @contextmanager
+    def passing(self) -> Iterator[None]:
+        """Give back at the end what is held within."""
+        balls = self.balls
+        try:
+            yield
+        finally:
+            self.balls = balls

@@ -26,7 +26,8 @@ __all__ = [
 
 _TERMS = 60
 _SMALL = arb(2) ** -100
-_LARGEST_STEP = 3e8
+_BLOCK = 3e6
+"""Products of numbers between two looks at the clock."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -103,15 +104,17 @@ def continuous_piece(slope: arb_mat, drift: arb_mat, length: arb, noise: arb_mat
 def discrete_piece(slope: arb_mat, noise: arb_mat) -> Piece:
     """The data of one step in discrete time; ``noise`` is the covariance of what is added."""
     one = identity(slope.nrows())
+    nothing = one * 0
     return Piece(
-        length=arb(1), transition=slope, gathered=one, noise=noise, deviation=one * 0, second=one * 0, slope=slope,
-        size=magnitude(slope), drift=one * 0,
+        length=arb(1), transition=slope, gathered=one, noise=noise, deviation=nothing, second=nothing, slope=slope,
+        size=magnitude(slope), drift=nothing,
     )
 
 
 def covariances(pieces: Sequence[Piece], start: arb_mat, budget: Budget) -> list[arb_mat]:
     """Covariances of Z at the nodes: V_{k+1} = F V_k F^T + Q."""
     result = [start]
+    budget.hold(len(pieces) * start.nrows() ** 2)
     for piece in pieces:
         budget.check()
         v = piece.transition * result[-1] * piece.transition.transpose() + piece.noise
@@ -157,6 +160,7 @@ def supports(
     budget : Budget
     """
     n = transitions[0].nrows()
+    budget.hold(3 * (n + 1) * sum(map(len, rows)))
     flat: list[arb] = []
     nodes: list[int] = []
     centre: list[arb] = []
@@ -176,26 +180,24 @@ def supports(
         count = len(nodes)
         if not count:
             continue
-        if count * n * n > _LARGEST_STEP:
-            raise Unproved(f"the check along {count} rows of {n} states is too large")
-        current, load = arb_mat(count, n, flat), loads[j]
-        middle = (current * load.centre).entries()
+        load = loads[j]
+        middle = _products(flat, load.centre, budget)
         boxes = [value for pair in zip(load.radius, load.box) for value in pair]
-        spread = (arb_mat(count, n, [x.abs_upper() for x in flat]) * arb_mat(n, 2, boxes)).entries()
+        spread = _products([x.abs_upper() for x in flat], arb_mat(n, 2, boxes), budget)
         for i in range(count):
             centre[i] += middle[i]
             radius[i] += spread[2 * i]
             reach[i] += spread[2 * i + 1]
         if load.generators is not None:
             columns = load.generators.ncols()
-            shares = (current * load.generators).entries()
+            shares = _products(flat, load.generators, budget)
             for i in range(count):
                 reach[i] += sum((x.abs_upper() for x in shares[i * columns : (i + 1) * columns]), arb(0))
-        flat = (current * transitions[j]).entries()
+        flat = _products(flat, transitions[j], budget)
     take(0)
     count = len(nodes)
     if count:
-        spread = (arb_mat(count, n, [x.abs_upper() for x in flat]) * arb_mat(n, 1, list(start))).entries()
+        spread = _products([x.abs_upper() for x in flat], arb_mat(n, 1, list(start)), budget)
         reach = [a + b for a, b in zip(reach, spread)]
     low: list[list[arb]] = [[] for _ in rows]
     high: list[list[arb]] = [[] for _ in rows]
@@ -205,6 +207,18 @@ def supports(
         high[node].append((centre[i] + radius[i]).upper())
         size[node].append(reach[i].upper())
     return Supports(low=low, high=high, reach=size)
+
+
+def _products(flat: list[arb], matrix: arb_mat, budget: Budget) -> list[arb]:
+    """Rows, one after another, times a matrix, block by block."""
+    n, columns = matrix.nrows(), matrix.ncols()
+    block = n * max(1, int(_BLOCK / (n * columns)))
+    result: list[arb] = []
+    for start in range(0, len(flat), block):
+        budget.check()
+        part = flat[start : start + block]
+        result += (arb_mat(len(part) // n, n, part) * matrix).entries()
+    return result
 
 
 def over_piece(

@@ -114,7 +114,7 @@ class SafeSet:
             rows = [[image[i, j] for j in range(self.n)] for i in range(image.nrows())]
             bounds = [arb(0)] * len(rows)
         else:
-            rows = [region.lift([arb(x) for x in face], self.n) for face in region.faces]
+            rows = [region.lift(region.face(number), self.n) for number in range(len(region.faces))]
             bounds, bound = [arb(b) for b in region.bounds], None
             if not rows and not constraint.inside:
                 raise Unproved(f"'{constraint.label}' leaves nothing")

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from flint import arb
 
 from certbound.checker.arithmetic import BALLS, Undecided, kink, power
+from certbound.checker.report import Budget
 from certbound.problem.tape import JUMPS, Tape
 
 __all__ = ["expand"]
@@ -19,16 +20,19 @@ __all__ = ["expand"]
 Series = list[arb]
 
 
-def expand(tape: Tape, inputs: Sequence[Series], order: int) -> list[Series]:
+def expand(tape: Tape, inputs: Sequence[Series], order: int, budget: Budget) -> list[Series]:
     """Coefficients 0 .. ``order`` of a tape's outputs along series of its inputs.
 
     Raises
     ------
     Undecided
         If something jumps or is undefined there.
+    Unproved
+        If the time is used up.
     """
     values: list[Series] = []
     for node in tape.nodes:
+        budget.check()
         if node.op == "input":
             given = list(inputs[node.args[0]])[: order + 1]
             values.append(given + [arb(0)] * (order + 1 - len(given)))

@@ -102,7 +102,7 @@ class StateNoise:
     ) -> list[arb_mat]:
         """g - ghat over the nominal curve plus H, piece by piece."""
         n, columns = self.diffusion.shape
-        graph = Graph()
+        graph = Graph(budget)
         nodes = graph.include(self.diffusion, [graph.input(slot) for slot in range(n + 1)])
         outputs = [nodes[output] for output in self.diffusion.outputs]
         read = 0
@@ -113,6 +113,7 @@ class StateNoise:
         program = Program(graph, outputs, outputs, variables=n + 1)
         program.prepare([])
         found = []
+        budget.hold(len(times) * n * columns)
         for k, ((start, end), hull) in enumerate(zip(times, hulls)):
             budget.check()
             inputs = [start.union(end)]
@@ -178,6 +179,7 @@ class Stopped:
 
     def __init__(self, windows: Windows, excess: Sequence[arb_mat], factor: arb, budget: Budget) -> None:
         self.windows, self.excess, self.budget = windows, excess, budget
+        budget.hold(len(excess) * windows.n * (windows.n + (excess[0].ncols() if excess else 0)))
         self.sizes = [magnitude(g) for g in excess]
         one = identity(windows.n)
         self.bends = [_bend(piece) for piece in windows.pieces]

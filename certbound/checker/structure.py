@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 from flint import arb
 
+from certbound.checker.arithmetic import Undecided
 from certbound.checker.graph import Graph
 from certbound.checker.model import Model
 from certbound.checker.program import Program
-from certbound.checker.report import Budget
+from certbound.checker.report import Budget, Unproved
 from certbound.problem.tape import JUMPS
 
 __all__ = ["Structure", "structure_of"]
@@ -50,6 +51,7 @@ class Structure:
 
     def hidden(self, model: Model, output: int) -> list[int]:
         """Inputs that decide a jump of an output, or whether it is defined, and are none of its remainder's."""
+        self.graph.budget.check()
         count, n = len(model.dynamics.inputs), model.dimension
         first = count - len(model.disturbance)
         asked = sum(1 << slot for slot in [*range(1, n + 1), *range(first, count)])
@@ -63,7 +65,7 @@ class Structure:
 
 def structure_of(model: Model, budget: Budget) -> Structure:
     """Differentiate the model once."""
-    graph = Graph()
+    graph = Graph(budget)
     n, q = model.dimension, len(model.disturbance)
     slots = [graph.input(slot) for slot in range(len(model.dynamics.inputs))]
     nodes = graph.include(model.dynamics, slots)
@@ -108,4 +110,7 @@ def _values(graph: Graph, nodes: dict[tuple[int, int], int]) -> dict[tuple[int, 
     constant = {entry: node for entry, node in nodes.items() if not graph.masks[node]}
     program = Program(graph, list(constant.values()), variables=0)
     program.prepare([])
-    return dict(zip(constant, program.run([])))
+    try:
+        return dict(zip(constant, program.run([])))
+    except Undecided as error:
+        raise Unproved("a derivative of the dynamics that depends on nothing is not defined") from error

@@ -32,14 +32,15 @@ CORNERS = 10
 class Norm:
     """|x|_P = sqrt(x^T P x) for a positive definite P."""
 
-    def __init__(self, metric: arb_mat) -> None:
-        self.metric, self.size = metric, magnitude(metric)
-        self.root = cholesky(metric)
+    def __init__(self, metric: arb_mat, budget: Budget) -> None:
+        self.metric, self.size, self.budget = metric, magnitude(metric), budget
+        self.root = cholesky(metric, budget)
         self.inverse = metric.inv()
         self.n = metric.nrows()
 
     def length(self, vector: Sequence[arb]) -> arb:
         """Upper bound of the norm of a box: that of its middle plus that of its radii."""
+        self.budget.check()
         middle = column([x.mid() for x in vector])
         radius = column([x.rad() for x in vector])
         squares = [(middle.transpose() * self.metric * middle)[0, 0], (radius.transpose() * self.size * radius)[0, 0]]
@@ -47,12 +48,13 @@ class Norm:
 
     def dual(self, row: Sequence[arb]) -> arb:
         """Upper bound of sqrt(a^T P^-1 a)."""
+        self.budget.check()
         flat = arb_mat(1, self.n, list(row))
         return arb.max((flat * self.inverse * flat.transpose())[0, 0].upper(), arb(0)).sqrt().upper()
 
     def section(self, image: arb_mat) -> arb:
         """Upper bound of sup |W y| over |y|_P <= 1."""
-        return largest_eigenvalue(image * self.inverse * image.transpose()).sqrt().upper()
+        return largest_eigenvalue(image * self.inverse * image.transpose(), self.budget).sqrt().upper()
 
     def start(self, model: Model, low: Sequence[arb], high: Sequence[arb], centre: Sequence[arb], whole: bool) -> arb:
         """Upper bound of |x_0 - centre|_P over a box, or over a round initial set if the box is ``whole``."""
@@ -68,10 +70,10 @@ class Norm:
         initial = model.initial
         if whole and initial.kind in ("ball", "ellipsoid"):
             if initial.shape is None:
-                reach = largest_eigenvalue(self.metric).sqrt() * arb(initial.radius)
+                reach = largest_eigenvalue(self.metric, self.budget).sqrt() * arb(initial.radius)
             else:
-                inner = cholesky(initial.shape)
-                reach = largest_eigenvalue(inner.transpose() * self.metric * inner).sqrt()
+                inner = cholesky(initial.shape, self.budget)
+                reach = largest_eigenvalue(inner.transpose() * self.metric * inner, self.budget).sqrt()
             shift = self.length([arb(x) - c for x, c in zip(initial.centre, centre)])
             bound = arb.min(bound, reach + shift)
         return bound.upper()
@@ -160,7 +162,7 @@ class Tube:
             return [arb(x) for x in plan[min(k, len(plan) - 1)]]
         piece = self.pieces[k]
         share = arb(self.model.horizon) / len(plan)
-        row = int(float((piece.start + piece.end) / 2 / share))
+        row = min(int(float((piece.start + piece.end) / 2 / share)), len(plan) - 1)
         edges = share * row, share * (row + 1)
         slack = arb(self.model.horizon) * arb(2) ** -48
         if not (piece.start >= edges[0] - slack and piece.end <= edges[1] + slack):
@@ -197,14 +199,14 @@ class Tube:
         if not model.continuous:
             states = [[x] for x in piece.coefficients[0]]
             after = self.pieces[k + 1].coefficients[0]
-            values = expand(model.dynamics, [[arb(k)], *states, *inputs], 0)
+            values = expand(model.dynamics, [[arb(k)], *states, *inputs], 0, self.budget)
             return [[a - value[0] for a, value in zip(after, values)]], [arb(0)] * model.dimension
         span = (piece.start - piece.middle).union(piece.end - piece.middle)
         parts = []
         for tau in (arb(0), span):
             time = [piece.middle + tau, arb(1)]
             states = piece.series(tau, ORDER + 1)
-            parts.append((states, expand(model.dynamics, [time, *states, *inputs], ORDER)))
+            parts.append((states, expand(model.dynamics, [time, *states, *inputs], ORDER, self.budget)))
         (thin, thin_flow), (wide, wide_flow) = parts
         rows = [
             [_velocity(thin[x], j) - thin_flow[x][j] for x in range(model.dimension)] for j in range(ORDER)
@@ -232,6 +234,7 @@ class Tube:
         """The box hull of the curve on a piece."""
         points = self.pieces[k].hull()
         result = []
+        self.budget.check()
         for x in range(self.model.dimension):
             low = high = points[0][x]
             for point in points[1:]:

@@ -23,6 +23,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+_SLACK, _ROUNDING = 1e-12, 1e-14
+"""How far a semidefinite matrix with a diagonal of 1 may miss it, and how far its computed eigenvalues may."""
 
 
 def frozen(value: Any) -> Array:
@@ -94,13 +96,27 @@ def symmetric(name: str, value: Any, size: int | None = None) -> Array:
 
 
 def positive_definite(name: str, value: Any, size: int | None = None, *, strict: bool = True) -> Array:
-    """A symmetric matrix with positive (``strict=False``: nonnegative) eigenvalues, up to rounding."""
+    """A symmetric matrix with positive (``strict=False``: nonnegative) eigenvalues, up to rounding.
+
+    It is judged in units in which its diagonal is 1, so that a large entry hides nothing of a small one; what rounding
+    has taken from a semidefinite matrix is added to its diagonal.
+    """
     array = symmetric(name, value, size)
-    smallest, largest = (float(x) for x in np.linalg.eigvalsh(array)[[0, -1]])
-    if smallest <= 0 if strict else smallest < -1e-12 * max(largest, 1e-300):
-        rule = "positive definite" if strict else "positive semidefinite"
-        raise ValueError(f"`{name}` must be {rule}, its smallest eigenvalue is {smallest:.3g}.")
-    return array
+    rule = "positive definite" if strict else "positive semidefinite"
+    diagonal = np.diag(array)
+    if np.any(diagonal < 0) or (strict and not np.all(diagonal > 0)):
+        raise ValueError(f"`{name}` must be {rule}, its diagonal has {float(diagonal.min()):.3g}.")
+    kept = diagonal > 0
+    if np.any(array[~kept]):
+        raise ValueError(f"`{name}` must be {rule}: a row whose diagonal entry is 0 must be 0.")
+    scale = np.sqrt(diagonal[kept])
+    values = np.linalg.eigvalsh(array[np.ix_(kept, kept)] / scale[:, None] / scale)
+    smallest = float(values[0]) if len(values) else 0.0
+    if smallest <= 0 if strict else smallest < -_SLACK:
+        raise ValueError(
+            f"`{name}` must be {rule}, its smallest eigenvalue is {smallest:.3g} where its diagonal is scaled to 1."
+        )
+    return array if smallest > -_ROUNDING else frozen(array + np.diag(_SLACK * diagonal))
 
 
 def names(name: str, value: Sequence[str], reserved: Iterable[str] = ()) -> tuple[str, ...]:

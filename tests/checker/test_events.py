@@ -59,8 +59,8 @@ def test_a_level_below_zero_is_certainly_exceeded_and_none_asks_nothing() -> Non
     values = covariances(pieces, one, Budget(10))
     assert chain([[arb(1)]] * 2, [None, arb(-1)], [one], values, Budget(10)) == 1
     assert chain([[arb(1)]] * 2, [None, None], [one], values, Budget(10)) == 0
-    assert sub_gaussian([[arb(1)]] * 2, [None, arb(-1)], values) == 1
-    assert abs(sub_gaussian([[arb(1)]], [arb(2)], values) - (-arb(2)).exp()) < 1e-12
+    assert sub_gaussian([[arb(1)]] * 2, [None, arb(-1)], values, Budget(10)) == 1
+    assert abs(sub_gaussian([[arb(1)]], [arb(2)], values, Budget(10)) - (-arb(2)).exp()) < 1e-12
 
 
 def test_windows_bound_the_reflection_principle_of_brownian_motion() -> None:

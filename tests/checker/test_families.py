@@ -89,7 +89,7 @@ def events(values: list[float], *, normal: bool, opposite: bool = True) -> float
         families.append(Family(label="down", rows=[other], levels=[arb(level)]))
     one = arb_mat(n, n, [x for row in rows for x in row])
     budget = Budget(60)
-    return float(leaving(families, lambda f: chain(f.rows, f.levels, [], [one], budget), normal=normal))
+    return float(leaving(families, lambda f: chain(f.rows, f.levels, [], [one], budget), budget, normal=normal))
 
 
 def test_only_exactly_opposite_rows_of_a_normal_response_are_multiplied() -> None:
@@ -103,4 +103,6 @@ def test_only_exactly_opposite_rows_of_a_normal_response_are_multiplied() -> Non
 def test_a_family_that_leaves_nothing_is_named() -> None:
     family = Family(label="the wall", rows=[[arb(1)]], levels=[arb(-1)])
     with pytest.raises(Unproved, match="the wall"):
-        leaving([family], lambda f: chain(f.rows, f.levels, [], [arb_mat(1, 1, [1])], Budget(60)), normal=True)
+        leaving(
+            [family], lambda f: chain(f.rows, f.levels, [], [arb_mat(1, 1, [1])], Budget(60)), Budget(60), normal=True
+        )

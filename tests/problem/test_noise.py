@@ -44,6 +44,9 @@ def test_a_bare_number_is_refused_with_the_names(build, message):
         (lambda: Gaussian(std=np.eye(2)), "a matrix is a covariance="),
         (lambda: SubGaussian(proxy_std=np.eye(2)), "a matrix is a proxy_covariance="),
         (lambda: Gaussian(covariance=[[1, 2], [2, 1]]), "positive semidefinite, its smallest eigenvalue is -1"),
+        (lambda: Gaussian(covariance=[[1e12, 0], [0, -0.5]]), "its diagonal has -0.5"),
+        (lambda: Gaussian(covariance=[[1e12, 2], [2, 1e-12]]), "must be positive semidefinite, its smallest"),
+        (lambda: SubGaussian(proxy_covariance=[[1e12, 1], [1, 0]]), "a row whose diagonal entry is 0 must be 0"),
         (lambda: Gaussian(covariance=[[1, 2], [0, 1]]), "must be symmetric"),
         (lambda: Gaussian(covariance=[[1, 2, 3], [0, 1, 2]]), "must be square"),
         (lambda: Uniform(halfwidth=-1), "`halfwidth` must not be negative"),
@@ -54,6 +57,13 @@ def test_a_bare_number_is_refused_with_the_names(build, message):
 def test_levels_are_checked(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def test_what_rounding_has_taken_from_a_covariance_is_added_in_proportion_to_its_variances():
+    short = np.array([[1e12, 1 + 1e-13], [1 + 1e-13, 1e-12]])
+    found = Gaussian(covariance=short).covariance
+    np.testing.assert_allclose(np.diag(found), np.diag(short) * (1 + 1e-12), rtol=1e-15)
+    np.testing.assert_array_equal(Gaussian(covariance=np.ones((3, 3))).covariance, np.ones((3, 3)))
 
 
 @settings(derandomize=True, deadline=None)

@@ -1,0 +1,688 @@
+"""Forged certificates: for every inequality that a proof rests on, a file that violates just this one.
+
+Each is made from a certificate that is proved, so that nothing else is wrong with it. ``FORGERIES`` is keyed by the
+inequality's name in docs/certificate.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+import certbound as cb
+from certbound.checker import parse
+from certbound.safety.certificate import certificate_text, exact, problem_data
+from certbound.safety.verification import verify_safety
+from tests.checker import conftest
+from tests.checker.test_adversary import jumping, linear
+from tests.checker.test_barrier import by_hand, kinked
+from tests.checker.test_stopped import growth
+
+Data = dict[str, Any]
+
+MORE = "more than the claimed"
+BEYOND = f"{MORE}|nothing is left"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forgery:
+    """How a proved certificate is forged, and what the checker says: the function ``place`` of ``file`` refuses it."""
+
+    base: str
+    file: str
+    place: str
+    reason: str
+    change: Callable[[Data], None]
+
+
+FORGERIES: dict[str, Forgery] = {}
+
+
+def forges(
+    name: str, base: str, file: str, place: str, reason: str
+) -> Callable[[Callable[[Data], None]], Callable[[Data], None]]:
+    """Enter a change into the table."""
+
+    def enter(change: Callable[[Data], None]) -> Callable[[Data], None]:
+        assert name not in FORGERIES
+        FORGERIES[name] = Forgery(base=base, file=file, place=place, reason=reason, change=change)
+        return change
+
+    return enter
+
+
+# ---- certificates that are proved ----------------------------------------------------------------------------
+
+
+def _cornered() -> cb.Problem:
+    faces = ([1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0])
+    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=2, noise=cb.Gaussian(std=0.1))
+    safe = [cb.Inside(cb.HalfSpace(face, 0.25)) for face in faces]
+    return cb.Problem(system, initial=[0, 0], safe=safe, horizon=2, delta=0.2)
+
+
+def _unequal() -> cb.Problem:
+    system = cb.DiscreteSystem(
+        lambda x: [x[1], 0 * x[1]], states=2, noise=cb.Gaussian(covariance=[[1e12, 0], [0, 0.01]])
+    )
+    safe = [cb.Inside(cb.HalfSpace([0.0, 1.0], 1.0))]
+    return cb.Problem(system, initial=[0, 0], safe=safe, horizon=3, delta=0.5)
+
+
+def _still() -> cb.Problem:
+    system = cb.DiscreteSystem(lambda x: [0.5 * x[0] - 0.1 * x[0] ** 3], states=["x"], noise=cb.Gaussian(std=0.05))
+    return cb.Problem(
+        system, initial=[0.2], safe=[cb.Inside(cb.Box([-1], [1]))], domain=cb.Box([-2], [2]), horizon=3
+    )
+
+
+def _random() -> cb.Problem:
+    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=2, noise=cb.Gaussian(std=0.05))
+    start = cb.GaussianStart([0, 0], 0.01 * np.eye(2))
+    return cb.Problem(system, initial=start, safe=[cb.Inside(cb.Ball([0, 0], 1.0))], horizon=3, delta=1e-2)
+
+
+def _bounded() -> cb.Problem:
+    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=2, noise=cb.Uniform(halfwidth=[0.1, 0.05]))
+    safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    return cb.Problem(system, initial=[0.2, 0.1], safe=safe, horizon=3, delta=1e-2)
+
+
+def _planned() -> cb.Problem:
+    system = cb.ContinuousSystem(
+        lambda x, u: [-x[0] + u[0]], states=["x"], inputs=cb.Box([-1], [1]), diffusion=[[0.1]]
+    )
+    safe = [cb.Inside(cb.Box([-1], [1]))]
+    return cb.Problem(system, initial=[0], safe=safe, horizon=1.0, plan=[[0.2], [-0.2]], delta=1e-2)
+
+
+def _bent() -> cb.Problem:
+    system = cb.DiscreteSystem(lambda x: [0.5 * np.abs(x[0])], states=["x"], noise=cb.Gaussian(std=0.05))
+    return cb.Problem(system, initial=cb.Box([-0.1], [0.1]), safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3)
+
+
+def _rising() -> Data:
+    """x' = 10 tanh(40 (t + 1/2)) + .01 dW from 0 with x <= 12, by constants: x(1) is 10."""
+    system = cb.ContinuousSystem(
+        lambda t, x: [10 * np.tanh(40 * (t + 0.5)) + 0 * x[0]], states=["x"], diffusion=[[0.01]]
+    )
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.HalfSpace([1.0], 12.0))], horizon=1.0)
+    cell = {
+        "nominal": [exact([[0.0], [10.0]]), exact([[5.0], [10.0]])], "eta": exact([0.1, 0.1]),
+        "radius": exact([0.1, 0.2]), "separations": [None],
+    }  # fmt: skip
+    proof = {
+        "engine": "constants", "assumed": False, "metric": None, "region": "everywhere",
+        "times": exact([0.0, 0.5, 1.0]), "middles": exact([0.0, 0.5]), "rate": exact(1e-6), "sigma": exact(0.0101),
+        "nu": exact(1.0), "start_sigma": exact(0.0), "splits": [exact([0.0, 0.0])], "rooms": exact([0.5, 0.5]),
+        "kummer": {"form": "kummer", "a": exact(100.0), "v0": exact(1e-6)}, "cells": [cell],
+    }  # fmt: skip
+    return {
+        "format": "certbound certificate", "version": 1, "problem": problem_data(problem), "proof": proof,
+        "claim": {"log10_delta": exact(-180.0), "method": "constants", "assumptions": []},
+    }  # fmt: skip
+
+
+def _stated(build: Callable[[], cb.Problem], method: str) -> Callable[[], str]:
+    def text() -> str:
+        problem = build()
+        return certificate_text(problem, verify_safety(problem, method=method))
+
+    return text
+
+
+_BASES: dict[str, Callable[[], str]] = {
+    "steps": _stated(conftest.steps, "linear"),
+    "flow": _stated(conftest.flow, "linear"),
+    "stirred": _stated(conftest.stirred, "linear"),
+    "growth": _stated(growth, "linear"),
+    "cornered": _stated(_cornered, "linear"),
+    "unequal": _stated(_unequal, "linear"),
+    "bent": _stated(_bent, "linear"),
+    "bounded steps": _stated(_bounded, "linear"),
+    "straight": lambda: json.dumps(linear()),
+    "disturbed": lambda: json.dumps(linear(disturbance=cb.Box([0.0], [0.1]))),
+    "contraction": _stated(conftest.contraction, "constants"),
+    "still": _stated(_still, "constants"),
+    "random": _stated(_random, "constants"),
+    "bounded": _stated(_bounded, "constants"),
+    "planned": _stated(_planned, "constants"),
+    "rising": lambda: json.dumps(_rising()),
+    "barrier": lambda: json.dumps(by_hand(kinked(), 8.0, 0.7201, 0.0801, 7.999)),
+}
+
+
+@cache
+def text(base: str) -> str:
+    """A certificate that is proved."""
+    return _BASES[base]()
+
+
+def forged(name: str) -> Data:
+    """The forged certificate of an inequality."""
+    forgery = FORGERIES[name]
+    data = parse(text(forgery.base))
+    forgery.change(data)
+    return data
+
+
+# ---- small changes -------------------------------------------------------------------------------------------
+
+
+def _scale(holder: Any, key: Any, factor: float, shift: float = 0.0) -> None:
+    value = holder[key]
+    if isinstance(value, list):
+        for place in range(len(value)):
+            _scale(value, place, factor, shift)
+    else:
+        holder[key] = exact(float.fromhex(value) * factor + shift)
+
+
+def _cell(data: Data) -> Data:
+    found: Data = data["proof"]["cells"][0]
+    return found
+
+
+def _claim(data: Data, level: float) -> None:
+    data["claim"]["log10_delta"] = exact(level)
+
+
+def _from(data: Data, low: list[float], high: list[float]) -> None:
+    """Another initial box, and one cell that is just this."""
+    data["problem"]["initial"] |= {"low": exact(low), "high": exact(high)}
+    data["proof"]["splits"] = [exact([a, b]) for a, b in zip(low, high)]
+
+
+# ---- what every proof rests on -------------------------------------------------------------------------------
+
+
+@forges("the claimed probability is at least what follows", "still", "check.py", "_compare", MORE)
+def _(data: Data) -> None:
+    _claim(data, -44.9)
+
+
+@forges("the problem is the given one", "still", "comparison.py", "first_difference", "speaks of another problem")
+def _(data: Data) -> None:
+    region = data["problem"]["constraints"][0]["region"]
+    region["low"], region["high"] = exact([-1.1]), exact([1.1])
+
+
+@forges("a covariance is positive semidefinite", "unequal", "model.py", "_semidefinite", "negative variance")
+def _(data: Data) -> None:
+    data["problem"]["noise"]["values"][1][1] = exact(-0.5)
+    _claim(data, -100.0)
+
+
+@forges("no correlation exceeds 1", "unequal", "model.py", "_semidefinite", "must be positive semidefinite")
+def _(data: Data) -> None:
+    data["problem"]["noise"]["values"] = exact([[1e12, 2e5], [2e5, 0.01]])
+
+
+@forges("the cells cover the initial set", "steps", "partition.py", "cells_of", "do not cover")
+def _(data: Data) -> None:
+    top = float.fromhex(data["problem"]["initial"]["high"][0])
+    data["proof"]["splits"][0][-1] = exact(float(np.nextafter(top, 0.0)))
+
+
+# ---- the linear response -------------------------------------------------------------------------------------
+
+
+@forges("every entry of a Jacobian that varies is stated", "steps", "shared.py", "Shared", "entries of the Jacobian")
+def _(data: Data) -> None:
+    del data["proof"]["varying"][0]
+    for row in _cell(data)["slopes"]:
+        del row[0]
+
+
+@forges("every jump is decided", "straight", "linear.py", "_Cell._check_remainder", "may jump with x")
+def _(data: Data) -> None:
+    jumping(data, "sign", 1, 0.2)
+
+
+@forges("a constant derivative is defined", "straight", "structure.py", "_values", "is not defined")
+def _(data: Data) -> None:
+    tape = data["problem"]["dynamics"]
+    nodes = tape["nodes"]
+    n = len(nodes)
+    nodes += [["const", exact(0.0)], ["div", n, n], ["input", 1], ["mul", n + 1, n + 2]]
+    nodes.append(["add", tape["outputs"][0], n + 3])
+    tape["outputs"] = [n + 4]
+
+
+@forges("the nominal curve does not jump", "flow", "linear.py", "_Cell", "curve jumps")
+def _(data: Data) -> None:
+    for piece in _cell(data)["nominal"][25:]:
+        for point in piece:
+            point[0] = exact(float.fromhex(point[0]) + 1e-9)
+
+
+@forges("every state that enters nonlinearly has levels", "flow", "linear.py", "_Cell._frames", "enters nonlinearly")
+def _(data: Data) -> None:
+    data["proof"]["units"] = []
+    cell = _cell(data)
+    cell["levels"], cell["rows"] = [[] for _ in cell["levels"]], [[] for _ in cell["rows"]]
+
+
+@forges("the rows of a frame are independent", "steps", "remainder.py", "_Frame", "not regular")
+def _(data: Data) -> None:
+    _cell(data)["frames"][1] = [0, 0]
+
+
+@forges("the rows of a frame are as many as its states", "steps", "remainder.py", "_Frame", "as many rows")
+def _(data: Data) -> None:
+    _cell(data)["frames"][1] = [0]
+
+
+@forges("the remainder lies in its box at every step", "steps", "remainder.py", "OutputRemainder.prove", "in its box")
+def _(data: Data) -> None:
+    _scale(_cell(data)["slopes"][2], 0, 1.0, 0.3)
+    _claim(data, -3.9)
+
+
+@forges("the remainder lies in its box over a piece", "flow", "remainder.py", "OutputRemainder.prove", "in its box")
+def _(data: Data) -> None:
+    _scale(_cell(data)["drifts"][10], 0, 1.0, 20.0)
+
+
+@forges("a kinked remainder lies in its box", "bent", "remainder.py", "OutputRemainder._kinked_form", "in its box")
+def _(data: Data) -> None:
+    _scale(_cell(data)["slopes"][0], 0, 1.0, 1.0)
+    _claim(data, -23.0)
+
+
+@forges("the series of a piece converge", "flow", "response.py", "continuous_piece", "too long for the slope")
+def _(data: Data) -> None:
+    _scale(_cell(data)["slopes"][3], 0, 1.0, 1e4)
+
+
+@forges("y starts anywhere in its cell", "straight", "response.py", "supports", BEYOND)
+def _(data: Data) -> None:
+    _from(data, [0.1], [0.95])
+
+
+@forges("y takes every disturbance", "disturbed", "linear.py", "_Cell._load", BEYOND)
+def _(data: Data) -> None:
+    data["problem"]["disturbance_set"] = [exact([-0.35, 0.45])]  # the same middle
+
+
+@forges("Z has the covariance of the noise", "straight", "response.py", "covariances", MORE)
+def _(data: Data) -> None:
+    _scale(data["problem"]["noise"], "values", 1.1)
+
+
+@forges("a constraint leaves the room that is used", "straight", "demands.py", "_demand", BEYOND)
+def _(data: Data) -> None:
+    _scale(data["problem"]["constraints"][0]["region"], "high", 0.8)
+
+
+@forges("a direction keeps all of an obstacle off", "steps", "regions.py", "Constraint.read_separation", "nothing is")
+def _(data: Data) -> None:
+    for row in _cell(data)["separations"][1]:
+        _scale([row], 0, -1.0)
+
+
+@forges("weights of faces are not negative", "steps", "regions.py", "Constraint._mixed", "at least 0")
+def _(data: Data) -> None:
+    rows = _cell(data)["separations"][2]
+    rows[:] = [exact([0.0, 0.0, 0.0, -1.0])] * len(rows)
+
+
+@forges("an obstacle is kept off at every moment of a piece", "flow", "demands.py", "_centres", "nothing is left")
+def _(data: Data) -> None:
+    tape = data["problem"]["constraints"][1]["region"]["center"]  # o(t) (1 - exp(-(1e4 (t - .615))^2))
+    nodes = tape["nodes"]
+    n = len(nodes)
+    nodes += [["input", 0], ["const", exact(0.615)], ["sub", n, n + 1], ["const", exact(1e4)], ["mul", n + 2, n + 3]]
+    nodes += [["sq", n + 4], ["neg", n + 5], ["exp", n + 6], ["const", exact(1.0)], ["sub", n + 8, n + 7]]
+    nodes += [["mul", output, n + 9] for output in tape["outputs"]]
+    tape["outputs"] = [n + 10, n + 11]
+
+
+@forges("a constraint is asked on all of its window", "flow", "demands.py", "Grid.asked", "nothing is left")
+def _(data: Data) -> None:
+    constraint = data["problem"]["constraints"][1]
+    constraint["during"] = exact([0.615, 0.6150001])
+    constraint["region"]["center"] = exact([0.2, -0.3])
+
+
+@forges("levels are not negative", "steps", "linear.py", "_Cell._rows", "at least 0")
+def _(data: Data) -> None:
+    _cell(data)["levels"][2][0] = exact(-1.0)
+
+
+@forges("a level costs what Z exceeds it, in steps", "steps", "events.py", "chain", MORE)
+def _(data: Data) -> None:
+    _scale(_cell(data)["levels"], 3, 0.3)
+
+
+@forges("a level costs what Z exceeds it, in windows", "flow", "events.py", "Windows.exceedance", BEYOND)
+def _(data: Data) -> None:
+    _scale(_cell(data)["levels"], 20, 0.3)
+
+
+@forges("levels of the martingale's coordinates cost", "flow", "events.py", "Windows.coordinates", BEYOND)
+def _(data: Data) -> None:
+    _scale(_cell(data)["window_levels"], 12, 0.3)
+
+
+@forges("noise that is only sub-Gaussian has its own tail", "steps", "events.py", "sub_gaussian", MORE)
+def _(data: Data) -> None:
+    data["problem"]["noise"]["law"] = "subgaussian"
+
+
+@forges("a level costs what sub-Gaussian noise exceeds it", "bounded steps", "linear.py", "_Cell._leaving", MORE)
+def _(data: Data) -> None:
+    data["problem"]["noise"] |= {"law": "bounded", "level": "halfwidth", "independent": False}
+
+
+@forges("only opposite requirements share a product", "cornered", "families.py", "correlated", MORE)
+def _(data: Data) -> None:
+    data["problem"]["constraints"][1]["region"]["normal"] = exact([-1.0, 1e-12])
+
+
+@forges("the windows begin at 0 and rise", "flow", "shared.py", "Shared", "must rise from 0")
+def _(data: Data) -> None:
+    data["proof"]["windows"][0] = 1
+
+
+# ---- noise that depends on the state -------------------------------------------------------------------------
+
+
+def _stopped(data: Data) -> Data:
+    found: Data = _cell(data)["stopped"]
+    return found
+
+
+@forges(
+    "the state stays inside the set of its noise", "stirred", "stopped.py", "StateNoise.holds", "to stay in the set"
+)
+def _(data: Data) -> None:
+    _scale(_stopped(data)["high"], 20, 0.5)
+
+
+@forges("the excess of the noise is bounded over its set", "stirred", "stopped.py", "StateNoise.excess", "in its box")
+def _(data: Data) -> None:
+    _scale(_stopped(data), "reference", 0.95)  # more is M's, whose levels widen what the remainder must hold on
+    _claim(data, -4.0)
+
+
+@forges("the noise depends on states with bounds only", "growth", "stopped.py", "StateNoise.excess", "noise depends on")
+def _(data: Data) -> None:
+    data["proof"]["units"] = []
+    cell, stopped = _cell(data), _stopped(data)
+    for holder, name in ((cell, "levels"), (cell, "rows"), (stopped, "low"), (stopped, "high")):
+        holder[name] = [[] for _ in holder[name]]
+    stopped["rows"] = []
+
+
+@forges("levels of M's coordinates cost", "stirred", "stopped.py", "Stopped", BEYOND)
+def _(data: Data) -> None:
+    _scale(_stopped(data), "coordinates", 0.3)
+
+
+@forges("levels of M along the rows cost", "stirred", "stopped.py", "Stopped.along", BEYOND)
+def _(data: Data) -> None:
+    _scale(_stopped(data)["rows"], 0, 0.3)
+
+
+@forges("the part of a room that is M's costs", "stirred", "stopped.py", "Stopped.along", BEYOND)
+def _(data: Data) -> None:
+    _scale(_stopped(data), "rooms", 0.3)
+
+
+@forges("all of a room that is M's costs", "growth", "stopped.py", "_beyond", BEYOND)
+def _(data: Data) -> None:
+    _scale(data["problem"]["constraints"][0]["region"], "bound", 0.9)
+
+
+@forges("all of a room is M's where Z is 0", "stirred", "stopped.py", "StateNoise", "where all noise is in M")
+def _(data: Data) -> None:
+    _stopped(data)["rooms"] = None
+
+
+@forges("the windows of M begin at 0 and rise", "stirred", "stopped.py", "StateNoise", "must rise from 0")
+def _(data: Data) -> None:
+    _stopped(data)["windows"][0] = 1
+
+
+# ---- constants -----------------------------------------------------------------------------------------------
+
+
+@forges("the pieces cover the horizon", "contraction", "constants.py", "_Proof._read_times", "do not cover the horizon")
+def _(data: Data) -> None:
+    data["problem"]["horizon"] = exact(2.0)
+
+
+@forges(
+    "a polynomial is written about a time in its piece", "rising", "constants.py", "_Proof._read_times", "outside its"
+)
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["region"]["bound"] = exact(1.0)
+    data["proof"]["middles"] = exact([-10.0, -10.0])  # there the velocity is -10
+    _cell(data)["nominal"] = [exact([[100.0], [-10.0]])] * 2
+
+
+@forges("the metric is positive definite", "contraction", "eigen.py", "cholesky", "not positive definite")
+def _(data: Data) -> None:
+    data["proof"]["metric"] = exact([[1.0, 0.0], [0.0, -1.0]])
+
+
+@forges("the defect of the nominal curve is at most eta", "contraction", "tube.py", "Tube.defect", "defect")
+def _(data: Data) -> None:
+    _scale(_cell(data)["eta"], 60, 0.9)
+
+
+@forges("the defect holds for every disturbance", "contraction", "tube.py", "Tube._with_disturbance", "defect")
+def _(data: Data) -> None:
+    data["problem"]["disturbance_set"] = [exact([-1.1, 1.1])]
+
+
+@forges("an input of the plan holds on its own piece", "planned", "tube.py", "Tube.inputs", "between two changes")
+def _(data: Data) -> None:
+    proof, cell = data["proof"], _cell(data)
+    middle = proof["times"].index(exact(0.5))
+    for holder, name in ((proof, "times"), (proof, "middles"), (proof, "rooms")):
+        del holder[name][middle]
+    proof["middles"][middle - 1] = exact(0.5)
+    for name in ("nominal", "eta", "radius"):
+        del cell[name][middle]
+
+
+@forges("the reach tube starts around its cell", "contraction", "tube.py", "Norm.start", "stated radius on piece 0")
+def _(data: Data) -> None:
+    _from(data, [0.1, 0.1], [0.3, 0.2])
+
+
+@forges(
+    "the reach tube grows as its equation says", "contraction", "tube.py", "Tube.prove", "stated radius on piece 60"
+)
+def _(data: Data) -> None:
+    _scale(_cell(data)["radius"], 60, 0.99)
+
+
+@forges("jumps of the nominal curve widen the tube", "rising", "tube.py", "Tube.prove", "stated radius on piece 1")
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["region"]["bound"] = exact(8.0)
+    _cell(data)["nominal"][1] = exact([[1.0], [10.0]])
+
+
+@forges("a polyhedral constraint leaves the room", "still", "constants.py", "_Proof._check_rooms", "the stated room")
+def _(data: Data) -> None:
+    _scale(data["proof"]["rooms"], 2, 1.1)
+
+
+@forges("a round constraint leaves the room", "random", "demands.py", "round_demands", "the stated room")
+def _(data: Data) -> None:
+    _scale(data["proof"]["rooms"], 2, 1.01)
+
+
+@forges(
+    "a room is stated where a constraint is asked", "still", "constants.py", "_Proof._check_rooms", "states nothing"
+)
+def _(data: Data) -> None:
+    data["proof"]["rooms"][2] = None
+
+
+@forges("a certain start needs no room", "still", "constants.py", "_Proof._check_rooms", "stated room on piece 0")
+def _(data: Data) -> None:
+    _from(data, [1.5], [1.5])
+    cell = _cell(data)
+    cell["nominal"][:2] = exact([[[1.5]], [[0.5 * 1.5 - 0.1 * 1.5**3]]])
+    cell["nominal"][2:] = exact([[[0.20194]], [[0.10]]])
+    cell["eta"], cell["radius"] = exact([0.01] * 3), exact([0.03] * 4)
+    data["proof"]["rooms"] = exact([-0.6, 0.55, 0.7, 0.8])
+    _claim(data, -10.0)
+
+
+@forges(
+    "a start lies in the domain of the constants", "still", "constants.py", "_Proof._check_rooms", "domain.*piece 0"
+)
+def _(data: Data) -> None:
+    _from(data, [1.95], [2.1])
+    data["problem"]["constraints"][0]["during"] = exact([1.0, 3.0])
+    cell = _cell(data)
+    cell["nominal"], cell["eta"] = exact([[[2.025]], [[0.1821]], [[0.0904]], [[0.0451]]]), exact([1e-3] * 3)
+    cell["radius"] = exact([0.08, 0.07, 0.06, 0.06])
+    data["proof"]["rooms"] = exact([-0.2, 0.7, 0.8, 0.85])
+    _claim(data, -20.0)
+
+
+@forges("rooms are positive, in steps", "still", "kummer.py", "_least_discrete", MORE)
+def _(data: Data) -> None:
+    data["proof"]["rooms"][2] = exact(-0.5)
+
+
+@forges("rooms are positive, in continuous time", "rising", "kummer.py", "_least_continuous", MORE)
+def _(data: Data) -> None:
+    data["proof"]["rooms"][1] = exact(-0.1)
+
+
+@forges("the rate bounds the Jacobian", "contraction", "contraction.py", "Contraction.prove", "rate .* was not shown")
+def _(data: Data) -> None:
+    _scale(data["proof"], "rate", 1.01)
+
+
+@forges("the gain bounds the Jacobian", "still", "contraction.py", "Contraction.prove", "gain .* was not shown")
+def _(data: Data) -> None:
+    _scale(data["proof"], "rate", 0.99)
+
+
+@forges("the constants hold wherever a path may go", "still", "constants.py", "_Proof._global_box", "gain .* was not")
+def _(data: Data) -> None:
+    data["proof"]["region"] = "everywhere"
+
+
+@forges("the domain of the constants is a constraint", "still", "constants.py", "_Proof._global_box", "has no domain")
+def _(data: Data) -> None:
+    data["problem"]["domain"] = None
+    _cell(data)["separations"].pop()
+
+
+@forges("sigma bounds the noise", "contraction", "contraction.py", "Spread.prove", "were not shown to bound the noise")
+def _(data: Data) -> None:
+    _scale(data["problem"]["noise"]["diffusion"][0], 0, 1.01)
+
+
+@forges("nu bounds the trace of the noise", "bounded", "contraction.py", "Spread.prove", "were not shown to bound")
+def _(data: Data) -> None:
+    _scale(data["proof"], "nu", 0.99)
+    data["proof"]["kummer"]["a"] = exact(0.5)
+
+
+@forges("nu is at most the number of states", "still", "constants.py", "_Proof", "must lie in")
+def _(data: Data) -> None:
+    data["proof"]["nu"] = exact(0.0)
+
+
+@forges("sub-Gaussian noise with nu < n needs a < nu/2", "bounded", "constants.py", "_Proof._kummer", "a < nu/2")
+def _(data: Data) -> None:
+    _scale(data["proof"]["kummer"], "a", 1.1)
+
+
+@forges("a random start needs nu = n", "random", "constants.py", "_Proof._kummer", "random start needs nu")
+def _(data: Data) -> None:
+    data["problem"]["noise"] |= {"values": exact([0.05]), "matrix": exact([[1.0], [0.0]])}
+    data["proof"]["nu"] = exact(1.5)
+
+
+@forges(
+    "the spread of a random start is bounded", "random", "constants.py", "_Proof._check_start", "random start was not"
+)
+def _(data: Data) -> None:
+    _scale(data["problem"]["initial"]["covariance"][0], 0, 1.01)
+
+
+@forges("v0 exceeds the spread of a random start", "random", "kummer.py", "_initial", "v_0 is too small")
+def _(data: Data) -> None:
+    data["proof"]["kummer"]["v0"] = exact(0.005)
+
+
+@forges("Theorem K2 bounds the probability", "contraction", "kummer.py", "exit_probability", MORE)
+def _(data: Data) -> None:
+    _scale(data["proof"]["kummer"], "v0", 30.0)
+
+
+# ---- barriers ------------------------------------------------------------------------------------------------
+
+
+@forges("the barrier grows no faster than stated", "barrier", "barrier.py", "check_barrier", "grow as slowly")
+def _(data: Data) -> None:
+    _scale(data["proof"], "growth", 1.0, -0.0005)
+
+
+@forges("the barrier is below its level at the start", "barrier", "barrier.py", "check_barrier", "on the initial set")
+def _(data: Data) -> None:
+    _scale(data["proof"], "start", 1.0, -0.0005)
+
+
+@forges(
+    "the barrier is above its level at the boundary", "barrier", "safe_set.py", "SafeSet.boundary", "constraint breaks"
+)
+def _(data: Data) -> None:
+    _scale(data["proof"], "boundary", 1.0, 0.0015)
+
+
+@forges("the initial set lies in the safe set", "barrier", "safe_set.py", "SafeSet.contains", "lie in the safe set")
+def _(data: Data) -> None:
+    data["problem"]["initial"] |= {"low": exact([1.99]), "high": exact([2.01])}
+    proof = data["proof"]  # 8 x^2 - 2 x^4 is small again out there
+    proof |= {"exponents": [[2], [4]], "coefficients": exact([8.0, -2.0])}
+    proof |= {"start": exact(0.9), "boundary": exact(5.999)}
+    _claim(data, -1.9)
+
+
+@forges("the constraints bound every state", "barrier", "safe_set.py", "SafeSet", "bounds x|no constraint that")
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["region"]["low"] = [None]
+
+
+@forges("a negative growth gains nothing", "barrier", "barrier.py", "check_barrier", MORE)
+def _(data: Data) -> None:
+    problem = data["problem"]  # without noise every path falls below 1, and x^2 with it
+    problem["constraints"][0]["region"] |= {"low": exact([1.0]), "high": exact([2.0])}
+    problem["initial"] |= {"low": exact([1.5]), "high": exact([1.6])}
+    problem["noise"]["diffusion"] = exact([[0.0]])
+    data["proof"] |= {
+        "coefficients": exact([1.0]), "growth": exact(-3.99), "start": exact(2.57), "boundary": exact(0.999)
+    }
+    _claim(data, -1.0)
+
+
+@forges("the barrier's units are positive", "barrier", "barrier.py", "_Expressions._polynomial", "scale")
+def _(data: Data) -> None:
+    data["proof"]["scale"] = exact([-1.0])
+
+
+@forges("a barrier treats no constraint with a window", "barrier", "safe_set.py", "SafeSet._shape", "time window")
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["during"] = exact([0.0, 0.5])
+
+
+@forges("a barrier treats bounded starts only", "barrier", "barrier.py", "_refuse", "bounded initial set")
+def _(data: Data) -> None:
+    data["problem"]["initial"] = {"kind": "gaussian", "mean": exact([0.0]), "covariance": exact([[1e-4]])}
