@@ -125,6 +125,7 @@ def _log10(value: arb) -> float:
 
 def _reason(engine: str, proved: float, compared: bool, assumed: Sequence[str]) -> str:
     same = ", and the certificate speaks of the given problem" if compared else ""
-    bound = "no noise can break them" if proved <= -1e12 else f"the probability is at most 10^{rounded(proved, up=True)}"
+    found = f"the probability is at most 10^{rounded(proved, up=True)}"
+    bound = "no noise can break them" if proved <= -1e12 else found
     but = "but what the claim assumes " if assumed else ""
     return f"every inequality {but}was proved again in ball arithmetic, by {ENGINES[engine]}: {bound}{same}"
