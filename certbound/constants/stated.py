@@ -76,15 +76,17 @@ def _check_noise(constants: Constants, sigma: float, product: Array) -> None:
     n, values = constants.dimension, np.linalg.eigvals(product).real
     needed = float(np.sqrt(max(values.max(), 0.0)))
     if sigma * (1 + _ROUNDING) < needed:
+        least = rounded(needed * (1 - 1e-12), up=True)
         raise ValueError(
-            f"`constants.sigma` must be at least {rounded(needed * (1 - 1e-12), up=True)}, which the problem's own noise has in "
-            f"their metric, got {sigma!r}; state a larger one, or leave `constants` out."
+            f"`constants.sigma` must be at least {least}, which the problem's own noise has in their metric, "
+            f"got {sigma!r}; state a larger one, or leave `constants` out."
         )
     trace = float(np.trace(product))
     if constants.nu * sigma**2 * (1 + 3 * _ROUNDING) < trace:
+        least = rounded(trace / sigma**2 * (1 - 1e-12), up=True)
         raise ValueError(
-            f"`constants.effective_dimension` must be at least {rounded(trace / sigma**2 * (1 - 1e-12), up=True)}, which the "
-            f"problem's own noise has at their sigma, got {constants.nu!r}; leave it out for {n}."
+            f"`constants.effective_dimension` must be at least {least}, which the problem's own noise has at "
+            f"their sigma, got {constants.nu!r}; leave it out for {n}."
         )
     if constants.isotropic and not np.allclose(product, sigma**2 * np.eye(n), rtol=1e-6, atol=1e-9 * sigma**2):
         raise ValueError("`constants` assert isotropic noise, and the problem's is not; leave `isotropic` out.")

@@ -209,6 +209,6 @@ def test_a_name_cannot_imitate_a_verdict(stepping: Case) -> None:
 def test_the_method_is_the_proofs_engine(stepping: Case) -> None:
     data = stepping.data
     data["claim"]["method"] = "exact response (proved by hand)"
-    with pytest.raises(CertificateError, match='`claim.method` must be "linear"'):
+    with pytest.raises(CertificateError, match=r'`claim\.method` must be "linear"'):
         check_data(data)
     assert math.isfinite(check_data(stepping.data).log10_delta)
