@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.constants.bounds import bound_constants
 from certbound.display import rounded
+from certbound.errors import CertboundError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
@@ -13,7 +17,7 @@ from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian
 from certbound.tubes.constants import Constants
 
-__all__ = ["refuse_contradiction"]
+__all__ = ["proved_or_stated", "refuse_contradiction"]
 
 Array = NDArray[np.float64]
 
@@ -47,6 +51,34 @@ def refuse_contradiction(problem: Problem, constants: Constants) -> None:
     _check_noise(constants, sigma, metric @ _covariance(system, point))
     if problem.system.inputs is None or problem.plan is not None:
         _check_jacobian(problem, constants, metric, point)
+
+
+def proved_or_stated(problem: Problem, constants: Constants) -> Constants:
+    """The constants; without their proof unless they are proved of this very problem.
+
+    A proof knows its numbers and not the problem that it speaks of: constants of another one would be taken for
+    certified. They are bounded again in the same metric, and keep their proof where they are no smaller.
+    """
+    if not constants.certified:
+        return constants
+    metric = "euclidean" if constants.metric is None else constants.metric
+    try:
+        again = bound_constants(problem, metric=metric)
+    except (CertboundError, ValueError):
+        return replace(constants, proof=None)
+    return constants if _imply(again, constants) else replace(constants, proof=None)
+
+
+def _imply(known: Constants, weaker: Constants) -> bool:
+    """Whether constants that hold everywhere imply others."""
+    if weaker.times is not None or weaker.noise_bound is not None or known.continuous != weaker.continuous:
+        return False
+    name = "rate" if known.continuous else "gain"
+    numbers = all(
+        float(np.max(getattr(known, entry))) <= float(np.min(getattr(weaker, entry))) for entry in (name, "sigma")
+    )
+    kinds = known.gaussian >= weaker.gaussian and (known.isotropic and known.sigma == weaker.sigma) >= weaker.isotropic
+    return bool(numbers and kinds and known.nu <= weaker.nu and known.dimension == weaker.dimension)
 
 
 def _start(problem: Problem) -> Array:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from certbound.constants.bounds import bound_constants
 from certbound.constants.metrics import bound_metrics
-from certbound.constants.stated import refuse_contradiction
+from certbound.constants.stated import proved_or_stated, refuse_contradiction
 from certbound.display import log10_text, rounded
 from certbound.errors import CertboundError, EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
@@ -108,6 +108,7 @@ def constants_engine(
     """
     if constants is not None:
         refuse_contradiction(problem, constants)
+        constants = proved_or_stated(problem, constants)
     work = _Work(problem, method, cells)
     by_clearance, target = method in BY_CLEARANCE, math.log10(problem.delta)
     best: EngineAnswer | None = None

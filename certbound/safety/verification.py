@@ -182,7 +182,8 @@ def verify_safety(
     cells : int, optional
         Parts along each side of the initial set.
     constants : Constants, optional
-        Stated constants: used instead of certified ones by the constants engine, and named in ``reason``.
+        Used instead of certified ones by the constants engine, and named in ``reason`` as an assumption unless they
+        are certified and were proved again of this problem.
 
     Returns
     -------

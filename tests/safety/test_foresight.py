@@ -114,6 +114,22 @@ def test_stated_constants_that_agree_are_assumed() -> None:
         assert "assumed, not proved" in verdict.reason
 
 
+def test_constants_that_were_proved_of_another_problem_are_assumed_of_this_one() -> None:
+    """x' = -x + 30 x^2 sin x agrees with x' = -x at 0, and runs away from .2 on."""
+    safe = [cb.Inside(cb.Box([-1], [1]))]
+    tame = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=[[0.1]])
+    wild = cb.ContinuousSystem(lambda x: -x + 30 * x**2 * np.sin(x), states=1, diffusion=[[0.1]])
+    problem = cb.Problem(tame, initial=[0.0], safe=safe, horizon=5.0)
+    constants = cb.bound_constants(problem)
+    assert constants.certified
+    own = verify_safety(problem, method="constants", constants=constants)
+    assert "Assumption" not in own.reason
+    other = verify_safety(problem.replace(system=wild), method="constants", constants=constants)
+    assert "assumed, not proved" in other.reason
+    assert other.constants is not None
+    assert not other.constants.certified
+
+
 def test_noise_that_is_not_gaussian_is_not_stated_to_be() -> None:
     system = cb.DiscreteSystem(lambda x: 0.5 * x, states=1, noise=cb.Uniform(halfwidth=0.1))
     problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3)
