@@ -12,8 +12,8 @@ from flint import arb
 from certbound.rigor.balls import excess_floor, excess_tangent, lower, precision, upper
 from certbound.tubes.ballpath import ball_path
 from certbound.tubes.kummer import Start, initial_ball, phi_ball
+from certbound.tubes.line_search import golden
 from certbound.tubes.objective import Clearance
-from certbound.tubes.paper import golden
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.search import log_gain
 from certbound.tubes.series import log_excess_one, log_phi_one
