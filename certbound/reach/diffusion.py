@@ -213,7 +213,7 @@ class DiffusionRun(LinearRun):
                 self.held = Accepted(reference=reference, excess=excess)
                 levels, events = self.levels(log_nonlinear)
                 levels = levels * (1 + 1e-12) + 1e-280  # the state then stays strictly inside
-                reached = self._deviations(levels, *bounds) if np.isfinite(levels).all() else None
+                reached = self.deviations(levels, *bounds) if np.isfinite(levels).all() else None
                 if reached is None:
                     return None
                 inner = reached[0][:, :count], reached[1][:, :count]

@@ -54,7 +54,7 @@ def _tube(run: LinearRun, log_nonlinear: float) -> tuple[Array, Array, float]:
     levels = _levels(run, log_nonlinear)
     shape = (len(engine.centres), engine.pieces, engine.n)
     low, high = np.zeros(shape), np.zeros(shape)
-    base = run._deviations(levels, low, high)
+    base = run.deviations(levels, low, high)
     assert base is not None
     grown = 0.0
     tube = base
@@ -63,7 +63,7 @@ def _tube(run: LinearRun, log_nonlinear: float) -> tuple[Array, Array, float]:
         if not (np.isfinite(sample[0]).all() and np.isfinite(sample[1]).all()):
             return *base, np.inf
         low, high = sample
-        found = run._deviations(levels, low, high)
+        found = run.deviations(levels, low, high)
         if found is None:
             return *tube, np.inf
         size = _LARGEST * (base[1] - base[0])
