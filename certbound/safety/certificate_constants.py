@@ -25,7 +25,7 @@ from certbound.reach.norms import Norm
 from certbound.reach.separation import polyhedral_weights, round_directions
 from certbound.reach.tube import ReachTube
 from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificate import Proof, exact, needs_direction
+from certbound.safety.certificate_parts import Proof, exact, needs_direction
 from certbound.safety.erosion import Erosion, erode
 from certbound.safety.levels import joined, random_start
 from certbound.tubes.constants import Constants
