@@ -25,7 +25,7 @@ from certbound.reach.linearisation import Linearisation
 from certbound.reach.martingales import SplitEvents
 from certbound.reach.occupancy import log_occupancy
 from certbound.reach.overlaps import log_any_exceedance
-from certbound.reach.rows import WINDOW
+from certbound.reach.rows import WINDOW, inner_rows
 from certbound.reach.samples import sampled_range
 
 __all__ = ["Events", "LinearRun", "Outcome", "correlated", "level_along", "level_scale"]
@@ -82,7 +82,7 @@ class LinearRun:
 
     def __init__(self, engine: Linearisation, *, asked: bool = True) -> None:
         self.engine = engine
-        self.rows, self.extra = engine.directions()
+        self.rows, self.extra = inner_rows(engine)
         cells = range(len(engine.centres))
         self.requirements = [requirements(engine.problem, engine.nominal(cell)) if asked else [] for cell in cells]
         self.supports: list[Supports] = []
@@ -126,7 +126,7 @@ class LinearRun:
             if guess is None:
                 return None
             low, high = guess
-            implied = self._deviations(levels, low, high)
+            implied = self.deviations(levels, low, high)
             if implied is None:
                 return None
             polytope = self._wider(levels, implied)
@@ -159,7 +159,7 @@ class LinearRun:
                 engine.frame, p_low, p_high, self.flat_extra, effort, (target[0], target[1]), again)
             low[again], high[again] = found[0][again], found[1][again]
             b_low, b_high = low.reshape(shape), high.reshape(shape)
-            implied = self._deviations(levels, b_low, b_high) if self._all_finite(b_low, b_high) else None
+            implied = self.deviations(levels, b_low, b_high) if self._all_finite(b_low, b_high) else None
             if implied is None:
                 return None
             again = np.flatnonzero(((implied[0] < p_low) | (implied[1] > p_high)).any(axis=1))
@@ -177,7 +177,7 @@ class LinearRun:
     def _wider(self, levels: Array, implied: tuple[Array, Array]) -> tuple[Array, Array]:
         """A polytope with the remainder's share enlarged a little: room for bounds that differ a little."""
         nothing = np.zeros((len(self.supports), self.engine.pieces, self.engine.n))
-        base = self._deviations(levels, nothing, nothing)
+        base = self.deviations(levels, nothing, nothing)
         if base is None:
             return implied
         return implied[0] - _WIDER * np.abs(implied[0] - base[0]), implied[1] + _WIDER * np.abs(implied[1] - base[1])
@@ -188,7 +188,7 @@ class LinearRun:
         """The fixed point of the sampled range of beta, widened by ``share`` of itself and by what a proof needed."""
         low, high = start
         for _ in range(_GUESSES):
-            polytope = self._deviations(levels, low, high)
+            polytope = self.deviations(levels, low, high)
             if polytope is None:
                 return None
             old = low, high
@@ -220,7 +220,7 @@ class LinearRun:
             self.failed_at = int(np.argmax((~finite).any(axis=(0, 2))))
         return bool(finite.all())
 
-    def _deviations(self, levels: Array, low: Array, high: Array) -> tuple[Array, Array] | None:
+    def deviations(self, levels: Array, low: Array, high: Array) -> tuple[Array, Array] | None:
         """The polytope that bounds on beta imply, or None where it is beyond all use."""
         reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(self.supports, low, high, strict=True)]
         p_low, p_high = self.polytope(levels, reach)

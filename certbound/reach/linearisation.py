@@ -20,7 +20,6 @@ from certbound.reach.frame import Frame
 from certbound.reach.inclusion import Gathering
 from certbound.reach.remainder import Remainder
 from certbound.reach.response import LinearResponse, continuous_response, discrete_response
-from certbound.reach.rows import inner_rows
 from certbound.rigor.intervals import Interval
 
 __all__ = ["Linearisation"]
@@ -348,10 +347,6 @@ class Linearisation:
             return None
         found = {i for i, _ in self.model.entries} | set(np.flatnonzero((self.slopes[2] != 0).any(axis=(0, 1, 3))))
         return np.array(sorted(found), dtype=np.int64)
-
-    def directions(self) -> tuple[Array, Array]:
-        """Rows along which the remainder needs bounds: (B, N, D, n), and the extra ones over active coordinates."""
-        return inner_rows(self)
 
 
 def _square(a: Array) -> Array:

@@ -5,13 +5,10 @@ Any rows are valid; these bound what the Hessians see, and move so that bounds a
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from certbound.reach.linearisation import Linearisation
+from certbound.reach.linearisation import Linearisation
 
 __all__ = ["WINDOW", "inner_rows"]
 
