@@ -5,7 +5,9 @@ from __future__ import annotations
 import html
 import json
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +16,10 @@ from certbound._version import __version__
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Record", "Shown", "ask_later_room", "connect", "load_result", "log10_text", "plain", "span_text"]
+__all__ = [
+    "Record", "Shown", "ask_later_room", "connect", "load_result", "log10_text", "name_text", "one_line", "plain",
+    "power_above", "rounded", "span_text",
+]  # fmt: skip
 
 Rows = list[tuple[str, str]]
 
@@ -221,18 +226,88 @@ def span_text(value: Any) -> str:
     return f"{high:.6g}" if low == high else f"{low:.4g} ... {high:.4g}"
 
 
-def log10_text(log10: float) -> str:
+def rounded(value: float, *, up: bool, digits: int = 6) -> str:
+    """A number in ``digits`` decimal digits, never below the number itself (``up``), or never above it.
+
+    Examples
+    --------
+    >>> rounded(-2.9999997, up=True), rounded(-2.9999997, up=False), rounded(0.1234, up=True, digits=2)
+    ('-2.99999', '-3', '0.13')
+    """
+    if not math.isfinite(value):
+        return f"{value:g}"
+    context = Context(prec=digits, rounding=ROUND_CEILING if up else ROUND_FLOOR)
+    return f"{float(context.create_decimal_from_float(float(value))):.{digits}g}"
+
+
+def one_line(text: str) -> str:
+    """A text without line breaks, control characters and repeated blanks.
+
+    Examples
+    --------
+    >>> one_line("a\\n  b\\x1b[1m")
+    'a b [1m'
+    """
+    return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())
+
+
+def name_text(name: str, longest: int = 60) -> str:
+    """A problem's name on one line, shortened; in quotes where capitals or signs in it could pass for a verdict.
+
+    Examples
+    --------
+    >>> name_text("chain_rest"), name_text("x\\n[b]SAFE[/b]"), name_text("y" * 99, 8)
+    ('chain_rest', '"x [b]SAFE[/b]"', 'yyyyy...')
+    """
+    line = one_line(name).replace('"', "'")
+    line = line if len(line) <= longest else f"{line[: longest - 3]}..."
+    return f'"{line}"' if line != line.lower() or not line or re.search(r"[:;='\[\]\"]", line) else line
+
+
+def power_above(log10: float) -> float:
+    """10**log10 as a float that is not below it; 1 at most, and never 0.
+
+    Examples
+    --------
+    >>> power_above(-3.0), power_above(-0.5) >= 10**-0.5, power_above(-1e12) > 0
+    (0.001, True, True)
+    """
+    value = min(math.pow(10.0, log10), 1.0)
+    while value < 1 and (value == 0 or _EXACT.log10(Decimal(value)) < Decimal(log10)):
+        value = math.nextafter(value, 1.0)
+    return value
+
+
+_EXACT = Context(prec=60)
+
+
+def log10_text(log10: float, *, ulps: int = 0) -> str:
     """A probability given by its decimal logarithm, rounded up to two digits, also where no float could hold it.
+
+    ``ulps`` are the units in the last place by which the logarithm of a number that was asked for may have been rounded
+    up: 0.001 is then shown as it was asked.
 
     Examples
     --------
     >>> log10_text(-3.0), log10_text(-49718.25), log10_text(-4.698), log10_text(-0.12), log10_text(0.0)
     ('1e-3', '5.7e-49719', '2.1e-5', '0.76', '1')
+    >>> log10_text(-2.99999999), log10_text(-2.9999999999999996), log10_text(-2.9999999999999996, ulps=2)
+    ('1.1e-3', '1.1e-3', '1e-3')
     """
     if log10 >= 0:
         return "1"
-    if log10 > -2:
-        return f"{math.ceil(100 * 10**log10 - 1e-6) / 100:g}"
-    exponent = math.floor(log10 + 1e-12)
-    mantissa = math.ceil(10 * 10 ** (log10 - exponent) - 1e-6) / 10
-    return f"1e{exponent + 1}" if mantissa >= 10 else f"{mantissa:g}e{exponent}"
+    value = _EXACT.subtract(Decimal(log10), Decimal(ulps * math.ulp(log10)))
+    small = value <= -2
+    exponent = math.floor(value) if small else -1
+    digits = _digits(_EXACT.subtract(value, Decimal(exponent - 1)), 10 if small else 1)
+    if not small:
+        return f"{digits / 100:g}"
+    return f"1e{exponent + 1}" if digits >= 100 else f"{digits / 10:g}e{exponent}"
+
+
+def _digits(log10: Decimal, least: int) -> int:
+    """The least whole number, from ``least`` on, whose decimal logarithm is at least that."""
+    count = max(math.floor(math.pow(10.0, log10)) - 1, least)
+    while _EXACT.log10(Decimal(count)) < log10:
+        count += 1
+    return count

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound._version import __version__
+from certbound.display import name_text, rounded
 from certbound.plotting.panels import Panel, least_distance, panels_of, stairs
 from certbound.plotting.plane import outlines, plane_of, supports
 from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene, instants
@@ -66,7 +67,7 @@ def report_page(
     figures = list(_figures(scene))
     problem = scene.problem
     parts = [
-        _head(f"{problem.name}: {verdict.status}", get_plotlyjs()),
+        _head(f"{name_text(problem.name)}: {verdict.status}", get_plotlyjs()),
         _verdict_section(scene, verdict, probability),
         *(_figure_section(*figure) for figure in figures),
         _engine_section(verdict),
@@ -92,12 +93,13 @@ def _head(title: str, script: str) -> str:
 def _verdict_section(scene: Scene, verdict: Verdict, probability: str) -> str:
     problem = scene.problem
     unit = "s" if problem.system.time == "continuous" else "steps"
+    bound = probability or f"10^{rounded(verdict.log10_delta, up=True, digits=4)}"
     rows = [
-        ("certified bound on the probability of leaving", probability or f"10^{verdict.log10_delta:.4g}"),
-        ("asked for", f"{problem.delta:g}"),
+        ("certified bound on the probability of leaving", bound),
+        ("asked for", f"{problem.delta!r}"),
         ("horizon", f"{problem.horizon:g} {unit}"),
         ("states", ", ".join(problem.system.states)),
-        ("margin at the tightest place", _number(verdict.margin)),
+        ("margin at the tightest place", _least(verdict.margin)),
         ("where", "" if verdict.time is None else f"{verdict.constraint}, at {verdict.time:.4g} {unit}"),
         ("method", verdict.method),
         ("why", verdict.reason),
@@ -113,8 +115,8 @@ def _engine_section(verdict: Verdict) -> str:
         (
             name,
             answer.method,
-            f"{answer.log10_delta:.4g}" if answer.applicable else "does not apply",
-            _number(answer.margin),
+            rounded(answer.log10_delta, up=True, digits=4) if answer.applicable else "does not apply",
+            _least(answer.margin),
             answer.reason,
         )
         for name, answer in verdict.answers.items()
@@ -165,6 +167,10 @@ def _table(heading: Sequence[str] | None, rows: Iterable[Sequence[str]]) -> str:
 
 def _text(value: object) -> str:
     return html.escape(str(value))
+
+
+def _least(value: float | None) -> str:
+    return "" if value is None else rounded(value, up=False, digits=4)
 
 
 def _number(value: float | None) -> str:

@@ -2,11 +2,12 @@
 
 With D the set on which no constraint is broken, proved here by branch and bound over boxes that cover it:
 
-- grad V . f + 1/2 tr(g g^T Hess V) + 1/2 |g^T grad V|^2 <= growth on [0, T] x D, for every disturbance;
+- grad V . f + 1/2 tr(g g^T Hess V) + 1/2 |g^T grad V|^2 <= growth on [0, T] x D, for every value of the disturbance;
 - the initial set lies in D, and V <= start on it;
 - V >= boundary on the points of D where some constraint is about to be broken.
 
-Then P(leaving within T) <= exp(start - boundary + max(growth, 0) T). Source: docs/theory.md, Section 10.
+Then P(leaving within T) <= exp(start - boundary + max(growth, 0) T) for every disturbance that does not see coming
+noise. Source: docs/theory.md, Section 10.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ _PROOF = ("engine", "center", "scale", "exponents", "coefficients", "growth", "s
 
 
 def check_barrier(model: Model, value: object, budget: Budget) -> arb:
-    """Upper bound of the probability that a constraint is broken, for every start and disturbance.
+    """Upper bound of the probability that a constraint is broken.
+
+    It holds for every start and every disturbance that does not see coming noise (it makes exp(V) a supermartingale).
 
     Raises
     ------

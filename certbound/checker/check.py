@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from flint import arb, ctx
 
 from certbound.checker.barrier import check_barrier
+from certbound.checker.claims import ENGINES, assumptions, claim, engine_of
 from certbound.checker.comparison import first_difference
 from certbound.checker.constants import check_constants
 from certbound.checker.linear import check_linear
-from certbound.checker.model import Model, read_model
+from certbound.checker.model import read_model
 from certbound.checker.reading import Record, read, text
 from certbound.checker.report import Budget, Report, Unproved
-from certbound.checker.stopped import ASSUMPTION
+from certbound.checker.words import plainly, rounded
 from certbound.errors import CertificateError
-from certbound.problem.tape import Tape
 
 __all__ = ["SECONDS", "VERSION", "check_data", "check_file"]
 
@@ -29,24 +29,24 @@ SECONDS = 300.0
 PRECISION = 128
 
 _ENGINES = {"linear": check_linear, "constants": check_constants, "barrier": check_barrier}
-_WORDS = {
-    "linear": "linear response (Thm K7)",
-    "constants": "contraction constants (Thms K2, K5)",
-    "barrier": "a barrier that is the exponential of a polynomial",
-}
 
 
 def check_file(
-    path: str | os.PathLike[str], problem: Mapping[str, Any] | None = None, *, seconds: float = SECONDS
-) -> Report:
+    path: str | os.PathLike[str], problem: Mapping[str, Any] | None = None, *, seconds: float = SECONDS,
+    allow_assumptions: bool = False,
+) -> Report:  # fmt: skip
     """Check the certificate in a file; see `check_data`."""
-    return check_data(read(path), problem, seconds=seconds)
+    return check_data(read(path), problem, seconds=seconds, allow_assumptions=allow_assumptions)
 
 
 def check_data(
-    data: Mapping[str, Any], problem: Mapping[str, Any] | None = None, *, seconds: float = SECONDS
-) -> Report:
+    data: Mapping[str, Any], problem: Mapping[str, Any] | None = None, *, seconds: float = SECONDS,
+    allow_assumptions: bool = False,
+) -> Report:  # fmt: skip
     """Prove again, from a certificate's numbers alone, the probability that it claims.
+
+    The claim names the disturbances that its engine covers, and every assumption that the proof rests on: these are
+    derived from the proof, whatever the file's own list says.
 
     Parameters
     ----------
@@ -56,16 +56,19 @@ def check_data(
         The ``problem`` part that the certificate must speak of, up to names for humans and the order of operations.
     seconds : float
         Time limit.
+    allow_assumptions : bool
+        Whether ``valid`` is True also for what was proved under assumptions.
 
     Returns
     -------
     Report
-        ``valid`` is False where an inequality was not proved, or the certificate speaks of another problem.
+        ``valid`` is False where an inequality was not proved, the certificate speaks of another problem, or the proof
+        rests on assumptions that are not allowed; ``outcome`` tells these apart.
 
     Raises
     ------
     CertificateError
-        If the data are malformed.
+        If the data are malformed, or ``claim.method`` is not the proof's engine.
     """
     budget = Budget(seconds)
     record = Record(data, "certificate", ("format", "version", "claim", "problem", "proof"), ("notes",))
@@ -73,53 +76,42 @@ def check_data(
         raise CertificateError(f"`certificate.format` must be \"{FORMAT}\".")
     if record["version"] != VERSION:
         raise CertificateError(f"`certificate.version` must be {VERSION}; use the certbound that wrote the file.")
-    claim = Record(record["claim"], "claim", ("log10_delta", "method", "assumptions"))
-    claim.text("method", 100)
-    level = claim.number("log10_delta")
+    stated = Record(record["claim"], "claim", ("log10_delta", "method", "assumptions"))
+    method, level = stated.text("method", 100), stated.number("log10_delta")
     if not level <= 0:
         raise CertificateError(f"`claim.log10_delta` must not be positive, got {level:g}.")
-    named = [text(item, "claim.assumptions", 1000) for item in claim.items("assumptions", 0, 20)]
+    named = [text(item, "claim.assumptions", 1000) for item in stated.items("assumptions", 0, 20)]
     with ctx.workprec(PRECISION):
         model = read_model(record["problem"])
         proof = record["proof"]
-        if isinstance(proof, dict) and proof.get("assumed") is True:
-            named.append("the stated constants hold")
-        if isinstance(proof, dict) and proof.get("engine") == "linear" and isinstance(model.noise.diffusion, Tape):
-            named.append(ASSUMPTION)
-        words = _claim(model, level, named)
+        engine = engine_of(proof, method)
+        assumed = tuple(assumptions(model, proof, named))
+        words = claim(model, engine, level, assumed)
         proved = None
         try:
             if problem is not None:
                 difference = first_difference(record["problem"], problem)
                 if difference:
                     raise Unproved(f"the certificate speaks of another problem: {difference}")
-            proved = _proved(model, record, named, budget)
+            proved = _ENGINES[engine](model, proof, budget)
             _compare(proved, level)
         except Unproved as error:
             return Report(
                 valid=False, claim=words, reason=f"{error}.", seconds=budget.elapsed, log10_delta=level,
-                log10_proved=None if proved is None else _log10(proved),
+                log10_proved=None if proved is None else _log10(proved), assumptions=assumed,
             )  # fmt: skip
         return Report(
-            valid=True, claim=words, reason=_reason(record, _log10(proved), problem is not None),
-            seconds=budget.elapsed, log10_delta=level, log10_proved=_log10(proved),
+            valid=allow_assumptions or not assumed, proved=True, claim=words,
+            reason=_reason(engine, _log10(proved), problem is not None, assumed), seconds=budget.elapsed,
+            log10_delta=level, log10_proved=_log10(proved), assumptions=assumed,
         )  # fmt: skip
-
-
-def _proved(model: Model, record: Record, named: list[str], budget: Budget) -> arb:
-    """The probability that the engine's proof bounds."""
-    proof = record["proof"]
-    engine = proof.get("engine") if isinstance(proof, dict) else None
-    if not isinstance(engine, str) or engine not in _ENGINES:
-        raise CertificateError(f"`proof.engine` must be one of {', '.join(_ENGINES)}.")
-    return _ENGINES[engine](model, proof, budget)
 
 
 def _compare(proved: arb, level: float) -> None:
     if not (proved.is_zero() or proved.log() <= arb(level) * arb(10).log()):
         raise Unproved(
-            f"the probability that follows is at most 10^{_log10(proved):.6g}, which is more than the claimed "
-            f"10^{level:.6g}"
+            f"the probability that follows is at most 10^{rounded(_log10(proved), up=True)}, which is more than the "
+            f"claimed 10^{plainly(level)}"
         )
 
 
@@ -131,20 +123,9 @@ def _log10(value: arb) -> float:
     return math.nextafter(float(top), math.inf) if top.is_finite() else 0.0
 
 
-def _claim(model: Model, level: float, assumptions: list[str]) -> str:
-    unit = "s" if model.continuous else "steps"
-    start = "a normal start" if model.initial.covariance is not None else "every start in the initial set"
-    also = ", whatever the disturbance does," if model.disturbance else ""
-    safe = "at most" if arb(level) <= arb(model.delta).log() / arb(10).log() else "more than"
-    words = (
-        f"from {start}{also} {model.name} breaks one of its {len(model.constraints)} constraints within "
-        f"{model.horizon:g} {unit} with probability at most 10^{level:.6g} ({safe} delta = {model.delta:g})"
-    )
-    return words + "".join(f"; assuming that {item}" for item in assumptions)
-
-
-def _reason(record: Record, proved: float, compared: bool) -> str:
-    words = _WORDS[record["proof"]["engine"]]
+def _reason(engine: str, proved: float, compared: bool, assumed: Sequence[str]) -> str:
     same = ", and the certificate speaks of the given problem" if compared else ""
-    bound = "no noise can break them" if proved <= -1e12 else f"the probability is at most 10^{proved:.6g}"
-    return f"every inequality was proved again in ball arithmetic, by {words}: {bound}{same}"
+    found = f"the probability is at most 10^{rounded(proved, up=True)}"
+    bound = "no noise can break them" if proved <= -1e12 else found
+    but = "but what the claim assumes " if assumed else ""
+    return f"every inequality {but}was proved again in ball arithmetic, by {ENGINES[engine]}: {bound}{same}"

@@ -2,8 +2,8 @@
 
 With J^T P + P J <= 2 c P (or ||J||_P <= L) everywhere, or on the model's domain: every noise-free trajectory stays
 within rho_k of the nominal curve (Thm K5), every constraint leaves room for a deviation of r_k around that, and
-P(exists t: ||S_t||_P > r_t) is bounded by Thm K2. Constants are needed only until a room is left, and leaving the
-domain is a broken constraint.
+P(exists t: ||S_t||_P > r_t) is bounded by Thm K2, for disturbances that do not see coming noise. Constants are needed
+only until a room is left, and leaving the domain is a broken constraint.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ Box = list[tuple[arb, arb]]
 
 
 def check_constants(model: Model, value: object, budget: Budget) -> arb:
-    """Upper bound of the probability that a constraint is broken, for every start and disturbance.
+    """Upper bound of the probability that a constraint is broken.
+
+    It holds for every start and every disturbance that does not see coming noise (Thm K2 rests on a supermartingale).
 
     Raises
     ------
@@ -117,7 +119,9 @@ class _Proof:
         self.structure = structure_of(model, self.budget)
         for index, (item, box) in enumerate(zip(items, boxes)):
             self._check_cell(Record(item, f"proof.cells[{index}]", _CELL), box, whole=len(boxes) == 1)
-        if not record.flag("assumed"):
+        if record.flag("assumed"):
+            self._check_assumed(boxes[0])
+        else:
             self._check_constants()
         return exit_probability(self._kummer(), self.budget)
 
@@ -178,6 +182,28 @@ class _Proof:
         contraction.prove(box, self.rate, "rate" if model.continuous else "gain")
         spread = Spread(model, self.norm.metric, self.budget)
         spread.prove(box[: 1 + model.dimension], self.sigma, self.nu)
+
+    def _check_assumed(self, start: Box) -> None:
+        """What is assumed may not contradict the model: its constant noise, its Jacobian and noise at a start.
+
+        A constant noise leaves nothing to assume of sigma and nu, which are proved in the stated metric.
+        """
+        model, metric = self.model, self.norm.metric
+        point = [(arb(0), arb(0)), *((low, low) for low, _ in start)]
+        spread = Spread(model, metric, self.budget)
+        if spread.contradicts(point, self.sigma, self.nu):
+            raise Unproved(
+                f"the stated sigma = {float(self.sigma):.9g} and nu = {float(self.nu):.6g} contradict the file's own "
+                "noise, which is larger in the stated metric"
+            )
+        inputs = [] if model.plan is None else [(arb(x), arb(x)) for x in model.plan[0]]
+        disturbances = [(arb(low), arb(low)) for low, _ in model.disturbance]
+        contraction = Contraction(model, self.structure, metric, self.budget)
+        if contraction.contradicts([*point, *inputs, *disturbances], self.rate):
+            raise Unproved(
+                f"the stated {'rate' if model.continuous else 'gain'} = {float(self.rate):.9g} contradicts the file's "
+                "own dynamics, which expand more at the start in the stated metric"
+            )
 
     def _global_box(self) -> Box:
         """All inputs of the dynamics, everywhere or on the domain."""

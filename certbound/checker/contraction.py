@@ -28,6 +28,7 @@ Box = list[tuple[arb, arb]]
 
 MOST_VERTICES = 4096
 _MOST_BOXES = 20_000
+_SLACK = arb(2) ** -30
 _PARTIAL = JUMPS | {"atan2", "sqrt", "log", "asin", "acos", "tan", "div", "pow", "hypot"}
 
 
@@ -73,6 +74,14 @@ class Contraction:
         """
         if not _everywhere(box, lambda part: self._holds(part, bound), self.relevant, self.budget):
             raise Unproved(f"{what} {float(bound):.9g} was not shown to bound the Jacobian")
+
+    def contradicts(self, point: Box, bound: arb) -> bool:
+        """Whether the Jacobian at a point of all inputs exceeds ``bound``, but for rounding, where it exists."""
+        try:
+            self.program.run([low for low, _ in point])
+        except Undecided:
+            return False
+        return not self._holds(point, bound + _SLACK * (1 + abs(bound)))
 
     def _holds(self, box: Box, bound: arb) -> bool:
         try:
@@ -220,6 +229,13 @@ class Spread:
         """
         if not _everywhere(box, lambda part: self._holds(part, sigma, nu), self.relevant, self.budget):
             raise Unproved(f"sigma = {float(sigma):.9g} and nu = {float(nu):.6g} were not shown to bound the noise")
+
+    def contradicts(self, point: Box, sigma: arb, nu: arb) -> bool:
+        """Whether noise that is constant exceeds the constants at all, or other noise does at a point (t, state)."""
+        covariance = self._covariance(point)
+        if covariance is None or all(entry.is_zero() for entry in covariance.entries()):
+            return False
+        return not self._holds(point, sigma if self.program is None else sigma * (1 + _SLACK), nu)
 
     def _holds(self, box: Box, sigma: arb, nu: arb) -> bool:
         covariance = self._covariance(box)

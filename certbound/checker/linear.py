@@ -55,7 +55,10 @@ _CELL = (
 
 
 def check_linear(model: Model, value: object, budget: Budget) -> arb:
-    """Upper bound of the probability that a constraint is broken, for every start and disturbance.
+    """Upper bound of the probability that a constraint is broken.
+
+    It holds for every start and every disturbance, even one that sees coming noise; where the noise depends on the
+    state, for every disturbance that does not.
 
     Raises
     ------

@@ -7,7 +7,11 @@ from dataclasses import dataclass
 
 from certbound.errors import CertboundError
 
-__all__ = ["Budget", "Report", "Unproved"]
+__all__ = ["NOT_PROVED", "UNDER_ASSUMPTIONS", "VALID", "Budget", "Report", "Unproved"]
+
+VALID = "valid"
+UNDER_ASSUMPTIONS = "valid under assumptions"
+NOT_PROVED = "not proved"
 
 
 class Unproved(CertboundError):
@@ -21,9 +25,10 @@ class Report:
     Parameters
     ----------
     valid : bool
-        Whether every inequality was proved again.
+        Whether the claim may be relied on: every inequality was proved again, and nothing had to be assumed, unless
+        whoever asked allows assumptions.
     claim : str
-        What the certificate claims, in words, with the assumptions it names.
+        What the certificate claims, in words: for which disturbances, and under which assumptions.
     reason : str
         What was proved, or the first thing that could not be.
     seconds : float
@@ -32,6 +37,10 @@ class Report:
         The claimed bound on log10 of the probability.
     log10_proved : float or None
         The bound that the checker itself arrived at (None where it did not).
+    assumptions : tuple of str
+        What the proof takes for granted, derived from the proof itself, and what the file says besides.
+    proved : bool
+        Whether every inequality was proved again but for the assumptions.
     """
 
     valid: bool
@@ -40,6 +49,15 @@ class Report:
     seconds: float
     log10_delta: float
     log10_proved: float | None = None
+    assumptions: tuple[str, ...] = ()
+    proved: bool = False
+
+    @property
+    def outcome(self) -> str:
+        """`VALID`, `UNDER_ASSUMPTIONS` or `NOT_PROVED`, whatever is allowed."""
+        if not self.proved:
+            return NOT_PROVED
+        return UNDER_ASSUMPTIONS if self.assumptions else VALID
 
 
 class Budget:

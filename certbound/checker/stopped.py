@@ -7,6 +7,7 @@ ends at t_e the martingale r . Phi(t_e, t) M_t exceeds q kappa with probability 
 
 The row r Phi(t_e, .) lies on a chord over every piece up to a bulge; the squared size is convex along the chord, so
 that its integral is at most that of its ends (trapezoid). That s stays strictly inside H is proved from the levels.
+A martingale needs an integrand that does not see coming noise: the claim says so of the disturbance.
 """
 
 from __future__ import annotations
@@ -30,9 +31,7 @@ from certbound.checker.response import Piece
 from certbound.errors import CertificateError
 from certbound.problem.tape import Tape
 
-__all__ = ["ASSUMPTION", "Along", "Asked", "StateNoise", "Stopped"]
-
-ASSUMPTION = "the initial state and the disturbance do not anticipate the noise, which depends on the state"
+__all__ = ["Along", "Asked", "StateNoise", "Stopped"]
 
 _FIELDS = ("windows", "reference", "low", "high", "coordinates", "rows", "rooms")
 

@@ -14,6 +14,7 @@ from certbound.cli.describe import describe_constants, log10_text
 from certbound.cli.limits import Clock, OutOfTime, TimeLimitOption
 from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, examples, load_problem
 from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.display import name_text
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def derive(
     """Bound the contraction rate (or gain) and the noise, with a metric for each constraint."""
     subject = load_problem(problem, pairs, horizon=horizon)
     started = time.perf_counter()
-    with spinner(f"bounding the constants of {subject.name}"):
+    with spinner(f"bounding the constants of {name_text(subject.name)}"):
         constants, metrics, where = _bound(subject, Clock(time_limit))
     seconds = time.perf_counter() - started
     result = {
@@ -108,7 +109,7 @@ def _local(subject: Problem) -> tuple[Constants, str]:
     horizon = float(subject.horizon)
     try:
         reach = bound_reach(subject)
-        odds = f"left with probability at most {log10_text(reach.log10_delta)}"
+        odds = f"left with probability at most {log10_text(reach.log10_delta, ulps=2)}"
     except (ArithmeticError, InfeasibleError) as error:
         _log.info("no tube with noise: %s", error)
         reach = bound_reach(subject, noise=False)

@@ -26,6 +26,7 @@ from certbound.cli.options import (
     number,
 )
 from certbound.cli.output import SETTINGS, console, print_json
+from certbound.display import one_line, rounded
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
@@ -252,8 +253,9 @@ def _progress_bar(paths: int) -> Iterator[Callable[[Progress], None] | None]:
 def _print(result: dict[str, Any]) -> None:
     screen = console()
     low, high = result["lower"], result["upper"]
+    least, most = rounded(low, up=False, digits=4), rounded(high, up=True, digits=4)
     sure = f"{100 * result['confidence']:g} %"
-    screen.print(f"exit probability {result['probability']:.4g}  ({sure} limits {low:.4g} ... {high:.4g})")
+    screen.print(f"exit probability {result['probability']:.4g}  ({sure} limits {least} ... {most})")
     if SETTINGS.quiet:
         return
     steps = f"{result['steps']} steps of the {result['scheme']} scheme"
@@ -263,11 +265,11 @@ def _print(result: dict[str, Any]) -> None:
     else:
         screen.print(f"{result['exits']} of {result['paths']} paths left, {steps}")
     for label, count in result.get("by_constraint", {}).items():
-        screen.print(f"  {count:>9}  {label}", markup=False)
-    screen.print(f"a claim of less than {low:.4g} is refuted; the smallest delta supported is {high:.4g}")
+        screen.print(f"  {count:>9}  {one_line(label)}", markup=False)
+    screen.print(f"a claim of less than {least} is refuted; the smallest delta supported is {most}")
     if result.get("asked", result["paths"]) != result["paths"]:
         screen.print(f"the time was enough for {result['paths']} of {result['asked']} paths")
     if "against" in result:
         word = "contradicts" if result["against"]["contradicted"] else "does not contradict"
-        screen.print(f"the simulation {word} the certificate (10^{result['against']['log10_delta']:.6g})")
+        screen.print(f"the simulation {word} the certificate (10^{rounded(result['against']['log10_delta'], up=True)})")
     screen.print(f"{result['seconds']:.2f} s, {result['path_steps_per_second']:.3g} path-steps per second")

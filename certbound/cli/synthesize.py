@@ -27,6 +27,7 @@ from certbound.cli.options import (
     number,
 )
 from certbound.cli.output import SETTINGS, console, plain, print_json, write_file
+from certbound.display import name_text, one_line
 
 if TYPE_CHECKING:
     from certbound.synthesis.closed_loop import ClosedLoop
@@ -182,7 +183,7 @@ def _picture(result: Synthesis, suffix: str) -> bytes:
         tube=noisy_reach(verdict),
         times=times,
         paths=paths,
-        title=f"{result.source.name}: {result.status}, P(exit) <= {log10_text(result.log10_delta)}",
+        title=f"{name_text(result.source.name)}: {result.status}, P(exit) <= {log10_text(result.log10_delta)}",
     )
     stream = BytesIO()
     draw_scene(scene).savefig(stream, format=suffix, dpi=150)
@@ -248,13 +249,14 @@ def _print(result: Synthesis, answer: dict[str, Any]) -> None:
     screen = console()
     colors = {"SAFE": "bold green", "UNSAFE_NOMINAL": "bold red", "UNKNOWN": "bold yellow"}
     word = "a plan" if result.feasible else "no plan"
-    screen.print(f"[{colors[result.status]}]{result.status}[/]  {result.source.name}: {word} with tube ", end="")
+    screen.print(f"[{colors[result.status]}]{result.status}[/]  ", end="")
+    screen.print(f"{name_text(result.source.name)}: {word} with tube ", end="", markup=False)
     screen.print(f"{result.method}, P(leaving) <= {log10_text(result.log10_delta)}", markup=False)
     if SETTINGS.quiet:
         return
     screen.print(f"cost {result.cost:.6g}, largest input {result.max_input:.4g}, room for {result.scale:.4g} tubes")
     if result.reason:
-        screen.print(result.reason, markup=False)
+        screen.print(one_line(result.reason), markup=False)
     runs = answer["closed_loop"]
     if runs is not None:
         screen.print(

@@ -27,6 +27,7 @@ from certbound.cli.options import (
     load_problem,
 )
 from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
+from certbound.display import name_text
 from certbound.errors import SolverError
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def tune(
     with contextlib.suppress(OutOfTime), Clock(time_limit).running():
         from certbound.constants.bounds import bound_constants
 
-        with spinner(f"bounding the constants of {subject.name}"):
+        with spinner(f"bounding the constants of {name_text(subject.name)}"):
             constants = bound_constants(subject)
         for tube, row in _rows(constants, subject.horizon, subject.delta):
             rows.append(row)

@@ -30,6 +30,7 @@ from certbound.cli.options import (
     load_problem,
 )
 from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
+from certbound.display import name_text, one_line, rounded
 from certbound.errors import CertificateError
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def verify(
     check_picture(plot)
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
     started = time.perf_counter()
-    with spinner(f"verifying {subject.name}"):
+    with spinner(f"verifying {name_text(subject.name)}"):
         clock = Clock(time_limit)
         verdict = _verdict(subject, method, cells, clock)
         if smallest and verdict.status == "SAFE":
@@ -246,7 +247,7 @@ def _scene(problem: Problem, verdict: Verdict, reach: ReachTube) -> Scene:
         _log.info("no sample paths are drawn: %s", error)
         paths = None
     times = None if paths is None else np.linspace(0.0, float(problem.horizon), paths.shape[1])
-    title = f"{problem.name}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
+    title = f"{name_text(problem.name)}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
     tube = noisy_reach(verdict)
     return Scene(problem=problem, reach=reach, tube=tube, times=times, paths=paths, title=title)
 
@@ -256,26 +257,27 @@ def _print(problem: Problem, result: dict[str, Any]) -> None:
     colors = {"SAFE": "bold green", "UNSAFE_NOMINAL": "bold red", "UNKNOWN": "bold yellow"}
     unit = "s" if problem.system.time == "continuous" else "steps"
     color = colors[result["status"]]
-    screen.print(f"[{color}]{result['status']}[/]  {problem.name}", end="")
+    screen.print(f"[{color}]{result['status']}[/]  ", end="")
     screen.print(
-        f": P(leaving within {problem.horizon:g} {unit}) <= {log10_text(result['log10_delta'])}"
-        f", asked {result['delta']:g}",
+        f"{name_text(problem.name)}: P(leaving within {problem.horizon:g} {unit}) <= "
+        f"{log10_text(result['log10_delta'])}, asked {result['delta']!r}",
         markup=False,
     )
     if SETTINGS.quiet:
         return
     if result["margin"] is not None and result["constraint"]:
         when = "" if result["time"] is None else f" at {'t' if unit == 's' else 'step'} = {result['time']:.4g}"
-        screen.print(f"margin {result['margin']:.4g}{when}, constraint: {result['constraint']}", markup=False)
+        margin = rounded(result["margin"], up=False, digits=4)
+        screen.print(f"margin {margin}{when}, constraint: {one_line(result['constraint'])}", markup=False)
     if result["reason"]:
-        screen.print(result["reason"], markup=False)
+        screen.print(one_line(result["reason"]), markup=False)
     tube = result["tube"]
     if tube is not None:
-        largest = max(tube["radius"])
-        screen.print(f"stochastic deviation: at most {largest:.4g} with that probability", markup=False)
+        largest = rounded(float(max(tube["radius"])), up=True, digits=4)
+        screen.print(f"stochastic deviation: at most {largest} with that probability", markup=False)
     screen.print(f"method {result['method']}, {result['seconds']:.1f} s", markup=False)
     for row in result.get("engines", ()):
         bound = f"<= {log10_text(row['log10_delta'])}" if row["applicable"] else "does not apply"
-        screen.print(f"  {row['engine']} ({row['method']}): {bound}. {row['reason']}", markup=False)
+        screen.print(f"  {row['engine']} ({row['method']}): {bound}. {one_line(row['reason'])}", markup=False)
     if "limits" in result:
         screen.print(result["limits"]["summary"], markup=False)

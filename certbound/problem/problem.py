@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.display import Shown, ask_later_room
+from certbound.display import Shown, ask_later_room, name_text
 from certbound.problem.checks import frozen, nearest, number, positive_definite, vector
 from certbound.problem.initial import check_start
 from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, Inside
@@ -32,7 +32,8 @@ class Problem(Shown):
     system : ContinuousSystem or DiscreteSystem
         The model.
     initial : Box, Ball, Ellipsoid, GaussianStart or array_like of shape (n,)
-        Every start in a set counts (also one chosen by an adversary); a point is stored as a degenerate box.
+        Every start in a set counts (also one chosen by an adversary who does not see coming noise); a point is stored
+        as a degenerate box.
     safe : sequence of Inside and Outside
         Constraints, each over its own window.
     horizon : float or int
@@ -144,7 +145,7 @@ class Problem(Shown):
         unit = "s" if self.system.time == "continuous" else "steps"
         count = {"state": self.system.dimension, "constraint": len(self.safe)}
         what = ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for word, number in count.items())
-        return f"{self.name}, {what}, {self.horizon:g} {unit}, delta {self.delta:g}"
+        return f"{name_text(self.name)}, {what}, {self.horizon:g} {unit}, delta {self.delta!r}"
 
     def rows(self) -> list[tuple[str, str]]:
         """Signals, start and constraints."""

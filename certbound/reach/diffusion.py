@@ -5,7 +5,7 @@ the state leaves a tube. `DiffusionRun` guesses the tube, bounds g - ghat over i
 the remainder, and accepts when what follows lies strictly inside the guess. Two choices of ghat compete: g along the
 nominal curve (M is of second order), and 0 (all noise in M: better where the state moves g a lot).
 
-M is a martingale only if the start and the disturbance do not see coming noise; `ASSUMPTION` says so.
+M is a martingale only if the start and the disturbance do not see coming noise: every answer says so.
 """
 
 from __future__ import annotations
@@ -30,11 +30,10 @@ from certbound.reach.response import LinearResponse, continuous_response
 from certbound.reach.rows import WINDOW
 from certbound.rigor.intervals import Interval
 
-__all__ = ["ASSUMPTION", "DiffusionRun", "depends_on_state"]
+__all__ = ["DiffusionRun", "depends_on_state"]
 
 Array = NDArray[np.float64]
 
-ASSUMPTION = "the initial state and the disturbance do not anticipate the noise (it depends on the state)"
 _ROUNDS = 12
 _SETTLE = 6
 _GROWTH = 0.03

@@ -107,7 +107,7 @@ class ReachTube(Shown):
 
     def summary(self) -> str:
         """The tube in one line."""
-        kind = f"left with probability at most {log10_text(self.log10_delta)}" if self.noise else "noise-free"
+        kind = f"left with probability at most {log10_text(self.log10_delta, ulps=2)}" if self.noise else "noise-free"
         cells = f"{self.curve.cells} cells, " if self.curve.cells > 1 else ""
         return f"{kind}, by {self.method}, up to {self.end:g} in {self.curve.pieces} pieces, {cells}" + (
             f"{self.curve.dimension} states" + (f"; assumes {self.assumption}" if self.assumption else "")

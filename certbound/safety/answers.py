@@ -11,7 +11,7 @@ import numpy as np
 from flint import arb
 from numpy.typing import NDArray
 
-from certbound.display import Shown
+from certbound.display import Shown, rounded
 from certbound.reach.norms import Norm
 from certbound.reach.tube import ReachTube
 from certbound.rigor.balls import lower, precision
@@ -42,7 +42,8 @@ class Deviation(Shown):
 
     def summary(self) -> str:
         """The largest radius, in one line."""
-        return f"stochastic deviation of at most {np.max(self.radius):.6g} in {len(self.radius)} pieces of time"
+        largest = rounded(float(np.max(self.radius)), up=True)
+        return f"stochastic deviation of at most {largest} in {len(self.radius)} pieces of time"
 
     def to_dict(self) -> dict[str, Any]:
         """``times``, ``radius`` and ``extent`` as lists."""
@@ -93,6 +94,8 @@ class EngineAnswer:
         False where the probability is not of trajectory level (one-time bounds): such an answer is never SAFE.
     assumption : str
         What the answer rests on besides the problem (stated constants); empty when nothing.
+    foresight : bool
+        Whether the probability covers even disturbances that see coming noise; the others are always covered.
     details : Any
         Whatever a certificate needs of the engine.
     conclusive : bool
@@ -112,6 +115,7 @@ class EngineAnswer:
     method: str = ""
     certified: bool = True
     assumption: str = ""
+    foresight: bool = False
     details: Any = None
     conclusive: bool = False
 

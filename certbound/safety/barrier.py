@@ -1,11 +1,11 @@
 """The barrier engine: exp(V) of a polynomial V, found by a convex program and proved by intervals.
 
 Let D be the set where no constraint is broken, and let V be twice differentiable with
-    grad V . f + 1/2 tr(g g^T Hess V) + 1/2 |g^T grad V|^2 <= kappa   on [0, T] x D, for every disturbance.
+    grad V . f + 1/2 tr(g g^T Hess V) + 1/2 |g^T grad V|^2 <= kappa   on [0, T] x D, for every d in its set.
 Then exp(V(X) - kappa t), stopped when X leaves D, is a supermartingale (Ito; it is positive), and a path that leaves
 does so on the boundary of D, where V >= u; X_0 lies in D, which is proved too. So
     P(leaving within T) <= exp(max over X_0 of V - u + max(kappa, 0) T).
-The disturbance may see the noise.
+The disturbance may react to the state and the past, but must not see coming noise: Ito's formula needs an adapted d.
 
 The condition is convex in V: for a polynomial each point of a grid gives a second-order cone, and the exponent is
 linear, so that the best polynomial is one conic program. What it proposes is then bounded over all of D, from above
@@ -87,6 +87,7 @@ class Barrier:
 def barrier_engine(problem: Problem, *, quick: bool = False, **_: Any) -> EngineAnswer:
     """The smallest probability that an exponential polynomial barrier proves (options of other engines are ignored).
 
+    It covers the disturbances that do not see coming noise.
     ``quick`` leaves the search out: another engine has proved enough.
     """
     refused = "another engine is enough." if quick else _refusal(problem)

@@ -8,6 +8,8 @@
   K2 is applied to the cut room.
 - A method of the paper by name: its tube at delta must fit into the room; delta is then made as small as it goes.
 
+All of them cover the disturbances that do not see coming noise, and no others: they rest on supermartingales.
+
 Source: Thms K1, K2, K4, K5 of theory; Table I and Prop 4 (paper).
 """
 
@@ -24,6 +26,8 @@ from numpy.typing import NDArray
 
 from certbound.constants.bounds import bound_constants
 from certbound.constants.metrics import bound_metrics
+from certbound.constants.stated import refuse_contradiction
+from certbound.display import log10_text, rounded
 from certbound.errors import CertboundError, EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
@@ -82,7 +86,7 @@ def constants_engine(
 ) -> EngineAnswer:
     """The best answer from constants: global ones, or local ones along the reach tube where none are global.
 
-    Options of other engines are ignored.
+    It covers the disturbances that do not see coming noise. Options of other engines are ignored.
 
     Parameters
     ----------
@@ -99,9 +103,11 @@ def constants_engine(
     Raises
     ------
     ValueError
-        If the Jacobian is unbounded or undefined on the domain that the user gave, or the nominal is lost before the
-        horizon.
+        If the Jacobian is unbounded or undefined on the domain that the user gave, the nominal is lost before the
+        horizon, or stated constants contradict the problem's own noise.
     """
+    if constants is not None:
+        refuse_contradiction(problem, constants)
     work = _Work(problem, method, cells)
     by_clearance, target = method in BY_CLEARANCE, math.log10(problem.delta)
     best: EngineAnswer | None = None
@@ -337,11 +343,12 @@ class _Work:
             return "no constraint asks anything."
         ratio = _taken(erosion, needed)
         if fits:
-            return f"the tube takes {100 * ratio:.3g} % of the room that the constraints leave."
-        larger = f"delta >= {10**level:.2g}, or " if level < -0.01 else ""
+            return f"the tube takes {rounded(100 * ratio, up=True, digits=3)} % of the room that the constraints leave."
+        quieter = rounded(1 / ratio, up=False, digits=2)
+        larger = f"delta >= {log10_text(level)}, or " if level < -0.01 else ""
         return (
-            f"at delta = {self.problem.delta:g} the tube takes {ratio:.3g} times the room that '{worst.label}' leaves "
-            f"at {self._when(worst.time)}; what would do: {larger}noise at most {1 / ratio:.2g} times as large."
+            f"at delta = {self.problem.delta!r} the tube takes {ratio:.3g} times the room that '{worst.label}' leaves "
+            f"at {self._when(worst.time)}; what would do: {larger}noise at most {quieter} times as large."
         )
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from certbound.display import power_above, rounded
 from certbound.errors import CertboundError
 from certbound.problem.problem import Problem
 from certbound.problem.regions import Ball, Box, HalfSpace, Polytope, Region
@@ -52,14 +53,14 @@ class Limits:
     widening: float | None
 
     def summary(self) -> str:
-        """One sentence."""
+        """One sentence; every number is rounded to the side on which SAFE was proved."""
         found = [
-            ("delta", self.delta, "delta = {:.3g}"),
-            ("horizon", self.horizon, "a horizon of {:.4g}"),
-            ("noise", self.noise, "noise {:.3g} times as large"),
-            ("widening", self.widening, "constraints moved outward by {:.3g}"),
+            (self.delta, True, 3, "delta = {}"),
+            (self.horizon, False, 4, "a horizon of {}"),
+            (self.noise, False, 3, "noise {} times as large"),
+            (self.widening, True, 3, "constraints moved outward by {}"),
         ]
-        words = [text.format(value) for _, value, text in found if value is not None]
+        words = [text.format(rounded(value, up=up, digits=n)) for value, up, n, text in found if value is not None]
         return f"SAFE would be: {', or '.join(words)}." if words else "Nothing near the problem was certified."
 
 
@@ -90,7 +91,7 @@ def find_limits(verdict: Verdict, *, cells: int | None = None) -> Limits:
         except (CertboundError, ValueError, ArithmeticError):
             return False
 
-    level = 10.0**verdict.log10_delta
+    level = power_above(verdict.log10_delta)
     return Limits(
         delta=level if level < 1 else None,
         horizon=_horizon(problem, safe),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from certbound.problem.problem import Problem
-from certbound.reach.diffusion import ASSUMPTION, depends_on_state
+from certbound.reach.diffusion import depends_on_state
 from certbound.reach.jumps import hidden_jump
 from certbound.reach.response_tube import DeviationTube, LinearAnswer, linear_answer
 from certbound.safety.answers import Deviation, EngineAnswer
@@ -17,6 +17,9 @@ __all__ = ["linear_engine"]
 
 def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool = True, **_: Any) -> EngineAnswer:
     """Smallest probability that Thm K7' proves for the problem (options of other engines are ignored).
+
+    With additive noise it covers every disturbance, even one that sees coming noise; with noise that depends on the
+    state, those that do not.
 
     Without ``thorough`` the initial set is one cell unless ``cells`` says otherwise.
     """
@@ -37,7 +40,7 @@ def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool 
         method="linear",
         details=answer,
         conclusive=answer.exact,
-        assumption=ASSUMPTION if depends_on_state(problem) else "",
+        foresight=not depends_on_state(problem),
     )
 
 

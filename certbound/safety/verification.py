@@ -9,7 +9,7 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from certbound.display import Shown, log10_text
+from certbound.display import Shown, log10_text, name_text, rounded
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.reach.tube import ReachTube
@@ -69,7 +69,7 @@ class Verdict(Shown):
     time, constraint
         Where the margin is least, and for which constraint.
     reason : str
-        Why, in words; assumptions (stated constants) are named here.
+        Why, in words; the disturbances that the bound covers, and assumptions (stated constants), are named here.
     method : str
         What proved it.
     tube, reach, constants
@@ -125,14 +125,16 @@ class Verdict(Shown):
 
     def summary(self) -> str:
         """The verdict in one line."""
-        asked = "" if self.problem is None else f"{self.problem.name}: "
-        target = "" if self.problem is None else f", asked {self.problem.delta:g}"
+        asked = "" if self.problem is None else f"{name_text(self.problem.name)}: "
+        target = "" if self.problem is None else f", asked {self.problem.delta!r}"
         return f"{self.status}  {asked}P(leaving) <= {log10_text(self.log10_delta)}{target}"
 
     def rows(self) -> list[tuple[str, str]]:
         """Margin, method and reason."""
         where = "" if self.time is None else f" at t = {self.time:.4g}"
-        found = [] if self.margin is None else [("margin", f"{self.margin:.4g}{where}, {self.constraint}")]
+        found = []
+        if self.margin is not None:
+            found.append(("margin", f"{rounded(self.margin, up=False, digits=4)}{where}, {self.constraint}"))
         found += [] if self.constants is None else [("constants", self.constants.summary())]
         return [*found, ("method", self.method), ("reason", self.reason)]
 
@@ -166,7 +168,8 @@ def verify_safety(
     """Prove that a problem's constraints are broken with probability at most delta, or say why not.
 
     Proves, for SAFE: P(some constraint is broken at some time of its window) <= 10**log10_delta <= delta, for every
-    start in the initial set and every non-anticipating disturbance; leaving the model's domain counts as breaking.
+    start in the initial set and every disturbance that does not see coming noise (by the linear response with
+    additive noise: also those that do); ``reason`` says which. Leaving the model's domain counts as breaking.
 
     Parameters
     ----------
@@ -256,6 +259,8 @@ def _verdict(problem: Problem, answers: Mapping[str, EngineAnswer]) -> Verdict:
             f"nominal {'fits' if level <= math.log10(problem.delta) else 'does not fit'}, and proves no more. {reason}"
         )
         level = 0.0
+    if best.applicable and level < 0 and problem.system.disturbance is not None:
+        reason = f"{_sentence(reason)} {_covered(best)}"
     if best.assumption:
         reason = f"{_sentence(reason)} Assumption: {best.assumption}."
     others = [f"By {other}: {_sentence(answers[other].reason)}" for other in answers if other != name and not safe]
@@ -274,6 +279,13 @@ def _verdict(problem: Problem, answers: Mapping[str, EngineAnswer]) -> Verdict:
         problem=problem,
         answers=MappingProxyType(dict(answers)),
     )
+
+
+def _covered(answer: EngineAnswer) -> str:
+    """For which disturbances an answer holds."""
+    if answer.foresight:
+        return "It holds for every disturbance in its set, even one that sees coming noise."
+    return "It holds for every disturbance in its set that does not see coming noise."
 
 
 def _sentence(text: str) -> str:

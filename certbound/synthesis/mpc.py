@@ -14,6 +14,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from certbound.constants.stated import refuse_contradiction
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.regions import Region
@@ -83,7 +84,8 @@ def synthesize_plan(
     ------
     ValueError
         If the system has no inputs, K does not stabilise, the inputs have no bounds where the tube needs them, the
-        terminal set leaves the tightened constraints, or the method is unknown.
+        terminal set leaves the tightened constraints, stated constants contradict the problem's own noise, or the
+        method is unknown.
     InfeasibleError
         If no noise-free trajectory exists to begin with.
 
@@ -101,6 +103,8 @@ def synthesize_plan(
     """
     began = time.perf_counter()
     names = _chosen(tube, problem)
+    if constants is not None:
+        refuse_contradiction(problem, constants)
     work = Attempts(
         Planner(problem, stage_cost=stage_cost, terminal=terminal, feedback=feedback, steps=steps),
         given=tube if isinstance(tube, Tube) else None,

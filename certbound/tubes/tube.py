@@ -13,7 +13,7 @@ import numpy as np
 from flint import arb, arb_mat
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.display import Shown, log10_text
+from certbound.display import Shown, log10_text, rounded
 from certbound.rigor.balls import lower, precision, upper
 from certbound.tubes.constants import Constants
 
@@ -131,8 +131,8 @@ class Tube(Shown):
     def summary(self) -> str:
         """The tube in one line."""
         unit = "s" if self.constants.continuous else "steps"
-        size = f"radius at most {self.maximum:.6g} within {self.horizon:g} {unit}"
-        return f"{self.method}, {size}, delta {log10_text(self.log10_delta)}, {self.level} level"
+        size = f"radius at most {rounded(self.maximum, up=True)} within {self.horizon:g} {unit}"
+        return f"{self.method}, {size}, delta {log10_text(self.log10_delta, ulps=2)}, {self.level} level"
 
     def rows(self) -> list[tuple[str, str]]:
         """Parameters, and what the tube rests on."""

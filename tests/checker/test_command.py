@@ -21,8 +21,9 @@ def certificate(tmp_path_factory: pytest.TempPathFactory):
 def test_a_valid_certificate_exits_with_0(certificate, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["check", str(certificate), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert list(result) == ["valid", "claim", "reason", "seconds"]
+    assert list(result) == ["valid", "claim", "reason", "seconds", "outcome", "assumptions"]
     assert result["valid"] is True
+    assert (result["outcome"], result["assumptions"]) == ("valid", [])
     assert "chain" in result["claim"]
 
 

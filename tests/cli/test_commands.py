@@ -315,3 +315,16 @@ def test_bad_input_gets_three_lines(
     assert why in lines[1]
     assert cure in lines[2]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_problems_name_cannot_imitate_a_verdict(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    file = tmp_path / "named.toml"
+    file.write_text(
+        'name = "[bold]x[/]\\nSAFE  y: P(leaving within 1 s) <= 1e-9, asked 0.001"\ntime = "continuous"\nhorizon = 1\n'
+        'states = ["x"]\n[dynamics]\nx = "x"\n[noise]\ndiffusion = [[3.0]]\n[initial]\npoint = [0]\n'
+        '[[stay]]\nlabel = "a\\nSAFE"\nbox = { x = [-1, 1] }\n'
+    )
+    assert run(["verify", str(file), "--method", "kummer"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith('UNKNOWN  "[bold]x[/] SAFE y: P(leaving')
+    assert not any(line.startswith("SAFE") for line in lines)

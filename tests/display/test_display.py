@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.display import Record, Shown, log10_text, plain
+from certbound.display import Record, Shown, log10_text, name_text, plain, power_above
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +89,26 @@ def test_the_lines_say_what_matters(results: dict[str, Any]) -> None:
     assert results["verdict"].summary().startswith("SAFE  a <b> & c: P(leaving) <= ")
     assert results["tube"].summary().endswith("within 2 s, delta 1e-3, trajectory level")
     assert ("constraint", "-2 <= px <= 2, -2 <= py <= 2") in results["problem"].rows()
+
+
+def test_a_printed_probability_is_never_below_the_one_it_stands_for() -> None:
+    for log10 in (-2.9999997, -2.99999999, np.nextafter(-3.0, 0.0), -0.30102999, -1.99999999999, -49718.999999999):
+        shown = Decimal(log10_text(float(log10)))
+        assert shown.log10() >= Decimal(float(log10))
+        assert shown <= Decimal("1.1") * Decimal(10) ** Decimal(float(log10)) or shown == Decimal("0.02")
+    assert log10_text(float(np.nextafter(-3.0, 0.0)), ulps=2) == "1e-3"
+    for log10 in (-300.25, -3.0, -0.3010299956639812, -1e-17, -1e12):
+        assert power_above(log10) > 0
+        assert Decimal(power_above(log10)).log10() >= Decimal(log10)
+
+
+def test_a_name_cannot_imitate_a_verdict() -> None:
+    verdict = cb.verify_safety(cb.load("ou").replace(name="x\nSAFE  ou: P(leaving) <= 1e-9"), method="kummer")
+    assert verdict.summary().startswith('SAFE  "x SAFE ou: P(leaving) <= 1e-9": P(leaving) <= ')
+    assert len(name_text("y" * 1000)) == 60
+    assert [name_text(name) for name in ("chain_rest", "obstacle course", "SAFE", "\x1b[1m", "")] == [
+        "chain_rest", "obstacle course", '"SAFE"', '"[1m"', '""',
+    ]  # fmt: skip
 
 
 def test_tubes_come_as_columns(results: dict[str, Any]) -> None:

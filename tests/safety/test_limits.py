@@ -7,7 +7,7 @@ import pytest
 from scipy.special import log_ndtr
 
 import certbound as cb
-from certbound.safety.limits import find_limits, find_smallest
+from certbound.safety.limits import Limits, find_limits, find_smallest
 
 
 def walk(bound: float = 4.0, sigma: float = 1.0, steps: int = 16) -> cb.Problem:
@@ -72,3 +72,11 @@ def test_the_smallest_probability_is_near_the_truth_where_that_is_known() -> Non
     best = find_smallest(verdict, method="linear")
     truth = np.log10(4) + log_ndtr(-20.0 / 4.0) / np.log(10)
     assert truth - 0.6 < best.log10_delta <= verdict.log10_delta
+
+
+def test_what_would_be_safe_is_rounded_to_the_side_that_was_proved() -> None:
+    found = Limits(delta=0.0012341, horizon=1.23459, noise=0.98765, widening=0.12341)
+    assert found.summary() == (
+        "SAFE would be: delta = 0.00124, or a horizon of 1.234, or noise 0.987 times as large, "
+        "or constraints moved outward by 0.124."
+    )

@@ -44,22 +44,24 @@ def test_constants_give_a_plan_of_their_own(problem: cb.Problem) -> None:
     assert (found.status == "SAFE") == (found.log10_delta <= -3)
 
 
-def test_a_one_time_bound_is_unknown_however_well_it_fits(problem: cb.Problem) -> None:
-    constants = cb.Constants(gain=1.0, sigma=0.001, dimension=2, isotropic=True)
-    found = cb.synthesize_plan(problem, tube="markov", constants=constants)
+def test_a_one_time_bound_is_unknown_however_well_it_fits() -> None:
+    constants = cb.Constants(gain=1.06, sigma=0.001, dimension=2, isotropic=True)
+    found = cb.synthesize_plan(cart(std=0.001), tube="markov", constants=constants)
     assert found.feasible
     assert found.status == "UNKNOWN"
     assert "one time" in found.reason
 
 
 def test_stated_constants_are_named_as_an_assumption(problem: cb.Problem) -> None:
-    constants = cb.Constants(gain=1.0, sigma=0.001, dimension=2)
+    constants = cb.Constants(gain=1.06, sigma=0.01, dimension=2)
     found = cb.synthesize_plan(problem, tube="kummer", constants=constants)
     assert "assumed" in found.reason
+    with pytest.raises(ValueError, match=r"`constants.sigma` must be at least 0.01, .* got 0.001"):
+        cb.synthesize_plan(problem, tube="kummer", constants=cb.Constants(gain=1.06, sigma=0.001, dimension=2))
 
 
 def test_an_infeasible_problem_says_why_and_what_would_do(problem: cb.Problem) -> None:
-    constants = cb.Constants(gain=1.0, sigma=0.02, dimension=2)
+    constants = cb.Constants(gain=1.06, sigma=0.02, dimension=2)
     found = cb.synthesize_plan(problem, tube="markov", constants=constants)
     assert not found.feasible
     assert found.infeasibility is not None

@@ -1,0 +1,90 @@
+"""What a certificate claims, in words: whose disturbances, at what probability, under which assumptions.
+
+The assumptions are derived from the proof itself, so that a file cannot hide one; what the file adds of its own is
+quoted, and counts as an assumption too. That a disturbance does not see coming noise is part of the model, no
+assumption: the claim says for which disturbances it holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from flint import arb
+
+from certbound.checker.model import Model
+from certbound.checker.reading import number
+from certbound.checker.words import plainly, quoted, rounded
+from certbound.errors import CertificateError
+from certbound.problem.tape import Tape
+
+__all__ = ["ENGINES", "STATED", "assumptions", "claim", "engine_of", "foresees"]
+
+ENGINES = {
+    "linear": "linear response (Thm K7)",
+    "constants": "contraction constants (Thms K2, K5)",
+    "barrier": "a barrier that is the exponential of a polynomial",
+}
+STATED = "the stated constants hold"
+"""How a certificate's own list names what `assumptions` derives from the proof."""
+
+_ANY = "for every disturbance in its set, even one that sees coming noise"
+_BLIND = "for every disturbance in its set that does not see coming noise"
+
+
+def engine_of(proof: object, method: str) -> str:
+    """The engine that a proof names, which ``claim.method`` must name too.
+
+    Raises
+    ------
+    CertificateError
+    """
+    engine = proof.get("engine") if isinstance(proof, Mapping) else None
+    if not isinstance(engine, str) or engine not in ENGINES:
+        raise CertificateError(f"`proof.engine` must be one of {', '.join(ENGINES)}.")
+    if method != engine:
+        raise CertificateError(f"`claim.method` must be \"{engine}\", the proof's engine, got {quoted(method)}.")
+    return engine
+
+
+def foresees(model: Model, engine: str) -> bool:
+    """Whether the engine's bound covers even disturbances that see coming noise.
+
+    The linear response bounds a Gaussian process that no disturbance moves, and all else path by path. The other
+    proofs, and noise that depends on the state, rest on supermartingales, which foresight would spoil.
+    """
+    return engine == "linear" and not isinstance(model.noise.diffusion, Tape)
+
+
+def assumptions(model: Model, proof: Mapping[str, object], named: Sequence[str]) -> list[str]:
+    """What the proof takes for granted, and what else the file says that it assumes, in quotes."""
+    own = []
+    if proof["engine"] == "constants" and proof.get("assumed") is True:
+        own.append(_stated(model, proof))
+    return own + [f"as the file says, {quoted(item, 200)}" for item in named if not (own and item == STATED)]
+
+
+def _stated(model: Model, proof: Mapping[str, object]) -> str:
+    """The stated constants; rounded down, they are no weaker an assumption than the proof's."""
+    name, unit = ("rate", " 1/s") if model.continuous else ("gain", " per step")
+    rate, sigma, nu = (
+        rounded(number(proof.get(key), f"proof.{key}"), up=False) for key in ("rate", "sigma", "nu")
+    )
+    where = "on the domain" if proof.get("region") == "domain" else "everywhere"
+    norm = "Euclidean norm" if proof.get("metric") is None else "norm of the stated metric"
+    return (
+        f"{STATED} {where}: {name} {rate}{unit}, noise level sigma {sigma}, effective dimension {nu}, in the {norm}"
+    )
+
+
+def claim(model: Model, engine: str, level: float, assumed: Sequence[str]) -> str:
+    """The claim as one sentence."""
+    unit = "s" if model.continuous else "steps"
+    start = "a normal start" if model.initial.covariance is not None else "every start in the initial set"
+    whose = "" if not model.disturbance else f", {_ANY if foresees(model, engine) else _BLIND},"
+    safe = "at most" if arb(level) <= arb(model.delta).log() / arb(10).log() else "more than"
+    words = (
+        f"from {start}{whose} the problem {quoted(model.name)} breaks one of its {len(model.constraints)} constraints "
+        f"within {plainly(model.horizon)} {unit} with probability at most 10^{rounded(level, up=True)} "
+        f"({safe} delta = {plainly(model.delta)})"
+    )
+    return words + "".join(f"; assuming that {item}" for item in assumed)

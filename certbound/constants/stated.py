@@ -1,0 +1,121 @@
+"""Stated constants may be assumed, but not against the problem itself: its own noise, its Jacobian where it starts."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.display import rounded
+from certbound.problem.problem import Problem
+from certbound.problem.sets import GaussianStart
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem
+from certbound.problem.tape import Tape
+from certbound.problem.trace import compile_numpy, jacobian
+from certbound.tubes.constants import Constants
+
+__all__ = ["refuse_contradiction"]
+
+Array = NDArray[np.float64]
+
+_ROUNDING = 1e-9  # what floating-point evaluations of the problem's own numbers may be wrong by, and more
+
+
+def refuse_contradiction(problem: Problem, constants: Constants) -> None:
+    """Refuse constants that the problem's own numbers contradict.
+
+    sigma and nu are compared with the constant noise in the constants' metric, g g^T <= sigma^2 P^-1 and
+    tr(P g g^T) <= nu sigma^2 (G S G^T with the variance proxy S in discrete time), or with g(0, x) where g depends on
+    the state; rate or gain with the Jacobian at x, the middle of the initial set (but for inputs without a plan). What
+    agrees is not proved by that.
+
+    Raises
+    ------
+    ValueError
+        If sigma, the effective dimension, the rate or the gain is smaller than that, or the noise is not of the kind
+        that the constants assert.
+    """
+    system = problem.system
+    if constants.dimension != system.dimension:
+        raise ValueError(f"`constants` must have dimension {system.dimension}, got {constants.dimension}.")
+    if isinstance(system, DiscreteSystem) and constants.gaussian and not system.noise.gaussian:
+        raise ValueError("`constants` assert Gaussian noise, and the problem's is not; leave `gaussian` out.")
+    n = system.dimension
+    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric)
+    point = _start(problem)
+    varies = isinstance(system, ContinuousSystem) and isinstance(system.diffusion, Tape)
+    sigma = float(np.ravel(constants.sigma)[0]) if varies else float(np.min(constants.sigma))
+    _check_noise(constants, sigma, metric @ _covariance(system, point))
+    if problem.system.inputs is None or problem.plan is not None:
+        _check_jacobian(problem, constants, metric, point)
+
+
+def _start(problem: Problem) -> Array:
+    """The middle of the initial set."""
+    start = problem.initial
+    if isinstance(start, GaussianStart):
+        return np.asarray(start.mean, dtype=float)
+    middle = getattr(start, "center", None)
+    return np.asarray((start.low + start.high) / 2 if middle is None else middle, dtype=float)
+
+
+def _covariance(system: ContinuousSystem | DiscreteSystem, point: Array) -> Array:
+    """g g^T at the start, or G S G^T."""
+    if isinstance(system, DiscreteSystem):
+        return np.asarray(system.noise_matrix @ system.noise.proxy @ system.noise_matrix.T)
+    g = system.diffusion
+    if isinstance(g, Tape):
+        with np.errstate(all="ignore"):
+            g = np.asarray(compile_numpy(g)(0.0, *point), dtype=float).reshape(system.dimension, -1)
+    return np.asarray(g @ g.T)
+
+
+def _check_noise(constants: Constants, sigma: float, product: Array) -> None:
+    """P g g^T, whose eigenvalues are those of P^1/2 g g^T P^1/2."""
+    if not np.isfinite(product).all():
+        return
+    n, values = constants.dimension, np.linalg.eigvals(product).real
+    needed = float(np.sqrt(max(values.max(), 0.0)))
+    if sigma * (1 + _ROUNDING) < needed:
+        least = rounded(needed * (1 - 1e-12), up=True)
+        raise ValueError(
+            f"`constants.sigma` must be at least {least}, which the problem's own noise has in their metric, "
+            f"got {sigma!r}; state a larger one, or leave `constants` out."
+        )
+    trace = float(np.trace(product))
+    if constants.nu * sigma**2 * (1 + 3 * _ROUNDING) < trace:
+        least = rounded(trace / sigma**2 * (1 - 1e-12), up=True)
+        raise ValueError(
+            f"`constants.effective_dimension` must be at least {least}, which the problem's own noise has at "
+            f"their sigma, got {constants.nu!r}; leave it out for {n}."
+        )
+    if constants.isotropic and not np.allclose(product, sigma**2 * np.eye(n), rtol=1e-6, atol=1e-9 * sigma**2):
+        raise ValueError("`constants` assert isotropic noise, and the problem's is not; leave `isotropic` out.")
+
+
+def _check_jacobian(problem: Problem, constants: Constants, metric: Array, point: Array) -> None:
+    """mu_P or the norm of D_x f at the start of the horizon."""
+    system, n = problem.system, problem.system.dimension
+    slope = jacobian(problem.closed_loop, range(1, n + 1))
+    rows = problem.input_sequence
+    inputs = [] if rows is None else list(rows[0])
+    box = system.disturbance
+    middle = [] if box is None else list((np.asarray(box.low) + np.asarray(box.high)) / 2)
+    with np.errstate(all="ignore"):
+        found = np.asarray(compile_numpy(slope)(0.0, *point, *inputs, *middle), dtype=float)
+    matrix = found.reshape(n, n)
+    if not np.isfinite(matrix).all():
+        return
+    root = np.linalg.cholesky(metric).T
+    turned = root @ matrix @ np.linalg.inv(root)
+    if constants.continuous:
+        name, needed = "rate", float(np.linalg.eigvalsh((turned + turned.T) / 2)[-1])
+    else:
+        name, needed = "gain", float(np.linalg.norm(turned, 2))
+    given = float(np.ravel(getattr(constants, name))[0])
+    if given + 1e-6 * (1 + abs(given)) < needed:
+        least = rounded(needed - 1e-9 * (1 + abs(needed)), up=True)
+        raise ValueError(
+            f"`constants.{name}` must be at least {least}, which the problem's own dynamics have at "
+            f"the middle of the initial set in their metric, got {given!r}; state a larger one, or leave `constants` "
+            "out."
+        )
