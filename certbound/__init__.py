@@ -10,6 +10,7 @@ import logging
 from typing import Any
 
 from certbound._version import __version__
+from certbound.display import connect
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 
@@ -60,6 +61,27 @@ _HOME = {
 }
 
 __all__ = ["__version__", *_HOME]
+
+
+def _draw(result: Any, axes: Any) -> None:
+    from certbound.plotting.results import draw
+
+    draw(result, axes)
+
+
+def _content(problem: Any, plan_file: str) -> dict[str, Any]:
+    from certbound.problem.writing import content_of
+
+    return content_of(problem, plan_file)
+
+
+def _constants(data: dict[str, Any]) -> Any:
+    from certbound.tubes.constants import Constants
+
+    return Constants.from_dict(data)
+
+
+connect(draw=_draw, content=_content, constants=_constants)
 
 
 def __getattr__(name: str) -> Any:

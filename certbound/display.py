@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import html
-import importlib
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +17,33 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
-    "Record", "Shown", "load_result", "log10_text", "name_text", "one_line", "plain", "power_above", "rounded",
-    "span_text",
+    "Record", "Shown", "ask_later_room", "connect", "load_result", "log10_text", "name_text", "one_line", "plain",
+    "power_above", "rounded", "span_text",
 ]  # fmt: skip
 
 Rows = list[tuple[str, str]]
+
+_LATER: dict[str, Callable[..., Any]] = {}
+
+
+def connect(**calls: Callable[..., Any]) -> None:
+    """Say who does what a result is asked for and a later room does; the package's own ``__init__`` does so.
+
+    ``draw`` (result, axes) draws a result, ``content`` (problem, plan file) is what a problem file holds, ``constants``
+    (data) reads constants back. In this way no room has to know a later one.
+    """
+    _LATER.update(calls)
+
+
+def ask_later_room(name: str, *arguments: Any) -> Any:
+    """What ``connect`` was told to call, called.
+
+    Examples
+    --------
+    >>> ask_later_room("constants", {"rate": -0.5, "sigma": 0.1, "dimension": 2}).rate
+    -0.5
+    """
+    return _LATER[name](*arguments)
 
 
 class Shown:
@@ -65,8 +86,7 @@ class Shown:
             import matplotlib.pyplot as plt
 
             ax = plt.gca()
-        # The one door that opens upwards: a result draws itself when it is asked to.
-        importlib.import_module("certbound.plotting.results").draw(self, ax)
+        ask_later_room("draw", self, ax)
         return ax
 
     def __repr__(self) -> str:
@@ -168,7 +188,7 @@ def load_result(path: str | Path) -> Any:
     except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"`path` must be a saved result, got {str(path)!r}: {error!r}; {cure}.") from error
     if kind == "Constants":
-        return importlib.import_module("certbound.tubes.constants").Constants.from_dict(data)
+        return ask_later_room("constants", data)
     return Record(kind, data)
 
 

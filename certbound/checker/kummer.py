@@ -20,7 +20,7 @@ from flint import arb
 from certbound.checker.matrices import upper
 from certbound.checker.report import Budget, Unproved
 
-__all__ = ["Kummer", "exit_probability"]
+__all__ = ["Kummer", "exit_probability", "lower_excess", "partial_excess"]
 
 MOST_POWER = 1e5
 _LARGEST = arb(10) ** 7
@@ -77,7 +77,7 @@ def exit_probability(data: Kummer, budget: Budget) -> arb:
 def _least_discrete(data: Kummer, v: list[arb], info: list[arb], budget: Budget) -> arb | None:
     """Lower bound of the least gain over the steps; None where nothing is asked."""
     least: arb | None = None
-    excess = _excess(data)
+    excess = lower_excess(data)
     for k, radius in enumerate(data.radii):
         budget.check()
         if radius is None:
@@ -89,7 +89,7 @@ def _least_discrete(data: Kummer, v: list[arb], info: list[arb], budget: Budget)
 
 def _least_continuous(data: Kummer, v: list[arb], info: list[arb], budget: Budget) -> arb | None:
     """The same over the pieces: I falls and v is monotone on a piece, and pieces are cut where that loses much."""
-    excess = _excess(data)
+    excess = lower_excess(data)
     bounds: dict[int, arb] = {}
     attained: arb | None = None
     for k, radius in enumerate(data.radii):
@@ -148,7 +148,7 @@ def _phi(data: Kummer, info: arb) -> arb:
     return info if data.a.is_zero() else (data.a * info).expm1() / data.a
 
 
-def _excess(data: Kummer) -> Callable[[arb], arb]:
+def lower_excess(data: Kummer) -> Callable[[arb], arb]:
     """Lower bound of E_a, which grows with z: large z are cut, and a partial sum of positive terms serves."""
 
     def value(z: arb) -> arb:
@@ -158,12 +158,12 @@ def _excess(data: Kummer) -> Callable[[arb], arb]:
             exact = (a * z).hypgeom_0f1(b) if data.bessel else z.hypgeom_1f1(a, b)
             if exact.is_finite() and exact.rel_accuracy_bits() > 20:
                 return ((exact - 1) / a).lower()
-        return _partial(data, z)
+        return partial_excess(data, z)
 
     return value
 
 
-def _partial(data: Kummer, z: arb) -> arb:
+def partial_excess(data: Kummer, z: arb) -> arb:
     """Some of the terms of the series of E_a, which are all positive: the first ones, and those about the largest."""
     first = _terms(data, z, 1, z / data.half)
     if not z > 0:

@@ -7,37 +7,23 @@ paper).
 
 from __future__ import annotations
 
-import functools
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.constants.branching import Supremum, bound_supremum, random_points, split_boxes
+from certbound.constants.branching import split_boxes
+from certbound.constants.certification import certify, record, relative_widths, slope_weights
 from certbound.constants.coordinates import Metric
 from certbound.constants.derivatives import StateJacobian
 from certbound.constants.models import Model, model_of
-from certbound.constants.noises import NoiseBound, bound_noise
-from certbound.constants.recheck import certify_gain, certify_rate
-from certbound.constants.structure import affine_set
-from certbound.errors import EnclosureError, InfeasibleError
+from certbound.constants.noises import bound_noise
 from certbound.rigor.intervals import Interval
-from certbound.tubes.constants import Constants, Proof
+from certbound.tubes.constants import Constants
 
 __all__ = ["bound_constants", "constants_along"]
 
 Array = NDArray[np.float64]
-
-FIRST_BUDGET = 4000
-"""Boxes before the affine structure of the Jacobian is looked for."""
-MOST_SIDES = 8
-"""Coordinates above which bisection is left out where the affine structure gives a bound."""
-EXACT = 1e-9
-"""A relative gap that leaves nothing to gain."""
-
-SMALLEST_GAIN = 1e-12
-"""Stands for L = 0, which the tubes exclude."""
 
 
 def bound_constants(
@@ -122,145 +108,6 @@ def _propose(
     return metrics.improve(model, euclidean, objective=objective, horizon=horizon, delta=delta)
 
 
-def certify(
-    model: Model, metric: ArrayLike | None, *, status: str = "closed form", tolerance: float, budget: int
-) -> Constants:
-    """Constants in a given metric, certified by branch and bound whatever proposed the metric."""
-    norm = Metric(metric, model.dimension)
-    jacobian = StateJacobian(model.dynamics, model.state_slots, model.ranges)
-    found = _supremum(model, jacobian, norm, tolerance, budget)
-    if not np.isfinite(found.upper):
-        _refuse(model, jacobian, found)
-    noise, status = bound_noise(model, norm), jacobian.remark(status)
-    return _record(model, norm, noise, np.array(found.upper), found.sampled, found.boxes, status, None)
-
-
-def _supremum(model: Model, jacobian: StateJacobian, norm: Metric, tolerance: float, budget: int) -> Supremum:
-    quantity = norm.measure if model.continuous else norm.norm
-    sampled = norm.sample_measure if model.continuous else norm.sample_norm
-
-    def bound(boxes: Interval, threshold: float) -> tuple[Array, Array]:
-        uppers = quantity(jacobian.enclose(boxes))
-        weights = _relative_widths(boxes, jacobian.box)
-        bounded = np.isfinite(boxes.lo).all(axis=1) & np.isfinite(boxes.hi).all(axis=1)
-        sharpen = np.flatnonzero(bounded & (uppers > threshold))
-        form = jacobian.spread(boxes[sharpen]) if len(sharpen) else None
-        if form is not None:
-            uppers[sharpen] = np.minimum(uppers[sharpen], quantity(*form))
-            weights[sharpen] = _slope_weights(norm, form[1], weights[sharpen])
-        return uppers, weights
-
-    def value(points: Array) -> Array:
-        matrices = jacobian.values(points)
-        defined = np.isfinite(matrices).all(axis=(-1, -2))
-        result = np.full(len(points), np.nan)
-        if defined.any():
-            result[defined] = sampled(matrices[defined])
-        return result
-
-    limit = tolerance * _scale(jacobian, norm)
-    starts = jacobian.starts()
-    search = functools.partial(bound_supremum, bound, value, jacobian.box, tolerance=limit, starts=starts)
-    unbounded = not (np.isfinite(jacobian.box.lo) & np.isfinite(jacobian.box.hi)).all()
-    many = len(jacobian.active) > 3
-    budget = max(1, int(budget * min(1.0, (6 / model.dimension) ** 2)))  # a box costs the more, the larger n
-    if unbounded:
-        ceiling = _structural_bound(model, jacobian, norm)
-        hopeless = len(jacobian.active) > MOST_SIDES and np.isfinite(ceiling)
-        return search(budget=1 if hopeless else budget, ceiling=ceiling)
-    found = search(budget=min(budget, FIRST_BUDGET))
-    if not np.isfinite(found.sampled):
-        return found
-    close = found.upper - found.sampled <= limit
-    if close and found.upper - found.sampled <= EXACT * abs(found.upper):
-        return found
-    ceiling = _structural_bound(model, jacobian, norm) if close or many else np.inf
-    if close:  # where the parameters vary independently, the affine set leaves no gap at all
-        return search(budget=1, ceiling=ceiling) if ceiling < found.upper else found
-    if np.isinf(found.upper) and np.isinf(ceiling):
-        return found
-    return search(budget=budget, ceiling=ceiling, earlier=found)
-
-
-def _structural_bound(model: Model, jacobian: StateJacobian, norm: Metric) -> float:
-    """Bound over the affine set of all Jacobians: exact where its parameters vary independently."""
-    try:
-        members = affine_set(jacobian.tape, [jacobian.ranges[k] for k in range(len(jacobian.ranges))])
-        matrix = np.eye(model.dimension) if norm.matrix is None else norm.matrix
-        certified = certify_rate if model.continuous else certify_gain
-        return certified(matrix, members)
-    except EnclosureError:
-        return np.inf
-
-
-def _relative_widths(boxes: Interval, box: Interval) -> Array:
-    with np.errstate(all="ignore"):
-        share = (boxes.hi - boxes.lo) / np.maximum(box.hi - box.lo, 1e-300)
-    return np.where(np.isfinite(share), share, np.where(np.isinf(boxes.hi - boxes.lo), 2.0, 1e-3))
-
-
-def _slope_weights(norm: Metric, spread: Any, fallback: Array) -> Array:
-    size = spread.slopes.mag
-    finite = np.isfinite(size).all(axis=(-1, -2, -3)) & np.isfinite(spread.reach).all(axis=-1)
-    safe = np.where(finite[:, None, None, None], size, 0.0)
-    with np.errstate(all="ignore"):  # weights only order the halving: an overflow is as good as any
-        seen = np.abs(norm.transform(safe))
-        weights = np.where(finite[:, None], spread.reach, 0.0) * np.sqrt(np.sum(seen**2, axis=(-1, -2)))
-    result: Array = np.where(finite[:, None], weights, fallback)
-    return result
-
-
-def _scale(jacobian: StateJacobian, norm: Metric) -> float:
-    """max(1, largest sampled norm of the Jacobian)."""
-    matrices = jacobian.values(random_points(np.random.default_rng(1), jacobian.box, 256))
-    defined = np.isfinite(matrices).all(axis=(-1, -2))
-    return max(1.0, float(np.max(norm.sample_norm(matrices[defined]), initial=0.0)))
-
-
-def _refuse(model: Model, jacobian: StateJacobian, found: Supremum) -> None:
-    cure = "give a smaller `domain=`" if model.bounded_by_user else "give `domain=cb.Box(low, high)`"
-    try:
-        reason = jacobian.explain(found.worst)
-    except EnclosureError as error:
-        if model.bounded_by_user:
-            raise
-        raise InfeasibleError(f"no constants hold on all of R^n: {error} Or {cure}.") from error
-    if model.bounded_by_user:
-        raise ValueError(f"`domain` must keep the Jacobian bounded, but {reason} is unbounded; {cure}.")
-    raise InfeasibleError(f"no constants hold on all of R^n: {reason} is unbounded; {cure}.")
-
-
-def _record(
-    model: Model,
-    norm: Metric,
-    noise: NoiseBound,
-    value: Array,
-    sampled: float,
-    boxes: int,
-    status: str,
-    times: Array | None,
-    where: str | None = None,
-) -> Constants:
-    """The only place where a proof is attached to constants."""
-    number: Any = float(value) if value.ndim == 0 else value
-    gain: Any = None if model.continuous else np.maximum(number, SMALLEST_GAIN)
-    found = Constants(
-        rate=number if model.continuous else None,
-        gain=gain,
-        sigma=noise.sigma,
-        dimension=model.dimension,
-        effective_dimension=noise.effective_dimension,
-        metric=norm.matrix,
-        isotropic=noise.isotropic,
-        gaussian=noise.gaussian,
-        times=times,
-    )
-    proof = Proof(
-        sampled=sampled, boxes=boxes, status=status, domain=where or model.domain_text, fingerprint=found.fingerprint
-    )
-    return replace(found, proof=proof)
-
-
 def constants_along(
     source: Any,
     times: ArrayLike,
@@ -316,7 +163,7 @@ def constants_along(
     noise = bound_noise(model, norm, pieces)
     largest = float(sampled[np.argmax(values)])
     where = f"the given boxes, one for each of {len(boxes)} time pieces up to {ends[-1]:g}"
-    return _record(model, norm, noise, values, largest, count, jacobian.remark("given metric"), ends, where)
+    return record(model, norm, noise, values, largest, count, jacobian.remark("given metric"), ends, where)
 
 
 def _piecewise(model: Model, jacobian: StateJacobian, norm: Metric, boxes: Interval, refine: int) -> tuple[Array, int]:
@@ -326,10 +173,10 @@ def _piecewise(model: Model, jacobian: StateJacobian, norm: Metric, boxes: Inter
     while True:
         direct = quantity(jacobian.enclose(parts))
         form = jacobian.spread(parts)
-        weights = _relative_widths(parts, jacobian.box)
+        weights = relative_widths(parts, jacobian.box)
         if form is not None:
             direct = np.minimum(direct, quantity(*form))
-            weights = _slope_weights(norm, form[1], weights)
+            weights = slope_weights(norm, form[1], weights)
         if len(parts) * 2 > refine * len(boxes) or not jacobian.active:
             break
         parts = split_boxes(parts, weights)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.constants.affine import AffineSet
 from certbound.constants.branching import random_points
+from certbound.constants.certification import certify
 from certbound.constants.derivatives import StateJacobian
 from certbound.constants.jacobians import JacobianSet, as_set
 from certbound.constants.models import Model, model_of
@@ -182,12 +183,10 @@ def bound_metrics(
 
     Source: "one metric per constraint", Sec. 4 and 6 of docs/theory.md.
     """
-    from certbound.constants.bounds import bound_constants
-
     if not isinstance(problem, Problem):
         raise TypeError(f"`problem` must be a Problem, got {type(problem).__name__}.")
-    euclidean = bound_constants(problem, domain, metric="euclidean", horizon=horizon)
     model = model_of(problem, domain, horizon)
+    euclidean = certify(model, None, tolerance=5e-3, budget=60_000)
     span = float(problem.horizon) if horizon is None else float(horizon)
     times, targets = constraint_targets(problem)
     share = (problem.delta if delta is None else delta) / len(problem.constraints)
@@ -330,8 +329,6 @@ def _tried(members: JacobianSet, propose: Callable[[JacobianSet], list[Proposal]
 
 
 def _certified(model: Model, proposal: Proposal) -> list[Constants]:
-    from certbound.constants.bounds import certify
-
     try:
         return [certify(model, proposal.metric, status=proposal.status, tolerance=2e-3, budget=60_000)]
     except (EnclosureError, InfeasibleError):

@@ -7,7 +7,8 @@ colour-blind readers lose nothing. Everything drawn here is a rendering of sets 
 
 from __future__ import annotations
 
-from certbound.plotting.scene import Scene, draw_scene, noisy_reach
+from certbound.plotting.picture import draw_scene
+from certbound.plotting.scene import Scene, noisy_reach
 from certbound.plotting.tubes import draw_tubes
 
 __all__ = ["Scene", "draw_scene", "draw_tubes", "noisy_reach"]

@@ -1,18 +1,14 @@
-"""The whole picture: the plane of the obstacles, where there is one, and every constraint over time."""
+"""What a picture shows, and in which colours."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.sets import Outside
-
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from certbound.problem.problem import Problem
     from certbound.reach.tube import ReachTube
     from certbound.safety.verification import Verdict
@@ -27,15 +23,14 @@ __all__ = [
     "VERMILION",
     "YELLOW",
     "Scene",
-    "draw_scene",
     "instants",
+    "noisy_reach",
 ]
 
 Array = NDArray[np.float64]
 
 INK, GREY, BLUE, VERMILION, YELLOW = "#000000", "#8c8c8c", "#0072B2", "#D55E00", "#F0E442"
 INNER, OUTER, RIM = "#86B9DD", "#C3E0F2", "#7a3500"
-PANELS = 6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -70,58 +65,6 @@ class Scene:
         return inner if self.tube is None else [(self.tube, OUTER), *inner]
 
 
-def draw_scene(scene: Scene) -> Figure:
-    """Draw a scene.
-
-    Parameters
-    ----------
-    scene : Scene
-        What to draw.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Not attached to pyplot; ``savefig`` works on it.
-    """
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
-    from certbound.plotting.panels import draw_panel, panels_of
-    from certbound.plotting.plane import draw_plane, plane_of
-
-    plane = plane_of(scene.problem)
-    every = panels_of(scene.problem)
-    shown = every[:PANELS]
-    style: Any = {
-        "font.size": 8,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "hatch.linewidth": 0.6,
-    }
-    with mpl.rc_context(style):
-        if plane is None:
-            columns = min(2, len(shown))
-            rows = -(-len(shown) // columns)
-            figure = Figure(figsize=(4.2 * columns, 2.2 * rows + 0.9), layout="constrained")
-            grid = figure.subplots(rows, columns, squeeze=False, sharex=True)
-        else:
-            figure = Figure(figsize=(9.6, max(4.8, 1.5 * len(shown) + 0.6)), layout="constrained")
-            halves: Any = figure.subfigures(1, 2, width_ratios=[1.15, 1])
-            left, right = halves
-            draw_plane(left.subplots(), scene, plane)
-            grid = right.subplots(len(shown), 1, squeeze=False, sharex=True)
-        for axes, panel in zip(grid.flat, shown):
-            draw_panel(axes, scene, panel)
-        for axes in grid.flat[len(shown) :]:
-            axes.set_visible(False)
-        for axes in grid[-1]:
-            axes.set_xlabel("time (s)" if scene.problem.system.time == "continuous" else "time (steps)")
-        rest = len(every) - len(shown)
-        figure.suptitle(scene.title + (f"  (and {rest} more constraints)" if rest else ""), fontsize=9)
-        figure.legend(handles=_legend(scene), loc="outside lower center", ncols=8, fontsize=7, frameon=False)
-    return figure
-
-
 def noisy_reach(verdict: Verdict) -> ReachTube | None:
     """The reach tube of a verdict with the stochastic deviation at the problem's delta, where there is one."""
     from certbound.reach.local import radius_over_pieces
@@ -145,23 +88,3 @@ def instants(tube: ReachTube, count: int = 400) -> Array:
     if tube.curve.continuous:
         return np.linspace(float(tube.curve.starts[0]), tube.end, count)
     return np.asarray(tube.curve.starts)
-
-
-def _legend(scene: Scene) -> list[Any]:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    obstacles = any(isinstance(constraint, Outside) for constraint in scene.problem.safe)
-    handles: list[Any] = [Line2D([], [], color=INK, linewidth=1.2, label="nominal")]
-    handles.append(Patch(facecolor=INNER, label="noise-free"))
-    if scene.tube is not None:
-        handles.append(Patch(facecolor=OUTER, label="with noise"))
-    if scene.tube is not None and obstacles:
-        handles.append(Line2D([], [], color=BLUE, linewidth=1.2, label="certified least distance"))
-    if scene.paths is not None:
-        handles.append(Line2D([], [], color=GREY, linewidth=0.8, label=f"{len(scene.paths)} sample paths"))
-    handles.append(Line2D([], [], color=VERMILION, linestyle=(0, (5, 2)), linewidth=1.2, label="limit"))
-    if obstacles:
-        handles.append(Patch(facecolor=VERMILION, hatch="////", edgecolor=RIM, label="obstacle"))
-        handles.append(Patch(facecolor=YELLOW, alpha=0.6, label="eroded"))
-    return handles

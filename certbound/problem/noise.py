@@ -26,11 +26,11 @@ class Law:
 
     name = "law"
     gaussian = False
-    _levels: tuple[str, ...] = ()
+    levels: tuple[str, ...] = ()
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         if args:
-            levels = " or ".join(f"{level}=" for level in cls._levels)
+            levels = " or ".join(f"{level}=" for level in cls.levels)
             raise TypeError(f"{cls.__name__} takes no bare value, got {args[0]!r}; say {levels}.")
         return super().__new__(cls)
 
@@ -90,17 +90,17 @@ class _Quadratic(Law):
     """A law given by a standard deviation, a variance or a covariance (or proxies of these)."""
 
     def __post_init__(self) -> None:
-        kind = _one_of(self, self._levels)
+        kind = _one_of(self, self.levels)
         value = getattr(self, kind)
         if kind.endswith("covariance"):
             object.__setattr__(self, kind, positive_definite(kind, value, strict=False))
             return
         if np.ndim(value) > 1:
-            raise ValueError(f"`{kind}` must be a number or a vector; a matrix is a {self._levels[2]}=.")
+            raise ValueError(f"`{kind}` must be a number or a vector; a matrix is a {self.levels[2]}=.")
         object.__setattr__(self, kind, _level(kind, value))
 
     def resolve(self, dimension: int) -> Self:
-        kind = _one_of(self, self._levels)
+        kind = _one_of(self, self.levels)
         value = getattr(self, kind)
         if kind.endswith("covariance"):
             if len(value) != dimension:
@@ -111,7 +111,7 @@ class _Quadratic(Law):
 
     @property
     def proxy(self) -> Array:
-        kind = _one_of(self, self._levels)
+        kind = _one_of(self, self.levels)
         value: Array = getattr(self, kind)
         if kind.endswith("covariance"):
             return value
@@ -142,7 +142,7 @@ class Gaussian(_Quadratic):
 
     name = "gaussian"
     gaussian = True
-    _levels = ("std", "variance", "covariance")
+    levels = ("std", "variance", "covariance")
 
     def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
         return _normal(rng, size, self.factor)
@@ -150,7 +150,7 @@ class Gaussian(_Quadratic):
     @property
     def factor(self) -> Array:
         """A matrix F with F F' equal to the covariance, up to rounding."""
-        kind = _one_of(self, self._levels)
+        kind = _one_of(self, self.levels)
         if kind == "covariance":
             values, vectors = np.linalg.eigh(self.covariance)
             return frozen(vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -179,7 +179,7 @@ class SubGaussian(_Quadratic):
     proxy_covariance: Any = None
 
     name = "subgaussian"
-    _levels = ("proxy_std", "proxy_variance", "proxy_covariance")
+    levels = ("proxy_std", "proxy_variance", "proxy_covariance")
 
     def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
         raise ValueError(
@@ -227,7 +227,7 @@ class Uniform(_Box):
     halfwidth: Any
 
     name = "uniform"
-    _levels = ("halfwidth",)
+    levels = ("halfwidth",)
 
     @property
     def proxy(self) -> Array:
@@ -251,7 +251,7 @@ class Rademacher(_Box):
     scale: Any
 
     name = "rademacher"
-    _levels = ("scale",)
+    levels = ("scale",)
     _level_name = "scale"
 
     def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
@@ -282,7 +282,7 @@ class Bounded(_Box):
     independent: bool = True
 
     name = "bounded"
-    _levels = ("halfwidth",)
+    levels = ("halfwidth",)
 
     def _options(self) -> dict[str, Any]:
         return {"independent": self.independent}

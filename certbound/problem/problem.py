@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.display import Shown, name_text
+from certbound.display import Shown, ask_later_room, name_text
 from certbound.problem.checks import frozen, nearest, number, positive_definite, vector
 from certbound.problem.initial import check_start
 from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, Inside, Outside
@@ -163,9 +163,8 @@ class Problem(Shown):
         ValueError
             If the model uses what problem files do not have (np.where, ...).
         """
-        from certbound.problem.writing import content_of
-
-        return content_of(self, f"{self.name}.plan.json")
+        content: dict[str, Any] = ask_later_room("content", self, f"{self.name}.plan.json")
+        return content
 
     def replace(self, **changes: Any) -> Problem:
         """The same problem with other values of some arguments; everything is checked again.

@@ -65,13 +65,14 @@ class Region:
     def support(self, directions: ArrayLike, t: float = 0.0) -> Array:
         """max a.x over the set at time t, for directions a of shape (..., n); inf where unbounded."""
         raw = np.asarray(directions, dtype=float)
-        value = self._support(self.local(raw), t)
+        value = self.local_support(self.local(raw), t)
         if self.coordinates is None:
             return value
         rest = np.delete(raw, list(self.coordinates), axis=-1)
         return np.where(np.any(rest != 0, axis=-1), np.inf, value)
 
-    def _support(self, directions: Array, t: float) -> Array:
+    def local_support(self, directions: Array, t: float) -> Array:
+        """`support` along directions of the coordinates that the set bounds."""
         raise NotImplementedError
 
     def sample(self, rng: np.random.Generator, count: int, t: float = 0.0) -> Array:
@@ -156,7 +157,7 @@ class Box(Region):
         y = self.local(x) - self.center_at(t)
         return np.asarray(np.all((self.low <= y) & (y <= self.high), axis=-1))
 
-    def _support(self, directions: Array, t: float) -> Array:
+    def local_support(self, directions: Array, t: float) -> Array:
         ends = np.where(directions > 0, self.high, self.low)
         terms = np.where(directions == 0, 0.0, directions) * np.where(directions == 0, 0.0, ends)
         return np.asarray(np.sum(terms, axis=-1) + directions @ self.center_at(t))
@@ -209,7 +210,7 @@ class Ball(Region):
     def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
         return np.asarray(np.linalg.norm(self.local(x) - self.center_at(t), axis=-1) <= self.radius)
 
-    def _support(self, directions: Array, t: float) -> Array:
+    def local_support(self, directions: Array, t: float) -> Array:
         return np.asarray(directions @ self.center_at(t) + self.radius * np.linalg.norm(directions, axis=-1))
 
     def sample(self, rng: np.random.Generator, count: int, t: float = 0.0) -> Array:
@@ -249,7 +250,7 @@ class Ellipsoid(Region):
         y = self.local(x) - self.center_at(t)
         return np.asarray(np.einsum("...i,...i->...", y, y @ np.linalg.inv(self.shape)) <= 1.0)
 
-    def _support(self, directions: Array, t: float) -> Array:
+    def local_support(self, directions: Array, t: float) -> Array:
         spread = np.sqrt(np.einsum("...i,...i->...", directions, directions @ self.shape))
         return np.asarray(directions @ self.center_at(t) + spread)
 
@@ -296,7 +297,7 @@ class HalfSpace(Region):
     def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
         return np.asarray(self.local(x) @ self.normal <= self.bound)
 
-    def _support(self, directions: Array, t: float) -> Array:
+    def local_support(self, directions: Array, t: float) -> Array:
         scale = directions @ self.normal / (self.normal @ self.normal)
         residual = np.linalg.norm(directions - scale[..., None] * self.normal, axis=-1)
         parallel = residual <= 1e-14 * np.linalg.norm(directions, axis=-1)
@@ -343,7 +344,7 @@ class Polytope(Region):
     def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
         return np.asarray(np.all(self.local(x) @ self.A.T <= self.b, axis=-1))
 
-    def _support(self, directions: Array, t: float) -> Array:
+    def local_support(self, directions: Array, t: float) -> Array:
         flat = directions.reshape(-1, self.dimension)
         values = [_linear_maximum(self.A, self.b, direction) for direction in flat]
         return np.array(values, dtype=float).reshape(directions.shape[:-1])

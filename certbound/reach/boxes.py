@@ -12,19 +12,16 @@ everything that is a radius is summed in floats and widened by a bound of the ro
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certbound.constants.enclosures import enclose
+from certbound.reach.derivatives import Derivatives
+from certbound.reach.frame import Frame
 from certbound.reach.polytope import linear_range
 from certbound.reach.still import Still
 from certbound.rigor.intervals import Interval
-
-if TYPE_CHECKING:
-    from certbound.reach.frame import Frame
-    from certbound.reach.remainder import Remainder
 
 __all__ = ["Expansion", "Parts"]
 
@@ -59,7 +56,7 @@ class Parts:
 class Expansion:
     """Expansions of one model over the pieces of one frame."""
 
-    def __init__(self, model: Remainder, frame: Frame) -> None:
+    def __init__(self, model: Derivatives, frame: Frame) -> None:
         self.model, self.frame, self.active = model, frame, model.active
         n = frame.spread.shape[1]
         position = {int(state): a for a, state in enumerate(self.active)}

@@ -17,7 +17,7 @@ Source: set erosion, Thm 1 and Prop 4 (paper), with the nominal piece enclosed a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +32,36 @@ from certbound.reach.series import Series, expand, polynomial_range, series_prod
 from certbound.rigor import intervals as iv
 from certbound.rigor.intervals import Interval
 
-if TYPE_CHECKING:
-    from certbound.reach.tube import ReachTube
-
 __all__ = ["Clearance", "constraint_clearance"]
 
 Array = NDArray[np.float64]
+
+
+class Sets(Protocol):
+    """What is read of a reach tube: its curve, and the sets about it (see `ReachTube`)."""
+
+    @property
+    def curve(self) -> Curve:
+        """The nominal curve of every cell."""
+
+    @property
+    def norm(self) -> Norm:
+        """The norm of ``radius``."""
+
+    @property
+    def radius(self) -> Array:
+        """Radius per cell and piece."""
+
+    @property
+    def generators(self) -> Array | None:
+        """Of a zonotope."""
+
+    @property
+    def box(self) -> Interval | None:
+        """And of a box."""
+
+    def spread(self, directions: Interval) -> Array:
+        """Support of the sets about the curve."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -56,7 +80,7 @@ class Clearance:
     factor: Array
 
 
-def constraint_clearance(tube: ReachTube, constraint: Inside, norm: Norm) -> Clearance:
+def constraint_clearance(tube: Sets, constraint: Inside, norm: Norm) -> Clearance:
     """Room of ``constraint`` around the sets of ``tube``, measured in ``norm``."""
     curve = tube.curve
     asked, span = _window(curve, constraint)
@@ -127,7 +151,7 @@ def _lift(direction: Interval, region: Region, dimension: int) -> Interval:
     return Interval(low, high)
 
 
-def _room(tube: ReachTube, norm: Norm, gap: Interval, lifted: Interval) -> tuple[Array, Array]:
+def _room(tube: Sets, norm: Norm, gap: Interval, lifted: Interval) -> tuple[Array, Array]:
     """(gap - spread)/dual length per cell and piece, and the Euclidean length of a unit of it."""
     spread = Interval.point(tube.spread(lifted))
     room = (gap - spread).lo
@@ -148,7 +172,7 @@ def _least(radius: Array, factor: Array) -> Clearance:
     return Clearance(radius=flat[index, columns], factor=scale[index, columns])
 
 
-def _inside(tube: ReachTube, region: Region, norm: Norm, relative: list[Series], span: Interval) -> Clearance:
+def _inside(tube: Sets, region: Region, norm: Norm, relative: list[Series], span: Interval) -> Clearance:
     if isinstance(region, (Ball, Ellipsoid)):
         return _inside_round(tube, region, norm, relative, span)
     faces, bounds = region.halfspaces()
@@ -165,7 +189,7 @@ def _inside(tube: ReachTube, region: Region, norm: Norm, relative: list[Series],
 
 
 def _inside_round(
-    tube: ReachTube, region: Ball | Ellipsoid, norm: Norm, relative: list[Series], span: Interval
+    tube: Sets, region: Ball | Ellipsoid, norm: Norm, relative: list[Series], span: Interval
 ) -> Clearance:
     n, size = tube.curve.dimension, region.dimension
     if isinstance(region, Ball):
@@ -215,7 +239,7 @@ def _added(x: Series, y: Series) -> Series:
 
 
 def _outside(
-    tube: ReachTube, region: Region, norm: Norm, relative: list[Series], span: Interval
+    tube: Sets, region: Region, norm: Norm, relative: list[Series], span: Interval
 ) -> Clearance:
     """The best of a few separating directions per cell and piece."""
     shape = (tube.curve.cells, tube.curve.pieces)

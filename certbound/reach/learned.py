@@ -1,4 +1,4 @@
-"""Reachable sets learned by Gaussian-process classification: a statistical statement, like `certbound.reach.sampled`.
+"""Reachable sets learned by Gaussian-process classification: a statistical statement, no proof.
 
 Whether a state is reachable at a time t is a question with a yes or a no, and a simulation answers it: the noise-free
 model, run backwards from that state, ends in the initial set or not (for some of a few constant disturbances). A

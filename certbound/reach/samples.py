@@ -7,16 +7,13 @@ fit over them is a slope Jhat that leaves less to the remainder than the Jacobia
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.trace import compile_numpy
-
-if TYPE_CHECKING:
-    from certbound.reach.frame import Frame
-    from certbound.reach.remainder import Remainder
+from certbound.reach.derivatives import Derivatives
+from certbound.reach.frame import Frame
 
 __all__ = ["fitted_slopes", "sampled_range"]
 
@@ -24,15 +21,16 @@ Array = NDArray[np.float64]
 
 _POINTS = {1: 17, 2: 9, 3: 7, 4: 3, 5: 3, 6: 3}
 _DIRECTIONS = 64
-_NEGLIGIBLE = 1e-9
+_NEGLIGIBLE = 1e-9  # of the widest deviation of a state
+_ROUNDING = 1e-13  # of the nominal state
 
 
-def sampled_range(model: Remainder, frame: Frame, low: Array, high: Array, rows: Array) -> tuple[Array, Array]:
+def sampled_range(model: Derivatives, frame: Frame, low: Array, high: Array, rows: Array) -> tuple[Array, Array]:
     """Range of beta at the middle of every piece over the points: two arrays (M, n).
 
     Parameters
     ----------
-    model : Remainder
+    model : Derivatives
     frame : Frame
     low, high : ndarray, shape (M, D)
         Bounds of s along the active coordinates (first) and along ``rows``.
@@ -49,7 +47,7 @@ def sampled_range(model: Remainder, frame: Frame, low: Array, high: Array, rows:
     return lower, upper
 
 
-def fitted_slopes(model: Remainder, frame: Frame, low: Array, high: Array, rows: Array) -> Array:
+def fitted_slopes(model: Derivatives, frame: Frame, low: Array, high: Array, rows: Array) -> Array:
     """What to add to the slope at the middle of every piece: the affine fit of beta over the points, (M, n, n).
 
     Constant entries of the Jacobian keep their values.
@@ -60,7 +58,8 @@ def fitted_slopes(model: Remainder, frame: Frame, low: Array, high: Array, rows:
     for group in model.blocks:
         shift, half = _points(model, group, low, high, rows)
         values = _remainder(model, frame, shift)
-        scale = np.where(half > _NEGLIGIBLE, half, np.inf)
+        moving = (half > _NEGLIGIBLE * half.max(axis=0)) & (half > _ROUNDING * np.abs(frame.middle.mid[:, model.active]))
+        scale = np.where(moving, half, np.inf)
         for i in range(n):
             states = [j for o, j in model.entries if o == i and any(position[j] in block for block in group)]
             if not states:
@@ -76,7 +75,7 @@ def fitted_slopes(model: Remainder, frame: Frame, low: Array, high: Array, rows:
 
 
 def _points(
-    model: Remainder, group: list[list[int]], low: Array, high: Array, rows: Array
+    model: Derivatives, group: list[list[int]], low: Array, high: Array, rows: Array
 ) -> tuple[Array, Array]:
     """Points (M, K, active) of the polytope that move the blocks of one group, and the half-widths (M, active)."""
     count, size = len(model.active), len(group[0])
@@ -100,7 +99,7 @@ def _points(
     return shift + step, half
 
 
-def _remainder(model: Remainder, frame: Frame, shift: Array) -> Array:
+def _remainder(model: Derivatives, frame: Frame, shift: Array) -> Array:
     """beta in floats at the middle of the pieces for deviations ``shift`` (M, K, active): (M, K, n)."""
     m, points = shift.shape[:2]
     n = frame.spread.shape[1]

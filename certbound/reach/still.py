@@ -8,19 +8,16 @@ first order in s: bounding it beside what holds at s = 0 keeps the two from bein
 from __future__ import annotations
 
 from math import comb
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certbound.constants.enclosures import enclose
+from certbound.problem.tape import Tape
+from certbound.reach.derivatives import Derivatives
+from certbound.reach.frame import Frame
 from certbound.reach.series import Series, expand, polynomial_range, taylor_bounds
 from certbound.rigor.intervals import Interval, stack
-
-if TYPE_CHECKING:
-    from certbound.problem.tape import Tape
-    from certbound.reach.frame import Frame
-    from certbound.reach.remainder import Remainder
 
 __all__ = ["Still", "bound_defect_over_pieces"]
 
@@ -51,7 +48,7 @@ class Still:
     curve : ndarray, shape (M, n)
     """
 
-    def __init__(self, model: Remainder, frame: Frame) -> None:
+    def __init__(self, model: Derivatives, frame: Frame) -> None:
         n, count = frame.spread.shape[1], len(frame)
         reach = frame.spread * (1 + 1e-14)
         thin = model.slots(frame.middle_time, frame.middle, frame.inputs, frame.disturbance_middle)
@@ -82,7 +79,7 @@ class Still:
         self.curve = np.where(known, 0.0, (_product(constant, frame.acceleration) - frame.jerk).mag)
 
 
-def bound_defect_over_pieces(model: Remainder, frame: Frame) -> Interval:
+def bound_defect_over_pieces(model: Derivatives, frame: Frame) -> Interval:
     """Enclosure of f(p, d0) - p' over every piece, shape (M, n); infinite where it is not expanded.
 
     Proves: the difference lies in the box at every t of the piece, by Taylor expansion with Lagrange's remainder about

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.display import Shown, log10_text
 from certbound.problem.sets import Inside
+from certbound.reach.clearance import constraint_clearance
 from certbound.reach.curve import Curve
 from certbound.reach.norms import Norm
 from certbound.reach.series import polynomial_range
@@ -248,8 +249,6 @@ class ReachTube(Shown):
 
         Negative: the set of some piece breaks it, or could not be shown not to.
         """
-        from certbound.reach.clearance import constraint_clearance
-
         room = constraint_clearance(self, constraint, Norm(self.curve.dimension))
         return float(np.min(room.radius, initial=np.inf))
 

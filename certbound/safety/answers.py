@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from flint import arb
@@ -17,7 +17,7 @@ from certbound.reach.tube import ReachTube
 from certbound.rigor.balls import lower, precision
 from certbound.tubes.constants import Constants
 
-__all__ = ["Deviation", "EngineAnswer", "is_at_most", "settled"]
+__all__ = ["Answered", "Deviation", "EngineAnswer", "is_at_most", "settled"]
 
 Array = NDArray[np.float64]
 
@@ -118,6 +118,22 @@ class EngineAnswer:
     foresight: bool = False
     details: Any = None
     conclusive: bool = False
+
+
+class Answered(Protocol):
+    """What a certificate needs of a verdict."""
+
+    @property
+    def status(self) -> str:
+        """SAFE, UNKNOWN or UNSAFE."""
+
+    @property
+    def reason(self) -> str:
+        """In one sentence."""
+
+    @property
+    def answers(self) -> Mapping[str, EngineAnswer]:
+        """What each engine answered, by its name."""
 
 
 def is_at_most(log10_delta: float, target: float) -> bool:

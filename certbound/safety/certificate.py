@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,40 +17,19 @@ from certbound.errors import CertificateError
 from certbound.problem.noise import Law
 from certbound.problem.problem import Problem
 from certbound.problem.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
-from certbound.problem.sets import GaussianStart, Inside, Outside
+from certbound.problem.sets import GaussianStart, Outside
 from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
-from certbound.safety.answers import EngineAnswer, is_at_most
+from certbound.safety.answers import Answered, EngineAnswer, is_at_most
+from certbound.safety.certificate_parts import Proof, exact
 
-if TYPE_CHECKING:
-    from certbound.safety.verification import Verdict
-
-__all__ = [
-    "FORMAT", "VERSION", "certificate_data", "certificate_text", "exact", "needs_direction", "problem_data",
-    "restated",
-]  # fmt: skip
+__all__ = ["FORMAT", "VERSION", "certificate_data", "certificate_text", "problem_data", "restated"]
 
 FORMAT = "certbound certificate"
 VERSION = 1
 _ROUNDING = 1e-6  # other versions of the ball arithmetic may round otherwise
 
-Proof = tuple[dict[str, Any], float, list[str]]
-
-
-def exact(value: Any) -> Any:
-    """Floats as hexadecimal strings, arrays as nested lists of them."""
-    if isinstance(value, (float, np.floating)):
-        if not np.isfinite(value):
-            raise CertificateError(f"the proof holds the number {value}, which no certificate can state.")
-        return float(value).hex()
-    if isinstance(value, np.ndarray):
-        return exact(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [exact(item) for item in value]
-    return value
-
-
-def certificate_text(problem: Problem, verdict: Verdict, *, attempt: int = 0) -> str:
+def certificate_text(problem: Problem, verdict: Answered, *, attempt: int = 0) -> str:
     """The certificate of a verdict as the text of a JSON file; see `certificate_data`."""
     return json.dumps(certificate_data(problem, verdict, attempt=attempt), separators=(",", ":")) + "\n"
 
@@ -69,7 +48,7 @@ def restated(text: str, log10_proved: float) -> str:
     return json.dumps(data, separators=(",", ":")) + "\n"
 
 
-def certificate_data(problem: Problem, verdict: Verdict, *, attempt: int = 0) -> dict[str, Any]:
+def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -> dict[str, Any]:
     """The certificate of a verdict: P(some constraint is broken) <= 10**claim, with what proves it.
 
     The claim rests on inequalities that the checker knows, and may be weaker than the verdict's ``log10_delta``. Where
@@ -113,7 +92,7 @@ def certificate_data(problem: Problem, verdict: Verdict, *, attempt: int = 0) ->
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
 
 
-def _answers(problem: Problem, verdict: Verdict) -> Iterator[tuple[str, EngineAnswer]]:
+def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineAnswer]]:
     """Engines that bounded a probability, the best first; then a barrier, where that was not asked for.
 
     What a certificate states can be weaker than what its engine proved, so that another engine's may be needed.
@@ -136,9 +115,7 @@ def _answers(problem: Problem, verdict: Verdict) -> Iterator[tuple[str, EngineAn
 
 def _writer(name: str) -> Callable[[Problem, EngineAnswer, int], Proof]:
     if name == "linear":
-        from certbound.safety.certificate_linear import linear_proof
-
-        return linear_proof
+        return _linear_proof
     if name == "barrier":
         from certbound.safety.certificate_barrier import barrier_proof
 
@@ -146,6 +123,18 @@ def _writer(name: str) -> Callable[[Problem, EngineAnswer, int], Proof]:
     from certbound.safety.certificate_constants import constants_proof
 
     return constants_proof
+
+
+def _linear_proof(problem: Problem, answer: EngineAnswer, attempt: int) -> Proof:
+    from certbound.reach.diffusion import depends_on_state
+
+    if depends_on_state(problem):
+        from certbound.safety.certificate_diffusion import diffusion_proof
+
+        return diffusion_proof(problem, answer, attempt)
+    from certbound.safety.certificate_linear import linear_proof
+
+    return linear_proof(problem, answer, attempt)
 
 
 # ---- the problem -------------------------------------------------------------------------------------------
@@ -190,11 +179,6 @@ def problem_data(problem: Problem) -> dict[str, Any]:
     }
 
 
-def needs_direction(constraint: Inside) -> bool:
-    """Whether the proof names a direction that keeps the obstacle off, piece by piece."""
-    return isinstance(constraint, Outside) and not isinstance(constraint.region, HalfSpace)
-
-
 def tape_data(tape: Tape) -> dict[str, Any]:
     """A tape's operations: [op, ...arguments], ["const", value], ["pow", argument, exponent]."""
     nodes: list[list[Any]] = []
@@ -224,7 +208,7 @@ def _noise(system: Any) -> dict[str, Any]:
             return {"law": "wiener", "diffusion": {"columns": int(g.shape[1]), **tape_data(g)}}
         return {"law": "wiener", "diffusion": exact(np.asarray(g, dtype=float))}
     law: Law = system.noise
-    level = next(name for name in law._levels if getattr(law, name) is not None)
+    level = next(name for name in law.levels if getattr(law, name) is not None)
     data = {
         "law": law.name,
         "level": level.removeprefix("proxy_"),

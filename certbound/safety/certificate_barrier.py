@@ -10,7 +10,7 @@ from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.barrier import Barrier
-from certbound.safety.certificate import Proof, exact
+from certbound.safety.certificate_parts import Proof, exact
 
 __all__ = ["barrier_proof"]
 

@@ -25,7 +25,7 @@ from certbound.reach.norms import Norm
 from certbound.reach.separation import polyhedral_weights, round_directions
 from certbound.reach.tube import ReachTube
 from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificate import Proof, exact, needs_direction
+from certbound.safety.certificate_parts import Proof, exact, needs_direction
 from certbound.safety.erosion import Erosion, erode
 from certbound.safety.levels import joined, random_start
 from certbound.tubes.constants import Constants
@@ -134,7 +134,9 @@ def _rounded(given: Constants, slack: float) -> Constants:
 
 def _smallest(curve: Curve, norm: Norm) -> float:
     """A unit for what is nearly 0: the size of the nominal states."""
-    return 1e-3 * float(np.max(norm.dual(np.eye(curve.dimension)))) * (1e-3 + float(np.abs(curve.coefficients).max()))
+    return 1e-3 * float(np.max(norm.dual(np.eye(curve.dimension)))) * (
+        float(np.abs(curve.coefficients[..., 0, :]).max()) or 1.0
+    )
 
 
 def _cells_along(curve: Curve) -> int:

@@ -20,8 +20,18 @@ from certbound.reach.events import WindowEvents, logsumexp
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.martingales import MartingaleEvent, Martingales, SplitEvents
 from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificate import Proof, exact
-from certbound.safety.certificate_linear import EFFORTS, PADS, SLACK, WINDOW, Stated, grids, proof_data, widened
+from certbound.safety.certificate_linear import (
+    EFFORTS,
+    PADS,
+    SLACK,
+    WINDOW,
+    Stated,
+    engine_of,
+    grids,
+    proof_data,
+    widened,
+)
+from certbound.safety.certificate_parts import Proof, exact
 
 __all__ = ["diffusion_proof"]
 
@@ -47,7 +57,7 @@ def diffusion_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
     """
     effort = min(attempt, EFFORTS - 1)
     found = answer.details
-    engine: Linearisation = found.run.engine
+    engine = engine_of(answer)
     target = math.log(problem.delta)
     shares = list(dict.fromkeys([found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]))
     best: tuple[_StatedRun, Stated] | None = None
@@ -96,7 +106,7 @@ class _StatedRun(DiffusionRun):
         self.held = found[0]
         count = len(self.engine.model.active)
         levels, _ = self.levels(log_nonlinear)
-        reached = self._deviations(levels * _MOVED, *found[1])
+        reached = self.deviations(levels * _MOVED, *found[1])
         if reached is None:
             return None
         low, high = _wider(reached[0][:, :count], reached[1][:, :count], _WIDER)
@@ -109,7 +119,7 @@ class _StatedRun(DiffusionRun):
             levels = levels * _MOVED + 1e-280
             bounds = self.include(levels, 2) if np.isfinite(levels).all() else None
             boxes = None if bounds is None else widened(self, levels, bounds, pad)
-            reached = None if boxes is None else self._deviations(levels, *boxes)
+            reached = None if boxes is None else self.deviations(levels, *boxes)
             if boxes is None or reached is None:
                 return None
             needed = _wider(reached[0][:, :count], reached[1][:, :count], _INSIDE)
@@ -168,7 +178,7 @@ class _StatedRun(DiffusionRun):
 
 
 def _wider(low: Array, high: Array, share: float) -> tuple[Array, Array]:
-    room = share * (high - low) + 1e-12
+    room = share * (high - low) + 1e-12 * (high - low).max(axis=0)
     return low - room, high + room
 
 

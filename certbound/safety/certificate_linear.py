@@ -24,15 +24,16 @@ from certbound.problem.sets import Inside
 from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Tape
 from certbound.problem.trace import compile_numpy, jacobian
-from certbound.reach.diffusion import depends_on_state
 from certbound.reach.events import StepEvents, WindowEvents, logsumexp
 from certbound.reach.linear import LinearRun, correlated, level_scale
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.tapes import varying_outputs
 from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificate import Proof, exact, needs_direction
+from certbound.safety.certificate_parts import Proof, exact, needs_direction
 
-__all__ = ["EFFORTS", "PADS", "SLACK", "WINDOW", "Stated", "grids", "linear_proof", "proof_data", "widened"]
+__all__ = [
+    "EFFORTS", "PADS", "SLACK", "WINDOW", "Stated", "engine_of", "grids", "linear_proof", "proof_data", "widened",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Events = StepEvents | WindowEvents
@@ -60,13 +61,7 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     """
     effort = min(attempt, EFFORTS - 1)
     found = answer.details
-    engine: Linearisation = found.run.engine
-    if not engine.pieces or found.outcome.bounds is None:
-        raise CertificateError("the linear response bounds nothing here.")
-    if depends_on_state(problem):
-        from certbound.safety.certificate_diffusion import diffusion_proof
-
-        return diffusion_proof(problem, answer, attempt)
+    engine = engine_of(answer)
     target = math.log(problem.delta)
     tried = [found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]
     if not len(engine.model.active):  # only windows ask for a share
@@ -85,6 +80,21 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     exact_sums = not engine.continuous and effort == 0 and log10 > _LIKELY
     slack = SLACK * (0.01 if exact_sums else 1 + 0.1 * abs(log10))
     return proof_data(problem, *best), min(log10 + slack, 0.0), []
+
+
+def engine_of(answer: EngineAnswer) -> Linearisation:
+    """The linearisation that an answer rests on.
+
+    Raises
+    ------
+    CertificateError
+        If it bounds nothing.
+    """
+    found = answer.details
+    engine: Linearisation = found.run.engine
+    if not engine.pieces or found.outcome.bounds is None:
+        raise CertificateError("the linear response bounds nothing here.")
+    return engine
 
 
 def grids(engine: Linearisation, effort: int) -> Iterator[Linearisation]:
@@ -216,17 +226,17 @@ def widened(run: LinearRun, levels: Array, found: tuple[Array, Array], pad: floa
     """
     engine, shape = run.engine, found[0].shape
     extra = run.extra.reshape(shape[0] * shape[1], *run.extra.shape[2:])
-    boxes = _padded(found, pad)
+    boxes = _padded(engine, found, pad)
     for _ in range(_ROUNDS):
-        held = _implied(run, levels, _padded(boxes, pad / 2))
+        held = _implied(run, levels, _padded(engine, boxes, pad / 2))
         if held is None:
             return None
-        wanted = [part.reshape(-1, engine.n) for part in _padded(found, pad / 2)]
+        wanted = [part.reshape(-1, engine.n) for part in _padded(engine, found, pad / 2)]
         bound = engine.model.bound(engine.frame, *held, extra, 2, (wanted[0], wanted[1]))
         inner = bound[0].reshape(shape), bound[1].reshape(shape)
         if not all(np.isfinite(part).all() for part in inner):
             return None
-        boxes = _padded(inner, pad / 2)
+        boxes = _padded(engine, inner, pad / 2)
         implied = _implied(run, levels, boxes)
         if implied is None:
             return None
@@ -246,10 +256,10 @@ def _implied(run: LinearRun, levels: Array, boxes: tuple[Array, Array]) -> tuple
     return low - slack, high + slack
 
 
-def _padded(bounds: tuple[Array, Array], pad: float) -> tuple[Array, Array]:
+def _padded(engine: Linearisation, bounds: tuple[Array, Array], pad: float) -> tuple[Array, Array]:
     low, high = bounds
     size = np.maximum(np.abs(low), np.abs(high))
-    room = pad * (high - low) + 1e-9 * size + pad * 1e-11
+    room = pad * (high - low) + 1e-9 * size + pad * 1e-11 * engine.remainder_sizes
     return low - room, high + room
 
 

@@ -145,7 +145,7 @@ def _middle(region: Region, dimension: int) -> Array:
         full[places] = region.center_at(0.0)
     else:
         eye = np.eye(len(places))
-        full[places] = (region._support(eye, 0.0) - region._support(-eye, 0.0)) / 2
+        full[places] = (region.local_support(eye, 0.0) - region.local_support(-eye, 0.0)) / 2
     return full
 
 

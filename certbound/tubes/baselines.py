@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.tubes.constants import Constants
-from certbound.tubes.kummer import check_delta
+from certbound.tubes.constants import Constants, check_delta
 from certbound.tubes.objective import Objective
 from certbound.tubes.paper import RootProfile, Tail, best_epsilon, best_growth, growth, sharp_tail
 from certbound.tubes.schedule import Schedule, integral, make_schedule

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.display import Shown, plain, span_text
 
-__all__ = ["Constants", "Proof"]
+__all__ = ["Constants", "Proof", "check_delta"]
 
 Array = NDArray[np.float64]
 
@@ -278,3 +278,11 @@ def _checked_metric(metric: ArrayLike, dimension: int) -> Array:
     if smallest <= 0:
         raise ValueError(f"`metric` must be positive definite, its smallest eigenvalue is {smallest:.3g}.")
     return matrix
+
+
+def check_delta(delta: float) -> float:
+    """``delta`` as a float in (0, 1)."""
+    value = float(delta)
+    if not 0 < value < 1:
+        raise ValueError(f"`delta` must lie in (0, 1), got {delta}.")
+    return value

@@ -12,13 +12,13 @@ from flint import arb
 from certbound.rigor.balls import excess_floor, excess_tangent, lower, precision, upper
 from certbound.tubes.ballpath import ball_path
 from certbound.tubes.kummer import Start, initial_ball, phi_ball
+from certbound.tubes.line_search import golden
 from certbound.tubes.objective import Clearance
-from certbound.tubes.paper import golden
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.search import log_gain
 from certbound.tubes.series import log_excess_one, log_phi_one
 
-__all__ = ["exit_level", "union_level", "union_may_help"]
+__all__ = ["Tangents", "exit_level", "union_level", "union_may_help"]
 
 _MOST_UNIONS = 128
 _LOSS = 1e-3  # of a logarithm, from a tangent instead of the function
@@ -107,7 +107,7 @@ def best_power(half: float, x: float) -> float:
     return math.exp(golden(level, middle - 2.5, middle + 0.5, 1e-2))
 
 
-class _Tangents:
+class Tangents:
     """Lower bounds of E_a by tangents of log E_a over log z: convex, since the series has no negative coefficient."""
 
     def __init__(self, a: arb, half: float, bessel: bool) -> None:
@@ -148,7 +148,7 @@ class _Gain:
         self.power, self.unit = arb(a), arb(schedule.unit)
         self.half, self.bessel = schedule.nu / 2, bessel
         self._states: dict[tuple[int, float], tuple[arb, arb]] = {}
-        self.tangents = _Tangents(self.power, self.half, bessel)
+        self.tangents = Tangents(self.power, self.half, bessel)
         self.initial = initial_ball(self.path, a, start)
         self.first = 0.0 if schedule.continuous or start.sigma > 0 else 1.0
 

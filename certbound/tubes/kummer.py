@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 
 from certbound.rigor.balls import bessel_excess, excess_floor, kummer_excess, lower, precision, solve_upward, upper
 from certbound.tubes.ballpath import BallPath, ball_path
-from certbound.tubes.constants import Constants
+from certbound.tubes.constants import Constants, check_delta
 from certbound.tubes.schedule import Schedule, make_schedule
 from certbound.tubes.series import log_excess_one, log_phi, log_phi_one, solve_excess, solve_excess_one
 from certbound.tubes.tube import Tube
 
-__all__ = ["KummerProfile", "Start", "check_delta", "kummer_tube", "log_initial", "log_target"]
+__all__ = ["KummerProfile", "Start", "kummer_tube", "log_initial", "log_target"]
 
 Array = NDArray[np.float64]
 
@@ -280,14 +280,6 @@ def kummer_tube(
         method="bessel" if bessel else "kummer", parameters={"a": float(a), "v0": float(v0)}, level="trajectory",
         certified=True, delta=delta, horizon=float(horizon), constants=constants, objective=None, profile=profile,
     )  # fmt: skip
-
-
-def check_delta(delta: float) -> float:
-    """``delta`` as a float in (0, 1)."""
-    value = float(delta)
-    if not 0 < value < 1:
-        raise ValueError(f"`delta` must lie in (0, 1), got {delta}.")
-    return value
 
 
 def check_power(schedule: Schedule, a: float, *, bessel: bool) -> None:

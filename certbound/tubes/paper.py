@@ -15,7 +15,6 @@ The sharp tail (item 7.11) is B = 2 x, (e^k - 1)/(0F1(; nu/2; k x) - 1) = delta/
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -26,11 +25,12 @@ from numpy.typing import NDArray
 
 from certbound.rigor.balls import bessel_excess, precision, solve_upward, upper
 from certbound.tubes.ballpath import BallPath, ball_path, integral
+from certbound.tubes.line_search import golden
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.series import log_phi_one, solve_excess_one
 from certbound.tubes.tube import monotone
 
-__all__ = ["RootProfile", "Tail", "best_epsilon", "best_growth", "golden", "growth", "growth_ball", "sharp_tail"]
+__all__ = ["RootProfile", "Tail", "best_epsilon", "best_growth", "growth", "growth_ball", "sharp_tail"]
 
 Array = NDArray[np.float64]
 
@@ -128,23 +128,6 @@ def sharp_tail(*, delta: float, dimension: float, count: float = 1.0) -> Tail:
     middle = math.log(best_growth(dimension, max(level, 1e-6)) / 2)
     power = math.exp(golden(size, middle - 6.0, middle + 3.0, 1e-6))
     return Tail(kind="sharp", delta=delta, dimension=dimension, count=count, power=power)
-
-
-def golden(function: Callable[[float], float], low: float, high: float, width: float) -> float:
-    """Place of the least value of a unimodal function on [low, high]."""
-    ratio = (math.sqrt(5) - 1) / 2
-    a, b = high - ratio * (high - low), low + ratio * (high - low)
-    fa, fb = function(a), function(b)
-    while high - low > width:
-        if fa <= fb:
-            high, b, fb = b, a, fa
-            a = high - ratio * (high - low)
-            fa = function(a)
-        else:
-            low, a, fa = a, b, fb
-            b = low + ratio * (high - low)
-            fb = function(b)
-    return (low + high) / 2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

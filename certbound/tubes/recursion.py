@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from certbound.rigor.balls import bessel_excess, precision, upper
 from certbound.rigor.rounding import LIBRARY_ULPS, UNIT
 
-__all__ = ["Recursion"]
+__all__ = ["Recursion", "legendre_rule"]
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ class Recursion:
     @cached_property
     def _grid(self) -> tuple[Array, Array]:
         """Nodes and weights on [0, R] and on as many panels beyond as carry probability."""
-        points, weights = _legendre()
+        points, weights = legendre_rule()
         width = self.radius / self._panels
         panels = np.arange(self._panels + math.ceil(self._beyond / width))
         nodes = ((points[None, :] + 1) / 2 + panels[:, None]).ravel() * width
@@ -175,7 +175,7 @@ class Recursion:
 
 
 @cache
-def _legendre() -> tuple[Array, Array]:
+def legendre_rule() -> tuple[Array, Array]:
     """Gauss-Legendre nodes on [-1, 1] to the last place, and their weights rounded up."""
     with precision():
         roots = [arb.legendre_p_root(_POINTS, k, weight=True) for k in range(_POINTS)]

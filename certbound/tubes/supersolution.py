@@ -27,7 +27,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.tubes.paper import golden
+from certbound.tubes.line_search import golden
 
 __all__ = ["Supersolution"]
 

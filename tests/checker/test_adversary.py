@@ -15,7 +15,8 @@ from certbound.checker import check_data, parse
 from certbound.checker.arithmetic import BALLS, Undecided, generalised_kink, power
 from certbound.errors import CertificateError
 from certbound.problem.tape import JUMPS, UNARY
-from certbound.safety.certificate import certificate_text, exact, problem_data
+from certbound.safety.certificate import certificate_text, problem_data
+from certbound.safety.certificate_parts import exact
 from certbound.safety.verification import verify_safety
 from tests.checker.mutations import rejected
 

@@ -120,7 +120,7 @@ def test_the_tube_that_bounds_the_noise_contains_what_follows_from_it() -> None:
     outcome = run.probability(float(np.log(1e-3)))
     assert outcome.bounds is not None
     levels, _ = run.levels(float(np.log(1e-3)))
-    low, high = run._deviations(levels, *outcome.bounds)  # type: ignore[misc]
+    low, high = run.deviations(levels, *outcome.bounds)  # type: ignore[misc]
     active = len(run.engine.model.active)
     again = run.excess(run.held.reference, low[:, :active], high[:, :active])
     assert again is not None

@@ -102,7 +102,7 @@ def test_the_remainder_bound_contains_the_remainder_at_random_points() -> None:
     engine = run.engine
     levels, _ = run.levels(np.log(1e-3))
     shape = (1, engine.pieces, engine.n)
-    low, high = run._deviations(levels, np.zeros(shape), np.zeros(shape))  # type: ignore[misc]
+    low, high = run.deviations(levels, np.zeros(shape), np.zeros(shape))  # type: ignore[misc]
     extra = run.extra.reshape(engine.pieces, *run.extra.shape[2:])
     lower, upper = engine.model.bound(engine.frame, low, high, extra, 1)
     rng = np.random.default_rng(3)
@@ -206,7 +206,7 @@ def test_bounds_of_the_remainder_prove_themselves(effort: int) -> None:
     levels, _ = run.levels(float(np.log(1e-4)))
     bounds = run.include(levels, effort)
     assert bounds is not None
-    implied = run._deviations(levels, *bounds)
+    implied = run.deviations(levels, *bounds)
     assert implied is not None
     sample = run.sampled(implied)
     assert np.all(sample[0] >= bounds[0])
@@ -223,7 +223,7 @@ def test_a_piece_that_needs_more_is_tried_again_alone() -> None:
     levels, _ = run.levels(float(np.log(1e-4)))
     bounds = run.include(levels, 1)
     assert bounds is not None
-    implied = run._deviations(levels, *bounds)
+    implied = run.deviations(levels, *bounds)
     assert implied is not None
     low, high = (b.copy() for b in run._wider(levels, implied))
     middle = (low[20] + high[20]) / 2
@@ -241,7 +241,7 @@ def test_a_piece_that_needs_more_is_tried_again_alone() -> None:
     assert found[0]
     assert asked[0] == run.engine.pieces
     assert 1 <= max(asked[1:]) < run.engine.pieces / 2
-    sample = run.sampled(run._deviations(levels, *found[1:]) or implied)
+    sample = run.sampled(run.deviations(levels, *found[1:]) or implied)
     assert np.all(sample[0] >= found[1])
     assert np.all(sample[1] <= found[2])
 

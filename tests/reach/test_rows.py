@@ -9,9 +9,9 @@ from scipy.linalg import expm
 import certbound as cb
 from certbound.reach.events import WindowEvent, WindowEvents
 from certbound.reach.linear import level_along, level_scale
-from certbound.reach.linearisation import Linearisation
+from certbound.reach.linearisation import WINDOW, Linearisation
 from certbound.reach.response import LinearResponse, continuous_response
-from certbound.reach.rows import WINDOW, inner_rows
+from certbound.reach.rows import inner_rows
 
 TURN = np.array([[-0.2, -3.0], [3.0, -0.1]])
 PIECES, STEP = 24, 0.025

@@ -14,7 +14,8 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
 from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificate import certificate_data, certificate_text, exact, problem_data, restated
+from certbound.safety.certificate import certificate_data, certificate_text, problem_data, restated
+from certbound.safety.certificate_parts import exact
 from certbound.safety.verification import verify_safety
 
 

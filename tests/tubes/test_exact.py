@@ -14,7 +14,7 @@ from certbound.errors import InfeasibleError
 from certbound.tubes.constants import Constants
 from certbound.tubes.exact import bound_exact_exit, bound_worst_exit
 from certbound.tubes.radial import estimate_exit_probability, estimate_radius
-from certbound.tubes.recursion import Recursion, _legendre
+from certbound.tubes.recursion import Recursion, legendre_rule
 from certbound.tubes.supersolution import Supersolution
 from certbound.tubes.tuning import bound_exit_probability, tune_tube
 from experiments.limits import exact_radius
@@ -97,7 +97,7 @@ def test_chains_follow_the_estimate_from_above(gains, n, horizon, radius):
 
 
 def test_the_nodes_are_those_of_gauss_and_legendre():
-    nodes, weights = _legendre()
+    nodes, weights = legendre_rule()
     for power in range(27):
         exact = 0.0 if power % 2 else 2 / (power + 1)
         assert float(weights @ nodes**power) == pytest.approx(exact, abs=1e-14)

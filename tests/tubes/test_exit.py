@@ -13,7 +13,7 @@ from scipy.special import gamma, hyp1f1, iv
 
 from certbound.rigor.balls import excess_floor, precision
 from certbound.tubes.constants import Constants
-from certbound.tubes.exit import _Tangents, exit_level, union_level, union_may_help
+from certbound.tubes.exit import Tangents, exit_level, union_level, union_may_help
 from certbound.tubes.kummer import Start, kummer_tube, log_initial
 from certbound.tubes.objective import read_clearance
 from certbound.tubes.radial import estimate_exit_probability
@@ -179,7 +179,7 @@ def test_clearances_that_make_no_sense_are_refused(clearance, message):
 
 def test_a_floor_without_a_slope_is_not_carried_to_places_that_only_balls_tell_from_it():
     with precision():
-        tangents, touched = _Tangents(arb(0), 1.0, False), arb(1e12)
+        tangents, touched = Tangents(arb(0), 1.0, False), arb(1e12)
         assert tangents.touch(touched)
         before = touched * (1 - arb(2) ** -56)
         assert float(before.log()) == float(touched.log())

@@ -12,7 +12,7 @@ import pytest
 
 from certbound.tubes.constants import Constants
 from certbound.tubes.kummer import kummer_tube
-from certbound.tubes.paper import golden
+from certbound.tubes.line_search import golden
 from certbound.tubes.tuning import tune_tube
 from experiments.limits import exact_radius
 
