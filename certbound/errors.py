@@ -77,6 +77,6 @@ def contained(engine: str) -> Iterator[None]:
 
 
 def _failure(engine: str, error: Exception) -> str:
-    words = " ".join(str(error).split())
+    words = " ".join(str(error).split()).rstrip(".")
     short = words if len(words) <= _LONGEST else f"{words[:_LONGEST]}..."
-    return f"the {engine} engine failed ({type(error).__name__}{': ' if short else ''}{short.rstrip('.')})."
+    return f"the {engine} engine failed ({type(error).__name__}{': ' if short else ''}{short})."

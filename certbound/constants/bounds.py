@@ -157,7 +157,7 @@ def constants_along(
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         reason = jacobian.explain(active[int(bad[0])])
-        raise ValueError(f"`boxes` must keep the Jacobian bounded; on piece {bad[0]}, {reason} is unbounded.")
+        raise EnclosureError(f"`boxes` must keep the Jacobian bounded; on piece {bad[0]}, {reason} is unbounded.")
     matrices = jacobian.values(active.mid)
     sampled = norm.sample_measure(matrices) if model.continuous else norm.sample_norm(matrices)
     noise = bound_noise(model, norm, pieces)

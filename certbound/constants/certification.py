@@ -141,7 +141,7 @@ def _refuse(model: Model, jacobian: StateJacobian, found: Supremum) -> None:
             raise
         raise InfeasibleError(f"no constants hold on all of R^n: {error} Or {cure}.") from error
     if model.bounded_by_user:
-        raise ValueError(f"`domain` must keep the Jacobian bounded, but {reason} is unbounded; {cure}.")
+        raise EnclosureError(f"`domain` must keep the Jacobian bounded, but {reason} is unbounded; {cure}.")
     raise InfeasibleError(f"no constants hold on all of R^n: {reason} is unbounded; {cure}.")
 
 

@@ -320,10 +320,11 @@ class Linearisation:
 
     @cached_property
     def sizes(self) -> Array:
-        """A typical size of every state: of the nominal, the initial set and the noise, (n,); 0 where it stays 0."""
+        """A typical size of every state, (n,): of the nominal, the initial set and the noise; always positive."""
         variance = np.diagonal(self.response.covariance, axis1=-2, axis2=-1).max(axis=(0, 1))
         deviation = np.sqrt(np.maximum(np.where(np.isfinite(variance), variance, 0.0), 0.0))
-        return np.asarray(np.abs(self.nodes).max(axis=(0, 1)) + self.radii.max(axis=0) + deviation)
+        found = np.abs(self.nodes).max(axis=(0, 1)) + self.radii.max(axis=0) + deviation
+        return np.asarray(np.maximum(found, max(1e-6 * float(found.max()), 1e-100)))
 
     @property
     def remainder_sizes(self) -> Array:

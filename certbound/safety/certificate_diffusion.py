@@ -24,7 +24,6 @@ from certbound.safety.certificate_linear import (
     EFFORTS,
     PADS,
     SLACK,
-    WINDOW,
     Stated,
     engine_of,
     grids,
@@ -92,8 +91,7 @@ class _StatedRun(DiffusionRun):
             share = shared_log + _HALF
             key = cell, self.references.index(reference), share
             if key not in self.windows:
-                length = max(1, round(WINDOW / self.engine.step))
-                self.windows[key] = WindowEvents(reference.response, cell, length, share)
+                self.windows[key] = WindowEvents(reference.response, cell, self.engine.window, share)
             gaussian = self.windows[key]
         martingales = Martingales(reference.response, cell, self.held.excess[cell], share, self.frames[cell])
         return SplitEvents(gaussian=gaussian, martingales=martingales)

@@ -103,8 +103,11 @@ def constants_engine(
     Raises
     ------
     ValueError
-        If the Jacobian is unbounded or undefined on the domain that the user gave, the nominal is lost before the
-        horizon, or stated constants contradict the problem's own noise.
+        If stated constants contradict the problem's own noise.
+    EnclosureError
+        If the Jacobian is unbounded or undefined on the domain that the user gave.
+    EngineError
+        If the nominal is lost before the horizon.
     """
     if constants is not None:
         refuse_contradiction(problem, constants)
@@ -123,7 +126,7 @@ def constants_engine(
             best = work.with_own_metrics(best)
     except (InfeasibleError, EnclosureError) as error:
         if problem.domain is not None and best is None:
-            raise ValueError(f"`domain` must lie where the model is defined and smooth: {error}") from error
+            raise EnclosureError(f"`domain` must lie where the model is defined and smooth: {error}") from error
         reason = str(error)
     if best is not None and (not by_clearance or quick or constants is not None or best.log10_delta <= target):
         return best

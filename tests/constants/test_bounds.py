@@ -162,7 +162,7 @@ def test_unbounded_jacobians_are_refused_with_entry_and_cure():
     cubic = cb.ContinuousSystem(lambda x: [x[0] ** 3, -x[1]], states=["q", "r"])
     with pytest.raises(InfeasibleError, match=r"all of R\^n: entry d f_q / d q = .*give `domain=cb.Box"):
         bound_constants(cubic, metric="euclidean")
-    with pytest.raises(ValueError, match=r"`domain` must keep the Jacobian bounded, but entry d f_q / d q"):
+    with pytest.raises(EnclosureError, match=r"`domain` must keep the Jacobian bounded, but entry d f_q / d q"):
         bound_constants(cubic, cb.Box([0, 0], [np.inf, 1]), metric="euclidean")
 
 
