@@ -110,7 +110,8 @@ def proved_certificate(problem: Problem, verdict: Verdict) -> str:
     SolverError
         If the checker did not prove what was written.
     """
-    left, reasons = dict(verdict.answers), []
+    left = dict(verdict.answers)
+    reasons: list[str] = []
     while left:
         try:
             found, engine, reason = _proved(problem, replace(verdict, answers=left))

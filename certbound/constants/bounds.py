@@ -18,6 +18,7 @@ from certbound.constants.coordinates import Metric
 from certbound.constants.derivatives import StateJacobian
 from certbound.constants.models import Model, model_of
 from certbound.constants.noises import bound_noise
+from certbound.errors import EnclosureError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from certbound.errors import CertificateError
-from certbound.problem.noise import Law
+from certbound.problem.noise import Law, check_law
 from certbound.problem.problem import Problem
 from certbound.problem.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 from certbound.problem.sets import GaussianStart, Outside
@@ -208,6 +208,10 @@ def _noise(system: Any) -> dict[str, Any]:
             return {"law": "wiener", "diffusion": {"columns": int(g.shape[1]), **tape_data(g)}}
         return {"law": "wiener", "diffusion": exact(np.asarray(g, dtype=float))}
     law: Law = system.noise
+    try:
+        check_law(law, "be certified")
+    except TypeError as error:
+        raise CertificateError(str(error)) from error
     level = next(name for name in law.levels if getattr(law, name) is not None)
     data = {
         "law": law.name,

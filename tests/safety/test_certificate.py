@@ -171,3 +171,15 @@ def test_windows_of_a_linear_flow_cost_little_of_a_small_probability() -> None:
     claim = float.fromhex(certificate_data(problem, verdict)["claim"]["log10_delta"])
     assert verdict.log10_delta < -7
     assert claim < 0.85 * verdict.log10_delta
+
+
+def test_a_law_of_an_unknown_class_is_stated_by_no_certificate() -> None:
+    class Triangular(cb.Uniform):
+        """Draws otherwise than its parent."""
+
+    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=1, noise=Triangular(halfwidth=0.01))
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3)
+    verdict = cb.verify_safety(problem)
+    assert verdict.status == "SAFE"
+    with pytest.raises(CertificateError, match="got the class Triangular"):
+        verdict.certificate_text(problem)
