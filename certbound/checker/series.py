@@ -165,7 +165,7 @@ def _abs(x: Series) -> Series:
 def _power(x: Series, exponent: float) -> Series:
     order = len(x) - 1
     if exponent == 0.0:
-        return _constant(arb(1), order)
+        return _constant(x[0] if x[0].is_nan() else arb(1), order)
     if exponent == int(exponent) and 1 <= exponent <= 64:
         result = x
         for _ in range(int(exponent) - 1):

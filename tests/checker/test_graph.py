@@ -146,3 +146,11 @@ def test_taylor_series_enclose_the_function_along_a_line(op: str) -> None:
         exact = power(args[0], 2.5) if op == "pow" else BALLS[op](*args[: len(nodes) - 1])
         assert abs(float(total - exact)) < 1e-9 or total.overlaps(exact)
         assert total.lower() - 1e-15 <= exact <= total.upper() + 1e-15
+
+
+def test_a_power_of_0_makes_no_number_of_what_is_undefined() -> None:
+    nodes = (Node("input", (0,)), Node("log", (0,)), Node("pow", (1,), 0.0))
+    tape = Tape(inputs=("t",), nodes=nodes, outputs=(2,), shape=(1,))
+    assert expand(tape, [[arb(1), arb(1)]], 1, Budget(60))[0] == [1, 0]
+    with pytest.raises(Undecided):
+        expand(tape, [[arb(-1), arb(1)]], 1, Budget(60))

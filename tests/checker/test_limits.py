@@ -81,7 +81,7 @@ def test_these_certificates_are_proved_where_they_are_small() -> None:
     assert check_data(by_response(2, 3, [box(2, exact([-1.0, -1.0]), exact([1.0, 1.0]))])).valid
 
 
-@pytest.mark.parametrize("data", [by_constants(60, 2000, 20), by_constants(2, 100_000, 1)], ids=["rooms", "steps"])
+@pytest.mark.parametrize("data", [by_constants(60, 2000, 20), by_constants(2, 20_000, 1)], ids=["rooms", "steps"])
 def test_a_limit_on_time_holds_in_every_loop(data: Data) -> None:
     started = time.monotonic()
     report = check_data(data, seconds=0.3)
