@@ -123,7 +123,7 @@ def _log10(value: arb) -> float:
     if value.is_zero():
         return -1e12
     top = (value.log() / arb(10).log()).upper()
-    return math.nextafter(float(top), math.inf) if top.is_finite() else 0.0
+    return min(math.nextafter(float(top), math.inf), 0.0) if top.is_finite() else 0.0
 
 
 def _reason(engine: str, proved: float, compared: bool, assumed: Sequence[str]) -> str:
