@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from certbound.plotting import Scene
     from certbound.problem.problem import Problem
     from certbound.reach.tube import ReachTube
+    from certbound.safety.answers import EngineAnswer
     from certbound.safety.verification import Verdict
 
 __all__ = ["register"]
@@ -114,7 +115,7 @@ def verify(
     if not as_json:  # the verdict comes first: it stands, whatever becomes of the rest
         _print(subject, result)
     if explain and verdict.status == "UNKNOWN":
-        result["limits"] = _limits(verdict, cells)
+        result["limits"] = _limits(verdict, cells, clock)
         if not as_json and not SETTINGS.quiet:
             console().print(result["limits"]["summary"], markup=False)
     proof = ""
@@ -133,6 +134,7 @@ def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> 
     if clock.limit is None:
         return verify_safety(problem, method=method, cells=cells)
     best: Verdict | None = None
+    answers: dict[str, EngineAnswer] = {}
     over = f"The search was stopped after {clock.limit:g} s."
     try:
         for engine in ENGINES if method == "auto" else (method,):
@@ -140,15 +142,16 @@ def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> 
                 break
             with clock.running():
                 found = verify_safety(problem, method=engine, cells=cells)
+            answers |= found.answers
             if best is None or (found.status != "SAFE", found.log10_delta) < (best.status != "SAFE", best.log10_delta):
                 best = found
             if found.status == "UNSAFE_NOMINAL":
                 return found
     except OutOfTime:
         if best is not None:
-            return replace(best, reason=f"{best.reason} {over}")
+            return replace(best, reason=f"{best.reason} {over}", answers=answers)
     if best is not None:
-        return best
+        return replace(best, answers=answers)
     cure = "Give it more time, fewer --cells or a shorter --horizon."
     return Verdict(
         status="UNKNOWN", log10_delta=0.0, margin=None, time=None, constraint=None, reason=f"{over} {cure}",
@@ -191,16 +194,18 @@ def _engines(verdict: Verdict) -> list[dict[str, Any]]:
     return rows
 
 
-def _limits(verdict: Verdict, cells: int | None) -> dict[str, Any]:
-    """What would be SAFE, for --explain."""
+def _limits(verdict: Verdict, cells: int | None, clock: Clock) -> dict[str, Any]:
+    """What would be SAFE, for --explain, as far as time allows."""
     from certbound.safety.limits import Limits, find_limits
 
+    nothing = asdict(Limits(delta=None, horizon=None, noise=None, widening=None))
     try:
-        with spinner("looking for what would be SAFE"), contained("search for limits"):
+        with spinner("looking for what would be SAFE"), contained("search for limits"), clock.running():
             found = find_limits(verdict, cells=cells)
+    except OutOfTime:
+        return nothing | {"summary": "The time was over before it was known what would be SAFE."}
     except EngineError as error:
-        _log.info("nothing near the problem was looked at: %s", error)
-        found = Limits(delta=None, horizon=None, noise=None, widening=None)
+        return nothing | {"summary": f"What would be SAFE is not known: {error}"}
     return asdict(found) | {"summary": found.summary()}
 
 
