@@ -208,7 +208,7 @@ def verify_safety(
     >>> verify_safety(problem, method="constants").status
     'SAFE'
     """
-    names = _chosen(method)
+    names = _chosen(method, problem)
     _checked(problem, cells, constants)
     violation = _violation(problem)
     if violation is not None:
@@ -268,20 +268,25 @@ def _checked(problem: Problem, cells: int | None, constants: Constants | None) -
         raise ValueError(f"`constants` must be of dimension {n}, as the problem is, got {constants.dimension}.")
     if constants.times is not None and constants.times[-1] < problem.horizon:
         raise ValueError(f"`constants` must reach the horizon {problem.horizon:g}, got {constants.times[-1]:g}.")
+    from certbound.constants.stated import refuse_contradiction
+
+    refuse_contradiction(problem, constants)
 
 
 def _is_safe(answer: EngineAnswer, problem: Problem) -> bool:
     return answer.applicable and answer.certified and is_at_most(min(answer.log10_delta, 0.0), problem.delta)
 
 
-def _chosen(method: str) -> tuple[str, ...]:
+def _chosen(method: str, problem: Problem) -> tuple[str, ...]:
     if method == "auto":
         return tuple(_ENGINES)
     if method in _ENGINES:
         return (method,)
+    from certbound.tubes.baselines import check_time
     from certbound.tubes.tuning import METHODS
 
     if method in METHODS:
+        check_time(method, continuous=problem.system.time == "continuous")
         return ("constants",)
     known = ", ".join(["auto", *_ENGINES, *(name for name in METHODS if name != "auto")])
     raise ValueError(f"`method` must be one of {known}, got {method!r}.")

@@ -32,7 +32,7 @@ def halving(n: int, steps: int, constraints: list[Data], proof: Data) -> Data:
         outputs.append(len(nodes) - 1)
     return {
         "format": "certbound certificate", "version": 1, "proof": proof,
-        "claim": {"log10_delta": exact(-1.0), "method": "linear", "assumptions": []},
+        "claim": {"log10_delta": exact(-1.0), "method": proof["engine"], "assumptions": []},
         "problem": {
             "name": "halving", "time": "discrete", "horizon": exact(float(steps)), "delta": exact(0.1),
             "states": [f"x{i}" for i in range(n)], "inputs": [], "disturbances": [], "plan": None,

@@ -78,11 +78,12 @@ def dividing():
 """
 
 
-def refused(capsys: pytest.CaptureFixture[str], words: list[str], code: int = 2) -> list[str]:
-    """The three lines of a refusal."""
+def refused(capsys: pytest.CaptureFixture[str], words: list[str], code: int = 2, out: str = "") -> list[str]:
+    """The three lines of a refusal, after ``out``: what was answered before."""
     assert run(words) == code
     captured = capsys.readouterr()
-    assert captured.out == ""
+    assert captured.out.startswith(out)
+    assert bool(captured.out) == bool(out)
     assert "Traceback" not in captured.err
     lines = captured.err.splitlines()
     assert len(lines) == 3, captured.err
@@ -232,7 +233,8 @@ def test_a_disk_that_is_full(
         raise OSError(28, "No space left on device", "ou.png")
 
     monkeypatch.setattr(os, "replace", full)
-    lines = refused(capsys, ["verify", "ou", "--method", "kummer", "--plot", str(tmp_path / "ou.png")])
+    words = ["verify", "ou", "--method", "kummer", "--plot", str(tmp_path / "ou.png")]
+    lines = refused(capsys, words, out="SAFE  ou: ")
     assert "No space left" in lines[1]
     assert list(tmp_path.iterdir()) == []
 
