@@ -48,8 +48,8 @@ def _work(connection: Any, trace: str, limit: float) -> None:
 
 
 class _Worker:
-    def __init__(self, limit: float) -> None:
-        self.limit = limit
+    def __init__(self, limit: float, grace: float) -> None:
+        self.limit, self.grace = limit, grace
         with tempfile.NamedTemporaryFile(suffix=".trace", delete=False) as file:
             self.trace = file.name
         context = multiprocessing.get_context("spawn")
@@ -64,7 +64,7 @@ class _Worker:
         self.connection.send(seed)
         self.done += 1
         try:
-            if self.connection.poll(self.limit + 60.0 * (self.done == 1)):
+            if self.connection.poll(self.limit + self.grace * (self.done == 1)):
                 record: dict[str, Any] = self.connection.recv()
                 return record
             kind = "hang"
@@ -90,7 +90,12 @@ class _Worker:
 
 
 def run_campaign(
-    seeds: Iterable[int], *, jobs: int, limit: float, finished: Callable[[dict[str, Any]], None]
+    seeds: Iterable[int],
+    *,
+    jobs: int,
+    limit: float,
+    finished: Callable[[dict[str, Any]], None],
+    grace: float = 60.0,
 ) -> None:
     """Run seeds in ``jobs`` processes; ``finished`` is called with every record, one at a time.
 
@@ -102,6 +107,8 @@ def run_campaign(
     limit : float
         Seconds of the clock after which a problem counts as hanging.
     finished : callable
+    grace : float
+        Seconds more for the first problem of a process, which imports everything.
     """
     queue, lock = iter(seeds), threading.Lock()
 
@@ -112,7 +119,7 @@ def run_campaign(
                 if worker is not None and worker.done >= RECYCLED:
                     worker.close()
                     worker = None
-                worker = worker or _Worker(limit)
+                worker = worker or _Worker(limit, grace)
                 record = worker.run(seed)
                 with lock:
                     finished(record)

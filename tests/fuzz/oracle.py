@@ -125,14 +125,13 @@ class _Model:
 
     def __init__(self, draft: Draft, policy: Signal | None) -> None:
         self.draft, self.policy = draft, policy
+        self.row = 0  # of a plan that is an array
 
     def names(self, t: float, x: Array) -> dict[str, Any]:
         draft = self.draft
         names: dict[str, Any] = {"t": t} | {f"x{k}": x[:, k] for k in range(x.shape[1])}
         if isinstance(draft.plan, np.ndarray):
-            rows = len(draft.plan)
-            row = int(t * rows / draft.horizon * (1 + 1e-12)) if draft.continuous else int(t)
-            names |= {f"u{k}": value for k, value in enumerate(draft.plan[min(row, rows - 1)])}
+            names |= {f"u{k}": value for k, value in enumerate(draft.plan[self.row])}
         elif draft.plan is not None:
             names |= {f"u{k}": row.value(names) for k, row in enumerate(draft.plan)}
         if self.policy is not None:
@@ -168,13 +167,16 @@ def follow(
     yield 0.0, x
     if not draft.continuous:
         for k in range(int(draft.horizon)):
+            model.row = k
             x = model.drift(float(k), x) + (variates(draft, rng, len(x)) if noise else 0.0)
             yield float(k + 1), x
         return
+    pieces = len(draft.plan) if isinstance(draft.plan, np.ndarray) else 1
+    steps = -(-steps // pieces) * pieces
     h = draft.horizon / steps
     columns = len(draft.diffusion[0]) if draft.diffusion else 0
     for k in range(steps):
-        t = k * h
+        t, model.row = k * h, k * pieces // steps
         if not noise:
             x = _runge_kutta(model, t, x, h)
         elif columns:
@@ -189,7 +191,7 @@ def _runge_kutta(model: _Model, t: float, x: Array, h: float) -> Array:
     a = model.drift(t, x)
     b = model.drift(t + h / 2, x + h / 2 * a)
     c = model.drift(t + h / 2, x + h / 2 * b)
-    d = model.drift(t + h * (1 - 1e-12), x + h * c)
+    d = model.drift(t + h, x + h * c)
     return x + h / 6 * (a + 2 * b + 2 * c + d)
 
 
