@@ -1,4 +1,7 @@
-"""``python -m tests.fuzz --count 2000 --seed 0 --jobs 2 --out results.jsonl``; ``--show SEED`` runs one and prints it."""
+"""``python -m tests.fuzz --count 2000 --seed 0 --jobs 2 --out results.jsonl``.
+
+``--show SEED`` runs one problem and prints its record; with ``--dump FILE`` it is written as a problem file instead.
+"""
 
 from __future__ import annotations
 

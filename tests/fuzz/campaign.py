@@ -34,7 +34,7 @@ def _work(connection: Any, trace: str, limit: float) -> None:
     """A worker: seeds come in, records go out."""
     from tests.fuzz.runner import run_seed
 
-    with open(trace, "w+", encoding="utf-8") as stream:  # noqa: SIM117  (lives as long as the worker)
+    with open(trace, "w+", encoding="utf-8") as stream:
         while True:
             seed = connection.recv()
             if seed is None:

@@ -103,9 +103,14 @@ class Run:
         self.answers["verify"] = verdict.status
         self.facts |= {"log10_delta": verdict.log10_delta, "delta": self.draft.delta, "method": verdict.method}
         level = verdict.log10_delta
-        if not (math.isfinite(level) and level <= 0 and verdict.status in ("SAFE", "UNSAFE", "UNSAFE_NOMINAL", "UNKNOWN")):
+        if not (
+            math.isfinite(level) and level <= 0 and verdict.status in ("SAFE", "UNSAFE", "UNSAFE_NOMINAL", "UNKNOWN")
+        ):
             self.report("verify", "malformed", f"status {verdict.status}, log10_delta {level}")
-        if (verdict.status == "SAFE") != (level <= math.log10(self.draft.delta)) and verdict.status in ("SAFE", "UNKNOWN"):
+        if (verdict.status == "SAFE") != (level <= math.log10(self.draft.delta)) and verdict.status in (
+            "SAFE",
+            "UNKNOWN",
+        ):
             self.report("verify", "malformed", "SAFE is not log10_delta <= log10(delta)", f"{verdict.status} {level}")
 
     def units(self, name: str, factor: float, time_factor: float = 1.0) -> None:
@@ -184,13 +189,17 @@ class Run:
             tube = self._attempt("reach", lambda noise=noise: cb.bound_reach(self.problem, noise=noise))
             if tube is not None:
                 level = 10.0**tube.log10_delta if noise else 0.0
-                self._compare("reach", level, lambda steps, tube=tube, noise=noise: self._outside_reach(tube, noise, steps))
+                self._compare(
+                    "reach", level, lambda steps, tube=tube, noise=noise: self._outside_reach(tube, noise, steps)
+                )
 
     def simulate(self) -> None:
         """Exits by certbound's simulation and by the oracle's: neither may contradict what is certified."""
         rng = self.rng(1)
         known = self.draft.noise is None or self.draft.noise.law != "subgaussian"
-        found = self._attempt("simulate", lambda: cb.simulate_exits(self.problem, paths=PATHS, rng=rng, steps=self._steps()))
+        found = self._attempt(
+            "simulate", lambda: cb.simulate_exits(self.problem, paths=PATHS, rng=rng, steps=self._steps())
+        )
         if found is not None and not known:
             self.report("simulate", "malformed", "noise without a law was simulated")
         worst, policy = oracle.worst_case(self.draft, rng, paths=PATHS)
@@ -233,7 +242,9 @@ class Run:
 
         found = self._attempt("file", there_and_back)
         if found is not None:
-            difference = self._attempt("file", lambda: first_difference(problem_data(self.problem), problem_data(found)))
+            difference = self._attempt(
+                "file", lambda: first_difference(problem_data(self.problem), problem_data(found))
+            )
             if difference:
                 self.report("file", "changed", _plain(difference), difference)
 
@@ -245,10 +256,13 @@ class Run:
                 cb.save(self.problem, path)
             except ValueError:
                 return
-            proof, limited = str(Path(folder) / "proof.json"), ["--time-limit", str(limit)]
-            self._command(["verify", str(path), "--json", "--certificate", proof, *limited], (0, 1), limit)
-            self._command(["derive", str(path), "--json", *limited], (0, 2, 3), limit)
-            self._command(["tune", str(path), "--json", *limited], (0, 2, 3), limit)
+            limited = ["--json", "--time-limit", str(limit)]
+            files = {"--certificate": "proof.json", "--plot": "plot.png", "--report": "report.html"}
+            written = [word for option, name in files.items() for word in (option, str(Path(folder) / name))]
+            self._command(["verify", str(path), *limited, *written], (0, 1), limit)
+            self._command(["derive", str(path), *limited], (0, 2, 3), limit)
+            self._command(["tune", str(path), *limited, "--plot", str(Path(folder) / "tubes.png")], (0, 2, 3), limit)
+            self._command(["simulate", str(path), "--json", "--paths", "1000", "--seed", "1"], (0, 2), limit)
 
     def _command(self, words: list[str], codes: tuple[int, ...], limit: float) -> None:
         from certbound.cli.app import run
@@ -313,7 +327,9 @@ class Run:
             said.append(f"{hits} of {paths} in {oracle.STEPS * factor} steps")
             if lower <= level:
                 return
-        self.report(command, "contradiction", f"{command} refuted by simulation", f"certified {level:.6g}: {', '.join(said)}")
+        self.report(
+            command, "contradiction", f"{command} refuted by simulation", f"certified {level:.6g}: {', '.join(said)}"
+        )
 
     def _steps(self) -> int | None:
         if not self.draft.continuous:
@@ -325,7 +341,9 @@ class Run:
         draft, rng = self.draft, self.rng(4)
         policy = next(iter(oracle.policies(draft, rng)))
         with np.errstate(all="ignore"):
-            yield from oracle.follow(draft, oracle.starts(draft, rng, paths), rng, steps=steps, policy=policy, noise=noise)
+            yield from oracle.follow(
+                draft, oracle.starts(draft, rng, paths), rng, steps=steps, policy=policy, noise=noise
+            )
 
     def _outside_tube(self, tube: Any, constants: Any, steps: int) -> tuple[int, int]:
         """Paths whose distance from the noise-free path of the same start exceeds the radius at some time.
@@ -356,7 +374,9 @@ class Run:
         left: Any = False
         hull = tube.hull
         rough = bool(self.draft.features & {"model: jump", "model: kink"})
-        share = 1e-9 if noise else 1e-3 if rough else 1e-6  # of the scheme's own error where a kink or jump spoils its order
+        share = (
+            1e-9 if noise else 1e-3 if rough else 1e-6
+        )  # of the scheme's own error where a kink or jump spoils its order
         slack = share * (1e-3 * units.state + np.maximum(np.abs(hull.lo), np.abs(hull.hi)))
         for t, x in self._pairs(steps, noise):
             at = min(t * units.time, float(self.problem.horizon))
@@ -416,5 +436,3 @@ def units_of(draft: Draft, rng: np.random.Generator) -> list[tuple[str, float, f
     if draft.continuous and rng.random() < 0.2:
         found[1] = ("time", 1.0, 2.0 ** float(rng.integers(-12, 13)))
     return found
-
-

@@ -285,7 +285,9 @@ class Draft:
     def _through_a_file(self, problem: cb.Problem, units: Units) -> cb.Problem:
         """The problem as a reader of its file gets it: model, noise and plan as text, the rest as it is written."""
         content = problem.to_dict()
-        content["dynamics"] = dict(zip(problem.system.states, self._texts(self.dynamics, units, units.state, units.time)))
+        content["dynamics"] = dict(
+            zip(problem.system.states, self._texts(self.dynamics, units, units.state, units.time))
+        )
         if self.continuous and self.diffusion:
             columns, root = len(self.diffusion[0]), float(np.sqrt(units.time))
             entries = tuple(entry for row in self.diffusion for entry in row)
@@ -302,7 +304,10 @@ class Draft:
         return [(row if f == 1.0 else number(f) * row).text(names) for row, f in zip(rows, factors)]
 
     def _names(self, units: Units) -> Mapping[str, str]:
-        count = {"u": len(self.inputs[0]) if self.inputs else 0, "d": len(self.disturbance[0]) if self.disturbance else 0}
+        count = {
+            "u": len(self.inputs[0]) if self.inputs else 0,
+            "d": len(self.disturbance[0]) if self.disturbance else 0,
+        }
         names = {"t": "t" if units.time == 1.0 else f"(t/{units.time!r})"}
         for k, scale in enumerate(units.state.tolist()):
             names[f"x{k}"] = f"x{k + 1}" if scale == 1.0 else f"(x{k + 1}/{scale!r})"

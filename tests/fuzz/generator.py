@@ -59,7 +59,8 @@ def _draft(seed: int, rng: Random) -> Draft | None:
         seed=seed, family=name, continuous=model.continuous, dynamics=dynamics, start=_start(rng, model), walls=(),
         horizon=model.horizon, delta=log_uniform(rng, *((1e-9, 1e-3) if rng.random() < 0.4 else (1e-3, 0.3))),
         diffusion=_diffusion(rng, model), noise=_noise(rng, model),
-        disturbance=(-half, half * rng.choice([0.0, 0.5, 1.0])) if model.disturbance else None, inputs=inputs, plan=plan,
+        disturbance=(-half, half * rng.choice([0.0, 0.5, 1.0])) if model.disturbance else None,
+        inputs=inputs, plan=plan,
         domain=None if model.domain is None else (np.array(model.domain[0]), np.array(model.domain[1])),
         matrices=model.matrices if inputs is None else None, units=Units(state=np.ones(n)),
     )  # fmt: skip
@@ -139,7 +140,9 @@ def _noise(rng: Random, model: Sketch) -> Noise | None:
         columns = int(rng.integers(1, n + 1))
         matrix = np.round(rng.standard_normal((n, columns)), 2) * std[:, None]
         std = np.ones(columns)
-    law = str(rng.choice(["gaussian", "uniform", "rademacher", "bounded", "subgaussian"], p=[0.5, 0.16, 0.11, 0.13, 0.1]))
+    law = str(
+        rng.choice(["gaussian", "uniform", "rademacher", "bounded", "subgaussian"], p=[0.5, 0.16, 0.11, 0.13, 0.1])
+    )
     if law in ("gaussian", "subgaussian"):
         prefix = "" if law == "gaussian" else "proxy_"
         level = str(rng.choice(["std", "variance", "covariance"]))
@@ -159,7 +162,9 @@ def _pilot(draft: Draft, rng: Random) -> tuple[Draft, Array, Array | None]:
         policy = Policy(low, high, constant=high)
     initial = starts(draft, rng, PILOT)
     with np.errstate(all="ignore"):
-        run = list(follow(draft, initial, rng, steps=PILOT_STEPS * (20 if draft.family == "stiff_rates" else 1), policy=policy))
+        run = list(
+            follow(draft, initial, rng, steps=PILOT_STEPS * (20 if draft.family == "stiff_rates" else 1), policy=policy)
+        )
     good = 0
     domain = draft.domain
     while good < len(run) and np.all(np.isfinite(run[good][1])) and np.max(np.abs(run[good][1])) < LARGEST:

@@ -147,8 +147,7 @@ class _Model:
         """g(t, x) z."""
         names = self.names(t, x)
         rows = [
-            sum(np.asarray(entry.value(names)) * z[:, k] for k, entry in enumerate(row))
-            for row in self.draft.diffusion
+            sum(np.asarray(entry.value(names)) * z[:, k] for k, entry in enumerate(row)) for row in self.draft.diffusion
         ]
         return np.stack([np.broadcast_to(np.asarray(row, dtype=float), len(x)) for row in rows], axis=1)
 
@@ -222,15 +221,15 @@ def exits(
     return gone
 
 
-def worst_case(draft: Draft, rng: np.random.Generator, *, paths: int, pilot: int = 2000) -> tuple[Count, Policy | None]:
+def worst_case(draft: Draft, rng: np.random.Generator, *, paths: int, pilot: int = 1000) -> tuple[Count, Policy | None]:
     """The start and the policy of most exits in a pilot run, simulated afresh."""
-    points = starts(draft, rng, 48)
+    points = starts(draft, rng, 24)
     random = draft.start[0] == "gaussian"
     best: tuple[int, Array | None, Policy | None] = (-1, None, None)
     for policy in policies(draft, rng):
         owner = np.arange(pilot) % len(points)
         initial = starts(draft, rng, pilot) if random else points[owner]
-        left = exits(draft, initial, rng, steps=STEPS, policy=policy)
+        left = exits(draft, initial, rng, steps=STEPS // 2, policy=policy)
         score = int(left.sum()) if random else int(np.bincount(owner, left, len(points)).max())
         if score > best[0]:
             place = None if random else points[int(np.argmax(np.bincount(owner, left, len(points))))]

@@ -24,7 +24,15 @@ def run_seed(seed: int, *, command_line: bool | None = None, units: int = 2) -> 
             draft, problem = draw(seed)
     except Exception as error:  # noqa: BLE001  (a legal problem that is refused is a finding)
         finding = {"command": "problem", "kind": "error", "signature": signature_of(error), "message": str(error)}
-        return {"seed": seed, "family": "?", "features": [], "answers": {}, "seconds": {}, "facts": {}, "findings": [finding]}
+        return {
+            "seed": seed,
+            "family": "?",
+            "features": [],
+            "answers": {},
+            "seconds": {},
+            "facts": {},
+            "findings": [finding],
+        }
     run = Run(draft, problem)
     run.verify()
     if run.seconds["verify"] < 2.0:

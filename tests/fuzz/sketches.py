@@ -232,7 +232,9 @@ def logistic_map(rng: Random) -> Sketch:
 
 @family
 def ricker_map(rng: Random) -> Sketch:
-    return _discrete([x(0) * apply("exp", between(rng, 0.2, 1.8) * (1 - x(0)))], [0.9], [log_uniform(rng, 1e-3, 0.1)], 8.0)
+    return _discrete(
+        [x(0) * apply("exp", between(rng, 0.2, 1.8) * (1 - x(0)))], [0.9], [log_uniform(rng, 1e-3, 0.1)], 8.0
+    )
 
 
 @family
@@ -287,7 +289,9 @@ def saturated_map(rng: Random) -> Sketch:
 
 @family
 def large_sine(rng: Random) -> Sketch:
-    return _discrete([between(rng, 0.3, 1.5) * sin(x(0))], [0.3], [log_uniform(rng, 0.01, 0.3)], float(rng.integers(2, 12)))
+    return _discrete(
+        [between(rng, 0.3, 1.5) * sin(x(0))], [0.3], [log_uniform(rng, 0.01, 0.3)], float(rng.integers(2, 12))
+    )
 
 
 @family

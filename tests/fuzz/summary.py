@@ -38,7 +38,9 @@ def _coverage(rows: list[Mapping[str, Any]]) -> list[str]:
 
 
 def _closest(rows: list[Mapping[str, Any]]) -> list[str]:
-    known = sorted((row["facts"]["ratio to estimate"], row["seed"]) for row in rows if "ratio to estimate" in row["facts"])
+    known = sorted(
+        (row["facts"]["ratio to estimate"], row["seed"]) for row in rows if "ratio to estimate" in row["facts"]
+    )
     limits = sorted((row["facts"]["ratio"], row["seed"]) for row in rows if "ratio" in row["facts"])
     lines = [f"certified over simulated ({len(known)} with exits), closest"]
     lines += [f"  {ratio:.4g} to the estimate (seed {seed})" for ratio, seed in known[:5]]
