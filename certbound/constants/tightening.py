@@ -156,8 +156,8 @@ class RadiusModel:
         places = np.searchsorted(np.concatenate([[0.0], times]), times)
         power = a[:, None]
         whole = info[:, :1]
-        info, base = info[:, places], (room**2 / (2 * v[:, places]))
         with np.errstate(all="ignore"):
+            info, base = info[:, places], (room**2 / (2 * v[:, places]))
             goal = (np.log(whole) + log_phi(power * whole))[:, 0] - np.log(self.delta)
             spent = np.log(info) + log_phi(power * info)
             x = np.log(np.max(2 * v[:, places] * (nu / 2 + np.log(1 / self.delta)) / room**2, axis=-1))
@@ -169,7 +169,7 @@ class RadiusModel:
                 share = np.exp(power * info + excess - level)[rows, worst]
                 step = np.clip((goal - level[rows, worst]) / (slope[rows, worst] * share), -1.5, 1.5)
                 x = x + step
-                if np.nanmax(np.abs(step)) < 1e-4:
+                if not np.any(np.abs(step) >= 1e-4):  # nan: out of range, and counted as endless below
                     break
             result: Array = np.nan_to_num(np.exp(x), nan=np.inf)
         return result
@@ -207,8 +207,17 @@ class _Search:
         _, self.nu, self.fit = self.evaluate(start, value, None)
 
     def weights(self, value: float, steepness: float) -> Array:
-        """Rooms that a radius growing like a power of the standard deviation leaves."""
-        spread = self.model.variances(value, self.targets.times)
+        """Rooms that a radius growing like a power of the standard deviation leaves.
+
+        Raises
+        ------
+        SolverError
+            If the standard deviation overflows within the horizon.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            spread = self.model.variances(value, self.targets.times)
+        if not np.all(np.isfinite(spread)) or not spread.max() > 0:
+            raise SolverError(f"the deviation overflows at the value {value:.3g} within the horizon.")
         return self.targets.effective((spread / spread.max()) ** (steepness / 2))
 
     def evaluate(self, metric: Array, value: float, near: Fit | None) -> tuple[float, float, Fit]:

@@ -76,7 +76,9 @@ class Run:
     verdict: Any = None
 
     def report(self, command: str, kind: str, signature: str, message: str = "") -> None:
-        """Note a finding."""
+        """Note a finding, once."""
+        if any((f.command, f.kind, f.signature) == (command, kind, signature) for f in self.findings):
+            return
         self.findings.append(Finding(command, kind, signature, message[:2000]))
 
     def rng(self, purpose: int) -> np.random.Generator:
@@ -231,8 +233,6 @@ class Run:
 
     def file(self) -> None:
         """Saved and loaded again: the same problem."""
-        from certbound.checker.comparison import first_difference
-        from certbound.safety.certificate import problem_data
 
         def there_and_back() -> cb.Problem:
             with tempfile.TemporaryDirectory() as folder:
@@ -242,11 +242,30 @@ class Run:
 
         found = self._attempt("file", there_and_back)
         if found is not None:
-            difference = self._attempt(
-                "file", lambda: first_difference(problem_data(self.problem), problem_data(found))
-            )
+            difference = self._attempt("file", lambda: self._difference(found))
             if difference:
                 self.report("file", "changed", _plain(difference), difference)
+
+    def _difference(self, other: cb.Problem) -> str:
+        """What differs from the problem: model, noise, start by their data, constraints by where they hold."""
+        from certbound.checker.comparison import first_difference
+        from certbound.safety.certificate import problem_data
+
+        mine, theirs = ({**problem_data(p), "constraints": []} for p in (self.problem, other))
+        difference = first_difference(mine, theirs)
+        if difference:
+            return difference
+        ordered = sorted(self.problem.safe, key=lambda constraint: isinstance(constraint, cb.Outside))
+        points = (
+            oracle.starts(self.draft, self.rng(7), 200) * self.rng(8).uniform(-3, 3, (200, 1)) * self.draft.units.state
+        )
+        for first, second in zip(ordered, other.safe, strict=True):
+            if (first.during, first.label) != (second.during, second.label):
+                return f"constraint {first.label}, {first.during} became {second.label}, {second.during}"
+            for t in (0.0, 0.7 * float(self.problem.horizon)):
+                if np.any(first.satisfied(points, t) != second.satisfied(points, t)):
+                    return f"constraint {first.label} holds elsewhere"
+        return ""
 
     def command_line(self, limit: float = 5.0) -> None:
         """``verify --json --time-limit`` and ``derive`` on the saved file: documented exit codes, one JSON object."""
