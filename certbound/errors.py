@@ -7,7 +7,16 @@ value and the cure. The classes below are for work that was understood and could
 
 from __future__ import annotations
 
-__all__ = ["CertboundError", "CertificateError", "EnclosureError", "InfeasibleError", "SolverError"]
+import contextlib
+import logging
+from collections.abc import Iterator
+
+__all__ = [
+    "CertboundError", "CertificateError", "EnclosureError", "EngineError", "InfeasibleError", "SolverError", "contained",
+]  # fmt: skip
+
+_LONGEST = 200  # letters of a foreign message that are repeated
+_log = logging.getLogger(__name__)
 
 
 class CertboundError(Exception):
@@ -28,3 +37,46 @@ class CertificateError(CertboundError, ValueError):
 
 class EnclosureError(CertboundError, ArithmeticError):
     """A function has no finite enclosure on a box: the message names the expression and the box."""
+
+
+class EngineError(CertboundError, ArithmeticError):
+    """A method does not carry through a problem that is legal; the message says which, why and what may help."""
+
+
+@contextlib.contextmanager
+def contained(engine: str) -> Iterator[None]:
+    """Turn whatever goes wrong in the block into an ``EngineError``; the input has to be checked before it.
+
+    What certbound raises on its own account keeps its words, also from the checks of its inner rooms, whose
+    arguments are then certbound's own. Anything else is a defect and called so; its trace is logged. A warning that
+    was turned into an error stays what it is.
+
+    Raises
+    ------
+    EngineError
+        For every exception in the block but warnings.
+
+    Examples
+    --------
+    >>> with contained("linear"):
+    ...     raise ZeroDivisionError("division by zero")
+    Traceback (most recent call last):
+    ...
+    certbound.errors.EngineError: the linear engine failed (ZeroDivisionError: division by zero).
+    """
+    try:
+        yield
+    except (EngineError, Warning):
+        raise
+    except (CertboundError, ArithmeticError, ValueError, MemoryError, RecursionError) as error:
+        own = isinstance(error, CertboundError) or type(error) is ArithmeticError
+        raise EngineError(str(error) if own else _failure(engine, error)) from error
+    except Exception as error:  # noqa: BLE001  (one engine's defect must not hide what another one proved)
+        _log.debug("the %s engine failed", engine, exc_info=True)
+        raise EngineError(f"{_failure(engine, error)} This is a defect of certbound.") from error
+
+
+def _failure(engine: str, error: Exception) -> str:
+    words = " ".join(str(error).split())
+    short = words if len(words) <= _LONGEST else f"{words[:_LONGEST]}..."
+    return f"the {engine} engine failed ({type(error).__name__}{': ' if short else ''}{short.rstrip('.')})."

@@ -129,7 +129,7 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
             lambda boxes, _, which=which: (levels(boxes)[which], _widths(boxes)),  # type: ignore[misc]
             lambda points, which=which: values(points, which),  # type: ignore[misc]
             ranges,
-            tolerance=1e-3 * max(scale, 1e-12),
+            tolerance=1e-3 * (scale or 1e-300),
             budget=20_000,
         )
         if not np.isfinite(found.upper):

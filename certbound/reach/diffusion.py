@@ -27,7 +27,6 @@ from certbound.reach.linear import LinearRun, Outcome, level_along
 from certbound.reach.linearisation import Linearisation
 from certbound.reach.martingales import Martingales, SplitEvents, Windowed
 from certbound.reach.response import LinearResponse, continuous_response
-from certbound.reach.rows import WINDOW
 from certbound.rigor.intervals import Interval
 
 __all__ = ["ASSUMPTION", "DiffusionRun", "depends_on_state"]
@@ -123,7 +122,7 @@ class DiffusionRun(LinearRun):
         if reference.gaussian:
             share = shared_log + _HALF
             if (cell, share) not in reference.events:
-                windows = WindowEvents(reference.response, cell, max(1, round(WINDOW / engine.step)), share)
+                windows = WindowEvents(reference.response, cell, engine.window, share)
                 found = ClockEvents(windows, reference.value[cell], reference.memory.setdefault(cell, {}))
                 reference.events[cell, share] = found
             gaussian = reference.events[cell, share]

@@ -34,7 +34,10 @@ def fitted(engine: Linearisation, log_nonlinear: float) -> Linearisation:
         return engine
     run = LinearRun(engine, asked=False)
     for _ in range(2):
-        low, high, grown = _tube(run, log_nonlinear)
+        tube = _tube(run, log_nonlinear)
+        if tube is None:
+            break
+        low, high, grown = tube
         found = fitted_slopes(engine.model, engine.frame, low, high, run.flat_extra)
         other = engine.corrected(_at_nodes(engine, found))
         steepest, plain = (e.step * float(np.abs(s).sum(-1).max()) for e, s in (
@@ -48,14 +51,18 @@ def fitted(engine: Linearisation, log_nonlinear: float) -> Linearisation:
     return engine
 
 
-def _tube(run: LinearRun, log_nonlinear: float) -> tuple[Array, Array, float]:
-    """Rough bounds of the deviation along the inner rows (B N, D), and the remainder's share of them."""
+def _tube(run: LinearRun, log_nonlinear: float) -> tuple[Array, Array, float] | None:
+    """Rough bounds of the deviation along the inner rows (B N, D), and the remainder's share of them.
+
+    None where the deviation without any remainder is beyond all use already.
+    """
     engine = run.engine
     levels = _levels(run, log_nonlinear)
     shape = (len(engine.centres), engine.pieces, engine.n)
     low, high = np.zeros(shape), np.zeros(shape)
     base = run._deviations(levels, low, high)
-    assert base is not None
+    if base is None:
+        return None
     grown = 0.0
     tube = base
     for _ in range(_PICARD):

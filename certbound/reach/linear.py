@@ -22,10 +22,9 @@ from certbound.reach.events import StepEvents, WindowEvents, logsumexp
 from certbound.reach.inclusion import Supports
 from certbound.reach.levels import level_along, level_scale
 from certbound.reach.linearisation import Linearisation
-from certbound.reach.martingales import SplitEvents
+from certbound.reach.martingales import SplitEvents, quantile
 from certbound.reach.occupancy import log_occupancy
 from certbound.reach.overlaps import log_any_exceedance
-from certbound.reach.rows import WINDOW
 from certbound.reach.samples import sampled_range
 
 __all__ = ["Events", "LinearRun", "Outcome", "correlated", "level_along", "level_scale"]
@@ -36,7 +35,8 @@ _LOG = logging.getLogger(__name__)
 
 _GUESSES = 30
 _PICARD = 12
-_HUGE = 1e6
+_HUGE = 1e6  # times what a row sees of the nominal states, the initial set and the noise: beyond all use
+_ROUNDING = 1e-12  # share of a typical remainder that its guess is widened by, so that it may be 0
 _PADS = (0.15, 0.1, 0.06, 0.04)  # how much wider than the sampled range the first guess is, by effort
 _REPAIRS, _REPAIRED = 4, 0.03  # times that pieces are tried again, each with so much more room
 _WIDER = 0.05  # of the remainder's share in a polytope
@@ -100,6 +100,8 @@ class LinearRun:
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
         self.kept: dict[float, tuple[Array, list[Events]]] = {}
+        self.spent: dict[float, bool] = {}
+        self.failed_at = 0
 
     def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
         """Bounds of s = y + Z + R along the inner rows over all pieces: (B N, D)."""
@@ -119,7 +121,8 @@ class LinearRun:
         shape = (len(engine.centres), engine.pieces, engine.n)
         self.failed_at = engine.pieces - 1
         # what the proof needs beyond the sampled range
-        below = above = engine.model.defect(engine.frame).reshape(shape) * 1.05 + 1e-12
+        least = _ROUNDING * engine.remainder_sizes
+        below = above = engine.model.defect(engine.frame).reshape(shape) * 1.05 + least
         low, high = np.zeros(shape), np.zeros(shape)
         for attempt in range(_PICARD):
             guess = self.guess(levels, (low, high), (below, above), _PADS[effort] if attempt == 0 else 0.02)
@@ -139,8 +142,8 @@ class LinearRun:
             _LOG.debug("inclusion %d: widths %s, beyond the guess by %.3g", attempt, (b_high - b_low).max(
                 axis=(0, 2))[:: max(1, engine.pieces // 8)].round(4), max(np.max(low - b_low), np.max(b_high - high)))
             sample = self.sampled(polytope)
-            below = np.maximum(1.02 * (sample[0] - b_low), 0.0) + 1e-12
-            above = np.maximum(1.02 * (b_high - sample[1]), 0.0) + 1e-12
+            below = np.maximum(1.02 * (sample[0] - b_low), 0.0) + least
+            above = np.maximum(1.02 * (b_high - sample[1]), 0.0) + least
         return None
 
     def _closed(
@@ -224,11 +227,20 @@ class LinearRun:
         """The polytope that bounds on beta imply, or None where it is beyond all use."""
         reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(self.supports, low, high, strict=True)]
         p_low, p_high = self.polytope(levels, reach)
-        beyond = ~(np.isfinite(p_low) & np.isfinite(p_high)) | (p_high - p_low > _HUGE)
+        with np.errstate(invalid="ignore"):
+            beyond = ~(np.isfinite(p_low) & np.isfinite(p_high)) | (p_high - p_low > self._limit(levels))
         if beyond.any():
             self.failed_at = int(np.argmax(beyond.any(axis=1).reshape(len(low), -1).any(axis=0)))
             return None
         return p_low, p_high
+
+    def _limit(self, levels: Array) -> Array:
+        """The widest polytope that is of any use, in the units of every row: (B N, D)."""
+        count = self.engine.pieces
+        moved = np.stack([2 * support.y[:count, : self.inner] for support in self.supports]) + 2 * levels
+        size = np.abs(self.rows) @ self.engine.sizes + moved
+        widest = np.broadcast_to(size.max(axis=(0, 1), initial=0.0), (size.shape[0] * count, self.inner))
+        return np.where(widest > 0, _HUGE * widest, np.inf)
 
     # ---- probabilities -----------------------------------------------------------------------------------
 
@@ -236,7 +248,7 @@ class LinearRun:
         """Scalar events of one cell; ``shared_log`` is the log probability that they may share."""
         engine = self.engine
         if isinstance(engine.system, ContinuousSystem):
-            windows = WindowEvents(engine.response, cell, max(1, round(WINDOW / engine.step)), shared_log)
+            windows = WindowEvents(engine.response, cell, engine.window, shared_log)
             diffusion = engine.diffusion if engine.diffusion.ndim == 2 else engine.diffusion[cell]
             return ClockEvents(windows, diffusion, self.memory.setdefault(cell, {}))
         if cell not in self.steps:
@@ -263,9 +275,28 @@ class LinearRun:
         self.kept[log_nonlinear] = result, found
         return result, found
 
+    def hopeless(self, log_nonlinear: float) -> bool:
+        """Whether the remainder feeds itself at levels that are too small already (``failed_at`` names a piece).
+
+        Z leaves a level of q standard deviations with probability 2 Q(q) at one time alone, so that all levels that cost
+        exp(log_nonlinear) are larger; they are dear in continuous time, and not asked for where this tells enough.
+        """
+        if not (self.engine.continuous and self.engine.noise and len(self.engine.model.active)):
+            return False
+        if log_nonlinear not in self.spent:
+            q = quantile(log_nonlinear - float(np.log(2.0)))
+            v = self.engine.response.covariance[:, 1:]
+            variance = np.einsum("bkdi,bkij,bkdj->bkd", self.rows, v, self.rows)
+            levels = 0.99 * q * np.sqrt(np.maximum(variance, 0.0))
+            nothing = np.zeros((len(levels), self.engine.pieces, self.engine.n))
+            self.spent[log_nonlinear] = self.guess(levels, (nothing, nothing), (nothing, nothing), 0.0) is None
+        return self.spent[log_nonlinear]
+
     def promise(self, log_nonlinear: float, effort: int) -> float:
         """What `probability` is likely to find, in logarithms: from a guess of the remainder that is not proved."""
         shape = (len(self.engine.centres), self.engine.pieces, self.engine.n)
+        if self.hopeless(log_nonlinear):
+            return 0.0
         levels, events = self.levels(log_nonlinear)
         nothing = np.zeros(shape), np.zeros(shape)
         guess = self.guess(levels, nothing, nothing, _MARGIN * _PADS[effort])
@@ -276,6 +307,8 @@ class LinearRun:
 
     def probability(self, log_nonlinear: float, effort: int = 2) -> Outcome:
         """Thm K7' with delta_N = exp(log_nonlinear): the outcome of the worst cell."""
+        if self.hopeless(log_nonlinear):
+            return Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None)
         levels, events = self.levels(log_nonlinear)
         bounds = self.include(levels, effort)
         if bounds is None:

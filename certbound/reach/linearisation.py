@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.errors import EngineError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
 from certbound.problem.systems import ContinuousSystem
@@ -20,7 +21,7 @@ from certbound.reach.frame import Frame
 from certbound.reach.inclusion import Gathering
 from certbound.reach.remainder import Remainder
 from certbound.reach.response import LinearResponse, continuous_response, discrete_response
-from certbound.reach.rows import inner_rows
+from certbound.reach.rows import WINDOW, WINDOW_TURN, inner_rows
 from certbound.rigor.intervals import Interval
 
 __all__ = ["Linearisation"]
@@ -132,9 +133,9 @@ class Linearisation:
             while last > 0 and sizes[last] > 100 * (1 + sizes[last - 1]):  # finite, but no longer meant
                 last -= 1
             end = last * self.step
-            raise ValueError(
-                f"`horizon` must end before the noise-free trajectory is lost, after t = {end:.4g}; got "
-                f"{self.problem.horizon:g}: shorten it, or check the model."
+            raise EngineError(
+                f"the noise-free trajectory is lost after t = {end:.4g}, before the horizon {self.problem.horizon:g}; "
+                "shorten the horizon, or check the model there."
             )
         return nodes
 
@@ -192,7 +193,7 @@ class Linearisation:
         In discrete time the last node counts for nothing.
         """
         other = copy.copy(self)
-        for name in ("slopes", "response", "frame", "gathering"):
+        for name in ("slopes", "response", "frame", "gathering", "sizes", "window"):
             vars(other).pop(name, None)
         other.correction = correction
         return other
@@ -313,6 +314,25 @@ class Linearisation:
             inputs=np.tile(self.inputs, (cells, 1)), disturbance_middle=self.d_middle,
             disturbance_low=self.d_low, disturbance_high=self.d_high,
         )
+
+    @cached_property
+    def sizes(self) -> Array:
+        """A typical size of every state: of the nominal, the initial set and the noise, (n,); 0 where it stays 0."""
+        variance = np.diagonal(self.response.covariance, axis1=-2, axis2=-1).max(axis=(0, 1))
+        deviation = np.sqrt(np.maximum(np.where(np.isfinite(variance), variance, 0.0), 0.0))
+        return np.asarray(np.abs(self.nodes).max(axis=(0, 1)) + self.radii.max(axis=0) + deviation)
+
+    @property
+    def remainder_sizes(self) -> Array:
+        """The same for the dynamics: in continuous time a tenth of the size in the time of a piece."""
+        return self.sizes * (0.1 / self.step if self.continuous else 1.0)
+
+    @cached_property
+    def window(self) -> int:
+        """Pieces of a martingale window."""
+        slope = self.slopes[0]
+        turn = float(np.abs(np.where(np.isfinite(slope), slope, 0.0)).sum(axis=-1).max()) * self.step
+        return max(1, min(round(WINDOW / self.step), int(WINDOW_TURN / max(turn, 1e-6))))
 
     # ---- supports ----------------------------------------------------------------------------------------
 

@@ -42,6 +42,7 @@ GUESSES = 12
 TUBE_INFLATION = 1.1
 SEGMENTS = 48
 SUPREMUM_GAP = 2e-3
+_FARTHEST = 1e150  # radius beyond which nothing is looked for: its square must be finite
 
 
 def local_contraction_tube(
@@ -98,6 +99,7 @@ class _March:
         self.slopes = LocalSlopes(flow, norm)
         self.eta = bound_forcing(flow, curve, norm)
         self.gaps = jump_sizes(curve, norm)
+        self.least = 1e-12 * float(np.max(norm.length(curve.range()))) + 1e-280  # more than what rounding takes
 
     def run(self, rho: Array) -> Array:
         """Radii of all pieces that could be proved, shape (B, proved)."""
@@ -130,9 +132,9 @@ class _March:
             radius, after = integrate_radius(part, gaps, rho, slopes, eta)
             if np.all(radius < guess):
                 return radius, after, slopes[:, -1]
-            if not np.all(np.isfinite(radius)):
+            if not np.all(radius < _FARTHEST):
                 return None
-            guess = np.where(radius < guess, guess, INFLATION * radius + 1e-12)
+            guess = np.where(radius < guess, guess, INFLATION * radius + self.least)
             slopes = self.slopes.bound(part, guess)
         return None
 

@@ -17,6 +17,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.errors import EngineError
 from certbound.problem.problem import Problem
 from certbound.reach.curve import Curve
 from certbound.reach.flow import Flow
@@ -56,7 +57,7 @@ def nominal_curve(
 
     Raises
     ------
-    ValueError
+    EngineError
         If the trajectory cannot be followed up to the horizon.
     """
     flow = problem if isinstance(problem, Flow) else Flow(problem)
@@ -214,7 +215,7 @@ def _node_states(flow: Flow, grid: Array, states: Array) -> Array:
                 method="DOP853",
                 t_eval=grid[first : last + 1],
                 rtol=1e-12,
-                atol=1e-13 * (1e-3 + float(np.max(np.abs(start)))),
+                atol=1e-13 * _magnitude(flow, start, slope(float(grid[first]), start)),
             )
         if solution.status != 0 or not np.all(np.isfinite(solution.y)):
             raise _lost(float(solution.t[-1]) if len(solution.t) else float(grid[first]), flow)
@@ -263,15 +264,22 @@ def _estimate_defect(flow: Flow, curve: Curve) -> Array:
 def _size(curve: Curve) -> Array:
     values = curve.coefficients[..., 0, :]
     spread = np.max(values, axis=(0, 1)) - np.min(values, axis=(0, 1))
-    return np.asarray(np.maximum(spread, 1e-3 * (1e-3 + np.max(np.abs(values)))))
+    return np.asarray(np.maximum(spread, 1e-3 * (float(np.max(np.abs(values))) or 1.0)))
+
+
+def _magnitude(flow: Flow, start: Array, velocity: Array) -> float:
+    """A size of the states, by which a solver's absolute tolerance is measured: any positive number serves."""
+    moved = 1e-3 * flow.horizon * float(np.max(np.abs(velocity)))
+    size = float(np.max(np.abs(start))) + (moved if np.isfinite(moved) else 0.0)
+    return size if 1e-250 < size < np.inf else 1.0
 
 
 def _tolerance(curve: Curve) -> float:
     return 1e-8 / max(float(curve.ends[-1]), 1e-300)
 
 
-def _lost(time: float, flow: Flow) -> ValueError:
-    return ValueError(
-        "`horizon` must end before the noise-free trajectory is lost: it cannot be followed beyond "
-        f"t = {time:.6g}, got {flow.horizon:g}; shorten the horizon, or check the model there."
+def _lost(time: float, flow: Flow) -> EngineError:
+    return EngineError(
+        f"the noise-free trajectory is lost: it cannot be followed beyond t = {time:.6g}, before the horizon "
+        f"{flow.horizon:g}; shorten the horizon, or check the model there."
     )

@@ -94,7 +94,8 @@ class Remainder:
         low, high = np.zeros(n * n), np.zeros(n * n)
         if fixed:
             nowhere = [Interval.point(np.zeros(1))] * len(tape.inputs)
-            values = enclose(selected(first, fixed, tape), nowhere, undefined="infinite")
+            # of their own nodes alone: the function itself may be undefined at 0, where they are read
+            values = enclose(selected(first, fixed, None), nowhere, undefined="infinite")
             low[fixed], high[fixed] = values.broadcast_to((1, len(fixed))).lo[0], values.hi.reshape(-1)
         varying = selected(first, entries, tape)
         # where the Jacobian has kinks its own nodes are kept: as jumps they tell on which boxes it is smooth

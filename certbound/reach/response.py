@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.errors import EngineError
+
 __all__ = ["LinearResponse", "RowResponse", "discrete_response", "continuous_response"]
 
 Array = NDArray[np.float64]
@@ -119,9 +121,7 @@ def _transition(slope: Array, drift: Array, step: float, slope_error: float) -> 
     # beyond the last term the majorant falls by this ratio at least every second term
     ratio = (alpha + kappa) / _TERMS
     if np.any(ratio > 0.5):
-        raise ValueError(
-            f"`pieces` must be larger: ||J|| h = {float((alpha + kappa).max()):.3g} is beyond {_TERMS / 2:g}."
-        )
+        raise _too_stiff(float((alpha + kappa).max()))
     tail = 4.1 * (majorant[-1] + majorant[-2]) * np.maximum(ratio, _TINY)
     growth = np.exp(alpha + kappa) * (1 + 1e-13)
     error = tail + _TERMS * (3 * n + 12) * 2 * _UNIT * growth + 2 * n * step * slope_error * growth
@@ -130,6 +130,13 @@ def _transition(slope: Array, drift: Array, step: float, slope_error: float) -> 
     mass = np.expm1(_norm(size_)) * (1 + 1e-13)
     deviation = size_ + 0.5 * (square + _absmul(square, np.broadcast_to(mass[..., None, None], a.shape)))
     return total, error, np.asarray(deviation * (1 + 1e-14))
+
+
+def _too_stiff(turn: float) -> EngineError:
+    return EngineError(
+        f"the system is too stiff for the linear engine: ||J|| h = {turn:.3g} on its finest pieces of time, and its "
+        f"series serve up to {_TERMS / 4:g}; shorten the horizon, or use another method."
+    )
 
 
 def _noise_covariance(slope: Array, drift: Array, step: float, gram: Array) -> tuple[Array, Array]:
@@ -149,7 +156,7 @@ def _noise_covariance(slope: Array, drift: Array, step: float, gram: Array) -> t
         total = total + newer
     ratio = (alpha + kappa) / _TERMS
     if np.any(ratio > 0.5):
-        raise ValueError(f"`pieces` must be larger: 2 ||J|| h = {float((alpha + kappa).max()):.3g}.")
+        raise _too_stiff(float((alpha + kappa).max()) / 2)
     scale = _norm(gram) * step
     error = (4.1 * (big + small) * np.maximum(ratio, _TINY)
              + _TERMS * (3 * n + 12) * 4 * _UNIT * np.exp(alpha + kappa)) * scale

@@ -102,6 +102,8 @@ class LinearAnswer:
                 f"{what} from t = {self.time:.4g} on; split the initial set (cells), shorten the horizon or lower "
                 "the noise"
             )
+        if self.margin == -np.inf:
+            return f"no bound of the deviation was found that the room of '{self.constraint}' could be compared with"
         return f"the room of '{self.constraint}' at t = {self.time:.4g} is {self.margin:.4g}"
 
     @cached_property

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from certbound.reach.linearisation import Linearisation
 
-__all__ = ["WINDOW", "inner_rows"]
+__all__ = ["WINDOW", "WINDOW_TURN", "inner_rows"]
 
 Array = NDArray[np.float64]
 
 WINDOW = 0.05
 """Time of the martingale windows that bound rows which turn."""
+WINDOW_TURN = 8.0
+"""||J|| times that time, at most: the transition matrix of a window is inverted, and next to singular beyond."""
 
 
 def inner_rows(engine: Linearisation) -> tuple[Array, Array]:
@@ -47,7 +49,7 @@ def _curved(engine: Linearisation) -> Array:
     spread = 16 * engine.response.covariance[:, node] + _spread(engine)[:, node]
     spread = spread[..., active, :][..., active]
     trace = np.trace(spread, axis1=-2, axis2=-1)[..., None, None]
-    spread = spread + (1e-9 * trace + 1e-30) * np.eye(count)
+    spread = spread + (1e-9 * trace + 1e-30 * float(engine.sizes.max()) ** 2 + 1e-300) * np.eye(count)
     root = np.linalg.cholesky(spread)
     inverse = np.linalg.inv(root)
     _, vectors = np.linalg.eigh(np.swapaxes(root, -1, -2)[:, :, None] @ hessians @ root[:, :, None])
@@ -67,7 +69,7 @@ def _curved(engine: Linearisation) -> Array:
 
 def _carried(rows: Array, engine: Linearisation) -> Array:
     """The rows of every window's middle, moved with the flow: seen from the window's end they hardly turn."""
-    result, length = rows.copy(), max(1, round(WINDOW / engine.step))
+    result, length = rows.copy(), engine.window
     forward = engine.response.transition
     back = np.linalg.inv(forward)
     for start in range(0, engine.pieces, length):

@@ -24,7 +24,8 @@ Array = NDArray[np.float64]
 
 _POINTS = {1: 17, 2: 9, 3: 7, 4: 3, 5: 3, 6: 3}
 _DIRECTIONS = 64
-_NEGLIGIBLE = 1e-9
+_NEGLIGIBLE = 1e-9  # of the widest deviation of a state
+_ROUNDING = 1e-13  # of the nominal state
 
 
 def sampled_range(model: Remainder, frame: Frame, low: Array, high: Array, rows: Array) -> tuple[Array, Array]:
@@ -60,7 +61,8 @@ def fitted_slopes(model: Remainder, frame: Frame, low: Array, high: Array, rows:
     for group in model.blocks:
         shift, half = _points(model, group, low, high, rows)
         values = _remainder(model, frame, shift)
-        scale = np.where(half > _NEGLIGIBLE, half, np.inf)
+        moving = (half > _NEGLIGIBLE * half.max(axis=0)) & (half > _ROUNDING * np.abs(frame.middle.mid[:, model.active]))
+        scale = np.where(moving, half, np.inf)
         for i in range(n):
             states = [j for o, j in model.entries if o == i and any(position[j] in block for block in group)]
             if not states:

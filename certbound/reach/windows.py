@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.errors import EngineError
 from certbound.reach.response import LinearResponse
 from certbound.tubes.gaussian_normal import log_below_above, log_tail
 
@@ -62,7 +63,7 @@ def inverse_of(forward: Array, slack: float) -> tuple[Array, float]:
 
     Raises
     ------
-    ValueError
+    EngineError
         If it may be singular.
     """
     n = len(forward)
@@ -71,7 +72,10 @@ def inverse_of(forward: Array, slack: float) -> tuple[Array, float]:
     residual = float(np.abs(np.eye(n) - inverse @ forward).sum(1).max())
     residual += size * (n * slack + (n + 2) * 4e-16 * norm)
     if residual >= 0.5:
-        raise ValueError("`length` of a window is too large for this system; take shorter windows.")
+        raise EngineError(
+            "the system is too stiff for the linear engine: the transition matrix of a window of its pieces of time is "
+            "next to singular; shorten the horizon, or use another method."
+        )
     return inverse, 2 * residual * size
 
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from certbound.constants.branching import bound_supremum
 from certbound.constants.enclosures import enclose
+from certbound.errors import EngineError
 from certbound.problem.problem import Problem
 from certbound.problem.regions import Ball, Box, HalfSpace, Polytope
 from certbound.problem.sets import GaussianStart
@@ -45,6 +46,7 @@ _MOST_STATES = 3
 _DEGREES = {1: (4, 6), 2: (4, 6), 3: (4,)}
 _GRID = {1: 201, 2: 41, 3: 13}
 _ROUNDS = 3
+_FAR = 1 / 3  # share of the exponent asked for, from which on the next degree is worth its time
 _CLOSE = 0.1  # of log10: what is proved may be that far from what the program hoped for
 _BUDGET = 20_000
 _TOLERANCE = 0.02  # of kappa T, of V at the start and of V at the boundary: a loss of 0.03 in log10
@@ -102,10 +104,15 @@ def barrier_engine(problem: Problem, *, quick: bool = False, **_: Any) -> Engine
     best: Barrier | None = None
     level = 0.0
     for degree in _DEGREES[work.n]:
-        found = work.search(degree)
+        try:
+            found = work.search(degree)
+        except EngineError:
+            if best is None:
+                raise
+            break
         if found is not None and found.log10_probability(problem.horizon) < level:
             best, level = found, found.log10_probability(problem.horizon)
-        if level <= math.log10(problem.delta):
+        if level <= math.log10(problem.delta) or 0 > level > _FAR * math.log10(problem.delta):
             break
     if best is None:
         return EngineAnswer(reason="no polynomial barrier was found.", method="barrier")
@@ -148,6 +155,7 @@ class _Work:
         low, high = hull_of(self.gaps)
         self.hull = Interval(low, high)
         self.center, self.scale = (low + high) / 2, (high - low) / 2
+        self.size = float(np.max(self.scale))
         self.start = initial_cells(problem).boxes[0]
         disturbance = system.disturbance
         free = [(0.0, float(problem.horizon)), *zip(low.tolist(), high.tolist())]
@@ -183,9 +191,9 @@ class _Work:
         count = _GRID[self.n]
         axes = [np.linspace(a, b, count) for a, b in zip(self.hull.lo, self.hull.hi)]
         grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
-        inside = self._gap(grid) <= 1e-12
+        inside = self._gap(grid) <= 1e-12 * self.size
         shaped = inside.reshape([count] * self.n)
-        boundary = [grid[inside & (self._gap(grid) >= -1e-9)]]
+        boundary = [grid[inside & (self._gap(grid) >= -1e-9 * self.size)]]
         index = np.arange(len(grid)).reshape(shaped.shape)
         for axis in range(self.n):
             first, second = (np.take(index, range(k, count - 1 + k), axis=axis).ravel() for k in (0, 1))
@@ -286,6 +294,12 @@ class _Work:
         growth = self._supremum(
             self._generator(value), self.ranges, 1, self._safe, tolerance / float(self.problem.horizon)
         )
+        if not np.isfinite(growth.upper):  # V is finite everywhere: no other one would help
+            raise EngineError(
+                "the dynamics have no finite enclosure near ("
+                + ", ".join(f"{x:.4g}" for x in growth.worst.mid[1 : self.n + 1])
+                + "), a part of the safe set: they are undefined there, or jump."
+            )
         start = self._supremum(value, self.start, 0, _anywhere, tolerance)
         negative = substitute(trace(lambda v: -v[0], {"v": ["v"]}), names, {"v": value})
         exit_ = self._supremum(negative, self.hull, 0, self._leaving, tolerance)

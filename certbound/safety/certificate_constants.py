@@ -132,7 +132,9 @@ def _rounded(given: Constants, slack: float) -> Constants:
 
 def _smallest(curve: Curve, norm: Norm) -> float:
     """A unit for what is nearly 0: the size of the nominal states."""
-    return 1e-3 * float(np.max(norm.dual(np.eye(curve.dimension)))) * (1e-3 + float(np.abs(curve.coefficients).max()))
+    return 1e-3 * float(np.max(norm.dual(np.eye(curve.dimension)))) * (
+        float(np.abs(curve.coefficients[..., 0, :]).max()) or 1.0
+    )
 
 
 def _cells_along(curve: Curve) -> int:

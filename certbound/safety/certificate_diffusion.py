@@ -168,7 +168,7 @@ class _StatedRun(DiffusionRun):
 
 
 def _wider(low: Array, high: Array, share: float) -> tuple[Array, Array]:
-    room = share * (high - low) + 1e-12
+    room = share * (high - low) + 1e-12 * (high - low).max(axis=0)
     return low - room, high + room
 
 

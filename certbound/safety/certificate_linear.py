@@ -216,17 +216,17 @@ def widened(run: LinearRun, levels: Array, found: tuple[Array, Array], pad: floa
     """
     engine, shape = run.engine, found[0].shape
     extra = run.extra.reshape(shape[0] * shape[1], *run.extra.shape[2:])
-    boxes = _padded(found, pad)
+    boxes = _padded(engine, found, pad)
     for _ in range(_ROUNDS):
-        held = _implied(run, levels, _padded(boxes, pad / 2))
+        held = _implied(run, levels, _padded(engine, boxes, pad / 2))
         if held is None:
             return None
-        wanted = [part.reshape(-1, engine.n) for part in _padded(found, pad / 2)]
+        wanted = [part.reshape(-1, engine.n) for part in _padded(engine, found, pad / 2)]
         bound = engine.model.bound(engine.frame, *held, extra, 2, (wanted[0], wanted[1]))
         inner = bound[0].reshape(shape), bound[1].reshape(shape)
         if not all(np.isfinite(part).all() for part in inner):
             return None
-        boxes = _padded(inner, pad / 2)
+        boxes = _padded(engine, inner, pad / 2)
         implied = _implied(run, levels, boxes)
         if implied is None:
             return None
@@ -246,10 +246,10 @@ def _implied(run: LinearRun, levels: Array, boxes: tuple[Array, Array]) -> tuple
     return low - slack, high + slack
 
 
-def _padded(bounds: tuple[Array, Array], pad: float) -> tuple[Array, Array]:
+def _padded(engine: Linearisation, bounds: tuple[Array, Array], pad: float) -> tuple[Array, Array]:
     low, high = bounds
     size = np.maximum(np.abs(low), np.abs(high))
-    room = pad * (high - low) + 1e-9 * size + pad * 1e-11
+    room = pad * (high - low) + 1e-9 * size + pad * 1e-11 * engine.remainder_sizes
     return low - room, high + room
 
 

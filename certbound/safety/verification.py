@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -10,8 +11,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from certbound.display import Shown, log10_text
-from certbound.errors import CertificateError
+from certbound.errors import CertificateError, EngineError, contained
 from certbound.problem.problem import Problem
+from certbound.reach.cells import initial_cells
 from certbound.reach.tube import ReachTube
 from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, settled
 from certbound.safety.falsification import Violation, find_violation
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
 
 __all__ = ["ENGINES", "EngineAnswer", "Verdict", "verify_safety"]
+
+_log = logging.getLogger(__name__)
 
 
 def _constants(problem: Problem, **options: Any) -> EngineAnswer:
@@ -201,7 +205,8 @@ def verify_safety(
     'SAFE'
     """
     names = _chosen(method)
-    violation = find_violation(problem)
+    _checked(problem, cells, constants)
+    violation = _violation(problem)
     if violation is not None:
         return _unsafe(problem, violation)
     answers: dict[str, EngineAnswer] = {}
@@ -210,14 +215,55 @@ def verify_safety(
         quick = any(_is_safe(answer, problem) or answer.conclusive for answer in answers.values())
         if quick and problem.system.dimension > _LARGE:
             continue
-        answers[name] = _ENGINES[name](
-            problem, method=inner, cells=cells, constants=constants, quick=quick, thorough=method != "auto"
-        )
+        options = {"method": inner, "cells": cells, "constants": constants, "quick": quick}
+        answers[name] = _asked(name, problem, **options, thorough=method != "auto")
     first = answers["linear"] if method == "auto" and cells is None else None
     proved = any(_is_safe(answer, problem) for answer in answers.values())
     if first is not None and first.applicable and not first.conclusive and not proved:
-        answers["linear"] = min(first, linear_engine(problem), key=lambda answer: answer.log10_delta)
+        second = _asked("linear", problem)
+        if second.applicable:
+            answers["linear"] = min(first, second, key=lambda answer: answer.log10_delta)
     return _verdict(problem, answers)
+
+
+def _asked(name: str, problem: Problem, **options: Any) -> EngineAnswer:
+    """What an engine answers; where it fails, that it does not apply, and why."""
+    try:
+        with contained(name):
+            return _ENGINES[name](problem, **options)
+    except EngineError as error:
+        return EngineAnswer(applicable=False, reason=str(error), method=name)
+
+
+def _violation(problem: Problem) -> Violation | None:
+    """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
+    try:
+        with contained("noise-free"):
+            return find_violation(problem)
+    except EngineError as error:
+        _log.info("no noise-free trajectory was followed: %s", error)
+        return None
+
+
+def _checked(problem: Problem, cells: int | None, constants: Constants | None) -> None:
+    """Refuse what is wrong with the arguments before any engine runs: from then on whatever fails is an engine.
+
+    Raises
+    ------
+    ValueError
+        If the system has inputs and no plan, ``cells`` cannot be, or the constants do not fit the problem.
+    """
+    initial_cells(problem, cells)
+    _ = problem.closed_loop
+    if constants is None:
+        return
+    continuous, n = problem.system.time == "continuous", problem.system.dimension
+    if constants.continuous != continuous:
+        raise ValueError(f"`constants` must state a {'rate' if continuous else 'gain'}, as the problem's time asks.")
+    if constants.dimension != n:
+        raise ValueError(f"`constants` must be of dimension {n}, as the problem is, got {constants.dimension}.")
+    if constants.times is not None and constants.times[-1] < problem.horizon:
+        raise ValueError(f"`constants` must reach the horizon {problem.horizon:g}, got {constants.times[-1]:g}.")
 
 
 def _is_safe(answer: EngineAnswer, problem: Problem) -> bool:
