@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 import certbound as cb
+from certbound.errors import EngineError
 from tests.fuzz import oracle
 from tests.fuzz.drafts import Draft
 
@@ -40,7 +41,7 @@ DOCUMENTED: dict[str, tuple[type[Exception], ...]] = {
     "certificate": (cb.CertificateError,),
     "derive": (cb.EnclosureError, cb.InfeasibleError),
     "tune": (),
-    "reach": (cb.EnclosureError, cb.InfeasibleError),
+    "reach": (cb.EnclosureError, cb.InfeasibleError, EngineError),
     "simulate": (),
 }
 """Errors that are answers: what was asked for does not exist, and the message says why."""
@@ -104,6 +105,9 @@ class Run:
         verdict = self.verdict
         self.answers["verify"] = verdict.status
         self.facts |= {"log10_delta": verdict.log10_delta, "delta": self.draft.delta, "method": verdict.method}
+        for name, answer in verdict.answers.items():
+            if "engine failed" in answer.reason:
+                self.report("verify", "engine failed", f"{name}: {_plain(answer.reason)}", answer.reason)
         level = verdict.log10_delta
         if not (
             math.isfinite(level) and level <= 0 and verdict.status in ("SAFE", "UNSAFE", "UNSAFE_NOMINAL", "UNKNOWN")

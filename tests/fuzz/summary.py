@@ -8,8 +8,9 @@ from typing import Any
 
 __all__ = ["summarize"]
 
-SOFT = frozenset({"close call", "none"})
-"""Kinds that are counted apart: a verdict within 2 % of its limit in other units, and SAFE without a certificate."""
+SOFT = frozenset({"close call", "none", "engine failed"})
+"""Kinds that are counted apart: a verdict within 2 % of its limit in other units, SAFE without a certificate, and an
+engine that failed where it should have said why it does not apply."""
 
 
 def summarize(records: Iterable[Mapping[str, Any]]) -> str:
