@@ -360,13 +360,15 @@ class Run:
         plan = self.draft.plan
         return oracle.STEPS * (len(plan) if isinstance(plan, np.ndarray) else 1)
 
-    def _pairs(self, steps: int, noise: bool, paths: int = 2000) -> Iterator[tuple[float, Any]]:
+    def _paths(self, steps: int, noise: bool, paths: int = 2000) -> Iterator[tuple[float, Any]]:
+        """Paths of the oracle; without noise a random start is its mean."""
         draft, rng = self.draft, self.rng(4)
         policy = next(iter(oracle.policies(draft, rng)))
+        initial = oracle.starts(draft, rng, paths)
+        if not noise and draft.start[0] == "gaussian":
+            initial = np.tile(draft.start[1], (paths, 1))
         with np.errstate(all="ignore"):
-            yield from oracle.follow(
-                draft, oracle.starts(draft, rng, paths), rng, steps=steps, policy=policy, noise=noise
-            )
+            yield from oracle.follow(draft, initial, rng, steps=steps, policy=policy, noise=noise)
 
     def _outside_tube(self, tube: Any, constants: Any, steps: int) -> tuple[int, int]:
         """Paths whose distance from the noise-free path of the same start exceeds the radius at some time.
@@ -401,7 +403,7 @@ class Run:
             1e-9 if noise else 1e-3 if rough else 1e-6
         )  # of the scheme's own error where a kink or jump spoils its order
         slack = share * (1e-3 * units.state + np.maximum(np.abs(hull.lo), np.abs(hull.hi)))
-        for t, x in self._pairs(steps, noise):
+        for t, x in self._paths(steps, noise):
             at = min(t * units.time, float(self.problem.horizon))
             if at > tube.end:
                 break
