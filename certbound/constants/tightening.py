@@ -34,6 +34,7 @@ _POWERS = np.exp(np.linspace(np.log(0.03), np.log(100.0), 9))
 _STARTS = np.array([1.0, 0.3, 0.1, 0.03, 0.01])
 _STEPS = np.array([0.55, 1.0, 1.8])
 _NODES = 24
+_LEAST_SQUARE = 1e-24  # stands for L^2 = 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -203,7 +204,7 @@ class _Search:
         )
         self.best: TightMetric | None = None
         self.failures: list[str] = []
-        value = reachable_value(start, jacobians, continuous=model.continuous)
+        value = _reached(start, jacobians, model)
         _, self.nu, self.fit = self.evaluate(start, value, None)
 
     def weights(self, value: float, steepness: float) -> Array:
@@ -280,7 +281,7 @@ def tighten(
         If no value could be solved for.
     """
     search = _Search(jacobians, targets.coarse(), noise, model, start, form)
-    least = reachable_value(start, jacobians, continuous=model.continuous)
+    least = _reached(start, jacobians, model)
     scale = abs(least if model.continuous else 1 - least) + 1 / model.horizon
     steep, shift = 1.0, -4.0
 
@@ -295,6 +296,12 @@ def tighten(
     if search.best is None:
         raise SolverError(f"the tightening found no metric: {search.failures[-1]}")
     return search.best
+
+
+def _reached(metric: Array, jacobians: JacobianSet, model: RadiusModel) -> float:
+    """c or L^2 that a metric reaches; a map without slope counts as one of gain 1e-12, since tubes exclude 0."""
+    value = reachable_value(metric, jacobians, continuous=model.continuous)
+    return value if model.continuous else max(value, _LEAST_SQUARE)
 
 
 def _smallest(function: Callable[[float], float], points: Sequence[float], resolution: float) -> float:

@@ -1,4 +1,4 @@
-"""Metrics of problems whose states are measured in very unlike units, or whose deviation overflows."""
+"""Metrics at the ends of what is legal: very unlike units, deviations that overflow, maps without slope."""
 
 import numpy as np
 import pytest
@@ -51,3 +51,13 @@ def test_a_metric_for_the_last_step_alone_is_found():
     system = cb.DiscreteSystem(lambda x: 0.999999999 * x, states=2, noise=cb.Gaussian(std=0.1))
     (found,) = cb.bound_metrics(cb.Problem(system, initial=[0.0, 0.0], safe=stay, horizon=26))
     assert found.certified
+
+
+@pytest.mark.parametrize("slope", [0.0, 1e-200, 1e-13])
+def test_a_constant_map_has_a_metric_for_each_constraint(slope):
+    stay = [cb.Inside(cb.Box([-1, -3], [2, 3])), cb.Inside(cb.Ball([0, 0], 4.0), during=(1, 2))]
+    system = cb.DiscreteSystem(
+        lambda x: [0.5 + slope * x[0], -0.2 + slope * x[1]], states=2, noise=cb.Gaussian(std=0.1)
+    )
+    found = cb.bound_metrics(cb.Problem(system, initial=[0.5, -0.2], safe=stay, horizon=4))
+    assert [constants.gain < 1e-9 for constants in found] == [True, True]
