@@ -215,7 +215,7 @@ class Run:
         if self.verdict is None:
             return
         level = 10.0**self.verdict.log10_delta
-        if worst.lower > 0:
+        if worst.lower > 0 and level < 1:
             self.facts["ratio"] = level / worst.lower
             self.facts["ratio to estimate"] = level / (worst.exits / worst.paths)
 
