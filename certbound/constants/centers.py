@@ -180,26 +180,27 @@ def lyapunov_metric(matrix: Array, share: float, *, continuous: bool) -> Array:
     Raises
     ------
     numpy.linalg.LinAlgError
-        If the equation is singular in floating point (a Jordan block on the stability limit).
+        If the equation is singular in floating point (a Jordan block on the stability limit, very unlike units).
     """
     from scipy.linalg import LinAlgWarning, solve_continuous_lyapunov, solve_discrete_lyapunov
 
     n = len(matrix)
     eigenvalues = np.linalg.eigvals(matrix)
-    if continuous:
-        top = float(eigenvalues.real.max())
-        shift = top + share * max(abs(top), 1e-3 * float(np.abs(eigenvalues).max()), 1e-9)
-        metric = solve_continuous_lyapunov((matrix - shift * np.eye(n)).T, -np.eye(n))
-    else:
-        top = float(np.abs(eigenvalues).max()) ** 2
-        scale = top + share * max(abs(1 - top), 1e-6)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", LinAlgWarning)
-            try:
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("error")
+            if continuous:
+                top = float(eigenvalues.real.max())
+                shift = top + share * max(abs(top), 1e-3 * float(np.abs(eigenvalues).max()), 1e-9)
+                metric = solve_continuous_lyapunov((matrix - shift * np.eye(n)).T, -np.eye(n))
+            else:
+                top = float(np.abs(eigenvalues).max()) ** 2
+                scale = top + share * max(abs(1 - top), 1e-6)
                 metric = solve_discrete_lyapunov(matrix.T / np.sqrt(scale), np.eye(n))
-            except LinAlgWarning as warning:
-                raise np.linalg.LinAlgError(str(warning)) from warning
+    except (LinAlgWarning, RuntimeWarning) as warning:
+        raise np.linalg.LinAlgError(str(warning)) from warning
     metric = (metric + metric.T) / 2
+    np.linalg.cholesky(metric)  # refuses what is positive definite on paper only
     return np.asarray(metric / np.linalg.norm(metric, 2))
 
 

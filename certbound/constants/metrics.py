@@ -278,7 +278,9 @@ def erosion_ratio(constants: Constants, rooms: Rooms, horizon: float, delta: flo
         values = np.concatenate([[np.inf], room[np.searchsorted(rooms.times, steps)]])
         times = np.arange(int(horizon) + 2.0)
     tube = tune_tube(constants, horizon=horizon, delta=delta, objective=(times, values))
-    return float(np.max(np.asarray(tube.radius(rooms.times)) / room))
+    asked = np.isfinite(room)  # elsewhere nothing is asked, and an endless radius is no erosion
+    ratios = np.asarray(tube.radius(rooms.times))[asked] / room[asked]
+    return float(np.max(ratios, initial=0.0))
 
 
 def _least_erosion(model: Model, euclidean: Constants, targets: Rooms, horizon: float, delta: float) -> Constants:
@@ -321,10 +323,10 @@ def _candidate_sets(model: Model) -> list[JacobianSet]:
 
 
 def _tried(members: JacobianSet, propose: Callable[[JacobianSet], list[Proposal]]) -> list[Proposal]:
-    """The proposals, or none where every solver stalls: the identity metric is there already."""
+    """The proposals, or none where every solver stalls or overflows: the identity metric is there already."""
     try:
         return propose(members)
-    except SolverError:
+    except (SolverError, np.linalg.LinAlgError):
         return []
 
 

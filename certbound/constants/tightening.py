@@ -35,6 +35,7 @@ _POWERS = np.exp(np.linspace(np.log(0.03), np.log(100.0), 9))
 _STARTS = np.array([1.0, 0.3, 0.1, 0.03, 0.01])
 _STEPS = np.array([0.55, 1.0, 1.8])
 _NODES = 24
+_LEAST_SQUARE = 1e-24  # stands for L^2 = 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -157,8 +158,8 @@ class RadiusModel:
         places = np.searchsorted(np.concatenate([[0.0], times]), times)
         power = a[:, None]
         whole = info[:, :1]
-        info, base = info[:, places], (room**2 / (2 * v[:, places]))
         with np.errstate(all="ignore"):
+            info, base = info[:, places], (room**2 / (2 * v[:, places]))
             goal = (np.log(whole) + log_phi(power * whole))[:, 0] - np.log(self.delta)
             spent = np.log(info) + log_phi(power * info)
             x = np.log(np.max(2 * v[:, places] * (nu / 2 + np.log(1 / self.delta)) / room**2, axis=-1))
@@ -170,7 +171,7 @@ class RadiusModel:
                 share = np.exp(power * info + excess - level)[rows, worst]
                 step = np.clip((goal - level[rows, worst]) / (slope[rows, worst] * share), -1.5, 1.5)
                 x = x + step
-                if np.nanmax(np.abs(step)) < 1e-4:
+                if not np.any(np.abs(step) >= 1e-4):  # nan: out of range, and counted as endless below
                     break
             result: Array = np.nan_to_num(np.exp(x), nan=np.inf)
         return result
@@ -204,12 +205,21 @@ class _Search:
         )
         self.best: TightMetric | None = None
         self.failures: list[str] = []
-        value = reachable_value(start, jacobians, continuous=model.continuous)
+        value = _reached(start, jacobians, model)
         _, self.nu, self.fit = self.evaluate(start, value, None)
 
     def weights(self, value: float, steepness: float) -> Array:
-        """Rooms that a radius growing like a power of the standard deviation leaves."""
-        spread = self.model.variances(value, self.targets.times)
+        """Rooms that a radius growing like a power of the standard deviation leaves.
+
+        Raises
+        ------
+        SolverError
+            If the standard deviation overflows within the horizon.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            spread = self.model.variances(value, self.targets.times)
+        if not np.all(np.isfinite(spread)) or not spread.max() > 0:
+            raise SolverError(f"the deviation overflows at the value {value:.3g} within the horizon.")
         return self.targets.effective((spread / spread.max()) ** (steepness / 2))
 
     def evaluate(self, metric: Array, value: float, near: Fit | None) -> tuple[float, float, Fit]:
@@ -272,7 +282,7 @@ def tighten(
         If no value could be solved for.
     """
     search = _Search(jacobians, targets.coarse(), noise, model, start, form)
-    least = reachable_value(start, jacobians, continuous=model.continuous)
+    least = _reached(start, jacobians, model)
     scale = abs(least if model.continuous else 1 - least) + 1 / model.horizon
     steep, shift = 1.0, -4.0
 
@@ -287,6 +297,12 @@ def tighten(
     if search.best is None:
         raise SolverError(f"the tightening found no metric: {search.failures[-1]}")
     return search.best
+
+
+def _reached(metric: Array, jacobians: JacobianSet, model: RadiusModel) -> float:
+    """c or L^2 that a metric reaches; a map without slope counts as one of gain 1e-12, since tubes exclude 0."""
+    value = reachable_value(metric, jacobians, continuous=model.continuous)
+    return value if model.continuous else max(value, _LEAST_SQUARE)
 
 
 def _smallest(function: Callable[[float], float], points: Sequence[float], resolution: float) -> float:

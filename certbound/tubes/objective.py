@@ -36,8 +36,11 @@ class Clearance:
         return np.unique(np.concatenate([first, first - 1]))
 
 
-def read_clearance(value: Any, horizon: float, name: str = "clearance") -> Clearance:
-    """A number or a pair (times, values), checked.
+def read_clearance(value: Any, horizon: float, name: str = "clearance", *, continuous: bool = False) -> Clearance:
+    """A number or a pair (times, values), checked and cut at the horizon.
+
+    A pair may go on beyond the horizon T: a smaller value that begins at T holds there, and is asked from step T - 1
+    (in continuous time T - T/1000) on.
 
     Raises
     ------
@@ -68,11 +71,25 @@ def read_clearance(value: Any, horizon: float, name: str = "clearance") -> Clear
         raise ValueError(f"times of `{name}` must rise strictly from 0 to the horizon {horizon:g} or beyond.")
     if not np.all(values > 0):
         raise ValueError(f"`{name}` must be positive everywhere, its least value is {np.min(values):g}.")
-    kept = int(np.searchsorted(times, horizon, side="left"))
-    times, values = np.append(times[:kept], horizon), values[:kept].copy()
+    times, values = _until(times, values, horizon, continuous=continuous)
     times.setflags(write=False)
     values.setflags(write=False)
     return Clearance(times, values)
+
+
+def _until(times: Array, values: Array, horizon: float, *, continuous: bool) -> tuple[Array, Array]:
+    """The pieces up to the horizon; what is asked at the horizon is asked over the last step (T/1000) as well."""
+    kept = int(np.searchsorted(times, horizon, side="left"))
+    starts, held = times[:kept], values[:kept]
+    begins = kept < len(values) and times[kept] == horizon
+    if continuous and not begins:
+        return np.append(starts, horizon), held.copy()
+    asked = values[kept] if begins else held[-1]
+    cut = horizon - (1e-3 * horizon if continuous else 1.0)
+    place = int(np.searchsorted(starts, cut, side="right"))
+    if place and starts[place - 1] < cut and held[place - 1] > asked:
+        starts, held = np.insert(starts, place, cut), np.insert(held, place, held[place - 1])
+    return np.append(starts, horizon), np.where(starts >= cut, np.minimum(held, asked), held)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +148,7 @@ def _mean(schedule: Schedule, values: Array) -> float:
     return float(np.mean(np.interp(np.arange(1.0, times[-1] + 1), times, values)))
 
 
-def make_objective(given: Any, horizon: float) -> Objective:
+def make_objective(given: Any, horizon: float, *, continuous: bool = False) -> Objective:
     """Read ``objective``.
 
     Raises
@@ -147,4 +164,4 @@ def make_objective(given: Any, horizon: float) -> Objective:
         if callable(given):
             read_clearance(given, horizon, "objective")
         raise ValueError(f"`objective` must be 'max', 'final', 'mean' or a pair (times, values), got {given!r}.")
-    return Objective(given, "scale", read_clearance(given, horizon, "objective"))
+    return Objective(given, "scale", read_clearance(given, horizon, "objective", continuous=continuous))

@@ -96,7 +96,7 @@ def tune_tube(
     if method not in METHODS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
     schedule = make_schedule(constants, horizon)
-    goal = make_objective(objective, schedule.horizon)
+    goal = make_objective(objective, schedule.horizon, continuous=schedule.continuous)
     start = start or Start()
     check_start(schedule, start, constants.dimension)
     moving = start.offset > 0 or start.sigma > 0
@@ -309,7 +309,7 @@ def bound_exit_probability(
     True
     """
     schedule = make_schedule(constants, horizon)
-    held = read_clearance(clearance, schedule.horizon)
+    held = read_clearance(clearance, schedule.horizon, continuous=schedule.continuous)
     start = start or Start()
     check_start(schedule, start, constants.dimension)
     if np.max(schedule.sigmas) == 0 and start == Start():

@@ -99,8 +99,9 @@ def test_the_union_bound_adds_the_one_time_tails_of_the_steps(dimension):
     schedule, radii = make_schedule(constants, 4), (4.0, 5.0, 4.5, 6.0, 5.5)
     held = read_clearance(((0, 1, 2, 3, 4, 5), radii), 4)
     variance = np.cumsum(0.6 ** (2 * np.arange(4)))
-    # at the horizon itself the last piece's clearance counts
-    expected = sum(one_time_tail(dimension, r * r / (2 * v)) for r, v in zip((5.0, 4.5, 6.0, 6.0), variance))
+    # what is asked at the horizon is asked a step before as well, and both steps share the larger variance
+    pairs = zip((5.0, 4.5, 5.5, 5.5), variance[[0, 1, 3, 3]])
+    expected = sum(one_time_tail(dimension, r * r / (2 * v)) for r, v in pairs)
     got = union_level(schedule.refined(held.ends(schedule)), held)
     assert math.log10(expected) - 1e-3 < got < math.log10(expected) + 0.01
 
@@ -126,6 +127,31 @@ def test_in_discrete_time_a_piece_counts_at_its_own_whole_steps_only():
     hollow = ((0, 2.2, 2.8, 6), (9.0, 0.01, 9.0))  # no whole step in [2.2, 2.8)
     assert base - 0.3 < bound_exit_probability(CHAIN, horizon=6, clearance=hollow) < base + 0.05
     assert bound_exit_probability(CHAIN, horizon=6, clearance=((0, 2, 2.8, 6), (9.0, 0.01, 9.0))) > -0.01
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [
+        ((0, 1, 2, 3), (30.0, 30.0, 3.0)),
+        ((0, 1, 2, 3), (math.inf, math.inf, 3.0)),
+        ((0, 1.5, 2, 7), (30.0, 40.0, 3.0)),
+        ((0, 1.5, 2), (30.0, 3.0)),
+        ((0, 2, 3), (30.0, 3.0)),
+    ],
+)
+def test_a_clearance_that_shrinks_at_the_horizon_counts_there(profile):
+    walk, motion = Constants(gain=1.0, sigma=1.0, dimension=1), Constants(rate=1e-15, sigma=1.0, dimension=1)
+    truth = math.log10(math.erfc(3 / 2))  # P(|S_2| > 3), of variance 2
+    assert bound_exit_probability(walk, horizon=2, clearance=profile) > truth
+    assert bound_exit_probability(motion, horizon=2.0, clearance=profile) > truth
+    tube = tune_tube(walk, horizon=2, delta=1e-3, objective=profile)
+    assert tube.bound(0, 2) < 12
+
+
+def test_a_clearance_that_grows_beyond_the_horizon_changes_nothing():
+    constants = Constants(gain=1.0, sigma=1.0, dimension=1)
+    short = bound_exit_probability(constants, horizon=2, clearance=((0, 1, 2), (30.0, 3.0)))
+    assert bound_exit_probability(constants, horizon=2, clearance=((0, 1, 2, 3), (30.0, 3.0, 9.0))) == short
 
 
 def test_a_short_narrow_piece_counts_in_continuous_time():
