@@ -96,7 +96,7 @@ def proved_certificate(problem: Problem, verdict: Verdict) -> str:
     SolverError
         If the checker did not prove what was written.
     """
-    left, reasons = dict(verdict.answers), []
+    left, reasons = dict(verdict.answers), list[str]()
     while left:
         try:
             found, engine, reason = _proved(problem, replace(verdict, answers=left))

@@ -252,7 +252,7 @@ def test_pieces_on_which_the_model_is_undefined_are_refused():
     with pytest.raises(EnclosureError, match=r"\(1 / q\)"):
         constants_along(system, [0.0, 1.0, 2.0], Interval([[1.0], [-1.0]], [[2.0], [1.0]]))
     cubic = cb.ContinuousSystem(lambda x: [x[0] ** 3], states=["q"])
-    with pytest.raises(ValueError, match="on piece 0, entry d f_q / d q"):
+    with pytest.raises(EnclosureError, match="on piece 0, entry d f_q / d q"):
         constants_along(cubic, [0.0, 1.0], Interval([[0.0]], [[np.inf]]))
     with pytest.raises(ValueError, match="one row of 1 intervals"):
         constants_along(cubic, [0.0, 1.0], Interval(np.zeros((2, 1)), np.ones((2, 1))))
