@@ -192,8 +192,8 @@ def verify_safety(
     Raises
     ------
     ValueError
-        If the system has inputs and no plan, the method is unknown, or ``cells`` or the constants do not fit. What fails
-        afterwards is an engine: it answers that it does not apply, and why.
+        If the system has inputs and no plan, the method is unknown, or ``cells`` or the constants do not fit. What
+        fails afterwards is an engine: it answers that it does not apply, and why.
 
     Source: Thms K2, K4, K5, K7 of theory.
 
@@ -252,7 +252,7 @@ def _checked(problem: Problem, method: str, cells: int | None, constants: Consta
     Raises
     ------
     ValueError
-        If the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit the problem.
+        If the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit it.
     """
     from certbound.tubes.baselines import check_method
 
