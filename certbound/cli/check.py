@@ -110,8 +110,7 @@ def proved_certificate(problem: Problem, verdict: Verdict) -> str:
     SolverError
         If the checker did not prove what was written.
     """
-    left = dict(verdict.answers)
-    reasons: list[str] = []
+    left, reasons = dict(verdict.answers), list[str]()
     while left:
         try:
             found, engine, reason = _proved(problem, replace(verdict, answers=left))

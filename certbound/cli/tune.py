@@ -85,7 +85,7 @@ def tune(
     if (constants is None or not valid) and time_limit is not None:
         raise SolverError(f"no tube was computed within {time_limit:g} s; give a larger --time-limit")
     if constants is None or not valid:
-        raise SolverError(f"no tube along whole trajectories was found for {subject.name}; try verify, which has others")
+        raise SolverError(f"no tube along whole trajectories was found for {subject.name}; try verify, it has others")
     best = min(valid, key=lambda row: row["maximum"])["method"]
     if plot is not None:
         _draw(subject, tubes, best, plot)

@@ -141,7 +141,7 @@ def _diffusion(
     )  # fmt: skip
 
 
-def _chain(constants: Constants, schedule: Schedule, radius: float) -> Recursion | None:
+def chain_of(constants: Constants, schedule: Schedule, radius: float) -> Recursion | None:
     """The recursion for a radius; None when it would be too large."""
     steps = np.round(schedule.lengths).astype(np.intp)
     if (
@@ -179,7 +179,7 @@ def bound_exact_exit(constants: Constants, *, horizon: float, radius: float, tar
     _check_isotropic(constants)
     schedule = make_schedule(constants, horizon)
     if not schedule.continuous:
-        chain = _chain(constants, schedule, radius)
+        chain = chain_of(constants, schedule, radius)
         if chain is not None:
             return chain.bound()
     problem = _diffusion(constants, schedule, radius, target, worst=False)
@@ -241,11 +241,11 @@ def first_passage_tube(
     """
     (_check_continuous if worst else _check_isotropic)(constants)
     schedule = make_schedule(constants, horizon)
-    chained = not schedule.continuous and _chain(constants, schedule, above) is not None
+    chained = not schedule.continuous and chain_of(constants, schedule, above) is not None
 
     def bound(radius: float, coarseness: float = 0.0) -> float:
         if chained:
-            chain = _chain(constants, schedule, radius)
+            chain = chain_of(constants, schedule, radius)
             return 1.0 if chain is None else chain.bound()
         problem = _diffusion(constants, schedule, radius, delta, worst=worst, coarseness=coarseness or 1.0)
         if problem is None:

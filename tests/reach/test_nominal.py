@@ -159,7 +159,7 @@ def test_twelve_states_and_several_cells_at_once():
 
 def test_a_horizon_beyond_a_blow_up_is_refused():
     flow = continuous(lambda x: [x[0] ** 2], 1, point=[1.0], horizon=2.0)
-    with pytest.raises(EngineError, match="the noise-free trajectory is lost.*; shorten the horizon"):
+    with pytest.raises(EngineError, match=r"the noise-free trajectory is lost.*; shorten the horizon"):
         nominal_curve(flow, [1.0])
 
 

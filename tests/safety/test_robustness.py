@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
+from certbound.cli.check import proved_certificate
 from certbound.constants.metrics import bound_metrics
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, SolverError, contained
 from certbound.reach.linearisation import Linearisation
@@ -161,6 +163,7 @@ def test_warnings_and_interruptions_are_not_swallowed(kind: type[BaseException])
     [
         ({"cells": 0}, "`cells` must be a positive integer"),
         ({"method": "magic"}, "`method` must be one of"),
+        ({"method": "thm3"}, "`method` 'thm3' needs constants with `rate`"),
         ({"constants": cb.Constants(rate=-1.0, sigma=0.1, dimension=1)}, "`constants` must state a gain"),
         ({"constants": cb.Constants(gain=0.5, sigma=0.1, dimension=2)}, "`constants` must be of dimension 1"),
         (
@@ -232,3 +235,11 @@ def test_other_units_give_the_same_verdict(build: Callable[[float], cb.Problem],
     plain, scaled = (verify_safety(build(size), method=method) for size in (1.0, unit))
     assert scaled.status == plain.status
     assert scaled.log10_delta == pytest.approx(plain.log10_delta, rel=1e-2)
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1e8])
+@pytest.mark.parametrize(("build", "method"), [(sine_map, "linear"), (sine_map, "constants"), (decaying, "linear")])
+def test_other_units_have_a_certificate_too(build: Callable[[float], cb.Problem], method: str, unit: float) -> None:
+    problem = build(unit)
+    text = proved_certificate(problem, verify_safety(problem, method=method))
+    assert float.fromhex(json.loads(text)["claim"]["log10_delta"]) < -3
