@@ -277,6 +277,7 @@ def _around(rng: Random, kind: str, times: Array, states: Array, room: float, mo
     center = _center(rng, times, middle, drift, moving)
     y = _relative(times, states, center)
     if kind == "box":
+        room = np.maximum(room, -0.2 * np.ptp(y, axis=(0, 1)))
         low, high = y.min(axis=(0, 1)) - room, y.max(axis=(0, 1)) + room
         if not moving:
             low, high = low + middle, high + middle
