@@ -12,7 +12,8 @@ import logging
 from collections.abc import Iterator
 
 __all__ = [
-    "CertboundError", "CertificateError", "EnclosureError", "EngineError", "InfeasibleError", "SolverError", "contained",
+    "CertboundError", "CertificateError", "EnclosureError", "EngineError", "InfeasibleError", "SolverError",
+    "contained",
 ]  # fmt: skip
 
 _LONGEST = 200  # letters of a foreign message that are repeated
@@ -71,12 +72,12 @@ def contained(engine: str) -> Iterator[None]:
     except (CertboundError, ArithmeticError, ValueError, MemoryError, RecursionError) as error:
         own = isinstance(error, CertboundError) or type(error) is ArithmeticError
         raise EngineError(str(error) if own else _failure(engine, error)) from error
-    except Exception as error:  # noqa: BLE001  (one engine's defect must not hide what another one proved)
+    except Exception as error:  # all of them: one engine's defect must not hide what another one proved
         _log.debug("the %s engine failed", engine, exc_info=True)
         raise EngineError(f"{_failure(engine, error)} This is a defect of certbound.") from error
 
 
 def _failure(engine: str, error: Exception) -> str:
-    words = " ".join(str(error).split())
+    words = " ".join(str(error).split()).rstrip(".")
     short = words if len(words) <= _LONGEST else f"{words[:_LONGEST]}..."
-    return f"the {engine} engine failed ({type(error).__name__}{': ' if short else ''}{short.rstrip('.')})."
+    return f"the {engine} engine failed ({type(error).__name__}{': ' if short else ''}{short})."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +12,7 @@ import typer
 from certbound.cli.messages import InputError
 from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, examples, load_problem
 from certbound.cli.output import SETTINGS, console, print_json, spinner
-from certbound.errors import SolverError
+from certbound.errors import CertificateError, EngineError, SolverError, contained
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
@@ -86,24 +87,61 @@ def _stated(
 def proved_certificate(problem: Problem, verdict: Verdict) -> str:
     """The text of a verdict's certificate, which the checker has proved again; it claims what was proved.
 
+    Where the checker proves no certificate of one engine, at any effort, the other engines' are tried.
+
     Raises
     ------
     CertificateError
         If the verdict bounds no probability.
     SolverError
-        If the checker did not prove what was written, at any effort.
+        If the checker did not prove what was written.
+    """
+    left, reasons = dict(verdict.answers), list[str]()
+    while left:
+        try:
+            found, engine, reason = _proved(problem, replace(verdict, answers=left))
+        except EngineError as error:
+            if not reasons:
+                raise CertificateError(str(error)) from error
+            break
+        if found is not None:
+            return found
+        reasons.append(f"{engine}: {reason}")
+        if left.pop(engine, None) is None:
+            break
+    if not reasons:
+        raise CertificateError(f"no probability was bounded that a certificate could state: {verdict.reason}")
+    raise SolverError(f"the certificate could not be proved again by the checker: {' '.join(reasons)}")
+
+
+def _proved(problem: Problem, verdict: Verdict) -> tuple[str | None, str, str]:
+    """A certificate that the checker has proved (None: it proved none), its engine, and what stood in the way.
+
+    Raises
+    ------
+    EngineError
+        If no certificate could be written.
     """
     from certbound.checker import check_data, parse
     from certbound.safety.certificate import problem_data, restated
 
-    reason = ""
+    engine = reason = ""
     for attempt in range(ATTEMPTS):
-        text = verdict.certificate_text(problem, attempt=attempt)
-        report = check_data(parse(text), problem_data(problem))
+        try:
+            with contained("certificate"):
+                text = verdict.certificate_text(problem, attempt=attempt)
+        except EngineError as error:
+            if attempt + 1 == ATTEMPTS and not engine:
+                raise
+            reason = str(error)
+            continue
+        data = parse(text)
+        engine = str(data["claim"]["method"])
+        report = check_data(data, problem_data(problem))
         if report.valid and report.log10_proved is not None:
-            return restated(text, report.log10_proved)
+            return restated(text, report.log10_proved), engine, ""
         reason = report.reason
-    raise SolverError(f"the certificate could not be proved again by the checker: {reason}")
+    return None, engine, reason
 
 
 def _print(result: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ import typer
 
 from certbound.cli.describe import describe_constants, log10_text
 from certbound.cli.limits import Clock, OutOfTime, TimeLimitOption
+from certbound.cli.messages import computing
 from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, examples, load_problem
 from certbound.cli.output import SETTINGS, console, print_json, spinner
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
@@ -43,7 +44,7 @@ def derive(
     """Bound the contraction rate (or gain) and the noise, with a metric for each constraint."""
     subject = load_problem(problem, pairs, horizon=horizon)
     started = time.perf_counter()
-    with spinner(f"bounding the constants of {subject.name}"):
+    with spinner(f"bounding the constants of {subject.name}"), computing("constants", subject):
         constants, metrics, where = _bound(subject, Clock(time_limit))
     seconds = time.perf_counter() - started
     result = {

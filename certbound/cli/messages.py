@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import linecache
 import re
 import sys
+from collections.abc import Iterator
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from certbound.errors import (
     CertboundError,
     CertificateError,
     EnclosureError,
+    EngineError,
     InfeasibleError,
     SolverError,
+    contained,
 )
 
-__all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "InputError", "explain", "split_cure", "write_error"]
+if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
+
+__all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "InputError", "computing", "explain", "split_cure", "write_error"]
 
 BAD_INPUT = 2
 FAILED = 3
@@ -66,6 +74,29 @@ def explain(error: Exception, command: str) -> tuple[int, str, str]:
         f"certbound failed: {type(error).__name__}: {_one_line(str(error))}",
         "this is a defect; run again with --verbose and report what it prints",
     )
+
+
+@contextlib.contextmanager
+def computing(engine: str, problem: Problem) -> Iterator[None]:
+    """What fails in the block is a failure of certbound's, for the problem was checked when it was read.
+
+    Two refusals stay the user's to mend: a plan that is missing, and a domain of the user's on which the model is
+    undefined or its slopes unbounded.
+
+    Raises
+    ------
+    EngineError, SolverError
+        For every other failure.
+    """
+    _ = problem.closed_loop
+    try:
+        with contained(engine):
+            yield
+    except EngineError as error:
+        cause = error.__cause__
+        if isinstance(cause, SolverError) or (isinstance(cause, EnclosureError) and problem.domain is not None):
+            raise cause from error
+        raise
 
 
 def split_cure(message: str) -> tuple[str, str]:

@@ -15,6 +15,7 @@ import typer
 
 from certbound.cli.describe import describe_parameters
 from certbound.cli.limits import Clock, OutOfTime, TimeLimitOption
+from certbound.cli.messages import computing
 from certbound.cli.options import (
     DeltaOption,
     HorizonOption,
@@ -71,7 +72,7 @@ def tune(
     rows: list[dict[str, Any]] = []
     tubes: dict[str, Tube] = {}
     constants: Constants | None = None
-    with contextlib.suppress(OutOfTime), Clock(time_limit).running():
+    with contextlib.suppress(OutOfTime), Clock(time_limit).running(), computing("constants", subject):
         from certbound.constants.bounds import bound_constants
 
         with spinner(f"bounding the constants of {subject.name}"):
@@ -80,8 +81,10 @@ def tune(
             rows.append(row)
             tubes.setdefault(row["method"], tube)
     valid = [row for row in rows if row["level"] == "trajectory" and not row["method"].endswith("_as_printed")]
-    if constants is None or not valid:
+    if (constants is None or not valid) and time_limit is not None:
         raise SolverError(f"no tube was computed within {time_limit:g} s; give a larger --time-limit")
+    if constants is None or not valid:
+        raise SolverError(f"no tube along whole trajectories was found for {subject.name}; try verify, it has others")
     best = min(valid, key=lambda row: row["maximum"])["method"]
     if plot is not None:
         _draw(subject, tubes, best, plot)
@@ -122,7 +125,7 @@ def _rows(constants: Constants, horizon: float, delta: float) -> Iterator[tuple[
         try:
             with spinner(f"tuning {method}"):
                 tube = tune_tube(constants, horizon=horizon, delta=delta, method=method, **fixed)  # type: ignore[arg-type]  # floats by name
-        except ValueError as error:
+        except (ValueError, ArithmeticError) as error:
             _log.debug("%s does not apply: %s", method, error)
             continue
         yield tube, _row(tube, method, horizon, time.perf_counter() - started, constants.continuous)

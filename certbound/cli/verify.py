@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import shlex
 import sys
@@ -30,12 +31,13 @@ from certbound.cli.options import (
     load_problem,
 )
 from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
-from certbound.errors import CertificateError
+from certbound.errors import CertificateError, EngineError, SolverError, contained
 
 if TYPE_CHECKING:
     from certbound.plotting import Scene
     from certbound.problem.problem import Problem
     from certbound.reach.tube import ReachTube
+    from certbound.safety.answers import EngineAnswer
     from certbound.safety.verification import Verdict
 
 __all__ = ["register"]
@@ -109,13 +111,18 @@ def verify(
     result = _result(subject, verdict, seconds)
     if explain:
         result["engines"] = _engines(verdict)
-        if verdict.status == "UNKNOWN":
-            result["limits"] = _limits(verdict, cells)
-    _write(subject, verdict, certificate=certificate, report=report, plot=plot)
+    if not as_json:  # the verdict comes first: it stands, whatever becomes of the rest
+        _print(subject, result)
+    if explain and verdict.status == "UNKNOWN":
+        result["limits"] = _limits(verdict, cells, clock)
+        if not as_json and not SETTINGS.quiet:
+            console().print(result["limits"]["summary"], markup=False)
+    proof = ""
+    if certificate is not None:
+        proof, result["certificate"] = _certify(subject, verdict, certificate)
+    _write(subject, verdict, proof, report=report, plot=plot)
     if as_json:
         print_json(result)
-    else:
-        _print(subject, result)
     raise typer.Exit(0 if verdict.status == "SAFE" else 1)
 
 
@@ -126,6 +133,7 @@ def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> 
     if clock.limit is None:
         return verify_safety(problem, method=method, cells=cells)
     best: Verdict | None = None
+    answers: dict[str, EngineAnswer] = {}
     over = f"The search was stopped after {clock.limit:g} s."
     try:
         for engine in ENGINES if method == "auto" else (method,):
@@ -133,15 +141,16 @@ def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> 
                 break
             with clock.running():
                 found = verify_safety(problem, method=engine, cells=cells)
+            answers |= found.answers
             if best is None or (found.status != "SAFE", found.log10_delta) < (best.status != "SAFE", best.log10_delta):
                 best = found
             if found.status == "UNSAFE_NOMINAL":
                 return found
     except OutOfTime:
         if best is not None:
-            return replace(best, reason=f"{best.reason} {over}")
+            return replace(best, reason=f"{best.reason} {over}", answers=answers)
     if best is not None:
-        return best
+        return replace(best, answers=answers)
     cure = "Give it more time, fewer --cells or a shorter --horizon."
     return Verdict(
         status="UNKNOWN", log10_delta=0.0, margin=None, time=None, constraint=None, reason=f"{over} {cure}",
@@ -184,19 +193,22 @@ def _engines(verdict: Verdict) -> list[dict[str, Any]]:
     return rows
 
 
-def _limits(verdict: Verdict, cells: int | None) -> dict[str, Any]:
-    """What would be SAFE, for --explain."""
-    from certbound.safety.limits import find_limits
+def _limits(verdict: Verdict, cells: int | None, clock: Clock) -> dict[str, Any]:
+    """What would be SAFE, for --explain, as far as time allows."""
+    from certbound.safety.limits import Limits, find_limits
 
-    with spinner("looking for what would be SAFE"):
-        found = find_limits(verdict, cells=cells)
+    nothing = asdict(Limits(delta=None, horizon=None, noise=None, widening=None))
+    try:
+        with spinner("looking for what would be SAFE"), contained("search for limits"), clock.running():
+            found = find_limits(verdict, cells=cells)
+    except OutOfTime:
+        return nothing | {"summary": "The time was over before it was known what would be SAFE."}
+    except EngineError as error:
+        return nothing | {"summary": f"What would be SAFE is not known: {error}"}
     return asdict(found) | {"summary": found.summary()}
 
 
-def _write(
-    problem: Problem, verdict: Verdict, *, certificate: Path | None, report: Path | None, plot: Path | None
-) -> None:
-    proof = "" if certificate is None else _certify(problem, verdict, certificate)
+def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | None, plot: Path | None) -> None:
     if plot is None and report is None:
         return
     if verdict.reach is None:
@@ -219,18 +231,26 @@ def _write(
             write_file(report, report_page(scene, verdict, command=command, probability=probability, certificate=proof))
 
 
-def _certify(problem: Problem, verdict: Verdict, path: Path) -> str:
-    """Write a certificate that the checker has proved, and return it; a verdict without one says why, on stderr."""
+def _certify(problem: Problem, verdict: Verdict, path: Path) -> tuple[str, dict[str, Any]]:
+    """Write a certificate that the checker has proved; its text, and what ``--json`` says of it.
+
+    What it misses is said in one line on standard error: that none was written, or that it proves less than delta.
+    """
     try:
         with spinner("writing and checking the certificate"):
             text = proved_certificate(problem, verdict)
-    except CertificateError as error:
-        if verdict.status == "SAFE":
-            raise
-        sys.stderr.write(f"certbound: no certificate was written: {error}\n")
-        return ""
+    except (CertificateError, SolverError) as error:
+        reason = " ".join(str(error).split())
+        sys.stderr.write(f"certbound: no certificate was written: {reason}\n")
+        return "", {"path": None, "log10_delta": None, "reason": reason}
     write_file(path, text)
-    return text
+    from certbound.safety.answers import is_at_most
+
+    proved, reason = float.fromhex(json.loads(text)["claim"]["log10_delta"]), ""
+    if verdict.status == "SAFE" and not is_at_most(min(proved, 0.0), problem.delta):
+        reason = f"the certificate proves {log10_text(proved)}, not the {problem.delta:g} of the verdict"
+        sys.stderr.write(f"certbound: {reason}\n")
+    return text, {"path": str(path), "log10_delta": proved, "reason": reason}
 
 
 def _scene(problem: Problem, verdict: Verdict, reach: ReachTube) -> Scene:
@@ -277,5 +297,3 @@ def _print(problem: Problem, result: dict[str, Any]) -> None:
     for row in result.get("engines", ()):
         bound = f"<= {log10_text(row['log10_delta'])}" if row["applicable"] else "does not apply"
         screen.print(f"  {row['engine']} ({row['method']}): {bound}. {row['reason']}", markup=False)
-    if "limits" in result:
-        screen.print(result["limits"]["summary"], markup=False)

@@ -226,7 +226,7 @@ def _refuse(model: Model, jacobian: StateJacobian, found: Supremum) -> None:
             raise
         raise InfeasibleError(f"no constants hold on all of R^n: {error} Or {cure}.") from error
     if model.bounded_by_user:
-        raise ValueError(f"`domain` must keep the Jacobian bounded, but {reason} is unbounded; {cure}.")
+        raise EnclosureError(f"`domain` must keep the Jacobian bounded, but {reason} is unbounded; {cure}.")
     raise InfeasibleError(f"no constants hold on all of R^n: {reason} is unbounded; {cure}.")
 
 
@@ -310,7 +310,7 @@ def constants_along(
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         reason = jacobian.explain(active[int(bad[0])])
-        raise ValueError(f"`boxes` must keep the Jacobian bounded; on piece {bad[0]}, {reason} is unbounded.")
+        raise EnclosureError(f"`boxes` must keep the Jacobian bounded; on piece {bad[0]}, {reason} is unbounded.")
     matrices = jacobian.values(active.mid)
     sampled = norm.sample_measure(matrices) if model.continuous else norm.sample_norm(matrices)
     noise = bound_noise(model, norm, pieces)

@@ -154,7 +154,7 @@ def _refuse(tape: Tape, box: Interval, bounded_by_user: bool) -> None:
         message = f"the diffusion is unbounded on all of R^n: {error} Or give `domain=`."
         raise InfeasibleError(message) from error
     if bounded_by_user:
-        raise ValueError("`domain` must keep the diffusion bounded; give a smaller `domain=`.")
+        raise EnclosureError("`domain` must keep the diffusion bounded; give a smaller `domain=`.")
     raise InfeasibleError("the diffusion is unbounded on all of R^n; give `domain=cb.Box(low, high)`.")
 
 

@@ -30,6 +30,7 @@ __all__ = ["RadiusModel", "Rooms", "TightMetric", "erosion_factors", "noise_numb
 Array = NDArray[np.float64]
 
 _ROUNDS = 2
+_LEAST = 1e-24  # L^2 of a map that forgets its state
 _POWERS = np.exp(np.linspace(np.log(0.03), np.log(100.0), 9))
 _STARTS = np.array([1.0, 0.3, 0.1, 0.03, 0.01])
 _STEPS = np.array([0.55, 1.0, 1.8])
@@ -137,7 +138,7 @@ class RadiusModel:
 
     def variances(self, value: float, times: Array) -> Array:
         """Variance of the linear recursion at sigma = 1, shape (K,)."""
-        rate = 2 * value if self.continuous else float(np.log(value))
+        rate = 2 * value if self.continuous else float(np.log(max(value, _LEAST)))
         growth = np.expm1(rate * times) if abs(rate) > 1e-12 else times
         scale = 1.0 if abs(rate) <= 1e-12 else (rate if self.continuous else float(np.expm1(rate)))
         result: Array = np.asarray(growth / scale)
@@ -147,7 +148,7 @@ class RadiusModel:
         """max_t r_t^2 / room_t^2 for each (a, v0): Newton's method on the probability of Thm K2, log in log."""
         constants = Constants(
             rate=value if self.continuous else None,
-            gain=None if self.continuous else float(np.sqrt(value)),
+            gain=None if self.continuous else float(np.sqrt(max(value, _LEAST))),
             sigma=1.0,
             dimension=self.dimension,
             effective_dimension=nu,

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from certbound.constants.bounds import bound_constants
-from certbound.errors import EnclosureError, InfeasibleError
+from certbound.errors import EnclosureError, EngineError, InfeasibleError, contained
 from certbound.problem.problem import Problem
+from certbound.reach.cells import initial_cells
 from certbound.reach.contraction import contraction_tube
 from certbound.reach.flow import Flow
 from certbound.reach.local import local_contraction_tube, local_tube, radius_over_pieces
@@ -54,10 +55,9 @@ def bound_reach(
     Raises
     ------
     ValueError
-        If the method is unknown or does not take an argument, the system has inputs and no plan, or the nominal is lost
-        before the horizon.
-    ArithmeticError, InfeasibleError
-        If no engine proved anything.
+        If the method is unknown or does not take an argument, ``cells`` cannot be, or a plan is missing.
+    EngineError, InfeasibleError
+        If no engine proved anything; it says what stood in the way of the last.
 
     Source: Thms K4, K5, K7 of theory.
     """
@@ -68,13 +68,16 @@ def bound_reach(
     if sampling:
         name = next(iter(sampling))
         raise ValueError(f"`{name}` must be left out for the method {method!r}; it belongs to 'sampled' and 'learned'.")
+    initial_cells(problem, cells)  # with the plan, what can be wrong with the input
+    _ = problem.closed_loop
     best: ReachTube | None = None
-    failure: ArithmeticError | InfeasibleError | None = None
+    failure = EngineError("no engine fits the problem.")
     for name in _ENGINES if method == "auto" else (method,):
         try:
-            engine = response_reach if name == "linear" else contraction_reach
-            tube = engine(problem, noise=noise, cells=cells)
-        except (ArithmeticError, InfeasibleError) as error:
+            with contained(name):
+                engine = response_reach if name == "linear" else contraction_reach
+                tube = engine(problem, noise=noise, cells=cells)
+        except EngineError as error:
             failure = error
             continue
         if best is None or tube.end > best.end:
@@ -82,7 +85,8 @@ def bound_reach(
         if best.end >= float(problem.horizon):
             return best
     if best is None:
-        raise failure if failure is not None else InfeasibleError("no engine fits the problem.")
+        cause = failure.__cause__
+        raise cause if isinstance(cause, InfeasibleError) else failure
     return best
 
 

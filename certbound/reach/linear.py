@@ -278,8 +278,8 @@ class LinearRun:
     def hopeless(self, log_nonlinear: float) -> bool:
         """Whether the remainder feeds itself at levels that are too small already (``failed_at`` names a piece).
 
-        Z leaves a level of q standard deviations with probability 2 Q(q) at one time alone, so that all levels that cost
-        exp(log_nonlinear) are larger; they are dear in continuous time, and not asked for where this tells enough.
+        Z leaves a level of q standard deviations with probability 2 Q(q) at one time alone, so that all levels that
+        cost exp(log_nonlinear) are larger; in continuous time they are dear, and not asked for where this is enough.
         """
         if not (self.engine.continuous and self.engine.noise and len(self.engine.model.active)):
             return False

@@ -90,6 +90,8 @@ class Linearisation:
         if problem.system.time == "discrete":
             return cls(problem, cells=cells, noise=noise)
         trial = cls(problem, noise=noise)
+        while trial.lost and 4 * trial.pieces <= _MOST_PIECES:  # a coarse grid loses a stiff system's nominal at once
+            trial = cls(problem, pieces=4 * trial.pieces, noise=noise)
         size = float(np.linalg.norm(np.nan_to_num(trial.slopes[0]), axis=(-2, -1)).max())
         pieces = int(np.clip(np.ceil(problem.horizon * size / _STEP), _FEWEST_PIECES, _MOST_PIECES))
         alike = (cells is None or cells == 1) and trial._pieces(pieces) == trial.pieces
@@ -118,15 +120,25 @@ class Linearisation:
         return compile_numpy(self.problem.closed_loop)
 
     @cached_property
-    def nodes(self) -> Array:
-        """Nominal states at the nodes: shape (B, N + 1, n)."""
+    def lost(self) -> bool:
+        """Whether the nominal overflows on this grid."""
+        return not bool(np.isfinite(self._followed).all())
+
+    @cached_property
+    def _followed(self) -> Array:
+        """The nominal states, finite or not."""
         x = np.array(self.centres)
         states = [x]
         with np.errstate(all="ignore"):
             for k in range(self.pieces):
                 x = self._advance(k, x) if self.continuous else self._evaluate(k, float(k), x)
                 states.append(x)
-        nodes = np.stack(states, axis=1)
+        return np.stack(states, axis=1)
+
+    @cached_property
+    def nodes(self) -> Array:
+        """Nominal states at the nodes: shape (B, N + 1, n)."""
+        nodes = self._followed
         lost = ~np.isfinite(nodes).all(axis=(0, 2))
         if lost.any():
             last, sizes = int(np.argmax(lost)) - 1, np.abs(nodes).max(axis=(0, 2))
@@ -317,10 +329,11 @@ class Linearisation:
 
     @cached_property
     def sizes(self) -> Array:
-        """A typical size of every state: of the nominal, the initial set and the noise, (n,); 0 where it stays 0."""
+        """A typical size of every state, (n,): of the nominal, the initial set and the noise; always positive."""
         variance = np.diagonal(self.response.covariance, axis1=-2, axis2=-1).max(axis=(0, 1))
         deviation = np.sqrt(np.maximum(np.where(np.isfinite(variance), variance, 0.0), 0.0))
-        return np.asarray(np.abs(self.nodes).max(axis=(0, 1)) + self.radii.max(axis=0) + deviation)
+        found = np.abs(self.nodes).max(axis=(0, 1)) + self.radii.max(axis=0) + deviation
+        return np.asarray(np.maximum(found, max(1e-6 * float(found.max()), 1e-100)))
 
     @property
     def remainder_sizes(self) -> Array:

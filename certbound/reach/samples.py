@@ -61,8 +61,8 @@ def fitted_slopes(model: Remainder, frame: Frame, low: Array, high: Array, rows:
     for group in model.blocks:
         shift, half = _points(model, group, low, high, rows)
         values = _remainder(model, frame, shift)
-        moving = (half > _NEGLIGIBLE * half.max(axis=0)) & (half > _ROUNDING * np.abs(frame.middle.mid[:, model.active]))
-        scale = np.where(moving, half, np.inf)
+        least = np.maximum(_NEGLIGIBLE * half.max(axis=0), _ROUNDING * np.abs(frame.middle.mid[:, model.active]))
+        scale = np.where(half > least, half, np.inf)
         for i in range(n):
             states = [j for o, j in model.entries if o == i and any(position[j] in block for block in group)]
             if not states:

@@ -21,7 +21,7 @@ from certbound.reach.linearisation import Linearisation
 from certbound.reach.martingales import MartingaleEvent, Martingales, SplitEvents
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import Proof, exact
-from certbound.safety.certificate_linear import EFFORTS, PADS, SLACK, WINDOW, Stated, grids, proof_data, widened
+from certbound.safety.certificate_linear import EFFORTS, PADS, SLACK, Stated, grids, proof_data, widened
 
 __all__ = ["diffusion_proof"]
 
@@ -82,8 +82,7 @@ class _StatedRun(DiffusionRun):
             share = shared_log + _HALF
             key = cell, self.references.index(reference), share
             if key not in self.windows:
-                length = max(1, round(WINDOW / self.engine.step))
-                self.windows[key] = WindowEvents(reference.response, cell, length, share)
+                self.windows[key] = WindowEvents(reference.response, cell, self.engine.window, share)
             gaussian = self.windows[key]
         martingales = Martingales(reference.response, cell, self.held.excess[cell], share, self.frames[cell])
         return SplitEvents(gaussian=gaussian, martingales=martingales)

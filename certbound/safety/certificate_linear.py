@@ -32,7 +32,7 @@ from certbound.reach.tapes import varying_outputs
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import Proof, exact, needs_direction
 
-__all__ = ["EFFORTS", "PADS", "SLACK", "WINDOW", "Stated", "grids", "linear_proof", "proof_data", "widened"]
+__all__ = ["EFFORTS", "PADS", "SLACK", "Stated", "grids", "linear_proof", "proof_data", "widened"]
 
 Array = NDArray[np.float64]
 Events = StepEvents | WindowEvents
@@ -43,7 +43,6 @@ EFFORTS = len(_STEPS)
 PADS = ((0.08, 0.03, 0.01), (0.15, 0.05, 0.02), (0.25, 0.1, 0.03))  # a smaller one where a larger does not close
 _NEARLY = 1.3
 _ROUNDS = 8
-WINDOW = 0.05
 SLACK = 0.01
 _NEAR = 0.9  # of the logarithm that the engine proved
 _LIKELY = -2.0  # log10 of a probability of which a per cent matters
@@ -134,7 +133,7 @@ class Stated:
 def _events(run: LinearRun, cell: int, shared: float) -> Events:
     engine = run.engine
     if isinstance(engine.system, ContinuousSystem):
-        return WindowEvents(engine.response, cell, max(1, round(WINDOW / engine.step)), shared)
+        return WindowEvents(engine.response, cell, engine.window, shared)
     return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
 
 

@@ -98,9 +98,10 @@ def constants_engine(
 
     Raises
     ------
-    ValueError
-        If the Jacobian is unbounded or undefined on the domain that the user gave, or the nominal is lost before the
-        horizon.
+    EnclosureError
+        If the Jacobian is unbounded or undefined on the domain that the user gave.
+    EngineError
+        If the nominal is lost before the horizon.
     """
     work = _Work(problem, method, cells)
     by_clearance, target = method in BY_CLEARANCE, math.log10(problem.delta)
@@ -116,7 +117,7 @@ def constants_engine(
             best = work.with_own_metrics(best)
     except (InfeasibleError, EnclosureError) as error:
         if problem.domain is not None and best is None:
-            raise ValueError(f"`domain` must lie where the model is defined and smooth: {error}") from error
+            raise EnclosureError(f"`domain` must lie where the model is defined and smooth: {error}") from error
         reason = str(error)
     if best is not None and (not by_clearance or quick or constants is not None or best.log10_delta <= target):
         return best

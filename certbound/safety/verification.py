@@ -192,7 +192,8 @@ def verify_safety(
     Raises
     ------
     ValueError
-        If the system has inputs and no plan, the method is unknown, or the horizon outlives the nominal trajectory.
+        If the system has inputs and no plan, the method is unknown, or ``cells`` or the constants do not fit. What fails
+        afterwards is an engine: it answers that it does not apply, and why.
 
     Source: Thms K2, K4, K5, K7 of theory.
 
@@ -205,7 +206,7 @@ def verify_safety(
     'SAFE'
     """
     names = _chosen(method)
-    _checked(problem, cells, constants)
+    _checked(problem, method, cells, constants)
     violation = _violation(problem)
     if violation is not None:
         return _unsafe(problem, violation)
@@ -245,19 +246,22 @@ def _violation(problem: Problem) -> Violation | None:
         return None
 
 
-def _checked(problem: Problem, cells: int | None, constants: Constants | None) -> None:
+def _checked(problem: Problem, method: str, cells: int | None, constants: Constants | None) -> None:
     """Refuse what is wrong with the arguments before any engine runs: from then on whatever fails is an engine.
 
     Raises
     ------
     ValueError
-        If the system has inputs and no plan, ``cells`` cannot be, or the constants do not fit the problem.
+        If the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit the problem.
     """
+    from certbound.tubes.baselines import check_method
+
     initial_cells(problem, cells)
     _ = problem.closed_loop
+    continuous, n = problem.system.time == "continuous", problem.system.dimension
+    check_method(method, continuous=continuous, dimension=n)
     if constants is None:
         return
-    continuous, n = problem.system.time == "continuous", problem.system.dimension
     if constants.continuous != continuous:
         raise ValueError(f"`constants` must state a {'rate' if continuous else 'gain'}, as the problem's time asks.")
     if constants.dimension != n:

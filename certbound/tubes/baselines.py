@@ -18,7 +18,7 @@ from certbound.tubes.schedule import Schedule, integral, make_schedule
 from certbound.tubes.tube import Profile, Tube
 from certbound.tubes.windows import WindowProfile, event_count, window_scale
 
-__all__ = ["BASELINES", "Baseline", "baseline_tube"]
+__all__ = ["BASELINES", "Baseline", "baseline_tube", "check_method"]
 
 Array = NDArray[np.float64]
 
@@ -141,14 +141,28 @@ def baseline_tube(
     )  # fmt: skip
 
 
-def _check_hypotheses(constants: Constants, method: str, row: Baseline, schedule: Schedule) -> None:
-    asked = "both" if row.time == "both" else ("continuous" if constants.continuous else "discrete")
+def check_method(method: str, *, continuous: bool, dimension: int) -> None:
+    """Refuse a method of the paper whose theorem is for the other time, or for one dimension only.
+
+    Raises
+    ------
+    ValueError
+        If that is so; methods that are not the paper's pass.
+    """
+    row = BASELINES.get(method)
+    if row is None:
+        return
+    asked = "both" if row.time == "both" else ("continuous" if continuous else "discrete")
     if row.time != asked:
         other = {"continuous": "`rate` (continuous time)", "discrete": "`gain` (discrete time)"}[row.time]
         use = "thm4 or thm5" if row.time == "continuous" else "thm2 or thm3"
         raise ValueError(f"`method` {method!r} needs constants with {other}; use {use}, or 'auto'.")
-    if row.tail == "cosh" and constants.dimension != 1:
-        raise ValueError(f"`method` {method!r} needs dimension 1, got {constants.dimension}; drop '_cosh'.")
+    if row.tail == "cosh" and dimension != 1:
+        raise ValueError(f"`method` {method!r} needs dimension 1, got {dimension}; drop '_cosh'.")
+
+
+def _check_hypotheses(constants: Constants, method: str, row: Baseline, schedule: Schedule) -> None:
+    check_method(method, continuous=constants.continuous, dimension=constants.dimension)
     worst = float(np.max(schedule.slopes))
     if row.kind == "windows" and row.tail != "sharp":
         if constants.continuous and worst >= 0:

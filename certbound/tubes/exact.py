@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 
 _LARGEST_CHAIN = 2.0e10
 _MOST_KERNELS = 12
+_MOST_ENTRIES = 5.0e7  # of one kernel: it and what it is made of take some two gigabytes
 _OUTWARD = 180.0
 """K of the boundary in expanding systems: it costs about 0.8/K of the radius."""
 
@@ -152,7 +153,8 @@ def _chain(constants: Constants, schedule: Schedule, radius: float) -> Recursion
         gains=schedule.slopes, sigmas=schedule.sigmas / schedule.unit, counts=steps, dimension=constants.dimension,
         radius=radius / schedule.unit,
     )  # fmt: skip
-    return chain if chain.size**2 * float(steps.sum()) < _LARGEST_CHAIN else None
+    small = chain.size**2 * float(steps.sum()) < _LARGEST_CHAIN and chain.entries < _MOST_ENTRIES
+    return chain if small else None
 
 
 def bound_exact_exit(constants: Constants, *, horizon: float, radius: float, target: float = 1e-3) -> float:

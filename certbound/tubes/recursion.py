@@ -58,6 +58,11 @@ class Recursion:
         """Number of nodes."""
         return _POINTS * self._panels
 
+    @property
+    def entries(self) -> float:
+        """Number of entries of one kernel: from the nodes of the ball to all nodes."""
+        return float(self.size) * _POINTS * (self._panels + self._beyond / self.radius * self._panels + 1)
+
     @cached_property
     def _panels(self) -> int:
         wide = 2.0 if self.dimension <= 3 else (1.5 if self.dimension <= 20 else 1.0)

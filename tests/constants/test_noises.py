@@ -118,7 +118,7 @@ def test_unbounded_or_undefined_diffusion_is_refused():
     with pytest.raises(InfeasibleError, match=r"diffusion is unbounded on all of R\^n"):
         bound_constants(growing, metric="euclidean")
     assert bound_constants(growing, cb.Box([-2], [2]), metric="euclidean").sigma < 0.2 + 1e-4
-    with pytest.raises(ValueError, match="keep the diffusion bounded"):
+    with pytest.raises(EnclosureError, match="keep the diffusion bounded"):
         bound_constants(growing, cb.Box([0], [np.inf]), metric="euclidean")
     root = cb.ContinuousSystem(lambda x: -x, states=["q"], diffusion=lambda x: [[np.sqrt(x[0])]])
     with pytest.raises(EnclosureError, match=r"sqrt\(q\)"):

@@ -320,11 +320,13 @@ def test_an_unknown_method_is_refused():
         verify_safety(brownian(), method="magic")
 
 
-def test_an_unbounded_jacobian_on_the_users_domain_is_refused():
+def test_an_unbounded_jacobian_on_the_users_domain_is_the_constants_engines_reason():
     system = cb.ContinuousSystem(lambda x: [-np.sqrt(x[0])], states=1, diffusion=0.01)
     problem = cb.Problem(system, initial=[1.0], safe=[], horizon=0.5, domain=cb.Box([0.0], [2.0]))
-    with pytest.raises(ValueError, match="`domain` must"):
-        verify_safety(problem, method="constants")
+    verdict = verify_safety(problem, method="constants")
+    assert verdict.status == "UNKNOWN"
+    assert not verdict.answers["constants"].applicable
+    assert "`domain` must" in verdict.reason
 
 
 def test_a_verdict_is_no_boolean():

@@ -12,9 +12,10 @@ from scipy.stats import chi, norm
 
 from certbound.errors import InfeasibleError
 from certbound.tubes.constants import Constants
-from certbound.tubes.exact import bound_exact_exit, bound_worst_exit
+from certbound.tubes.exact import _chain, bound_exact_exit, bound_worst_exit
 from certbound.tubes.radial import estimate_exit_probability, estimate_radius
 from certbound.tubes.recursion import Recursion, _legendre
+from certbound.tubes.schedule import make_schedule
 from certbound.tubes.supersolution import Supersolution
 from certbound.tubes.tuning import bound_exit_probability, tune_tube
 from experiments.limits import exact_radius
@@ -218,3 +219,11 @@ def test_negative_terminal_values_prove_nothing(monkeypatch):
 def test_what_the_hypotheses_do_not_cover_is_refused(call, message):
     with pytest.raises((ValueError, InfeasibleError), match=message):
         call()
+
+
+def test_a_chain_whose_kernel_would_not_fit_into_memory_is_not_built():
+    fast = Constants(gain=2.1, sigma=0.001, dimension=1, isotropic=True)  # 24000 nodes inside, 51000 in all
+    assert _chain(fast, make_schedule(fast, 10), 3.5) is None
+    tube = tune_tube(fast, horizon=10, delta=1e-3, method="exact")
+    spread = 0.001 * math.sqrt(sum(2.1 ** (2 * k) for k in range(10)))
+    assert norm.isf(5e-4) * spread < tube.bound(0, 10) < 1.02 * norm.isf(5e-4) * spread
