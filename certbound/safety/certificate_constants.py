@@ -165,7 +165,8 @@ def _search(constants: Constants, erosion: Erosion, horizon: float, start: Start
     profile = joined(erosion.profile(random_start=start != Start()), 1e-9)
     if not np.any(np.isfinite(profile[1])):
         return -1e12, {"form": "kummer", "a": exact(1.0), "v0": exact(1.0)}
-    schedule, held = make_schedule(constants, horizon), read_clearance(profile, horizon)
+    schedule = make_schedule(constants, horizon)
+    held = read_clearance(profile, horizon, continuous=schedule.continuous)
     cut = schedule.refined(held.ends(schedule))
     best, chosen = 0.0, None
     for bessel, a, v0 in _candidates(cut, held, start):

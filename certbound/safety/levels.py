@@ -64,7 +64,7 @@ def room_level(constants: Constants, *, horizon: float, profile: Profile, start:
     level = bound_exit_probability(constants, horizon=horizon, clearance=profile, start=start)
     if level < 0.0 or not fits:
         return level
-    held = read_clearance(profile, horizon)
+    held = read_clearance(profile, horizon, continuous=constants.continuous)
     schedule = make_schedule(constants, horizon)
     cut = schedule.refined(held.ends(schedule))
     limit = math.inf if schedule.any_power else schedule.nu / 2 * (1 - 1e-9)

@@ -239,10 +239,11 @@ def _flat(rng: Random, kind: str, states: Array, room: float, inside: bool) -> S
         along, size = states @ normal, float(np.linalg.norm(normal))
         bound = float(along.max() + room * size) if inside else float(along.min() - room * size)
         return Shape(kind=kind, data=(normal[None], np.array([bound])))
-    faces = np.vstack([np.eye(n), -np.eye(n), np.round(rng.standard_normal((2, n)) + 0.01, 2)])
+    slanted = np.round(rng.standard_normal((2, n)), 2)
+    faces = np.vstack([np.eye(n), -np.eye(n), np.where(np.any(slanted, axis=1, keepdims=True), slanted, 1.0)])
     along, size = states @ faces.T, np.linalg.norm(faces, axis=1)
     if inside:
-        return Shape(kind=kind, data=(faces, along.max(axis=(0, 1)) + room * size))
+        return Shape(kind=kind, data=(faces, along.max(axis=(0, 1)) + max(room, 0.0) * size))
     center = states.mean(axis=(0, 1)) + _away(rng, states, room)
     reach = np.max((states - center) @ faces.T / size, axis=-1).min() - room  # in the gauge of the faces
     return Shape(kind=kind, data=(faces, faces @ center + max(reach, 1e-3) * size))
@@ -277,6 +278,7 @@ def _around(rng: Random, kind: str, times: Array, states: Array, room: float, mo
     center = _center(rng, times, middle, drift, moving)
     y = _relative(times, states, center)
     if kind == "box":
+        room = np.maximum(room, -0.2 * np.ptp(y, axis=(0, 1)))
         low, high = y.min(axis=(0, 1)) - room, y.max(axis=(0, 1)) + room
         if not moving:
             low, high = low + middle, high + middle

@@ -153,7 +153,8 @@ def grammar(rng: Random) -> Sketch:
         row = own * x(i)
         for _ in range(int(rng.integers(0, 3)) if n > 1 else 0):
             row = row + between(rng, -0.5, 0.5) * x(int(rng.integers(n)))
-        for _ in range(int(rng.integers(0, 3))):
+        terms = int(rng.integers(0, 3)) if n <= 3 else int(rng.random() < 0.3)  # many states, few curvatures: quick
+        for _ in range(terms):
             pool = SMOOTH
             if positive and rng.random() < 0.6:
                 pool = POSITIVE
@@ -455,7 +456,7 @@ def saturated_flow(rng: Random) -> Sketch:
 
 @family
 def phase_oscillators(rng: Random) -> Sketch:
-    n = int(rng.integers(2, 6))
+    n = int(rng.integers(2, 4))
     rows = [between(rng, -0.3, 0.3) + sum((0.5 / n) * sin(x(j) - x(i)) for j in range(n) if j != i) for i in range(n)]
     return _flow(rows, [between(rng, -0.5, 0.5) for _ in range(n)], [0.05] * n, 1.0)
 

@@ -148,6 +148,11 @@ def test_a_clearance_that_shrinks_at_the_horizon_counts_there(profile):
     assert tube.bound(0, 2) < 12
 
 
+def test_a_profile_that_ends_at_the_horizon_is_kept_as_it_is_in_continuous_time():
+    held = read_clearance(((0.0, 0.3, 0.7), (5.0, 2.0)), 0.7, continuous=True)
+    assert (held.times.tolist(), held.values.tolist()) == ([0.0, 0.3, 0.7], [5.0, 2.0])
+
+
 def test_a_clearance_that_grows_beyond_the_horizon_changes_nothing():
     constants = Constants(gain=1.0, sigma=1.0, dimension=1)
     short = bound_exit_probability(constants, horizon=2, clearance=((0, 1, 2), (30.0, 3.0)))
