@@ -29,7 +29,7 @@ from certbound.tubes.schedule import Schedule, make_schedule
 from certbound.tubes.supersolution import Supersolution
 from certbound.tubes.tube import Tube
 
-__all__ = ["ConstantProfile", "bound_exact_exit", "bound_worst_exit", "first_passage_tube"]
+__all__ = ["ConstantProfile", "bound_exact_exit", "bound_worst_exit", "chain_of", "first_passage_tube"]
 
 Array = NDArray[np.float64]
 
