@@ -187,7 +187,7 @@ def _propagate(
             w[:, k + 1] = (grown + _transposed(grown)) / 2 + (residual * (1 + 1e-10) + _TINY)[:, None, None] * eye
     if not (np.isfinite(v).all() and np.isfinite(w).all()):
         raise EngineError(
-            "the deviation of the linearised system grows beyond all floating-point numbers before the horizon; shorten it."
+            "the deviation of the linearised system grows beyond all floats before the horizon; shorten the horizon."
         )
     return v, w
 

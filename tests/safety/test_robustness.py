@@ -36,6 +36,15 @@ def pendulum(unit: float = 1.0) -> cb.Problem:
     return cb.Problem(system, initial=initial, safe=safe, horizon=1)
 
 
+def bent_map(unit: float = 1.0) -> cb.Problem:
+    """No constants hold everywhere."""
+    system = cb.DiscreteSystem(
+        lambda x: 0.8 * x + 0.1 * x**2 / unit, states=1, noise=cb.Gaussian(std=0.05 * unit)
+    )
+    initial = cb.Box([0.1 * unit], [0.2 * unit])
+    return cb.Problem(system, initial=initial, safe=[cb.Inside(cb.Box([-unit], [unit]))], horizon=4)
+
+
 def decaying(unit: float = 1.0) -> cb.Problem:
     """The noise depends on the state."""
     system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=lambda x: [[0.1 * x[0]]])
@@ -246,7 +255,7 @@ def test_dynamics_undefined_inside_the_safe_set_end_the_search_for_a_barrier() -
 @pytest.mark.parametrize(
     ("build", "method"),
     [
-        (sine_map, "linear"), (sine_map, "constants"), (pendulum, "linear"), (pendulum, "constants"),
+        (sine_map, "linear"), (sine_map, "constants"), (bent_map, "constants"), (pendulum, "linear"), (pendulum, "constants"),
         (decaying, "linear"), (decaying, "constants"), (decaying, "barrier"),
     ],
 )  # fmt: skip
@@ -258,10 +267,10 @@ def test_other_units_give_the_same_verdict(build: Callable[[float], cb.Problem],
 
 @pytest.mark.parametrize("unit", [1e-14, 1e8])
 def test_noise_that_depends_on_the_state_is_bounded_alike_in_other_units(unit: float) -> None:
-    plain, scaled = (
-        bound_constants(decaying(size).replace(domain=cb.Box([-size], [size])), metric="euclidean") for size in (1.0, unit)
-    )
-    assert float(np.max(scaled.sigma)) / unit == pytest.approx(float(np.max(plain.sigma)), rel=1e-2)
+    system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=lambda x: [[0.1 * x[0] * (1 - x[0] / unit)]])
+    domain = cb.Box([0.0], [unit])
+    problem = cb.Problem(system, initial=[0.5 * unit], safe=[], horizon=1, domain=domain)
+    assert float(np.max(bound_constants(problem, metric="euclidean").sigma)) == pytest.approx(0.025 * unit, rel=1e-2)
 
 
 @pytest.mark.parametrize("unit", [1e-14, 1e8])
