@@ -173,17 +173,22 @@ def _propagate(
     v[:, 0] = start
     w[:, 0] = np.eye(n) * (2 * n * _UNIT * float(np.abs(start).max(initial=0.0)))
     eye = np.eye(n)
-    for k in range(pieces):
-        f, phi = transition[:, k], transition_error[:, k]
-        product = f @ v[:, k] @ _transposed(f) + noise[:, k]
-        v[:, k + 1] = (product + _transposed(product)) / 2
-        size_f, size_v, size_w = _norm(f), _norm(v[:, k]), _norm(w[:, k])
-        columns = _norm(_transposed(f))
-        spread = n * phi * (size_f + columns + n * phi)
-        rounding = 2 * _gamma(2 * n + 4) * (size_f * columns * (size_v + size_w) + _norm(v[:, k + 1]))
-        residual = n * (rounding + noise_error[:, k]) + n * spread * (size_v + size_w)
-        grown = f @ w[:, k] @ _transposed(f)
-        w[:, k + 1] = (grown + _transposed(grown)) / 2 + (residual * (1 + 1e-10) + _TINY)[:, None, None] * eye
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(pieces):
+            f, phi = transition[:, k], transition_error[:, k]
+            product = f @ v[:, k] @ _transposed(f) + noise[:, k]
+            v[:, k + 1] = (product + _transposed(product)) / 2
+            size_f, size_v, size_w = _norm(f), _norm(v[:, k]), _norm(w[:, k])
+            columns = _norm(_transposed(f))
+            spread = n * phi * (size_f + columns + n * phi)
+            rounding = 2 * _gamma(2 * n + 4) * (size_f * columns * (size_v + size_w) + _norm(v[:, k + 1]))
+            residual = n * (rounding + noise_error[:, k]) + n * spread * (size_v + size_w)
+            grown = f @ w[:, k] @ _transposed(f)
+            w[:, k + 1] = (grown + _transposed(grown)) / 2 + (residual * (1 + 1e-10) + _TINY)[:, None, None] * eye
+    if not (np.isfinite(v).all() and np.isfinite(w).all()):
+        raise EngineError(
+            "the deviation of the linearised system grows beyond all floats before the horizon; shorten the horizon."
+        )
     return v, w
 
 

@@ -73,7 +73,7 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
     curve = reach.curve
     norm = Norm(flow.dimension, constants.metric)
     cells = initial_cells(problem, _cells_along(curve))
-    eta = bound_forcing(flow, curve, norm) * (1 + _ROOM[effort]) + _smallest(curve, norm) * slack
+    eta = bound_forcing(flow, curve, norm) * (1 + _ROOM[effort]) + _smallest(curve, norm, answer) * slack
     slope = float(np.max(np.asarray(constants.rate if constants.rate is not None else constants.gain, dtype=float)))
     rho = cells.radii(norm, curve.initial())
     slopes = np.full(curve.pieces, slope)
@@ -132,10 +132,11 @@ def _rounded(given: Constants, slack: float) -> Constants:
     )
 
 
-def _smallest(curve: Curve, norm: Norm) -> float:
-    """A unit for what is nearly 0: the size of the nominal states."""
+def _smallest(curve: Curve, norm: Norm, answer: EngineAnswer) -> float:
+    """A unit for what is nearly 0: the size of the nominal states and of the deviation from them."""
+    deviation = 0.0 if answer.deviation is None else float(np.max(answer.deviation.radius, initial=0.0))
     return 1e-3 * float(np.max(norm.dual(np.eye(curve.dimension)))) * (
-        float(np.abs(curve.coefficients[..., 0, :]).max()) or 1.0
+        float(np.abs(curve.coefficients[..., 0, :]).max()) + deviation or 1.0
     )
 
 

@@ -12,6 +12,7 @@ import pytest
 
 import certbound as cb
 from certbound.cli.check import proved_certificate
+from certbound.constants.bounds import bound_constants
 from certbound.constants.metrics import bound_metrics
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, SolverError, contained
 from certbound.reach.linearisation import Linearisation
@@ -33,6 +34,15 @@ def pendulum(unit: float = 1.0) -> cb.Problem:
     safe = [cb.Inside(cb.Box([-unit, -unit], [unit, unit]))]
     initial = cb.Box([-0.05 * unit, 0.0], [0.05 * unit, 0.0])
     return cb.Problem(system, initial=initial, safe=safe, horizon=1)
+
+
+def bent_map(unit: float = 1.0) -> cb.Problem:
+    """No constants hold everywhere."""
+    system = cb.DiscreteSystem(
+        lambda x: 0.8 * x + 0.1 * x**2 / unit, states=1, noise=cb.Gaussian(std=0.05 * unit)
+    )
+    initial = cb.Box([0.1 * unit], [0.2 * unit])
+    return cb.Problem(system, initial=initial, safe=[cb.Inside(cb.Box([-unit], [unit]))], horizon=4)
 
 
 def decaying(unit: float = 1.0) -> cb.Problem:
@@ -83,7 +93,7 @@ def constant_map() -> cb.Problem:
 def draining() -> cb.Problem:
     """Undefined at x = 0, where constant slopes are read."""
     system = cb.ContinuousSystem(
-        lambda x: [0.3 - 0.5 * np.sqrt(x[0]), -x[1]], states=2, diffusion=0.01 * np.eye(2)
+        lambda x: [-0.1 * np.log(x[0] / 0.5), -x[1]], states=2, diffusion=0.01 * np.eye(2)
     )
     return cb.Problem(system, initial=[0.4, 0], safe=[cb.Inside(cb.Box([0.02, -1], [1, 1]))], horizon=1)
 
@@ -212,6 +222,24 @@ def test_constant_slopes_are_read_where_the_function_is_undefined() -> None:
     assert np.isfinite(slope).all()
 
 
+def test_the_nominal_of_a_stiff_system_is_not_lost_on_a_coarse_grid() -> None:
+    system = cb.ContinuousSystem(
+        lambda x: [-500 * (x[0] - np.tanh(x[1])), -0.3 * x[1] + 0.1 * x[0]], states=2, diffusion=0.01 * np.eye(2)
+    )
+    problem = cb.Problem(system, initial=[0, 0.1], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=3)
+    assert np.abs(Linearisation.of(problem).nodes).max() < 0.2
+
+
+def test_a_deviation_that_overflows_is_an_answer() -> None:
+    system = cb.ContinuousSystem(lambda x: 2 * x + 0.1 * np.sin(x), states=1, diffusion=[[0.01]])
+    problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=400)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        verdict = verify_safety(problem, method="linear")
+    assert verdict.status == "UNKNOWN"
+    assert "defect" not in verdict.reason
+
+
 def test_dynamics_undefined_inside_the_safe_set_end_the_search_for_a_barrier() -> None:
     system = cb.ContinuousSystem(lambda x: [-np.sign(x[0])], states=1, diffusion=[[0.1]])
     problem = cb.Problem(system, initial=[0.5], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1)
@@ -223,11 +251,12 @@ def test_dynamics_undefined_inside_the_safe_set_end_the_search_for_a_barrier() -
 # ---- other units -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("unit", [1e-8, 1e8])
+@pytest.mark.parametrize("unit", [1e-14, 1e8])
 @pytest.mark.parametrize(
     ("build", "method"),
     [
-        (sine_map, "linear"), (sine_map, "constants"), (pendulum, "linear"), (pendulum, "constants"),
+        (sine_map, "linear"), (sine_map, "constants"), (bent_map, "constants"),
+        (pendulum, "linear"), (pendulum, "constants"),
         (decaying, "linear"), (decaying, "constants"), (decaying, "barrier"),
     ],
 )  # fmt: skip
@@ -237,7 +266,16 @@ def test_other_units_give_the_same_verdict(build: Callable[[float], cb.Problem],
     assert scaled.log10_delta == pytest.approx(plain.log10_delta, rel=1e-2)
 
 
-@pytest.mark.parametrize("unit", [1e-8, 1e8])
+@pytest.mark.parametrize("unit", [1e-14, 1e8])
+def test_noise_that_depends_on_the_state_is_bounded_alike_in_other_units(unit: float) -> None:
+    system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=lambda x: [[0.1 * x[0] * (1 - x[0] / unit)]])
+    domain = cb.Box([0.0], [unit])
+    problem = cb.Problem(system, initial=[0.5 * unit], safe=[], horizon=1, domain=domain)
+    sigma = float(np.max(bound_constants(problem, metric="euclidean").sigma))
+    assert sigma / unit == pytest.approx(0.025, rel=1e-2)
+
+
+@pytest.mark.parametrize("unit", [1e-14, 1e8])
 @pytest.mark.parametrize(("build", "method"), [(sine_map, "linear"), (sine_map, "constants"), (decaying, "linear")])
 def test_other_units_have_a_certificate_too(build: Callable[[float], cb.Problem], method: str, unit: float) -> None:
     problem = build(unit)
