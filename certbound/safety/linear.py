@@ -36,7 +36,7 @@ def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool 
         deviation=None if tube is None else _deviation(answer, tube),
         method="linear",
         details=answer,
-        conclusive=answer.exact,
+        conclusive=answer.exact and answer.margin > -np.inf,
         assumption=ASSUMPTION if depends_on_state(problem) else "",
     )
 
