@@ -121,12 +121,13 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
         found = np.linalg.norm(safe, 2, axis=(-2, -1)) if which == 0 else np.trace(safe, axis1=-2, axis2=-1)
         return np.where(defined, found, np.nan)
 
-    results = []
+    results, reads = [], {node.args[0] for node in tape.nodes if node.op == "input"}
+    used = np.array([slot in reads for slot in range(slots)])
     for which in (0, 1):
         start = values(ranges.mid[None], which)
         scale = float(start[0]) if np.isfinite(start[0]) else 1.0
         found = bound_supremum(  # mypy cannot type a lambda with a default
-            lambda boxes, _, which=which: (levels(boxes)[which], _widths(boxes)),  # type: ignore[misc]
+            lambda boxes, _, which=which: (levels(boxes)[which], _widths(boxes, ranges, used)),  # type: ignore[misc]
             lambda points, which=which: values(points, which),  # type: ignore[misc]
             ranges,
             tolerance=1e-3 * (scale or 1e-300),
@@ -140,9 +141,13 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
     return NoiseBound(sigma=sigma, effective_dimension=nu, isotropic=False, gaussian=True)
 
 
-def _widths(boxes: Interval) -> Array:
+def _widths(boxes: Interval, whole: Interval, used: NDArray[np.bool_]) -> Array:
+    """Widths as shares of the whole range, whatever its units; 0 for what the diffusion does not read."""
     with np.errstate(all="ignore"):
-        return np.where(np.isfinite(boxes.lo) & np.isfinite(boxes.hi), boxes.hi - boxes.lo, np.inf)
+        share = (boxes.hi - boxes.lo) / (whole.hi - whole.lo)
+        finite = np.where(np.isnan(share) | np.isinf(whole.hi - whole.lo), boxes.hi - boxes.lo, share)
+    bounded = np.isfinite(boxes.lo) & np.isfinite(boxes.hi)
+    return np.where(used, np.where(bounded, finite, np.inf), 0.0)
 
 
 def _refuse(tape: Tape, box: Interval, bounded_by_user: bool) -> None:

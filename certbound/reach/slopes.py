@@ -109,7 +109,7 @@ class LocalSlopes:
         values = measure(self.jacobian.enclose(boxes))
         form = self.jacobian.spread(boxes)
         if form is None:
-            return values, boxes.width
+            return values, boxes.width / np.maximum(boxes.width.max(axis=0, initial=0.0), 1e-300)
         values = np.minimum(values, measure(*form))
         slopes = np.where(np.isfinite(form[1].slopes.mag), form[1].slopes.mag, 1e100)
         return values, np.sum(slopes, axis=(-1, -2)) * form[1].reach

@@ -39,7 +39,7 @@ def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool 
         deviation=None if tube is None else _deviation(answer, tube),
         method="linear",
         details=answer,
-        conclusive=answer.exact,
+        conclusive=answer.exact and answer.margin > -np.inf,
         foresight=not depends_on_state(problem),
     )
 

@@ -212,6 +212,15 @@ def test_a_system_too_stiff_for_the_linear_engine_says_so() -> None:
     assert "too stiff for the linear engine: ||J|| h = 50" in verdict.reason
 
 
+def test_an_exact_engine_that_found_no_bound_keeps_no_other_from_being_asked() -> None:
+    system = cb.ContinuousSystem(lambda x: -1000 * x, states=1, diffusion=[[1.0]])
+    problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-0.5], [0.5]))], horizon=5)
+    answer = verify_safety(problem, method="linear").answers["linear"]
+    assert answer.margin is None
+    assert not answer.conclusive
+    assert "no bound of the deviation was found" in answer.reason
+
+
 def test_a_map_that_forgets_its_state_has_metrics_for_its_constraints() -> None:
     assert all(constants.certified for constants in bound_metrics(constant_map()))
 
