@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from certbound.rigor.intervals import Interval
 
-__all__ = ["Grid", "around_nodes", "corners", "graded_axis"]
+__all__ = ["Grid", "around_nodes", "corners", "graded_axis", "over_corners"]
 
 Array = NDArray[np.float64]
 
@@ -67,6 +67,14 @@ def corners(nodal: Array) -> list[Array]:
         second = tuple(slice(1, None) if k == axis else slice(None) for k in range(nodal.ndim))
         found = [part[side] for part in found for side in (first, second)]
     return found
+
+
+def over_corners(pick: np.ufunc, nodal: Array) -> Array:
+    """The largest (``np.maximum``) or smallest (``np.minimum``) corner of every cell."""
+    for axis in range(nodal.ndim):
+        moved = np.moveaxis(nodal, axis, 0)
+        nodal = np.moveaxis(pick(moved[:-1], moved[1:]), 0, axis)
+    return nodal
 
 
 def around_nodes(cellwise: Array, *, largest: bool) -> Array:

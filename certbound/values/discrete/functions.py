@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.values.grids import Grid, corners
+from certbound.values.grids import Grid, over_corners
 
 __all__ = ["ValueFunction"]
 
@@ -47,7 +47,7 @@ class ValueFunction:
 
     def size(self) -> Array:
         """Upper bound of the sum of the absolute parts of the function on every cell, shape grid.shape."""
-        largest = np.maximum.reduce([np.abs(part) for part in corners(self.nodal)])
+        largest = over_corners(np.maximum, np.abs(self.nodal))
         parts = sum(np.abs(self.bend[i]) * self.grid.widths(i) ** 2 / 8 for i in range(self.grid.dimension))
         total = largest + parts
         if self.fixed is not None:

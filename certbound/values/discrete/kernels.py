@@ -27,7 +27,7 @@ BAND = 10.5
 """Standard deviations up to which intervals (their centres) are integrated; ``REACH`` is what that surely covers."""
 REACH = 10.0
 ORDERS = 3
-_ROWS = 64
+_ROWS = 32
 _WANTED = 2e-14
 _UNIT = 2.0**-53
 

@@ -3,7 +3,8 @@
 Between the mesh's nodes h is interpolated by polynomials through `POINTS` nodes an axis. With L_i the interpolation
 along axis i, Lambda its norm and omega_p = max prod |theta - k|/p!,
     |h - L_1 ... L_n h| <= sum_i Lambda^(i-1) omega_p delta_i^p sup |d_i^p h|.
-Over a mesh cell a derivative g of h lies between its least and largest corner, widened by sum_i delta_i^2/8 sup |d_ii g|.
+Over a mesh cell a derivative g of h lies between its least and largest corner, widened by sum_i delta_i^2/8 sup |d_ii g|;
+d_ii g is known from second differences at the nodes.
 """
 
 from __future__ import annotations
@@ -13,13 +14,12 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import dominance
 from certbound.values.discrete.fields import POINTS, Field, Tables
 from certbound.values.discrete.steps import CellImages, Step
-from certbound.values.grids import corners
+from certbound.values.grids import over_corners
 
 __all__ = ["Transition"]
 
@@ -128,14 +128,25 @@ class _Windows:
     def extreme(self, table: Array, *, largest: bool) -> Array:
         """Over the window of every cell, of a table over mesh cells."""
         found = np.empty(self.count)
-        function = maximum_filter1d if largest else minimum_filter1d
+        pick = np.maximum if largest else np.minimum
         for size, members, flat in self.groups:
             part = table
             for axis, width in enumerate(size):
-                if width > 1:
-                    part = function(part, width, axis=axis, mode="nearest", origin=-(width // 2))
+                part = _sliding(pick, part, width, axis)
             found[members] = part.ravel().take(flat)
         return found
+
+
+def _sliding(pick: np.ufunc, table: Array, width: int, axis: int) -> Array:
+    """The extreme over ``width`` entries from every entry on along an axis (fewer at the end), by doubling."""
+    moved = np.moveaxis(table, axis, 0)
+    done = 1
+    while done < width:
+        hop = min(done, width - done)
+        longer = moved.copy()
+        pick(moved[:-hop], moved[hop:], out=longer[:-hop])
+        moved, done = longer, done + hop
+    return np.moveaxis(moved, 0, axis)
 
 
 class Transition:
@@ -169,7 +180,7 @@ class Transition:
         zero = (0,) * self.n
         table, wide = field.tables[zero], field.dominant
         for axis in range(self.n):
-            wide = maximum_filter1d(wide, POINTS, axis=axis, mode="nearest", origin=-(POINTS // 2))
+            wide = _sliding(np.maximum, wide, POINTS, axis)
         found = []
         for places in self.places:
             value = places.interpolate(table)
@@ -197,22 +208,46 @@ class Transition:
         return [self._of_box(k, bounds, variables) for k in range(len(self.step.cells))]
 
     def _over_mesh(self, field: Field, alpha: Alpha) -> tuple[Array, Array]:
-        """A derivative of h over the mesh's cells: least and largest."""
-        order = sum(alpha)
-        close = np.maximum.reduce(corners(field.dominant))
-        reach = [float(r) / 2 for r in self._ratio]
-        factor, beyond = 0.0, 0.0
+        """A derivative g of h over the mesh's cells: least and largest.
+
+        At the nodes d_ii g is the second difference up to delta_i^2/12 sup |d_i^4 g|, over a cell it is at most the
+        largest corner plus sum_j delta_j^2/8 sup |d_jj d_ii g|.
+        """
+        sigma, ratio = self.tables.sigma, self._ratio
+        scale = math.prod(float(sigma[i]) ** -alpha[i] for i in range(self.n))
+        table = field.tables[alpha]
+        wrong = field.error[alpha] * field.dominant + field.floor[alpha]
+        close = over_corners(np.maximum, field.dominant)
+        noise = over_corners(np.maximum, wrong)
+        slack = noise.copy()
         for i in range(self.n):
-            raised = tuple(a + (2 if k == i else 0) for k, a in enumerate(alpha))
-            share = float(self._ratio[i]) ** 2 / 8
-            factor += share * math.prod(dominance(a, r) for a, r in zip(raised, reach))
-            beyond += share * self.tables.beyond(raised)
-        scale = math.prod(float(self.tables.sigma[i]) ** -alpha[i] for i in range(self.n))
-        slack = (factor * scale * (1 + 1e-9) + field.error[alpha]) * close
-        slack += field.floor[alpha] + beyond * scale * field.largest
-        views = corners(field.tables[alpha])
-        assert order <= 2
-        return np.minimum.reduce(views) - slack, np.maximum.reduce(views) + slack
+            share = float(ratio[i]) ** 2 / 8
+            bent = over_corners(np.maximum, _second_differences(table, i))
+            near, beyond = self._fourth(alpha, i)
+            edge = self._edge(table.shape, i)
+            twice = _raised(alpha, i, 2)
+            fallback = math.prod(dominance(a, float(r) / 2) for a, r in zip(twice, ratio)) * share
+            rest = np.where(edge, fallback, near) * close * scale
+            rest += (beyond + share * self.tables.beyond(twice)) * scale * field.largest
+            slack += np.where(edge, 0.0, bent / 8 + noise / 2) + rest
+        slack *= 1 + 1e-9
+        return over_corners(np.minimum, table) - slack, over_corners(np.maximum, table) + slack
+
+    def _fourth(self, alpha: Alpha, i: int) -> tuple[float, float]:
+        """What the second difference along axis i misses, times delta_i^2/8: relative to H, and beyond its reach."""
+        share = float(self._ratio[i]) ** 2 / 8
+        parts = [(float(self._ratio[i]) ** 2 / 12, _raised(alpha, i, 4), [float(r) for r in self._ratio])]
+        for j in range(self.n):
+            half = [float(r) / 2 for r in self._ratio]
+            parts.append((float(self._ratio[j]) ** 2 / 8, _raised(_raised(alpha, i, 2), j, 2), half))
+        near = sum(c * math.prod(dominance(a, r) for a, r in zip(order, reach)) for c, order, reach in parts)
+        return share * near, share * sum(c * self.tables.beyond(order) for c, order, _ in parts)
+
+    def _edge(self, shape: tuple[int, ...], i: int) -> Mask:
+        """Mesh cells with a corner that has no second difference along axis i; shaped to broadcast."""
+        edge = np.zeros(shape[i] - 1, dtype=bool)
+        edge[0] = edge[-1] = True
+        return edge.reshape([-1 if k == i else 1 for k in range(self.n)])
 
     def _of_box(self, k: int, bounds: dict[Alpha, tuple[Array, Array]], variables: range) -> list[Interval]:
         windows, images, forms = self.windows[k], self.step.cells[k], self.forms[k]
@@ -283,6 +318,18 @@ def _combined(over: dict[Alpha, Interval], terms: list[tuple[Alpha, Interval | N
         term = factor * over[alpha]
         total = term if total is None else total + term
     return Interval.point(np.zeros(next(iter(over.values())).shape)) if total is None else total
+
+
+def _raised(alpha: Alpha, i: int, by: int) -> Alpha:
+    return tuple(a + (by if k == i else 0) for k, a in enumerate(alpha))
+
+
+def _second_differences(table: Array, axis: int) -> Array:
+    """|g_{j-1} - 2 g_j + g_{j+1}| along an axis; 0 at its ends."""
+    moved = np.moveaxis(table, axis, 0)
+    found = np.zeros_like(moved)
+    found[1:-1] = np.abs(moved[2:] - 2 * moved[1:-1] + moved[:-2])
+    return np.moveaxis(found, 0, axis)
 
 
 def _unit(k: int, n: int) -> Alpha:
