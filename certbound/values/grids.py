@@ -55,7 +55,7 @@ class Grid:
 
     def widths(self, axis: int) -> Array:
         """Widths of the cells along an axis, rounded up, shaped to broadcast against cells."""
-        widths = np.diff(self.axes[axis]) * (1 + 1e-15)
+        widths = np.diff(self.axes[axis]) * (1 + 1e-15)  # 0 on an axis of two equal nodes
         return widths.reshape([-1 if k == axis else 1 for k in range(self.dimension)])
 
 

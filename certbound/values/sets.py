@@ -23,11 +23,16 @@ def active_at(constraints: Sequence[Inside], step: int) -> list[Inside]:
     return [c for c in constraints if c.during is None or c.during[0] <= step <= c.during[1]]
 
 
-def respected(constraints: Sequence[Inside], boxes: Interval, step: int) -> tuple[Mask, Mask]:
-    """Boxes, shape (N, n), all of whose points respect every constraint, and boxes none of whose points do."""
+def respected(
+    constraints: Sequence[Inside], boxes: Interval, step: int, *, interiors: bool = False
+) -> tuple[Mask, Mask]:
+    """Boxes, shape (N, n), all of whose points respect every constraint, and boxes none of whose points do.
+
+    With ``interiors`` only the boxes' interior points count: enough where noise has a density, since faces have no mass.
+    """
     safe, broken = np.ones(len(boxes), dtype=bool), np.zeros(len(boxes), dtype=bool)
     for constraint in constraints:
-        inside, outside = contains(constraint.region, boxes, step)
+        inside, outside = contains(constraint.region, boxes, step, interiors=interiors)
         if isinstance(constraint, Outside):
             inside, outside = outside, inside
         safe &= inside
@@ -35,18 +40,21 @@ def respected(constraints: Sequence[Inside], boxes: Interval, step: int) -> tupl
     return safe, broken
 
 
-def contains(region: Region, boxes: Interval, step: int) -> tuple[Mask, Mask]:
-    """Boxes that surely lie in a region, and boxes that surely do not meet it."""
+def contains(region: Region, boxes: Interval, step: int, *, interiors: bool = False) -> tuple[Mask, Mask]:
+    """Boxes that surely lie in a region, and boxes that surely do not meet it (but for points of their faces)."""
     local = boxes if region.coordinates is None else boxes[:, list(region.coordinates)]
     if isinstance(region, Box):
         y = local if region.center is None else local - _center(region, step)
         inside = (y.lo >= region.low) & (y.hi <= region.high)
         outside = (y.hi < region.low) | (y.lo > region.high)
+        if interiors:
+            outside |= (y.hi <= region.low) | (y.lo >= region.high)
         return np.asarray(inside.all(axis=1)), np.asarray(outside.any(axis=1))
     if isinstance(region, HalfSpace | Polytope):
         normals, bounds = region.halfspaces()
         values = (Interval.point(normals) * local[:, None, :]).sum(axis=-1)
-        return np.asarray((values.hi <= bounds).all(axis=1)), np.asarray((values.lo > bounds).any(axis=1))
+        outside = (values.lo >= bounds) if interiors else (values.lo > bounds)
+        return np.asarray((values.hi <= bounds).all(axis=1)), np.asarray(outside.any(axis=1))
     if isinstance(region, Ball):
         square = sq(local - _center(region, step)).sum(axis=-1)
         limit = sq(Interval.point(region.radius))

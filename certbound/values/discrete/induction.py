@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from certbound.problem.regions import Region
 from certbound.problem.sets import Inside
+from certbound.values.discrete.fields import Field
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.transitions import Transition
 from certbound.values.grids import Grid, around_nodes, corners
 from certbound.values.sets import contains, respected
 
-__all__ = ["Zones", "back_above", "back_below", "final", "zones_of"]
+__all__ = ["Zones", "back_above", "back_below", "final", "values_above", "zones_of"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -43,13 +44,13 @@ class Zones:
 
 
 def zones_of(grid: Grid, constraints: Sequence[Inside], target: Region | None, step: int) -> Zones:
-    """The zones of a grid at a step, given the constraints active then."""
+    """The zones of a grid at a step, given the constraints active then; faces of cells do not count."""
     cells = grid.cells()
-    safe, unsafe = respected(constraints, cells, step)
+    safe, unsafe = respected(constraints, cells, step, interiors=True)
     done = np.zeros(len(cells), dtype=bool)
     undone = ~done
     if target is not None:
-        done, undone = contains(target, cells, step)
+        done, undone = contains(target, cells, step, interiors=True)
     masks = (mask.reshape(grid.shape) for mask in (safe, unsafe, done, undone))
     return Zones(**dict(zip(("safe", "unsafe", "done", "undone"), masks)), has_target=target is not None)
 
@@ -70,18 +71,22 @@ def final(grid: Grid, zones: Zones, *, above: bool) -> ValueFunction:
 def back_above(transition: Transition, value: ValueFunction, zones: Zones) -> ValueFunction:
     """A function at least V_t, given one that is at least V_{t+1}."""
     grid = transition.step.grid
-    field = transition.tables.field(value)
-    nodal = np.maximum.reduce([at + error for at, error in transition.at_nodes(field)])
-    bend, bump, known = _bends(transition, field, above=True)
+    nodal, bend, known = values_above(transition, value)
     fixed = ~zones.safe | ~known
-    nodal, holes = _without_holes(nodal, 1.0)
-    fixed |= holes
-    nodal = nodal + np.where(np.isfinite(bump), bump, 0.0)
     level = np.ones(grid.shape)
     if zones.has_target:
         ended = zones.done & zones.safe
         fixed, level = fixed | ended, np.where(ended, 0.0, level)
     return _function(grid, nodal, bend, fixed, level)
+
+
+def values_above(transition: Transition, value: ValueFunction) -> tuple[Array, Array, Mask]:
+    """Node values, bends and the cells on which they lie above sup_d phi."""
+    field = transition.tables.field(value)
+    nodal = np.maximum.reduce([at + error for at, error in transition.at_nodes(field)])
+    bend, bump, known = _bends(transition, field, above=True)
+    nodal, holes = _without_holes(nodal + bump, 1.0)
+    return nodal, bend, known & ~holes
 
 
 def back_below(transition: Transition, value: ValueFunction, zones: Zones) -> ValueFunction:
@@ -111,11 +116,11 @@ def _policy(options: list[Array]) -> Array:
     return np.where(nodal < -1e299, -np.inf, nodal)
 
 
-def _bends(transition: Transition, field: object, *, above: bool) -> tuple[Array, Array, Mask]:
+def _bends(transition: Transition, field: Field, *, above: bool) -> tuple[Array, Array, Mask]:
     """b per axis and cell, what disturbances between vertices add at the nodes, and where all of it is known."""
     grid, n = transition.step.grid, transition.n
     extra = transition.step.pieces.shape[1]
-    found = transition.bends(field, range(n + (extra if above else 0)))  # type: ignore[arg-type]
+    found = transition.bends(field, range(n + (extra if above else 0)))
     pick = (lambda bend: bend.lo) if above else (lambda bend: bend.hi)
     merge = np.minimum if above else np.maximum
     bend = np.stack([merge.reduce([pick(box[i]) for box in found]).reshape(grid.shape) for i in range(n)])
