@@ -115,6 +115,7 @@ class Tables:
             counts.append(number + POINTS)
         self.mesh = Mesh(start=np.array(starts), step=step, count=tuple(counts))
         self.kernels = [self._kernel(i) for i in range(n)]
+        self._beside: dict[int, list[tuple[tuple[int, ...], Array]]] = {}
         self._constants()
 
     # ---- the common factor -----------------------------------------------------------------------------------
@@ -258,6 +259,8 @@ class Tables:
 
     def _outside(self, order: int) -> list[tuple[tuple[int, ...], Array]]:
         """Derivatives of the probability of landing outside the grid: out_1 + in_1 out_2 + in_1 in_2 out_3."""
+        if order in self._beside:
+            return self._beside[order]
         found = []
         for alpha in orders_up_to(order, self.n):
             total = np.zeros([len(kernel.points) for kernel in self.kernels])
@@ -271,6 +274,7 @@ class Tables:
                     term = term * line.reshape([-1 if k == i else 1 for k in range(self.n)])
                 total = total + term
             found.append((alpha, total))
+        self._beside[order] = found
         return found
 
     def _dominating(self, size: Array) -> Array:

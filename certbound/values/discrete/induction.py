@@ -120,10 +120,9 @@ def _bends(transition: Transition, field: Field, *, above: bool) -> tuple[Array,
     """b per axis and cell, what disturbances between vertices add at the nodes, and where all of it is known."""
     grid, n = transition.step.grid, transition.n
     extra = transition.step.pieces.shape[1]
-    found = transition.bends(field, range(n + (extra if above else 0)))
-    pick = (lambda bend: bend.lo) if above else (lambda bend: bend.hi)
+    found = transition.bends(field, range(n + (extra if above else 0)), above=above)
     merge = np.minimum if above else np.maximum
-    bend = np.stack([merge.reduce([pick(box[i]) for box in found]).reshape(grid.shape) for i in range(n)])
+    bend = np.stack([merge.reduce([box[i] for box in found]).reshape(grid.shape) for i in range(n)])
     steep = sum(np.abs(bend[i]) * grid.widths(i) ** 2 / 8 for i in range(n))
     known = np.all([images.steady for images in transition.step.cells], axis=0).reshape(grid.shape)
     known &= np.asarray(steep < _STEEPEST)
@@ -131,7 +130,7 @@ def _bends(transition: Transition, field: Field, *, above: bool) -> tuple[Array,
     if above and extra:
         raised = np.zeros(grid.shape)
         for box, width in zip(found, transition.step.pieces):
-            more = sum(np.maximum(-box[n + k].lo, 0.0) * width[k] ** 2 / 8 for k in range(extra))
+            more = sum(np.maximum(-box[n + k], 0.0) * width[k] ** 2 / 8 for k in range(extra))
             raised = np.maximum(raised, np.reshape(more, grid.shape) * (1 + 1e-12))
         bump = around_nodes(raised, largest=False)
     return np.where(known, bend, 0.0), bump, known

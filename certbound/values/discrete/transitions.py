@@ -198,38 +198,53 @@ class Transition:
 
     # ---- second derivatives over cells -----------------------------------------------------------------------
 
-    def bends(self, field: Field, variables: range) -> list[list[Interval]]:
-        """Per box of disturbances and variable: the second derivative of phi over every cell, shape (cells,).
+    def bends(self, field: Field, variables: range, *, above: bool) -> list[list[Array]]:
+        """Per box of disturbances and variable: the least (else largest) second derivative of phi over every cell.
 
-        Where f is not smooth but steady, numbers that serve the same purpose: +-2 (range of the slope)/width. Unbounded
+        Where f is not smooth but steady, numbers that serve the same purpose: -+2 (range of the slope)/width. Unbounded
         where neither is known.
         """
-        bounds = {alpha: self._over_mesh(field, alpha) for alpha in field.tables if sum(alpha) > 0}
-        return [self._of_box(k, bounds, variables) for k in range(len(self.step.cells))]
-
-    def _over_mesh(self, field: Field, alpha: Alpha) -> tuple[Array, Array]:
-        """A derivative g of h over the mesh's cells: least and largest.
-
-        At the nodes d_ii g is the second difference up to delta_i^2/12 sup |d_i^4 g|, over a cell it is at most the
-        largest corner plus sum_j delta_j^2/8 sup |d_jj d_ii g|.
-        """
-        sigma, ratio = self.tables.sigma, self._ratio
-        scale = math.prod(float(sigma[i]) ** -alpha[i] for i in range(self.n))
-        table = field.tables[alpha]
-        wrong = field.error[alpha] * field.dominant + field.floor[alpha]
         close = over_corners(np.maximum, field.dominant)
-        noise = over_corners(np.maximum, wrong)
-        slack = noise.copy()
+        if all(form.constant for form in self.forms):
+            found = []
+            for i in variables:
+                low, high = self._over_mesh(field, self.forms[0].terms(i), close)
+                table = low if above else high
+                found.append([windows.extreme(table, largest=not above) for windows in self.windows])
+            return [list(box) for box in zip(*found)]
+        bounds = {a: self._over_mesh(field, [(a, _ONE)], close) for a in field.tables if sum(a) > 0}
+        boxes = [self._of_box(k, bounds, variables) for k in range(len(self.step.cells))]
+        return [[bend.lo if above else bend.hi for bend in box] for box in boxes]
+
+    def _over_mesh(self, field: Field, terms: list[tuple[Alpha, Interval]], close: Array) -> tuple[Array, Array]:
+        """A sum g of derivatives of h with constant factors over the mesh's cells: least and largest.
+
+        At the nodes d_ii g is the second difference up to delta_i^2/12 sup |d_i^4 g|; over a cell |d_ii g| is at most its
+        interpolation plus sum_j delta_j^2/8 sup |d_jj d_ii g|. At the mesh's ends |d_ii g| itself is dominated.
+        ``close`` is the largest H at a cell's corners.
+        """
+        table, near, beyond = np.zeros(field.mesh.count), 0.0, 0.0
+        ends = np.zeros((self.n, 2))
+        noise = 1 + self.n / 2  # of a corner, and of second differences (4 of them, times 1/8) along every axis
+        for alpha, factor in terms:
+            scale = math.prod(float(self.tables.sigma[i]) ** -alpha[i] for i in range(self.n)) * float(factor.mag)
+            table += float(factor.mid) * field.tables[alpha]
+            loose = (float(factor.rad) / float(factor.mag) + 16 * 2.0**-53) * math.prod(dominance(a) for a in alpha)
+            near += (loose * scale * 1.01 + field.error[alpha] * float(factor.mag)) * noise
+            beyond += field.floor[alpha] / field.largest * float(factor.mag) * noise
+            for i in range(self.n):
+                more = self._fourth(alpha, i)
+                near, beyond = near + more[0] * scale, beyond + more[1] * scale
+                order, share = _raised(alpha, i, 2), float(self._ratio[i]) ** 2 / 8 * scale
+                ends[i, 0] += share * math.prod(dominance(a, float(r) / 2) for a, r in zip(order, self._ratio))
+                ends[i, 1] += share * self.tables.beyond(order)
+        bent = np.zeros_like(table)
         for i in range(self.n):
-            share = float(ratio[i]) ** 2 / 8
-            bent = over_corners(np.maximum, _second_differences(table, i))
-            near, beyond = self._fourth(alpha, i)
-            edge = self._edge(table.shape, i)
-            twice = _raised(alpha, i, 2)
-            fallback = math.prod(dominance(a, float(r) / 2) for a, r in zip(twice, ratio)) * share
-            rest = np.where(edge, fallback, near) * close * scale
-            rest += (beyond + share * self.tables.beyond(twice)) * scale * field.largest
-            slack += np.where(edge, 0.0, bent / 8 + noise / 2) + rest
+            _add_second_differences(table, i, bent)
+        slack = over_corners(np.maximum, bent) / 8 + close * near + beyond * field.largest
+        for i in range(self.n):
+            for end in (0, -1):
+                np.moveaxis(slack, i, 0)[end] += ends[i, 0] * np.moveaxis(close, i, 0)[end] + ends[i, 1] * field.largest
         slack *= 1 + 1e-9
         return over_corners(np.minimum, table) - slack, over_corners(np.maximum, table) + slack
 
@@ -242,12 +257,6 @@ class Transition:
             parts.append((float(self._ratio[j]) ** 2 / 8, _raised(_raised(alpha, i, 2), j, 2), half))
         near = sum(c * math.prod(dominance(a, r) for a, r in zip(order, reach)) for c, order, reach in parts)
         return share * near, share * sum(c * self.tables.beyond(order) for c, order, _ in parts)
-
-    def _edge(self, shape: tuple[int, ...], i: int) -> Mask:
-        """Mesh cells with a corner that has no second difference along axis i; shaped to broadcast."""
-        edge = np.zeros(shape[i] - 1, dtype=bool)
-        edge[0] = edge[-1] = True
-        return edge.reshape([-1 if k == i else 1 for k in range(self.n)])
 
     def _of_box(self, k: int, bounds: dict[Alpha, tuple[Array, Array]], variables: range) -> list[Interval]:
         windows, images, forms = self.windows[k], self.step.cells[k], self.forms[k]
@@ -280,7 +289,7 @@ class _Forms:
     """Products of f's derivatives, made once: d_ii phi = sum_kl h_kl J_ki J_li + sum_k h_k B_ki."""
 
     def __init__(self, images: CellImages, n: int) -> None:
-        self.n = n
+        self.n, self.whole = n, bool(images.smooth.all())
         slopes = _cleaned(images.slopes, images.steady)
         bends = _cleaned(images.bends, images.smooth)
         variables = slopes.shape[2]
@@ -298,6 +307,16 @@ class _Forms:
                     else:
                         row.append((alpha, first**2 if k == m else first * second * 2.0))
             self.square.append(row)
+
+    @property
+    def constant(self) -> bool:
+        """Whether f is affine and the same on all cells."""
+        straight = all(factor is None for row in self.bent for factor in row)
+        return self.whole and straight and all(f is None or f.ndim == 0 for row in self.square for _, f in row)
+
+    def terms(self, i: int) -> list[tuple[Alpha, Interval]]:
+        """Constant factors of h's second derivatives in d_ii phi."""
+        return [(alpha, factor) for alpha, factor in self.square[i] if factor is not None]
 
     def first(self, over: dict[Alpha, Interval], i: int) -> Interval:
         """d_i phi."""
@@ -324,12 +343,15 @@ def _raised(alpha: Alpha, i: int, by: int) -> Alpha:
     return tuple(a + (by if k == i else 0) for k, a in enumerate(alpha))
 
 
-def _second_differences(table: Array, axis: int) -> Array:
-    """|g_{j-1} - 2 g_j + g_{j+1}| along an axis; 0 at its ends."""
-    moved = np.moveaxis(table, axis, 0)
-    found = np.zeros_like(moved)
-    found[1:-1] = np.abs(moved[2:] - 2 * moved[1:-1] + moved[:-2])
-    return np.moveaxis(found, 0, axis)
+def _add_second_differences(table: Array, axis: int, total: Array) -> None:
+    """Add |g_{j-1} - 2 g_j + g_{j+1}| along an axis, but at its ends."""
+    g, out = np.moveaxis(table, axis, 0), np.moveaxis(total, axis, 0)
+    found = g[2:] + g[:-2]
+    found -= 2 * g[1:-1]
+    out[1:-1] += np.abs(found, out=found)
+
+
+_ONE = Interval.point(1.0)
 
 
 def _unit(k: int, n: int) -> Alpha:
@@ -346,6 +368,6 @@ def _short(x: Interval) -> Interval | None:
     """None for zeros, one number for a constant."""
     if not x.mag.any():
         return None
-    if x.lo[0] == x.hi[0] and np.all(x.lo == x.lo[0]) and np.all(x.hi == x.hi[0]):
-        return Interval.point(float(x.lo[0]))
+    if np.all(x.lo == x.lo[0]) and np.all(x.hi == x.hi[0]):
+        return Interval(x.lo[0], x.hi[0])
     return x
