@@ -30,7 +30,7 @@ __all__ = ["Field", "Mesh", "POINTS", "Tables", "orders_up_to"]
 
 Array = NDArray[np.float64]
 
-POINTS = 6
+POINTS = 8
 """Points of the interpolation between the mesh's nodes."""
 FINENESS = 6.0
 """Mesh steps per standard deviation."""

@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 from certbound.rigor.balls import precision
 from certbound.values.discrete.dominance import KAPPA, dominance, quadrature_error
 
-__all__ = ["BAND", "ORDERS", "AxisKernel", "axis_kernel"]
+__all__ = ["ORDERS", "REACH", "AxisKernel", "axis_kernel"]
 
 Array = NDArray[np.float64]
 
-BAND = 10.5
-"""Standard deviations up to which intervals (their centres) are integrated; ``REACH`` is what that surely covers."""
 REACH = 10.0
+"""Standard deviations up to which every interval is integrated that comes so near."""
 ORDERS = 3
+_MARGIN = REACH + 1e-3
+_FARTHEST = 40.0  # beyond it the density is below 1e-140 of the dominating one
 _ROWS = 32
 _WANTED = 2e-14
 _UNIT = 2.0**-53
@@ -109,12 +110,10 @@ def axis_kernel(points: Array, nodes: Array, sigma: float, spread: float) -> Axi
     half = float(widths.max()) / sigma / panels / 2 * (1 + 1e-9)
     count = _points(half)
     place, weight = _rule(count, panels)
-    centres = (nodes[:-1] + nodes[1:]) / 2
     blocks = []
     for first in range(0, len(points), _ROWS):
         rows = points[first : first + _ROWS]
-        near = (centres >= rows[0] - BAND * sigma) & (centres <= rows[-1] + BAND * sigma)
-        index = np.flatnonzero(near)
+        index = np.flatnonzero((nodes[1:] >= rows[0] - _MARGIN * sigma) & (nodes[:-1] <= rows[-1] + _MARGIN * sigma))
         left, right = (int(index[0]), int(index[-1]) + 1) if len(index) else (0, 0)
         parts, mass = _integrals(rows, nodes[left : right + 1], sigma, place, weight)
         blocks.append(Block(
@@ -135,8 +134,8 @@ def _points(half: float) -> int:
     """Points of the rule that suffice for the derivatives and, to 1e-4 of themselves, for the masses."""
 
     def fits(count: int) -> bool:
-        wrong = max(quadrature_error(count, half, order, BAND + 1) for order in range(ORDERS))
-        return wrong <= _WANTED and quadrature_error(count, half / KAPPA, 0, (BAND + 1) / KAPPA, 1.0) <= 1e-4
+        wrong = max(quadrature_error(count, half, order, _FARTHEST) for order in range(ORDERS))
+        return wrong <= _WANTED and quadrature_error(count, half / KAPPA, 0, (REACH + 1) / KAPPA, 1.0) <= 1e-4
 
     return next(count for count in range(4, 64) if fits(count))
 
@@ -155,8 +154,9 @@ def _integrals(rows: Array, nodes: Array, sigma: float, place: Array, weight: Ar
     y = nodes[:-1, None] + widths[:, None] * place
     z = (y[None] - rows[:, None, None]) / sigma
     density = np.exp(-0.5 * z * z) / (sigma * math.sqrt(2 * math.pi))
-    centre = np.abs((nodes[:-1] + nodes[1:]) / 2 - rows[:, None]) <= BAND * sigma
-    density *= centre[:, :, None]
+    gap = np.maximum(nodes[:-1] - rows[:, None], rows[:, None] - nodes[1:])
+    near = (gap <= _MARGIN * sigma)[:, :, None]
+    density *= near
     shapes = np.stack([1 - place, place, place * (1 - place) / 2, np.ones_like(place)], axis=1) * weight[:, None]
     moments = np.stack([density, density * z / sigma, density * (z * z - 1) / sigma**2])
     values = np.moveaxis(moments @ shapes, -1, 0) * widths  # (4, ORDERS, rows, intervals)
@@ -165,7 +165,7 @@ def _integrals(rows: Array, nodes: Array, sigma: float, place: Array, weight: Ar
     hat[..., :-1] += left
     hat[..., 1:] += right
     parts = {"hat": hat, "left": left, "right": right, "bubble": bubble * widths**2, "whole": whole}
-    wide = np.exp(-0.5 * (z / KAPPA) ** 2) / (KAPPA * sigma * math.sqrt(2 * math.pi)) * centre[:, :, None]
+    wide = np.exp(-0.5 * (z / KAPPA) ** 2) / (KAPPA * sigma * math.sqrt(2 * math.pi)) * near
     return parts, (wide @ weight) * widths
 
 
