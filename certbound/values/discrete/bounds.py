@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,12 @@ from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.functions import ValueFunction
-from certbound.values.discrete.induction import Zones, back_above, back_below, final, values_above, zones_of
+from certbound.values.discrete.induction import AnyTransition, Zones, back_above, back_below, final, values_above, zones_of
 from certbound.values.discrete.layout import Boxes, boxes_of, grid_of, widths_of
 from certbound.values.discrete.shocks import Inapplicable, Shocks, gaussian_shocks, shocks_of
 from certbound.values.discrete.steps import Dynamics, Step
 from certbound.values.discrete.transitions import Transition
+from certbound.values.discrete.uniform import UniformTables, UniformTransition
 from certbound.values.grids import Grid, corners
 from certbound.values.sets import active_at, box_around, contains, respected
 
@@ -29,8 +31,20 @@ __all__ = ["FailureBounds", "bound_failure"]
 Array = NDArray[np.float64]
 
 MOST_STATES = 3
-_SHARES = (0.5, 0.33, 0.22, 0.15, 0.1, 0.07, 0.05, 0.035, 0.025)
+_SHARES = {
+    1: (0.33, 0.15, 0.07, 0.035, 0.0175, 0.01),
+    2: (0.5, 0.33, 0.22, 0.15, 0.1, 0.07, 0.05, 0.035),
+    3: (0.5, 0.25, 0.15, 0.1, 0.07),
+}
+"""Sizes of the cells that are tried, relative to the lengths over which the solution changes."""
+_UNIFORM_SHARES = {
+    1: (0.2, 0.07, 0.025, 0.01, 0.005),
+    2: (0.3, 0.15, 0.07, 0.035, 0.02, 0.012),
+    3: (0.5, 0.3, 0.2, 0.12),
+}
 _MOST_NODES = 3_000_000
+_PATIENCE = 1.0  # seconds for which grids are refined although the question is answered
+_FLOOR = 1e-16  # where what lies beyond ten standard deviations begins to count
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,29 +109,44 @@ def bound_failure(
     """
     work = _Work(problem, target, parts)
     begun = time.perf_counter()
-    upper, lower, spent = 1.0, 0.0, 0.0
+    upper, lower = 1.0, 0.0
     tried: list[tuple[float, float, float]] = []
-    cells, share = (0,), 0.0
-    for k, finer in enumerate(_SHARES):
-        layout = work.layout(finer)
+    spent: list[tuple[int, float]] = []
+    cells: tuple[int, ...] = ()
+    for share in (_UNIFORM_SHARES if work.shocks.uniform else _SHARES)[work.n]:
+        layout = work.layout(share)
         if layout is None:
             if not tried:
                 raise Inapplicable(work.too_large)
             break
-        growth = 1.0 if not k else (_SHARES[k - 1] / finer) ** problem.system.dimension
-        if tried and time.perf_counter() - begun + spent * growth > seconds:
+        finest = max((grid.shape for grid in layout), key=math.prod)
+        if tried and time.perf_counter() - begun + _expected(spent, math.prod(finest)) > seconds:
             break
         start = time.perf_counter()
-        found = work.bounds(layout, finer)
-        spent = time.perf_counter() - start
-        upper, lower = min(upper, found[0]), max(lower, found[1])
-        cells, share = max((grid.shape for grid in layout), key=math.prod), finer
-        tried.append((finer, *found))
-        if upper <= ratio * lower or _settled(upper, lower, delta) or upper < 1e-17:
+        try:
+            found = work.bounds(layout, share)
+        except Inapplicable:
+            if not tried:
+                raise
+            break
+        spent.append((math.prod(finest), time.perf_counter() - start))
+        upper, lower, cells = min(upper, found[0]), max(lower, found[1]), finest
+        tried.append((share, *found))
+        settled = time.perf_counter() - begun > _PATIENCE and _settled(upper, lower, delta)
+        if upper <= ratio * lower or settled or upper < _FLOOR:
             break
     return FailureBounds(
-        upper=upper, lower=lower, cells=cells, share=share, seconds=time.perf_counter() - begun, tried=tuple(tried)
+        upper=upper, lower=lower, cells=cells, share=tried[-1][0], seconds=time.perf_counter() - begun, tried=tuple(tried)
     )
+
+
+def _expected(spent: list[tuple[int, float]], cells: int) -> float:
+    """Seconds that so many cells will take: a straight line through the last two grids, or half in proportion."""
+    (count, last) = spent[-1]
+    if len(spent) == 1:
+        return last * (0.5 + 0.5 * cells / count)
+    before, earlier = spent[-2]
+    return last + max(last - earlier, 0.0) / max(count - before, 1) * max(cells - count, 0)
 
 
 def _settled(upper: float, lower: float, delta: float | None) -> bool:
@@ -197,12 +226,12 @@ class _Work:
         zones = [self._zones(grids, t) for t in range(last + 1)]
         above = final(grids[last], zones[last], above=True)
         below = final(grids[last], zones[last], above=False)
-        kept: tuple[object, Transition] | None = None
+        kept: tuple[object, AnyTransition] | None = None
         end = 0 if self.random else 1
         for t in range(last - 1, end - 1, -1):
             key = (id(grids[t]), id(grids[t + 1])) if self.dynamics.steady else t
             if kept is None or kept[0] != key:
-                kept = (key, self._transition(t, grids[t], grids[t + 1]))
+                kept = (key, self._transition(t, grids[t], grids[t + 1], share))
             above = back_above(kept[1], above, zones[t])
             below = back_below(kept[1], below, zones[t])
         upper, lower = self._at_random(above, below) if self.random else self._over_start(above, below, share)
@@ -212,8 +241,10 @@ class _Work:
     def _zones(self, grids: list[Grid], t: int) -> Zones:
         return zones_of(grids[t], active_at(self.problem.constraints, t), self.target, t)
 
-    def _transition(self, t: int, grid: Grid, after: Grid) -> Transition:
+    def _transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
         step = self.dynamics.step(t, grid)
+        if self.shocks.uniform:
+            return UniformTransition(step, UniformTables(after, self.shocks, *step.hull(), fineness=max(2 / share, 4.0)))
         return Transition(step, Tables(after, self.shocks, *step.hull()))
 
     def _at_random(self, above: ValueFunction, below: ValueFunction) -> tuple[float, float]:
@@ -238,17 +269,18 @@ class _Work:
         if not np.all(safe[meets]):
             upper = 1.0
         else:
-            transition = self._transition(0, grid, above.grid)
+            transition = self._transition(0, grid, above.grid, share)
             upper = self._highest(transition, above, meets)
-        transition = self._transition(0, grid, below.grid)
-        values = np.maximum.reduce([at - error for at, error in transition.at_nodes(transition.tables.field(below, order=0))])
+        transition = self._transition(0, grid, below.grid, share)
+        field: Any = transition.tables.field(below, order=0)
+        values = np.maximum.reduce([at - error for at, error in transition.at_nodes(field)])
         inside = contains(region, Interval.point(grid.nodes()), 0)[0]
         if self.target is not None:
             inside &= contains(self.target, Interval.point(grid.nodes()), 0)[1]
         values = values.ravel()[inside]
         return upper, float(values.max()) if len(values) else 0.0
 
-    def _highest(self, transition: Transition, above: ValueFunction, meets: NDArray[np.bool_]) -> float:
+    def _highest(self, transition: AnyTransition, above: ValueFunction, meets: NDArray[np.bool_]) -> float:
         nodal, bend, known = values_above(transition, above)
         top = np.maximum.reduce(corners(nodal))
         for i in range(self.n):

@@ -23,7 +23,7 @@ from certbound.rigor.rounding import product_error
 from certbound.values.discrete.dominance import density_tail, dominance
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.kernels import REACH, AxisKernel, axis_kernel
-from certbound.values.discrete.shocks import Shocks
+from certbound.values.discrete.shocks import Inapplicable, Shocks
 from certbound.values.grids import Grid, corners
 
 __all__ = ["Field", "Mesh", "POINTS", "Tables", "orders_up_to"]
@@ -34,6 +34,7 @@ POINTS = 8
 """Points of the interpolation between the mesh's nodes."""
 FINENESS = 6.0
 """Mesh steps per standard deviation."""
+_MOST_POINTS = 6_000_000
 _UNIT = 2.0**-53
 _DECAY = 34.5  # -log of the trapezoidal rule's error
 
@@ -53,6 +54,13 @@ class Mesh:
     start: Array
     step: Array
     count: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if math.prod(self.count) > _MOST_POINTS:
+            raise Inapplicable(
+                f"value functions would need tables of more than {_MOST_POINTS} entries: the safe set is very many "
+                "standard deviations of the noise wide. Use another engine, which is at its best there."
+            )
 
     def points(self, axis: int) -> Array:
         """Points of one axis."""
@@ -209,6 +217,22 @@ class Tables:
 
     def field(self, value: ValueFunction, *, order: int = 2) -> Field:
         """h and its derivatives up to an order of 0 or 2."""
+        raw = self._raw(value, order)
+        size = value.size()
+        dominant = self._mixed(self._dominating(size)) * 1.001
+        largest = max(1.0, float(size.max()))
+        tables = {alpha: self._mixed(part) for alpha, part in raw.items()}
+        floor = {alpha: 6 * largest * tail for alpha, tail in self.tail.items()}
+        return Field(
+            mesh=self.mesh, tables=tables, dominant=dominant, error=self.error, floor=floor, largest=largest
+        )
+
+    def means(self, value: ValueFunction) -> Array:
+        """h alone, before the common factor."""
+        return self._raw(value, 0)[(0,) * self.n]
+
+    def _raw(self, value: ValueFunction, order: int) -> dict[tuple[int, ...], Array]:
+        """Sums over the grid of what the parts of the function contribute, and what lies outside."""
         raw: dict[tuple[int, ...], Array] = {}
 
         def add(names: list[str], tensor: Array, sign: float) -> None:
@@ -223,12 +247,7 @@ class Tables:
             self._add_fixed(value, add)
         for alpha, part in self._outside(order):
             raw[alpha] = raw[alpha] + part
-        size = value.size()
-        dominant = self._mixed(self._dominating(size)) * 1.001
-        largest = max(1.0, float(size.max()))
-        tables = {alpha: self._mixed(part) for alpha, part in raw.items()}
-        floor = {alpha: 6 * largest * tail for alpha, tail in self.tail.items()}
-        return Field(mesh=self.mesh, tables=tables, dominant=dominant, error=self.error, floor=floor, largest=largest)
+        return raw
 
     def _add_fixed(self, value: ValueFunction, add: object) -> None:
         """On fixed cells: the constant instead of the multilinear part."""

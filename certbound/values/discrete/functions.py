@@ -54,6 +54,18 @@ class ValueFunction:
             total = np.where(self.fixed, 2 * largest + np.abs(self.level), total)
         return np.asarray(total * (1 + 1e-12))
 
+    def range(self) -> tuple[Array, Array]:
+        """Bounds of the function on every cell, shapes grid.shape."""
+        low, high = over_corners(np.minimum, self.nodal), over_corners(np.maximum, self.nodal)
+        for i in range(self.grid.dimension):
+            share = self.grid.widths(i) ** 2 / 8 * (1 + 1e-12)
+            low = low - np.maximum(self.bend[i], 0.0) * share
+            high = high + np.maximum(-self.bend[i], 0.0) * share
+        slack = 1e-12 * (np.abs(low) + np.abs(high))
+        if self.fixed is not None:
+            low, high = np.where(self.fixed, self.level, low), np.where(self.fixed, self.level, high)
+        return low - slack, high + slack
+
     def values(self, points: Array) -> Array:
         """At points (P, n), in plain floats; 1 outside."""
         places, shares = [], []

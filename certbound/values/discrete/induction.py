@@ -11,22 +11,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.regions import Region
 from certbound.problem.sets import Inside
-from certbound.values.discrete.fields import Field
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.transitions import Transition
+from certbound.values.discrete.uniform import UniformTransition
 from certbound.values.grids import Grid, around_nodes, corners
 from certbound.values.sets import contains, respected
 
-__all__ = ["Zones", "back_above", "back_below", "final", "values_above", "zones_of"]
+__all__ = ["AnyTransition", "Zones", "back_above", "back_below", "final", "values_above", "zones_of"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+AnyTransition = Transition | UniformTransition
 
 _STEEPEST = 0.5
 """Largest bend times width^2/8 that a cell keeps; beyond it the cell is constant."""
@@ -68,7 +70,7 @@ def final(grid: Grid, zones: Zones, *, above: bool) -> ValueFunction:
     return _function(grid, np.zeros(grid.node_shape), np.zeros((grid.dimension, *grid.shape)), fixed, level)
 
 
-def back_above(transition: Transition, value: ValueFunction, zones: Zones) -> ValueFunction:
+def back_above(transition: AnyTransition, value: ValueFunction, zones: Zones) -> ValueFunction:
     """A function at least V_t, given one that is at least V_{t+1}."""
     grid = transition.step.grid
     nodal, bend, known = values_above(transition, value)
@@ -80,19 +82,19 @@ def back_above(transition: Transition, value: ValueFunction, zones: Zones) -> Va
     return _function(grid, nodal, bend, fixed, level)
 
 
-def values_above(transition: Transition, value: ValueFunction) -> tuple[Array, Array, Mask]:
+def values_above(transition: AnyTransition, value: ValueFunction) -> tuple[Array, Array, Mask]:
     """Node values, bends and the cells on which they lie above sup_d phi."""
-    field = transition.tables.field(value)
+    field: Any = transition.tables.field(value)
     nodal = np.maximum.reduce([at + error for at, error in transition.at_nodes(field)])
     bend, bump, known = _bends(transition, field, above=True)
     nodal, holes = _without_holes(nodal + bump, 1.0)
     return nodal, bend, known & ~holes
 
 
-def back_below(transition: Transition, value: ValueFunction, zones: Zones) -> ValueFunction:
+def back_below(transition: AnyTransition, value: ValueFunction, zones: Zones) -> ValueFunction:
     """A function at most V_t, given one that is at most V_{t+1}."""
     grid = transition.step.grid
-    field = transition.tables.field(value)
+    field: Any = transition.tables.field(value)
     options = [at - error for at, error in transition.at_nodes(field)]
     nodal = options[0] if len(options) == 1 else _policy(options)
     bend, _, known = _bends(transition, field, above=False)
@@ -116,11 +118,11 @@ def _policy(options: list[Array]) -> Array:
     return np.where(nodal < -1e299, -np.inf, nodal)
 
 
-def _bends(transition: Transition, field: Field, *, above: bool) -> tuple[Array, Array, Mask]:
+def _bends(transition: AnyTransition, field: Any, *, above: bool) -> tuple[Array, Array, Mask]:
     """b per axis and cell, what disturbances between vertices add at the nodes, and where all of it is known."""
     grid, n = transition.step.grid, transition.n
     extra = transition.step.pieces.shape[1]
-    found = transition.bends(field, range(n + (extra if above else 0)), above=above)
+    found: list[list[Array]] = transition.bends(field, range(n + (extra if above else 0)), above=above)
     merge = np.minimum if above else np.maximum
     bend = np.stack([merge.reduce([box[i] for box in found]).reshape(grid.shape) for i in range(n)])
     steep = sum(np.abs(bend[i]) * grid.widths(i) ** 2 / 8 for i in range(n))

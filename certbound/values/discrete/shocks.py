@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import CertboundError
-from certbound.problem.noise import Bounded, Gaussian, Law, SubGaussian
+from certbound.problem.noise import Bounded, Gaussian, Law, SubGaussian, Uniform
 from certbound.rigor.intervals import Interval, sq, sqrt
 
 __all__ = ["Inapplicable", "Shocks", "gaussian_shocks", "shocks_of"]
@@ -31,10 +31,13 @@ class Shocks:
         Standard deviations of the independent parts, positive, known up to rounding.
     factor : Interval, shape (n,)
         Loads of the common factor; all 0 where the entries are independent.
+    uniform : bool
+        True: w is uniform on the box [-sigma, sigma] instead, without a common factor.
     """
 
     sigma: Interval
     factor: Interval
+    uniform: bool = False
 
     @property
     def dimension(self) -> int:
@@ -48,21 +51,33 @@ class Shocks:
 
 
 def shocks_of(law: Law, gain: Array) -> Shocks:
-    """The law of G w for Gaussian w.
+    """The law of G w, for Gaussian w and for uniform w that moves every state on its own.
 
     Raises
     ------
     Inapplicable
-        For every other law, and where G w leaves a state without noise of its own.
+        For other laws, and where G w leaves a state without noise of its own.
     """
     if isinstance(law, Bounded | SubGaussian):
         raise Inapplicable(
             f"value functions need the noise's law; {type(law).__name__} names a class of laws (give cb.Gaussian "
             "if that is what it is)."
         )
+    if isinstance(law, Uniform):
+        return _uniform_shocks(law, gain)
     if not isinstance(law, Gaussian):
-        raise Inapplicable(f"value functions know Gaussian noise only so far, not {type(law).__name__}.")
+        raise Inapplicable(f"value functions take Gaussian and uniform noise so far, not {type(law).__name__}.")
     return gaussian_shocks(_covariance(law, gain))
+
+
+def _uniform_shocks(law: Uniform, gain: Array) -> Shocks:
+    n = len(gain)
+    alone = gain.shape == (n, n) and np.all((gain != 0).sum(axis=1) == 1) and np.all((gain != 0).sum(axis=0) == 1)
+    if not alone or not np.all(np.asarray(law.halfwidth) > 0):
+        raise Inapplicable("value functions need uniform noise that moves every state by an entry of its own.")
+    place = np.argmax(gain != 0, axis=1)
+    sides = Interval.point(np.abs(gain[np.arange(n), place])) * Interval.point(np.asarray(law.halfwidth)[place])
+    return Shocks(sigma=sides, factor=Interval.point(np.zeros(n)), uniform=True)
 
 
 def _covariance(law: Gaussian, gain: Array) -> Interval:

@@ -65,6 +65,14 @@ class Step:
     cells: list[CellImages]
     pieces: Array
 
+    def width(self, box: int, variable: int) -> Array | float:
+        """Width of the cells, or of a box of disturbances, along a variable; rounded down."""
+        n = self.grid.dimension
+        if variable >= n:
+            return float(self.pieces[box, variable - n]) * (1 - 1e-12) or 1.0
+        widths = self.grid.widths(variable) * (1 - 1e-12)
+        return np.asarray(np.broadcast_to(np.where(widths > 0, widths, 1.0), self.grid.shape).ravel())
+
     def hull(self) -> tuple[Array, Array]:
         """Ends of a box around all images that are finite, shapes (n,)."""
         low = np.full(self.grid.dimension, np.inf)

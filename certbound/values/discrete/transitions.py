@@ -21,7 +21,7 @@ from certbound.values.discrete.fields import POINTS, Field, Tables
 from certbound.values.discrete.steps import CellImages, Step
 from certbound.values.grids import over_corners
 
-__all__ = ["Transition"]
+__all__ = ["Forms", "Places", "Transition", "Windows"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -45,21 +45,23 @@ def _rule_constants(points: int) -> tuple[float, float]:
     return float(norm.hi.max()), odd**2 / math.factorial(points) * (1 + 1e-6)
 
 
-class _Places:
+class Places:
     """Where points lie in a mesh: the first node of the stencil and the weights, axis by axis."""
 
-    def __init__(self, image: Interval, usable: Mask, tables: Tables) -> None:
+    def __init__(self, image: Interval, usable: Mask, tables: Tables, *, points: int = POINTS) -> None:
         mesh, n = tables.mesh, tables.n
         middle = np.where(usable[:, None], np.nan_to_num(image.mid), 0.0)
         self.radius = np.where(usable[:, None], image.rad, np.inf)
         self.usable = usable & np.all(self.radius <= mesh.step / 2, axis=1)
-        self.base, self.weights = [], []
+        self.points = points
+        self.base: list[Index] = []
+        self.weights: list[list[Array]] = []
         for i in range(n):
             place = np.clip((middle[:, i] - mesh.start[i]) / mesh.step[i], 0, mesh.count[i] - 1)
-            base = np.clip(np.floor(place).astype(np.int64) - (POINTS // 2 - 1), 0, mesh.count[i] - POINTS)
+            base = np.clip(np.floor(place).astype(np.int64) - (points // 2 - 1), 0, mesh.count[i] - points)
             theta = place - base
             self.base.append(base)
-            self.weights.append(_weights(theta))
+            self.weights.append(_weights(theta, points))
 
     def flat(self, count: tuple[int, ...], shift: tuple[int, ...]) -> Index:
         """Flat index of the stencils' nodes ``shift``."""
@@ -77,7 +79,7 @@ class _Places:
 
         def along(axis: int, index: Index) -> Array:
             total = np.zeros(len(index))
-            for k in range(POINTS):
+            for k in range(self.points):
                 moved = index + k * strides[axis]
                 inner = flat.take(moved) if axis == n - 1 else along(axis + 1, moved)
                 total += self.weights[axis][k] * inner
@@ -86,18 +88,18 @@ class _Places:
         return along(0, start)
 
 
-def _weights(theta: Array) -> list[Array]:
+def _weights(theta: Array, points: int) -> list[Array]:
     found = []
-    for k in range(POINTS):
+    for k in range(points):
         weight = np.ones_like(theta)
-        for j in range(POINTS):
+        for j in range(points):
             if j != k:
                 weight = weight * ((theta - j) / (k - j))
         found.append(weight)
     return found
 
 
-class _Windows:
+class Windows:
     """Which mesh cells the images of cells meet, in groups of one window size."""
 
     def __init__(self, images: CellImages, tables: Tables) -> None:
@@ -154,9 +156,9 @@ class Transition:
 
     def __init__(self, step: Step, tables: Tables) -> None:
         self.step, self.tables, self.n = step, tables, tables.n
-        self.places = [_Places(image, usable, tables) for image, usable in step.vertices]
-        self.windows = [_Windows(images, tables) for images in step.cells]
-        self.forms = [_Forms(images, self.n) for images in step.cells]
+        self.places = [Places(image, usable, tables) for image, usable in step.vertices]
+        pairs = self.windows_and_forms(step, tables)
+        self.windows, self.forms = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         ratio = tables.mesh.step / tables.sigma
         self._ratio = ratio
         norm, omega = _rule_constants(POINTS)
@@ -172,6 +174,11 @@ class Transition:
         )
         self.sensitivity = [dominance(1, reach[i]) * math.prod(still) / still[i] / tables.sigma[i] for i in range(self.n)]
         self.norm = norm**self.n
+
+    @staticmethod
+    def windows_and_forms(step: Step, tables: Tables) -> list[tuple[Windows, Forms]]:
+        """Per box of disturbances: where the cells land, and f's derivatives over them."""
+        return [(Windows(images, tables), Forms(images, tables.n)) for images in step.cells]
 
     # ---- values at nodes -------------------------------------------------------------------------------------
 
@@ -268,7 +275,7 @@ class Transition:
         for i in variables:
             bend = forms.second(over, i)
             if not images.smooth.all():
-                width = self._width(k, i)
+                width = self.step.width(k, i)
                 jump = forms.first(over, i).width * 2 / width * (1 + 1e-12)
                 rough = Interval(-jump, jump)
                 low = np.where(images.smooth, bend.lo, np.where(images.steady, rough.lo, -np.inf))
@@ -277,15 +284,8 @@ class Transition:
             found.append(bend)
         return found
 
-    def _width(self, k: int, i: int) -> Array | float:
-        """Width of the cells along a variable, rounded down."""
-        if i >= self.n:
-            return float(self.step.pieces[k, i - self.n]) * (1 - 1e-12) or 1.0
-        widths = self.step.grid.widths(i) * (1 - 1e-12)
-        return np.asarray(np.broadcast_to(widths, self.step.grid.shape).ravel())
 
-
-class _Forms:
+class Forms:
     """Products of f's derivatives, made once: d_ii phi = sum_kl h_kl J_ki J_li + sum_k h_k B_ki."""
 
     def __init__(self, images: CellImages, n: int) -> None:
