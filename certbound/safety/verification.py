@@ -185,8 +185,8 @@ def verify_safety(
         With a plan if its system has inputs.
     method : str
         "auto" runs every engine that fits and keeps the smallest probability (the barrier engine and value functions
-        only where the others have not proved SAFE); "linear", "constants", "barrier" or "values" runs one; a tube method such as "kummer" or
-        "thm3" runs the constants engine with that tube.
+        only where the others have not proved SAFE); "linear", "constants", "barrier" or "values" runs one; a tube
+        method such as "kummer" or "thm3" runs the constants engine with that tube.
     cells : int, optional
         Parts along each side of the initial set.
     constants : Constants, optional

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -100,7 +101,7 @@ def graded_axis(low: float, high: float, places: Array, widths: Array, marks: Se
     """
     ends = [low, *sorted({float(mark) for mark in marks if low < mark < high}), high]
     parts = []
-    for first, last in zip(ends[:-1], ends[1:]):
+    for first, last in itertools.pairwise(ends):
         fine = np.linspace(first, last, 513)
         rate = 1 / np.interp(fine, places, widths)
         count = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(fine))])

@@ -28,7 +28,7 @@ def respected(
 ) -> tuple[Mask, Mask]:
     """Boxes, shape (N, n), all of whose points respect every constraint, and boxes none of whose points do.
 
-    With ``interiors`` only the boxes' interior points count: enough where noise has a density, since faces have no mass.
+    With ``interiors`` only the boxes' interior points count: enough where noise has a density, since faces are null.
     """
     safe, broken = np.ones(len(boxes), dtype=bool), np.zeros(len(boxes), dtype=bool)
     for constraint in constraints:

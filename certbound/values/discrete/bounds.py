@@ -17,7 +17,15 @@ from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.functions import ValueFunction
-from certbound.values.discrete.induction import AnyTransition, Zones, back_above, back_below, final, values_above, zones_of
+from certbound.values.discrete.induction import (
+    AnyTransition,
+    Zones,
+    back_above,
+    back_below,
+    final,
+    values_above,
+    zones_of,
+)
 from certbound.values.discrete.layout import Boxes, boxes_of, grid_of, widths_of
 from certbound.values.discrete.shocks import Inapplicable, Shocks, gaussian_shocks, shocks_of
 from certbound.values.discrete.steps import Dynamics, Step
@@ -34,9 +42,10 @@ MOST_STATES = 3
 _SHARES = {
     1: (0.33, 0.15, 0.07, 0.035, 0.0175, 0.01),
     2: (0.5, 0.33, 0.22, 0.15, 0.1, 0.07, 0.05, 0.035),
-    3: (0.5, 0.25, 0.15, 0.1, 0.07),
+    3: (0.4, 0.17, 0.1, 0.07),
 }
 """Sizes of the cells that are tried, relative to the lengths over which the solution changes."""
+_UNIFORM_FLOOR = 1e-9  # means over boxes are known up to an absolute error
 _UNIFORM_SHARES = {
     1: (0.2, 0.07, 0.025, 0.01, 0.005),
     2: (0.3, 0.15, 0.07, 0.035, 0.02, 0.012),
@@ -49,7 +58,7 @@ _FLOOR = 1e-16  # where what lies beyond ten standard deviations begins to count
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FailureBounds:
-    """lower <= sup over starts and disturbances of P(failure within the horizon) <= upper (its mean for a random start).
+    """lower <= largest P(failure within the horizon) over starts and disturbances <= upper; a random start is averaged.
 
     Parameters
     ----------
@@ -84,8 +93,8 @@ def bound_failure(
 ) -> FailureBounds:
     """Bound the probability of failing, on finer and finer grids.
 
-    Failing is to break a constraint at a step of its window; with a ``target``, before the target was entered, and never
-    to enter it counts too.
+    Failing is to break a constraint at a step of its window; with a ``target``, to break one before the target was
+    entered, or never to enter it.
 
     Parameters
     ----------
@@ -133,10 +142,15 @@ def bound_failure(
         upper, lower, cells = min(upper, found[0]), max(lower, found[1]), finest
         tried.append((share, *found))
         settled = time.perf_counter() - begun > _PATIENCE and _settled(upper, lower, delta)
-        if upper <= ratio * lower or settled or upper < _FLOOR:
+        if upper <= ratio * lower or settled or upper < (_UNIFORM_FLOOR if work.shocks.uniform else _FLOOR):
             break
     return FailureBounds(
-        upper=upper, lower=lower, cells=cells, share=tried[-1][0], seconds=time.perf_counter() - begun, tried=tuple(tried)
+        upper=upper,
+        lower=lower,
+        cells=cells,
+        share=tried[-1][0],
+        seconds=time.perf_counter() - begun,
+        tried=tuple(tried),
     )
 
 
@@ -158,8 +172,8 @@ class _Work:
     """One problem: its noise, its boxes, its steps."""
 
     too_large = (
-        f"value functions would need more than {_MOST_NODES} nodes: the safe set is very many standard deviations of the "
-        "noise wide. Use another engine, which is at its best there."
+        f"value functions would need more than {_MOST_NODES} nodes: the safe set is very many standard "
+        "deviations of the noise wide. Use another engine, which is at its best there."
     )
 
     def __init__(self, problem: Problem, target: Region | None, parts: int) -> None:
@@ -244,19 +258,22 @@ class _Work:
     def _transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
         step = self.dynamics.step(t, grid)
         if self.shocks.uniform:
-            return UniformTransition(step, UniformTables(after, self.shocks, *step.hull(), fineness=max(2 / share, 4.0)))
+            return UniformTransition(
+                step, UniformTables(after, self.shocks, *step.hull(), fineness=max(2 / share, 4.0))
+            )
         return Transition(step, Tables(after, self.shocks, *step.hull()))
 
     def _at_random(self, above: ValueFunction, below: ValueFunction) -> tuple[float, float]:
         """Mean over a Gaussian start: one more convolution, read at the mean."""
-        assert self.start_shocks is not None and isinstance(self.problem.initial, GaussianStart)
+        assert self.start_shocks is not None
+        assert isinstance(self.problem.initial, GaussianStart)
         mean = self.problem.initial.mean
         tables = Tables(above.grid, self.start_shocks, mean, mean)
         point = Grid(axes=tuple(np.array([value]) for value in mean))
         image = (Interval.point(mean[None]), np.ones(1, dtype=bool))
         transition = Transition(Step(grid=point, vertices=[image], cells=[], pieces=np.empty((0, 0))), tables)
-        (high, error), = transition.at_nodes(tables.field(above, order=0))
-        (low, other), = transition.at_nodes(tables.field(below, order=0))
+        ((high, error),) = transition.at_nodes(tables.field(above, order=0))
+        ((low, other),) = transition.at_nodes(tables.field(below, order=0))
         return float(high.item() + error.item()), float(low.item() - other.item())
 
     def _over_start(self, above: ValueFunction, below: ValueFunction, share: float) -> tuple[float, float]:

@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import product_error
 from certbound.values.discrete.dominance import density_tail, dominance
 from certbound.values.discrete.functions import ValueFunction
@@ -110,14 +110,11 @@ class Tables:
         step = self._steps(fineness)
         starts, counts = [], []
         for i in range(n):
-            first = max(low[i], grid.axes[i][0] - REACH * self.sigma[i])
-            last = min(high[i], grid.axes[i][-1] + REACH * self.sigma[i])
-            if self.shocks.common:  # the common factor moves images too
-                reach = REACH * abs(self.factor[i])
-                first = max(low[i], grid.axes[i][0] - REACH * self.sigma[i] - reach)
-                last = min(high[i], grid.axes[i][-1] + REACH * self.sigma[i] + reach)
-            if first > last:
-                first = last = grid.axes[i][0] - REACH * self.sigma[i] if high[i] < grid.axes[i][0] else last
+            reach = REACH * float(
+                self.sigma[i] + abs(self.factor[i])
+            )  # beyond it U(m + w) = 1 but for the noise's tails
+            floor, ceiling = grid.axes[i][0] - reach, grid.axes[i][-1] + reach
+            first, last = (min(max(float(end[i]), floor), ceiling) for end in (low, high))
             number = max(2, math.ceil((last - first) / step[i]) + 1)
             starts.append(first - (POINTS // 2) * step[i])
             counts.append(number + POINTS)
@@ -223,9 +220,7 @@ class Tables:
         largest = max(1.0, float(size.max()))
         tables = {alpha: self._mixed(part) for alpha, part in raw.items()}
         floor = {alpha: 6 * largest * tail for alpha, tail in self.tail.items()}
-        return Field(
-            mesh=self.mesh, tables=tables, dominant=dominant, error=self.error, floor=floor, largest=largest
-        )
+        return Field(mesh=self.mesh, tables=tables, dominant=dominant, error=self.error, floor=floor, largest=largest)
 
     def means(self, value: ValueFunction) -> Array:
         """h alone, before the common factor."""
@@ -249,10 +244,12 @@ class Tables:
             raw[alpha] = raw[alpha] + part
         return raw
 
-    def _add_fixed(self, value: ValueFunction, add: object) -> None:
+    def _add_fixed(self, value: ValueFunction, add: Callable[[list[str], Array, float], None]) -> None:
         """On fixed cells: the constant instead of the multilinear part."""
-        assert value.fixed is not None and callable(add)
-        places = [np.flatnonzero(np.any(value.fixed, axis=tuple(k for k in range(self.n) if k != i))) for i in range(self.n)]
+        assert value.fixed is not None
+        places = [
+            np.flatnonzero(np.any(value.fixed, axis=tuple(k for k in range(self.n) if k != i))) for i in range(self.n)
+        ]
         if not len(places[0]):
             return
         window = tuple(slice(int(p[0]), int(p[-1]) + 1) for p in places)

@@ -114,7 +114,7 @@ def _policy(options: list[Array]) -> Array:
     choice = np.argmax(np.stack(score), axis=0)
     nodal = np.full(options[0].shape, np.inf)
     for k, option in enumerate(finite):
-        nodal = np.minimum(nodal, np.where(around_nodes(choice == k, largest=True) > 0, option, np.inf))
+        nodal = np.minimum(nodal, np.where(around_nodes((choice == k).astype(float), largest=True) > 0, option, np.inf))
     return np.where(nodal < -1e299, -np.inf, nodal)
 
 
@@ -152,6 +152,6 @@ def _function(grid: Grid, nodal: Array, bend: Array, fixed: Mask, level: Array) 
         return ValueFunction(grid=grid, nodal=nodal, bend=bend, fixed=None, level=level)
     bend = np.where(fixed, 0.0, bend)
     level = np.where(fixed, level, 0.0)
-    lonely = around_nodes(~fixed, largest=True) <= 0
+    lonely = around_nodes((~fixed).astype(float), largest=True) <= 0
     nodal = np.where(lonely, np.clip(around_nodes(level, largest=True), 0.0, 1.0), nodal)
     return ValueFunction(grid=grid, nodal=nodal, bend=bend, fixed=fixed, level=level)

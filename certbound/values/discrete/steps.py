@@ -77,6 +77,10 @@ class Step:
         """Ends of a box around all images that are finite, shapes (n,)."""
         low = np.full(self.grid.dimension, np.inf)
         high = -low
+        for image, usable in self.vertices:
+            if usable.any():
+                low = np.minimum(low, image.lo[usable].min(axis=0))
+                high = np.maximum(high, image.hi[usable].max(axis=0))
         for part in self.cells:
             if part.defined.any():
                 low = np.minimum(low, part.image.lo[part.defined].min(axis=0))
@@ -144,14 +148,20 @@ class Dynamics:
         count, variables = len(boxes), len(self.columns)
         slopes = slopes.reshape(count, self.n, variables)
         parts = [evaluate(tape, whole) for tape in self.bends]
-        bends = Interval(*(np.stack([getattr(p[0], end).reshape(count, self.n) for p in parts], -1) for end in ("lo", "hi")))
+        bends = Interval(
+            *(np.stack([getattr(p[0], end).reshape(count, self.n) for p in parts], -1) for end in ("lo", "hi"))
+        )
         steady = ~undefined & ~jumps & ~bad_slopes & ~kinks & np.isfinite(slopes.mag).all(axis=(1, 2))
         smooth = steady & ~np.any([p[1] | p[2] for p in parts], axis=0) & np.isfinite(bends.mag).all(axis=(1, 2))
         image = self._centred(t, boxes, box, image, slopes, steady)
         defined = ~undefined & np.isfinite(image.mag).all(axis=1)
-        return CellImages(image=image, slopes=slopes, bends=bends, defined=defined, steady=steady & defined, smooth=smooth & defined)
+        return CellImages(
+            image=image, slopes=slopes, bends=bends, defined=defined, steady=steady & defined, smooth=smooth & defined
+        )
 
-    def _centred(self, t: int, boxes: Interval, box: Interval, image: Interval, slopes: Interval, steady: Mask) -> Interval:
+    def _centred(
+        self, t: int, boxes: Interval, box: Interval, image: Interval, slopes: Interval, steady: Mask
+    ) -> Interval:
         """f(middle) + slopes (v - middle), where that is sharper."""
         if not steady.any():
             return image
@@ -182,8 +192,10 @@ def _vertices(low: Array, high: Array, parts: int) -> list[Array]:
 
 def _boxes(low: Array, high: Array, parts: int) -> list[Interval]:
     cuts = [np.linspace(a, b, parts + 1) if a < b else np.array([a, a]) for a, b in zip(low, high)]
-    pieces = [list(zip(cut[:-1], cut[1:])) for cut in cuts]
-    return [Interval(np.array([p[0] for p in box]), np.array([p[1] for p in box])) for box in itertools.product(*pieces)]
+    pieces = [list(itertools.pairwise(cut)) for cut in cuts]
+    return [
+        Interval(np.array([p[0] for p in box]), np.array([p[1] for p in box])) for box in itertools.product(*pieces)
+    ]
 
 
 def evaluate(tape: Tape, inputs: list[Interval]) -> tuple[Interval, Mask, Mask]:
@@ -230,7 +242,9 @@ def _run(tape: Tape, inputs: list[Interval], undefined: Mask, jumps: Mask) -> li
             value = ARITHMETIC[node.op](*args)
         if node.op in UNDEFINED:
             mask = UNDEFINED["pow"](args[0], node.value) if node.op == "pow" else UNDEFINED[node.op](*args)
-            np.logical_or(undefined if node.op != "atan2" else jumps, mask, out=undefined if node.op != "atan2" else jumps)
+            np.logical_or(
+                undefined if node.op != "atan2" else jumps, mask, out=undefined if node.op != "atan2" else jumps
+            )
         if node.op == "if_else_zero":
             np.logical_or(jumps, (args[0].lo <= 0) & (args[0].hi >= 0) & (args[0].lo != args[0].hi), out=jumps)
         elif node.op in JUMPS:

@@ -3,8 +3,8 @@
 Between the mesh's nodes h is interpolated by polynomials through `POINTS` nodes an axis. With L_i the interpolation
 along axis i, Lambda its norm and omega_p = max prod |theta - k|/p!,
     |h - L_1 ... L_n h| <= sum_i Lambda^(i-1) omega_p delta_i^p sup |d_i^p h|.
-Over a mesh cell a derivative g of h lies between its least and largest corner, widened by sum_i delta_i^2/8 sup |d_ii g|;
-d_ii g is known from second differences at the nodes.
+Over a mesh cell a derivative g of h lies between its least and largest corner, widened by sum_i delta_i^2/8 sup
+|d_ii g|; d_ii g is known from second differences at the nodes.
 """
 
 from __future__ import annotations
@@ -169,10 +169,15 @@ class Transition:
             for i in range(self.n)
         ) * (1 + 1e-9)
         self.beyond = sum(
-            norm**i * omega * float(ratio[i]) ** POINTS * tables.beyond(tuple(POINTS if k == i else 0 for k in range(self.n)))
+            norm**i
+            * omega
+            * float(ratio[i]) ** POINTS
+            * tables.beyond(tuple(POINTS if k == i else 0 for k in range(self.n)))
             for i in range(self.n)
         )
-        self.sensitivity = [dominance(1, reach[i]) * math.prod(still) / still[i] / tables.sigma[i] for i in range(self.n)]
+        self.sensitivity = [
+            dominance(1, reach[i]) * math.prod(still) / still[i] / tables.sigma[i] for i in range(self.n)
+        ]
         self.norm = norm**self.n
 
     @staticmethod
@@ -226,8 +231,8 @@ class Transition:
     def _over_mesh(self, field: Field, terms: list[tuple[Alpha, Interval]], close: Array) -> tuple[Array, Array]:
         """A sum g of derivatives of h with constant factors over the mesh's cells: least and largest.
 
-        At the nodes d_ii g is the second difference up to delta_i^2/12 sup |d_i^4 g|; over a cell |d_ii g| is at most its
-        interpolation plus sum_j delta_j^2/8 sup |d_jj d_ii g|. At the mesh's ends |d_ii g| itself is dominated.
+        At the nodes d_ii g is the second difference up to delta_i^2/12 sup |d_i^4 g|; over a cell |d_ii g| is at most
+        its interpolation plus sum_j delta_j^2/8 sup |d_jj d_ii g|. At the mesh's ends |d_ii g| itself is dominated.
         ``close`` is the largest H at a cell's corners.
         """
         table, near, beyond = np.zeros(field.mesh.count), 0.0, 0.0

@@ -52,10 +52,8 @@ class UniformTables(Tables):
         step = self.reach / fineness
         starts, counts = np.empty(n), []
         for i in range(n):
-            first = max(low[i], grid.axes[i][0] - 1.01 * self.reach[i])
-            last = min(high[i], grid.axes[i][-1] + 1.01 * self.reach[i])
-            if first > last:
-                first = last = grid.axes[i][0] - 2 * self.reach[i] if high[i] < grid.axes[i][0] else last
+            floor, ceiling = (end + sign * 1.01 * self.reach[i] for end, sign in zip(grid.axes[i][[0, -1]], (-1, 1)))
+            first, last = (min(max(float(end[i]), floor), ceiling) for end in (low, high))
             starts[i] = first - step[i]
             counts.append(max(2, math.ceil((last - first) / step[i]) + 1) + 2)
         self.mesh = Mesh(start=starts, step=step, count=tuple(counts))
@@ -113,7 +111,9 @@ class UniformTables(Tables):
         r, points = float(self.reach[i]), self.mesh.points(i)
         ends = []
         for sign in (1, -1):
-            ends.append((self._met(least, i, points + sign * r, np.minimum), self._met(most, i, points + sign * r, np.maximum)))
+            ends.append(
+                (self._met(least, i, points + sign * r, np.minimum), self._met(most, i, points + sign * r, np.maximum))
+            )
         (ahead_low, ahead_high), (behind_low, behind_high) = ends
         slack = self.wrong * max(1.0, float(np.abs(most).max()), float(np.abs(least).max())) / r
         return (ahead_low - behind_high) / (2 * r) - slack, (ahead_high - behind_low) / (2 * r) + slack
@@ -195,4 +195,3 @@ class UniformTransition:
                 row.append(np.where(steady, -jump if above else jump, -np.inf if above else np.inf))
             found.append(row)
         return found
-

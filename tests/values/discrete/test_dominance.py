@@ -56,6 +56,7 @@ def test_the_rule_is_as_exact_as_stated(points: int, half: float, order: int) ->
     fine, heavy = np.polynomial.legendre.leggauss(40)
     for centre in np.linspace(0, 8, 33):
         for shape in (lambda t: np.ones_like(t), lambda t: (1 + t) / 2, lambda t: 1 - t**2):
+
             def rule(t: np.ndarray, w: np.ndarray, shape=shape, centre=centre) -> float:  # type: ignore[no-untyped-def]
                 z = centre + half * t
                 return float(np.sum(w * shape(t) * hermite(order, z) * density(z)))

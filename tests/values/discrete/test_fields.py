@@ -9,7 +9,6 @@ from certbound.rigor.intervals import Interval
 from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.shocks import gaussian_shocks
 from certbound.values.grids import Grid
-
 from tests.values.discrete.helpers import mean_after_noise, random_function
 
 COVARIANCES = [

@@ -17,7 +17,6 @@ from certbound.values.discrete.shocks import shocks_of
 from certbound.values.discrete.steps import Dynamics
 from certbound.values.discrete.transitions import Transition
 from certbound.values.grids import Grid
-
 from tests.values.discrete.helpers import mean_after_noise, random_function
 
 STEPS: dict[str, Callable[..., Any]] = {
@@ -83,6 +82,21 @@ def test_one_step_back_lies_above_and_below_phi_everywhere(name: str, seed: int)
     assert np.all(below.values(points) <= exact + 1e-9)
 
 
+def test_correlated_noise_and_images_far_outside_are_bounded_too() -> None:
+    covariance = np.array([[0.04, 0.05], [0.05, 0.09]])
+    system = cb.DiscreteSystem(lambda x: [3.0 + x[0], 2.0 * x[1] - 4.0], states=2, noise=cb.Gaussian(covariance=covariance))
+    problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 0.9]))], horizon=1)
+    grid = Grid(axes=(np.linspace(-1, 1, 6), np.linspace(-1, 0.9, 5)))
+    step = Dynamics(problem).step(0, grid)
+    transition = Transition(step, Tables(grid, shocks_of(system.noise, system.noise_matrix), *step.hull()))
+    value = random_function(np.random.default_rng(1), grid)
+    zones = zones_of(grid, problem.constraints, None, 0)
+    points = np.random.default_rng(0).uniform([-1, -1], [1, 0.9], (100, 2))
+    exact = mean_after_noise(value, compile_numpy(problem.closed_loop)(0.0, *points.T), covariance)
+    assert np.all(back_above(transition, value, zones).values(points) >= exact - 1e-9)
+    assert np.all(back_below(transition, value, zones).values(points) <= exact + 1e-9)
+
+
 def test_finer_cells_bring_both_sides_together() -> None:
     gaps = []
     for cells in (6, 12, 24):
@@ -94,6 +108,11 @@ def test_finer_cells_bring_both_sides_together() -> None:
         )  # fmt: skip
         zones = zones_of(grid, problem.constraints, None, 0)
         points = np.random.default_rng(0).uniform(-0.9, 0.9, (500, 2))
-        gaps.append(np.max(back_above(transition, value, zones).values(points) - back_below(transition, value, zones).values(points)))
+        gaps.append(
+            np.max(
+                back_above(transition, value, zones).values(points)
+                - back_below(transition, value, zones).values(points)
+            )
+        )
     assert gaps[1] < gaps[0] / 3
     assert gaps[2] < gaps[1] / 3
