@@ -41,3 +41,21 @@ def mean_after_noise(value: ValueFunction, points: np.ndarray, covariance: np.nd
         density = law.pdf(y - point) * w
         found.append(np.sum(density * share) + 1 - np.sum(density))
     return np.array(found)
+
+
+def mean_over_boxes(value: ValueFunction, points: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """E U(m + w), w uniform on [-half, half], by Gauss's rule between all nodes; points (P, n)."""
+    root, weight = np.polynomial.legendre.leggauss(3)
+    found = []
+    for point in points:
+        places, weights = [], []
+        for axis, middle, r in zip(value.grid.axes, point, half):
+            inner = axis[(axis > middle - r) & (axis < middle + r)]
+            cuts = np.concatenate([[middle - r], inner, [middle + r]])
+            width = np.diff(cuts)[:, None]
+            places.append((cuts[:-1, None] + width * (root + 1) / 2).ravel())
+            weights.append((width * weight / (4 * r)).ravel())
+        y = np.stack([part.ravel() for part in np.meshgrid(*places, indexing="ij")], axis=1)
+        w = np.prod([part.ravel() for part in np.meshgrid(*weights, indexing="ij")], axis=0)
+        found.append(np.sum(w * value.values(y)))
+    return np.array(found)

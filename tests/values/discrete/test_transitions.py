@@ -84,7 +84,9 @@ def test_one_step_back_lies_above_and_below_phi_everywhere(name: str, seed: int)
 
 def test_correlated_noise_and_images_far_outside_are_bounded_too() -> None:
     covariance = np.array([[0.04, 0.05], [0.05, 0.09]])
-    system = cb.DiscreteSystem(lambda x: [3.0 + x[0], 2.0 * x[1] - 4.0], states=2, noise=cb.Gaussian(covariance=covariance))
+    system = cb.DiscreteSystem(
+        lambda x: [3.0 + x[0], 2.0 * x[1] - 4.0], states=2, noise=cb.Gaussian(covariance=covariance)
+    )
     problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 0.9]))], horizon=1)
     grid = Grid(axes=(np.linspace(-1, 1, 6), np.linspace(-1, 0.9, 5)))
     step = Dynamics(problem).step(0, grid)
