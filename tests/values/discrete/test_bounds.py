@@ -55,6 +55,17 @@ def test_a_set_of_starts_counts_its_worst_point() -> None:
     assert found.lower >= exact / 1.001
 
 
+@pytest.mark.parametrize("low", [-0.4, -0.31, -0.2])
+def test_the_worst_start_may_lie_between_the_nodes(low: float) -> None:
+    problem = scalar(
+        lambda x: 0.6 - 3 * x**2,
+        initial=cb.Box([low], [0.35]),
+        noise=cb.Gaussian(std=0.1),
+        safe=[cb.Inside(cb.Box([-2], [1]))],
+    )
+    assert bound_failure(problem, ratio=1e9).upper >= norm.sf(4.0)
+
+
 def test_a_random_start_is_one_more_convolution() -> None:
     found = bound_failure(scalar(lambda x: x, initial=cb.GaussianStart([0.0], [[0.01]]), safe=[
         cb.Inside(cb.Box([-1], [1]), during=(1, 1))]), ratio=1.001)  # fmt: skip

@@ -82,6 +82,42 @@ def test_one_step_back_lies_above_and_below_phi_everywhere(name: str, seed: int)
     assert np.all(below.values(points) <= exact + 1e-9)
 
 
+@pytest.mark.parametrize("kind", ["turning", "peaked"])
+def test_all_disturbances_lie_below_and_the_worst_above(kind: str) -> None:
+    moves = {
+        "turning": lambda x, d: [x[0] + 0.6 * np.sin(3 * d[0]) * x[1] + 0.3, x[1] * np.cos(2 * d[0])],
+        "peaked": lambda x, d: [0.9 - 4 * (d[0] - 0.13) ** 2 + 0.3 * x[0], 0.4 * x[1] + d[0] * x[0] ** 2],
+    }
+    system = cb.DiscreteSystem(
+        moves[kind], states=2, noise=cb.Gaussian(std=[0.2, 0.3]), disturbance=cb.Box([-1.0], [1.0])
+    )
+    problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 0.9]))], horizon=1)
+    grid = Grid(axes=(np.linspace(-1, 1, 6), np.linspace(-1, 0.9, 6)))
+    step = Dynamics(problem, parts=4).step(0, grid)
+    transition = Transition(step, Tables(grid, shocks_of(system.noise, system.noise_matrix), *step.hull()))
+    zero = np.zeros(grid.node_shape)
+    value = ValueFunction(
+        grid=grid, nodal=zero, bend=np.zeros((2, *grid.shape)), fixed=None, level=np.zeros(grid.shape)
+    )
+    zones = zones_of(grid, problem.constraints, None, 0)
+    points = np.concatenate([grid.nodes(), np.random.default_rng(0).uniform([-1, -1], [1, 0.9], (150, 2))])
+    image = compile_numpy(problem.closed_loop)
+    covariance = np.diag([0.04, 0.09])
+    each = [mean_after_noise(value, image(0.0, *points.T, d), covariance) for d in np.linspace(-1, 1, 41)]
+    worst = np.max(each, axis=0)
+    above, below = back_above(transition, value, zones), back_below(transition, value, zones)
+    if above.fixed is not None:
+        assert above.fixed.mean() < 0.7
+    assert np.all(above.values(points) >= worst - 1e-9)
+    assert np.all(below.values(points) <= worst + 1e-3)
+    field = transition.tables.field(value)
+    for function, is_above in ((above, True), (below, False)):
+        free = np.ones(grid.shape, dtype=bool) if function.fixed is None else ~function.fixed
+        for box in transition.bends(field, range(2), above=is_above):
+            gap = np.stack([part.reshape(grid.shape) for part in box]) - function.bend
+            assert np.all((gap if is_above else -gap)[:, free] >= -1e-12)
+
+
 def test_correlated_noise_and_images_far_outside_are_bounded_too() -> None:
     covariance = np.array([[0.04, 0.05], [0.05, 0.09]])
     system = cb.DiscreteSystem(
