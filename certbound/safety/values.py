@@ -7,18 +7,19 @@ import importlib.util
 import math
 from typing import Any
 
+from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.regions import Region
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import EngineAnswer
 from certbound.values.discrete.bounds import FailureBounds, bound_failure
-from certbound.values.discrete.shocks import Inapplicable
 
 __all__ = ["values_engine"]
 
 _CONTINUOUS = "certbound.values.continuous"
 _SECONDS = 20.0
 _FLOOR = -300.0
+_CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 
 
 def values_engine(
@@ -51,22 +52,30 @@ def values_engine(
     """
     if quick:
         return EngineAnswer(applicable=False, method="values", reason="left out, since another engine has answered.")
-    if not isinstance(problem.system, DiscreteSystem):
-        return _continuous(problem, target=target, ratio=ratio, seconds=seconds)
     limit = seconds if thorough else seconds / 4
     try:
+        if not isinstance(problem.system, DiscreteSystem):
+            return _continuous(problem, target=target, seconds=limit)
         found = bound_failure(problem, target=target, ratio=ratio, seconds=limit, delta=problem.delta)
-    except Inapplicable as error:
+    except (InfeasibleError, EnclosureError) as error:
         return EngineAnswer(applicable=False, method="values", reason=str(error))
     return _answer(problem, found)
 
 
-def _continuous(problem: Problem, **options: Any) -> EngineAnswer:
+def _continuous(problem: Problem, *, target: Region | None, seconds: float) -> EngineAnswer:
     if importlib.util.find_spec(_CONTINUOUS) is None:
         reason = "value functions are not there for continuous time yet."
         return EngineAnswer(applicable=False, method="values", reason=reason)
-    answer: EngineAnswer = importlib.import_module(_CONTINUOUS).continuous_engine(problem, **options)
-    return answer
+    found: Any = importlib.import_module(_CONTINUOUS).bound_exits(problem, target=target, seconds=seconds)
+    close = found.lower is not None and found.upper <= found.lower + math.log10(_CLOSE)
+    return EngineAnswer(
+        log10_delta=found.upper,
+        log10_lower=found.lower,
+        reason=found.words,
+        method="values",
+        details=found,
+        conclusive=close,
+    )
 
 
 def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
@@ -81,7 +90,7 @@ def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
         reason=reason + ".",
         method="values",
         details=found,
-        conclusive=found.upper <= 1.2 * found.lower,
+        conclusive=found.upper <= _CLOSE * found.lower,
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.errors import CertboundError
+from certbound.errors import InfeasibleError
 from certbound.problem.noise import Bounded, Gaussian, Law, SubGaussian, Uniform
 from certbound.rigor.intervals import Interval, sq, sqrt
 
@@ -17,7 +17,7 @@ __all__ = ["Inapplicable", "Shocks", "gaussian_shocks", "shocks_of"]
 Array = NDArray[np.float64]
 
 
-class Inapplicable(CertboundError, ValueError):
+class Inapplicable(InfeasibleError):
     """Value functions do not fit the problem; the message says why, and what would make them fit."""
 
 
