@@ -83,6 +83,16 @@ def test_two_independent_states_fail_as_two_scalar_ones() -> None:
     assert found.upper <= 1.03 * found.lower
 
 
+def test_three_independent_states_fail_as_three_scalar_ones() -> None:
+    one = bound_failure(scalar(lambda x: 0.3 * x, horizon=2), ratio=1.001)
+    system = cb.DiscreteSystem(lambda x: 0.3 * x, states=3, noise=cb.Gaussian(std=0.3))
+    three = cb.Problem(system, initial=[0.1] * 3, safe=[cb.Inside(cb.Box([-1] * 3, [1] * 3))], horizon=2)
+    found = bound_failure(three, ratio=1.2)
+    assert found.lower <= 1 - (1 - one.upper) ** 3 * (1 - 1e-9)
+    assert found.upper >= 1 - (1 - one.lower) ** 3 * (1 - 1e-9)
+    assert found.upper <= 1.2 * found.lower
+
+
 @pytest.mark.parametrize("std", [0.04, 0.06])
 def test_the_logistic_map_is_bounded_tightly(std: float) -> None:
     system = cb.DiscreteSystem(lambda x: 2.8 * x * (1 - x), states=1, noise=cb.Gaussian(std=std))
