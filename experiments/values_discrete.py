@@ -21,7 +21,7 @@ from experiments.harness import Arrays, Claims, main
 
 __all__ = ["PROBLEMS", "compute", "row", "simulated"]
 
-PATHS = {False: 100_000, True: 2_000_000}
+PATHS = {False: 100_000, True: 400_000}
 CHUNK = 100_000
 LEVEL = 1e-3
 
