@@ -17,6 +17,7 @@ ORDER = [
     {"rigor"},
     {"problem"},
     {"tubes"},
+    {"values"},
     {"simulation"},
     {"constants"},
     {"reach"},

@@ -72,6 +72,8 @@ class EngineAnswer:
     ----------
     log10_delta : float
         log10 of an upper bound of the probability that a constraint is broken: finite, at most 0 (0: nothing).
+    log10_lower : float or None
+        log10 of a lower bound of that probability from some start, None where the engine has none.
     margin : float or None
         Least Euclidean room left at the target probability, negative when it does not fit; None if unknown.
     time, constraint
@@ -103,6 +105,7 @@ class EngineAnswer:
     """
 
     log10_delta: float = 0.0
+    log10_lower: float | None = None
     margin: float | None = None
     time: float | None = None
     constraint: str | None = None

@@ -120,6 +120,8 @@ def _writer(name: str) -> Callable[[Problem, EngineAnswer, int], Proof]:
         from certbound.safety.certificate_barrier import barrier_proof
 
         return barrier_proof
+    if name == "values":
+        raise CertificateError("certificates do not state value functions yet.")
     from certbound.safety.certificate_constants import constants_proof
 
     return constants_proof

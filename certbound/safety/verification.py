@@ -43,7 +43,18 @@ def _barrier(problem: Problem, **options: Any) -> EngineAnswer:
     return barrier_engine(problem, **options)
 
 
-_ENGINES: dict[str, Callable[..., EngineAnswer]] = {"linear": _linear, "constants": _constants, "barrier": _barrier}
+def _values(problem: Problem, **options: Any) -> EngineAnswer:
+    from certbound.safety.values import values_engine
+
+    return values_engine(problem, **options)
+
+
+_ENGINES: dict[str, Callable[..., EngineAnswer]] = {
+    "linear": _linear,
+    "constants": _constants,
+    "barrier": _barrier,
+    "values": _values,
+}
 """Engines in the order in which they are tried: name to function(problem, **options).
 
 ``quick`` says that another engine has proved SAFE or been conclusive: slow refinements may be left out; without
@@ -180,9 +191,9 @@ def verify_safety(
     problem : Problem
         With a plan if its system has inputs.
     method : str
-        "auto" runs every engine that fits and keeps the smallest probability (the barrier engine only where the
-        others have not proved SAFE); "linear", "constants" or "barrier" runs one; a tube method such as "kummer" or
-        "thm3" runs the constants engine with that tube.
+        "auto" runs every engine that fits and keeps the smallest probability (the barrier engine and value functions
+        only where the others have not proved SAFE); "linear", "constants", "barrier" or "values" runs one; a tube
+        method such as "kummer" or "thm3" runs the constants engine with that tube.
     cells : int, optional
         Parts along each side of the initial set.
     constants : Constants, optional

@@ -1,0 +1,157 @@
+"""Backward induction: one function above, one below the probability of failing from every state at every step.
+
+With V_t(x) the largest probability, over the disturbances, of failing from x at step t on,
+    V_T = 1 off S_T and 0 on it,  V_t = 1 off S_t,  V_t(x) = sup_d E V_{t+1}(f(t, x, d) + G w) on S_t.
+Above: U_t is 1 outside the grid and on every cell that is not surely safe, and at least sup_d phi elsewhere; below: the
+grid contains S_t, U_t is 1 on cells that are surely unsafe, and at most phi for one disturbance a cell elsewhere (V_t
+is at least that everywhere). A target G_t that ends the danger puts 0 on its cells, and 1 on the others at step T.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.regions import Region
+from certbound.problem.sets import Inside
+from certbound.values.discrete.functions import ValueFunction
+from certbound.values.discrete.transitions import Transition
+from certbound.values.discrete.uniform import UniformTransition
+from certbound.values.grids import Grid, around_nodes, corners
+from certbound.values.sets import contains, respected
+
+__all__ = ["AnyTransition", "Zones", "back_above", "back_below", "final", "values_above", "zones_of"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+AnyTransition = Transition | UniformTransition
+
+_STEEPEST = 0.5
+"""Largest bend times width^2/8 that a cell keeps; beyond it the cell is constant."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Zones:
+    """Which cells of a grid are surely safe, surely unsafe, surely in the target, surely outside it."""
+
+    safe: Mask
+    unsafe: Mask
+    done: Mask
+    undone: Mask
+    has_target: bool
+
+
+def zones_of(grid: Grid, constraints: Sequence[Inside], target: Region | None, step: int) -> Zones:
+    """The zones of a grid at a step, given the constraints active then; faces of cells do not count."""
+    cells = grid.cells()
+    safe, unsafe = respected(constraints, cells, step, interiors=True)
+    done = np.zeros(len(cells), dtype=bool)
+    undone = ~done
+    if target is not None:
+        done, undone = contains(target, cells, step, interiors=True)
+    masks = (mask.reshape(grid.shape) for mask in (safe, unsafe, done, undone))
+    return Zones(**dict(zip(("safe", "unsafe", "done", "undone"), masks)), has_target=target is not None)
+
+
+def final(grid: Grid, zones: Zones, *, above: bool) -> ValueFunction:
+    """The function at the horizon."""
+    if above:
+        level = np.where(zones.safe & (zones.done | (not zones.has_target)), 0.0, 1.0)
+        fixed = level > 0
+    else:
+        level = np.where(zones.unsafe, 1.0, 0.0)
+        if zones.has_target:
+            level = np.where(zones.undone, 1.0, level)
+        fixed = level > 0
+    return _function(grid, np.zeros(grid.node_shape), np.zeros((grid.dimension, *grid.shape)), fixed, level)
+
+
+def back_above(transition: AnyTransition, value: ValueFunction, zones: Zones) -> ValueFunction:
+    """A function at least V_t, given one that is at least V_{t+1}."""
+    grid = transition.step.grid
+    nodal, bend, known = values_above(transition, value)
+    fixed = ~zones.safe | ~known
+    level = np.ones(grid.shape)
+    if zones.has_target:
+        ended = zones.done & zones.safe
+        fixed, level = fixed | ended, np.where(ended, 0.0, level)
+    return _function(grid, nodal, bend, fixed, level)
+
+
+def values_above(transition: AnyTransition, value: ValueFunction) -> tuple[Array, Array, Mask]:
+    """Node values, bends and the cells on which they lie above sup_d phi."""
+    field: Any = transition.tables.field(value)
+    nodal = np.maximum.reduce([at + error for at, error in transition.at_nodes(field)])
+    bend, bump, known = _bends(transition, field, above=True)
+    nodal, holes = _without_holes(nodal + bump, 1.0)
+    return nodal, bend, known & ~holes
+
+
+def back_below(transition: AnyTransition, value: ValueFunction, zones: Zones) -> ValueFunction:
+    """A function at most V_t, given one that is at most V_{t+1}."""
+    grid = transition.step.grid
+    field: Any = transition.tables.field(value)
+    options = [at - error for at, error in transition.at_nodes(field)]
+    nodal = options[0] if len(options) == 1 else _policy(options)
+    bend, _, known = _bends(transition, field, above=False)
+    nodal, holes = _without_holes(nodal, 0.0)
+    fixed = zones.unsafe | ~known | holes
+    level = np.where(zones.unsafe, 1.0, 0.0)
+    if zones.has_target:
+        maybe = ~zones.undone & ~zones.unsafe
+        fixed, level = fixed | maybe, np.where(maybe, 0.0, level)
+    return _function(grid, nodal, bend, fixed, level)
+
+
+def _policy(options: list[Array]) -> Array:
+    """Node values below phi under one disturbance a cell: the vertex that is best at the cell's corners."""
+    finite = [np.where(np.isfinite(option), option, -1e300) for option in options]
+    score = [sum(corners(option)) for option in finite]
+    choice = np.argmax(np.stack(score), axis=0)
+    nodal = np.full(options[0].shape, np.inf)
+    for k, option in enumerate(finite):
+        nodal = np.minimum(nodal, np.where(around_nodes((choice == k).astype(float), largest=True) > 0, option, np.inf))
+    return np.where(nodal < -1e299, -np.inf, nodal)
+
+
+def _bends(transition: AnyTransition, field: Any, *, above: bool) -> tuple[Array, Array, Mask]:
+    """b per axis and cell, what disturbances between vertices add at the nodes, and where all of it is known."""
+    grid, n = transition.step.grid, transition.n
+    extra = transition.step.pieces.shape[1]
+    found: list[list[Array]] = transition.bends(field, range(n + (extra if above else 0)), above=above)
+    merge = np.minimum if above else np.maximum
+    bend = np.stack([merge.reduce([box[i] for box in found]).reshape(grid.shape) for i in range(n)])
+    steep = sum(np.abs(bend[i]) * grid.widths(i) ** 2 / 8 for i in range(n))
+    known = np.all([images.steady for images in transition.step.cells], axis=0).reshape(grid.shape)
+    known &= np.asarray(steep < _STEEPEST)
+    bump = np.zeros(grid.node_shape)
+    if above and extra:
+        raised = np.zeros(grid.shape)
+        for box, width in zip(found, transition.step.pieces):
+            more = sum(np.maximum(-box[n + k], 0.0) * width[k] ** 2 / 8 for k in range(extra))
+            raised = np.maximum(raised, np.reshape(more, grid.shape) * (1 + 1e-12))
+        bump = around_nodes(raised, largest=False)
+    return np.where(known, bend, 0.0), bump, known
+
+
+def _without_holes(nodal: Array, filling: float) -> tuple[Array, Mask]:
+    """Finite node values, and the cells that touch a node without one."""
+    bad = ~np.isfinite(nodal)
+    if not bad.any():
+        return nodal, np.zeros([size - 1 for size in nodal.shape], dtype=bool)
+    return np.where(bad, filling, nodal), np.logical_or.reduce(corners(bad))
+
+
+def _function(grid: Grid, nodal: Array, bend: Array, fixed: Mask, level: Array) -> ValueFunction:
+    """Cells that are not fixed keep their bends; nodes that only fixed cells use take their level."""
+    if not fixed.any():
+        return ValueFunction(grid=grid, nodal=nodal, bend=bend, fixed=None, level=level)
+    bend = np.where(fixed, 0.0, bend)
+    level = np.where(fixed, level, 0.0)
+    lonely = around_nodes((~fixed).astype(float), largest=True) <= 0
+    nodal = np.where(lonely, np.clip(around_nodes(level, largest=True), 0.0, 1.0), nodal)
+    return ValueFunction(grid=grid, nodal=nodal, bend=bend, fixed=fixed, level=level)

@@ -1,0 +1,186 @@
+"""Integrals of the basis functions of one axis against the normal density, as banded matrices.
+
+On the interval [x_k, x_{k + 1}] of width D_k with tau = (y - x_k)/D_k the basis functions are L = 1 - tau, R = tau,
+Q = D_k^2 tau (1 - tau)/2 and P = 1; the hat of a node is R to its left and L to its right. For every row m
+    K^(a)[m, k] = d^a/dm^a int b_k(y) phi_s(y - m) dy = int b_k(y) s^-a He_a(z) phi_s(y - m) dy,  z = (y - m)/s,
+is evaluated by Gauss's rule. `AxisKernel.error` bounds what is wrong with an entry, relative to the mass that the
+dominating density phi_{kappa s} has on the interval; see ``dominance``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from flint import arb
+from numpy.typing import NDArray
+
+from certbound.rigor.balls import precision
+from certbound.values.discrete.dominance import KAPPA, dominance, quadrature_error
+
+__all__ = ["ORDERS", "REACH", "AxisKernel", "axis_kernel"]
+
+Array = NDArray[np.float64]
+
+REACH = 10.0
+"""Standard deviations up to which every interval is integrated that comes so near."""
+ORDERS = 3
+_MARGIN = REACH + 1e-3
+_FARTHEST = 40.0  # beyond it the density is below 1e-140 of the dominating one
+_ROWS = 32
+_WANTED = 2e-14
+_UNIT = 2.0**-53
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Block:
+    """Rows ``first:last`` of an axis' matrices, on the intervals ``left:right``."""
+
+    first: int
+    last: int
+    left: int
+    right: int
+    parts: dict[str, Array]
+    """Name to (ORDERS, rows, intervals); ``hat`` has one column more."""
+    mass: Array
+    """Mass of the dominating density, (rows, intervals)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class AxisKernel:
+    """One axis: where the noise-free step may end (``points``), and the integrals from there.
+
+    Parameters
+    ----------
+    points : ndarray, shape (M,)
+        Rows.
+    nodes : ndarray, shape (N + 1,)
+        The grid's nodes.
+    sigma : float
+        Standard deviation, known up to the relative error ``spread``.
+    error : float
+        |K^(a) - computed| <= error s^-a mass, entry by entry, for basis functions bounded by 1.
+    outside : ndarray, shape (ORDERS, M)
+        Derivatives of the probability that m + w lies outside [nodes[0], nodes[-1]], up to error s^-a outside_mass.
+    outside_mass : ndarray, shape (M,)
+        That probability for the dominating density.
+    """
+
+    points: Array
+    nodes: Array
+    sigma: float
+    error: float
+    blocks: list[Block] = field(repr=False)
+    outside: Array = field(repr=False)
+    outside_mass: Array = field(repr=False)
+
+    def apply(self, name: str, tensor: Array, orders: int = ORDERS) -> list[Array]:
+        """Contract the first axis of a tensor with the first ``orders`` derivatives of one basis' matrix."""
+        flat = tensor.reshape(len(tensor), -1)
+        found = np.empty((orders, len(self.points), flat.shape[1]))
+        for block in self.blocks:
+            part = block.parts[name][:orders]
+            rows = part.shape[1]
+            columns = flat[block.left : block.left + part.shape[2]]
+            found[:, block.first : block.last] = (part.reshape(orders * rows, -1) @ columns).reshape(orders, rows, -1)
+        return list(found.reshape(orders, len(self.points), *tensor.shape[1:]))
+
+    def apply_mass(self, tensor: Array) -> Array:
+        """Contract the first axis of a tensor over the intervals with the dominating masses."""
+        flat = tensor.reshape(len(tensor), -1)
+        found = np.empty((len(self.points), flat.shape[1]))
+        for block in self.blocks:
+            found[block.first : block.last] = block.mass @ flat[block.left : block.right]
+        return found.reshape(len(self.points), *tensor.shape[1:])
+
+
+def axis_kernel(points: Array, nodes: Array, sigma: float, spread: float) -> AxisKernel:
+    """The matrices of one axis.
+
+    Parameters
+    ----------
+    points, nodes : ndarray
+        Rising.
+    sigma, spread : float
+        Standard deviation and its relative uncertainty (at most 1e-9).
+    """
+    widths = np.diff(nodes)
+    panels = max(1, math.ceil(float(widths.max()) / sigma / 0.9))
+    half = float(widths.max()) / sigma / panels / 2 * (1 + 1e-9)
+    count = _points(half)
+    place, weight = _rule(count, panels)
+    blocks = []
+    for first in range(0, len(points), _ROWS):
+        rows = points[first : first + _ROWS]
+        index = np.flatnonzero((nodes[1:] >= rows[0] - _MARGIN * sigma) & (nodes[:-1] <= rows[-1] + _MARGIN * sigma))
+        left, right = (int(index[0]), int(index[-1]) + 1) if len(index) else (0, 0)
+        parts, mass = _integrals(rows, nodes[left : right + 1], sigma, place, weight)
+        blocks.append(Block(
+            first=first, last=first + len(rows), left=left, right=right, parts=parts, mass=mass,
+        ))  # fmt: skip
+    scale = float(max(np.abs(nodes).max(), np.abs(points).max())) / sigma
+    # density at a point: z is off by 3 u scale (the node) and |z| (3 u + spread), the exponential by 8 units; weights
+    # and sums cost 40 u more. All of it is taken times (1 + |z|)^(2 + 2) phi <= dominance(...) phi_{kappa s}.
+    slack = 3 * _UNIT * scale + 3 * _UNIT + spread + 60 * _UNIT
+    error = _WANTED + 1.1 * slack * dominance(0, min(2 * half, 3.0), 4)
+    outside, outside_mass = _outside(points, float(nodes[0]), float(nodes[-1]), sigma)
+    return AxisKernel(
+        points=points, nodes=nodes, sigma=sigma, error=error, blocks=blocks, outside=outside, outside_mass=outside_mass
+    )
+
+
+def _points(half: float) -> int:
+    """Points of the rule that suffice for the derivatives and, to 1e-4 of themselves, for the masses."""
+
+    def fits(count: int) -> bool:
+        wrong = max(quadrature_error(count, half, order, _FARTHEST) for order in range(ORDERS))
+        return wrong <= _WANTED and quadrature_error(count, half / KAPPA, 0, (REACH + 1) / KAPPA, 1.0) <= 1e-4
+
+    return next(count for count in range(4, 64) if fits(count))
+
+
+def _rule(count: int, panels: int) -> tuple[Array, Array]:
+    """Gauss's rule on [0, 1], repeated on equal panels; nodes and weights are balls rounded to floats."""
+    with precision():
+        pairs = [arb.legendre_p_root(count, k, weight=True) for k in reversed(range(count))]
+    root, weight = (np.array([float(pair[k]) for pair in pairs]) for k in range(2))
+    shifts = np.arange(panels)[:, None]
+    return ((shifts + (root + 1) / 2) / panels).ravel(), np.tile(weight / 2 / panels, panels)
+
+
+def _integrals(rows: Array, nodes: Array, sigma: float, place: Array, weight: Array) -> tuple[dict[str, Array], Array]:
+    widths = np.diff(nodes)
+    y = nodes[:-1, None] + widths[:, None] * place
+    z = (y[None] - rows[:, None, None]) / sigma
+    density = np.exp(-0.5 * z * z) / (sigma * math.sqrt(2 * math.pi))
+    gap = np.maximum(nodes[:-1] - rows[:, None], rows[:, None] - nodes[1:])
+    near = (gap <= _MARGIN * sigma)[:, :, None]
+    density *= near
+    shapes = np.stack([1 - place, place, place * (1 - place) / 2, np.ones_like(place)], axis=1) * weight[:, None]
+    moments = np.stack([density, density * z / sigma, density * (z * z - 1) / sigma**2])
+    values = np.moveaxis(moments @ shapes, -1, 0) * widths  # (4, ORDERS, rows, intervals)
+    left, right, bubble, whole = values
+    hat = np.zeros((ORDERS, len(rows), len(nodes)))
+    hat[..., :-1] += left
+    hat[..., 1:] += right
+    parts = {"hat": hat, "left": left, "right": right, "bubble": bubble * widths**2, "whole": whole}
+    wide = np.exp(-0.5 * (z / KAPPA) ** 2) / (KAPPA * sigma * math.sqrt(2 * math.pi)) * near
+    return parts, (wide @ weight) * widths
+
+
+def _outside(points: Array, low: float, high: float, sigma: float) -> tuple[Array, Array]:
+    """Probability of leaving [low, high], its derivatives by m, and the dominating one."""
+    above, below = (high - points) / sigma, (points - low) / sigma
+    density = [np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi) for z in (above, below)]
+    value = _upper_tail(above) + _upper_tail(below)
+    first = (density[0] - density[1]) / sigma
+    second = (above * density[0] + below * density[1]) / sigma**2
+    return np.stack([value, first, second]), _upper_tail(above / KAPPA) + _upper_tail(below / KAPPA)
+
+
+def _upper_tail(z: Array) -> Array:
+    """P(N(0, 1) > z), to the last places: balls, point by point."""
+    with precision():
+        root = arb(2).sqrt()
+        return np.array([float((arb(float(value)) / root).erfc() / 2) for value in z])

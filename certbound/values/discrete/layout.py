@@ -1,0 +1,183 @@
+"""The boxes and grids of all steps: where value functions live, and how fine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.problem import Problem
+from certbound.problem.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope, Region
+from certbound.problem.sets import GaussianStart, Inside, Outside
+from certbound.problem.trace import compile_numpy
+from certbound.rigor.intervals import Interval
+from certbound.values.discrete.dominance import tail
+from certbound.values.discrete.kernels import REACH
+from certbound.values.discrete.shocks import Inapplicable, Shocks
+from certbound.values.discrete.steps import Dynamics
+from certbound.values.grids import Grid, graded_axis
+from certbound.values.sets import active_at, box_around
+
+__all__ = ["Boxes", "boxes_of", "grid_of", "widths_of"]
+
+Array = NDArray[np.float64]
+
+_COARSE = {1: 256, 2: 32, 3: 12}  # cells along each side when the reach of a step is bounded
+
+
+class Boxes:
+    """Per step a box outside which a path counts as failed, and what that adds to the probability of failing.
+
+    Parameters
+    ----------
+    low, high : ndarray, shape (T + 1, n)
+        Ends.
+    leak : float
+        Upper bound of the probability that a path leaves a box through a side that no constraint has put there.
+    """
+
+    def __init__(self, low: Array, high: Array, leak: float) -> None:
+        self.low, self.high, self.leak = low, high, leak
+
+
+def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
+    """The boxes of all steps; sides that no constraint gives come from where the states can get to.
+
+    Raises
+    ------
+    Inapplicable
+        If some state is not bounded at some step; the message says what bound would help.
+    """
+    n, horizon = problem.system.dimension, int(problem.horizon)
+    low, high = np.empty((horizon + 1, n)), np.empty((horizon + 1, n))
+    spread = REACH * (np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (1 + 1e-12))
+    reach = _start_box(problem, spread)
+    leak = 0.0
+    for t in range(horizon + 1):
+        low[t], high[t] = box_around(active_at(problem.constraints, t), n, t)
+        free = ~np.isfinite(low[t]) | ~np.isfinite(high[t])
+        if np.any(free):
+            leak += 2 * n * tail(REACH)
+            below, above = np.isfinite(low[t]), np.isfinite(high[t])
+            low[t] = np.where(below, low[t], reach[0] - 1e-9 * (1 + np.abs(reach[0])))
+            high[t] = np.where(above, high[t], reach[1] + 1e-9 * (1 + np.abs(reach[1])))
+        _check_box(problem, low[t], high[t], t, spread)
+        if t < horizon and _needed(problem, t):
+            reach = _next_reach(dynamics, t, low[t], high[t], reach, spread)
+    return Boxes(low, high, leak)
+
+
+def _start_box(problem: Problem, spread: Array) -> tuple[Array, Array]:
+    initial = problem.initial
+    eye = np.eye(problem.system.dimension)
+    if isinstance(initial, GaussianStart):
+        away = REACH * np.sqrt(np.diag(initial.covariance)) * (1 + 1e-12)
+        return initial.mean - away, initial.mean + away
+    if isinstance(initial, Box):
+        return initial.low, initial.high
+    return -initial.support(-eye) * 1.0 - 1e-9 * spread, initial.support(eye) + 1e-9 * spread
+
+
+def _needed(problem: Problem, t: int) -> bool:
+    """Whether some later step lacks a side."""
+    n = problem.system.dimension
+    later = range(t + 1, int(problem.horizon) + 1)
+    return any(not np.isfinite(box_around(active_at(problem.constraints, k), n, k)).all() for k in later)
+
+
+def _check_box(problem: Problem, low: Array, high: Array, t: int, spread: Array) -> None:
+    for i, name in enumerate(problem.system.states):
+        if not (np.isfinite(low[i]) and np.isfinite(high[i]) and high[i] - low[i] < 1e4 * spread[i]):
+            raise Inapplicable(
+                f"value functions need bounds on every state, and `{name}` has none at step {t} that is of use: add a "
+                f"constraint or a `domain` that bounds `{name}` on both sides."
+            )
+        if not low[i] < high[i]:
+            raise Inapplicable(f"value functions need a safe set with an interior, and `{name}` has none at step {t}.")
+
+
+def _next_reach(
+    dynamics: Dynamics, t: int, low: Array, high: Array, reach: tuple[Array, Array], spread: Array
+) -> tuple[Array, Array]:
+    """Where the states in the box can get to in one step, but for the noise's tails."""
+    first, last = np.maximum(low, reach[0]), np.minimum(high, reach[1])
+    last = np.maximum(first, last)
+    count = _COARSE[dynamics.n]
+    step = dynamics.step(t, Grid(axes=tuple(np.linspace(a, b, count + 1) for a, b in zip(first, last))))
+    if not all(part.defined.all() for part in step.cells):
+        return np.full(dynamics.n, -np.inf), np.full(dynamics.n, np.inf)
+    below, above = step.hull()
+    ends = Interval(below, above) + Interval(-spread, spread)
+    return ends.lo, ends.hi
+
+
+def widths_of(
+    problem: Problem, dynamics: Dynamics, shocks: Shocks, boxes: Boxes, t: int, when: int
+) -> list[tuple[Array, Array]]:
+    """Per axis places in the box of step t and the lengths over which phi changes: 1/sqrt(sum_k (J_ki/s_k)^2).
+
+    In plain floats; J is that of step ``when``.
+    """
+    n = problem.system.dimension
+    count = {1: 257, 2: 33, 3: 13}[n]
+    axes = [np.linspace(a, b, count) for a, b in zip(boxes.low[t], boxes.high[t])]
+    points = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
+    disturbance = problem.system.disturbance
+    middle = [] if disturbance is None else list((disturbance.low + disturbance.high) / 2)
+    inputs = [] if problem.input_sequence is None else list(problem.input_sequence[when])
+    slopes = compile_numpy(dynamics.slopes)(float(when), *points.T, *inputs, *middle)[:, :, :n]
+    slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+    square = np.sum((slopes / shocks.sigma.mid[:, None]) ** 2, axis=1).reshape([count] * n + [n])
+    found = []
+    for i, axis in enumerate(axes):
+        others = tuple(k for k in range(n) if k != i)
+        rate = np.sqrt(square[..., i].mean(axis=others) if others else square[..., i])
+        longest = (axis[-1] - axis[0]) / 4
+        found.append((axis, 1 / np.maximum(rate, 1 / longest)))
+    return found
+
+
+def grid_of(
+    low: Array, high: Array, lengths: list[tuple[Array, Array]], share: float, constraints: Sequence[Inside],
+    target: Region | None, shocks: Shocks, t: int,
+) -> Grid:  # fmt: skip
+    """A grid whose cells are ``share`` of those lengths, finer where constraints do not follow the axes."""
+    axes = []
+    for i, (places, wanted) in enumerate(lengths):
+        widths = share * wanted
+        marks: list[float] = []
+        for constraint in constraints:
+            widths, more = _finer(constraint, i, places, widths, share / 3 * float(shocks.sigma.mid[i]), t)
+            marks += more
+        if target is not None:
+            widths, more = _finer(Outside(target), i, places, widths, share / 3 * float(shocks.sigma.mid[i]), t)
+            marks += more
+        axes.append(graded_axis(float(low[i]), float(high[i]), places, widths, marks))
+    return Grid(axes=tuple(axes))
+
+
+def _finer(
+    constraint: Inside, axis: int, places: Array, widths: Array, fine: float, t: int
+) -> tuple[Array, list[float]]:
+    """Widths cut down along a round or slanted constraint, and faces that become nodes."""
+    region = constraint.region
+    used = list(range(region.dimension)) if region.coordinates is None else list(region.coordinates)
+    if axis not in used:
+        return widths, []
+    place = used.index(axis)
+    center = region.center_at(t)[place]
+    if isinstance(region, Box):
+        return widths, [float(end + center) for end in (region.low[place], region.high[place]) if np.isfinite(end)]
+    if isinstance(region, HalfSpace | Polytope):
+        normals, bounds = region.halfspaces()
+        alone = [np.count_nonzero(row) == 1 for row in normals]
+        faces = [float(b / row[place]) for row, b, one in zip(normals, bounds, alone) if one and row[place]]
+        slanted = any(row[place] and not one for row, one in zip(normals, alone))
+        return (np.minimum(widths, fine) if slanted else widths), faces
+    assert isinstance(region, Ball | Ellipsoid)
+    if not isinstance(constraint, Outside):
+        return np.minimum(widths, fine), []
+    half = float(region.radius) if isinstance(region, Ball) else float(np.sqrt(region.shape[place, place]))
+    near = np.abs(places - center) <= half + float(np.max(np.diff(places)))
+    return np.where(near, np.minimum(widths, fine), widths), []

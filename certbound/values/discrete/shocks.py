@@ -1,0 +1,154 @@
+"""The noise of one step, G w, as independent coordinates and one common factor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.errors import InfeasibleError
+from certbound.problem.noise import Bounded, Gaussian, Law, SubGaussian, Uniform
+from certbound.rigor.intervals import Interval, sq, sqrt
+
+__all__ = ["Inapplicable", "Shocks", "gaussian_shocks", "shocks_of"]
+
+Array = NDArray[np.float64]
+
+
+class Inapplicable(InfeasibleError):
+    """Value functions do not fit the problem; the message says why, and what would make them fit."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Shocks:
+    """w = diag(sigma) xi + factor zeta, with xi and zeta independent standard normal.
+
+    Parameters
+    ----------
+    sigma : Interval, shape (n,)
+        Standard deviations of the independent parts, positive, known up to rounding.
+    factor : Interval, shape (n,)
+        Loads of the common factor; all 0 where the entries are independent.
+    uniform : bool
+        True: w is uniform on the box [-sigma, sigma] instead, without a common factor.
+    """
+
+    sigma: Interval
+    factor: Interval
+    uniform: bool = False
+
+    @property
+    def dimension(self) -> int:
+        """Number of states."""
+        return len(self.sigma)
+
+    @property
+    def common(self) -> bool:
+        """Whether there is a common factor."""
+        return bool(np.any(self.factor.mag > 0))
+
+
+def shocks_of(law: Law, gain: Array) -> Shocks:
+    """The law of G w, for Gaussian w and for uniform w that moves every state on its own.
+
+    Raises
+    ------
+    Inapplicable
+        For other laws, and where G w leaves a state without noise of its own.
+    """
+    if isinstance(law, Bounded | SubGaussian):
+        raise Inapplicable(
+            f"value functions need the noise's law; {type(law).__name__} names a class of laws (give cb.Gaussian "
+            "if that is what it is)."
+        )
+    if isinstance(law, Uniform):
+        return _uniform_shocks(law, gain)
+    if not isinstance(law, Gaussian):
+        raise Inapplicable(f"value functions take Gaussian and uniform noise so far, not {type(law).__name__}.")
+    return gaussian_shocks(_covariance(law, gain))
+
+
+def _uniform_shocks(law: Uniform, gain: Array) -> Shocks:
+    n = len(gain)
+    alone = gain.shape == (n, n) and np.all((gain != 0).sum(axis=1) == 1) and np.all((gain != 0).sum(axis=0) == 1)
+    if not alone or not np.all(np.asarray(law.halfwidth) > 0):
+        raise Inapplicable("value functions need uniform noise that moves every state by an entry of its own.")
+    place = np.argmax(gain != 0, axis=1)
+    sides = Interval.point(np.abs(gain[np.arange(n), place])) * Interval.point(np.asarray(law.halfwidth)[place])
+    return Shocks(sigma=sides, factor=Interval.point(np.zeros(n)), uniform=True)
+
+
+def _covariance(law: Gaussian, gain: Array) -> Interval:
+    """Enclosure of G Sigma G', shape (n, n); zeros that the structure gives are exact."""
+    if law.covariance is not None:
+        inner = Interval.point(np.asarray(law.covariance))
+    else:
+        level = np.asarray(law.variance if law.std is None else law.std, dtype=float)
+        square = Interval.point(level) if law.std is None else sq(Interval.point(level))
+        inner = Interval(np.diag(square.lo), np.diag(square.hi))
+    left = Interval.point(gain)
+    half = (left[:, :, None] * inner[None, :, :]).sum(axis=1)
+    return (half[:, None, :] * left[None, :, :]).sum(axis=-1)
+
+
+def gaussian_shocks(covariance: Interval) -> Shocks:
+    """A normal law of that covariance as independent parts and one common factor.
+
+    With C = diag(s^2) + e e' the normal law N(0, C) is that of s xi + e zeta. One pair of correlated states needs
+    e_i e_j = C_ij, balanced so that both keep the same share of their variance; three need e_i^2 = C_ij C_ik / C_jk.
+
+    Raises
+    ------
+    Inapplicable
+        If no such factor leaves every state noise of its own.
+    """
+    n = len(covariance)
+    factor = _factor(covariance)
+    rest = [covariance[i, i] - sq(factor[i]) for i in range(n)]
+    floor = [1e-4 * float(covariance.hi[i, i]) for i in range(n)]
+    for i, value in enumerate(rest):
+        if not float(value.lo) > floor[i] or not float(value.lo) > 0:
+            raise Inapplicable(
+                f"value functions need noise of its own on every state; that of state {i + 1} is zero or a combination "
+                "of the others'. Add a little noise there, or use another engine."
+            )
+    sigma = sqrt(Interval(np.array([float(v.lo) for v in rest]), np.array([float(v.hi) for v in rest])))
+    return Shocks(sigma=sigma, factor=factor)
+
+
+def _factor(covariance: Interval) -> Interval:
+    n = len(covariance)
+    pairs = [(i, j) for i in range(n) for j in range(i) if covariance.mag[i, j] > 0]
+    lo, hi = np.zeros(n), np.zeros(n)
+
+    def load(i: int, value: Interval) -> None:
+        lo[i], hi[i] = float(value.lo), float(value.hi)
+
+    if len(pairs) == 1:
+        i, j = pairs[0]
+        if not (covariance.lo[i, i] > 0 and covariance.lo[j, j] > 0):
+            return Interval(lo, hi)
+        c = covariance[i, j]
+        first = Interval.point(math.sqrt(float(c.mag) * math.sqrt(float(covariance.hi[i, i] / covariance.hi[j, j]))))
+        load(i, first)
+        load(j, c / first)
+    elif len(pairs) == 3:
+        c21, c31, c32 = covariance[1, 0], covariance[2, 0], covariance[2, 1]
+        square = c21 * c31 / c32
+        if not float(square.lo) > 0:
+            raise Inapplicable(_NO_FACTOR)
+        first = sqrt(square)
+        load(0, first)
+        load(1, c21 / first)
+        load(2, c31 / first)
+    elif len(pairs) == 2:
+        raise Inapplicable(_NO_FACTOR)
+    return Interval(lo, hi)
+
+
+_NO_FACTOR = (
+    "value functions treat correlated noise of three states only where it is independent noise plus one common factor; "
+    "this covariance is not."
+)

@@ -1,0 +1,60 @@
+"""What constraints say about boxes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.rigor.intervals import Interval
+from certbound.values.sets import active_at, box_around, contains, respected
+
+REGIONS = [
+    cb.Box([-0.5, -np.inf], [0.7, 0.4]),
+    cb.Box([-0.5, -0.3], [0.7, 0.4], center=lambda t: [0.1 * t, -0.2]),
+    cb.Box([-0.5], [0.4], coordinates=[1]),
+    cb.Ball([0.1, 0.2], 0.6),
+    cb.Ball(lambda t: [0.1 * t, 0.2], 0.6),
+    cb.Ellipsoid([0.1, 0.0], [[0.5, 0.2], [0.2, 0.3]]),
+    cb.HalfSpace([1.0, -2.0], 0.3),
+    cb.Polytope([[1.0, 1.0], [-1.0, 0.5], [0.0, -1.0]], [0.5, 0.6, 0.7]),
+]
+
+
+@pytest.mark.parametrize("region", REGIONS)
+@pytest.mark.parametrize("interiors", [False, True])
+def test_surely_inside_and_surely_outside_hold_at_every_point(region: cb.Region, interiors: bool) -> None:
+    rng = np.random.default_rng(0)
+    low = rng.uniform(-1.2, 1.2, (400, 2))
+    boxes = Interval(low, low + rng.uniform(0, 0.3, (400, 2)))
+    inside, outside = contains(region, boxes, 2, interiors=interiors)
+    assert inside.any()
+    assert outside.any()
+    assert not np.any(inside & outside)
+    points = boxes.lo[:, None] + rng.uniform(0.001, 0.999, (400, 60, 2)) * (boxes.hi - boxes.lo)[:, None]
+    held = region.contains(points, 2.0)
+    assert held[inside].all()
+    assert not held[outside].any()
+    undecided = ~inside & ~outside
+    assert undecided.mean() < 0.5
+
+
+def test_a_face_counts_unless_only_interiors_do() -> None:
+    boxes = Interval(np.array([[0.5, 0.0]]), np.array([[0.6, 0.1]]))
+    obstacle = [cb.Outside(cb.Box([0.0, 0.0], [0.5, 1.0]))]
+    assert not respected(obstacle, boxes, 0)[0].any()
+    assert respected(obstacle, boxes, 0, interiors=True)[0].all()
+
+
+@pytest.mark.parametrize("region", REGIONS)
+def test_the_box_around_a_region_holds_it(region: cb.Region) -> None:
+    low, high = box_around([cb.Inside(region)], 2, 2)
+    points = np.random.default_rng(1).uniform(-2, 2, (5000, 2))
+    held = points[region.contains(points, 2.0)]
+    assert np.all((low <= held) & (held <= high))
+
+
+def test_obstacles_and_windows_put_no_box_around_anything() -> None:
+    constraints = [cb.Outside(cb.Ball([0, 0], 1)), cb.Inside(cb.Box([-1, -1], [1, 1]), during=(2, 3))]
+    assert np.isinf(box_around(active_at(constraints, 1), 2, 1)[0]).all()
+    assert np.isfinite(box_around(active_at(constraints, 2), 2, 2)[0]).all()
