@@ -1,0 +1,179 @@
+"""Bounds of the probability that a path leaves its safe set, from both sides: one state (see the package)."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.evaluation import compile_numpy
+from certbound.rigor.intervals import Interval
+from certbound.values.continuous.coefficients import Cells, Interpolant, Reader
+from certbound.values.continuous.payment import Patched, Payment, pay_lower, pay_upper
+from certbound.values.continuous.polynomials import nodes_of
+from certbound.values.continuous.residual import Ranges, bound_ranges
+from certbound.values.continuous.surface import Surface
+
+__all__ = ["Model", "Proof", "prove_lower", "prove_upper"]
+
+Array = NDArray[np.float64]
+
+NEGLIGIBLE = 1e-4
+"""lam and eps (in units of the bound), summed over the horizon, that are granted without being looked at."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Model:
+    """Drift f(t, x, d) and a(t, x) on a box, and the branches that cover D.
+
+    ``branches`` are boxes of d whose union (or, where f is affine in d, the hull of whose union) is D.
+    """
+
+    drift: Reader
+    square: Reader
+    branches: tuple[tuple[Interval, ...], ...]
+
+    @property
+    def autonomous(self) -> bool:
+        """True when neither depends on t."""
+        return self.drift.autonomous and self.square.autonomous
+
+    def counts(self) -> tuple[int, ...]:
+        """Samples in time and in each state with which the residual is a polynomial known exactly."""
+        n = self.drift.axes - 1
+        f, a = self.drift.degrees, self.square.degrees
+        own = 4 if n == 1 else 5  # degree of V_x in its own variable; that of V_y in x is 5
+        squared = 8 if n == 1 else 10
+        space = [max(5, f[1 + i] + own, a[1 + i] + squared) + 1 for i in range(n)]
+        return (max(3 + f[0], 6 + a[0]) + 1, *space)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Proof:
+    """What the residual inequality says about one surface: ranges of every patch, in the order of `Surface.patches`."""
+
+    ranges: Ranges
+    slab: NDArray[np.intp]
+
+
+def examine(surface: Surface, model: Model) -> Proof:
+    """Enclose R, V and (where R is not negligible) Q2 on every patch of a surface."""
+    counts = model.counts()
+    found: list[Ranges] = []
+    slabs = []
+    fixed = _interpolants(surface, model, 0, 1, counts) if model.autonomous else None
+    per = int(np.prod(surface.cells))
+    negligible = NEGLIGIBLE / float(surface.times[-1])
+    for first, last in surface.chunks():
+        patches = surface.patches(first, last)
+        drifts, squares = fixed or _interpolants(surface, model, first, last, counts)
+        if fixed:
+            drifts, squares = [_repeated(one, last - first) for one in drifts], _repeated(squares, last - first)
+        found.append(bound_ranges(patches, drifts, squares, counts, wanted=negligible))
+        slabs.append(np.repeat(np.arange(first, last), per))
+    joined = Ranges(**{
+        name: np.concatenate([getattr(one, name) for one in found]) for name in Ranges.__dataclass_fields__
+    })  # fmt: skip
+    return Proof(ranges=joined, slab=np.concatenate(slabs))
+
+
+def _repeated(one: Interpolant, count: int) -> Interpolant:
+    """The same cells for several slabs."""
+    def tiled(array: Array) -> Array:
+        return np.tile(array, (1, count, *([1] * (array.ndim - 2))))
+
+    return Interpolant(samples=tiled(one.samples), size=tiled(one.size), remainder=tiled(one.remainder))
+
+
+def _interpolants(
+    surface: Surface, model: Model, first: int, last: int, counts: Sequence[int]
+) -> tuple[list[Interpolant], Interpolant]:
+    cells = _cells(surface, first, last)
+    points = [nodes_of(count) for count in counts]
+    if model.autonomous:
+        points = [(0.5,), *points[1:]]
+    drifts = [model.drift.interpolate(cells, branch, points) for branch in model.branches]
+    return drifts, model.square.interpolate(cells, (), points)
+
+
+def _cells(surface: Surface, first: int, last: int) -> Cells:
+    ends = [(surface.times[first:last], surface.times[first + 1 : last + 1])]
+    ends += [(axis[:-1], axis[1:]) for axis in surface.axes]
+    low = np.meshgrid(*(pair[0] for pair in ends), indexing="ij")
+    high = np.meshgrid(*(pair[1] for pair in ends), indexing="ij")
+    return Cells(low=tuple(array.ravel() for array in low), high=tuple(array.ravel() for array in high))
+
+
+def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment:
+    """An upper bound of log P(leaving the box of the surface by T), whatever the surface is."""
+    lift = max(0.0, -min(surface.face_range(axis, side)[0] for axis in range(len(surface.axes)) for side in (0, 1)))
+    proof = examine(surface, model)
+    ranges = proof.ranges
+    start = extreme_over(surface, starts, upper=True) + lift
+    due = (ranges.low + lift < 0) & ~(ranges.residual_high <= 0)
+    patched = _patched(proof, ranges.residual_high, due, lift, surface.steps, start)
+    floor = float(surface.range_at(-1)[0].min())
+    return pay_upper(patched, _up(start), floor)
+
+
+def prove_lower(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment | None:
+    """A lower bound of log P(leaving the box of the surface by T) from the best start, whatever the surface is."""
+    proof = examine(surface, model)
+    ranges = proof.ranges
+    drop = max(0.0, float(ranges.high.max()))
+    start = extreme_over(surface, starts, upper=False) - drop
+    due = ~(ranges.residual_low >= 0)
+    patched = _patched(proof, -ranges.residual_low, due, -drop, surface.steps, start)
+    ceiling = float(surface.range_at(-1)[1].max())
+    return pay_lower(patched, -_up(-start), ceiling)
+
+
+def _up(value: float) -> float:
+    return value + 1e-15 * (1 + abs(value))
+
+
+def _patched(
+    proof: Proof, excess: Array, due: NDArray[np.bool_], shift: float, steps: Array, start: float
+) -> Patched:
+    """The patches that are due, less those that a negligible lam and eps on every slab pay for."""
+    ranges, slack = proof.ranges, 1e-15 * (1 + abs(shift))
+    high = ranges.high + shift + slack
+    spare = NEGLIGIBLE / float(steps.sum())
+    with np.errstate(over="ignore"):
+        free = spare * (1 + np.exp(np.minimum(start - high, 700.0)) * (1 - 1e-13))
+    due = due & ~(excess <= free * (1 - 1e-13))
+    return Patched(
+        excess=excess[due], low=ranges.low[due] + shift - slack, high=high[due],
+        energy=ranges.energy[due], slab=proof.slab[due], steps=steps, spare=spare,
+    )  # fmt: skip
+
+
+def extreme_over(surface: Surface, starts: Sequence[tuple[float, float]], *, upper: bool) -> float:
+    """The supremum of V(0, .) over the starts (upper), or V at the best of the nodes among them, rounded safely.
+
+    Starts that are no union of cells are covered by the cells that they touch. Where a start is a node of the grid in
+    every state, V there is one of the data.
+    """
+    exact = [
+        np.flatnonzero((axis >= low) & (axis <= high)) for axis, (low, high) in zip(surface.axes, starts)
+    ]
+    index = np.ix_(*itertools.chain.from_iterable((nodes, [0]) for nodes in exact))
+    at_nodes = float(surface.values[0][index].max()) if all(len(nodes) for nodes in exact) else -math.inf
+    low, high = surface.range_at(0)
+    touched = np.ix_(*(_touched(axis, *ends) for axis, ends in zip(surface.axes, starts)))
+    if upper:
+        if all(low == high for low, high in starts) and at_nodes > -math.inf:
+            return at_nodes
+        return float(high[touched].max())
+    return max(at_nodes, float(low[touched].max()))
+
+
+def _touched(axis: Array, low: float, high: float) -> NDArray[np.intp]:
+    if low == high:
+        return np.flatnonzero((axis[:-1] <= low) & (axis[1:] >= high))
+    return np.flatnonzero((axis[:-1] < high) & (axis[1:] > low))
