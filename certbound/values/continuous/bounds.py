@@ -16,7 +16,7 @@ from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Cells, Interpolant, Reader
 from certbound.values.continuous.payment import Patched, Payment, pay_lower, pay_upper
 from certbound.values.continuous.polynomials import nodes_of
-from certbound.values.continuous.residual import Ranges, bound_ranges
+from certbound.values.continuous.residual import Ranges, bound_ranges, coarse_size, value_range
 from certbound.values.continuous.surface import Surface
 
 __all__ = ["Model", "Proof", "prove_lower", "prove_upper"]
@@ -61,33 +61,50 @@ class Proof:
     slab: NDArray[np.intp]
 
 
-def examine(surface: Surface, model: Model) -> Proof:
-    """Enclose R, V and (where R is not negligible) Q2 on every patch of a surface."""
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Need:
+    """Which patches need no close look: V >= ``top`` throughout, or |R| paid for by ``spare`` (1 + exp(start - V))."""
+
+    spare: float
+    start: float
+    top: float
+
+    def free(self, high: Array) -> Array:
+        """The excess that is paid for in any case where V <= ``high``."""
+        return self.spare * (1 + np.exp(np.minimum(self.start - high, 700.0)) * (1 - 1e-13)) * (1 - 1e-13)
+
+
+def examine(surface: Surface, model: Model, need: Need) -> Proof:
+    """Enclose R, V and Q2 on every patch of a surface that needs it."""
     counts = model.counts()
     found: list[Ranges] = []
     slabs = []
     fixed = _interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
-    negligible = NEGLIGIBLE / float(surface.times[-1])
     for first, last in surface.chunks():
         patches = surface.patches(first, last)
+        place = np.arange(len(patches.size))
         drifts, squares = fixed or _interpolants(surface, model, first, last, counts)
-        if fixed:
-            drifts, squares = [_repeated(one, last - first) for one in drifts], _repeated(squares, last - first)
-        found.append(bound_ranges(patches, drifts, squares, counts, wanted=negligible))
-        slabs.append(np.repeat(np.arange(first, last), per))
+        low, high = value_range(patches)
+        size = coarse_size(patches, *_for(drifts, squares, place % per if fixed else place))
+        kept = np.flatnonzero((low < need.top) & ~(size <= need.free(high)))
+        cells = _for(drifts, squares, kept % per if fixed else kept)
+        if len(kept):
+            found.append(bound_ranges(patches.take(kept), *cells, counts, wanted=need.spare))
+            slabs.append(first + kept // per)
+    if not found:
+        empty = np.empty(0)
+        return Proof(ranges=Ranges(residual_low=empty, residual_high=empty, low=empty, high=empty, energy=empty), slab=np.empty(0, dtype=np.intp))
     joined = Ranges(**{
         name: np.concatenate([getattr(one, name) for one in found]) for name in Ranges.__dataclass_fields__
     })  # fmt: skip
     return Proof(ranges=joined, slab=np.concatenate(slabs))
 
 
-def _repeated(one: Interpolant, count: int) -> Interpolant:
-    """The same cells for several slabs."""
-    def tiled(array: Array) -> Array:
-        return np.tile(array, (1, count, *([1] * (array.ndim - 2))))
-
-    return Interpolant(samples=tiled(one.samples), size=tiled(one.size), remainder=tiled(one.remainder))
+def _for(
+    drifts: list[Interpolant], squares: Interpolant, place: NDArray[np.intp]
+) -> tuple[list[Interpolant], Interpolant]:
+    return [drift.take(place) for drift in drifts], squares.take(place)
 
 
 def _interpolants(
@@ -112,44 +129,41 @@ def _cells(surface: Surface, first: int, last: int) -> Cells:
 def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment:
     """An upper bound of log P(leaving the box of the surface by T), whatever the surface is."""
     lift = max(0.0, -min(surface.face_range(axis, side)[0] for axis in range(len(surface.axes)) for side in (0, 1)))
-    proof = examine(surface, model)
-    ranges = proof.ranges
-    start = extreme_over(surface, starts, upper=True) + lift
-    due = (ranges.low + lift < 0) & ~(ranges.residual_high <= 0)
-    patched = _patched(proof, ranges.residual_high, due, lift, surface.steps, start)
-    floor = float(surface.range_at(-1)[0].min())
-    return pay_upper(patched, _up(start), floor)
+    surface = surface.raised(_up(lift)) if lift else surface
+    if any(surface.face_range(axis, side)[0] < 0 for axis in range(len(surface.axes)) for side in (0, 1)):
+        surface = surface.raised(1e-12 * (1 + lift))
+    start = _up(extreme_over(surface, starts, upper=True))
+    need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
+    proof = examine(surface, model, need)
+    patched = _patched(proof, proof.ranges.residual_high, need, surface.steps)
+    return pay_upper(patched, start, float(surface.range_at(-1)[0].min()))
 
 
 def prove_lower(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment | None:
     """A lower bound of log P(leaving the box of the surface by T) from the best start, whatever the surface is."""
-    proof = examine(surface, model)
-    ranges = proof.ranges
-    drop = max(0.0, float(ranges.high.max()))
-    start = extreme_over(surface, starts, upper=False) - drop
-    due = ~(ranges.residual_low >= 0)
-    patched = _patched(proof, -ranges.residual_low, due, -drop, surface.steps, start)
-    ceiling = float(surface.range_at(-1)[1].max())
-    return pay_lower(patched, -_up(-start), ceiling)
+    highest = max(float(value_range(surface.patches(*chunk))[1].max()) for chunk in surface.chunks())
+    if highest > 0:
+        surface = surface.raised(-highest - 1e-12 * (1 + highest))
+    start = -_up(-extreme_over(surface, starts, upper=False))
+    need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=np.inf)
+    proof = examine(surface, model, need)
+    if np.any(proof.ranges.high > 0):
+        return None
+    patched = _patched(proof, -proof.ranges.residual_low, need, surface.steps)
+    return pay_lower(patched, start, float(surface.range_at(-1)[1].max()))
 
 
 def _up(value: float) -> float:
     return value + 1e-15 * (1 + abs(value))
 
 
-def _patched(
-    proof: Proof, excess: Array, due: NDArray[np.bool_], shift: float, steps: Array, start: float
-) -> Patched:
-    """The patches that are due, less those that a negligible lam and eps on every slab pay for."""
-    ranges, slack = proof.ranges, 1e-15 * (1 + abs(shift))
-    high = ranges.high + shift + slack
-    spare = NEGLIGIBLE / float(steps.sum())
-    with np.errstate(over="ignore"):
-        free = spare * (1 + np.exp(np.minimum(start - high, 700.0)) * (1 - 1e-13))
-    due = due & ~(excess <= free * (1 - 1e-13))
+def _patched(proof: Proof, excess: Array, need: Need, steps: Array) -> Patched:
+    """The patches that cost more than what every slab pays in any case."""
+    ranges = proof.ranges
+    due = (ranges.low < need.top) & ~(excess <= need.free(ranges.high))
     return Patched(
-        excess=excess[due], low=ranges.low[due] + shift - slack, high=high[due],
-        energy=ranges.energy[due], slab=proof.slab[due], steps=steps, spare=spare,
+        excess=excess[due], low=ranges.low[due], high=ranges.high[due], energy=ranges.energy[due],
+        slab=proof.slab[due], steps=steps, spare=need.spare,
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,18 +18,18 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart
 from certbound.problem.tape import Node, Tape
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.bounds import Model, prove_lower, prove_upper
-from certbound.values.continuous.coefficients import Cells, Reader, enclose, squared_diffusion
-from certbound.values.continuous.proposal import Line, Sketch, sketch
+from certbound.values.continuous.bounds import Model, extreme_over, prove_lower, prove_upper
+from certbound.values.continuous.coefficients import Reader, enclose, squared_diffusion
+from certbound.values.continuous.proposal import Line, sketch
 from certbound.values.continuous.room import Room, safe_room
-from certbound.values.continuous.shapes import propose_lower, propose_upper
+from certbound.values.continuous.shapes import propose_lower, propose_upper, sealed
 
 __all__ = ["ExitBounds", "bound_exits"]
 
 Array = NDArray[np.float64]
 
 _LN10 = math.log(10)
-_LEAD = 0.008
+_LEAD = 0.012
 _SHARES = (0.003, 0.1)
 
 
@@ -209,29 +209,58 @@ def _one_state(
     inner = _line(problem, model, room.inner_low[0], room.inner_high[0])
     outer = _line(problem, model, room.outer_low[0], room.outer_high[0])
     rough = sketch(inner)
-    upper, least, level = 0.0, None, rough.level
-    cells, tolerance, lead = 50.0, 1e-3, _LEAD
-    done: list[str] = []
+    found = _Found(level=rough.level)
+    effort, tolerance, lead = 60.0, 3e-4, _LEAD
     for attempt in range(5):
-        before, count = time.perf_counter(), int(cells + 9 * cells / 50 * min(-level, 80))
+        begin = time.perf_counter()
+        cells = int(effort * (1 + 0.2 * min(-found.level, 80)))
         span = inner.horizon * lead / max(rough.growth, 1.0)
-        surface = propose_upper(inner, level, span, share=_SHARES[0], cells=count, tolerance=tolerance)
-        gain = 0.0
-        if surface is not None:
-            value = prove_upper(surface, model, starts).log
-            gain, upper = upper - value, min(upper, value)
-            level = min(level, upper) if upper < level + 1 else level
-            done.append(f"{count} x {surface.slabs}")
+        gain = _raise_upper(found, inner, model, starts, span, cells, tolerance)
         if lower:
-            surface = propose_lower(outer, level, span, share=_SHARES[1], cells=count, tolerance=tolerance)
-            payment = None if surface is None else prove_lower(surface, model, starts)
-            if payment is not None:
-                gain = max(gain, payment.log - least if least is not None else np.inf)
-                least = payment.log if least is None else max(least, payment.log)
-        spent = time.perf_counter() - before
-        enough = gain < 0.005 and attempt > 0
-        if enough or time.perf_counter() + 2.5 * spent > deadline:
+            gain = max(gain, _raise_lower(found, outer, model, starts, 3 * span, cells, tolerance))
+        spent = time.perf_counter() - begin
+        if (gain < 0.005 and attempt > 0) or time.perf_counter() + 2.5 * spent > deadline:
             break
-        cells, tolerance, lead = cells * 1.5, tolerance / 3, lead * 0.7
-    words = f"value function in one state, cells x slabs of time: {', '.join(done) or 'none came to an end'}"
-    return upper, least, words
+        effort, tolerance, lead = effort * 1.4, tolerance / 3, lead * 0.6
+    words = f"value function in one state, cells x slabs of time: {', '.join(found.done) or 'none came to an end'}"
+    return found.upper, found.lower, words
+
+
+@dataclass(slots=True)
+class _Found:
+    """The best bounds so far (natural logarithms), and log P as far as it is known."""
+
+    level: float
+    upper: float = 0.0
+    lower: float | None = None
+    done: list[str] = field(default_factory=list)
+
+
+def _raise_upper(
+    found: _Found, line: Line, model: Model, starts: list[tuple[float, float]], span: float, cells: int, tolerance: float
+) -> float:
+    """One attempt at the upper bound; what it gained."""
+    short, _ = sealed(line, found.level)
+    surface = propose_upper(short, found.level, span, share=_SHARES[0], cells=cells, tolerance=tolerance)
+    if surface is None:
+        return 0.0
+    found.done.append(f"{cells} x {surface.slabs}")
+    found.level = min(found.level, extreme_over(surface, starts, upper=True))
+    value = prove_upper(surface, model, starts).log
+    gain = found.upper - value
+    found.upper = min(found.upper, value)
+    return gain
+
+
+def _raise_lower(
+    found: _Found, line: Line, model: Model, starts: list[tuple[float, float]], span: float, cells: int, tolerance: float
+) -> float:
+    """One attempt at the lower bound; what it gained."""
+    _, far = sealed(line, found.level)
+    surface = propose_lower(line, found.level, span, far, share=_SHARES[1], cells=cells, tolerance=tolerance)
+    payment = None if surface is None else prove_lower(surface, model, starts)
+    if payment is None:
+        return 0.0
+    gain = math.inf if found.lower is None else payment.log - found.lower
+    found.lower = payment.log if found.lower is None else max(found.lower, payment.log)
+    return gain

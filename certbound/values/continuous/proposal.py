@@ -102,13 +102,15 @@ def _rates(line: Line, t: float, x: Array, u: Array, left: Array, right: Array) 
 
 
 def graded(line: Line, cells: int, layers: list[float]) -> Array:
-    """Nodes that crowd at both faces (cell sizes in proportion to the distance, down to ``layers``)."""
+    """Nodes that crowd at both faces: cells in proportion to the distance, down to ``layers``, measured by the noise."""
     fine = np.linspace(line.low, line.high, 8001)
-    density = np.full(len(fine), 0.8 / (line.high - line.low))
-    for distance, layer in ((fine - line.low, layers[0]), (line.high - fine, layers[1])):
+    scale = 1 / np.sqrt(np.maximum(line.square(0.5 * line.horizon, fine), 1e-300))
+    way = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(fine))])
+    density = np.full(len(fine), 0.8 / way[-1])
+    for distance, layer in ((way, layers[0] * scale[0]), (way[-1] - way, layers[1] * scale[-1])):
         weight = 1 / (distance + layer)
-        density += 0.5 * weight / np.trapezoid(weight, fine)
-    total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+        density += 0.5 * weight / np.trapezoid(weight, way)
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(way))])
     nodes = np.interp(np.linspace(0, total[-1], cells + 1), total, fine)
     nodes[0], nodes[-1] = line.low, line.high
     return _through(nodes, line.starts)
@@ -174,25 +176,26 @@ class _Banded:
 class Boundary:
     """Start profile at tau = 0, and V with its rate at both faces as functions of tau.
 
-    At a ``free`` face V' = 0 instead.
+    ``step`` is the first step of time. At a ``free`` face V' = 0 instead.
     """
 
     profile: Callable[[Array], Array]
     faces: Callable[[float], tuple[Array, Array]]
+    step: float
     free: tuple[bool, bool] = (False, False)
 
 
 def propose(
-    line: Line, nodes: Array, boundary: Boundary, *, tolerance: float, drift: Callable[[float, Array], Array] | None = None,
+    line: Line, nodes: Array, boundary: Boundary, *, tolerance: float,
     floor: float = -np.inf, most_steps: int = 1500,
 ) -> Surface | None:
     """V on the given nodes; None where the integration breaks down.
 
-    ``drift`` may hold more branches than the line's own (weakened layers). Errors count less where V is near ``floor``.
+    Errors count less where V is near ``floor``.
     """
-    system = _Collocation(line, nodes, boundary, drift or line.drift)
+    system = _Collocation(line, nodes, boundary)
     coefficients, tau = system.start(), 0.0
-    step, smallest = 1e-4 * line.horizon, 1e-9 * line.horizon
+    step, smallest = boundary.step, 1e-9 * line.horizon
     ends, values, first, last = [0.0], [coefficients], [], []
     rate = system.rate(tau, coefficients)
     for _ in range(most_steps):
@@ -217,15 +220,15 @@ def propose(
         values.append(coefficients)
         step *= min(2.0, 0.85 * max(size, 1e-9) ** (-1 / 3))
         if tau >= line.horizon:
-            return _surface(line, nodes, system.splines, ends, values, first, last, boundary)
+            return _surface(line, nodes, system.splines, ends, values, first, last)
     return None
 
 
 class _Collocation:
     """The semi-discrete equation: mass matrix times rate of the coefficients = right-hand side."""
 
-    def __init__(self, line: Line, nodes: Array, boundary: Boundary, drift: Callable[[float, Array], Array]) -> None:
-        self.line, self.boundary, self.drift = line, boundary, drift
+    def __init__(self, line: Line, nodes: Array, boundary: Boundary) -> None:
+        self.line, self.boundary = line, boundary
         self.splines = _Splines(nodes)
         self.weights = self.splines.at[0].copy()
         for row, free in zip((0, -1), boundary.free):
@@ -233,7 +236,10 @@ class _Collocation:
                 self.weights[row] = self.splines.at[1][row]
         self.mass = _Banded(self.weights)
         x = self.splines.points
-        self.fixed = (drift(0.0, x), line.square(0.0, x)) if line.autonomous else None
+        self.fixed = self._model(0.0, x) if line.autonomous else None
+
+    def _model(self, t: float, x: Array) -> tuple[Array, Array]:
+        return self.line.drift(t, x), self.line.square(t, x)
 
     def start(self) -> Array:
         values = self.boundary.profile(self.splines.points)
@@ -248,14 +254,13 @@ class _Collocation:
 
     def _right(self, tau: float, coefficients: Array) -> tuple[Array, Array, Array]:
         s = self.splines
-        f, a = self.fixed or (
-            self.drift(self.line.horizon - tau, s.points), self.line.square(self.line.horizon - tau, s.points)
-        )
+        f, a = self.fixed or self._model(self.line.horizon - tau, s.points)
         slope, bend = s.times(s.at[1], coefficients), s.times(s.at[2], coefficients)
         best = f[0] if len(f) == 1 else f[np.argmax(f * slope, axis=0), np.arange(len(slope))]
         value = best * slope + 0.5 * a * (bend + slope * slope)
+        speed = best + a * slope
         value[[0, -1]] = np.where(self.boundary.free, 0.0, self.boundary.faces(tau)[1])
-        return value, best + a * slope, a
+        return value, speed, a
 
     def step(self, tau: float, c: Array, h: float) -> tuple[Array, Array]:
         """One step of RODAS3: the new coefficients and the estimated error."""
@@ -272,28 +277,17 @@ class _Collocation:
         k3 = matrix.solve(value + s.times(self.weights, k1 - k2) / h)
         value = self._right(tau + h, c + 2 * k1 + k3)[0]
         k4 = matrix.solve(value + s.times(self.weights, k1 - k2 - 8 / 3 * k3) / h)
-        return c + 2 * k1 + k3 + k4, s.times(self.weights, k4)
+        return c + 2 * k1 + k3 + k4, s.times(s.at[0], k4)
 
 
 def _surface(
     line: Line, nodes: Array, splines: _Splines, ends: list[float], values: list[Array], first: list[Array],
-    last: list[Array], boundary: Boundary,
+    last: list[Array],
 ) -> Surface:
-    def data(rows: list[Array], part: int) -> Array:
+    def data(rows: list[Array]) -> Array:
         table = np.array(rows)
-        found = np.stack([table @ matrix.T for matrix in splines.at_nodes], axis=-1)
-        known = [boundary.faces(tau)[part] for tau in times]
-        for place, (edge, free) in enumerate(zip((0, -1), boundary.free)):
-            if not free:
-                found[:, edge, 0] = [pair[place] for pair in known]
-        return found[::-1]
+        return np.stack([table @ matrix.T for matrix in splines.at_nodes], axis=-1)[::-1]
 
-    times = np.array(ends)
-    found = data(values, 0)
-    times = np.array(ends)[1:]
-    at_start = -data(last, 1)
-    times = np.array(ends)[:-1]
-    at_end = -data(first, 1)
     forward = line.horizon - np.array(ends)[::-1]
     forward[0], forward[-1] = 0.0, line.horizon
-    return Surface(axes=(nodes,), times=forward, values=found, start_rates=at_start, end_rates=at_end)
+    return Surface(axes=(nodes,), times=forward, values=data(values), start_rates=-data(last), end_rates=-data(first))

@@ -23,7 +23,7 @@ from certbound.rigor.rounding import UNIT
 from certbound.values.continuous.coefficients import Interpolant
 from certbound.values.continuous.polynomials import basis_at, nodes_of, norm, to_bernstein
 
-__all__ = ["Patches", "Ranges", "bound_ranges"]
+__all__ = ["Patches", "Ranges", "bound_ranges", "coarse_size", "value_range"]
 
 Array = NDArray[np.float64]
 
@@ -50,6 +50,13 @@ class Patches:
     size: Array
     step: Array
     widths: tuple[Array, ...]
+
+    def take(self, place: NDArray[np.intp]) -> Patches:
+        """Some of the patches."""
+        return Patches(
+            coefficients=self.coefficients[place], reference=self.reference[place], size=self.size[place],
+            step=self.step[place], widths=tuple(width[place] for width in self.widths),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -113,6 +120,22 @@ def bound_ranges(
         slack = amplification * _ROUNDOFFS * error + _diffusive_loss(patches, squares, n)
         floor[place] = np.maximum(least - slack[place], 0.0)
     return Ranges(residual_low=low, residual_high=high, low=v_low, high=v_high, energy=floor)
+
+
+def coarse_size(patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant) -> Array:
+    """An upper bound of |R| over each patch from the sizes of its terms: good where V hardly moves."""
+    n = len(patches.widths)
+    steep = [_steepest(patches, i) for i in range(n)]
+    rate = _derived(patches.coefficients, 1, patches.step).reshape(len(patches.size), -1)
+    total = np.abs(rate).max(axis=1) + _ROUNDOFFS * 6 * patches.size / patches.step
+    for i in range(n):
+        force = np.max([drift.size[i] + drift.remainder[i] for drift in drifts], axis=0)
+        total = total + force * steep[i]
+        for j in range(n):
+            a = squares.size[i * n + j] + squares.remainder[i * n + j]
+            if a.any():
+                total = total + 0.5 * a * (_bent(patches, i, j) + steep[i] * steep[j])
+    return total * (1 + 1e-12)
 
 
 def value_range(patches: Patches) -> tuple[Array, Array]:
@@ -186,6 +209,13 @@ def _steepest(patches: Patches, axis: int) -> Array:
     return flat + _ROUNDOFFS * 10 * patches.size / patches.widths[axis]
 
 
+def _bent(patches: Patches, i: int, j: int) -> Array:
+    """A bound of |V_ij| over each patch."""
+    curved = _derived(_derived(patches.coefficients, 2 + i, patches.widths[i]), 2 + j, patches.widths[j])
+    size = np.abs(curved).reshape(len(curved), -1).max(axis=1)
+    return size + _ROUNDOFFS * 100 * patches.size / (patches.widths[i] * patches.widths[j])
+
+
 def _diffusive_loss(patches: Patches, squares: Interpolant, n: int) -> Array:
     """What the remainders of a cost: their sum with |V_ij| + |V_i||V_j|, halved."""
     if not squares.remainder.any():
@@ -194,8 +224,5 @@ def _diffusive_loss(patches: Patches, squares: Interpolant, n: int) -> Array:
     total = np.zeros(len(patches.size))
     for i in range(n):
         for j in range(n):
-            curved = _derived(_derived(patches.coefficients, 2 + i, patches.widths[i]), 2 + j, patches.widths[j])
-            bent = np.abs(curved).reshape(len(curved), -1).max(axis=1)
-            bent = bent + _ROUNDOFFS * 100 * patches.size / (patches.widths[i] * patches.widths[j])
-            total = total + 0.5 * squares.remainder[i * n + j] * (bent + steep[i] * steep[j])
+            total = total + 0.5 * squares.remainder[i * n + j] * (_bent(patches, i, j) + steep[i] * steep[j])
     return total
