@@ -83,14 +83,14 @@ def examine(surface: Surface, model: Model, need: Need) -> Proof:
     per = int(np.prod(surface.cells))
     for first, last in surface.chunks():
         patches = surface.patches(first, last)
-        place = np.arange(len(patches.size))
+        place = np.arange(len(patches.size)) % (per if fixed else len(patches.size))
         drifts, squares = fixed or _interpolants(surface, model, first, last, counts)
         low, high = value_range(patches)
-        size = coarse_size(patches, *_for(drifts, squares, place % per if fixed else place))
+        size = coarse_size(patches, drifts, squares, place)
         kept = np.flatnonzero((low < need.top) & ~(size <= need.free(high)))
-        cells = _for(drifts, squares, kept % per if fixed else kept)
         if len(kept):
-            found.append(bound_ranges(patches.take(kept), *cells, counts, wanted=need.spare))
+            part = patches.take(kept)
+            found.append(bound_ranges(part, drifts, squares, place[kept], counts, wanted=need.spare))
             slabs.append(first + kept // per)
     if not found:
         empty = np.empty(0)
@@ -99,12 +99,6 @@ def examine(surface: Surface, model: Model, need: Need) -> Proof:
         name: np.concatenate([getattr(one, name) for one in found]) for name in Ranges.__dataclass_fields__
     })  # fmt: skip
     return Proof(ranges=joined, slab=np.concatenate(slabs))
-
-
-def _for(
-    drifts: list[Interpolant], squares: Interpolant, place: NDArray[np.intp]
-) -> tuple[list[Interpolant], Interpolant]:
-    return [drift.take(place) for drift in drifts], squares.take(place)
 
 
 def _interpolants(

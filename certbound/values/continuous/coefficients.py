@@ -156,12 +156,6 @@ class Interpolant:
     size: Array
     remainder: Array
 
-    def take(self, place: NDArray[np.intp]) -> Interpolant:
-        """The same on some of the cells."""
-        return Interpolant(
-            samples=self.samples[:, place], size=self.size[:, place], remainder=self.remainder[:, place]
-        )
-
 
 class Reader:
     """One function of (t, x), with its derivatives, that is interpolated on any batch of cells.

@@ -210,7 +210,7 @@ def _one_state(
     outer = _line(problem, model, room.outer_low[0], room.outer_high[0])
     rough = sketch(inner)
     found = _Found(level=rough.level)
-    effort, tolerance, lead = 60.0, 3e-4, _LEAD
+    effort, tolerance, lead = 60.0, 1.5e-4, _LEAD
     for attempt in range(5):
         begin = time.perf_counter()
         cells = int(effort * (1 + 0.2 * min(-found.level, 80)))
@@ -257,7 +257,7 @@ def _raise_lower(
 ) -> float:
     """One attempt at the lower bound; what it gained."""
     _, far = sealed(line, found.level)
-    surface = propose_lower(line, found.level, span, far, share=_SHARES[1], cells=cells, tolerance=tolerance)
+    surface = propose_lower(line, found.level, span, far, share=_SHARES[1], cells=cells, tolerance=0.3 * tolerance)
     payment = None if surface is None else prove_lower(surface, model, starts)
     if payment is None:
         return 0.0

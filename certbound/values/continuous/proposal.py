@@ -22,7 +22,7 @@ from scipy.linalg.lapack import dgbtrf, dgbtrs
 
 from certbound.values.continuous.surface import Surface
 
-__all__ = ["Line", "Sketch", "propose", "sketch"]
+__all__ = ["Boundary", "Line", "Sketch", "Splines", "graded", "propose", "sketch"]
 
 Array = NDArray[np.float64]
 
@@ -127,7 +127,7 @@ def _through(nodes: Array, starts: tuple[float, float]) -> Array:
     return nodes
 
 
-class _Splines:
+class Splines:
     """Collocation matrices of quintic splines with given nodes, banded."""
 
     def __init__(self, nodes: Array) -> None:
@@ -136,7 +136,8 @@ class _Splines:
         self.points = np.array([knots[k + 1 : k + _DEGREE + 1].mean() for k in range(self.count)])
         self.points[0], self.points[-1] = nodes[0], nodes[-1]
         spline = BSpline(knots, np.eye(self.count), _DEGREE)
-        self.at = [self._banded(spline(self.points, order)) for order in range(3)]
+        self.dense = [spline(self.points, order) for order in range(3)]
+        self.at = [self._banded(matrix) for matrix in self.dense]
         self.at_nodes = [spline(nodes, order) for order in range(3)]
 
     @staticmethod
@@ -229,7 +230,7 @@ class _Collocation:
 
     def __init__(self, line: Line, nodes: Array, boundary: Boundary) -> None:
         self.line, self.boundary = line, boundary
-        self.splines = _Splines(nodes)
+        self.splines = Splines(nodes)
         self.weights = self.splines.at[0].copy()
         for row, free in zip((0, -1), boundary.free):
             if free:
@@ -281,7 +282,7 @@ class _Collocation:
 
 
 def _surface(
-    line: Line, nodes: Array, splines: _Splines, ends: list[float], values: list[Array], first: list[Array],
+    line: Line, nodes: Array, splines: Splines, ends: list[float], values: list[Array], first: list[Array],
     last: list[Array],
 ) -> Surface:
     def data(rows: list[Array]) -> Array:

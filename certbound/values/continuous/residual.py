@@ -76,7 +76,8 @@ def along(matrix: Array, array: Array, axis: int) -> Array:
 
 
 def bound_ranges(
-    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, counts: Sequence[int], *, wanted: float = 0.0
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp],
+    counts: Sequence[int], *, wanted: float = 0.0,
 ) -> Ranges:
     """Ranges of R (its maximum over the drifts), V and Q2; see the module.
 
@@ -86,10 +87,12 @@ def bound_ranges(
         One a branch of the disturbance, n outputs each, at the samples ``nodes_of(count)`` of every axis.
     squares : Interpolant
         a, n * n outputs, at the same samples.
+    place : ndarray of int, shape (B,)
+        Which cell of the interpolants a patch is.
     counts : sequence of int
         Samples in time and in each state; at least the degree of R plus 1.
     wanted : float
-        Where |R| <= ``wanted`` the bound of Q2 is 0, which saves its evaluation.
+        Where |R| <= ``wanted`` the bound of Q2 may be 0, which saves its evaluation.
 
     Notes
     -----
@@ -97,32 +100,79 @@ def bound_ranges(
     single branches, each of which is a lower bound of the supremum.
     """
     n = len(patches.widths)
-    slopes, rest, energy = _sampled(patches, squares, counts)
-    error, sizes = _errors(patches, squares, n)
+    extremes = _in_plane if n == 2 else _on_line
+    least, most, floor = extremes(patches, drifts, squares, place, counts, wanted)
+    error, sizes = _errors(patches, squares.size[:, place], n)
+    loss = _diffusive_loss(patches, squares.remainder[:, place], n)
     amplification = float(np.prod([norm(to_bernstein(count)) for count in counts]))
     high, low = np.full(len(error), -np.inf), np.full(len(error), -np.inf)
-    for drift in drifts:
-        total = rest.copy()
-        own = error.copy()
-        loss = np.zeros(len(error))
+    for branch, drift in enumerate(drifts):
+        own, slack = error, loss
         for i in range(n):
-            total += drift.samples[i] * slopes[i]
-            own = own + drift.size[i] * sizes[i]
-            loss = loss + drift.remainder[i] * _steepest(patches, i)
-        slack = amplification * _ROUNDOFFS * own + loss + _diffusive_loss(patches, squares, n)
-        least, most = _extremes(total, counts)
-        high, low = np.maximum(high, most + slack * (1 + 1e-9)), np.maximum(low, least - slack * (1 + 1e-9))
+            own = own + drift.size[i, place] * sizes[i]
+            slack = slack + drift.remainder[i, place] * _steepest(patches, i)
+        slack = (amplification * _ROUNDOFFS * own + slack) * (1 + 1e-9)
+        high, low = np.maximum(high, most[branch] + slack), np.maximum(low, least[branch] - slack)
+    floor = np.maximum(floor - (amplification * _ROUNDOFFS * error + loss) * (1 + 1e-9), 0.0)
     v_low, v_high = value_range(patches)
-    floor = np.zeros(len(error))
-    place = np.flatnonzero((low < -wanted) | (high > wanted))
-    if len(place):
-        least, _ = _extremes(energy[place], counts)
-        slack = amplification * _ROUNDOFFS * error + _diffusive_loss(patches, squares, n)
-        floor[place] = np.maximum(least - slack[place], 0.0)
     return Ranges(residual_low=low, residual_high=high, low=v_low, high=v_high, energy=floor)
 
 
-def coarse_size(patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant) -> Array:
+Extremes = tuple[Array, Array, Array]
+
+
+def _on_line(
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp],
+    counts: Sequence[int], wanted: float,
+) -> Extremes:
+    """Least and largest Bernstein coefficients of R, one row a branch, and the least of Q2: one state."""
+    first = _derived(patches.coefficients, 2, patches.widths[0])
+    slope = _at_samples(first, counts)
+    half = 0.5 * squares.samples[0, place]
+    energy = half * slope * slope
+    rest = _at_samples(_derived(patches.coefficients, 1, patches.step), counts) + energy
+    rest += half * _at_samples(_derived(first, 2, patches.widths[0]), counts)
+    found = [_extremes(rest + drift.samples[0, place] * slope, counts) for drift in drifts]
+    least, most = np.array([pair[0] for pair in found]), np.array([pair[1] for pair in found])
+    floor = np.zeros(len(rest))
+    looked = np.flatnonzero((least.min(axis=0) < -wanted) | (most.max(axis=0) > wanted))
+    if len(looked):
+        floor[looked] = _extremes(energy[looked], counts)[0]
+    return least, most, floor
+
+
+def _in_plane(
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp],
+    counts: Sequence[int], wanted: float,
+) -> Extremes:
+    """The same in two states, compiled."""
+    from certbound.values.continuous.kernel import extremes_in_plane
+
+    time, x, y = (
+        _derivatives(count, degree, orders) for count, degree, orders in zip(counts, (TIME, SPACE, SPACE), (2, 3, 3))
+    )
+    inverses = tuple(to_bernstein(count) for count in counts)
+    out = np.empty((len(patches.size), len(drifts), 3))
+    extremes_in_plane(
+        np.ascontiguousarray(patches.coefficients), patches.step, *patches.widths, place,
+        np.ascontiguousarray([drift.samples for drift in drifts]), np.ascontiguousarray(squares.samples),
+        (*time, *x, *y), inverses, wanted, out,
+    )  # fmt: skip
+    return out[:, :, 0].T, out[:, :, 1].T, out[:, :, 2].min(axis=1)
+
+
+def _derivatives(count: int, degree: int, orders: int) -> list[Array]:
+    """Values at the samples of a Bernstein basis and of its derivatives on the unit interval."""
+    found, change = [], np.eye(degree + 1)
+    for order in range(orders):
+        found.append(basis_at(nodes_of(count), degree - order) @ change)
+        change = (degree - order) * np.diff(change, axis=0)
+    return found
+
+
+def coarse_size(
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp]
+) -> Array:
     """An upper bound of |R| over each patch from the sizes of its terms: good where V hardly moves."""
     n = len(patches.widths)
     steep = [_steepest(patches, i) for i in range(n)]
@@ -130,11 +180,11 @@ def coarse_size(patches: Patches, drifts: Sequence[Interpolant], squares: Interp
     total = np.abs(rate).max(axis=1) + _ROUNDOFFS * 6 * patches.size / patches.step
     for i in range(n):
         force = np.max([drift.size[i] + drift.remainder[i] for drift in drifts], axis=0)
-        total = total + force * steep[i]
+        total = total + force[place] * steep[i]
         for j in range(n):
             a = squares.size[i * n + j] + squares.remainder[i * n + j]
             if a.any():
-                total = total + 0.5 * a * (_bent(patches, i, j) + steep[i] * steep[j])
+                total = total + 0.5 * a[place] * (_bent(patches, i, j) + steep[i] * steep[j])
     return total * (1 + 1e-12)
 
 
@@ -174,31 +224,14 @@ def _at_samples(coefficients: Array, counts: Sequence[int]) -> Array:
     return _changed(coefficients, matrices)
 
 
-def _sampled(patches: Patches, squares: Interpolant, counts: Sequence[int]) -> tuple[list[Array], Array, Array]:
-    """grad V, V_t + tr(a V'')/2 + Q2, and Q2 at the samples."""
-    c, n = patches.coefficients, len(patches.widths)
-    first = [_derived(c, 2 + i, patches.widths[i]) for i in range(n)]
-    slopes = [_at_samples(slope, counts) for slope in first]
-    rest = _at_samples(_derived(c, 1, patches.step), counts)
-    energy = np.zeros_like(rest)
-    for i in range(n):
-        for j in range(n):
-            if not squares.size[i * n + j].any():
-                continue
-            half = 0.5 * squares.samples[i * n + j]
-            energy += half * slopes[i] * slopes[j]
-            rest += half * _at_samples(_derived(first[i], 2 + j, patches.widths[j]), counts)
-    return slopes, rest + energy, energy
-
-
-def _errors(patches: Patches, squares: Interpolant, n: int) -> tuple[Array, list[Array]]:
+def _errors(patches: Patches, squares: Array, n: int) -> tuple[Array, list[Array]]:
     """The size in which rounding errors of everything but f.grad V are counted, and the sizes of grad V."""
     sizes = [10 * patches.size / width for width in patches.widths]
     total = 6 * patches.size / patches.step
     for i in range(n):
         for j in range(n):
             curved = 100 * patches.size / (patches.widths[i] * patches.widths[j]) + sizes[i] * sizes[j]
-            total = total + 0.5 * squares.size[i * n + j] * curved
+            total = total + 0.5 * squares[i * n + j] * curved
     return total, sizes
 
 
@@ -216,13 +249,13 @@ def _bent(patches: Patches, i: int, j: int) -> Array:
     return size + _ROUNDOFFS * 100 * patches.size / (patches.widths[i] * patches.widths[j])
 
 
-def _diffusive_loss(patches: Patches, squares: Interpolant, n: int) -> Array:
+def _diffusive_loss(patches: Patches, remainders: Array, n: int) -> Array:
     """What the remainders of a cost: their sum with |V_ij| + |V_i||V_j|, halved."""
-    if not squares.remainder.any():
+    if not remainders.any():
         return np.zeros(len(patches.size))
     steep = [_steepest(patches, i) for i in range(n)]
     total = np.zeros(len(patches.size))
     for i in range(n):
         for j in range(n):
-            total = total + 0.5 * squares.remainder[i * n + j] * (_bent(patches, i, j) + steep[i] * steep[j])
+            total = total + 0.5 * remainders[i * n + j] * (_bent(patches, i, j) + steep[i] * steep[j])
     return total

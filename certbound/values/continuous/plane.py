@@ -1,0 +1,297 @@
+"""Two states: proposals by quintic splines with steps split along the axes, and the search for the best bounds.
+
+The equation of V = log u is that of `proposal`, with mixed second derivatives where a has them. A step is ROS2 with an
+approximate factorisation, (I - g h J_x)(I - g h J_y), which keeps order 2 whatever the factorisation leaves out
+(Hundsdorfer and Verwer, Numerical Solution of Time-Dependent Advection-Diffusion-Reaction Equations, Sec. IV.5).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.evaluation import compile_numpy
+from certbound.problem.problem import Problem
+from certbound.values.continuous.bounds import Model, extreme_over, prove_lower, prove_upper
+from certbound.values.continuous.lines import solve_lines
+from certbound.values.continuous.proposal import Splines
+from certbound.values.continuous.room import Room
+from certbound.values.continuous.surface import Surface
+
+__all__ = ["two_states"]
+
+Array = NDArray[np.float64]
+Pair = tuple[float, float]
+
+_GAMMA = 1 - 0.5**0.5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Plane:
+    """The problem in floats: drift (branches, 2, ...) and a (2, 2, ...) at (t, x, y), on a box."""
+
+    low: Pair
+    high: Pair
+    horizon: float
+    drift: Callable[[float, Array, Array], Array]
+    square: Callable[[float, Array, Array], Array]
+    starts: list[Pair]
+    autonomous: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Plan:
+    """How a proposal is made: cells along each axis, slabs' growth, steps a slab, the lead and the floor of V."""
+
+    cells: int
+    growth: float
+    substeps: int
+    lead: float
+    floor: float
+    upper: bool
+
+
+def two_states(
+    problem: Problem, model: Model, room: Room, deadline: float, lower: bool
+) -> tuple[float, float | None, str]:
+    """Refine both sides until the time is spent; see `exits.bound_exits`."""
+    from certbound.values.continuous.exits import starts_of
+
+    starts = starts_of(problem)
+    inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
+    outer = _plane(problem, model, room.outer_low, room.outer_high, starts)
+    level = _rough_level(inner)
+    best = _Best()
+    cells, growth, lead = 40, 0.25, 0.01
+    for _ in range(4):
+        begin = time.perf_counter()
+        plan = Plan(cells=cells, growth=growth, substeps=8, lead=lead * inner.horizon, floor=level - 5, upper=True)
+        surface = propose_plane(inner, plan)
+        if surface is not None:
+            level = min(level, extreme_over(surface, starts, upper=True))
+            best.upper = min(best.upper, prove_upper(surface, model, starts).log)
+            best.done.append(f"{cells}^2 x {surface.slabs}")
+        if lower:
+            plan = Plan(cells=cells, growth=growth, substeps=8, lead=3 * plan.lead, floor=level - 1.5, upper=False)
+            surface = propose_plane(outer, plan)
+            payment = None if surface is None else prove_lower(surface, model, starts)
+            if payment is not None:
+                best.lower = payment.log if best.lower is None else max(best.lower, payment.log)
+        spent = time.perf_counter() - begin
+        if time.perf_counter() + 3.2 * spent > deadline:
+            break
+        cells, growth, lead = int(1.4 * cells), growth / 1.4, lead * 0.7
+    words = f"value function in two states, cells x slabs of time: {', '.join(best.done) or 'none came to an end'}"
+    return best.upper, best.lower, words
+
+
+@dataclass(slots=True)
+class _Best:
+    upper: float = 0.0
+    lower: float | None = None
+    done: list[str] = field(default_factory=list)
+
+
+def _rough_level(plane: Plane) -> float:
+    """log P from a coarse proposal; the floor is lowered until it does not matter."""
+    level = 0.0
+    for floor in (-8.0, -20.0, -45.0):
+        plan = Plan(cells=28, growth=0.4, substeps=6, lead=0.02 * plane.horizon, floor=floor, upper=True)
+        surface = propose_plane(plane, plan)
+        if surface is None:
+            continue
+        level = min(level, extreme_over(surface, plane.starts, upper=True)) if level else float(
+            extreme_over(surface, plane.starts, upper=True)
+        )
+        if level > floor + 2:
+            break
+    return level
+
+
+def _plane(problem: Problem, model: Model, low: tuple[float, ...], high: tuple[float, ...], starts: list[Pair]) -> Plane:
+    drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
+    corners = [[float(value.mid) for value in branch] for branch in model.branches]
+
+    def drifts(t: float, x: Array, y: Array) -> Array:
+        return np.array([np.moveaxis(drift(t, x, y, *corner), -1, 0) for corner in corners])
+
+    return Plane(
+        low=(low[0], low[1]), high=(high[0], high[1]), horizon=float(problem.horizon), drift=drifts,
+        square=lambda t, x, y: np.moveaxis(square(t, x, y), (-2, -1), (0, 1)), starts=starts,
+        autonomous=model.autonomous,
+    )  # fmt: skip
+
+
+def propose_plane(plane: Plane, plan: Plan) -> Surface | None:
+    """V on a tensor grid; None where the integration breaks down."""
+    solver = _Solver(plane, plan)
+    times = _slab_times(plane.horizon, plan)
+    value = solver.start()
+    values, first, last = [value], [], []
+    for begin, end in zip(times[:-1], times[1:]):
+        first.append(solver.rate(begin, value))
+        step = (end - begin) / plan.substeps
+        for part in range(plan.substeps):
+            value = solver.step(begin + part * step, value, step)
+        if not np.isfinite(value).all() or value.max() > 30:
+            return None
+        values.append(value)
+        last.append(solver.rate(end, value))
+    return solver.surface(times, values, first, last)
+
+
+def _slab_times(horizon: float, plan: Plan) -> Array:
+    times = [0.0]
+    while times[-1] < horizon:
+        times.append(times[-1] + min(plan.growth * (0.4 * plan.lead + times[-1]), horizon * plan.growth / 4))
+    return np.array(times) * (horizon / times[-1])
+
+
+class _Solver:
+    """V at Greville's points of both axes, shape (count_x, count_y)."""
+
+    def __init__(self, plane: Plane, plan: Plan) -> None:
+        self.plane, self.plan = plane, plan
+        self.nodes = [_grid(plane, plan, axis) for axis in (0, 1)]
+        self.splines = [Splines(nodes) for nodes in self.nodes]
+        self.inverse = [np.linalg.inv(one.dense[0]) for one in self.splines]
+        self.slope = [one.dense[1] @ inverse for one, inverse in zip(self.splines, self.inverse)]
+        self.bend = [one.dense[2] @ inverse for one, inverse in zip(self.splines, self.inverse)]
+        self.x, self.y = np.meshgrid(*(one.points for one in self.splines), indexing="ij")
+        self.edge = np.ones(self.x.shape, dtype=bool)
+        self.edge[1:-1, 1:-1] = False
+        self.fixed = self._model(0.0) if plane.autonomous else None
+
+    def _model(self, t: float) -> tuple[Array, Array, Array | None]:
+        drift, square = self.plane.drift(t, self.x, self.y), self.plane.square(t, self.x, self.y)
+        weak = _weakened(self.plane, self.plan, drift[0], square, self.x, self.y) if self.plan.upper else None
+        return drift, square, weak
+
+    def start(self) -> Array:
+        if not self.plan.upper:
+            return np.full(self.x.shape, self.plan.floor)
+        product = np.ones(self.x.shape)
+        for axis, place in enumerate((self.x, self.y)):
+            for side in (0, 1):
+                rate = _layer_rate(self.plane, self.plan, axis, side)
+                distance = place - self.plane.low[axis] if side == 0 else self.plane.high[axis] - place
+                product = product * (1 - (1 + 0.5 * rate * distance) * np.exp(-rate * distance))
+        least = math.exp(self.plan.floor)
+        value = np.log(least + (1 - least) * (1 - product))
+        value[self.edge] = 0.0
+        return value
+
+    def _face_rate(self, tau: float) -> float:
+        if self.plan.upper or tau >= self.plan.lead:
+            return 0.0
+        s = tau / self.plan.lead
+        return -self.plan.floor * 30 * (s * (1 - s)) ** 2 / self.plan.lead
+
+    def _right(self, tau: float, value: Array) -> tuple[Array, Array, Array, Array]:
+        drift, a, weak = self.fixed or self._model(self.plane.horizon - tau)
+        vx, vy = self.slope[0] @ value, value @ self.slope[1].T
+        along_drift = drift[:, 0] * vx + drift[:, 1] * vy
+        best = np.argmax(along_drift, axis=0) if len(drift) > 1 else np.zeros(value.shape, dtype=int)
+        force = np.take_along_axis(drift, best[None, None], axis=0)[0]
+        if weak is not None:
+            force = np.stack([np.where((w - f) * v > 0, w, f) for w, f, v in zip(weak, force, (vx, vy))])
+        bends = a[0, 0] * (self.bend[0] @ value) + a[1, 1] * (value @ self.bend[1].T)
+        if np.any(a[0, 1]):
+            bends = bends + 2 * a[0, 1] * (vx @ self.slope[1].T)
+        energy = a[0, 0] * vx * vx + 2 * a[0, 1] * vx * vy + a[1, 1] * vy * vy
+        rate = force[0] * vx + force[1] * vy + 0.5 * (bends + energy)
+        rate[self.edge] = self._face_rate(tau)
+        speed_x = force[0] + a[0, 0] * vx + a[0, 1] * vy
+        speed_y = force[1] + a[1, 1] * vy + a[0, 1] * vx
+        return rate, speed_x, speed_y, a
+
+    def rate(self, tau: float, value: Array) -> Array:
+        return self._right(tau, value)[0]
+
+    def _divided(self, right: Array, speeds: tuple[Array, Array], a: Array, step: float) -> Array:
+        """(I - g h J_x)^-1 (I - g h J_y)^-1 applied."""
+        for axis in (1, 0):
+            own = self.splines[axis]
+            line = np.ascontiguousarray(right if axis == 0 else right.T)
+            speed = np.ascontiguousarray(speeds[axis] if axis == 0 else speeds[axis].T)
+            half = np.ascontiguousarray(0.5 * (a[0, 0] if axis == 0 else a[1, 1].T) * np.ones(line.shape))
+            solve_lines(own.at[0], own.at[1], own.at[2], speed, half, _GAMMA * step, line)
+            line = own.dense[0] @ line
+            right = line if axis == 0 else line.T
+        return right
+
+    def step(self, tau: float, value: Array, h: float) -> Array:
+        rate, speed_x, speed_y, a = self._right(tau, value)
+        k1 = self._divided(rate, (speed_x, speed_y), a, h)
+        again = self._right(tau + h, value + h * k1)[0]
+        k2 = self._divided(again - 2 * k1, (speed_x, speed_y), a, h)
+        return value + 1.5 * h * k1 + 0.5 * h * k2
+
+    def surface(self, times: Array, values: list[Array], first: list[Array], last: list[Array]) -> Surface:
+        maps = [np.stack([m @ inverse for m in one.at_nodes], axis=1)
+                for one, inverse in zip(self.splines, self.inverse)]  # fmt: skip
+
+        def data(tables: list[Array]) -> Array:
+            part = np.einsum("iap,kpq->kiaq", maps[0], np.array(tables), optimize=True)
+            found = np.einsum("jbq,kiaq->kiajb", maps[1], part, optimize=True)[::-1]
+            if self.plan.upper:  # V = 0 on the faces, exactly
+                found[:, [0, -1], 0] = 0.0
+                found[:, :, :, [0, -1], 0] = 0.0
+            return found
+
+        forward = self.plane.horizon - times[::-1]
+        forward[0], forward[-1] = 0.0, self.plane.horizon
+        return Surface(
+            axes=tuple(self.nodes), times=forward, values=data(values), start_rates=-data(last),
+            end_rates=-data(first),
+        )  # fmt: skip
+
+
+def _grid(plane: Plane, plan: Plan, axis: int) -> Array:
+    low, high = plane.low[axis], plane.high[axis]
+    fine = np.linspace(low, high, 4001)
+    density = np.full(len(fine), 1.6 / (high - low))
+    for side, distance in ((0, fine - low), (1, high - fine)):
+        weight = 1 / (distance + 1 / _layer_rate(plane, plan, axis, side))
+        density += 0.5 * weight / np.trapezoid(weight, fine)
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+    nodes = np.interp(np.linspace(0, total[-1], plan.cells + 1), total, fine)
+    nodes[0], nodes[-1] = low, high
+    for point in plane.starts[axis]:
+        place = 1 + int(np.argmin(np.abs(nodes[1:-1] - point)))
+        moved = nodes.copy()
+        moved[place] = point
+        gaps = np.diff(moved)
+        if np.all(gaps > 0.3 * np.median(gaps[max(0, place - 2) : place + 2])):
+            nodes = moved
+    return nodes
+
+
+def _layer_rate(plane: Plane, plan: Plan, axis: int, side: int) -> float:
+    """The rate of the start profile at a face: the largest that a layer of age ``lead`` has along it."""
+    ends = [np.linspace(plane.low[k], plane.high[k], 33) for k in (0, 1)]
+    ends[axis] = np.array([plane.low[axis] if side == 0 else plane.high[axis]])
+    x, y = np.meshgrid(*ends, indexing="ij")
+    a = plane.square(plane.horizon, x, y)[axis, axis] * np.ones(x.shape)
+    return float(np.max(1.3 * np.sqrt(2 / (np.maximum(a, 1e-300) * plan.lead))))
+
+
+def _weakened(plane: Plane, plan: Plan, drift: Array, a: Array, x: Array, y: Array) -> Array:
+    """The drift with its inward part cut off near the faces, so that layers which no path crosses fit the grid."""
+    result = []
+    for axis, place in enumerate((x, y)):
+        width = plane.high[axis] - plane.low[axis]
+        zone = 0.12 * width
+        most = 0.5 * a[axis, axis] * (6 - plan.floor) / zone
+        weak = drift[axis] * np.ones(x.shape)
+        for distance, sign in ((place - plane.low[axis], 1.0), (plane.high[axis] - place, -1.0)):
+            share = np.clip(2 - distance / zone, 0.0, 1.0)
+            cut = sign * np.minimum(sign * weak, most)
+            weak = np.where(distance < 2 * zone, share * cut + (1 - share) * weak, weak)
+        result.append(weak)
+    return np.stack(result)
