@@ -15,13 +15,13 @@ from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.derivative import jacobian
 from certbound.problem.evaluation import compile_numpy
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart
+from certbound.problem.sets import Box, GaussianStart
 from certbound.problem.tape import Node, Tape
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.bounds import Model, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.coefficients import Reader, enclose, squared_diffusion
 from certbound.values.continuous.proposal import Line, sketch
-from certbound.values.continuous.room import Room, safe_room
+from certbound.values.continuous.room import Room, safe_room, starts_of
 from certbound.values.continuous.shapes import propose_lower, propose_upper, sealed
 
 __all__ = ["ExitBounds", "bound_exits"]
@@ -68,7 +68,7 @@ def bound_exits(
     seconds : float
         When to stop refining; the first attempt is finished in any case.
     lower : bool
-        Whether to look for a lower bound too.
+        Whether to look for a lower bound too (one state; there is none in two).
 
     Returns
     -------
@@ -100,7 +100,7 @@ def bound_exits(
     else:
         from certbound.values.continuous.plane import two_states
 
-        upper, least, words = two_states(problem, model, room, begin + seconds, lower)
+        upper, least, words = two_states(problem, model, room, begin + seconds)
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin,
@@ -170,21 +170,6 @@ def _check_noise(model: Model, room: Room, problem: Problem) -> None:
             "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
             "direction has none somewhere (noise in the velocities only, say): another engine's answer stands."
         )
-
-
-def starts_of(problem: Problem) -> list[tuple[float, float]]:
-    """The bounding box of the starts, rounded outward."""
-    start = problem.initial
-    if isinstance(start, Box):
-        return [(float(a), float(b)) for a, b in zip(start.low, start.high)]
-    if isinstance(start, Ball):
-        reach = np.full(start.dimension, start.radius)
-    elif isinstance(start, Ellipsoid):
-        reach = np.sqrt(np.diagonal(start.shape))
-    else:
-        raise InfeasibleError(f"value functions do not serve starts of the kind {type(start).__name__}.")
-    slack = 1e-15 * (np.abs(start.center) + reach)
-    return [(float(a), float(b)) for a, b in zip(start.center - reach - slack, start.center + reach + slack)]
 
 
 def _line(problem: Problem, model: Model, low: float, high: float) -> Line:

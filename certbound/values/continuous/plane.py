@@ -10,17 +10,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.evaluation import compile_numpy
 from certbound.problem.problem import Problem
-from certbound.values.continuous.bounds import Model, extreme_over, prove_lower, prove_upper
+from certbound.values.continuous.bounds import Model, extreme_over, prove_upper
 from certbound.values.continuous.lines import solve_lines
 from certbound.values.continuous.proposal import Splines
-from certbound.values.continuous.room import Room
+from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
 
 __all__ = ["two_states"]
@@ -53,55 +53,35 @@ class Plan:
     substeps: int
     lead: float
     floor: float
-    upper: bool
 
 
-def two_states(
-    problem: Problem, model: Model, room: Room, deadline: float, lower: bool
-) -> tuple[float, float | None, str]:
-    """Refine both sides until the time is spent; see `exits.bound_exits`."""
-    from certbound.values.continuous.exits import starts_of
-
+def two_states(problem: Problem, model: Model, room: Room, deadline: float) -> tuple[float, None, str]:
+    """Refine the upper bound until the time is spent; lower bounds in two states are not looked for."""
     starts = starts_of(problem)
-    inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
-    outer = _plane(problem, model, room.outer_low, room.outer_high, starts)
-    level = _rough_level(inner)
-    best = _Best()
-    cells, growth, lead = 40, 0.25, 0.01
-    for _ in range(4):
+    plane = _plane(problem, model, room.inner_low, room.inner_high, starts)
+    level, upper, done = _rough_level(plane), 0.0, []
+    cells, growth, lead = 32, 0.18, 0.01
+    for _ in range(5):
         begin = time.perf_counter()
-        plan = Plan(cells=cells, growth=growth, substeps=8, lead=lead * inner.horizon, floor=level - 5, upper=True)
-        surface = propose_plane(inner, plan)
+        plan = Plan(cells=cells, growth=growth, substeps=8, lead=lead * plane.horizon, floor=level - 5)
+        surface = propose_plane(plane, plan)
         if surface is not None:
             level = min(level, extreme_over(surface, starts, upper=True))
-            best.upper = min(best.upper, prove_upper(surface, model, starts).log)
-            best.done.append(f"{cells}^2 x {surface.slabs}")
-        if lower:
-            plan = Plan(cells=cells, growth=growth, substeps=8, lead=3 * plan.lead, floor=level - 1.5, upper=False)
-            surface = propose_plane(outer, plan)
-            payment = None if surface is None else prove_lower(surface, model, starts)
-            if payment is not None:
-                best.lower = payment.log if best.lower is None else max(best.lower, payment.log)
+            upper = min(upper, prove_upper(surface, model, starts).log)
+            done.append(f"{cells}^2 x {surface.slabs}")
         spent = time.perf_counter() - begin
-        if time.perf_counter() + 3.2 * spent > deadline:
+        if time.perf_counter() + 2.5 * spent > deadline:
             break
-        cells, growth, lead = int(1.4 * cells), growth / 1.4, lead * 0.7
-    words = f"value function in two states, cells x slabs of time: {', '.join(best.done) or 'none came to an end'}"
-    return best.upper, best.lower, words
-
-
-@dataclass(slots=True)
-class _Best:
-    upper: float = 0.0
-    lower: float | None = None
-    done: list[str] = field(default_factory=list)
+        cells, growth, lead = int(1.25 * cells), growth / 1.4, lead * 0.8
+    words = f"value function in two states, cells x slabs of time: {', '.join(done) or 'none came to an end'}"
+    return upper, None, words
 
 
 def _rough_level(plane: Plane) -> float:
     """log P from a coarse proposal; the floor is lowered until it does not matter."""
     level = 0.0
     for floor in (-8.0, -20.0, -45.0):
-        plan = Plan(cells=28, growth=0.4, substeps=6, lead=0.02 * plane.horizon, floor=floor, upper=True)
+        plan = Plan(cells=28, growth=0.4, substeps=6, lead=0.02 * plane.horizon, floor=floor)
         surface = propose_plane(plane, plan)
         if surface is None:
             continue
@@ -167,30 +147,31 @@ class _Solver:
         self.edge[1:-1, 1:-1] = False
         self.fixed = self._model(0.0) if plane.autonomous else None
 
-    def _model(self, t: float) -> tuple[Array, Array, Array | None]:
+    def _model(self, t: float) -> tuple[Array, Array, Array]:
         drift, square = self.plane.drift(t, self.x, self.y), self.plane.square(t, self.x, self.y)
-        weak = _weakened(self.plane, self.plan, drift[0], square, self.x, self.y) if self.plan.upper else None
-        return drift, square, weak
+        return drift, square, _weakened(self.plane, self.plan, drift[0], square, self.x, self.y)
 
     def start(self) -> Array:
-        if not self.plan.upper:
-            return np.full(self.x.shape, self.plan.floor)
         product = np.ones(self.x.shape)
         for axis, place in enumerate((self.x, self.y)):
             for side in (0, 1):
-                rate = _layer_rate(self.plane, self.plan, axis, side)
+                rate, bend = self._layer(axis, side)
                 distance = place - self.plane.low[axis] if side == 0 else self.plane.high[axis] - place
-                product = product * (1 - (1 + 0.5 * rate * distance) * np.exp(-rate * distance))
+                product = product * (1 - (1 + bend * rate * distance) * np.exp(-rate * distance))
         least = math.exp(self.plan.floor)
         value = np.log(least + (1 - least) * (1 - product))
         value[self.edge] = 0.0
         return value
 
-    def _face_rate(self, tau: float) -> float:
-        if self.plan.upper or tau >= self.plan.lead:
-            return 0.0
-        s = tau / self.plan.lead
-        return -self.plan.floor * 30 * (s * (1 - s)) ** 2 / self.plan.lead
+    def _layer(self, axis: int, side: int) -> tuple[float, Array]:
+        """Rate k and bend c of the layer (1 + c k d) exp(-k d), for which a u'' / 2 + f u' = 0 on the face."""
+        rate = _layer_rate(self.plane, self.plan, axis, side)
+        place = [self.x, self.y]
+        place[axis] = np.full(self.x.shape, self.plane.low[axis] if side == 0 else self.plane.high[axis])
+        a = self.plane.square(self.plane.horizon, *place)[axis, axis]
+        inward = self.plane.drift(self.plane.horizon, *place)[0, axis] * (1 if side == 0 else -1)
+        inward = np.minimum(inward, 0.4 * rate * a)
+        return rate, np.clip((0.5 * rate * a - inward) / (rate * a - inward), 0.0, 0.9)
 
     def _right(self, tau: float, value: Array) -> tuple[Array, Array, Array, Array]:
         drift, a, weak = self.fixed or self._model(self.plane.horizon - tau)
@@ -198,14 +179,13 @@ class _Solver:
         along_drift = drift[:, 0] * vx + drift[:, 1] * vy
         best = np.argmax(along_drift, axis=0) if len(drift) > 1 else np.zeros(value.shape, dtype=int)
         force = np.take_along_axis(drift, best[None, None], axis=0)[0]
-        if weak is not None:
-            force = np.stack([np.where((w - f) * v > 0, w, f) for w, f, v in zip(weak, force, (vx, vy))])
+        force = np.stack([np.where((w - f) * v > 0, w, f) for w, f, v in zip(weak, force, (vx, vy))])
         bends = a[0, 0] * (self.bend[0] @ value) + a[1, 1] * (value @ self.bend[1].T)
         if np.any(a[0, 1]):
             bends = bends + 2 * a[0, 1] * (vx @ self.slope[1].T)
         energy = a[0, 0] * vx * vx + 2 * a[0, 1] * vx * vy + a[1, 1] * vy * vy
         rate = force[0] * vx + force[1] * vy + 0.5 * (bends + energy)
-        rate[self.edge] = self._face_rate(tau)
+        rate[self.edge] = 0.0
         speed_x = force[0] + a[0, 0] * vx + a[0, 1] * vy
         speed_y = force[1] + a[1, 1] * vy + a[0, 1] * vx
         return rate, speed_x, speed_y, a
@@ -239,9 +219,8 @@ class _Solver:
         def data(tables: list[Array]) -> Array:
             part = np.einsum("iap,kpq->kiaq", maps[0], np.array(tables), optimize=True)
             found = np.einsum("jbq,kiaq->kiajb", maps[1], part, optimize=True)[::-1]
-            if self.plan.upper:  # V = 0 on the faces, exactly
-                found[:, [0, -1], 0] = 0.0
-                found[:, :, :, [0, -1], 0] = 0.0
+            found[:, [0, -1], 0] = 0.0  # V = 0 on the faces, exactly
+            found[:, :, :, [0, -1], 0] = 0.0
             return found
 
         forward = self.plane.horizon - times[::-1]

@@ -151,12 +151,12 @@ def _in_plane(
     time, x, y = (
         _derivatives(count, degree, orders) for count, degree, orders in zip(counts, (TIME, SPACE, SPACE), (2, 3, 3))
     )
-    inverses = tuple(to_bernstein(count) for count in counts)
+    inverses = [np.array(to_bernstein(count)) for count in counts]
     out = np.empty((len(patches.size), len(drifts), 3))
     extremes_in_plane(
         np.ascontiguousarray(patches.coefficients), patches.step, *patches.widths, place,
         np.ascontiguousarray([drift.samples for drift in drifts]), np.ascontiguousarray(squares.samples),
-        (*time, *x, *y), inverses, wanted, out,
+        (*time, *x, *y), tuple(inverses), wanted, out,
     )  # fmt: skip
     return out[:, :, 0].T, out[:, :, 1].T, out[:, :, 2].min(axis=1)
 

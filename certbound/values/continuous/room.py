@@ -10,7 +10,7 @@ from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
 
-__all__ = ["Room", "safe_room"]
+__all__ = ["Room", "safe_room", "starts_of"]
 
 Ends = tuple[float, float]
 
@@ -118,3 +118,18 @@ def _rounded(place: float, side: int, size: float) -> Ends:
     """A computed face, moved inward and outward by more than its rounding error."""
     slack = 4e-16 * size
     return (place + slack, place - slack) if side == 0 else (place - slack, place + slack)
+
+
+def starts_of(problem: Problem) -> list[tuple[float, float]]:
+    """The bounding box of the starts, rounded outward."""
+    start = problem.initial
+    if isinstance(start, Box):
+        return [(float(a), float(b)) for a, b in zip(start.low, start.high)]
+    if isinstance(start, Ball):
+        reach = np.full(start.dimension, start.radius)
+    elif isinstance(start, Ellipsoid):
+        reach = np.sqrt(np.diagonal(start.shape))
+    else:
+        raise InfeasibleError(f"value functions do not serve starts of the kind {type(start).__name__}.")
+    slack = 1e-15 * (np.abs(start.center) + reach)
+    return [(float(a), float(b)) for a, b in zip(start.center - reach - slack, start.center + reach + slack)]
