@@ -18,6 +18,7 @@ ORDER = [
     {"problem"},
     {"tubes"},
     {"simulation"},
+    {"values"},
     {"constants"},
     {"reach"},
     {"safety"},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -41,7 +42,7 @@ def exit_probability(f, g, low, high, horizon, start, *, target_times=None, cell
         u = np.where((x == low) | (x == high), 1.0, 0.0)
         tau = horizon * np.concatenate([[0.0], np.geomspace(1e-5, 1.0, count)])
         gamma = 1 - 0.5**0.5
-        for begin, end in zip(tau[:-1], tau[1:]):
+        for begin, end in itertools.pairwise(tau):
             t, step = horizon - 0.5 * (begin + end), end - begin
             a, drift = g(t, x) ** 2, f(t, x)
             drift = np.where(np.gradient(u, x) > 0, drift.max(axis=0), drift.min(axis=0)) if drift.ndim == 2 else drift
@@ -140,7 +141,7 @@ def hermite_values(surface, slab, cell, time_share, shares):
     step = surface.times[slab + 1] - surface.times[slab]
     widths = [axis[k + 1] - axis[k] for axis, k in zip(surface.axes, cell)]
     parts = [surface.values[slab], surface.start_rates[slab], surface.values[slab + 1], surface.end_rates[slab]]
-    matrix = np.array([[s**k for k in range(4)] for s in (0.0, 1.0)] + [[k * s ** (k - 1) if k else 0.0 for k in range(4)] for s in (0.0, 1.0)])
+    matrix = np.array([[1, 0, 0, 0], [1, 1, 1, 1], [0, 1, 0, 0], [0, 1, 2, 3]])
     time_basis = np.linalg.inv(matrix)  # columns: v0, v1, h r0, h r1
     rows = [[math.perm(k, d) * s ** (k - d) if k >= d else 0.0 for k in range(6)] for s in (0.0, 1.0) for d in range(3)]
     space = np.linalg.inv(np.array(rows))
@@ -171,7 +172,10 @@ def test_ranges_of_the_residual_contain_samples_of_a_random_surface(n: int) -> N
     axes = (np.array([-1.0, -0.4, 0.1]), np.array([0.0, 0.5, 0.8]))[:n]
     surface = random_surface(rng, axes, 2)
     f = [lambda t, x: [np.sin(x[0]) + t], lambda t, x: [-x[1] + t, np.sin(x[0]) * x[1]]][n - 1]
-    g = [lambda t, x: np.array([[0.5 + 0.1 * x[0]]]), lambda t, x: np.array([[0.5, 0.2 * x[1]], [0.1, 0.4 + 0.1 * t]])][n - 1]
+    g = [
+        lambda t, x: np.array([[0.5 + 0.1 * x[0]]]),
+        lambda t, x: np.array([[0.5, 0.2 * x[1]], [0.1, 0.4 + 0.1 * t]]),
+    ][n - 1]
     names = ["x1", "x2"][:n]
     model = read(f, trace(g, {"t": ["t"], "x": names}), names)
     from certbound.values.continuous.bounds import _interpolants
@@ -297,11 +301,15 @@ def test_the_worst_disturbance_counts_in_both_bounds() -> None:
 
 def spoilt(surface: Surface, rng: np.random.Generator, size: float) -> Surface:
     """The surface with noise on all its data."""
-    noisy = {
-        name: getattr(surface, name) + size * np.abs(getattr(surface, name)).mean() * rng.normal(size=getattr(surface, name).shape)
-        for name in ("values", "start_rates", "end_rates")
-    }  # fmt: skip
+    noisy = {}
+    for name in ("values", "start_rates", "end_rates"):
+        data = getattr(surface, name)
+        noisy[name] = data + size * np.abs(data).mean() * rng.normal(size=data.shape)
     return dataclasses.replace(surface, **noisy)
+
+
+def well_truth(horizon: float, start: float) -> float:
+    return exit_probability(lambda t, x: x - x**3, lambda t, x: 0.35 + 0 * x, 0, 2.5, horizon, start, cells=1600)
 
 
 def proposals():
@@ -317,9 +325,7 @@ def proposals():
 
 def test_noise_on_a_proposal_never_passes_the_truth() -> None:
     model, starts, upper, lower = proposals()
-    truth = math.log(max(
-        exit_probability(lambda t, x: x - x**3, lambda t, x: 0.35 + 0 * x, 0, 2.5, 10, x, cells=1600) for x in (0.9, 1.1)
-    ))  # fmt: skip
+    truth = math.log(max(well_truth(10.0, x) for x in WELL[5]))
     rng = np.random.default_rng(0)
     seen = [prove_upper(upper, model, starts).log]
     for size in (0.0, 1e-6, 1e-4, 1e-2, 0.3):
@@ -334,9 +340,7 @@ def test_noise_on_a_proposal_never_passes_the_truth() -> None:
 
 def test_scaled_and_bent_proposals_never_pass_the_truth() -> None:
     model, starts, upper, lower = proposals()
-    truth = math.log(max(
-        exit_probability(lambda t, x: x - x**3, lambda t, x: 0.35 + 0 * x, 0, 2.5, 10, x, cells=1600) for x in (0.9, 1.1)
-    ))  # fmt: skip
+    truth = math.log(max(well_truth(10.0, x) for x in WELL[5]))
     for factor in (0.5, 0.9, 0.99, 1.01, 1.1, 1.5):
         def scaled(surface: Surface, factor: float = factor) -> Surface:
             return dataclasses.replace(
@@ -348,9 +352,7 @@ def test_scaled_and_bent_proposals_never_pass_the_truth() -> None:
         payment = prove_lower(scaled(lower), model, starts)
         assert payment is None or payment.log <= truth + 1e-3
         slower = dataclasses.replace(upper, times=upper.times * factor)
-        late = exit_probability(
-            lambda t, x: x - x**3, lambda t, x: 0.35 + 0 * x, 0, 2.5, 10 * factor, 0.9, cells=1600
-        )  # fmt: skip
+        late = well_truth(10.0 * factor, 0.9)
         assert prove_upper(slower, model, starts).log >= math.log(late) - 1e-3
 
 

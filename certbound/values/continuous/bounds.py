@@ -1,17 +1,27 @@
-"""Bounds of the probability that a path leaves its safe set, from both sides: one state (see the package)."""
+"""The proof: bounds of the probability that a path leaves the box of a surface, from both sides.
+
+Nothing here trusts the surface. What Theorem K8-CT asks for, and where it is shown:
+
+- V twice continuously differentiable in x, C^1 in t on slabs, continuous in t: by construction (`surface`);
+- V >= 0 on every face (upper), V <= 0 everywhere (lower): `prove_upper`, `prove_lower` shift V by what it misses;
+- R <= lam + eps e^-V + m(V) Q2 where V < 0 (upper), R >= -lam - eps e^-V - m(V) Q2 everywhere (lower): `examine`
+  bounds R, V, Q2 on every patch (or finds that a negligible lam and eps pay), `payment` pays for the worst;
+- the supremum over d: the branches of the model cover D (upper), the best single branch of a patch (lower);
+- q and theta: `payment.repay`, `payment.Levels.above`;
+- V(0, .) over the starts, V(T, .) over the box: `extreme_over`, `Surface.range_at`;
+- the box lies in the safe set (upper) or contains it (lower), and the slabs fill [0, T]: `covers`.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.evaluation import compile_numpy
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Cells, Interpolant, Reader
 from certbound.values.continuous.payment import Patched, Payment, pay_lower, pay_upper
@@ -19,7 +29,7 @@ from certbound.values.continuous.polynomials import nodes_of
 from certbound.values.continuous.residual import Ranges, bound_ranges, coarse_size, value_range
 from certbound.values.continuous.surface import Surface
 
-__all__ = ["Model", "Proof", "prove_lower", "prove_upper"]
+__all__ = ["Model", "Need", "Proof", "covers", "examine", "extreme_over", "prove_lower", "prove_upper"]
 
 Array = NDArray[np.float64]
 
@@ -94,7 +104,8 @@ def examine(surface: Surface, model: Model, need: Need) -> Proof:
             slabs.append(first + kept // per)
     if not found:
         empty = np.empty(0)
-        return Proof(ranges=Ranges(residual_low=empty, residual_high=empty, low=empty, high=empty, energy=empty), slab=np.empty(0, dtype=np.intp))
+        none = Ranges(residual_low=empty, residual_high=empty, low=empty, high=empty, energy=empty)
+        return Proof(ranges=none, slab=np.empty(0, dtype=np.intp))
     joined = Ranges(**{
         name: np.concatenate([getattr(one, name) for one in found]) for name in Ranges.__dataclass_fields__
     })  # fmt: skip
@@ -120,8 +131,18 @@ def _cells(surface: Surface, first: int, last: int) -> Cells:
     return Cells(low=tuple(array.ravel() for array in low), high=tuple(array.ravel() for array in high))
 
 
+def covers(surface: Surface, horizon: float, low: Sequence[float], high: Sequence[float], *, within: bool) -> bool:
+    """Whether a surface spans [0, horizon] and its box lies within another one (or contains it)."""
+    if surface.times[0] != 0 or surface.times[-1] != horizon:
+        return False
+    own = [(float(axis[0]), float(axis[-1])) for axis in surface.axes]
+    if within:
+        return all(a <= left and right <= b for (left, right), a, b in zip(own, low, high))
+    return all(left <= a and b <= right for (left, right), a, b in zip(own, low, high))
+
+
 def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment:
-    """An upper bound of log P(leaving the box of the surface by T), whatever the surface is."""
+    """An upper bound of log P(leaving the box of the surface by its last time), whatever the surface is."""
     lift = max(0.0, -min(surface.face_range(axis, side)[0] for axis in range(len(surface.axes)) for side in (0, 1)))
     surface = surface.raised(_up(lift)) if lift else surface
     if any(surface.face_range(axis, side)[0] < 0 for axis in range(len(surface.axes)) for side in (0, 1)):
@@ -134,7 +155,9 @@ def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, fl
 
 
 def prove_lower(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment | None:
-    """A lower bound of log P(leaving the box of the surface by T) from the best start, whatever the surface is."""
+    """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is."""
+    if extreme_over(surface, starts, upper=False) == -math.inf:
+        return None
     highest = max(float(value_range(surface.patches(*chunk))[1].max()) for chunk in surface.chunks())
     if highest > 0:
         surface = surface.raised(-highest - 1e-12 * (1 + highest))
@@ -165,8 +188,10 @@ def extreme_over(surface: Surface, starts: Sequence[tuple[float, float]], *, upp
     """The supremum of V(0, .) over the starts (upper), or V at the best of the nodes among them, rounded safely.
 
     Starts that are no union of cells are covered by the cells that they touch. Where a start is a node of the grid in
-    every state, V there is one of the data.
+    every state, V there is one of the data. Starts that stick out of the grid give infinity.
     """
+    if any(low < axis[0] or high > axis[-1] for axis, (low, high) in zip(surface.axes, starts)):
+        return math.inf if upper else -math.inf
     exact = [
         np.flatnonzero((axis >= low) & (axis <= high)) for axis, (low, high) in zip(surface.axes, starts)
     ]

@@ -67,7 +67,7 @@ def enclose(tape: Tape, inputs: Sequence[Interval]) -> tuple[list[Interval], Mas
 
 
 def _undefined(node: Node, args: Sequence[Interval]) -> Mask:
-    return UNDEFINED["pow"](args[0], node.value) if node.op == "pow" else UNDEFINED[node.op](*args)
+    return np.asarray(UNDEFINED["pow"](args[0], node.value) if node.op == "pow" else UNDEFINED[node.op](*args))
 
 
 def _applied(node: Node, args: Sequence[Interval]) -> Interval:
@@ -82,12 +82,12 @@ def _applied(node: Node, args: Sequence[Interval]) -> Interval:
 
 def _undecided(op: str, args: Sequence[Interval], value: Interval) -> Mask:
     if op in ("abs", "kink"):
-        return (args[0].lo <= 0) & (args[0].hi >= 0)
+        return np.asarray((args[0].lo <= 0) & (args[0].hi >= 0))
     if op in ("min", "max"):
-        return (args[0].lo <= args[1].hi) & (args[1].lo <= args[0].hi)
+        return np.asarray((args[0].lo <= args[1].hi) & (args[1].lo <= args[0].hi))
     if op == "if_else_zero":
-        return (args[0].lo <= 0) & (args[0].hi >= 0) & ~((args[0].lo == 0) & (args[0].hi == 0))
-    return value.lo != value.hi
+        return np.asarray((args[0].lo <= 0) & (args[0].hi >= 0) & ~((args[0].lo == 0) & (args[0].hi == 0)))
+    return np.asarray(value.lo != value.hi)
 
 
 def squared_diffusion(diffusion: Array | Tape, states: Sequence[str]) -> Tape:

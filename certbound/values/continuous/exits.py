@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.errors import EnclosureError, InfeasibleError
+from certbound.errors import InfeasibleError
 from certbound.problem.derivative import jacobian
 from certbound.problem.evaluation import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, GaussianStart
+from certbound.problem.systems import ContinuousSystem
 from certbound.problem.tape import Node, Tape
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.bounds import Model, extreme_over, prove_lower, prove_upper
+from certbound.values.continuous.bounds import Model, covers, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.coefficients import Reader, enclose, squared_diffusion
 from certbound.values.continuous.proposal import Line, sketch
 from certbound.values.continuous.room import Room, safe_room, starts_of
@@ -27,6 +28,7 @@ from certbound.values.continuous.shapes import propose_lower, propose_upper, sea
 __all__ = ["ExitBounds", "bound_exits"]
 
 Array = NDArray[np.float64]
+Starts = list[tuple[float, float]]
 
 _LN10 = math.log(10)
 _LEAD = 0.012
@@ -121,17 +123,20 @@ def _check(problem: Problem, target: Any, seconds: float) -> None:
     if target is not None:
         raise InfeasibleError("value functions in continuous time do not serve targets yet.")
     if isinstance(problem.initial, GaussianStart):
-        raise InfeasibleError("value functions in continuous time do not serve a random start yet; use a set of starts.")
+        raise InfeasibleError("value functions in continuous time do not serve a random start; use a set of starts.")
     if problem.input_sequence is not None:
-        raise InfeasibleError("value functions in continuous time do not serve plans that are arrays; give a feedback law.")
+        raise InfeasibleError("value functions in continuous time need a feedback law; the plan is an array.")
 
 
 def _model(problem: Problem) -> Model:
     n = problem.system.dimension
+    system = problem.system
+    if not isinstance(system, ContinuousSystem):
+        raise TypeError(f"`problem` must be in continuous time, got {system!r}.")
     drift = problem.closed_loop
     return Model(
         drift=Reader(drift, n + 1),
-        square=Reader(squared_diffusion(problem.system.diffusion, problem.system.states), n + 1),
+        square=Reader(squared_diffusion(system.diffusion, system.states), n + 1),
         branches=_branches(drift, problem.system.disturbance, n + 1),
     )
 
@@ -147,9 +152,9 @@ def _branches(drift: Tape, disturbance: Box | None, first: int) -> tuple[tuple[I
     if not edged and all(curved.nodes[output] == Node("const", (), 0.0) for output in curved.outputs):
         sides = [sorted({low, high}) for low, high in ends]
         return tuple(tuple(Interval.point(value) for value in corner) for corner in itertools.product(*sides))
-    parts = max(1, int(round(16 ** (1 / len(ends)))))
+    parts = max(1, round(16 ** (1 / len(ends))))
     edges = [np.linspace(low, high, parts + 1) for low, high in ends]
-    pieces = [[Interval(a, b) for a, b in zip(edge[:-1], edge[1:])] for edge in edges]
+    pieces = [[Interval(a, b) for a, b in itertools.pairwise(edge)] for edge in edges]
     return tuple(itertools.product(*pieces))
 
 
@@ -222,12 +227,12 @@ class _Found:
 
 
 def _raise_upper(
-    found: _Found, line: Line, model: Model, starts: list[tuple[float, float]], span: float, cells: int, tolerance: float
+    found: _Found, line: Line, model: Model, starts: Starts, span: float, cells: int, tolerance: float
 ) -> float:
     """One attempt at the upper bound; what it gained."""
     short, _ = sealed(line, found.level)
     surface = propose_upper(short, found.level, span, share=_SHARES[0], cells=cells, tolerance=tolerance)
-    if surface is None:
+    if surface is None or not covers(surface, line.horizon, [line.low], [line.high], within=True):
         return 0.0
     found.done.append(f"{cells} x {surface.slabs}")
     found.level = min(found.level, extreme_over(surface, starts, upper=True))
@@ -238,12 +243,14 @@ def _raise_upper(
 
 
 def _raise_lower(
-    found: _Found, line: Line, model: Model, starts: list[tuple[float, float]], span: float, cells: int, tolerance: float
+    found: _Found, line: Line, model: Model, starts: Starts, span: float, cells: int, tolerance: float
 ) -> float:
     """One attempt at the lower bound; what it gained."""
     _, far = sealed(line, found.level)
     surface = propose_lower(line, found.level, span, far, share=_SHARES[1], cells=cells, tolerance=0.3 * tolerance)
-    payment = None if surface is None else prove_lower(surface, model, starts)
+    if surface is None or not covers(surface, line.horizon, [line.low], [line.high], within=False):
+        return 0.0
+    payment = prove_lower(surface, model, starts)
     if payment is None:
         return 0.0
     gain = math.inf if found.lower is None else payment.log - found.lower

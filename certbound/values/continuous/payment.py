@@ -175,7 +175,7 @@ def _proposals(patched: Patched, start: float, *, upper: bool) -> Iterator[Level
     for cut, cap, base in itertools.product(_CUTS, _CAPS, _BASES):
         if cut == 0 and (cap, base) != (_CAPS[0], _BASES[0]):
             continue
-        count = int(round(cut / BIN))
+        count = round(cut / BIN)
         m = np.zeros(count)
         edges = -BIN * np.arange(count, -1, -1.0)
         if count:
@@ -274,7 +274,8 @@ def _settle_lower(patched: Patched, levels: Levels, start: float, ceiling: float
     left = first - rest - exp(Interval.point(ceiling) - Interval.point(start))
     if not left.lo > 0:
         return None
-    level = Interval.point(start) + log(Interval.point(left.lo)) - log(Interval.point(1.0) - exp(Interval.point(ceiling)))
+    kept = log(Interval.point(1.0) - exp(Interval.point(ceiling)))
+    level = Interval.point(start) + log(Interval.point(left.lo)) - kept
     return Payment(log=float(level.lo), lam=float(paid.hi), eps=float(rest.hi), growth=float(growth.hi))
 
 

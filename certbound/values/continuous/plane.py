@@ -7,6 +7,7 @@ approximate factorisation, (I - g h J_x)(I - g h J_y), which keeps order 2 whate
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from certbound.problem.evaluation import compile_numpy
 from certbound.problem.problem import Problem
-from certbound.values.continuous.bounds import Model, extreme_over, prove_upper
+from certbound.values.continuous.bounds import Model, covers, extreme_over, prove_upper
 from certbound.values.continuous.lines import solve_lines
 from certbound.values.continuous.proposal import Splines
 from certbound.values.continuous.room import Room, starts_of
@@ -60,12 +61,12 @@ def two_states(problem: Problem, model: Model, room: Room, deadline: float) -> t
     starts = starts_of(problem)
     plane = _plane(problem, model, room.inner_low, room.inner_high, starts)
     level, upper, done = _rough_level(plane), 0.0, []
-    cells, growth, lead = 32, 0.18, 0.01
+    cells, growth, lead = 46, 0.11, 0.008
     for _ in range(5):
         begin = time.perf_counter()
         plan = Plan(cells=cells, growth=growth, substeps=8, lead=lead * plane.horizon, floor=level - 5)
         surface = propose_plane(plane, plan)
-        if surface is not None:
+        if surface is not None and covers(surface, plane.horizon, plane.low, plane.high, within=True):
             level = min(level, extreme_over(surface, starts, upper=True))
             upper = min(upper, prove_upper(surface, model, starts).log)
             done.append(f"{cells}^2 x {surface.slabs}")
@@ -113,7 +114,7 @@ def propose_plane(plane: Plane, plan: Plan) -> Surface | None:
     times = _slab_times(plane.horizon, plan)
     value = solver.start()
     values, first, last = [value], [], []
-    for begin, end in zip(times[:-1], times[1:]):
+    for begin, end in itertools.pairwise(times):
         first.append(solver.rate(begin, value))
         step = (end - begin) / plan.substeps
         for part in range(plan.substeps):
@@ -221,7 +222,7 @@ class _Solver:
             found = np.einsum("jbq,kiaq->kiajb", maps[1], part, optimize=True)[::-1]
             found[:, [0, -1], 0] = 0.0  # V = 0 on the faces, exactly
             found[:, :, :, [0, -1], 0] = 0.0
-            return found
+            return np.asarray(found)
 
         forward = self.plane.horizon - times[::-1]
         forward[0], forward[-1] = 0.0, self.plane.horizon

@@ -153,8 +153,9 @@ def _in_plane(
     )
     inverses = [np.array(to_bernstein(count)) for count in counts]
     out = np.empty((len(patches.size), len(drifts), 3))
+    width_x, width_y = patches.widths
     extremes_in_plane(
-        np.ascontiguousarray(patches.coefficients), patches.step, *patches.widths, place,
+        np.ascontiguousarray(patches.coefficients), patches.step, width_x, width_y, place,
         np.ascontiguousarray([drift.samples for drift in drifts]), np.ascontiguousarray(squares.samples),
         (*time, *x, *y), tuple(inverses), wanted, out,
     )  # fmt: skip
@@ -185,7 +186,7 @@ def coarse_size(
             a = squares.size[i * n + j] + squares.remainder[i * n + j]
             if a.any():
                 total = total + 0.5 * a[place] * (_bent(patches, i, j) + steep[i] * steep[j])
-    return total * (1 + 1e-12)
+    return np.asarray(total * (1 + 1e-12))
 
 
 def value_range(patches: Patches) -> tuple[Array, Array]:
@@ -214,7 +215,7 @@ def _derived(coefficients: Array, axis: int, width: Array) -> Array:
     """Bernstein coefficients of the derivative along an axis of the coefficient array."""
     degree = coefficients.shape[axis] - 1
     slope = np.diff(coefficients, axis=axis)
-    return slope * (degree / width).reshape(-1, *([1] * (slope.ndim - 1)))
+    return np.asarray(slope * (degree / width).reshape(-1, *([1] * (slope.ndim - 1))))
 
 
 def _at_samples(coefficients: Array, counts: Sequence[int]) -> Array:
@@ -239,14 +240,14 @@ def _steepest(patches: Patches, axis: int) -> Array:
     """A bound of |V_i| over each patch, from the derivative's own coefficients."""
     slope = _derived(patches.coefficients, 2 + axis, patches.widths[axis])
     flat = np.abs(slope).reshape(len(slope), -1).max(axis=1)
-    return flat + _ROUNDOFFS * 10 * patches.size / patches.widths[axis]
+    return np.asarray(flat + _ROUNDOFFS * 10 * patches.size / patches.widths[axis])
 
 
 def _bent(patches: Patches, i: int, j: int) -> Array:
     """A bound of |V_ij| over each patch."""
     curved = _derived(_derived(patches.coefficients, 2 + i, patches.widths[i]), 2 + j, patches.widths[j])
     size = np.abs(curved).reshape(len(curved), -1).max(axis=1)
-    return size + _ROUNDOFFS * 100 * patches.size / (patches.widths[i] * patches.widths[j])
+    return np.asarray(size + _ROUNDOFFS * 100 * patches.size / (patches.widths[i] * patches.widths[j]))
 
 
 def _diffusive_loss(patches: Patches, remainders: Array, n: int) -> Array:

@@ -53,7 +53,8 @@ def safe_room(problem: Problem) -> Room:
             )
         if not lows[0][axis] < highs[0][axis]:
             raise InfeasibleError("the safe set has no interior.")
-    return Room(inner_low=tuple(lows[0]), inner_high=tuple(highs[0]), outer_low=tuple(lows[1]), outer_high=tuple(highs[1]))
+    ends = [tuple(float(value) for value in row) for row in (*lows, *highs)]
+    return Room(inner_low=ends[0], outer_low=ends[1], inner_high=ends[2], outer_high=ends[3])
 
 
 def _refuse_windows(constraint: Inside, problem: Problem) -> None:

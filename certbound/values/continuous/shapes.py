@@ -20,8 +20,8 @@ _SPARE = 8.0
 def sealed(line: Line, level: float) -> tuple[Line, tuple[bool, bool]]:
     """The line cut where the drift back inside keeps almost every path away: cut ends, and which they are.
 
-    An end is cut (for upper bounds; for lower bounds it is known to be out of reach) where exp(-int 2 |f| / a) along the way out is far below P. The proof
-    does not rest on that: leaving the longer line means leaving the shorter one first.
+    An end is cut (for upper bounds; for lower bounds it is known to be out of reach) where exp(-int 2 |f| / a) along
+    the way out is far below P. The proof does not rest on that: leaving the longer line means leaving the shorter one.
     """
     ends, cut = [line.low, line.high], [False, False]
     for side in (0, 1):
@@ -40,7 +40,8 @@ def _cut(line: Line, side: int, barrier: float) -> float | None:
     most = np.max([line.square(t, x) for t in np.linspace(0, line.horizon, 9)], axis=0)
     outward = np.flatnonzero(inward <= 0)
     first = int(outward[-1]) if len(outward) else 0
-    height = np.cumsum(np.where(np.arange(len(x)) >= first, 2 * inward / np.maximum(most, 1e-300), 0.0)) * abs(x[1] - x[0])
+    slope = np.where(np.arange(len(x)) >= first, 2 * inward / np.maximum(most, 1e-300), 0.0)
+    height = np.cumsum(slope) * abs(x[1] - x[0])
     if not height[-1] > 1.3 * barrier:
         return None
     return float(x[int(np.argmax(height > barrier))])
@@ -69,7 +70,7 @@ def propose_upper(
         for side, (rate, bend) in enumerate(layers):
             distance = _distance(line, x, side)
             u += (1 - least) * (1 + bend * rate * distance) * np.exp(-rate * distance)
-        return np.log(u)
+        return np.asarray(np.log(u))
 
     zero = np.zeros(2)
     boundary = Boundary(profile=profile, faces=lambda tau: (zero, zero), step=0.02 * lead)

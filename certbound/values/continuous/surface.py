@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +101,7 @@ class Surface:
     def face_range(self, axis: int, side: int) -> tuple[float, float]:
         """Bounds of V on one face of the grid over all times."""
         edge = 0 if side == 0 else -1
-        index = (slice(None), *((slice(None),) * (2 * axis)), edge, 0)
+        index: tuple[Any, ...] = (slice(None), *((slice(None),) * (2 * axis)), edge, 0)
         parts = [self.values[:-1], self.start_rates, self.values[1:], self.end_rates]
         data = np.stack([part[index] for part in parts], axis=1)
         rest = tuple(nodes for k, nodes in enumerate(self.axes) if k != axis)
@@ -127,8 +128,9 @@ def _patches_of(data: Array, steps: Array, axes: tuple[Array, ...]) -> Patches:
     data = data.transpose(order).reshape(slabs * int(np.prod(cells, dtype=int)), 4, *([6] * n))
     step = np.repeat(steps, int(np.prod(cells, dtype=int)))
     widths = _cell_widths(axes, slabs)
-    reference = data[(slice(None), 0, *([0] * n))].copy()
-    values = (slice(None), slice(0, 4, 2), *([slice(0, 6, 3)] * n))
+    corner: tuple[Any, ...] = (slice(None), 0, *([0] * n))
+    reference = data[corner].copy()
+    values: tuple[Any, ...] = (slice(None), slice(0, 4, 2), *([slice(0, 6, 3)] * n))
     data[values] -= reference.reshape(-1, *([1] * (n + 1)))
     data[:, 1::2] *= step.reshape(-1, *([1] * (n + 1)))
     for axis, width in enumerate(widths):
