@@ -33,7 +33,8 @@ __all__ = ["Model", "Need", "Proof", "covers", "examine", "extreme_over", "prove
 
 Array = NDArray[np.float64]
 
-NEGLIGIBLE = 1e-4
+_LIFTS = (0.0, 0.003, 0.02, 0.1)
+NEGLIGIBLE = 5e-4
 """lam and eps (in units of the bound), summed over the horizon, that are granted without being looked at."""
 
 
@@ -150,8 +151,16 @@ def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, fl
     start = _up(extreme_over(surface, starts, upper=True))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
     proof = examine(surface, model, need)
-    patched = _patched(proof, proof.ranges.residual_high, need, surface.steps)
-    return pay_upper(patched, start, float(surface.range_at(-1)[0].min()))
+    floor = float(surface.range_at(-1)[0].min())
+    best: Payment | None = None
+    for lift in _LIFTS:  # V + lift has the same residual, and nothing is due where it is positive
+        if best is not None and start + lift >= best.log:
+            break
+        patched = _patched(proof, proof.ranges.residual_high, need, surface.steps, lift)
+        payment = pay_upper(patched, _up(start + lift), floor + lift - 1e-15 * (1 + abs(floor)))
+        best = payment if best is None or payment.log < best.log else best
+    assert best is not None
+    return best
 
 
 def prove_lower(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment | None:
@@ -174,12 +183,14 @@ def _up(value: float) -> float:
     return value + 1e-15 * (1 + abs(value))
 
 
-def _patched(proof: Proof, excess: Array, need: Need, steps: Array) -> Patched:
-    """The patches that cost more than what every slab pays in any case."""
-    ranges = proof.ranges
-    due = (ranges.low < need.top) & ~(excess <= need.free(ranges.high))
+def _patched(proof: Proof, excess: Array, need: Need, steps: Array, lift: float = 0.0) -> Patched:
+    """The patches that cost more than what every slab pays in any case, for V + lift."""
+    ranges, slack = proof.ranges, 1e-14 if lift else 0.0
+    low, high = ranges.low + lift - slack * (1 + np.abs(ranges.low)), ranges.high + lift
+    high = high + slack * (1 + np.abs(ranges.high))
+    due = (low < need.top) & ~(excess <= need.free(ranges.high))
     return Patched(
-        excess=excess[due], low=ranges.low[due], high=ranges.high[due], energy=ranges.energy[due],
+        excess=excess[due], low=low[due], high=high[due], energy=ranges.energy[due],
         slab=proof.slab[due], steps=steps, spare=need.spare,
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ from certbound.problem.evaluation import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.continuous.bounds import Model, covers, extreme_over, prove_upper
 from certbound.values.continuous.lines import solve_lines
-from certbound.values.continuous.proposal import Splines
+from certbound.values.continuous.proposal import Splines, through
 from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
 
@@ -61,7 +61,7 @@ def two_states(problem: Problem, model: Model, room: Room, deadline: float) -> t
     starts = starts_of(problem)
     plane = _plane(problem, model, room.inner_low, room.inner_high, starts)
     level, upper, done = _rough_level(plane), 0.0, []
-    cells, growth, lead = 46, 0.11, 0.008
+    cells, growth, lead = 54, 0.16, 0.01
     for _ in range(5):
         begin = time.perf_counter()
         plan = Plan(cells=cells, growth=growth, substeps=8, lead=lead * plane.horizon, floor=level - 5)
@@ -94,7 +94,9 @@ def _rough_level(plane: Plane) -> float:
     return level
 
 
-def _plane(problem: Problem, model: Model, low: tuple[float, ...], high: tuple[float, ...], starts: list[Pair]) -> Plane:
+def _plane(
+    problem: Problem, model: Model, low: tuple[float, ...], high: tuple[float, ...], starts: list[Pair]
+) -> Plane:
     drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
     corners = [[float(value.mid) for value in branch] for branch in model.branches]
 
@@ -235,21 +237,14 @@ class _Solver:
 def _grid(plane: Plane, plan: Plan, axis: int) -> Array:
     low, high = plane.low[axis], plane.high[axis]
     fine = np.linspace(low, high, 4001)
-    density = np.full(len(fine), 1.6 / (high - low))
+    density = np.full(len(fine), 1.0 / (high - low))
     for side, distance in ((0, fine - low), (1, high - fine)):
         weight = 1 / (distance + 1 / _layer_rate(plane, plan, axis, side))
         density += 0.5 * weight / np.trapezoid(weight, fine)
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
     nodes = np.interp(np.linspace(0, total[-1], plan.cells + 1), total, fine)
     nodes[0], nodes[-1] = low, high
-    for point in plane.starts[axis]:
-        place = 1 + int(np.argmin(np.abs(nodes[1:-1] - point)))
-        moved = nodes.copy()
-        moved[place] = point
-        gaps = np.diff(moved)
-        if np.all(gaps > 0.3 * np.median(gaps[max(0, place - 2) : place + 2])):
-            nodes = moved
-    return nodes
+    return through(nodes, plane.starts[axis])
 
 
 def _layer_rate(plane: Plane, plan: Plan, axis: int, side: int) -> float:

@@ -22,7 +22,7 @@ from scipy.linalg.lapack import dgbtrf, dgbtrs
 
 from certbound.values.continuous.surface import Surface
 
-__all__ = ["Boundary", "Line", "Sketch", "Splines", "graded", "propose", "sketch"]
+__all__ = ["Boundary", "Line", "Sketch", "Splines", "graded", "propose", "sketch", "through"]
 
 Array = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ def _rates(line: Line, t: float, x: Array, u: Array, left: Array, right: Array) 
 
 
 def graded(line: Line, cells: int, layers: list[float]) -> Array:
-    """Nodes that crowd at both faces: cells in proportion to the distance (measured by the noise), down to ``layers``."""
+    """Nodes that crowd at both faces: cells in proportion to the distance (as the noise sees it), down to ``layers``."""
     fine = np.linspace(line.low, line.high, 8001)
     scale = 1 / np.sqrt(np.maximum(line.square(0.5 * line.horizon, fine), 1e-300))
     way = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(fine))])
@@ -113,18 +113,20 @@ def graded(line: Line, cells: int, layers: list[float]) -> Array:
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(way))])
     nodes = np.interp(np.linspace(0, total[-1], cells + 1), total, fine)
     nodes[0], nodes[-1] = line.low, line.high
-    return _through(nodes, line.starts)
+    return through(nodes, line.starts)
 
 
-def _through(nodes: Array, starts: tuple[float, float]) -> Array:
-    """Move the nearest inner nodes onto the ends of the starts."""
-    for point in starts:
-        place = 1 + int(np.argmin(np.abs(nodes[1:-1] - point)))
-        moved = nodes.copy()
-        moved[place] = point
-        if np.all(np.diff(moved) > 0):
-            nodes = moved
-    return nodes
+def through(nodes: Array, points: tuple[float, float]) -> Array:
+    """Nodes bent a little so that the inner ones nearest to the points lie on them; as they were where that fails."""
+    places = [1 + int(np.argmin(np.abs(nodes[1:-1] - point))) for point in points]
+    if places[0] == places[1] and points[0] != points[1]:
+        return nodes
+    known = {0: 0.0, len(nodes) - 1: 0.0} | {k: point - nodes[k] for k, point in zip(places, points)}
+    order = sorted(known)
+    moved = nodes + np.interp(np.arange(len(nodes)), order, [known[k] for k in order])
+    moved[[0, -1]] = nodes[[0, -1]]
+    moved[places] = points
+    return moved if np.all(np.diff(moved) > 0) else nodes
 
 
 class Splines:
