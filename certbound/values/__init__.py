@@ -1,0 +1,1 @@
+"""Value functions: the exit probability itself, computed on a grid and then proved."""

@@ -23,7 +23,6 @@ from certbound.values.continuous.polynomials import (
     interpolation,
     node_product,
     nodes_of,
-    restriction,
     to_bernstein,
 )
 from certbound.values.continuous.proposal import sketch
@@ -95,13 +94,6 @@ def test_bernstein_coefficients_reproduce_a_polynomial_and_its_interpolant(count
     assert np.allclose(interpolation(count, where) @ values, direct, atol=1e-8)
     fine = np.linspace(0, 1, 20001)[:, None]
     assert np.abs(np.prod(fine - np.array(nodes_of(count)), axis=1)).max() <= node_product(count)
-
-
-def test_coefficients_of_a_part_of_the_interval_belong_to_the_same_polynomial() -> None:
-    c = np.random.default_rng(0).normal(size=6)
-    z = np.linspace(0, 1, 17)
-    part = restriction(5, 0.25, 0.625) @ c
-    assert np.allclose(basis_at(tuple(z), 5) @ part, basis_at(tuple(0.25 + 0.375 * z), 5) @ c, atol=1e-13)
 
 
 @pytest.mark.parametrize(

@@ -37,8 +37,8 @@ Index = NDArray[np.intp]
 BIN = 0.125
 _UP = 1 + 1e-13
 _DOWN = 1 - 1e-13
-_CUTS = (0.0, 0.25, 0.5, 1.0, 1.75, 3.0, 5.0)
-_CAPS = (0.01, 0.03, 0.1, 0.3, 0.7)
+_CUTS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+_CAPS = (0.01, 0.03, 0.1, 0.3, 1.0)
 _BASES = (0.0, 0.003, 0.01, 0.03)
 
 
@@ -168,7 +168,7 @@ def pay_lower(patched: Patched, start: float, ceiling: float) -> Payment | None:
 
 
 def _proposals(patched: Patched, start: float, *, upper: bool) -> Iterator[Levels]:
-    """Step functions m: above a cut, what the patches there need beyond a base rate, up to a cap."""
+    """Step functions m: above a cut, what the patches there need beyond a base rate, those aside that need too much."""
     horizon = float(patched.steps.sum())
     lowest, highest = _bins(patched)
     seen: set[bytes] = set()
@@ -181,8 +181,8 @@ def _proposals(patched: Patched, start: float, *, upper: bool) -> Iterator[Level
         if count:
             first, last = lowest + count, np.minimum(highest, -1) + count
             need = (patched.excess - base / horizon) / np.maximum(patched.energy, 1e-300)
-            here = np.flatnonzero((last >= 0) & (need > 0))
-            need, first, last = np.minimum(need[here], cap), np.maximum(first[here], 0), last[here]
+            here = np.flatnonzero((last >= 0) & (need > 0) & (need <= cap))
+            need, first, last = need[here], np.maximum(first[here], 0), last[here]
             for offset in range(int(np.max(last - first, initial=-1)) + 1):
                 inside = first + offset <= last
                 np.maximum.at(m, (first + offset)[inside], need[inside])

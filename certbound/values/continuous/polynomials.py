@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "HERMITE", "TIME_HERMITE", "basis_at", "interpolation", "node_product", "nodes_of",
-    "norm", "restriction", "to_bernstein",
+    "norm", "to_bernstein",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -75,22 +75,6 @@ def node_product(count: int) -> float:
     values = [_absolute_product(Fraction(point), nodes) for point in finer]
     # |derivative| <= count on [0, 1], each factor being at most 1 in size: half a spacing to the nearest point
     return float(max(values)) + count / 2048
-
-
-def restriction(degree: int, left: float, right: float) -> Array:
-    """Bernstein coefficients on [left, right] within [0, 1] from those on [0, 1] (blossoms, rounded once)."""
-    a, b = Fraction(left), Fraction(right)
-    rows: Rows = []
-    for k in range(degree + 1):
-        polynomial = [Fraction(1)]
-        for argument in [a] * (degree - k) + [b] * k:  # multiplies by (1 - argument) + argument z
-            polynomial = [
-                (polynomial[j] if j < len(polynomial) else 0) * (1 - argument)
-                + (polynomial[j - 1] * argument if j else 0)
-                for j in range(len(polynomial) + 1)
-            ]
-        rows.append(polynomial)
-    return _rounded(rows)
 
 
 def norm(matrix: Array) -> float:
