@@ -102,7 +102,7 @@ def _rates(line: Line, t: float, x: Array, u: Array, left: Array, right: Array) 
 
 
 def graded(line: Line, cells: int, layers: list[float]) -> Array:
-    """Nodes that crowd at both faces: cells in proportion to the distance (as the noise sees it), down to ``layers``."""
+    """Nodes that crowd at both faces: cells in proportion to the distance (by the noise), down to ``layers``."""
     fine = np.linspace(line.low, line.high, 8001)
     scale = 1 / np.sqrt(np.maximum(line.square(0.5 * line.horizon, fine), 1e-300))
     way = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(fine))])
