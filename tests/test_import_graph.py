@@ -19,6 +19,7 @@ ORDER = [
     {"tubes"},
     {"values"},
     {"simulation"},
+    {"values"},
     {"constants"},
     {"reach"},
     {"safety"},

@@ -1,0 +1,269 @@
+"""Drift and squared diffusion as polynomials with a proved remainder, cell by cell.
+
+A function F(t, x, d), read from its tape, becomes p(t, x) + E with |E| <= remainder for every (t, x) of a cell and
+every d of a branch. p interpolates F at the nodes of `polynomials.nodes_of`; along an axis with q + 1 nodes
+
+    |F - I F| <= sup |d^(q+1) F| h^(q+1) max |prod (s - s_j)| / (q + 1)!,
+
+and the axes add up, each weighted by the Lebesgue constants of those before it. The derivatives are exact tapes, read
+in outward-rounded arithmetic over the whole cell. Where the tape has a kink or an undecided jump on a cell, p is a
+constant and the remainder the radius of the enclosed range.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import factorial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.errors import EnclosureError
+from certbound.problem.derivative import jacobian
+from certbound.problem.graph import Graph
+from certbound.problem.tape import JUMPS, Node, Tape
+from certbound.rigor.intervals import ARITHMETIC, UNDEFINED, Interval, sq
+from certbound.values.continuous.polynomials import interpolation, node_product, nodes_of, norm
+
+__all__ = ["Cells", "Interpolant", "Reader", "enclose", "squared_diffusion"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_EDGES = JUMPS | {"abs", "kink", "min", "max"}
+_HIGHEST = 6  # polynomials up to this degree are represented exactly
+_SMOOTH = 4  # degree of the interpolant of any other smooth function
+
+
+def enclose(tape: Tape, inputs: Sequence[Interval]) -> tuple[list[Interval], Mask]:
+    """Ranges of a tape's outputs over boxes, and where some node has an undecided kink or jump.
+
+    Proves: each output contains the function's values for all inputs in the boxes, jumps included.
+
+    Raises
+    ------
+    EnclosureError
+        An operation is undefined somewhere on a box.
+    """
+    batch = np.broadcast_shapes(*(value.shape for value in inputs))
+    edge = np.zeros(batch, dtype=bool)
+    values: list[Interval] = []
+    for index, node in enumerate(tape.nodes):
+        args = [] if node.op == "input" else [values[arg] for arg in node.args]
+        if node.op == "input":
+            values.append(inputs[node.args[0]])
+            continue
+        if node.op in UNDEFINED and np.any(_undefined(node, args)):
+            raise EnclosureError(
+                f"`{tape.describe(index)}` is undefined somewhere in the safe set; a value function needs the "
+                "model on all of it: add constraints (or a `domain`) that keep away from there."
+            )
+        values.append(_applied(node, args))
+        if node.op in _EDGES:
+            edge = edge | _undecided(node.op, args, values[-1])
+    return [values[output] for output in tape.outputs], np.broadcast_to(edge, batch)
+
+
+def _undefined(node: Node, args: Sequence[Interval]) -> Mask:
+    return np.asarray(UNDEFINED["pow"](args[0], node.value) if node.op == "pow" else UNDEFINED[node.op](*args))
+
+
+def _applied(node: Node, args: Sequence[Interval]) -> Interval:
+    if node.op == "const":
+        return Interval.point(node.value)
+    if node.op == "pow":
+        return ARITHMETIC["pow"](args[0], node.value)
+    if node.op == "mul" and node.args[0] == node.args[1]:
+        return sq(args[0])
+    return ARITHMETIC[node.op](*args)
+
+
+def _undecided(op: str, args: Sequence[Interval], value: Interval) -> Mask:
+    if op in ("abs", "kink"):
+        return np.asarray((args[0].lo <= 0) & (args[0].hi >= 0))
+    if op in ("min", "max"):
+        return np.asarray((args[0].lo <= args[1].hi) & (args[1].lo <= args[0].hi))
+    if op == "if_else_zero":
+        return np.asarray((args[0].lo <= 0) & (args[0].hi >= 0) & ~((args[0].lo == 0) & (args[0].hi == 0)))
+    return np.asarray(value.lo != value.hi)
+
+
+def squared_diffusion(diffusion: Array | Tape, states: Sequence[str]) -> Tape:
+    """The tape of a = g g', shape (n, n), over ``("t", *states)``."""
+    graph = Graph(("t", *states))
+    rows, columns = diffusion.shape
+    if isinstance(diffusion, Tape):
+        flat = diffusion.evaluate(graph.arithmetic(), [graph.input(slot) for slot in range(len(states) + 1)])
+    else:
+        flat = [graph.const(float(entry)) for entry in np.asarray(diffusion).reshape(-1)]
+    outputs = []
+    for i, j in itertools.product(range(rows), repeat=2):
+        terms = [graph.apply("mul", flat[i * columns + k], flat[j * columns + k]) for k in range(columns)]
+        total = terms[0]
+        for term in terms[1:]:
+            total = graph.apply("add", total, term)
+        outputs.append(total)
+    return graph.tape(outputs, (rows, rows))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Cells:
+    """A batch of boxes: ends of each axis, shape (B,); the first axis is time, then come the states."""
+
+    low: tuple[Array, ...]
+    high: tuple[Array, ...]
+
+    @property
+    def widths(self) -> tuple[Array, ...]:
+        """Float lengths of the sides, correctly rounded."""
+        return tuple(high - low for low, high in zip(self.low, self.high))
+
+    def whole(self) -> list[Interval]:
+        """The boxes themselves."""
+        return [Interval(low, high) for low, high in zip(self.low, self.high)]
+
+    def points(self, counts: Sequence[int]) -> list[Interval]:
+        """The nodes of each axis as narrow intervals, shaped for an outer product behind the batch."""
+        result = []
+        for axis, count in enumerate(counts):
+            shape = [1] * len(counts)
+            shape[axis] = count
+            low, high = Interval.point(self.low[axis]), Interval.point(self.high[axis])
+            share = np.array(nodes_of(count)).reshape(shape)
+            extended = (len(self.low[axis]), *([1] * len(counts)))
+            low, high = low.reshape(extended), high.reshape(extended)
+            result.append(low + (high - low) * Interval.point(share))
+        return result
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Interpolant:
+    """F = p + E: values of p at sample points, its size, and the bound of E.
+
+    Attributes
+    ----------
+    samples : ndarray, shape (outputs, B, *samples of each axis)
+        p there, off by at most 40 units of ``size`` roundoffs.
+    size : ndarray, shape (outputs, B)
+        Bound of |p| at the samples and of every intermediate result.
+    remainder : ndarray, shape (outputs, B)
+        Bound of |E| over the cell and the branch.
+    """
+
+    samples: Array
+    size: Array
+    remainder: Array
+
+
+class Reader:
+    """One function of (t, x), with its derivatives, that is interpolated on any batch of cells.
+
+    Parameters
+    ----------
+    tape : Tape
+        Over ``("t", *states, *disturbances)``.
+    axes : int
+        1 + number of states.
+    """
+
+    def __init__(self, tape: Tape, axes: int) -> None:
+        self.tape, self.axes = tape, axes
+        self.edged = any(node.op in _EDGES for node in tape.nodes)
+        self.degrees: list[int] = []
+        self.derivatives: list[Tape | None] = []
+        for axis in range(axes):
+            degree, derivative = _degree(tape, axis)
+            self.degrees.append(degree)
+            self.derivatives.append(derivative)
+
+    @property
+    def autonomous(self) -> bool:
+        """True when the function does not depend on t."""
+        return all(node.op != "input" or node.args[0] != 0 for node in self.tape.nodes)
+
+    def interpolate(self, cells: Cells, branch: Sequence[Interval], points: Sequence[tuple[float, ...]]) -> Interpolant:
+        """p at sample points (shares of each axis), and the remainder.
+
+        Proves: |F(t, x, d) - p(t, x)| <= remainder on each cell, d in the branch; see the module.
+        """
+        counts = [degree + 1 for degree in self.degrees]
+        values, _ = enclose(self.tape, [*cells.points(counts), *branch])
+        shape = (len(cells.low[0]), *counts)
+        full = [value.broadcast_to(shape) for value in values]
+        mid = np.array([value.mid for value in full])
+        rad = np.array([value.rad.reshape(shape[0], -1).max(axis=1) for value in full])
+        remainder = rad * np.prod([self._lebesgue(count) for count in counts]) + self._tail(cells, branch)
+        mid, remainder = self._at_edges(cells, branch, mid, remainder)
+        size = np.abs(mid).reshape(*mid.shape[:2], -1).max(axis=2)
+        for axis, (count, where) in enumerate(zip(counts, points)):
+            matrix = interpolation(count, tuple(where))
+            mid = np.moveaxis(np.tensordot(mid, matrix, axes=([axis + 2], [1])), -1, axis + 2)
+            size = size * norm(matrix)
+        return Interpolant(samples=mid, size=size * (1 + 1e-12), remainder=remainder * (1 + 1e-12))
+
+    @staticmethod
+    def _lebesgue(count: int) -> float:
+        finer = tuple(k / 256 for k in range(257))
+        # between the points the interpolant of values in [-1, 1] changes by at most degree^2 per unit times its norm
+        return norm(interpolation(count, finer)) / (1 - 2 * (count - 1) ** 2 / 512) if count > 1 else 1.0
+
+    def _tail(self, cells: Cells, branch: Sequence[Interval]) -> Array:
+        """The interpolation errors of all axes; 0 along an axis in which the function is a polynomial."""
+        total = np.zeros((len(self.tape.outputs), len(cells.low[0])))
+        weight = 1.0
+        for derivative, degree, width in zip(self.derivatives, self.degrees, cells.widths):
+            count = degree + 1
+            if derivative is not None:
+                sizes = _magnitudes(derivative, [*cells.whole(), *branch], len(width))
+                factor = node_product(count) / factorial(count) * (width * (1 + 1e-15)) ** count
+                total += weight * sizes * factor * (1 + 1e-12)
+            weight *= self._lebesgue(count)
+        return total
+
+    def _at_edges(
+        self, cells: Cells, branch: Sequence[Interval], mid: Array, remainder: Array
+    ) -> tuple[Array, Array]:
+        """Constants with the radius of the range where a kink or a jump lies on the cell, or no bound was found."""
+        rough = ~np.isfinite(remainder).all(axis=0)
+        if not self.edged and not rough.any():
+            return mid, remainder
+        ranges, edge = enclose(self.tape, [*cells.whole(), *branch])
+        place = np.flatnonzero(rough | np.broadcast_to(edge, rough.shape))
+        for output, value in enumerate(ranges):
+            full = value.broadcast_to(rough.shape)[place]
+            if not np.isfinite(full.lo).all() or not np.isfinite(full.hi).all():
+                raise EnclosureError(
+                    "the model has no finite range on a part of the safe set; add constraints (or a `domain`) "
+                    "that keep away from there."
+                )
+            mid[output, place] = full.mid.reshape(-1, *([1] * self.axes))
+            remainder[output, place] = full.rad
+        return mid, remainder
+
+
+def _magnitudes(derivative: Tape, inputs: Sequence[Interval], count: int) -> Array:
+    try:
+        values, _ = enclose(derivative, inputs)
+    except EnclosureError:  # of the derivative alone: a root at 0, say
+        return np.full((len(derivative.outputs), count), np.inf)
+    return np.array([np.broadcast_to(value.mag, (count,)) for value in values])
+
+
+def _degree(tape: Tape, axis: int) -> tuple[int, Tape | None]:
+    """Degree of the interpolant along an axis, and the derivative that bounds its error (None: it is exact)."""
+    current, tail = tape, None
+    for degree in range(_HIGHEST + 1):
+        current = _column(current, axis)
+        if all(current.nodes[output] == Node("const", (), 0.0) for output in current.outputs):
+            return degree, None
+        tail = current if degree == _SMOOTH else tail
+    return _SMOOTH, tail
+
+
+def _column(tape: Tape, axis: int) -> Tape:
+    derivative = jacobian(tape, [axis])
+    return Tape(
+        inputs=derivative.inputs, nodes=derivative.nodes, outputs=derivative.outputs, shape=(len(derivative.outputs),)
+    )

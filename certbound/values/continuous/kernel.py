@@ -1,0 +1,140 @@
+"""The residual's extreme Bernstein coefficients on patches of two states, compiled.
+
+The same operations as in `residual`, patch by patch so that they stay in the processor's cache; nothing is reordered
+by the compiler (no fast-math), and the bound of the rounding errors is that of `residual`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["extremes_in_plane"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+BLOCK = 8
+"""Patches that are worked on together, side by side in the last axis: the processor's vectors run along it."""
+
+
+@njit(cache=True)
+def _change(table: Array, first: Array, second: Array, third: Array, one: Array, two: Array, out: Array) -> None:
+    """A matrix along each of the first three axes of ``table``, written to ``out``."""
+    p, q, r = table.shape[0], table.shape[1], table.shape[2]
+    sums = np.empty(BLOCK)
+    for i in range(p):
+        for j in range(q):
+            for c in range(third.shape[0]):
+                for s in range(BLOCK):
+                    sums[s] = 0.0
+                for k in range(r):
+                    weight = third[c, k]
+                    for s in range(BLOCK):
+                        sums[s] += weight * table[i, j, k, s]
+                for s in range(BLOCK):
+                    one[i, j, c, s] = sums[s]
+        for b in range(second.shape[0]):
+            for c in range(third.shape[0]):
+                for s in range(BLOCK):
+                    sums[s] = 0.0
+                for j in range(q):
+                    weight = second[b, j]
+                    for s in range(BLOCK):
+                        sums[s] += weight * one[i, j, c, s]
+                for s in range(BLOCK):
+                    two[i, b, c, s] = sums[s]
+    for a in range(first.shape[0]):
+        for b in range(second.shape[0]):
+            for c in range(third.shape[0]):
+                for s in range(BLOCK):
+                    sums[s] = 0.0
+                for i in range(p):
+                    weight = first[a, i]
+                    for s in range(BLOCK):
+                        sums[s] += weight * two[i, b, c, s]
+                for s in range(BLOCK):
+                    out[a, b, c, s] = sums[s]
+
+
+@njit(cache=True)
+def _extreme(table: Array, low: Array, high: Array) -> None:
+    """Least and largest entry for each patch of the block."""
+    for s in range(BLOCK):
+        low[s] = high[s] = table[0, 0, 0, s]
+    for i in range(table.shape[0]):
+        for j in range(table.shape[1]):
+            for k in range(table.shape[2]):
+                for s in range(BLOCK):
+                    low[s] = min(low[s], table[i, j, k, s])
+                    high[s] = max(high[s], table[i, j, k, s])
+
+
+@njit(cache=True)
+def extremes_in_plane(
+    coefficients: Array, step: Array, width_x: Array, width_y: Array, place: Index, drift: Array, square: Array,
+    bases: tuple[Array, ...], inverses: tuple[Array, ...], wanted: float, out: Array,
+) -> None:
+    """Write least and largest coefficient of R for each branch, then the least of Q2, to ``out`` (B, branches, 3).
+
+    ``drift`` has shape (branches, 2, cells, 1 or t, x, y), ``square`` (4, cells, 1 or t, x, y); ``place`` says which
+    cell a patch is. ``bases`` are the values of the basis and of its derivatives at the samples: time 0, 1; x 0, 1, 2;
+    y 0, 1, 2. ``inverses`` lead from samples to Bernstein coefficients in time, x and y.
+    """
+    t0, t1, x0, x1, x2, y0, y1, y2 = bases
+    nt, nx, ny = t0.shape[0], x0.shape[0], y0.shape[0]
+    shape = (nt, nx, ny, BLOCK)
+    one, two = np.empty((nt, max(nx, 6), ny, BLOCK)), np.empty(shape)
+    vt, vx, vy, xx, yy, xy = (np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape),
+                              np.empty(shape))  # fmt: skip
+    rest, energy, result = np.empty(shape), np.empty(shape), np.empty(shape)
+    c = np.empty((4, 6, 6, BLOCK))
+    low, high, look = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    count = coefficients.shape[0]
+    for begin in range(0, count, BLOCK):
+        for s in range(BLOCK):  # the last patch is repeated where the block is not full
+            c[:, :, :, s] = coefficients[min(begin + s, count - 1)]
+            look[s] = 0.0
+        _change(c, t1, x0, y0, one, two, vt)
+        _change(c, t0, x1, y0, one, two, vx)
+        _change(c, t0, x0, y1, one, two, vy)
+        _change(c, t0, x2, y0, one, two, xx)
+        _change(c, t0, x0, y2, one, two, yy)
+        _change(c, t0, x1, y1, one, two, xy)
+        for s in range(BLOCK):
+            patch = min(begin + s, count - 1)
+            cell, h, wx, wy = place[patch], 1 / step[patch], 1 / width_x[patch], 1 / width_y[patch]
+            for i in range(nt):
+                ia = min(i, square.shape[2] - 1)
+                for j in range(nx):
+                    for k in range(ny):
+                        a, b = 0.5 * square[0, cell, ia, j, k], 0.5 * square[3, cell, ia, j, k]
+                        m = square[1, cell, ia, j, k]
+                        gx, gy = vx[i, j, k, s] * wx, vy[i, j, k, s] * wy
+                        e = a * gx * gx + b * gy * gy + m * gx * gy
+                        vx[i, j, k, s], vy[i, j, k, s], energy[i, j, k, s] = gx, gy, e
+                        bends = a * xx[i, j, k, s] * wx * wx + b * yy[i, j, k, s] * wy * wy
+                        rest[i, j, k, s] = vt[i, j, k, s] * h + bends + m * xy[i, j, k, s] * wx * wy + e
+        for branch in range(drift.shape[0]):
+            for s in range(BLOCK):
+                cell = place[min(begin + s, count - 1)]
+                for i in range(nt):
+                    ia = min(i, drift.shape[3] - 1)
+                    for j in range(nx):
+                        for k in range(ny):
+                            vt[i, j, k, s] = (rest[i, j, k, s] + drift[branch, 0, cell, ia, j, k] * vx[i, j, k, s]
+                                              + drift[branch, 1, cell, ia, j, k] * vy[i, j, k, s])  # fmt: skip
+            _change(vt, inverses[0], inverses[1], inverses[2], one, two, result)
+            _extreme(result, low, high)
+            for s in range(min(BLOCK, count - begin)):
+                out[begin + s, branch, 0], out[begin + s, branch, 1] = low[s], high[s]
+                look[s] = max(look[s], max(-low[s], high[s]))
+        if look.max() > wanted:
+            _change(energy, inverses[0], inverses[1], inverses[2], one, two, result)
+            _extreme(result, low, high)
+        else:
+            low[:] = 0.0
+        for s in range(min(BLOCK, count - begin)):
+            out[begin + s, :, 2] = low[s]

@@ -1,0 +1,136 @@
+"""The box that a problem keeps its state in, rounded inward (for upper bounds) and outward (for lower bounds)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from certbound.errors import InfeasibleError
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
+
+__all__ = ["Room", "safe_room", "starts_of"]
+
+Ends = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Room:
+    """The safe box: a path that stays in the inner one is safe, and a path that leaves the outer one is not."""
+
+    inner_low: tuple[float, ...]
+    inner_high: tuple[float, ...]
+    outer_low: tuple[float, ...]
+    outer_high: tuple[float, ...]
+
+
+def safe_room(problem: Problem) -> Room:
+    """The safe set as a box: the part around the start that obstacles leave, in one state.
+
+    Raises
+    ------
+    InfeasibleError
+        Windows, moving sets, curved or oblique sets in two states, or an unbounded safe set.
+    """
+    n = problem.system.dimension
+    lows, highs = [[-np.inf] * n, [-np.inf] * n], [[np.inf] * n, [np.inf] * n]
+    for constraint in problem.constraints:
+        _refuse_windows(constraint, problem)
+        for axis, side, inner, outer in _faces(constraint, problem):
+            for place, value in enumerate((inner, outer)):
+                if side == 0:
+                    lows[place][axis] = max(lows[place][axis], value)
+                else:
+                    highs[place][axis] = min(highs[place][axis], value)
+    for axis in range(n):
+        if not np.isfinite([lows[0][axis], highs[0][axis]]).all():
+            name = problem.system.states[axis]
+            where = "below" if lows[0][axis] == -np.inf else "above"
+            raise InfeasibleError(
+                f"value functions need a bounded safe set, and {name} is unbounded {where}; a bound that paths hardly "
+                f"reach will do: add a `domain`, or a constraint on {name}."
+            )
+        if not lows[0][axis] < highs[0][axis]:
+            raise InfeasibleError("the safe set has no interior.")
+    ends = [tuple(float(value) for value in row) for row in (*lows, *highs)]
+    return Room(inner_low=ends[0], outer_low=ends[1], inner_high=ends[2], outer_high=ends[3])
+
+
+def _refuse_windows(constraint: Inside, problem: Problem) -> None:
+    if constraint.region.moving:
+        raise InfeasibleError(f"value functions do not serve moving sets yet ('{constraint.label}').")
+    if constraint.during is not None and constraint.during != (0.0, float(problem.horizon)):
+        raise InfeasibleError(f"value functions do not serve constraints over a window yet ('{constraint.label}').")
+
+
+def _faces(constraint: Inside, problem: Problem) -> list[tuple[int, int, float, float]]:
+    """(state, side, inner place, outer place) of each face of a constraint."""
+    n, region = problem.system.dimension, constraint.region
+    if n > 1 and (isinstance(constraint, Outside) or not isinstance(region, (Box, HalfSpace, Polytope))):
+        raise InfeasibleError(f"value functions in two states serve boxes only, not '{constraint.label}'.")
+    if isinstance(constraint, Outside):
+        return _beside(constraint, problem)
+    return _of_region(region, constraint.label)
+
+
+def _of_region(region: object, label: str) -> list[tuple[int, int, float, float]]:
+    faces: list[tuple[int, int, float, float]] = []
+    if isinstance(region, (Ball, Ellipsoid)):
+        reach = float(region.radius if isinstance(region, Ball) else np.sqrt(region.shape[0, 0]))
+        center = float(region.center[0])
+        return [(0, 0, *_rounded(center - reach, 0, abs(center) + reach)),
+                (0, 1, *_rounded(center + reach, 1, abs(center) + reach))]  # fmt: skip
+    if isinstance(region, Box):
+        names = range(len(region.low)) if region.coordinates is None else region.coordinates
+        for axis, low, high in zip(names, region.low, region.high):
+            faces += [(axis, 0, low, low)] if np.isfinite(low) else []
+            faces += [(axis, 1, high, high)] if np.isfinite(high) else []
+        return faces
+    if not isinstance(region, (HalfSpace, Polytope)):
+        raise InfeasibleError(f"value functions do not serve '{label}'.")
+    for normal, bound in zip(*region.halfspaces()):
+        used = np.flatnonzero(normal)
+        if len(used) != 1:
+            raise InfeasibleError(f"value functions serve faces along the coordinates only, not '{label}'.")
+        axis, side = int(used[0]), int(normal[used[0]] > 0)
+        place = float(bound / normal[axis])
+        faces.append((axis, side, *_rounded(place, side, abs(place))))
+    return faces
+
+
+def _beside(constraint: Inside, problem: Problem) -> list[tuple[int, int, float, float]]:
+    """The face that an obstacle shows to the starts, in one state."""
+    faces = {side: (inner, outer) for _, side, inner, outer in _of_region(constraint.region, constraint.label)}
+    low, high = -np.inf, np.inf  # the obstacle's ends, as far as it has them
+    if 0 in faces:
+        low = min(faces[0])
+    if 1 in faces:
+        high = max(faces[1])
+    ends = [float(problem.initial.support(np.array([[sign]]))[0]) * sign for sign in (-1.0, 1.0)]
+    if ends[1] < low:
+        return [(0, 1, low, max(faces[0]))]
+    if ends[0] > high:
+        return [(0, 0, high, min(faces[1]))]
+    raise InfeasibleError(f"the starts must lie on one side of '{constraint.label}'.")
+
+
+def _rounded(place: float, side: int, size: float) -> Ends:
+    """A computed face, moved inward and outward by more than its rounding error."""
+    slack = 4e-16 * size
+    return (place + slack, place - slack) if side == 0 else (place - slack, place + slack)
+
+
+def starts_of(problem: Problem) -> list[tuple[float, float]]:
+    """The bounding box of the starts, rounded outward."""
+    start = problem.initial
+    if isinstance(start, Box):
+        return [(float(a), float(b)) for a, b in zip(start.low, start.high)]
+    if isinstance(start, Ball):
+        reach = np.full(start.dimension, start.radius)
+    elif isinstance(start, Ellipsoid):
+        reach = np.sqrt(np.diagonal(start.shape))
+    else:
+        raise InfeasibleError(f"value functions do not serve starts of the kind {type(start).__name__}.")
+    slack = 1e-15 * (np.abs(start.center) + reach)
+    return [(float(a), float(b)) for a, b in zip(start.center - reach - slack, start.center + reach + slack)]

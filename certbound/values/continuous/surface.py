@@ -1,0 +1,149 @@
+"""The function V that is proposed and then proved: floats at nodes, smooth whatever they are.
+
+V(t, x) is the piecewise polynomial that takes given values, first and second derivatives at the nodes of a grid (degree
+5 in each state), and given values and rates at the ends of slabs of time (degree 3). The data are shared by
+neighbouring cells and slabs, so that V is twice continuously differentiable in x, continuous in t and continuously
+differentiable in t on each slab for *any* finite data: a wrong proposal can only cost tightness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.values.continuous.polynomials import HERMITE, TIME_HERMITE
+from certbound.values.continuous.residual import Patches, along, value_range
+
+__all__ = ["Surface"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Surface:
+    """Hermite data of V over a grid; one or two states.
+
+    Attributes
+    ----------
+    axes : tuple of ndarray
+        Rising nodes of each state, N_i + 1 of them.
+    times : ndarray, shape (K + 1,)
+        Rising ends of the slabs.
+    values : ndarray, shape (K + 1, N_1 + 1, 3[, N_2 + 1, 3])
+        V and its derivatives by order in each state, at the ends of the slabs.
+    start_rates, end_rates : ndarray, shape (K, N_1 + 1, 3[, N_2 + 1, 3])
+        Time derivatives of the same at the start and at the end of each slab.
+
+    Raises
+    ------
+    ValueError
+        Nodes or times that do not rise, or data that are not finite.
+    """
+
+    axes: tuple[Array, ...]
+    times: Array
+    values: Array
+    start_rates: Array
+    end_rates: Array
+
+    def __post_init__(self) -> None:
+        for name, nodes in (("times", self.times), *(("axes", axis) for axis in self.axes)):
+            if not np.all(np.diff(nodes) > 0):
+                raise ValueError(f"`{name}` must rise strictly.")
+        for name in ("values", "start_rates", "end_rates"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"`{name}` must be finite everywhere.")
+
+    @property
+    def slabs(self) -> int:
+        """Number of slabs K."""
+        return len(self.times) - 1
+
+    @property
+    def cells(self) -> tuple[int, ...]:
+        """Number of cells along each state."""
+        return tuple(len(axis) - 1 for axis in self.axes)
+
+    @property
+    def steps(self) -> Array:
+        """Lengths of the slabs, correctly rounded."""
+        return np.diff(self.times)
+
+    def raised(self, shift: float) -> Surface:
+        """V + shift (each value rounded: another V, as good as this one)."""
+        values = self.values.copy()
+        values[(slice(None), *(slice(None), 0) * len(self.axes))] += shift
+        return replace(self, values=values)
+
+    def patches(self, first: int, last: int) -> Patches:
+        """All cells of the slabs ``first`` to ``last`` - 1, flattened with time slowest."""
+        parts = [self.values[first:last], self.start_rates[first:last],
+                 self.values[first + 1 : last + 1], self.end_rates[first:last]]  # fmt: skip
+        return self._patches(np.stack(parts, axis=1), self.steps[first:last])
+
+    def chunks(self, limit: int = 4000) -> Iterator[tuple[int, int]]:
+        """Ranges of slabs with at most ``limit`` patches (or one slab)."""
+        stride = max(1, limit // int(np.prod(self.cells)))
+        for first in range(0, self.slabs, stride):
+            yield first, min(first + stride, self.slabs)
+
+    def range_at(self, index: int) -> tuple[Array, Array]:
+        """Bounds of V over each cell at one end of a slab, shape ``cells``."""
+        data = self.values[index][None, None] * np.ones((1, 4, *([1] * (2 * len(self.axes)))))
+        data[:, 1] = data[:, 3] = 0.0
+        low, high = value_range(self._patches(data, np.ones(1)))
+        return low.reshape(self.cells), high.reshape(self.cells)
+
+    def face_range(self, axis: int, side: int) -> tuple[float, float]:
+        """Bounds of V on one face of the grid over all times."""
+        edge = 0 if side == 0 else -1
+        index: tuple[Any, ...] = (slice(None), *((slice(None),) * (2 * axis)), edge, 0)
+        parts = [self.values[:-1], self.start_rates, self.values[1:], self.end_rates]
+        data = np.stack([part[index] for part in parts], axis=1)
+        rest = tuple(nodes for k, nodes in enumerate(self.axes) if k != axis)
+        low, high = value_range(_patches_of(data, self.steps, rest))
+        return float(low.min()), float(high.max())
+
+    def _patches(self, data: Array, steps: Array) -> Patches:
+        return _patches_of(data, steps, self.axes)
+
+
+def _patches_of(data: Array, steps: Array, axes: tuple[Array, ...]) -> Patches:
+    """Bernstein coefficients from Hermite data of shape (S, 4, N_1 + 1, 3, ...)."""
+    n, slabs = len(axes), len(steps)
+    cells = tuple(len(axis) - 1 for axis in axes)
+    data = data.copy()
+    for axis in range(n):  # (S, 4, ..., N + 1, 3, ...) to (S, 4, ..., N, 6, ...)
+        place = 2 + 2 * axis
+        index = [slice(None)] * data.ndim
+        index[place] = slice(None, -1)
+        left = data[tuple(index)]
+        index[place] = slice(1, None)
+        data = np.concatenate([left, data[tuple(index)]], axis=place + 1)
+    order = [0, *(2 + 2 * axis for axis in range(n)), 1, *(3 + 2 * axis for axis in range(n))]
+    data = data.transpose(order).reshape(slabs * int(np.prod(cells, dtype=int)), 4, *([6] * n))
+    step = np.repeat(steps, int(np.prod(cells, dtype=int)))
+    widths = _cell_widths(axes, slabs)
+    corner: tuple[Any, ...] = (slice(None), 0, *([0] * n))
+    reference = data[corner].copy()
+    values: tuple[Any, ...] = (slice(None), slice(0, 4, 2), *([slice(0, 6, 3)] * n))
+    data[values] -= reference.reshape(-1, *([1] * (n + 1)))
+    data[:, 1::2] *= step.reshape(-1, *([1] * (n + 1)))
+    for axis, width in enumerate(widths):
+        powers = np.stack([np.ones_like(width), width, width * width] * 2, axis=1)
+        data *= powers.reshape(-1, *([1] * (axis + 1)), 6, *([1] * (n - 1 - axis)))
+    coefficients, magnitude = along(TIME_HERMITE, data, 1), along(np.abs(TIME_HERMITE), np.abs(data), 1)
+    for axis in range(n):
+        coefficients = along(HERMITE, coefficients, 2 + axis)
+        magnitude = along(np.abs(HERMITE), magnitude, 2 + axis)
+    size = magnitude.reshape(len(step), -1).max(axis=1)
+    return Patches(coefficients=coefficients, reference=reference, size=size, step=step, widths=widths)
+
+
+def _cell_widths(axes: tuple[Array, ...], slabs: int) -> tuple[Array, ...]:
+    grids = np.meshgrid(*(np.diff(axis) for axis in axes), indexing="ij") if axes else []
+    return tuple(np.tile(grid.ravel(), slabs) for grid in grids)
