@@ -86,7 +86,7 @@ def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
         reason += f": more than the {problem.delta:g} that is asked, from some start"
     return EngineAnswer(
         log10_delta=log10_outward(found.upper, up=True),
-        log10_lower=None if found.lower <= 0 else log10_outward(found.lower, up=False),
+        log10_lower=None if found.lower < 10.0**_FLOOR else log10_outward(found.lower, up=False),
         reason=reason + ".",
         method="values",
         details=found,

@@ -279,8 +279,6 @@ def _checked(problem: Problem, method: str, cells: int | None, constants: Consta
         return
     if constants.continuous != continuous:
         raise ValueError(f"`constants` must state a {'rate' if continuous else 'gain'}, as the problem's time asks.")
-    if constants.dimension != n:
-        raise ValueError(f"`constants` must be of dimension {n}, as the problem is, got {constants.dimension}.")
     if constants.times is not None and constants.times[-1] < problem.horizon:
         raise ValueError(f"`constants` must reach the horizon {problem.horizon:g}, got {constants.times[-1]:g}.")
     from certbound.constants.stated import refuse_contradiction

@@ -104,7 +104,7 @@ def synthesize_plan(
     """
     began = time.perf_counter()
     names = _chosen(tube, problem)
-    if constants is not None:
+    if constants is not None and not constants.certified:
         refuse_contradiction(problem, constants)
     work = Attempts(
         Planner(problem, stage_cost=stage_cost, terminal=terminal, feedback=feedback, steps=steps),

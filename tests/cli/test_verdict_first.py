@@ -70,8 +70,8 @@ def test_where_one_engines_certificate_is_not_proved_anothers_is_tried(monkeypat
     verdict = verify_safety(problem)
     best = min(verdict.answers, key=lambda name: verdict.answers[name].log10_delta)
 
-    def strict(data: Any, given: Any = None) -> Any:
-        report = whole(data, given)
+    def strict(data: Any, given: Any = None, **options: Any) -> Any:
+        report = whole(data, given, **options)
         refused = data["claim"]["method"] == best
         return replace(report, valid=False, reason="not this one") if refused else report
 

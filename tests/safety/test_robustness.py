@@ -175,7 +175,7 @@ def test_warnings_and_interruptions_are_not_swallowed(kind: type[BaseException])
         ({"method": "magic"}, "`method` must be one of"),
         ({"method": "thm3"}, "`method` 'thm3' needs constants with `rate`"),
         ({"constants": cb.Constants(rate=-1.0, sigma=0.1, dimension=1)}, "`constants` must state a gain"),
-        ({"constants": cb.Constants(gain=0.5, sigma=0.1, dimension=2)}, "`constants` must be of dimension 1"),
+        ({"constants": cb.Constants(gain=0.5, sigma=0.1, dimension=2)}, "`constants` must have dimension 1"),
         (
             {"constants": cb.Constants(gain=[0.5, 0.5], sigma=[0.1, 0.1], times=[0, 1, 2], dimension=1)},
             "`constants` must reach the horizon 6, got 2",
