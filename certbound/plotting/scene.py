@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
-    from certbound.reach.tube import ReachTube
+    from certbound.reach.sets import ReachTube
     from certbound.safety.verification import Verdict
 
 __all__ = [
@@ -67,8 +67,8 @@ class Scene:
 
 def noisy_reach(verdict: Verdict) -> ReachTube | None:
     """The reach tube of a verdict with the stochastic deviation at the problem's delta, where there is one."""
-    from certbound.reach.local import radius_over_pieces
-    from certbound.reach.tube import ReachTube
+    from certbound.reach.contraction import radius_over_pieces
+    from certbound.reach.sets import ReachTube
     from certbound.tubes.tube import Tube
 
     if verdict.reach is None or verdict.deviation is None:

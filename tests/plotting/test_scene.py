@@ -17,8 +17,8 @@ from certbound.plotting import Scene, draw_scene
 from certbound.plotting.panels import panels_of
 from certbound.plotting.plane import outlines, plane_of, supports
 from certbound.problem.problem import Problem
-from certbound.reach.curve import Curve
-from certbound.reach.tube import ReachTube
+from certbound.reach.nominal.curve import Curve
+from certbound.reach.sets.reach_tube import ReachTube
 
 PIECES = 20
 
@@ -118,8 +118,8 @@ import sys
 import numpy as np
 import certbound as cb
 from certbound.plotting import Scene, draw_scene
-from certbound.reach.curve import Curve
-from certbound.reach.tube import ReachTube
+from certbound.reach.nominal import Curve
+from certbound.reach.sets import ReachTube
 
 system = cb.DiscreteSystem(lambda x: 0.5 * x, states=2, noise=cb.Gaussian(std=0.1))
 problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=2)
