@@ -10,8 +10,9 @@ from certbound.problem.problem import Problem
 from certbound.reach.cells import initial_cells
 from certbound.reach.contraction import contraction_tube
 from certbound.reach.flow import Flow
-from certbound.reach.local import local_contraction_tube, local_tube, radius_over_pieces
+from certbound.reach.local import local_contraction_tube, local_tube, needed_radius, random_start
 from certbound.reach.tube import ReachTube
+from certbound.tubes.kummer import Start
 from certbound.tubes.tuning import tune_tube
 
 __all__ = ["bound_reach"]
@@ -28,8 +29,8 @@ def bound_reach(
 ) -> ReachTube:
     """A tube that contains the state at every time up to its ``end``.
 
-    Proves, for ``noise=False``: every noise-free trajectory from the initial set, under every disturbance, lies in
-    the tube. For ``noise=True``: with probability at least 1 - delta (the problem's) the noisy one does, at all
+    Proves, for ``noise=False``: every noise-free trajectory from the initial set (from the mean of a random start),
+    under every disturbance, lies in the tube. For ``noise=True``: with probability at least 1 - delta (the problem's) the noisy one does, at all
     times at once.
 
     Parameters
@@ -103,8 +104,11 @@ def contraction_reach(problem: Problem, *, noise: bool = True, cells: int | None
     reach = contraction_tube(problem, constants, cells=cells)
     if not noise:
         return reach
-    tube = tune_tube(constants, horizon=float(problem.horizon), delta=problem.delta)
-    radius = radius_over_pieces(tube, reach.curve)
+    start = random_start(problem, constants)
+    if start != Start():  # its spread belongs to the deviation, whose tube then needs nu = n
+        constants = constants.with_full_dimension()
+    tube = tune_tube(constants, horizon=float(problem.horizon), delta=problem.delta, start=start)
+    radius = needed_radius(tube, reach.curve, start)
     return reach.grown(radius, log10_delta=tube.log10_delta, method=f"{reach.method}, {tube.method}")
 
 

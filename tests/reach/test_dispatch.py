@@ -121,3 +121,25 @@ def test_fewer_pieces_keep_the_largest_values_and_the_proof():
         rate=coarse.rate - 1e-9, sigma=coarse.sigma, dimension=1, times=coarse.times, proof=coarse.proof
     )
     assert not altered.certified
+
+
+@pytest.mark.parametrize("continuous", [True, False])
+def test_the_contraction_tube_holds_the_spread_of_a_random_start(continuous):
+    start = cb.GaussianStart([1.0, 0.0], covariance=[[0.04, 0.0], [0.0, 0.01]])
+    law = {"states": 2, "diffusion": 1e-3 * np.eye(2)} if continuous else {"states": 2, "noise": cb.Gaussian(std=1e-3)}
+    kind = cb.ContinuousSystem if continuous else cb.DiscreteSystem
+    system = kind(lambda x: [-0.5 * x[0] if continuous else 0.5 * x[0], 0.2 * np.sin(x[1])], **law)
+    problem = cb.Problem(system, initial=start, safe=[], horizon=2, delta=0.05)
+    reach = cb.bound_reach(problem, method="contraction")
+    points = start.mean + np.random.default_rng(0).standard_normal((2000, 2)) * [0.2, 0.1]
+    outside = np.any((points < reach.hull.lo[0]) | (points > reach.hull.hi[0]), axis=1)
+    assert outside.mean() < problem.delta
+    assert cb.bound_reach(problem, noise=False, method="contraction").hull.hi[0, 0] == pytest.approx(1.0)
+
+
+def test_local_constants_make_no_tube_of_a_random_start():
+    system = cb.DiscreteSystem(lambda x: [0.5 * x[0] + 0.1 * x[0] ** 3], states=["x"], noise=cb.Gaussian(std=1e-3))
+    start = cb.GaussianStart([0.1], covariance=[[0.01]])
+    problem = cb.Problem(system, initial=start, safe=[], horizon=3)
+    with pytest.raises(InfeasibleError, match="`initial` is a GaussianStart"):
+        cb.bound_reach(problem, method="contraction")
