@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.errors import InfeasibleError
+from certbound.errors import EngineError, InfeasibleError
 from certbound.problem.models import MODELS
 from certbound.reach.local import local_constants, local_contraction_tube, local_tube, radius_over_pieces
 
@@ -143,3 +143,22 @@ def test_local_constants_make_no_tube_of_a_random_start():
     problem = cb.Problem(system, initial=start, safe=[], horizon=3)
     with pytest.raises(InfeasibleError, match="`initial` is a GaussianStart"):
         cb.bound_reach(problem, method="contraction")
+
+
+@pytest.mark.parametrize("continuous", [True, False])
+def test_constants_of_the_domain_prove_a_tube_while_it_is_in_the_domain(continuous):
+    law = {"diffusion": 1e-3} if continuous else {"noise": cb.Gaussian(std=1e-3)}
+    kind = cb.ContinuousSystem if continuous else cb.DiscreteSystem
+    system = kind(lambda x: [x[0] + x[0] ** 3], states=1, **law)
+    start, domain = cb.Box([0.5], [0.7]), cb.Box([-1], [1])
+    problem = cb.Problem(system, initial=start, safe=[], horizon=0.5 if continuous else 3, domain=domain)
+    for noise in (False, True):
+        reach = cb.bound_reach(problem, noise=noise, method="contraction")
+        assert 0 < reach.end < problem.horizon
+        assert np.all(reach.hull.hi[: None if continuous else -1] <= 1.0)
+        wide = cb.bound_reach(problem.replace(domain=cb.Box([-1e3], [1e3])), noise=noise, method="linear")
+        assert wide.end == problem.horizon
+    tiny = problem.replace(domain=cb.Box([0.5 - 1e-6], [0.7 + 1e-6]))
+    if continuous:
+        with pytest.raises(EngineError, match="leaves the model's domain on its first piece"):
+            cb.bound_reach(tiny, method="contraction")
