@@ -41,17 +41,17 @@ _HOME = {
     "Constants": "tubes.constants",
     "tune_tube": "tubes.tuning",
     "bound_exit_probability": "tubes.tuning",
-    "simulate_exits": "simulation.montecarlo",
-    "sample_paths": "simulation.paths",
+    "simulate_exits": "simulation.estimates",
+    "sample_paths": "simulation.estimates",
     "bound_constants": "constants.bounds",
     "bound_metrics": "constants.metrics",
     "bound_reach": "reach",
     "verify_safety": "safety.verification",
-    "synthesize_plan": "synthesis.mpc",
-    "simulate_closed_loop": "synthesis.closed_loop",
-    "PredictiveController": "synthesis.receding",
-    "ConvexPlanner": "synthesis.convex",
-    "SafetyFilter": "synthesis.filter",
+    "synthesize_plan": "synthesis.plans",
+    "simulate_closed_loop": "synthesis.controllers",
+    "PredictiveController": "synthesis.controllers",
+    "ConvexPlanner": "synthesis.controllers",
+    "SafetyFilter": "synthesis.controllers",
     "TerminalSet": "synthesis.terminal",
     "CertboundError": "errors",
     "CertificateError": "errors",
@@ -70,7 +70,7 @@ def _draw(result: Any, axes: Any) -> None:
 
 
 def _content(problem: Any, plan_file: str) -> dict[str, Any]:
-    from certbound.problem.writing import content_of
+    from certbound.problem.files import content_of
 
     return content_of(problem, plan_file)
 

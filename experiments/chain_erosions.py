@@ -10,12 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 import certbound as cb
+from certbound.gaussian.response import level_scale
 from certbound.problem.problem import Problem
-from certbound.reach.fit import fitted
-from certbound.reach.linear import LinearRun, level_scale
-from certbound.reach.linearisation import Linearisation
-from certbound.reach.response_tube import linear_answer
-from certbound.simulation.deviations import Measure, sup_deviation
+from certbound.reach.linear import Linearisation, LinearRun, linear_answer
+from certbound.reach.linear.fit import fitted
+from certbound.simulation.estimates.deviations import Measure, sup_deviation
 from experiments.harness import Arrays, Claims, main
 
 __all__ = ["compute", "erosions", "largest_multiple", "quantiles"]

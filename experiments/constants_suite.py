@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 import certbound as cb
-from certbound.constants.coordinates import Metric
-from certbound.constants.derivatives import StateJacobian
-from certbound.constants.models import model_of
+from certbound.constants.enclosures import Metric
+from certbound.constants.model_data import model_of
+from certbound.constants.state_jacobian import StateJacobian
 from certbound.rigor.intervals import Interval
 from experiments.harness import Arrays, Claims, main
 

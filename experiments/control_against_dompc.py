@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 
 import certbound as cb
-from certbound.problem.trace import casadi_module, compile_numpy, to_casadi
-from certbound.synthesis.erosions import initial_center
+from certbound.problem.adapters import casadi_module, to_casadi
+from certbound.problem.model import compile_numpy
 from certbound.synthesis.faces import faces_of
+from certbound.synthesis.tightening import initial_center
 from experiments.harness import Arrays, Claims, main
 
 HORIZON = 20

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 import certbound as cb
-from certbound.problem.trace import compile_numpy
-from certbound.synthesis.erosions import initial_center
+from certbound.problem.model import compile_numpy
+from certbound.synthesis.tightening import initial_center
 from experiments.harness import Arrays, Claims, main
 
 HORIZON = 20

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 import certbound as cb
-from certbound.problem.trace import compile_numpy, jacobian
+from certbound.problem.model import compile_numpy, jacobian
 from certbound.tubes.kummer import KummerProfile, Start
 from certbound.tubes.schedule import make_schedule
 from experiments.harness import Arrays, Claims, main

@@ -20,7 +20,7 @@ from scipy.stats import binom
 
 import certbound as cb
 from certbound.errors import CertboundError
-from certbound.tubes.kummer import kummer_tube
+from certbound.tubes.kummer.profile import kummer_tube
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import applicable_methods
 from experiments.harness import Arrays, Claims, main

@@ -1,6 +1,6 @@
 """Fig. 8: the unicycle past three obstacles, T = 2 and T = 5: nominal paths, reachable boxes, noisy paths.
 
-Controller gains, disturbance and noise level are reconstructed (see ``certbound.problem.models.unicycle``).
+Controller gains, disturbance and noise level are reconstructed (see ``certbound.problem.library.unicycle``).
 """
 
 from __future__ import annotations

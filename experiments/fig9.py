@@ -1,6 +1,6 @@
 """Fig. 9: the chain of masses under predictive control tightened by Theorem 5: constraints, input, cost, noisy paths.
 
-Parameters and noise level are reconstructed (see ``certbound.problem.models.chain``).
+Parameters and noise level are reconstructed (see ``certbound.problem.library.chain``).
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import numpy as np
 
 import certbound as cb
 from certbound.problem.problem import Problem
-from certbound.simulation.deviations import Measure, sup_deviation
+from certbound.simulation.estimates.deviations import Measure, sup_deviation
 from experiments.harness import Arrays, Claims, main
 
 ROWS = {

@@ -27,9 +27,9 @@ import numpy as np
 
 import certbound.rigor.arithmetic
 import certbound.rigor.elementary
-from certbound.checker import arithmetic as balls
-from certbound.constants.derivatives import StateJacobian
-from certbound.constants.models import Model, model_of
+from certbound.checker.expressions import arithmetic as balls
+from certbound.constants.model_data import Model, model_of
+from certbound.constants.state_jacobian import StateJacobian
 from certbound.rigor.intervals import Interval, matmul
 from experiments.constants_suite import suite
 from experiments.harness import Arrays, Claims, main

@@ -14,8 +14,9 @@ import numpy as np
 
 import certbound as cb
 from certbound.constants.metrics import bound_metrics, model_set, propose_metrics, split_delta
-from certbound.constants.models import model_of
-from certbound.constants.proposals import rate_proposals, spectral_bound
+from certbound.constants.model_data import model_of
+from certbound.constants.programs import rate_proposals
+from certbound.constants.programs.proposals import spectral_bound
 from certbound.constants.recheck import certify_gain
 from experiments.harness import Arrays, Claims, main
 

@@ -14,8 +14,8 @@ import numpy as np
 
 import certbound as cb
 from certbound.errors import CertboundError
-from certbound.safety import contraction
-from certbound.tubes.mixing import mixture_level
+from certbound.safety.engines import constants as contraction
+from certbound.tubes.kummer import mixture_level
 from certbound.tubes.objective import make_objective, read_clearance
 from certbound.tubes.schedule import make_schedule
 from certbound.tubes.tuning import tube_objective

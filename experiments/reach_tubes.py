@@ -17,10 +17,10 @@ import numpy as np
 
 import certbound as cb
 from certbound.problem.sets import GaussianStart
-from certbound.reach.flow import Flow
-from certbound.reach.linearisation import Linearisation
-from certbound.reach.sampled import noise_free_states
-from certbound.reach.tube import ReachTube
+from certbound.reach.linear import Linearisation
+from certbound.reach.nominal import Flow
+from certbound.reach.sampled.boxes import noise_free_states
+from certbound.reach.sets import ReachTube
 from experiments.harness import Arrays, Claims, main
 
 __all__ = ["Finding", "compare", "compute"]

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 import certbound as cb
-from certbound.simulation.deviations import sup_deviation
-from certbound.simulation.montecarlo import simulate_exits
+from certbound.simulation.estimates import simulate_exits
+from certbound.simulation.estimates.deviations import sup_deviation
 from certbound.simulation.stepping import Scenario
 from experiments.harness import Arrays, Claims, main
 

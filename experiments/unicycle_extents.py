@@ -16,10 +16,10 @@ import numpy as np
 import certbound as cb
 from certbound.errors import CertboundError
 from certbound.problem.problem import Problem
-from certbound.reach.flow import Flow
-from certbound.reach.local import local_contraction_tube, local_tube
-from certbound.reach.response_tube import linear_answer
-from certbound.simulation.deviations import Measure, sup_deviation
+from certbound.reach.contraction import local_contraction_tube, local_tube
+from certbound.reach.linear import linear_answer
+from certbound.reach.nominal import Flow
+from certbound.simulation.estimates.deviations import Measure, sup_deviation
 from experiments.harness import Arrays, Claims, main
 
 __all__ = ["compute", "ratios"]

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import solve_banded
 
 import certbound as cb
-from certbound.values.continuous import bound_exits
+from certbound.values.continuous.exits import bound_exits
 
 __all__ = ["compute", "line_problems", "plane_problems", "truth"]
 
@@ -62,7 +62,7 @@ def truth(problem: cb.Problem, cells: int = 2000, steps: int = 2000) -> float:
 
 
 def _solved(problem: cb.Problem, cells: int, steps: int) -> float:
-    from certbound.problem.evaluation import compile_numpy
+    from certbound.problem.model import compile_numpy
     from certbound.values.continuous.coefficients import squared_diffusion
 
     region = problem.safe[0].region

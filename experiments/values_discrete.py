@@ -15,8 +15,8 @@ import numpy as np
 from scipy.stats import beta
 
 import certbound as cb
-from certbound.problem.trace import compile_numpy
-from certbound.values.discrete.bounds import bound_failure
+from certbound.problem.model import compile_numpy
+from certbound.values.discrete.failures import bound_failure
 from experiments.harness import Arrays, Claims, main
 
 __all__ = ["PROBLEMS", "compute", "row", "simulated"]

@@ -1,54 +1,199 @@
-"""The doors between the rooms open in one direction: checked on the source, without running it."""
+"""The doors between rooms and sub-rooms open in one direction: checked on the source, without running it."""
 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
+from collections import Counter, defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[1] / "certbound"
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "certbound"
 
-ORDER = [
-    {"errors", "_version"},
-    {"display"},
-    {"rigor"},
-    {"problem"},
-    {"tubes"},
-    {"values"},
-    {"simulation"},
-    {"values"},
-    {"constants"},
-    {"reach"},
-    {"safety"},
-    {"synthesis"},
-    {"plotting"},
-    {"report"},
-    {"cli"},
-]
-LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
+# What a line names may import the lines above it: rooms, sub-rooms, and single modules that stand between these.
+ORDER = """
+errors _version
+checks
+display
+rigor
+problem.model
+problem.sets problem.noise
+problem.adapters
+problem.systems
+problem.problem
+problem problem.library
+problem.export problem.files
+gaussian.scalar
+gaussian.response
+gaussian
+tubes.constants tubes.line_search
+tubes.tube tubes.schedule tubes.excess
+tubes.ballpath tubes.objective
+tubes.paper tubes.kummer
+tubes.exact
+tubes
+values
+values.continuous values.discrete
+simulation.compiled
+simulation
+simulation.estimates
+constants.enclosures
+constants.jacobians
+constants.programs
+constants
+reach.nominal
+reach.sets reach.remainder
+reach.contraction reach.linear reach.sampled
+reach
+safety.answers
+safety.engines
+safety.certificates
+safety
+synthesis
+synthesis.plans
+synthesis.controllers
+plotting
+html_report
+cli.describe cli.messages cli.output
+cli.options
+cli.clock
+cli.commands
+cli
+"""
+CHECKER_ORDER = """
+report reading words
+balls expressions
+statement
+constants linear barrier
+claims
+check
+"""
+LEVEL = {unit: level for level, line in enumerate(ORDER.split("\n")) for unit in line.split()}
+LEVEL |= {
+    f"checker.{unit}": level for level, line in enumerate(CHECKER_ORDER.split("\n")) for unit in line.split()
+} | {"checker": 99}
 
-CHECKER_MAY_IMPORT = {"certbound.errors", "certbound.problem.tape", "flint"}
+GROUND = {"errors", "_version", "checks", "display", "rigor"}
+KNOWS_ONLY = {  # rooms that may be taken out and used elsewhere
+    "tubes": GROUND,
+    "gaussian": GROUND | {"problem"},
+    "values": GROUND | {"problem"},
+}
+CHECKER_MAY_IMPORT = {"certbound.errors", "certbound.problem.model", "flint"}
+CHECKER_TAKES = {"Tape", "Node", "JUMPS", "BINARY"}
+"""What the checker may take of ``problem.model``: the description of a tape."""
+
+ENTERED = {
+    ("cli", "cli.commands"): "one module a command, and the application lists them",
+}
+"""Sub-rooms whose modules are imported from outside, by whom, and why; everybody else enters by the door."""
+
+MOST_DOORS = 5
+MANY_DOORS = {
+    "gaussian.scalar": (27, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
+    "problem.model": (18, "the one description of functions, which every room reads, differentiates and evaluates"),
+    "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),
+    "reach.linear": (14, "certificates state the records of the search: its linearisation, rows, levels, references"),
+    "constants.jacobians": (15, "nine of them are what users take of the constants room"),
+    "constants.programs": (15, "one program each for rate, gain and erosion, with what it is asked"),
+    "checker.balls": (13, "operations on ball matrices, as a library would offer them"),
+    "problem.sets": (11, "the sets and constraints that users write"),
+    "reach.nominal": (11, "curves and series, which every kind of tube is made of"),
+    "checker.statement": (10, "what a certificate states is read once and asked by three proofs"),
+    "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
+    "checker.expressions": (9, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
+    "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),
+    "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
+    "problem.adapters": (7, "to and from each library"),
+    "safety.engines": (9, "three engines, and the rooms that their certificates restate"),
+    "reach.sets": (7, "tubes, requirements, and directions for the certificate"),
+}
+"""Sub-rooms with more than ``MOST_DOORS`` names in their ``__init__``: how many at most, and why."""
+
+WIDE_OPEN = {"problem.sets", "problem.library", "gaussian.scalar"}
+"""Sub-rooms that offer what they hold, whether the package itself uses it or not."""
+
+CIRCLES: dict[frozenset[str], str] = {}
+"""Modules that import each other in a circle, in functions or for types, and why; there is none."""
+
+TWICE = {
+    "arithmetic": "the operations on numbers that enclose: intervals in rigor, balls in the checker",
+    "barrier": "the barrier engine, its certificate, its check",
+    "check": "checking a certificate, and the command that does it",
+    "constants": "the constants c, L, sigma, nu: their record, the engine on them, its certificate",
+    "diffusion": "noise that depends on the state in the linear engine: search, certificate, check",
+    "elementary": "elementary functions: of intervals, and compiled into kernels",
+    "events": "exceedances of the Gaussian response",
+    "expansion": "second-order expansion over a box",
+    "graph": "expressions as a shared graph",
+    "linear": "the linear-response engine, its certificate",
+    "normal": "tails of the normal distribution",
+    "problem": "a safety problem",
+    "proof": "the proof of a whole certificate of one kind",
+    "reach_tube": "the noise-free reach tube",
+    "regions": "sets of states",
+    "reading": "files of strangers",
+    "rooms": "what constraints leave to the deviation",
+    "series": "Taylor series in time",
+    "structure": "which entries of a Jacobian vary, and how",
+}
+"""Module names that stand in more than one folder, and the one thing that they mean."""
+
+MOST_MODULES = 14
 HEAVY = {"casadi", "clarabel", "control", "cvxpy", "matplotlib", "numba", "plotly", "distributed", "dask"}
 
 
-def imports_of(path: Path, module: str) -> list[tuple[int, str]]:
-    """(line, absolute name) of everything that a module imports, wherever in it."""
+class Import:
+    """One name imported by one line: ``base`` is the module, ``name`` what is taken of it."""
+
+    def __init__(self, line: int, base: str, name: str) -> None:
+        self.line, self.base, self.name = line, base, name
+
+    def __repr__(self) -> str:
+        return f"{self.line} imports {self.base}{'.' if self.name else ''}{self.name}"
+
+
+def imports_of(path: Path, module: str) -> list[Import]:
+    """Everything that a module imports, wherever in it; texts that are a module's name count as well."""
     found = []
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            found += [(node.lineno, alias.name) for alias in node.names]
+            found += [Import(node.lineno, alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
                 parts = package.split(".")
                 parts = parts[: len(parts) - node.level + 1]
                 base = ".".join([*parts, base] if base else parts)
-            found += [(node.lineno, f"{base}.{alias.name}") for alias in node.names]
+            found += [Import(node.lineno, base, alias.name) for alias in node.names]
+        elif isinstance(node, ast.Constant) and re.fullmatch(r"certbound(\.\w+)+", str(node.value)):
+            found.append(Import(node.lineno, str(node.value), ""))
+        elif isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "_HOME":
+            homes = ast.literal_eval(node.value)
+            found += [Import(node.lineno, f"{package}.{home}", name) for name, home in homes.items()]
     return found
+
+
+def modules_of(package: Path) -> dict[str, Path]:
+    """Every module's name and file."""
+    found = {}
+    for path in sorted(package.rglob("*.py")):
+        parts = ["certbound", *path.relative_to(package).with_suffix("").parts]
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def unit_of(module: str) -> str | None:
+    """The longest name in the order that a module belongs to."""
+    parts = module.split(".")[1:] if module.split(".")[0] == "certbound" else []
+    names = [".".join(parts[:end]) for end in range(len(parts), 0, -1)]
+    return next((name for name in names if name in LEVEL), names[-1] if names else None)
 
 
 def room_of(module: str) -> str | None:
@@ -56,66 +201,193 @@ def room_of(module: str) -> str | None:
     return parts[1] if len(parts) > 1 and parts[0] == "certbound" else None
 
 
-def allowed(importer: str, imported: str) -> bool:
-    room, other = room_of(importer), room_of(imported)
-    if room == "checker":
-        own = imported.startswith("certbound.checker")
+def subrooms_of(package: Path) -> set[str]:
+    """Folders inside rooms."""
+    return {
+        ".".join(path.parent.relative_to(package).parts)
+        for path in package.rglob("__init__.py")
+        if len(path.parent.relative_to(package).parts) == 2
+    }
+
+
+def subroom_of(module: str, subrooms: set[str]) -> str | None:
+    name = ".".join(module.split(".")[1:3])
+    return name if module.startswith("certbound.") and name in subrooms else None
+
+
+def allowed(importer: str, found: Import) -> bool:
+    """Whether the order lets a module import this."""
+    room, other = room_of(importer), room_of(found.base)
+    if other is None and found.base == "certbound" and found.name and not found.name.startswith("__"):
+        other = found.name  # from certbound import safety
+    imported = found.base if room_of(found.base) else f"certbound.{other}" if other else found.base
+    if room == "checker" and other != "checker":
+        if imported == "certbound.problem.model":
+            return found.name in CHECKER_TAKES
         named = any(imported == name or imported.startswith(name + ".") for name in CHECKER_MAY_IMPORT)
-        standard = imported.split(".")[0] in sys.stdlib_module_names
-        return own or named or standard
-    if other is None or other == room:
+        return named or imported.split(".")[0] in sys.stdlib_module_names
+    if other is None or room is None or imported == "certbound.problem.__init__":
         return True
-    if imported.startswith("certbound.__"):
+    if other == "checker" and room != "checker":
+        return room in ("cli", "html_report")
+    if other != room and room in KNOWS_ONLY and other not in KNOWS_ONLY[room]:
+        return False
+    one, two = unit_of(importer), unit_of(f"{imported}.{found.name}" if found.name else imported)
+    if one == two or imported == f"certbound.{room}":
         return True
-    if other == "checker":
-        return room in ("cli", "report")
-    if room == "tubes":
-        return other in ("rigor", "errors", "display")
-    return room is None or LEVEL.get(other, 99) < LEVEL[room]
+    return LEVEL.get(two or "", 99) < LEVEL.get(one or "", -1)
+
+
+def by_the_door(importer: str, found: Import, subrooms: set[str], modules: set[str]) -> bool:
+    """Whether an import from another sub-room goes to the sub-room itself, not to a module in it."""
+    full = f"{found.base}.{found.name}" if f"{found.base}.{found.name}" in modules else found.base
+    own, other = subroom_of(importer, subrooms), subroom_of(full, subrooms)
+    if other is None or own == other or full == f"certbound.{other}":
+        return True
+    return (unit_of(importer), other) in ENTERED
 
 
 def violations(package: Path) -> list[str]:
-    """Every import against the order, as ``file:line imports name``."""
+    """Every import against the order or past a door, as ``file:line imports name``."""
     found = []
-    for path in sorted(package.rglob("*.py")):
-        relative = path.relative_to(package)
-        parts = ["certbound", *relative.with_suffix("").parts]
-        module = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-        for line, name in imports_of(path, module):
-            if not allowed(module, name):
-                found.append(f"{relative}:{line} imports {name}")
+    modules = modules_of(package)
+    subrooms = subrooms_of(package)
+    for module, path in modules.items():
+        for entry in imports_of(path, module):
+            if not allowed(module, entry) or not by_the_door(module, entry, subrooms, set(modules)):
+                found.append(f"{path.relative_to(package)}:{entry}")
     return found
 
 
-def test_every_import_points_from_a_later_room_to_an_earlier_one() -> None:
+def circles(package: Path) -> list[frozenset[str]]:
+    """Sets of modules each of which leads back to itself; a name counts for the module that its door took it from."""
+    modules = modules_of(package)
+    doors = {
+        (module, entry.name): entry.base
+        for module, path in modules.items()
+        if path.name == "__init__.py"
+        for entry in imports_of(path, module)
+    }
+    leads: dict[str, set[str]] = defaultdict(set)
+    for module, path in modules.items():
+        for entry in imports_of(path, module):
+            full = f"{entry.base}.{entry.name}"
+            target = full if full in modules else doors.get((entry.base, entry.name), entry.base)
+            if target in modules and target != module and module != "certbound":
+                leads[module].add(target)
+
+    def reached(start: str) -> set[str]:
+        seen: set[str] = set()
+        ahead = list(leads[start])
+        while ahead:
+            module = ahead.pop()
+            if module not in seen:
+                seen.add(module)
+                ahead += leads[module]
+        return seen
+
+    behind = {module: reached(module) for module in modules}
+    looped = [module for module in modules if module in behind[module]]
+    return sorted({frozenset(m for m in looped if m in behind[a] and a in behind[m]) for a in looped}, key=sorted)
+
+
+def test_every_import_points_from_a_later_room_to_an_earlier_one_and_enters_by_its_door() -> None:
     assert violations(PACKAGE) == []
 
 
-def test_every_room_of_the_package_has_its_place_in_the_order() -> None:
+def test_no_module_leads_back_to_itself() -> None:
+    assert [circle for circle in circles(PACKAGE) if circle not in CIRCLES] == []
+    assert set(CIRCLES) <= set(circles(PACKAGE))
+
+
+def test_every_room_and_sub_room_has_its_place_in_the_order() -> None:
     rooms = {
         path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
     }
-    assert rooms - {"__init__", "__main__", "checker"} <= set(LEVEL)
+    assert rooms - {"__init__", "__main__"} <= set(LEVEL)
+    assert subrooms_of(PACKAGE) <= set(LEVEL)
+
+
+def test_no_folder_holds_more_modules_than_can_be_looked_over() -> None:
+    counts = Counter(path.parent for path in PACKAGE.rglob("*.py"))
+    assert {str(folder): count for folder, count in counts.items() if count > MOST_MODULES} == {}
+
+
+def names_offered(path: Path) -> list[str]:
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+            return list(ast.literal_eval(node.value))
+    return []
+
+
+def test_a_sub_room_has_few_doors_or_says_why_not() -> None:
+    for room in sorted(subrooms_of(PACKAGE)):
+        offered = names_offered(PACKAGE / room.replace(".", "/") / "__init__.py")
+        assert len(offered) <= MANY_DOORS.get(room, (MOST_DOORS, ""))[0], room
+    assert set(MANY_DOORS) <= subrooms_of(PACKAGE)
+
+
+def python_files() -> Iterator[Path]:
+    for folder in ("certbound", "tests", "experiments", "paper_figs"):
+        yield from (ROOT / folder).rglob("*.py")
+
+
+def test_every_door_is_used_from_outside() -> None:
+    modules = modules_of(PACKAGE)
+    names = {path: module for module, path in modules.items()}
+    subrooms, taken = subrooms_of(PACKAGE), defaultdict(set)
+    for path in python_files():
+        module = names.get(path, "elsewhere.module")
+        for entry in imports_of(path, module):
+            if subroom_of(module, subrooms) != ".".join(entry.base.split(".")[1:3]):
+                taken[entry.base].add(entry.name)
+    for room in sorted(subrooms - WIDE_OPEN):
+        offered = names_offered(PACKAGE / room.replace(".", "/") / "__init__.py")
+        assert set(offered) <= taken[f"certbound.{room}"], room
+
+
+def test_no_private_name_is_imported() -> None:
+    found = []
+    for path in python_files():
+        for entry in imports_of(path, "elsewhere.module"):
+            if re.match(r"_[a-z]|_[A-Z]", entry.name) and entry.base.startswith("certbound"):
+                found.append(f"{path.relative_to(ROOT)}:{entry}")
+    assert found == []
+
+
+def test_a_module_name_means_one_thing() -> None:
+    names = Counter(path.stem for path in PACKAGE.rglob("*.py") if path.stem != "__init__")
+    assert {name for name, count in names.items() if count > 1} <= set(TWICE)
 
 
 @pytest.mark.parametrize(
     ("file", "source"),
     [
         ("problem/planted.py", "from certbound.safety import verification"),
-        ("problem/planted.py", "from ..reach.linear import anything"),
-        ("tubes/planted.py", "from certbound.problem.tape import Tape"),
+        ("problem/planted.py", "from ..reach.dispatch import anything"),
+        ("problem/sets/planted.py", "from certbound.problem.systems import ContinuousSystem"),
+        ("tubes/planted.py", "from certbound.problem.model import Tape"),
+        ("values/planted.py", "from certbound.tubes.tube import Tube"),
+        ("gaussian/planted.py", "from certbound.reach.linear import LinearRun"),
         ("constants/planted.py", "def late():\n    import certbound.cli.app"),
+        ("constants/planted.py", "import importlib\nimportlib.import_module('certbound.cli.app')"),
+        ("display.py", "import importlib\nimportlib.import_module('certbound.plotting.results').draw"),
         ("rigor/planted.py", "from .. import problem"),
+        ("rigor/__init__.py", "_HOME = {'planted': 'planted'}\nfrom certbound.tubes import tuning"),
         ("reach/planted.py", "from certbound.checker import verify"),
+        ("reach/linear/planted.py", "from certbound.reach.contraction import local_tube"),
+        ("safety/planted.py", "from certbound.reach.linear.run import LinearRun"),
+        ("safety/planted.py", "from certbound.reach.linear import run"),
+        ("reach/contraction/planted.py", "from certbound.reach.nominal.curve import Curve"),
         ("checker/planted.py", "import numpy"),
         ("checker/planted.py", "from certbound.problem.systems import ContinuousSystem"),
+        ("checker/planted.py", "from certbound.problem.model import compile_numpy"),
         ("checker/planted.py", "from certbound.rigor import intervals"),
+        ("checker/balls/planted.py", "from certbound.checker.statement import Model"),
     ],
 )
 def test_a_planted_wrong_import_is_detected(tmp_path: Path, file: str, source: str) -> None:
-    planted = tmp_path / file
-    planted.parent.mkdir()
-    planted.write_text(source)
+    plant(tmp_path, file, source)
     assert len(violations(tmp_path)) == 1
 
 
@@ -126,15 +398,36 @@ def test_a_planted_wrong_import_is_detected(tmp_path: Path, file: str, source: s
             "tubes/planted.py",
             "from certbound.rigor import balls\nfrom .constants import Constants\nimport numpy",
         ),
-        ("checker/planted.py", "import json\nfrom flint import arb\nfrom certbound.problem.tape import Tape"),
+        ("checker/planted.py", "import json\nfrom flint import arb\nfrom certbound.problem.model import Tape"),
         ("safety/planted.py", "from ..reach import linear\nfrom certbound import __version__"),
+        ("safety/planted.py", "from certbound.reach.linear import LinearRun"),
+        ("reach/linear/planted.py", "from certbound.reach.linear.run import LinearRun"),
+        ("cli/app.py", "from certbound.cli.commands import check"),
     ],
 )
 def test_an_import_in_the_right_direction_passes(tmp_path: Path, file: str, source: str) -> None:
-    planted = tmp_path / file
-    planted.parent.mkdir()
-    planted.write_text(source)
+    plant(tmp_path, file, source)
     assert violations(tmp_path) == []
+
+
+def plant(package: Path, file: str, source: str) -> None:
+    """A package with the sub-rooms that planted imports speak of, and one more file."""
+    rooms = ("reach/linear", "reach/contraction", "reach/nominal", "checker/statement", "problem/sets", "cli/commands")
+    for room in rooms:
+        (package / room).mkdir(parents=True)
+        (package / room / "__init__.py").write_text("")
+    for module in ("reach/linear/run", "reach/nominal/curve", "cli/commands/check"):
+        (package / f"{module}.py").write_text("")
+    planted = package / file
+    planted.parent.mkdir(parents=True, exist_ok=True)
+    planted.write_text(source)
+
+
+def test_a_planted_circle_is_detected(tmp_path: Path) -> None:
+    plant(tmp_path, "reach/linear/first.py", "from certbound.reach.linear.second import x")
+    second = tmp_path / "reach/linear/second.py"
+    second.write_text("if TYPE_CHECKING:\n    from certbound.reach.linear.first import y")
+    assert circles(tmp_path) == [frozenset({"certbound.reach.linear.first", "certbound.reach.linear.second"})]
 
 
 def loaded_by(statement: str, names: set[str]) -> set[str]:

@@ -17,15 +17,13 @@ from typing import Any
 
 from flint import arb
 
-from certbound.checker.ceiling import Ceiling, Side
-from certbound.checker.graph import Graph
-from certbound.checker.matrices import upper
-from certbound.checker.model import Model
+from certbound.checker.balls import upper
+from certbound.checker.expressions import Ceiling, Graph, Side
 from certbound.checker.reading import Record, wholes
 from certbound.checker.report import Budget, Unproved
-from certbound.checker.safe_set import SafeSet
+from certbound.checker.statement import Model, SafeSet
 from certbound.errors import CertificateError
-from certbound.problem.tape import Tape
+from certbound.problem.model import Tape
 
 __all__ = ["check_barrier"]
 

@@ -11,12 +11,11 @@ from flint import arb, ctx
 
 from certbound.checker.barrier import check_barrier
 from certbound.checker.claims import ENGINES, assumptions, claim, engine_of
-from certbound.checker.comparison import first_difference
 from certbound.checker.constants import check_constants
 from certbound.checker.linear import check_linear
-from certbound.checker.model import read_model
 from certbound.checker.reading import Record, read, text
 from certbound.checker.report import Budget, Report, Unproved
+from certbound.checker.statement import first_difference, read_model
 from certbound.checker.words import plainly, rounded
 from certbound.errors import CertificateError
 

@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 
 from flint import arb
 
-from certbound.checker.model import Model
 from certbound.checker.reading import number
+from certbound.checker.statement import Model
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
-from certbound.problem.tape import Tape
+from certbound.problem.model import Tape
 
 __all__ = ["ENGINES", "STATED", "assumptions", "claim", "engine_of", "foresees"]
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from certbound._version import __version__
-from certbound.cli import check, derive, doctor, new, problems, simulate, synthesize, tune, verify
+from certbound.cli.commands import check, derive, doctor, new, problems, simulate, synthesize, tune, verify
 from certbound.cli.messages import BAD_INPUT, INTERRUPTED, explain, write_error
 from certbound.cli.output import SETTINGS, logging_to_stderr
 

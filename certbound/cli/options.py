@@ -57,7 +57,7 @@ def integer(text: str) -> int:
 
 def complete_problem(incomplete: str) -> list[str]:
     """Names of bundled problems for the shell's completion."""
-    from certbound.problem.models import MODELS
+    from certbound.problem.library import MODELS
 
     return sorted(name for name in MODELS if name.startswith(incomplete))
 

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.constants.branching import split_boxes
 from certbound.constants.certification import certify, record, relative_widths, slope_weights
-from certbound.constants.coordinates import Metric
-from certbound.constants.derivatives import StateJacobian
-from certbound.constants.models import Model, model_of
-from certbound.constants.noises import bound_noise
+from certbound.constants.enclosures import Metric, split_boxes
+from certbound.constants.model_data import Model, model_of
+from certbound.constants.noise_bounds import bound_noise
+from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import EnclosureError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.constants.branching import Supremum, bound_supremum, random_points
-from certbound.constants.coordinates import Metric
-from certbound.constants.derivatives import StateJacobian
-from certbound.constants.models import Model
-from certbound.constants.noises import NoiseBound, bound_noise
+from certbound.constants.enclosures import Metric, Supremum, bound_supremum, random_points
+from certbound.constants.jacobians import affine_set
+from certbound.constants.model_data import Model
+from certbound.constants.noise_bounds import NoiseBound, bound_noise
 from certbound.constants.recheck import certify_gain, certify_rate
-from certbound.constants.structure import affine_set
+from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants, Proof

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.constants.bounds import constants_along
-from certbound.constants.derivatives import StateJacobian
-from certbound.constants.models import model_of
-from certbound.constants.proposals import rate_proposals, sampled_polytope
+from certbound.constants.model_data import model_of
+from certbound.constants.programs import rate_proposals, sampled_polytope
+from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import SolverError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants

@@ -13,22 +13,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.constants.affine import AffineSet
-from certbound.constants.branching import random_points
 from certbound.constants.certification import certify
-from certbound.constants.derivatives import StateJacobian
-from certbound.constants.jacobians import JacobianSet, as_set
-from certbound.constants.models import Model, model_of
-from certbound.constants.proposals import Proposal, erosion_proposals, rate_proposals, sampled_polytope
-from certbound.constants.structure import affine_set
-from certbound.constants.targets import constraint_targets, cut_rooms, rooms_of, stated_rooms
-from certbound.constants.tightening import RadiusModel, Rooms, erosion_factors
+from certbound.constants.enclosures import random_points
+from certbound.constants.jacobians import AffineSet, JacobianSet, affine_set, as_set
+from certbound.constants.model_data import Model, model_of
+from certbound.constants.programs import (
+    Proposal,
+    RadiusModel,
+    Rooms,
+    constraint_targets,
+    cut_rooms,
+    erosion_factors,
+    erosion_proposals,
+    rate_proposals,
+    rooms_of,
+    sampled_polytope,
+    stated_rooms,
+)
+from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
-from certbound.problem.derivative import jacobian
+from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
-from certbound.problem.tape import Tape
-from certbound.problem.trace import compile_numpy
 from certbound.tubes.constants import Constants
 
 __all__ = ["bound_metrics", "improve", "propose_metrics", "split_delta"]

@@ -14,11 +14,16 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.constants.affine import AffineSet, SectorSet
-from certbound.constants.blocks import centred, varying
-from certbound.constants.centers import center_multipliers
-from certbound.constants.jacobians import IntervalMatrixSet, JacobianSet, UnionSet, as_set
-from certbound.constants.matrices import square_matrix
+from certbound.constants.jacobians import (
+    AffineSet,
+    IntervalMatrixSet,
+    JacobianSet,
+    SectorSet,
+    UnionSet,
+    as_set,
+    square_matrix,
+)
+from certbound.constants.programs import center_multipliers, centred, varying
 from certbound.errors import EnclosureError
 from certbound.rigor.definite import eigenvalue_lower, eigenvalue_upper, is_positive_definite
 from certbound.rigor.intervals import Interval, down, matmul, up

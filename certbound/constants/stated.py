@@ -11,11 +11,10 @@ from certbound.constants.bounds import bound_constants
 from certbound.constants.matching import implies
 from certbound.display import rounded
 from certbound.errors import CertboundError
+from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
-from certbound.problem.tape import Tape
-from certbound.problem.trace import compile_numpy, jacobian
 from certbound.tubes.constants import Constants
 
 __all__ = ["proved_or_stated", "refuse_contradiction"]

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from certbound.plotting.plane import supports
 from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene, instants
-from certbound.problem.distances import clearance
-from certbound.problem.sets import Ball, Ellipsoid, Inside, Outside
+from certbound.problem.sets import Ball, Ellipsoid, Inside, Outside, clearance
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from certbound.problem.problem import Problem
-    from certbound.reach.tube import ReachTube
+    from certbound.reach.sets import ReachTube
 
 __all__ = ["Panel", "draw_panel", "least_distance", "panels_of", "stairs"]
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from certbound.problem.problem import Problem
-    from certbound.reach.tube import ReachTube
+    from certbound.reach.sets import ReachTube
 
 __all__ = ["draw_plane", "outlines", "plane_of", "supports"]
 
@@ -60,7 +60,7 @@ def draw_plane(axes: Axes, scene: Scene, plane: Plane) -> None:
 
 def supports(tube: ReachTube, direction: Array) -> Array:
     """max a.x over the tube on each piece, over all cells: shape (K,)."""
-    from certbound.reach.series import polynomial_range
+    from certbound.reach.nominal import polynomial_range
     from certbound.rigor.intervals import Interval
 
     coefficients = tube.curve.coefficients

@@ -12,7 +12,7 @@ from certbound.plotting.panels import draw_panel, panels_of
 from certbound.plotting.plane import draw_plane, plane_of
 from certbound.plotting.scene import BLUE, INK, OUTER, Scene, noisy_reach
 from certbound.problem.problem import Problem
-from certbound.reach.tube import ReachTube
+from certbound.reach.sets import ReachTube
 from certbound.safety.answers import Deviation
 from certbound.safety.verification import Verdict
 from certbound.tubes.constants import Constants

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
-    from certbound.reach.tube import ReachTube
+    from certbound.reach.sets import ReachTube
     from certbound.safety.verification import Verdict
 
 __all__ = [
@@ -67,8 +67,8 @@ class Scene:
 
 def noisy_reach(verdict: Verdict) -> ReachTube | None:
     """The reach tube of a verdict with the stochastic deviation at the problem's delta, where there is one."""
-    from certbound.reach.local import needed_radius
-    from certbound.reach.tube import ReachTube
+    from certbound.reach.contraction import needed_radius
+    from certbound.reach.sets import ReachTube
     from certbound.tubes.kummer import Start
     from certbound.tubes.tube import Tube
 
@@ -82,6 +82,8 @@ def noisy_reach(verdict: Verdict) -> ReachTube | None:
         return None
     start = getattr(verdict.tube.profile, "start", Start())
     radius = needed_radius(verdict.tube, verdict.reach.curve, start)
+    if not np.all(np.isfinite(radius)):
+        return None
     return verdict.reach.grown(radius, log10_delta=verdict.tube.log10_delta, method=verdict.method)
 
 

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from certbound.problem.casadi_bridge import casadi_module, to_casadi
-from certbound.problem.evaluation import compile_numpy
+from certbound.problem.adapters import casadi_module, to_casadi
+from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Ellipsoid, Inside, Outside
 from certbound.problem.systems import System
-from certbound.problem.tape import Tape
 
 __all__ = ["CasadiProblem", "export_casadi", "export_control"]
 

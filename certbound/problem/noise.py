@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.problem.checks import frozen, positive_definite, vector
+from certbound.checks import frozen, positive_definite, vector
 
 __all__ = ["Bounded", "Gaussian", "Law", "Rademacher", "SubGaussian", "Uniform", "check_law"]
 

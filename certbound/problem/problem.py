@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.checks import frozen, nearest, number, positive_definite, vector
 from certbound.display import Shown, ask_later_room, name_text
-from certbound.problem.checks import frozen, nearest, number, positive_definite, vector
-from certbound.problem.initial import check_start
-from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, Inside, Outside
+from certbound.problem.model import Tape, substitute, trace
+from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, Inside, Outside, check_start
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
-from certbound.problem.tape import Tape
-from certbound.problem.trace import substitute, trace
 
 __all__ = ["GaussianStart", "Problem"]
 

@@ -14,13 +14,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.problem.checks import frozen, matrix, names, number, vector
-from certbound.problem.io_systems import import_control, is_control_system
+from certbound.checks import frozen, matrix, names, number, vector
+from certbound.problem.adapters import import_control, is_control_system, is_symbolic, read_model, symbol_names
+from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.noise import Gaussian, Law
 from certbound.problem.sets import Box
-from certbound.problem.symbolic import is_symbolic, read_model, symbol_names
-from certbound.problem.tape import Tape
-from certbound.problem.trace import compile_numpy
 
 __all__ = ["ContinuousSystem", "DiscreteSystem", "System", "from_control", "linear_system"]
 

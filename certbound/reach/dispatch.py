@@ -9,11 +9,15 @@ import numpy as np
 from certbound.constants.bounds import bound_constants
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, contained
 from certbound.problem.problem import Problem
-from certbound.reach.cells import initial_cells
-from certbound.reach.contraction import contraction_tube
-from certbound.reach.flow import Flow
-from certbound.reach.local import local_contraction_tube, local_tube, needed_radius, random_start
-from certbound.reach.tube import ReachTube
+from certbound.reach.contraction import (
+    contraction_tube,
+    local_contraction_tube,
+    local_tube,
+    needed_radius,
+    random_start,
+)
+from certbound.reach.nominal import Flow, initial_cells
+from certbound.reach.sets import ReachTube
 from certbound.tubes.kummer import Start
 from certbound.tubes.tuning import tune_tube
 
@@ -32,8 +36,8 @@ def bound_reach(
     """A tube that contains the state at every time up to its ``end``.
 
     Proves, for ``noise=False``: every noise-free trajectory from the initial set (from the mean of a random start),
-    under every disturbance, lies in the tube. For ``noise=True``: with probability at least 1 - delta (the problem's) the noisy one does, at all
-    times at once.
+    under every disturbance, lies in the tube. For ``noise=True``: with probability at least 1 - delta (the problem's)
+    the noisy one does, at all times at once.
 
     Parameters
     ----------
@@ -45,8 +49,8 @@ def bound_reach(
         Parts along each side of the initial set; the tube is the union over the cells.
     method : {"auto", "linear", "contraction", "sampled", "learned"}
         Thm K7, or Thms K5 and K4; "auto" takes the first that reaches the horizon. "sampled" and "learned" prove
-        nothing: they give a statistical statement about sampled trajectories (`certbound.reach.sampled`,
-        `certbound.reach.learned`), marked as such, with ``certified`` False.
+        nothing: they give a statistical statement about sampled trajectories (`certbound.reach.sampled.boxes`,
+        `certbound.reach.sampled.classifier`), marked as such, with ``certified`` False.
     **sampling
         Only for the statistical methods: ``epsilon``, ``confidence``, ``pieces``, ``rng`` (and ``points``).
 
@@ -137,8 +141,8 @@ def _while_in_domain(problem: Problem, reach: ReachTube) -> ReachTube:
 
 def response_reach(problem: Problem, *, noise: bool = True, cells: int | None = None) -> ReachTube:
     """Thm K7, loaded when it is first used."""
-    from certbound.reach.jumps import hidden_jump
-    from certbound.reach.response_tube import linear_reach
+    from certbound.reach.linear import linear_reach
+    from certbound.reach.remainder import hidden_jump
 
     hidden = hidden_jump(problem)
     if hidden is not None:
@@ -150,8 +154,7 @@ def statistical_reach(
     problem: Problem, method: str, *, noise: bool, cells: int | None = None, **sampling: Any
 ) -> ReachTube:
     """A tube around samples, not certified; loaded when it is first used."""
-    from certbound.reach.learned import estimate_reach_by_classifier
-    from certbound.reach.sampled import estimate_reach
+    from certbound.reach.sampled import estimate_reach, estimate_reach_by_classifier
 
     if cells is not None:
         raise ValueError(f"`cells` must be left out for the method {method!r}, which does not split, got {cells!r}.")

@@ -1,1 +1,1 @@
-"""The rigor room."""
+"""Arithmetic that proves: intervals with outward rounding, balls, matrices, norms."""

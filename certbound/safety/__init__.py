@@ -1,1 +1,1 @@
-"""The safety room."""
+"""Verdicts: the engines that prove them, and the certificates that carry the proof."""

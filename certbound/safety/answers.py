@@ -12,9 +12,9 @@ from flint import arb
 from numpy.typing import NDArray
 
 from certbound.display import Shown, rounded
-from certbound.reach.norms import Norm
-from certbound.reach.tube import ReachTube
+from certbound.reach.sets import ReachTube
 from certbound.rigor.balls import lower, precision
+from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
 
 __all__ = ["Answered", "Deviation", "EngineAnswer", "is_at_most", "settled"]

@@ -12,15 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import CertboundError
-from certbound.problem.distances import clearance
+from certbound.problem.model import compile_numpy, varying_outputs
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Box, GaussianStart, Inside, Outside
-from certbound.problem.trace import compile_numpy
-from certbound.reach.clearance import constraint_clearance
-from certbound.reach.flow import Flow
-from certbound.reach.norms import Norm
-from certbound.reach.tapes import varying_outputs
-from certbound.reach.tube import ReachTube
+from certbound.problem.sets import Box, GaussianStart, Inside, Outside, clearance
+from certbound.reach.nominal import Flow
+from certbound.reach.sets import ReachTube, constraint_clearance
+from certbound.rigor.norms import Norm
 
 __all__ = ["Violation", "find_violation"]
 
@@ -153,7 +150,7 @@ def _proved(
     problem: Problem, start: Array, signal: Array, time: float, constraint: Inside, depth: float
 ) -> Violation | None:
     """The violation, if the enclosed trajectory shows it."""
-    from certbound.reach.local import local_contraction_tube
+    from certbound.reach.contraction import local_contraction_tube
 
     try:
         flow = Flow(problem.replace(initial=start), only=signal)

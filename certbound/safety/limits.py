@@ -16,12 +16,10 @@ import numpy as np
 
 from certbound.display import power_above, rounded
 from certbound.errors import CertboundError
+from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.problem import Problem
-from certbound.problem.regions import Ball, Box, HalfSpace, Polytope, Region
-from certbound.problem.sets import Inside, Outside
+from certbound.problem.sets import Ball, Box, HalfSpace, Inside, Outside, Polytope, Region
 from certbound.problem.systems import ContinuousSystem, System
-from certbound.problem.tape import Tape
-from certbound.problem.trace import substitute, trace
 from certbound.safety.verification import ENGINES, Verdict, verify_safety
 
 __all__ = ["Limits", "find_limits", "find_smallest", "smaller_verdicts"]

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 from certbound.display import Shown, log10_text, name_text, rounded
 from certbound.errors import CertificateError, EngineError, contained
 from certbound.problem.problem import Problem
-from certbound.reach.cells import initial_cells
-from certbound.reach.tube import ReachTube
+from certbound.reach.nominal import initial_cells
+from certbound.reach.sets import ReachTube
 from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, settled
+from certbound.safety.engines import linear_engine
 from certbound.safety.falsification import Violation, find_violation
-from certbound.safety.linear import linear_engine
 
 if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 
 def _constants(problem: Problem, **options: Any) -> EngineAnswer:
-    from certbound.safety.contraction import constants_engine
+    from certbound.safety.engines import constants_engine
 
     return constants_engine(problem, **options)
 
@@ -38,13 +38,13 @@ def _linear(problem: Problem, **options: Any) -> EngineAnswer:
 
 
 def _barrier(problem: Problem, **options: Any) -> EngineAnswer:
-    from certbound.safety.barrier import barrier_engine
+    from certbound.safety.engines import barrier_engine
 
     return barrier_engine(problem, **options)
 
 
 def _values(problem: Problem, **options: Any) -> EngineAnswer:
-    from certbound.safety.values import values_engine
+    from certbound.safety.engines import values_engine
 
     return values_engine(problem, **options)
 
@@ -119,7 +119,7 @@ class Verdict(Shown):
         """
         if self.problem is None:
             return None
-        from certbound.safety.certificate import certificate_data
+        from certbound.safety.certificates import certificate_data
 
         try:
             return certificate_data(self.problem, self)
@@ -134,7 +134,7 @@ class Verdict(Shown):
         CertificateError
             If no probability was bounded that a certificate could state.
         """
-        from certbound.safety.certificate import certificate_text
+        from certbound.safety.certificates import certificate_text
 
         return certificate_text(problem, self, attempt=attempt)
 
@@ -269,7 +269,7 @@ def _checked(problem: Problem, method: str, cells: int | None, constants: Consta
     ValueError
         If the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit it.
     """
-    from certbound.tubes.baselines import check_method
+    from certbound.tubes.paper import check_method
 
     initial_cells(problem, cells)
     _ = problem.closed_loop

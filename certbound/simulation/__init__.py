@@ -1,1 +1,1 @@
-"""The simulation room."""
+"""Random paths: how often they leave, how far they stray, with confidence limits."""

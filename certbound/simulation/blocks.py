@@ -136,7 +136,7 @@ class Work:
 
     def run_block(self, block: int, tally: Tally, out: Array | None = None) -> int:
         """Add one block to ``tally``'s arrays; returns the number of steps done."""
-        from certbound.simulation.streams import start_generator
+        from certbound.simulation.compiled import start_generator
 
         generator = start_generator(self.entropy, block)
         count = min(self.block, self.paths - block * self.block)
@@ -145,8 +145,7 @@ class Work:
         return self._call(starts, signals, block, tally, out)
 
     def _call(self, starts: Array, signals: Array, block: int, tally: Tally, out: Array | None) -> int:
-        from certbound.simulation.cache import load_kernel
-        from certbound.simulation.streams import seed_stream
+        from certbound.simulation.compiled import load_kernel, seed_stream
 
         notes = np.zeros(2 + self.dimension)
         kernel = load_kernel(self.source)

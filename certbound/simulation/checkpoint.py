@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.simulation.blocks import Tally, Work
-from certbound.simulation.cache import write_atomically
+from certbound.simulation.compiled import write_atomically
 
 __all__ = ["Checkpoint", "stored_entropy"]
 

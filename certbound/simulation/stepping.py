@@ -9,11 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.problem.model import Node, Tape, compile_numpy, jacobian, trace
 from certbound.problem.noise import Bounded, Gaussian, Law, Rademacher, Uniform, check_law
-from certbound.problem.tape import Node, Tape
-from certbound.problem.trace import compile_numpy, jacobian, trace
-from certbound.simulation.expressions import live_nodes
-from certbound.simulation.linear import exact_transition
+from certbound.simulation.tape_text import live_nodes
+from certbound.simulation.transition import exact_transition
 
 __all__ = ["Scenario", "StepModel", "step_model"]
 

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.simulation.barriers import EXPONENT, Barrier, Bridge, barrier_source
-from certbound.simulation.expressions import Parameters, linear_form
+from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, barrier_source
+from certbound.simulation.tape_text import Parameters, linear_form
 
 __all__ = ["LOWEST", "Lines", "Task", "task_source"]
 

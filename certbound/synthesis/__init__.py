@@ -1,1 +1,1 @@
-"""The synthesis room."""
+"""Plans, controllers and filters under which the noisy system provably stays safe."""

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.problem.adapters import to_casadi
+from certbound.problem.model import Tape, compile_numpy, trace
 from certbound.problem.problem import Problem
-from certbound.problem.tape import Tape
-from certbound.problem.trace import compile_numpy, to_casadi, trace
 from certbound.synthesis.plant import Grid
 
 __all__ = ["Cost", "cost_of"]

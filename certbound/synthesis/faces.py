@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.problem.adapters import to_casadi
+from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
-from certbound.problem.tape import Tape
-from certbound.problem.trace import to_casadi
 
 __all__ = ["Face", "Facets", "Plane", "Round", "faces_of"]
 
@@ -96,7 +96,7 @@ class Face:
         """Coordinates relative to the centre, shape (K, q)."""
         chosen = states[:, list(self.coordinates)]
         if isinstance(self.center, Tape):
-            from certbound.problem.trace import compile_numpy
+            from certbound.problem.model import compile_numpy
 
             return np.asarray(chosen - compile_numpy(self.center)(times))
         return np.asarray(chosen - self.center)

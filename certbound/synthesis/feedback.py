@@ -12,15 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.constants.lmi import design_feedback
-from certbound.constants.structure import jacobian_set
+from certbound.checks import matrix
+from certbound.constants.jacobians import jacobian_set
+from certbound.constants.programs import design_feedback
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
-from certbound.problem.checks import matrix
+from certbound.problem.model import Tape, jacobian, substitute, trace
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside, Polytope
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
-from certbound.problem.tape import Tape
-from certbound.problem.trace import jacobian, substitute, trace
 from certbound.synthesis.terminal import linearise, riccati
 
 __all__ = ["close_loop", "constrain_inputs", "depends_on", "resolve_feedback"]

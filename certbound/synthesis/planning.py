@@ -22,12 +22,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.constants.bounds import bound_constants
 from certbound.errors import InfeasibleError
+from certbound.problem.model import jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.regions import Region
-from certbound.problem.sets import GaussianStart
-from certbound.problem.trace import jacobian
+from certbound.problem.sets import GaussianStart, Region
 from certbound.synthesis.costs import Cost, cost_of
-from certbound.synthesis.erosions import (
+from certbound.synthesis.faces import Face, faces_of
+from certbound.synthesis.feedback import close_loop, constrain_inputs, depends_on, resolve_feedback
+from certbound.synthesis.plant import Grid, Plant
+from certbound.synthesis.terminal import TerminalSet, check_terminal, contraction_terminal, riccati_terminal
+from certbound.synthesis.tightening import (
     BallTube,
     Tightening,
     ball_tube,
@@ -36,15 +39,6 @@ from certbound.synthesis.erosions import (
     nominal_spread,
     spread_tube,
     tighten,
-)
-from certbound.synthesis.faces import Face, faces_of
-from certbound.synthesis.feedback import close_loop, constrain_inputs, depends_on, resolve_feedback
-from certbound.synthesis.plant import Grid, Plant
-from certbound.synthesis.terminal import (
-    TerminalSet,
-    check_terminal,
-    contraction_terminal,
-    riccati_terminal,
 )
 from certbound.synthesis.transcription import Solution, Transcription
 from certbound.tubes.constants import Constants

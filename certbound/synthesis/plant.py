@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.tape import Tape
-from certbound.problem.trace import compile_numpy, to_casadi
+from certbound.problem.adapters import to_casadi
+from certbound.problem.model import Tape, compile_numpy
 
 __all__ = ["Grid", "Plant"]
 

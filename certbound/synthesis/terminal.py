@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.regions import Region
-from certbound.problem.sets import Ball, Box, Ellipsoid
-from certbound.problem.trace import compile_numpy, jacobian
+from certbound.problem.sets import Ball, Box, Ellipsoid, Region
 from certbound.synthesis.faces import Face, Facets, Round
 from certbound.tubes.constants import Constants
 

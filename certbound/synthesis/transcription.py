@@ -23,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.trace import casadi_module
+from certbound.problem.adapters import casadi_module
 from certbound.synthesis.costs import Cost
 from certbound.synthesis.faces import Face, Facets
 from certbound.synthesis.plant import Grid, Plant

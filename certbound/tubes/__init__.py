@@ -1,1 +1,1 @@
-"""The tubes room."""
+"""Tubes around a noise-free trajectory from constants alone: the formulas, and which is smallest."""

@@ -10,16 +10,23 @@ from typing import Any
 import numpy as np
 
 from certbound.errors import InfeasibleError, SolverError
-from certbound.tubes.almost_sure import AlmostSureProfile
-from certbound.tubes.baselines import BASELINES, baseline_tube
 from certbound.tubes.constants import Constants, check_delta
-from certbound.tubes.exact import bound_exact_exit, bound_worst_exit, first_passage_tube
-from certbound.tubes.exit import exit_level, union_level, union_may_help
-from certbound.tubes.kummer import KummerProfile, Start, check_power, check_start
-from certbound.tubes.mixing import mixture_level, mixture_tube
+from certbound.tubes.exact import AlmostSureProfile, bound_exact_exit, bound_worst_exit, first_passage_tube
+from certbound.tubes.kummer import (
+    KummerProfile,
+    Search,
+    Start,
+    check_power,
+    check_start,
+    exit_level,
+    mixture_level,
+    mixture_tube,
+    union_level,
+    union_may_help,
+)
 from certbound.tubes.objective import Clearance, Objective, make_objective, read_clearance
+from certbound.tubes.paper import BASELINES, baseline_tube
 from certbound.tubes.schedule import Schedule, make_schedule, spread
-from certbound.tubes.search import Search
 from certbound.tubes.tube import Tube, log10_upper, supremum
 
 __all__ = ["METHODS", "applicable_methods", "bound_exit_probability", "tube_objective", "tune_tube"]

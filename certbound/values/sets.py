@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope, Region
-from certbound.problem.sets import Inside, Outside
-from certbound.problem.tape import Tape
+from certbound.problem.model import Tape
+from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope, Region
 from certbound.rigor.intervals import ARITHMETIC, Interval, sq, sqrt, stack
 
 __all__ = ["active_at", "box_around", "contains", "respected"]

@@ -16,12 +16,13 @@ import numpy as np
 
 import certbound as cb
 from certbound.checker import parse
-from certbound.safety.certificate import certificate_text, exact, problem_data
+from certbound.safety.certificates.file import certificate_text, problem_data
+from certbound.safety.certificates.parts import exact
 from certbound.safety.verification import verify_safety
 from tests.checker import conftest
+from tests.checker.linear.test_diffusion import growth
 from tests.checker.test_adversary import jumping, linear
 from tests.checker.test_barrier import by_hand, kinked
-from tests.checker.test_stopped import growth
 
 Data = dict[str, Any]
 
@@ -206,24 +207,28 @@ def _(data: Data) -> None:
     _claim(data, -44.9)
 
 
-@forges("the problem is the given one", "still", "comparison.py", "first_difference", "speaks of another problem")
+@forges(
+    "the problem is the given one", "still", "statement/comparison.py", "first_difference", "speaks of another problem",
+)
 def _(data: Data) -> None:
     region = data["problem"]["constraints"][0]["region"]
     region["low"], region["high"] = exact([-1.1]), exact([1.1])
 
 
-@forges("a covariance is positive semidefinite", "unequal", "model.py", "_semidefinite", "negative variance")
+@forges(
+    "a covariance is positive semidefinite", "unequal", "statement/problem.py", "_semidefinite", "negative variance",
+)
 def _(data: Data) -> None:
     data["problem"]["noise"]["values"][1][1] = exact(-0.5)
     _claim(data, -100.0)
 
 
-@forges("no correlation exceeds 1", "unequal", "model.py", "_semidefinite", "must be positive semidefinite")
+@forges("no correlation exceeds 1", "unequal", "statement/problem.py", "_semidefinite", "must be positive semidefinite")
 def _(data: Data) -> None:
     data["problem"]["noise"]["values"] = exact([[1e12, 2e5], [2e5, 0.01]])
 
 
-@forges("the cells cover the initial set", "steps", "partition.py", "cells_of", "do not cover")
+@forges("the cells cover the initial set", "steps", "statement/partition.py", "cells_of", "do not cover")
 def _(data: Data) -> None:
     top = float.fromhex(data["problem"]["initial"]["high"][0])
     data["proof"]["splits"][0][-1] = exact(float(np.nextafter(top, 0.0)))
@@ -232,19 +237,21 @@ def _(data: Data) -> None:
 # ---- the linear response -------------------------------------------------------------------------------------
 
 
-@forges("every entry of a Jacobian that varies is stated", "steps", "shared.py", "Shared", "entries of the Jacobian")
+@forges(
+    "every entry of a Jacobian that varies is stated", "steps", "linear/shared.py", "Shared", "entries of the Jacobian",
+)
 def _(data: Data) -> None:
     del data["proof"]["varying"][0]
     for row in _cell(data)["slopes"]:
         del row[0]
 
 
-@forges("every jump is decided", "straight", "linear.py", "_Cell._check_remainder", "may jump with x")
+@forges("every jump is decided", "straight", "linear/proof.py", "_Cell._check_remainder", "may jump with x")
 def _(data: Data) -> None:
     jumping(data, "sign", 1, 0.2)
 
 
-@forges("a constant derivative is defined", "straight", "structure.py", "_values", "is not defined")
+@forges("a constant derivative is defined", "straight", "statement/structure.py", "_values", "is not defined")
 def _(data: Data) -> None:
     tape = data["problem"]["dynamics"]
     nodes = tape["nodes"]
@@ -254,85 +261,99 @@ def _(data: Data) -> None:
     tape["outputs"] = [n + 4]
 
 
-@forges("the nominal curve does not jump", "flow", "linear.py", "_Cell", "curve jumps")
+@forges("the nominal curve does not jump", "flow", "linear/proof.py", "_Cell", "curve jumps")
 def _(data: Data) -> None:
     for piece in _cell(data)["nominal"][25:]:
         for point in piece:
             point[0] = exact(float.fromhex(point[0]) + 1e-9)
 
 
-@forges("every state that enters nonlinearly has levels", "flow", "linear.py", "_Cell._frames", "enters nonlinearly")
+@forges(
+    "every state that enters nonlinearly has levels", "flow", "linear/proof.py", "_Cell._frames", "enters nonlinearly",
+)
 def _(data: Data) -> None:
     data["proof"]["units"] = []
     cell = _cell(data)
     cell["levels"], cell["rows"] = [[] for _ in cell["levels"]], [[] for _ in cell["rows"]]
 
 
-@forges("the rows of a frame are independent", "steps", "remainder.py", "_Frame", "not regular")
+@forges("the rows of a frame are independent", "steps", "linear/remainder.py", "_Frame", "not regular")
 def _(data: Data) -> None:
     _cell(data)["frames"][1] = [0, 0]
 
 
-@forges("the rows of a frame are as many as its states", "steps", "remainder.py", "_Frame", "as many rows")
+@forges("the rows of a frame are as many as its states", "steps", "linear/remainder.py", "_Frame", "as many rows")
 def _(data: Data) -> None:
     _cell(data)["frames"][1] = [0]
 
 
-@forges("the remainder lies in its box at every step", "steps", "remainder.py", "OutputRemainder.prove", "in its box")
+@forges(
+    "the remainder lies in its box at every step", "steps", "linear/remainder.py", "OutputRemainder.prove",
+    "in its box",
+)
 def _(data: Data) -> None:
     _scale(_cell(data)["slopes"][2], 0, 1.0, 0.3)
     _claim(data, -3.9)
 
 
-@forges("the remainder lies in its box over a piece", "flow", "remainder.py", "OutputRemainder.prove", "in its box")
+@forges(
+    "the remainder lies in its box over a piece", "flow", "linear/remainder.py", "OutputRemainder.prove", "in its box",
+)
 def _(data: Data) -> None:
     _scale(_cell(data)["drifts"][10], 0, 1.0, 20.0)
 
 
-@forges("a kinked remainder lies in its box", "bent", "remainder.py", "OutputRemainder._kinked_form", "in its box")
+@forges(
+    "a kinked remainder lies in its box", "bent", "linear/remainder.py", "OutputRemainder._kinked_form", "in its box",
+)
 def _(data: Data) -> None:
     _scale(_cell(data)["slopes"][0], 0, 1.0, 1.0)
     _claim(data, -23.0)
 
 
-@forges("the series of a piece converge", "flow", "response.py", "continuous_piece", "too long for the slope")
+@forges("the series of a piece converge", "flow", "linear/response.py", "continuous_piece", "too long for the slope")
 def _(data: Data) -> None:
     _scale(_cell(data)["slopes"][3], 0, 1.0, 1e4)
 
 
-@forges("y starts anywhere in its cell", "straight", "response.py", "supports", BEYOND)
+@forges("y starts anywhere in its cell", "straight", "linear/response.py", "supports", BEYOND)
 def _(data: Data) -> None:
     _from(data, [0.1], [0.95])
 
 
-@forges("y takes every disturbance", "disturbed", "linear.py", "_Cell._load", BEYOND)
+@forges("y takes every disturbance", "disturbed", "linear/proof.py", "_Cell._load", BEYOND)
 def _(data: Data) -> None:
     data["problem"]["disturbance_set"] = [exact([-0.35, 0.45])]  # the same middle
 
 
-@forges("Z has the covariance of the noise", "straight", "response.py", "covariances", MORE)
+@forges("Z has the covariance of the noise", "straight", "linear/response.py", "covariances", MORE)
 def _(data: Data) -> None:
     _scale(data["problem"]["noise"], "values", 1.1)
 
 
-@forges("a constraint leaves the room that is used", "straight", "demands.py", "_demand", BEYOND)
+@forges("a constraint leaves the room that is used", "straight", "statement/rooms.py", "_demand", BEYOND)
 def _(data: Data) -> None:
     _scale(data["problem"]["constraints"][0]["region"], "high", 0.8)
 
 
-@forges("a direction keeps all of an obstacle off", "steps", "regions.py", "Constraint.read_separation", "nothing is")
+@forges(
+    "a direction keeps all of an obstacle off", "steps", "statement/regions.py", "Constraint.read_separation",
+    "nothing is",
+)
 def _(data: Data) -> None:
     for row in _cell(data)["separations"][1]:
         _scale([row], 0, -1.0)
 
 
-@forges("weights of faces are not negative", "steps", "regions.py", "Constraint._mixed", "at least 0")
+@forges("weights of faces are not negative", "steps", "statement/regions.py", "Constraint._mixed", "at least 0")
 def _(data: Data) -> None:
     rows = _cell(data)["separations"][2]
     rows[:] = [exact([0.0, 0.0, 0.0, -1.0])] * len(rows)
 
 
-@forges("an obstacle is kept off at every moment of a piece", "flow", "demands.py", "_centres", "nothing is left")
+@forges(
+    "an obstacle is kept off at every moment of a piece", "flow", "statement/rooms.py", "_centres", "nothing is left",
+)
 def _(data: Data) -> None:
     tape = data["problem"]["constraints"][1]["region"]["center"]  # o(t) (1 - exp(-(1e4 (t - .615))^2))
     nodes = tape["nodes"]
@@ -343,49 +364,49 @@ def _(data: Data) -> None:
     tape["outputs"] = [n + 10, n + 11]
 
 
-@forges("a constraint is asked on all of its window", "flow", "demands.py", "Grid.asked", "nothing is left")
+@forges("a constraint is asked on all of its window", "flow", "statement/rooms.py", "Grid.asked", "nothing is left")
 def _(data: Data) -> None:
     constraint = data["problem"]["constraints"][1]
     constraint["during"] = exact([0.615, 0.6150001])
     constraint["region"]["center"] = exact([0.2, -0.3])
 
 
-@forges("levels are not negative", "steps", "linear.py", "_Cell._rows", "at least 0")
+@forges("levels are not negative", "steps", "linear/proof.py", "_Cell._rows", "at least 0")
 def _(data: Data) -> None:
     _cell(data)["levels"][2][0] = exact(-1.0)
 
 
-@forges("a level costs what Z exceeds it, in steps", "steps", "events.py", "chain", MORE)
+@forges("a level costs what Z exceeds it, in steps", "steps", "linear/events.py", "chain", MORE)
 def _(data: Data) -> None:
     _scale(_cell(data)["levels"], 3, 0.3)
 
 
-@forges("a level costs what Z exceeds it, in windows", "flow", "events.py", "Windows.exceedance", BEYOND)
+@forges("a level costs what Z exceeds it, in windows", "flow", "linear/events.py", "Windows.exceedance", BEYOND)
 def _(data: Data) -> None:
     _scale(_cell(data)["levels"], 20, 0.3)
 
 
-@forges("levels of the martingale's coordinates cost", "flow", "events.py", "Windows.coordinates", BEYOND)
+@forges("levels of the martingale's coordinates cost", "flow", "linear/events.py", "Windows.coordinates", BEYOND)
 def _(data: Data) -> None:
     _scale(_cell(data)["window_levels"], 12, 0.3)
 
 
-@forges("noise that is only sub-Gaussian has its own tail", "steps", "events.py", "sub_gaussian", MORE)
+@forges("noise that is only sub-Gaussian has its own tail", "steps", "linear/events.py", "sub_gaussian", MORE)
 def _(data: Data) -> None:
     data["problem"]["noise"]["law"] = "subgaussian"
 
 
-@forges("a level costs what sub-Gaussian noise exceeds it", "bounded steps", "linear.py", "_Cell._leaving", MORE)
+@forges("a level costs what sub-Gaussian noise exceeds it", "bounded steps", "linear/proof.py", "_Cell._leaving", MORE)
 def _(data: Data) -> None:
     data["problem"]["noise"] |= {"law": "bounded", "level": "halfwidth", "independent": False}
 
 
-@forges("only opposite requirements share a product", "cornered", "families.py", "correlated", MORE)
+@forges("only opposite requirements share a product", "cornered", "linear/families.py", "correlated", MORE)
 def _(data: Data) -> None:
     data["problem"]["constraints"][1]["region"]["normal"] = exact([-1.0, 1e-12])
 
 
-@forges("the windows begin at 0 and rise", "flow", "shared.py", "Shared", "must rise from 0")
+@forges("the windows begin at 0 and rise", "flow", "linear/shared.py", "Shared", "must rise from 0")
 def _(data: Data) -> None:
     data["proof"]["windows"][0] = 1
 
@@ -399,19 +420,26 @@ def _stopped(data: Data) -> Data:
 
 
 @forges(
-    "the state stays inside the set of its noise", "stirred", "stopped.py", "StateNoise.holds", "to stay in the set"
+    "the state stays inside the set of its noise", "stirred", "linear/diffusion.py", "StateNoise.holds",
+    "to stay in the set",
 )
 def _(data: Data) -> None:
     _scale(_stopped(data)["high"], 20, 0.5)
 
 
-@forges("the excess of the noise is bounded over its set", "stirred", "stopped.py", "StateNoise.excess", "in its box")
+@forges(
+    "the excess of the noise is bounded over its set", "stirred", "linear/diffusion.py", "StateNoise.excess",
+    "in its box",
+)
 def _(data: Data) -> None:
     _scale(_stopped(data), "reference", 0.95)  # more is M's, whose levels widen what the remainder must hold on
     _claim(data, -4.0)
 
 
-@forges("the noise depends on states with bounds only", "growth", "stopped.py", "StateNoise.excess", "noise depends on")
+@forges(
+    "the noise depends on states with bounds only", "growth", "linear/diffusion.py", "StateNoise.excess",
+    "noise depends on",
+)
 def _(data: Data) -> None:
     data["proof"]["units"] = []
     cell, stopped = _cell(data), _stopped(data)
@@ -420,32 +448,32 @@ def _(data: Data) -> None:
     stopped["rows"] = []
 
 
-@forges("levels of M's coordinates cost", "stirred", "stopped.py", "Stopped", BEYOND)
+@forges("levels of M's coordinates cost", "stirred", "linear/diffusion.py", "Stopped", BEYOND)
 def _(data: Data) -> None:
     _scale(_stopped(data), "coordinates", 0.3)
 
 
-@forges("levels of M along the rows cost", "stirred", "stopped.py", "Stopped.along", BEYOND)
+@forges("levels of M along the rows cost", "stirred", "linear/diffusion.py", "Stopped.along", BEYOND)
 def _(data: Data) -> None:
     _scale(_stopped(data)["rows"], 0, 0.3)
 
 
-@forges("the part of a room that is M's costs", "stirred", "stopped.py", "Stopped.along", BEYOND)
+@forges("the part of a room that is M's costs", "stirred", "linear/diffusion.py", "Stopped.along", BEYOND)
 def _(data: Data) -> None:
     _scale(_stopped(data), "rooms", 0.3)
 
 
-@forges("all of a room that is M's costs", "growth", "stopped.py", "_beyond", BEYOND)
+@forges("all of a room that is M's costs", "growth", "linear/diffusion.py", "_beyond", BEYOND)
 def _(data: Data) -> None:
     _scale(data["problem"]["constraints"][0]["region"], "bound", 0.9)
 
 
-@forges("all of a room is M's where Z is 0", "stirred", "stopped.py", "StateNoise", "where all noise is in M")
+@forges("all of a room is M's where Z is 0", "stirred", "linear/diffusion.py", "StateNoise", "where all noise is in M")
 def _(data: Data) -> None:
     _stopped(data)["rooms"] = None
 
 
-@forges("the windows of M begin at 0 and rise", "stirred", "stopped.py", "StateNoise", "must rise from 0")
+@forges("the windows of M begin at 0 and rise", "stirred", "linear/diffusion.py", "StateNoise", "must rise from 0")
 def _(data: Data) -> None:
     _stopped(data)["windows"][0] = 1
 
@@ -453,13 +481,17 @@ def _(data: Data) -> None:
 # ---- constants -----------------------------------------------------------------------------------------------
 
 
-@forges("the pieces cover the horizon", "contraction", "constants.py", "_Proof._read_times", "do not cover the horizon")
+@forges(
+    "the pieces cover the horizon", "contraction", "constants/proof.py", "_Proof._read_times",
+    "do not cover the horizon",
+)
 def _(data: Data) -> None:
     data["problem"]["horizon"] = exact(2.0)
 
 
 @forges(
-    "a polynomial is written about a time in its piece", "rising", "constants.py", "_Proof._read_times", "outside its"
+    "a polynomial is written about a time in its piece", "rising", "constants/proof.py", "_Proof._read_times",
+    "outside its",
 )
 def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["bound"] = exact(1.0)
@@ -467,22 +499,30 @@ def _(data: Data) -> None:
     _cell(data)["nominal"] = [exact([[100.0], [-10.0]])] * 2
 
 
-@forges("the metric is positive definite", "contraction", "eigen.py", "cholesky", "not positive definite")
+@forges("the metric is positive definite", "contraction", "balls/eigen.py", "cholesky", "not positive definite")
 def _(data: Data) -> None:
     data["proof"]["metric"] = exact([[1.0, 0.0], [0.0, -1.0]])
 
 
-@forges("the defect of the nominal curve is at most eta", "contraction", "tube.py", "Tube.defect", "defect")
+@forges(
+    "the defect of the nominal curve is at most eta", "contraction", "constants/reach_tube.py", "Tube.defect", "defect",
+)
 def _(data: Data) -> None:
     _scale(_cell(data)["eta"], 60, 0.9)
 
 
-@forges("the defect holds for every disturbance", "contraction", "tube.py", "Tube._with_disturbance", "defect")
+@forges(
+    "the defect holds for every disturbance", "contraction", "constants/reach_tube.py", "Tube._with_disturbance",
+    "defect",
+)
 def _(data: Data) -> None:
     data["problem"]["disturbance_set"] = [exact([-1.1, 1.1])]
 
 
-@forges("an input of the plan holds on its own piece", "planned", "tube.py", "Tube.inputs", "between two changes")
+@forges(
+    "an input of the plan holds on its own piece", "planned", "constants/reach_tube.py", "Tube.inputs",
+    "between two changes",
+)
 def _(data: Data) -> None:
     proof, cell = data["proof"], _cell(data)
     middle = proof["times"].index(exact(0.5))
@@ -493,42 +533,52 @@ def _(data: Data) -> None:
         del cell[name][middle]
 
 
-@forges("the reach tube starts around its cell", "contraction", "tube.py", "Norm.start", "stated radius on piece 0")
+@forges(
+    "the reach tube starts around its cell", "contraction", "constants/reach_tube.py", "Norm.start",
+    "stated radius on piece 0",
+)
 def _(data: Data) -> None:
     _from(data, [0.1, 0.1], [0.3, 0.2])
 
 
 @forges(
-    "the reach tube grows as its equation says", "contraction", "tube.py", "Tube.prove", "stated radius on piece 60"
+    "the reach tube grows as its equation says", "contraction", "constants/reach_tube.py", "Tube.prove",
+    "stated radius on piece 60",
 )
 def _(data: Data) -> None:
     _scale(_cell(data)["radius"], 60, 0.99)
 
 
-@forges("jumps of the nominal curve widen the tube", "rising", "tube.py", "Tube.prove", "stated radius on piece 1")
+@forges(
+    "jumps of the nominal curve widen the tube", "rising", "constants/reach_tube.py", "Tube.prove",
+    "stated radius on piece 1",
+)
 def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["bound"] = exact(8.0)
     _cell(data)["nominal"][1] = exact([[1.0], [10.0]])
 
 
-@forges("a polyhedral constraint leaves the room", "still", "constants.py", "_Proof._check_rooms", "the stated room")
+@forges(
+    "a polyhedral constraint leaves the room", "still", "constants/proof.py", "_Proof._check_rooms", "the stated room",
+)
 def _(data: Data) -> None:
     _scale(data["proof"]["rooms"], 2, 1.1)
 
 
-@forges("a round constraint leaves the room", "random", "demands.py", "round_demands", "the stated room")
+@forges("a round constraint leaves the room", "random", "statement/rooms.py", "round_demands", "the stated room")
 def _(data: Data) -> None:
     _scale(data["proof"]["rooms"], 2, 1.01)
 
 
 @forges(
-    "a room is stated where a constraint is asked", "still", "constants.py", "_Proof._check_rooms", "states nothing"
+    "a room is stated where a constraint is asked", "still", "constants/proof.py", "_Proof._check_rooms",
+    "states nothing",
 )
 def _(data: Data) -> None:
     data["proof"]["rooms"][2] = None
 
 
-@forges("a certain start needs no room", "still", "constants.py", "_Proof._check_rooms", "stated room on piece 0")
+@forges("a certain start needs no room", "still", "constants/proof.py", "_Proof._check_rooms", "stated room on piece 0")
 def _(data: Data) -> None:
     _from(data, [1.5], [1.5])
     cell = _cell(data)
@@ -540,7 +590,8 @@ def _(data: Data) -> None:
 
 
 @forges(
-    "a start lies in the domain of the constants", "still", "constants.py", "_Proof._check_rooms", "domain.*piece 0"
+    "a start lies in the domain of the constants", "still", "constants/proof.py", "_Proof._check_rooms",
+    "domain.*piece 0",
 )
 def _(data: Data) -> None:
     _from(data, [1.95], [2.1])
@@ -552,77 +603,86 @@ def _(data: Data) -> None:
     _claim(data, -20.0)
 
 
-@forges("rooms are positive, in steps", "still", "kummer.py", "_least_discrete", MORE)
+@forges("rooms are positive, in steps", "still", "constants/kummer.py", "_least_discrete", MORE)
 def _(data: Data) -> None:
     data["proof"]["rooms"][2] = exact(-0.5)
 
 
-@forges("rooms are positive, in continuous time", "rising", "kummer.py", "_least_continuous", MORE)
+@forges("rooms are positive, in continuous time", "rising", "constants/kummer.py", "_least_continuous", MORE)
 def _(data: Data) -> None:
     data["proof"]["rooms"][1] = exact(-0.1)
 
 
-@forges("the rate bounds the Jacobian", "contraction", "contraction.py", "Contraction.prove", "rate .* was not shown")
+@forges(
+    "the rate bounds the Jacobian", "contraction", "constants/rates.py", "Contraction.prove", "rate .* was not shown",
+)
 def _(data: Data) -> None:
     _scale(data["proof"], "rate", 1.01)
 
 
-@forges("the gain bounds the Jacobian", "still", "contraction.py", "Contraction.prove", "gain .* was not shown")
+@forges("the gain bounds the Jacobian", "still", "constants/rates.py", "Contraction.prove", "gain .* was not shown")
 def _(data: Data) -> None:
     _scale(data["proof"], "rate", 0.99)
 
 
-@forges("the constants hold wherever a path may go", "still", "constants.py", "_Proof._global_box", "gain .* was not")
+@forges(
+    "the constants hold wherever a path may go", "still", "constants/proof.py", "_Proof._global_box", "gain .* was not",
+)
 def _(data: Data) -> None:
     data["proof"]["region"] = "everywhere"
 
 
-@forges("the domain of the constants is a constraint", "still", "constants.py", "_Proof._global_box", "has no domain")
+@forges(
+    "the domain of the constants is a constraint", "still", "constants/proof.py", "_Proof._global_box", "has no domain",
+)
 def _(data: Data) -> None:
     data["problem"]["domain"] = None
     _cell(data)["separations"].pop()
 
 
-@forges("sigma bounds the noise", "contraction", "contraction.py", "Spread.prove", "were not shown to bound the noise")
+@forges(
+    "sigma bounds the noise", "contraction", "constants/rates.py", "Spread.prove", "were not shown to bound the noise",
+)
 def _(data: Data) -> None:
     _scale(data["problem"]["noise"]["diffusion"][0], 0, 1.01)
 
 
-@forges("nu bounds the trace of the noise", "bounded", "contraction.py", "Spread.prove", "were not shown to bound")
+@forges("nu bounds the trace of the noise", "bounded", "constants/rates.py", "Spread.prove", "were not shown to bound")
 def _(data: Data) -> None:
     _scale(data["proof"], "nu", 0.99)
     data["proof"]["kummer"]["a"] = exact(0.5)
 
 
-@forges("nu is at most the number of states", "still", "constants.py", "_Proof", "must lie in")
+@forges("nu is at most the number of states", "still", "constants/proof.py", "_Proof", "must lie in")
 def _(data: Data) -> None:
     data["proof"]["nu"] = exact(0.0)
 
 
-@forges("sub-Gaussian noise with nu < n needs a < nu/2", "bounded", "constants.py", "_Proof._kummer", "a < nu/2")
+@forges("sub-Gaussian noise with nu < n needs a < nu/2", "bounded", "constants/proof.py", "_Proof._kummer", "a < nu/2")
 def _(data: Data) -> None:
     _scale(data["proof"]["kummer"], "a", 1.1)
 
 
-@forges("a random start needs nu = n", "random", "constants.py", "_Proof._kummer", "random start needs nu")
+@forges("a random start needs nu = n", "random", "constants/proof.py", "_Proof._kummer", "random start needs nu")
 def _(data: Data) -> None:
     data["problem"]["noise"] |= {"values": exact([0.05]), "matrix": exact([[1.0], [0.0]])}
     data["proof"]["nu"] = exact(1.5)
 
 
 @forges(
-    "the spread of a random start is bounded", "random", "constants.py", "_Proof._check_start", "random start was not"
+    "the spread of a random start is bounded", "random", "constants/proof.py", "_Proof._check_start",
+    "random start was not",
 )
 def _(data: Data) -> None:
     _scale(data["problem"]["initial"]["covariance"][0], 0, 1.01)
 
 
-@forges("v0 exceeds the spread of a random start", "random", "kummer.py", "_initial", "v_0 is too small")
+@forges("v0 exceeds the spread of a random start", "random", "constants/kummer.py", "_initial", "v_0 is too small")
 def _(data: Data) -> None:
     data["proof"]["kummer"]["v0"] = exact(0.005)
 
 
-@forges("Theorem K2 bounds the probability", "contraction", "kummer.py", "exit_probability", MORE)
+@forges("Theorem K2 bounds the probability", "contraction", "constants/kummer.py", "exit_probability", MORE)
 def _(data: Data) -> None:
     _scale(data["proof"]["kummer"], "v0", 30.0)
 
@@ -641,13 +701,17 @@ def _(data: Data) -> None:
 
 
 @forges(
-    "the barrier is above its level at the boundary", "barrier", "safe_set.py", "SafeSet.boundary", "constraint breaks"
+    "the barrier is above its level at the boundary", "barrier", "statement/safe_set.py", "SafeSet.boundary",
+    "constraint breaks",
 )
 def _(data: Data) -> None:
     _scale(data["proof"], "boundary", 1.0, 0.0015)
 
 
-@forges("the initial set lies in the safe set", "barrier", "safe_set.py", "SafeSet.contains", "lie in the safe set")
+@forges(
+    "the initial set lies in the safe set", "barrier", "statement/safe_set.py", "SafeSet.contains",
+    "lie in the safe set",
+)
 def _(data: Data) -> None:
     data["problem"]["initial"] |= {"low": exact([1.99]), "high": exact([2.01])}
     proof = data["proof"]  # 8 x^2 - 2 x^4 is small again out there
@@ -656,7 +720,9 @@ def _(data: Data) -> None:
     _claim(data, -1.9)
 
 
-@forges("the constraints bound every state", "barrier", "safe_set.py", "SafeSet", "bounds x|no constraint that")
+@forges(
+    "the constraints bound every state", "barrier", "statement/safe_set.py", "SafeSet", "bounds x|no constraint that",
+)
 def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["low"] = [None]
 
@@ -678,7 +744,9 @@ def _(data: Data) -> None:
     data["proof"]["scale"] = exact([-1.0])
 
 
-@forges("a barrier treats no constraint with a window", "barrier", "safe_set.py", "SafeSet._shape", "time window")
+@forges(
+    "a barrier treats no constraint with a window", "barrier", "statement/safe_set.py", "SafeSet._shape", "time window",
+)
 def _(data: Data) -> None:
     data["problem"]["constraints"][0]["during"] = exact([0.0, 0.5])
 

@@ -9,15 +9,15 @@ import pytest
 from flint import arb, arb_mat
 
 from certbound.checker import check_data
-from certbound.checker.events import sub_gaussian
-from certbound.checker.expansion import Expansion
-from certbound.checker.graph import Graph
-from certbound.checker.matrices import is_positive_definite
-from certbound.checker.program import Program
-from certbound.checker.quadratic import Quadratic
+from certbound.checker.balls.matrices import is_positive_definite
+from certbound.checker.expressions.expansion import Expansion
+from certbound.checker.expressions.graph import Graph
+from certbound.checker.expressions.program import Program
+from certbound.checker.expressions.quadratic import Quadratic
+from certbound.checker.linear.events import sub_gaussian
 from certbound.checker.report import Budget, Unproved
 from certbound.errors import CertificateError
-from certbound.safety.certificate import exact
+from certbound.safety.certificates.parts import exact
 from tests.checker.test_adversary import linear
 
 Data = dict[str, Any]

@@ -195,7 +195,7 @@ def test_the_doctor_reports_every_dependency(capsys: pytest.CaptureFixture[str])
 
 
 def test_a_broken_installation_is_reported(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from certbound.cli import doctor
+    from certbound.cli.commands import doctor
 
     monkeypatch.setattr(doctor, "_verdict", lambda: "fine")
     monkeypatch.setattr(doctor, "_requirements", lambda: {"numpy": ">=99.0", "not-there": ">=1"})

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 import certbound as cb
-from certbound.cli import check, verify
 from certbound.cli.app import run
-from certbound.cli.check import proved_certificate
+from certbound.cli.commands import check, verify
+from certbound.cli.commands.check import proved_certificate
 from certbound.errors import CertificateError, SolverError
 from certbound.safety.verification import verify_safety
 

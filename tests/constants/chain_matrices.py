@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from certbound.constants.jacobians import SectorSet
+from certbound.constants.jacobians.affine import SectorSet
 
 
 def chain_sector(masses: int, *, continuous: bool = False) -> SectorSet:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 import certbound as cb
 from certbound.constants.bounds import bound_constants, constants_along
 from certbound.errors import EnclosureError, InfeasibleError
-from certbound.problem.trace import compile_numpy, jacobian
+from certbound.problem.model.derivative import jacobian
+from certbound.problem.model.evaluation import compile_numpy
 from certbound.rigor.intervals import Interval
 
 

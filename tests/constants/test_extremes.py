@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.constants.centers import lyapunov_metric, starting_metric
+from certbound.constants.programs.centers import lyapunov_metric, starting_metric
 
 
 def coupled(units, *, time=1.0, during=None, domain=None):

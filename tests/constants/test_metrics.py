@@ -7,9 +7,9 @@ import pytest
 
 import certbound as cb
 from certbound.constants.metrics import erosion_ratio, propose_metrics, split_delta
+from certbound.constants.programs.least_erosion import RadiusModel, Rooms
+from certbound.constants.programs.targets import constraint_targets, nominal_paths, rooms_of
 from certbound.constants.recheck import certify_gain, certify_rate
-from certbound.constants.targets import constraint_targets, nominal_paths, rooms_of
-from certbound.constants.tightening import RadiusModel, Rooms
 from certbound.errors import EnclosureError
 from tests.constants.chain_matrices import DIRECTIONS, NOISE, chain_sector
 

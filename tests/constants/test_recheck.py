@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from certbound.constants import recheck
-from certbound.constants.affine import AffineSet, SectorSet
-from certbound.constants.blocks import contraction_value, lmi_blocks
-from certbound.constants.centers import center_metric
-from certbound.constants.jacobians import IntervalMatrixSet, UnionSet
+from certbound.constants.jacobians.affine import AffineSet, SectorSet
+from certbound.constants.jacobians.jacobian_sets import IntervalMatrixSet, UnionSet
+from certbound.constants.programs.centers import center_metric
+from certbound.constants.programs.sectors import contraction_value, lmi_blocks
 from certbound.constants.recheck import certify_gain, certify_rate, holds_gain, holds_rate
 from certbound.errors import EnclosureError
 from tests.constants.chain_matrices import chain_sector

@@ -9,7 +9,7 @@ from tests.docs.blocks import DOCS, ROOT
 
 
 def test_equal_strength_is_the_count_without_exits_that_the_limits_need() -> None:
-    from certbound.simulation.statistics import bound_binomial
+    from certbound.simulation.estimates.statistics import bound_binomial
 
     paths = round(10 ** equal_strength(-3))
     assert bound_binomial(0, paths, 0.99)[1] == pytest.approx(1e-3, rel=2e-3)

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import certbound as cb
-from certbound.problem.files import loads
-from certbound.problem.toml_text import toml_text
+from certbound.problem.files.loading import loads
+from certbound.problem.files.toml import toml_text
 from tests.fuzz.formulas import Formula, number
 
 __all__ = ["Draft", "Noise", "Shape", "Units", "Wall"]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.simulation.statistics import bound_binomial
+from certbound.simulation.estimates.statistics import bound_binomial
 from tests.fuzz.drafts import Draft, Wall
 
 __all__ = ["CONFIDENCE", "Count", "Policy", "exits", "follow", "lower_limit", "starts", "worst_case"]

@@ -78,7 +78,7 @@ def test_every_draft_means_the_same_by_file_and_by_function():
         names = problem.closed_loop.inputs
         values = np.random.default_rng(seed).uniform(0.3, 0.9, len(names))
         values[1 : 1 + draft.dimension] *= draft.units.state
-        both = [cb.problem.trace.compile_numpy(p.closed_loop)(*values) for p in (problem, twin)]
+        both = [cb.problem.model.evaluation.compile_numpy(p.closed_loop)(*values) for p in (problem, twin)]
         np.testing.assert_allclose(*both, rtol=1e-9, atol=1e-9 * np.max(draft.units.state))
         checked += 1
     assert checked >= 5
@@ -192,12 +192,12 @@ def test_formulas_are_read_alike_as_text_and_as_numbers():
     x, y = symbol("x0"), symbol("x1")
     formula = apply("min", apply("hypot", x, y) ** 1.5, 2 / (1 + apply("exp", -x))) - (-3.0) * apply("atan2", y, 2.0)
     values = (0.4, -0.7)
-    from certbound.problem.expressions import parse
-    from certbound.problem.graph import Graph
+    from certbound.problem.files.parser import parse
+    from certbound.problem.model.graph import Graph
 
     graph = Graph(["x0", "x1"])
     node = parse(formula.text({"x0": "x0", "x1": "x1"}), graph, {"x0": graph.input(0), "x1": graph.input(1)}, "f")
-    read = cb.problem.trace.compile_numpy(graph.tape([node], (1,)))(*values)[0]
+    read = cb.problem.model.evaluation.compile_numpy(graph.tape([node], (1,)))(*values)[0]
     assert read == pytest.approx(formula.value(dict(zip(("x0", "x1"), values))), rel=1e-13)
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from certbound.problem.files import load
-from certbound.problem.trace import compile_numpy
+from certbound.problem.files.loading import load
+from certbound.problem.model.evaluation import compile_numpy
 
 FOLDER = Path(__file__).parents[2] / "experiments" / "benchmarks"
 

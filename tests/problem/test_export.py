@@ -7,7 +7,7 @@ import pytest
 
 import certbound as cb
 from certbound.problem.export import export_casadi, export_control
-from certbound.problem.trace import compile_numpy
+from certbound.problem.model.evaluation import compile_numpy
 
 
 def arms() -> cb.Problem:

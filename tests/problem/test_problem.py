@@ -5,11 +5,13 @@ import pickle
 import numpy as np
 import pytest
 
+from certbound.problem.model.evaluation import compile_numpy
+from certbound.problem.model.tracing import trace
 from certbound.problem.noise import Gaussian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, HalfSpace, Inside, Outside, Polytope
+from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
+from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
-from certbound.problem.trace import compile_numpy, trace
 
 SQUARE = Inside(Box([-1, -1], [1, 1]))
 

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from certbound.problem.model.evaluation import compile_numpy
+from certbound.problem.model.tape import Tape
+from certbound.problem.model.tracing import trace
 from certbound.problem.noise import Bounded, Gaussian
-from certbound.problem.sets import Ball, Box
+from certbound.problem.sets.regions import Ball, Box
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, from_control, linear_system
-from certbound.problem.tape import Tape
-from certbound.problem.trace import compile_numpy, trace
 
 
 def test_arguments_are_passed_by_name_in_signal_order():

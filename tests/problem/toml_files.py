@@ -3,8 +3,8 @@
 import numpy as np
 
 import certbound as cb
-from certbound.problem.tape import Tape
-from certbound.problem.trace import compile_numpy
+from certbound.problem.model.evaluation import compile_numpy
+from certbound.problem.model.tape import Tape
 
 __all__ = ["COURSE", "STEPS", "changed", "course_in_python", "same"]
 

@@ -7,8 +7,8 @@ import pytest
 
 import certbound as cb
 from certbound.errors import EngineError, InfeasibleError
-from certbound.problem.models import MODELS
-from certbound.reach.local import local_constants, local_contraction_tube, local_tube, radius_over_pieces
+from certbound.problem.library import MODELS
+from certbound.reach.contraction.local import local_constants, local_contraction_tube, local_tube, radius_over_pieces
 
 
 def spiral(half=0.05, sigma=0.05, horizon=2.0) -> cb.Problem:

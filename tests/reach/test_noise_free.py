@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import certbound as cb
-from certbound.problem.models import MODELS
+from certbound.problem.library import MODELS
 from experiments.reach_tubes import compare
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from certbound.problem.tape import BINARY, UNARY
+from certbound.problem.model.tape import BINARY, UNARY
 from certbound.rigor import arithmetic, elementary
 from certbound.rigor import intervals as iv
 from certbound.rigor.intervals import Interval

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from certbound.reach.norms import Norm
+from certbound.rigor.norms import Norm
 from certbound.safety.answers import Deviation, is_at_most, settled
 
 

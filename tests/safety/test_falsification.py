@@ -7,9 +7,10 @@ import pytest
 
 from certbound.problem.noise import Gaussian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, GaussianStart, HalfSpace, Inside, Outside
+from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
+from certbound.problem.sets.regions import Ball, Box, HalfSpace
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
-from certbound.reach.flow import Flow
+from certbound.reach.nominal.flow import Flow
 from certbound.safety import falsification
 from certbound.safety.falsification import find_violation
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.cli.check import proved_certificate
+from certbound.cli.commands.check import proved_certificate
 from certbound.constants.bounds import bound_constants
 from certbound.constants.metrics import bound_metrics
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, SolverError, contained
-from certbound.reach.linearisation import Linearisation
+from certbound.reach.linear.linearisation import Linearisation
 from certbound.safety import verification
 from certbound.safety.verification import verify_safety
 

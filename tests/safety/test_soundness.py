@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 
 import certbound as cb
-from certbound.problem.trace import compile_numpy
+from certbound.problem.model.evaluation import compile_numpy
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.problem.models import MODELS
+from certbound.problem.library import MODELS
 from certbound.safety.verification import Verdict, verify_safety
 
 

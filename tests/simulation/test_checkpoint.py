@@ -12,8 +12,8 @@ import pytest
 import certbound as cb
 from certbound.errors import SolverError
 from certbound.simulation import executors
-from certbound.simulation.montecarlo import simulate_exits
-from certbound.simulation.splitting import simulate_rare_exits
+from certbound.simulation.estimates.montecarlo import simulate_exits
+from certbound.simulation.estimates.splitting import simulate_rare_exits
 
 STEPS = 50
 
@@ -131,7 +131,7 @@ SCRIPT = """
 import sys
 import certbound as cb
 from certbound.simulation import executors
-from certbound.simulation.montecarlo import simulate_exits
+from certbound.simulation.estimates import simulate_exits
 executors._SAVE_EVERY = 0.0
 system = cb.ContinuousSystem(lambda x: -0.5 * x, states=1, diffusion=[[0.1**0.5]])
 problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Ball([0.0], 0.8))], horizon=5.0)

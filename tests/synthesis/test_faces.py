@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.problem.trace import casadi_module
+from certbound.problem.adapters.casadi import casadi_module
 from certbound.synthesis.faces import Facets, Plane, Round, faces_of
 
 SYSTEM = cb.linear_system(np.eye(3) * 0.9, np.eye(3), inputs=cb.Box([-1] * 3, [1] * 3), time="discrete")

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.problem.models.unicycle import GOAL
-from certbound.problem.trace import compile_numpy, jacobian
+from certbound.problem.library.unicycle import GOAL
+from certbound.problem.model.derivative import jacobian
+from certbound.problem.model.evaluation import compile_numpy
 from certbound.tubes.constants import Constants
 from certbound.tubes.tuning import tune_tube
 from experiments import errata

@@ -11,7 +11,7 @@ from functools import cache
 import pytest
 
 from certbound.tubes.constants import Constants
-from certbound.tubes.kummer import kummer_tube
+from certbound.tubes.kummer.profile import kummer_tube
 from certbound.tubes.line_search import golden
 from certbound.tubes.tuning import tune_tube
 from experiments.limits import exact_radius

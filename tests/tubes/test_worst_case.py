@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from certbound.tubes.constants import Constants
-from certbound.tubes.exact import bound_worst_exit
-from certbound.tubes.radial import estimate_radius
+from certbound.tubes.exact.first_passage import bound_worst_exit
 from certbound.tubes.tuning import bound_exit_probability, tune_tube
+from tests.tubes.yardstick import estimate_radius
 
 
 def dynamic_programming(rate, n, nu, radius, horizon, cells=120):

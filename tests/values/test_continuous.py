@@ -12,19 +12,14 @@ from scipy.linalg import solve_banded
 
 import certbound as cb
 from certbound.errors import EnclosureError, InfeasibleError
-from certbound.problem.trace import trace
+from certbound.problem.model.tracing import trace
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous import bound_exits, exits
-from certbound.values.continuous.bounds import Model, extreme_over, prove_lower, prove_upper
+from certbound.values.continuous import exits
 from certbound.values.continuous.coefficients import Cells, Reader, enclose, squared_diffusion
+from certbound.values.continuous.exits import bound_exits
+from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.payment import BIN, Levels, Patched, pay_lower, pay_upper, repay
-from certbound.values.continuous.polynomials import (
-    basis_at,
-    interpolation,
-    node_product,
-    nodes_of,
-    to_bernstein,
-)
+from certbound.values.continuous.polynomials import basis_at, interpolation, node_product, nodes_of, to_bernstein
 from certbound.values.continuous.proposal import sketch
 from certbound.values.continuous.residual import bound_ranges
 from certbound.values.continuous.room import safe_room, starts_of
@@ -170,10 +165,10 @@ def test_ranges_of_the_residual_contain_samples_of_a_random_surface(n: int) -> N
     ][n - 1]
     names = ["x1", "x2"][:n]
     model = read(f, trace(g, {"t": ["t"], "x": names}), names)
-    from certbound.values.continuous.bounds import _interpolants
+    from certbound.values.continuous.hypotheses import interpolants
 
     counts = model.counts()
-    drifts, squares = _interpolants(surface, model, 0, 2, counts)
+    drifts, squares = interpolants(surface, model, 0, 2, counts)
     patches = surface.patches(0, 2)
     ranges = bound_ranges(patches, drifts, squares, np.arange(len(patches.size)), counts)
     for index in range(len(patches.size)):

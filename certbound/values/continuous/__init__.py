@@ -1,6 +1,6 @@
 """Value functions in continuous time: exit probabilities from both sides (Theorem K8-CT, docs/values.md).
 
-``bounds`` says which function proves which hypothesis.
+``hypotheses`` says which function proves which hypothesis.
 """
 
 from certbound.values.continuous.exits import ExitBounds, bound_exits

@@ -21,9 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import EnclosureError
-from certbound.problem.derivative import jacobian
-from certbound.problem.graph import Graph
-from certbound.problem.tape import JUMPS, Node, Tape
+from certbound.problem.model import JUMPS, Graph, Node, Tape, jacobian
 from certbound.rigor.intervals import ARITHMETIC, UNDEFINED, Interval, sq
 from certbound.values.continuous.polynomials import interpolation, node_product, nodes_of, norm
 

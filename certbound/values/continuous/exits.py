@@ -12,15 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import InfeasibleError
-from certbound.problem.derivative import jacobian
-from certbound.problem.evaluation import compile_numpy
+from certbound.problem.model import Node, Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, GaussianStart
 from certbound.problem.systems import ContinuousSystem
-from certbound.problem.tape import Node, Tape
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.bounds import Model, covers, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.coefficients import Reader, enclose, squared_diffusion
+from certbound.values.continuous.hypotheses import Model, covers, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.proposal import Line, sketch
 from certbound.values.continuous.room import Room, safe_room, starts_of
 from certbound.values.continuous.shapes import propose_lower, propose_upper, sealed
@@ -100,7 +98,7 @@ def bound_exits(
     if problem.system.dimension == 1:
         upper, least, words = _one_state(problem, model, room, begin + seconds, lower)
     else:
-        from certbound.values.continuous.plane import two_states
+        from certbound.values.continuous.two_states import two_states
 
         upper, least, words = two_states(problem, model, room, begin + seconds)
     return ExitBounds(

@@ -3,5 +3,9 @@
 From the bottom: ``dominance`` (constants of the normal density), ``shocks`` (the noise as independent coordinates),
 ``kernels`` (integrals of the basis functions), ``functions`` (what is carried from step to step), ``fields`` (its mean
 after the noise, as a function of where the noise-free step ends), ``steps`` (the noise-free step on a grid),
-``induction`` (one step back), ``bounds`` (the answer, refined until it is good).
+``induction`` (one step back), ``failures`` (the answer, refined until it is good).
 """
+
+from certbound.values.discrete.failures import FailureBounds, bound_failure
+
+__all__ = ["FailureBounds", "bound_failure"]

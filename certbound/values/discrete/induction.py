@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.regions import Region
-from certbound.problem.sets import Inside
+from certbound.problem.sets import Inside, Region
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.transitions import Transition
-from certbound.values.discrete.uniform import UniformTransition
+from certbound.values.discrete.uniform_noise import UniformTransition
 from certbound.values.grids import Grid, around_nodes, corners
 from certbound.values.sets import contains, respected
 

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
-from certbound.problem.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope, Region
-from certbound.problem.sets import GaussianStart, Inside, Outside
-from certbound.problem.trace import compile_numpy
+from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, HalfSpace, Inside, Outside, Polytope, Region
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import tail
 from certbound.values.discrete.kernels import REACH

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.problem.model import JUMPS, Tape, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.tape import JUMPS, Tape
-from certbound.problem.trace import jacobian
 from certbound.rigor.intervals import ARITHMETIC, UNDEFINED, Interval, sq
 from certbound.values.grids import Grid
 

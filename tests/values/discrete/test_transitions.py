@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.problem.trace import compile_numpy
+from certbound.problem.model.evaluation import compile_numpy
 from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import back_above, back_below, zones_of

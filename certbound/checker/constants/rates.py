@@ -1,0 +1,264 @@
+"""Contraction and noise constants over boxes: J^T P + P J <= 2 c P, or J^T P J <= L^2 P, and g g^T <= sigma^2 P^-1.
+
+The Jacobian is taken apart into J = J_0 + sum theta_m M_m, where the theta_m are the non-constant expressions that
+occur in it; over a box each theta_m has a range. Both sets of matrices are convex in J, so that the vertices suffice.
+A box on which that fails is halved.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+
+from flint import arb, arb_mat
+
+from certbound.checker.balls import cholesky, identity, is_positive_definite, matrix
+from certbound.checker.expressions import Graph, Program, Undecided
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.statement import Model, Structure
+from certbound.problem.model import JUMPS, Tape
+
+__all__ = ["Contraction", "Spread"]
+
+Box = list[tuple[arb, arb]]
+
+MOST_VERTICES = 4096
+_MOST_BOXES = 20_000
+_SLACK = arb(2) ** -30
+_PARTIAL = JUMPS | {"atan2", "sqrt", "log", "asin", "acos", "tan", "div", "pow", "hypot"}
+
+
+class Contraction:
+    """Bounds of the Jacobian in the norm of P.
+
+    Parameters
+    ----------
+    model : Model
+    structure : Structure
+    metric : arb_mat
+        P.
+    budget : Budget
+    """
+
+    def __init__(self, model: Model, structure: Structure, metric: arb_mat, budget: Budget) -> None:
+        self.model, self.metric, self.budget = model, metric, budget
+        graph, n = structure.graph, model.dimension
+        self.fixed = [[arb(0)] * n for _ in range(n)]
+        forms: dict[int, list[list[arb]]] = {}
+        for (i, j), node in structure.state_nodes.items():
+            constant, parts = _affine(graph, node)
+            self.fixed[i][j] = constant
+            for atom, factor in parts.items():
+                if atom not in forms:
+                    budget.hold(n * n)
+                    forms[atom] = [[arb(0)] * n for _ in range(n)]
+                forms[atom][i][j] = factor
+        self.atoms = sorted(forms)
+        self.forms = [matrix(forms[atom]) for atom in self.atoms]
+        risky = [k for k in graph.reachable(structure.outputs) if graph.node(k).op in _PARTIAL]
+        self.program = Program(
+            graph, self.atoms, risky, variables=len(model.dynamics.inputs), generalised=True, unbounded=True
+        )
+        self.program.prepare([])
+        self.relevant = 0
+        for node in [*self.atoms, *risky]:
+            self.relevant |= graph.masks[node]
+
+    def prove(self, box: Box, bound: arb, what: str) -> None:
+        """The rate (CT) or gain (DT) is at most ``bound`` over a box of all inputs of the dynamics.
+
+        Raises
+        ------
+        Unproved
+        """
+        if not _everywhere(box, lambda part: self._holds(part, bound), self.relevant, self.budget):
+            raise Unproved(f"{what} {float(bound):.9g} was not shown to bound the Jacobian")
+
+    def contradicts(self, point: Box, bound: arb) -> bool:
+        """Whether the Jacobian at a point of all inputs exceeds ``bound``, but for rounding, where it exists."""
+        try:
+            self.program.run([low for low, _ in point])
+        except Undecided:
+            return False
+        return not self._holds(point, bound + _SLACK * (1 + abs(bound)))
+
+    def _holds(self, box: Box, bound: arb) -> bool:
+        try:
+            ranges = self.program.run([low.union(high) if low < high else low for low, high in box])
+        except Undecided:
+            return False
+        base, wide = matrix(self.fixed), []
+        for value, form in zip(ranges, self.forms):
+            if value.is_exact():
+                base = base + form * value
+            else:
+                wide.append((form * value.lower(), form * value.upper()))
+            if 2 ** len(wide) > MOST_VERTICES:
+                raise Unproved(f"the Jacobian has {len(wide)} independent parts or more, too many to try every vertex")
+        for choice in itertools.product((0, 1), repeat=len(wide)):
+            self.budget.check()
+            jacobian = base
+            for place, pair in zip(choice, wide):
+                jacobian = jacobian + pair[place]
+            if not self._vertex(jacobian, bound):
+                return False
+        return True
+
+    def _vertex(self, jacobian: arb_mat, bound: arb) -> bool:
+        metric, turned = self.metric, self.metric * jacobian
+        if self.model.continuous:
+            return is_positive_definite(metric * (2 * bound) - turned - turned.transpose(), self.budget)
+        return is_positive_definite(metric * (bound * bound) - jacobian.transpose() * turned, self.budget)
+
+
+def _affine(graph: Graph, node: int) -> tuple[arb, dict[int, arb]]:
+    """A node as constant + sum of factor * atom."""
+    constant = arb(0)
+    parts: dict[int, arb] = {}
+    stack = [(node, arb(1))]
+    count = 0
+    while stack:
+        graph.budget.check()
+        index, factor = stack.pop()
+        op, args, _ = graph.node(index)
+        count += 1
+        if not graph.masks[index]:
+            constant += factor * _constant(graph, index)
+        elif count > 2000:
+            parts[index] = parts.get(index, arb(0)) + factor
+        elif op == "add":
+            stack += [(args[0], factor), (args[1], factor)]
+        elif op == "sub":
+            stack += [(args[0], factor), (args[1], -factor)]
+        elif op == "neg":
+            stack.append((args[0], -factor))
+        elif op == "mul" and not graph.masks[args[0]]:
+            stack.append((args[1], factor * _constant(graph, args[0])))
+        elif op == "mul" and not graph.masks[args[1]]:
+            stack.append((args[0], factor * _constant(graph, args[1])))
+        elif op == "div" and not graph.masks[args[1]]:
+            stack.append((args[0], factor / _constant(graph, args[1])))
+        else:
+            parts[index] = parts.get(index, arb(0)) + factor
+    return constant, parts
+
+
+def _constant(graph: Graph, index: int) -> arb:
+    with graph.budget.passing():
+        program = Program(graph, [index], variables=0)
+        program.prepare([])
+        try:
+            return program.run([])[0]
+        except Undecided as error:
+            raise Unproved("a constant of the model is not defined") from error
+
+
+def _everywhere(box: Box, holds: Callable[[Box], bool], relevant: int, budget: Budget) -> bool:
+    """Whether something holds on a box, cut across the inputs in the mask ``relevant`` where need be.
+
+    A part on which it fails although its middle point alone fails too, or which cannot be cut, settles that it is not
+    proved.
+    """
+    stack = [box]
+    for _ in range(_MOST_BOXES):
+        if not stack:
+            return True
+        budget.box()
+        current = stack.pop()
+        if holds(current):
+            continue
+        if not holds([_point(low, high) for low, high in current]):
+            return False
+        parts = _halves(current, relevant)
+        if parts is None:
+            return False
+        stack += parts
+    return False
+
+
+def _point(low: arb, high: arb) -> tuple[arb, arb]:
+    """A point of a side, which may be unbounded."""
+    if low.is_finite() and high.is_finite():
+        middle = ((low + high) / 2).mid()
+    else:
+        middle = low if low.is_finite() else high if high.is_finite() else arb(0)
+    return middle, middle
+
+
+def _halves(box: Box, relevant: int) -> list[Box] | None:
+    """A box cut across its widest bounded side (relative to its size); None where there is none."""
+    best, widest = -1, arb(0)
+    for place, (low, high) in enumerate(box):
+        width = high - low
+        if relevant >> place & 1 and width.is_finite() and width > 0:
+            scaled = (width / (1 + abs(low + high))).mid()
+            if scaled > widest:
+                best, widest = place, scaled
+    if best < 0:
+        return None
+    low, high = box[best]
+    middle = ((low + high) / 2).mid()
+    if not low < middle < high:
+        return None
+    return [[*box[:best], part, *box[best + 1 :]] for part in ((low, middle), (middle, high))]
+
+
+class Spread:
+    """Bounds of the noise in the norm of P: L^T g g^T L <= sigma^2 I with P = L L^T, tr(P g g^T) <= nu sigma^2."""
+
+    def __init__(self, model: Model, metric: arb_mat, budget: Budget) -> None:
+        self.model, self.metric, self.budget = model, metric, budget
+        self.root = cholesky(metric, budget)
+        self.program: Program | None = None
+        self.relevant = 0
+        diffusion = model.noise.diffusion
+        if isinstance(diffusion, Tape):
+            graph = Graph(budget)
+            nodes = graph.include(diffusion, [graph.input(slot) for slot in range(len(diffusion.inputs))])
+            outputs = [nodes[output] for output in diffusion.outputs]
+            self.program = Program(graph, outputs, variables=len(diffusion.inputs))
+            self.program.prepare([])
+            for node in outputs:
+                self.relevant |= graph.masks[node]
+
+    def prove(self, box: Box, sigma: arb, nu: arb) -> None:
+        """The constants hold on a box of (t, states).
+
+        Raises
+        ------
+        Unproved
+        """
+        if not _everywhere(box, lambda part: self._holds(part, sigma, nu), self.relevant, self.budget):
+            raise Unproved(f"sigma = {float(sigma):.9g} and nu = {float(nu):.6g} were not shown to bound the noise")
+
+    def contradicts(self, point: Box, sigma: arb, nu: arb) -> bool:
+        """Whether noise that is constant exceeds the constants at all, or other noise does at a point (t, state)."""
+        covariance = self._covariance(point)
+        if covariance is None or all(entry.is_zero() for entry in covariance.entries()):
+            return False
+        return not self._holds(point, sigma if self.program is None else sigma * (1 + _SLACK), nu)
+
+    def _holds(self, box: Box, sigma: arb, nu: arb) -> bool:
+        covariance = self._covariance(box)
+        if covariance is None:
+            return False
+        n, square = self.model.dimension, sigma * sigma
+        rest = identity(n) * square - self.root.transpose() * covariance * self.root
+        bounded = is_positive_definite(rest, self.budget)
+        return bool(bounded and (self.metric * covariance).trace() <= nu * square)
+
+    def _covariance(self, box: Box) -> arb_mat | None:
+        if self.program is None:
+            return self.model.noise.covariance()
+        try:
+            values = self.program.run([low.union(high) if low < high else low for low, high in box])
+        except Undecided:
+            return None
+        n = self.model.dimension
+        g = arb_mat(n, len(values) // n, values)
+        product = g * g.transpose()
+        rows = [[product[i, j] for j in range(n)] for i in range(n)]
+        for i in range(n):  # a square is not negative
+            entries: Sequence[arb] = [g[i, j] for j in range(g.ncols())]
+            rows[i][i] = sum((arb(0).union(x.abs_upper() ** 2) if x.contains(0) else x * x for x in entries), arb(0))
+        return matrix(rows)

@@ -1,0 +1,125 @@
+"""Programs over Taylor models, made from a graph: parameters are evaluated once, boxes many times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from flint import arb
+
+from certbound.checker.expressions.arithmetic import Undecided
+from certbound.checker.expressions.graph import Graph
+from certbound.checker.expressions.quadratic import Quadratic
+from certbound.checker.expressions.taylor import Model, applied, constant
+
+__all__ = ["Expansion"]
+
+_ZERO = arb(0)
+_MANY = 100
+"""Terms whose time and memory are worth counting."""
+
+_Step = tuple[str, tuple[int, ...], float]
+
+
+class Expansion:
+    """A node of a graph as a program over Taylor models: parameters are evaluated once, boxes many times.
+
+    Parameters
+    ----------
+    graph : Graph
+    node : int
+    guard : int
+        A node that must be defined too.
+    variables : int
+        Inputs below this number vary over the box; the others are parameters.
+    """
+
+    def __init__(self, graph: Graph, node: int, guard: int, *, variables: int) -> None:
+        self.variables, self._budget = variables, graph.budget
+        order = graph.reachable([node, guard])
+        self._budget.check()
+        self._budget.hold(4 * len(order))
+        place = {index: number for number, index in enumerate(order)}
+        below = (1 << variables) - 1
+        self._nodes: list[_Step] = []
+        for index in order:
+            op, args, value = graph.node(index)
+            places = args if op == "input" else tuple(place[arg] for arg in args)
+            self._nodes.append((op, places, value))
+        self._early = [number for number, index in enumerate(order) if not graph.masks[index] & below]
+        self._first = [number for number, index in enumerate(order) if graph.masks[index] & below == 1]
+        self._later = [number for number, index in enumerate(order) if graph.masks[index] & below > 1]
+        self._output, self._guard = place[node], place[guard]
+        self._template: list[Model | None] = []
+        self._last: tuple[arb, dict[int, arb]] | None = None
+
+    def prepare(self, parameters: Sequence[arb]) -> None:
+        """Set the parameters (inputs ``variables``, ``variables + 1``, ...)."""
+        self._budget.check()
+        values: list[Model | None] = [None] * len(self._nodes)
+        for number in self._early:
+            op, args, value = self._nodes[number]
+            try:
+                if op == "input":
+                    values[number] = constant(parameters[args[0] - self.variables])
+                else:
+                    values[number] = _value(op, args, value, values)
+            except Undecided:
+                values[number] = None
+        self._template, self._last = values, None
+
+    def run(self, inputs: Sequence[tuple[arb, dict[int, arb]]], size: int) -> Quadratic:
+        """The expression over a box of ``size`` coordinates; every variable is a centre and its linear coefficients.
+
+        Raises
+        ------
+        Undecided
+            If a jump is undecided or something is undefined somewhere in the box.
+        Unproved
+            If the budget of the graph is used up.
+        """
+        with self._budget.passing():
+            return self._run(inputs, size)
+
+    def _run(self, inputs: Sequence[tuple[arb, dict[int, arb]]], size: int) -> Quadratic:
+        self._budget.check()
+        if self._last != inputs[0]:  # most boxes share the time
+            self._last = None  # should a jump in time stop here, what is half done serves nobody
+            self._execute(self._first, self._template, inputs)
+            self._last = inputs[0]
+        values = self._template.copy()
+        self._execute(self._later, values, inputs)
+        found, guard = values[self._output], values[self._guard]
+        if found is None or guard is None or not guard.range().is_finite():
+            raise Undecided
+        if not found.range().is_finite():
+            raise Undecided
+        gradient, hessian = [_ZERO] * size, [[_ZERO] * size for _ in range(size)]
+        for a, c in found.linear.items():
+            gradient[a] = c
+        for (a, b), c in found.squares.items():
+            hessian[a][b] = hessian[b][a] = 2 * c if a == b else c
+        smear = [arb(found.blame.get(a, 0.0)) for a in range(size)]
+        return Quadratic(
+            value=found.value, gradient=gradient, hessian=hessian, radius=[arb(1)] * size, error=found.error.upper(),
+            smear=smear, budget=self._budget,
+        )
+
+    def _execute(
+        self, numbers: Sequence[int], values: list[Model | None], inputs: Sequence[tuple[arb, dict[int, arb]]]
+    ) -> None:
+        for number in numbers:
+            op, args, value = self._nodes[number]
+            if op == "input":
+                centre, linear = inputs[args[0]]
+                values[number] = Model(centre, linear, {}, _ZERO, {})
+            else:
+                found = values[number] = _value(op, args, value, values)
+                if found is not None and len(found.squares) > _MANY:
+                    self._budget.check()
+                    self._budget.hold(3 * len(found.squares))
+
+
+def _value(op: str, args: tuple[int, ...], value: float, values: list[Model | None]) -> Model | None:
+    if op == "const":
+        return constant(arb(value))
+    return applied(op, value, values[args[0]], values[args[1]] if len(args) == 2 else None)

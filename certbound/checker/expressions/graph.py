@@ -1,0 +1,256 @@
+"""Expressions as a shared graph, and their derivatives: the checker's own symbolic differentiation.
+
+Nodes are stored once (structurally equal ones are the same node). Derivatives are simplified where a factor or a
+summand is exactly 0 or 1, so that "does not depend on" is a fact about the graph; the function itself is stored as
+the tape has it, lest a simplification hide where it is undefined.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+from certbound.checker.report import Budget, Unproved
+from certbound.problem.model import JUMPS, Node, Tape
+
+__all__ = ["Graph"]
+
+MOST_NODES = 400_000
+_NODE = 6
+"""Memory of a node, in balls."""
+
+
+class Graph:
+    """A growing set of expressions over numbered inputs.
+
+    Parameters
+    ----------
+    budget : Budget, optional
+        Limits on what is built and on what runs over it.
+
+    Attributes
+    ----------
+    nodes : list of Node
+        Operations; arguments come before their users.
+    masks : list of int
+        Bit i is set where a node depends on input i.
+
+    Examples
+    --------
+    >>> graph = Graph()
+    >>> x = graph.input(0)
+    >>> graph.node(graph.derivative(graph.apply("sq", x), 0)).op
+    'mul'
+    >>> graph.derivative(graph.apply("add", x, graph.const(3.0)), 0) == graph.const(1.0)
+    True
+    """
+
+    def __init__(self, budget: Budget | None = None) -> None:
+        self.budget = Budget(math.inf) if budget is None else budget
+        self.nodes: list[Node] = []
+        self.masks: list[int] = []
+        self._numbers: dict[tuple[str, tuple[int, ...], str], int] = {}
+        self._derivatives: dict[tuple[int, int], int] = {}
+
+    # ---- building ----------------------------------------------------------------------------------------
+
+    def apply(self, op: str, *args: int, value: float = 0.0) -> int:
+        """The node of an operation, as it stands."""
+        key = (op, args, value.hex())
+        found = self._numbers.get(key)
+        if found is not None:
+            return found
+        if len(self.nodes) >= MOST_NODES:
+            raise Unproved(f"the model and its derivatives have more than {MOST_NODES} operations")
+        self.nodes.append(Node(op, args, value))
+        mask = 1 << args[0] if op == "input" else 0
+        if op != "input":
+            for arg in args:
+                mask |= self.masks[arg]
+        self.budget.hold(_NODE + mask.bit_length() // 512)
+        self.masks.append(mask)
+        self._numbers[key] = len(self.nodes) - 1
+        return len(self.nodes) - 1
+
+    def const(self, value: float) -> int:
+        """A constant."""
+        return self.apply("const", value=float(value))
+
+    def input(self, slot: int) -> int:
+        """An input."""
+        return self.apply("input", slot)
+
+    def node(self, index: int) -> Node:
+        """The operation of a node."""
+        return self.nodes[index]
+
+    def is_const(self, index: int, value: float) -> bool:
+        """Whether a node is the constant ``value`` (0 and -0 are the same)."""
+        node = self.nodes[index]
+        return node.op == "const" and node.value == value
+
+    def neg(self, a: int) -> int:
+        """-a."""
+        if self.is_const(a, 0.0):
+            return self.const(0.0)
+        return self.nodes[a].args[0] if self.nodes[a].op == "neg" else self.apply("neg", a)
+
+    def add(self, a: int, b: int) -> int:
+        """a + b."""
+        if self.is_const(a, 0.0):
+            return b
+        return a if self.is_const(b, 0.0) else self.apply("add", a, b)
+
+    def sub(self, a: int, b: int) -> int:
+        """a - b."""
+        if a == b:
+            return self.const(0.0)
+        if self.is_const(b, 0.0):
+            return a
+        return self.neg(b) if self.is_const(a, 0.0) else self.apply("sub", a, b)
+
+    def mul(self, a: int, b: int) -> int:
+        """a b."""
+        if self.is_const(a, 0.0) or self.is_const(b, 0.0):
+            return self.const(0.0)
+        if self.is_const(a, 1.0):
+            return b
+        return a if self.is_const(b, 1.0) else self.apply("mul", a, b)
+
+    def div(self, a: int, b: int) -> int:
+        """a / b."""
+        return self.const(0.0) if self.is_const(a, 0.0) else self.apply("div", a, b)
+
+    def sum(self, terms: Iterable[int]) -> int:
+        """The sum of some nodes."""
+        total = self.const(0.0)
+        for term in terms:
+            total = self.add(total, term)
+        return total
+
+    def include(self, tape: Tape, inputs: Sequence[int]) -> list[int]:
+        """Copy a tape, its inputs replaced by nodes; the nodes of all its operations."""
+        numbers: list[int] = []
+        for node in tape.nodes:
+            if node.op == "input":
+                numbers.append(inputs[node.args[0]])
+            elif node.op == "const":
+                numbers.append(self.const(node.value))
+            else:
+                numbers.append(self.apply(node.op, *(numbers[arg] for arg in node.args), value=node.value))
+        return numbers
+
+    def reachable(self, outputs: Iterable[int]) -> list[int]:
+        """All nodes that some nodes depend on, in topological order."""
+        seen: set[int] = set()
+        stack = list(outputs)
+        while stack:
+            index = stack.pop()
+            if index in seen:
+                continue
+            seen.add(index)
+            node = self.nodes[index]
+            if node.op != "input":
+                stack.extend(node.args)
+        return sorted(seen)
+
+    # ---- differentiating ---------------------------------------------------------------------------------
+
+    def derivative(self, index: int, slot: int) -> int:
+        """The derivative of a node with respect to an input (beside jumps: readers must decide those)."""
+        bit = 1 << slot
+        if not self.masks[index] & bit:
+            return self.const(0.0)
+        known = self._derivatives
+        for place in self.reachable([index]):
+            if self.masks[place] & bit and (place, slot) not in known:
+                self.budget.check()
+                self.budget.hold(2)
+                known[place, slot] = self._rule(place, slot)
+        return known[index, slot]
+
+    def _known(self, index: int, slot: int) -> int:
+        return self._derivatives.get((index, slot), -1) if self.masks[index] >> slot & 1 else self.const(0.0)
+
+    def _rule(self, index: int, slot: int) -> int:
+        op, args, value = self.nodes[index]
+        if op == "input":
+            return self.const(1.0)
+        if op == "kink" or (op in JUMPS and op != "if_else_zero"):
+            return self.const(0.0)
+        slopes = [self._known(arg, slot) for arg in args]
+        if len(args) == 2:
+            return self._binary(op, args[0], args[1], slopes[0], slopes[1], index)
+        if op == "neg":
+            return self.neg(slopes[0])
+        return self.mul(self._outer(op, args[0], value, index), slopes[0])
+
+    def _outer(self, op: str, a: int, value: float, index: int) -> int:
+        """The derivative of an operation of one argument."""
+        one = self.const(1.0)
+        match op:
+            case "sq":
+                return self.mul(self.const(2.0), a)
+            case "sqrt":
+                return self.div(self.const(0.5), index)
+            case "exp":
+                return index
+            case "log":
+                return self.div(one, a)
+            case "sin":
+                return self.apply("cos", a)
+            case "cos":
+                return self.neg(self.apply("sin", a))
+            case "tan":
+                return self.add(one, self.apply("sq", index))
+            case "asin":
+                return self.div(one, self.apply("sqrt", self.sub(one, self.apply("sq", a))))
+            case "acos":
+                return self.div(self.const(-1.0), self.apply("sqrt", self.sub(one, self.apply("sq", a))))
+            case "atan":
+                return self.div(one, self.add(one, self.apply("sq", a)))
+            case "sinh":
+                return self.apply("cosh", a)
+            case "cosh":
+                return self.apply("sinh", a)
+            case "tanh":
+                return self.sub(one, self.apply("sq", index))
+            case "abs":
+                return self.apply("kink", a)
+            case "pow":
+                return self._power(a, value, index)
+        raise Unproved(f"the operation `{op}` has no derivative")
+
+    def _power(self, a: int, exponent: float, index: int) -> int:
+        if exponent == 0.0:
+            return self.const(0.0)
+        if exponent == 1.0:
+            return self.const(1.0)
+        if exponent == int(exponent) and abs(exponent) <= 10_000:
+            lower = a if exponent == 2.0 else self.apply("pow", a, value=exponent - 1.0)
+            return self.mul(self.const(exponent), lower)
+        return self.mul(self.const(exponent), self.div(index, a))
+
+    def _binary(self, op: str, a: int, b: int, da: int, db: int, index: int) -> int:
+        match op:
+            case "add":
+                return self.add(da, db)
+            case "sub":
+                return self.sub(da, db)
+            case "mul":
+                return self.add(self.mul(da, b), self.mul(a, db))
+            case "div":
+                return self.div(self.sub(da, self.mul(index, db)), b)
+            case "atan2":
+                squares = self.add(self.apply("sq", a), self.apply("sq", b))
+                return self.div(self.sub(self.mul(b, da), self.mul(a, db)), squares)
+            case "hypot":
+                return self.div(self.add(self.mul(a, da), self.mul(b, db)), index)
+            case "min" | "max":
+                half, step = self.const(0.5), self.apply("kink", self.apply("sub", a, b))
+                mean = self.mul(half, self.add(da, db))
+                turn = self.mul(half, self.mul(step, self.sub(da, db)))
+                return self.add(mean, turn) if op == "max" else self.sub(mean, turn)
+            case "if_else_zero":
+                return self.const(0.0) if self.is_const(db, 0.0) else self.apply("if_else_zero", a, db)
+        raise Unproved(f"the operation `{op}` has no derivative")

@@ -1,0 +1,116 @@
+"""Straight-line programs over balls, made from a graph: parameters are evaluated once, variables many times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+from flint import arb
+
+from certbound.checker.expressions.arithmetic import BALLS, Undecided, generalised_kink, power
+from certbound.checker.expressions.graph import Graph
+
+__all__ = ["Program"]
+
+Step = tuple[int, Callable[..., arb], int, int]
+
+
+class Program:
+    """Some nodes of a graph as a program.
+
+    Parameters
+    ----------
+    graph : Graph
+    outputs : sequence of int
+        Nodes whose values are returned.
+    guards : iterable of int
+        Nodes that are evaluated, and must be finite and decided, but are not returned.
+    variables : int
+        Inputs below this number change from run to run; the others are parameters.
+    generalised : bool
+        The slope of |x| is all of [-1, 1] where x may be 0, instead of undecided.
+    unbounded : bool
+        Guards need only be defined, not finite.
+    """
+
+    def __init__(
+        self, graph: Graph, outputs: Sequence[int], guards: Iterable[int] = (), *, variables: int,
+        generalised: bool = False, unbounded: bool = False,
+    ) -> None:
+        self._unbounded, self._budget = unbounded, graph.budget
+        self.variables = variables
+        self._operations = BALLS | {"kink": generalised_kink} if generalised else BALLS
+        watched = sorted(set(guards))
+        order = graph.reachable([*outputs, *watched])
+        self._budget.check()
+        self._budget.hold(4 * len(order))
+        place = {index: number for number, index in enumerate(order)}
+        below = (1 << variables) - 1
+        self._inputs: list[tuple[int, int]] = []
+        self._early: list[Step] = []
+        self._late: list[Step] = []
+        self._constants: list[tuple[int, arb]] = []
+        for number, index in enumerate(order):
+            node = graph.node(index)
+            if node.op == "input":
+                self._inputs.append((number, node.args[0]))
+            elif node.op == "const":
+                self._constants.append((number, arb(node.value)))
+            else:
+                steps = self._late if graph.masks[index] & below else self._early
+                steps.append(self._step(number, node.op, [place[arg] for arg in node.args], node.value))
+        self._outputs = [place[index] for index in outputs]
+        self._watched = [place[index] for index in watched]
+        self._size = len(order)
+        self._template: list[arb] = []
+
+    def _step(self, number: int, op: str, args: list[int], value: float) -> Step:
+        if op == "pow":
+            return number, lambda x: power(x, value), args[0], -1
+        return number, self._operations[op], args[0], args[1] if len(args) == 2 else -1
+
+    def prepare(self, parameters: Sequence[arb]) -> None:
+        """Set the parameters (inputs ``variables``, ``variables + 1``, ...)."""
+        self._budget.check()
+        values: list[arb] = [arb(0)] * self._size
+        for number, constant in self._constants:
+            values[number] = constant
+        for number, slot in self._inputs:
+            if slot >= self.variables:
+                values[number] = parameters[slot - self.variables]
+        for step in self._early:
+            try:
+                _execute([step], values)
+            except Undecided:
+                values[step[0]] = arb.nan()
+        self._template = values
+
+    def run(self, variables: Sequence[arb]) -> list[arb]:
+        """Enclosures of the outputs.
+
+        Raises
+        ------
+        Undecided
+            If a jump is undecided or something is undefined somewhere in the balls.
+        Unproved
+            If the time of the graph's budget is used up.
+        """
+        self._budget.check()
+        values = self._template.copy()
+        for number, slot in self._inputs:
+            if slot < self.variables:
+                values[number] = variables[slot]
+        _execute(self._late, values)
+        for number in self._watched:
+            value = values[number]
+            if value.is_nan() if self._unbounded else not value.is_finite():
+                raise Undecided
+        result = [values[number] for number in self._outputs]
+        for value in result:
+            if not value.is_finite():
+                raise Undecided
+        return result
+
+
+def _execute(steps: list[Step], values: list[arb]) -> None:
+    for number, function, first, second in steps:
+        values[number] = function(values[first]) if second < 0 else function(values[first], values[second])

@@ -1,0 +1,393 @@
+"""Second-order Taylor models: an expression over a box as a quadratic polynomial and a bound of the rest.
+
+On a box x = c + r xi, abs(xi_a) <= 1, a model v + g . xi + xi^T H xi + [-e, e] holds an expression: products keep their
+terms up to the second order and bound the others, functions of one variable are expanded about v, with Lagrange's
+remainder over the range of their argument. Unlike derivatives evaluated on balls, what cancels between the linear and
+quadratic parts of an expression cancels here too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from flint import arb
+
+from certbound.checker.expressions.arithmetic import BALLS, Undecided, power
+from certbound.problem.model import BINARY
+
+__all__ = ["Model", "applied", "constant"]
+
+_ZERO = arb(0)
+
+K = TypeVar("K")
+
+
+class Model:
+    """One expression; ``linear`` and ``squares`` hold the coefficients that are not 0, ``blame`` splits the error.
+
+    ``blame`` only guides how boxes are cut.
+    """
+
+    __slots__ = ("blame", "error", "linear", "size", "squares", "sums", "value")
+
+    def __init__(
+        self, value: arb, linear: dict[int, arb], squares: dict[tuple[int, int], arb], error: arb,
+        blame: dict[int, float],
+    ) -> None:
+        self.value, self.linear, self.squares, self.error, self.blame = value, linear, squares, error, blame
+        self.sums: tuple[arb, arb] | None = None
+
+    @property
+    def fixed(self) -> bool:
+        """Whether nothing but the value is there."""
+        return not self.linear and not self.squares and self.error.is_zero()
+
+    def norms(self) -> tuple[arb, arb]:
+        """Bounds of the linear and of the quadratic part."""
+        if self.sums is None:
+            self.sums = (
+                sum((abs(x) for x in self.linear.values()), _ZERO), sum((abs(x) for x in self.squares.values()), _ZERO)
+            )
+        return self.sums
+
+    def reach(self) -> arb:
+        """Bound of the distance from the value."""
+        first, second = self.norms()
+        return (first + second + self.error).upper()
+
+    def range(self) -> arb:
+        """Ball of all values."""
+        return self.value + arb(0, self.reach())
+
+    def scaled(self, factor: arb) -> Model:
+        """The model times a number."""
+        size = abs(factor)
+        weight = float(size.mid())
+        return Model(
+            self.value * factor, {a: x * factor for a, x in self.linear.items()},
+            {pair: x * factor for pair, x in self.squares.items()}, self.error * size,
+            {a: x * weight for a, x in self.blame.items()},
+        )  # fmt: skip
+
+
+def constant(value: arb) -> Model:
+    return Model(value, {}, {}, _ZERO, {})
+
+
+def _merged(first: dict[K, arb], second: dict[K, arb]) -> dict[K, arb]:
+    result = dict(first)
+    for key, x in second.items():
+        known = result.get(key)
+        result[key] = x if known is None else known + x
+    return result
+
+
+def _blamed(first: dict[int, float], second: dict[int, float]) -> dict[int, float]:
+    result = dict(first)
+    for a, x in second.items():
+        result[a] = result.get(a, 0.0) + x
+    return result
+
+
+def _shared(amount: arb, *parts: dict[int, arb]) -> dict[int, float]:
+    """An error split between coordinates by their linear coefficients."""
+    size = float(amount.mid())
+    if not size > 0:
+        return {}
+    weights: dict[int, float] = {}
+    for linear in parts:
+        for a, x in linear.items():
+            weights[a] = weights.get(a, 0.0) + abs(float(x.mid()))
+    total = sum(weights.values())
+    return {a: size * weight / total for a, weight in weights.items()} if total > 0 else {}
+
+
+def _add(x: Model, y: Model) -> Model:
+    return Model(
+        x.value + y.value, _merged(x.linear, y.linear), _merged(x.squares, y.squares), x.error + y.error,
+        _blamed(x.blame, y.blame),
+    )  # fmt: skip
+
+
+def _neg(x: Model) -> Model:
+    return Model(
+        -x.value, {a: -c for a, c in x.linear.items()}, {p: -c for p, c in x.squares.items()}, x.error, x.blame
+    )
+
+
+def _mul(x: Model, y: Model) -> Model:
+    if y.fixed:
+        return x.scaled(y.value)
+    if x.fixed:
+        return y.scaled(x.value)
+    u, v = x.value, y.value
+    (l1, q1), (l2, q2) = x.norms(), y.norms()
+    linear = {a: c * v for a, c in x.linear.items()}
+    for a, c in y.linear.items():
+        linear[a] = linear[a] + c * u if a in linear else c * u
+    squares = {p: c * v for p, c in x.squares.items()}
+    for p, c in y.squares.items():
+        squares[p] = squares[p] + c * u if p in squares else c * u
+    for a, c in x.linear.items():
+        for b, d in y.linear.items():
+            pair = (a, b) if a <= b else (b, a)
+            squares[pair] = squares[pair] + c * d if pair in squares else c * d
+    rest = l1 * q2 + q1 * l2 + q1 * q2
+    error = rest
+    if not x.error.is_zero() or not y.error.is_zero():
+        error = rest + x.error * (abs(v) + l2 + q2 + y.error) + y.error * (abs(u) + l1 + q1)
+    blame = _shared(rest, x.linear, y.linear)
+    for model, factor in ((x, v), (y, u)):
+        weight = abs(float(factor.mid()))
+        blame = _blamed(blame, {a: weight * c for a, c in model.blame.items()})
+    return Model(u * v, linear, squares, error, blame)
+
+
+def _composed(x: Model, value: arb, first: arb, half: arb, third: arb) -> Model | None:
+    """phi(x) from phi, phi' and phi''/2 at the value, and phi''' over the range."""
+    if not (value.is_finite() and first.is_finite() and half.is_finite() and third.is_finite()):
+        return None
+    linear = {a: c * first for a, c in x.linear.items()}
+    squares = {p: c * first for p, c in x.squares.items()}
+    items = list(x.linear.items())
+    for i, (a, c) in enumerate(items):
+        scaled = c * half
+        for b, d in items[i:]:
+            pair = (a, b) if a <= b else (b, a)
+            term = scaled * d if a == b else 2 * scaled * d
+            squares[pair] = squares[pair] + term if pair in squares else term
+    one, two = x.norms()
+    reach = one + two + x.error
+    cross = two * (2 * one + two) + x.error * (2 * (one + two) + x.error)
+    rest = abs(half) * cross + abs(third) * reach * reach * reach / 6
+    size = abs(first)
+    weight = float(size.mid())
+    blame = _blamed({a: weight * c for a, c in x.blame.items()}, _shared(rest, x.linear))
+    return Model(value, linear, squares, rest + size * x.error, blame)
+
+
+# ---- functions of one variable: phi(v), phi'(v), phi''(v)/2 and a bound of phi''' over a ball ---------------
+
+
+def _sqrt(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    root = v.sqrt()
+    return root, 1 / (2 * root), -1 / (8 * root * v), power(r, -2.5) * 3 / 8
+
+
+def _exp(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    e = v.exp()
+    return e, e, e / 2, BALLS["exp"](r)
+
+
+def _log(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    return v.log(), 1 / v, -1 / (2 * v * v), 2 * power(r, -3.0) if r > 0 else arb.nan()
+
+
+def _sin(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    s, c = v.sin_cos()
+    return s, c, -s / 2, r.cos()
+
+
+def _cos(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    s, c = v.sin_cos()
+    return c, -s, -c / 2, r.sin()
+
+
+def _tan(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    t, whole = v.tan(), r.tan()
+    slope, square = 1 + t * t, power(whole, 2.0)
+    return t, slope, t * slope, 2 * (1 + square) * (1 + 3 * square)
+
+
+def _asin(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    left, whole = 1 - v * v, 1 - power(r, 2.0)
+    slope = 1 / left.sqrt()
+    return v.asin(), slope, v * slope / (2 * left), (1 + 2 * power(r, 2.0)) * power(whole, -2.5)
+
+
+def _acos(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    _, slope, half, third = _asin(v, r)
+    return v.acos(), -slope, -half, -third
+
+
+def _atan(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    slope, square = 1 / (1 + v * v), power(r, 2.0)
+    return v.atan(), slope, -v * slope * slope, (6 * square - 2) * power(1 + square, -3.0)
+
+
+def _sinh(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    s, c = v.sinh_cosh()
+    return s, c, s / 2, BALLS["cosh"](r)
+
+
+def _cosh(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    s, c = v.sinh_cosh()
+    return c, s, c / 2, BALLS["sinh"](r)
+
+
+def _tanh(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    t, square = v.tanh(), power(BALLS["tanh"](r), 2.0)
+    slope = 1 - t * t
+    return t, slope, -t * slope, (1 - square) * (6 * square - 2)
+
+
+def _inverse(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    i = 1 / v
+    return i, -i * i, i * i * i, -6 * power(r, -4.0) if r > 0 or r < 0 else arb.nan()
+
+
+_UNARY: dict[str, Callable[[arb, arb], tuple[arb, arb, arb, arb]]] = {
+    "sqrt": _sqrt, "exp": _exp, "log": _log, "sin": _sin, "cos": _cos, "tan": _tan, "asin": _asin, "acos": _acos,
+    "atan": _atan, "sinh": _sinh, "cosh": _cosh, "tanh": _tanh, "inverse": _inverse,
+}  # fmt: skip
+_DECIDED = {"kink", "sign", "floor", "not", "lt", "le", "eq", "ne", "and", "or"}
+
+
+def _apply(op: str, x: Model) -> Model | None:
+    return _composed(x, *_UNARY[op](x.value, x.range()))
+
+
+def _power(x: Model, exponent: float) -> Model | None:
+    """x ** exponent; where a factor of a derivative is 0, x may be so too."""
+    p = arb(exponent)
+    whole = exponent == int(exponent) and abs(exponent) <= 10_000
+    if not whole and not x.range() > 0:
+        return None
+
+    def at(place: arb, k: int) -> arb:
+        if whole:
+            return power(place, exponent - k)
+        return (place.lower() ** (p - k)).union(place.upper() ** (p - k))
+
+    factors = [p, p * (p - 1) / 2, p * (p - 1) * (p - 2)]
+    found = [
+        _ZERO if factor.is_zero() else factor * at(place, k + 1)
+        for k, (factor, place) in enumerate(zip(factors, (x.value, x.value, x.range())))
+    ]
+    return _composed(x, at(x.value, 0), *found)
+
+
+def _sign(x: Model) -> int:
+    """1 or -1 where the model has one sign.
+
+    Raises
+    ------
+    Undecided
+        If it may be 0.
+    """
+    whole = x.range()
+    if whole > 0:
+        return 1
+    if whole < 0:
+        return -1
+    raise Undecided
+
+
+def _with_error(x: Model, amount: arb, *parts: dict[int, arb]) -> Model | None:
+    """The model with a further error, blamed on the coordinates of some linear parts."""
+    if not amount.is_finite():
+        return None
+    return Model(x.value, x.linear, x.squares, x.error + amount, _blamed(x.blame, _shared(amount, *parts)))
+
+
+def _moved(x: Model) -> Model:
+    """The model less its value."""
+    return Model(_ZERO, x.linear, x.squares, x.error, x.blame)
+
+
+def _div(x: Model, y: Model) -> Model | None:
+    """x/y = q + n/y with q = v_x/v_y, n = x - q y, and 1/y = 1/v_y - d/v_y^2 + d^2/(v_y^2 y), d = y - v_y."""
+    inverse = 1 / y.value
+    if not inverse.is_finite():
+        return None
+    if y.fixed:
+        return x.scaled(inverse)
+    whole = y.range()
+    if not (whole > 0 or whole < 0):
+        return None
+    quotient = x.value * inverse
+    rest = _moved(_add(_moved(x), _moved(y).scaled(-quotient)))
+    found = _add(rest.scaled(inverse), _mul(rest, _moved(y)).scaled(-inverse * inverse))
+    found.value = quotient
+    size = y.reach() * inverse
+    return _with_error(found, abs(rest.reach() * size * size) / whole.abs_lower(), y.linear, rest.linear)
+
+
+def _atan2(y: Model, x: Model) -> Model | None:
+    """arg(z) = arg(z_0) + Im log(1 + w), w = (z - z_0)/z_0.
+
+    |log(1 + w) - w + w^2/2| <= |w|^3/(3 (1 - |Re w|)^3).
+    """
+    if not x.range() > 0:
+        _sign(y)
+    angle = BALLS["atan2"](y.value, x.value)
+    square = x.value * x.value + y.value * y.value
+    across, up = x.value / square, y.value / square
+    if not (across.is_finite() and up.is_finite()):
+        return None
+    right, top = _moved(x), _moved(y)
+    real = _add(right.scaled(across), top.scaled(up))
+    imaginary = _add(top.scaled(across), right.scaled(-up))
+    one, two = real.reach(), imaginary.reach()
+    if not one < 1:
+        return None
+    found = _add(imaginary, _neg(_mul(real, imaginary)))
+    found.value = angle
+    size = (one * one + two * two).sqrt() / (1 - one)
+    return _with_error(found, size * size * size / 3, imaginary.linear, real.linear)
+
+
+def _hypot(x: Model, y: Model) -> Model | None:
+    return _apply("sqrt", _add(_mul(x, x), _mul(y, y)))
+
+
+def _larger(x: Model, y: Model) -> bool:
+    return _sign(_add(x, _neg(y))) > 0
+
+
+_BINARY: dict[str, Callable[[Model, Model], Model | None]] = {
+    "add": _add,
+    "sub": lambda x, y: _add(x, _neg(y)),
+    "mul": _mul,
+    "div": _div,
+    "atan2": _atan2,
+    "hypot": _hypot,
+    "min": lambda x, y: y if _larger(x, y) else x,
+    "max": lambda x, y: x if _larger(x, y) else y,
+}
+
+
+def applied(op: str, value: float, first: Model | None, second: Model | None) -> Model | None:
+    """An operation of a tape on its one or two arguments; None is what is not defined.
+
+    Raises
+    ------
+    Undecided
+        If a jump, a kink or a branch cut may lie in the box.
+    """
+    if op == "if_else_zero":
+        if first is None:
+            return None
+        return second if BALLS["not"](first.range()).is_zero() else constant(_ZERO)
+    if first is None or (second is None and op in BINARY):
+        return None
+    given = [first] if second is None else [first, second]
+    if all(model.fixed for model in given):
+        known = power(first.value, value) if op == "pow" else BALLS[op](*(model.value for model in given))
+        return constant(known) if known.is_finite() else None
+    if op in _DECIDED:
+        return constant(BALLS[op](*(model.range() for model in given)))
+    if second is not None:
+        return _BINARY[op](first, second)
+    match op:
+        case "pow":
+            return _power(first, value)
+        case "neg":
+            return _neg(first)
+        case "sq":
+            return _mul(first, first)
+        case "abs":
+            return first if _sign(first) > 0 else _neg(first)
+        case _:
+            return _apply(op, first)

@@ -1,0 +1,398 @@
+"""The linear-response proof (Thm K7'): the certificate's numbers, and the inequalities that make them a proof.
+
+Per cell of the initial set the file gives a nominal curve p, slopes, boxes B for the remainder beta, rows with levels
+for the Gaussian part Z along them, and directions that keep obstacles off. From B follow sets of the remainder's
+response R; with y (initial set and disturbance) and the levels they bound the deviation s = y + Z + R in a polytope.
+Proved here, piece by piece: beta lies in B over that polytope. Then, but for the event that Z leaves its levels, the
+constraints hold wherever Z stays below what y and R leave, and the probabilities of all these events are joined
+(`families`). Noise that depends on the state adds a martingale M with levels of its own (`stopped`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+from flint import arb, arb_mat, ctx
+
+from certbound.checker.balls import column, identity, row_sums, upper
+from certbound.checker.linear.diffusion import Along, Asked, StateNoise, Stopped
+from certbound.checker.linear.events import Windows, chain, sub_gaussian
+from certbound.checker.linear.families import Family, leaving
+from certbound.checker.linear.remainder import OutputRemainder, PieceData, Polytope, remainders
+from certbound.checker.linear.response import (
+    Load,
+    Piece,
+    Supports,
+    continuous_piece,
+    covariances,
+    discrete_piece,
+    over_piece,
+    supports,
+)
+from certbound.checker.linear.shared import Shared
+from certbound.checker.reading import Record, number, numbers, wholes
+from certbound.checker.reading import entries as listed
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.statement import Grid, Model, cells_of, demands, structure_of
+from certbound.errors import CertificateError
+from certbound.problem.model import Tape
+
+__all__ = ["check_linear"]
+
+MOST_ROWS = 64
+MOST_STATES = 100
+_BITS, _MOST_BITS = 128, 3000
+
+_PROOF = ("engine", "splits", "pieces", "varying", "moving", "units", "windows", "cells")
+_CELL = (
+    "nominal", "slopes", "drifts", "gains", "remainder_low", "remainder_high", "rows", "levels", "window_levels",
+    "frames", "separations",
+)  # fmt: skip
+
+
+def check_linear(model: Model, value: object, budget: Budget) -> arb:
+    """Upper bound of the probability that a constraint is broken.
+
+    It holds for every start and every disturbance, even one that sees coming noise; where the noise depends on the
+    state, for every disturbance that does not.
+
+    Raises
+    ------
+    CertificateError
+        If the proof's data are malformed.
+    Unproved
+        If an inequality could not be proved.
+    """
+    record = Record(value, "proof", _PROOF)
+    if model.continuous and model.dimension > MOST_STATES:
+        raise Unproved(f"{model.dimension} states are too many for this proof in continuous time")
+    structure = structure_of(model, budget)
+    shared = Shared(model, structure, record)
+    boxes = cells_of(model, record)
+    entries = record.items("cells", len(boxes), len(boxes))
+    outputs = remainders(model, structure, budget)
+    worst = arb(0)
+    for index, (entry, box) in enumerate(zip(entries, boxes)):
+        with budget.passing():
+            cell = _Cell(shared, Record(entry, f"proof.cells[{index}]", _CELL, ("stopped",)), box, budget)
+            worst = arb.max(worst, cell.probability(outputs))
+    return upper(worst)
+
+
+class _Cell:
+    """One cell of the initial set."""
+
+    def __init__(self, shared: Shared, record: Record, box: list[tuple[arb, arb]], budget: Budget) -> None:
+        budget.check()
+        self.shared, self.model, self.budget = shared, shared.model, budget
+        self.record = record
+        model, n, count = shared.model, shared.model.dimension, shared.count
+        continuous = model.continuous
+        varying, moving = len(shared.structure.varying), len(shared.structure.moving)
+        self.nominal = record.array("nominal", *((count, 4, n) if continuous else (count + 1, n)))
+        if continuous and any(a[3] != b[0] for a, b in pairwise(self.nominal)):
+            raise Unproved("the nominal curve jumps")
+        self.slopes = record.array("slopes", count, varying)
+        if not continuous and record["drifts"] is not None:
+            raise CertificateError(f"`{record.at('drifts')}` must be null in discrete time.")
+        self.drifts = record.array("drifts", count, varying) if continuous else [[0.0] * varying] * count
+        self.gains = record.array("gains", count, moving)
+        self.low, self.high = record.array("remainder_low", count, n), record.array("remainder_high", count, n)
+        if any(a > b for lows, highs in zip(self.low, self.high) for a, b in zip(lows, highs)):
+            raise CertificateError(f"`{record.at('remainder_low')}` must not exceed `remainder_high`.")
+        self.rows, self.levels = self._rows()
+        self.frames = self._frames()
+        start = self.nominal[0][0] if continuous else self.nominal[0]
+        self.start = [arb.max(high - p, p - low).upper() for (low, high), p in zip(box, map(arb, start))]
+        middles = [(low + high) / 2 for low, high in model.disturbance] if model.disturbance else []
+        self.middle = [arb(x) for x in middles]
+        self.reach = [
+            arb.max(arb(high) - m, m - arb(low)) for (low, high), m in zip(model.disturbance, self.middle)
+        ]
+        self.grid = self._grid()
+        self.demands = demands(model, self.grid, record.items("separations"), record.at("separations"), budget)
+        self.state: StateNoise | None = None
+        if record["stopped"] is not None or isinstance(model.noise.diffusion, Tape):
+            self.state = StateNoise(
+                model, record["stopped"], record.at("stopped"), pieces=count, units=len(shared.units),
+                rows=len(self.rows[0]), demands=len(self.demands),
+            )
+
+    def _rows(self) -> tuple[list[list[list[arb]]], list[list[arb]]]:
+        """Rows of Z's levels on every piece (unit rows first), over all states, and the levels."""
+        record, units, n = self.record, self.shared.units, self.model.dimension
+        given = record.items("rows", self.shared.count, self.shared.count)
+        extra = len(listed(given[0], record.at("rows"), 0, MOST_ROWS))
+        rows = []
+        zero, one = arb(0), arb(1)
+        self.budget.hold((len(units) + self.shared.count * extra) * (n // 8 + 1))  # of the same 0
+        fixed = [[one if j == unit else zero for j in range(n)] for unit in units]
+        for item in numbers(given, record.at("rows"), self.shared.count, extra, len(units)):
+            self.budget.check()
+            whole = list(fixed)
+            for row in item:
+                full = [zero] * n
+                for unit, value in zip(units, row):
+                    full[unit] = arb(value)
+                whole.append(full)
+            rows.append(whole)
+        levels = [
+            [arb(number(x, record.at("levels"), least=0.0)) for x in listed(item, record.at("levels"), 0, 10**4)]
+            for item in record.items("levels", self.shared.count, self.shared.count)
+        ]
+        if any(len(item) != len(units) + extra for item in levels):
+            raise CertificateError(f"`{record.at('levels')}` must have one level a row.")
+        return rows, levels
+
+    def _frames(self) -> list[list[int]]:
+        """Rows that serve as coordinates for each output's remainder; null: the unit rows."""
+        record, structure, units = self.record, self.shared.structure, list(self.shared.units)
+        frames = []
+        most = len(self.rows[0]) - 1
+        for i, item in enumerate(record.items("frames", self.model.dimension, self.model.dimension)):
+            active = structure.active_states(i)
+            if item is not None:
+                frames.append(wholes(item, f"{record.at('frames')}[{i}]", 0, most))
+            elif any(j not in units for j in active):
+                raise Unproved("`proof.units` lacks a state that enters nonlinearly")
+            else:
+                frames.append([units.index(j) for j in active])
+        return frames
+
+    def _grid(self) -> Grid:
+        h = self.shared.length
+        if self.model.continuous:
+            times = [(h * k, h * (k + 1)) for k in range(self.shared.count)]
+            hulls = [[[arb(x) for x in point] for point in item] for item in self.nominal]
+        else:
+            times = [(arb(k), arb(k)) for k in range(self.shared.count + 1)]
+            hulls = [[[arb(x) for x in item]] for item in self.nominal]
+        return Grid(times=times, hulls=hulls)
+
+    # ---- the proof ---------------------------------------------------------------------------------------
+
+    def probability(self, outputs: Sequence[OutputRemainder]) -> arb:
+        """Upper bound of the probability that this cell's paths break a constraint."""
+        self.pieces = self._pieces()
+        growth = sum(max(0.0, float(row_sums(p.transition).log() / arb.const_log2())) for p in self.pieces)
+        if growth <= 20:
+            return self._probability(outputs)
+        if not growth < math.inf:
+            raise Unproved("the slopes are not finite")
+        with ctx.workprec(int(min(_BITS + growth, _MOST_BITS))):
+            self.pieces = self._pieces()
+            return self._probability(outputs)
+
+    def _probability(self, outputs: Sequence[OutputRemainder]) -> arb:
+        model, budget = self.model, self.budget
+        n = model.dimension
+        start = model.initial.covariance if model.initial.covariance is not None else identity(n) * 0
+        values = covariances(self.pieces, start, budget)
+        bounds = self._supports()
+        rooms = self._rooms(bounds)
+        found = None if self.state is None else self._stopped(self.state, rooms)
+        inner = len(self.rows[0])
+        for k in range(self.shared.count):
+            levels = self.levels[k]
+            if found is not None:
+                levels = [level + part.at(k) for level, part in zip(levels, found[1][:inner])]
+            self._check_remainder(k, bounds, levels, outputs)
+        return self._events(values, rooms, found)
+
+    def _stopped(self, state: StateNoise, rooms: list[list[arb | None]]) -> tuple[arb, list[Along]]:
+        """What the coordinates of M cost, and its levels along the rows of levels and along the demands."""
+        excess = state.excess(self.shared.units, self.grid.times, self.grid.hulls, self.budget)
+        found = Stopped(Windows(self.pieces, [], state.windows, self.budget), excess, state.coordinates, self.budget)
+        count = self.shared.count
+        asked = [
+            Asked(rows=[self.rows[k][d] for k in range(count)], levels=[arb(0)] * count, factors=factors)
+            for d, factors in enumerate(state.rows)
+        ]
+        for number_, demand in enumerate(self.demands):
+            factors = None if state.rooms is None else state.rooms[number_]
+            asked.append(Asked(rows=demand.rows, levels=rooms[number_], factors=factors))
+        return found.paid, found.along(asked)
+
+    def _pieces(self) -> list[Piece]:
+        shared, state = self.shared, self.state
+        fixed = identity(self.model.dimension) * 0 if state is not None else self.model.noise.covariance()
+        self.budget.hold(self.shared.count * self.model.dimension**2 * (8 if self.model.continuous else 4))
+        result = []
+        for k, (slopes, drifts) in enumerate(zip(self.slopes, self.drifts)):
+            self.budget.check()
+            noise = fixed if state is None else state.noise(k)
+            slope = shared.full(slopes)
+            if self.model.continuous:
+                result.append(continuous_piece(slope, shared.drift(drifts), shared.length, noise))
+            else:
+                result.append(discrete_piece(slope, noise))
+        return result
+
+    def _supports(self) -> Supports:
+        """Bounds of y and R along the rows of levels and demands, over every piece."""
+        n, count, continuous = self.model.dimension, self.shared.count, self.model.continuous
+        one = identity(n)
+        unit = [[one[i, j] for j in range(n)] for i in range(n)]
+        asked = [self._asked(k) for k in range(count if continuous else count + 1)]
+        if continuous:
+            self.budget.hold(n * sum(map(len, asked)))
+        loads = [self._load(k) for k in range(count)]
+        nodes: list[list[list[arb]]] = []
+        for k in range(count + 1):
+            self.budget.check()
+            own = asked[k] if k < len(asked) else []
+            if not continuous:
+                nodes.append(own)
+            elif k < count:
+                ends = [(arb_mat(1, n, row) * self.pieces[k].transition).entries() for row in own]
+                nodes.append([*unit, *own, *ends])
+            else:
+                nodes.append([])
+        found = supports([p.transition for p in self.pieces], nodes, loads, self.start, self.budget)
+        if not continuous:
+            return found
+        low, high, reach = [], [], []
+        for k in range(count):
+            self.budget.check()
+            gain = self._gain(k)
+            parts = over_piece(self.pieces[k], asked[k], found, k, self._box(k), None if gain is None else gain[1])
+            low.append(parts[0])
+            high.append(parts[1])
+            reach.append(parts[2])
+        return Supports(low=low, high=high, reach=reach)
+
+    def _asked(self, k: int) -> list[list[arb]]:
+        inner = self.rows[k] if k < self.shared.count else []
+        return [*inner, *(demand.rows[k] for demand in self.demands)]
+
+    def _box(self, k: int) -> tuple[list[arb], list[arb]]:
+        """Middle and radius of B on piece k."""
+        pairs = [(arb(a), arb(b)) for a, b in zip(self.low[k], self.high[k])]
+        return [(a + b) / 2 for a, b in pairs], [(b - a) / 2 for a, b in pairs]
+
+    def _gain(self, k: int) -> tuple[arb_mat, list[arb]] | None:
+        """E with its columns scaled by the disturbance's radii, and the bound of |E (d - d0)|."""
+        if not self.reach:
+            return None
+        gain = self.shared.full(self.gains[k], gains=True)
+        n, q = self.model.dimension, len(self.reach)
+        scaled = arb_mat(n, q, [gain[i, j] * self.reach[j] for i in range(n) for j in range(q)])
+        return scaled, [sum((abs(scaled[i, j]) for j in range(q)), arb(0)) for i in range(n)]
+
+    def _load(self, k: int) -> Load:
+        piece, n = self.pieces[k], self.model.dimension
+        middle, radius = self._box(k)
+        gain = self._gain(k)
+        zero = [arb(0)] * n
+        if not self.model.continuous:
+            return Load(centre=column(middle), radius=radius, generators=None if gain is None else gain[0], box=zero)
+        h, one = piece.length, identity(n)
+        spread = ((one + piece.deviation) * column(radius) * h).entries()
+        generators, box = None, zero
+        if gain is not None:
+            generators = (one + piece.slope * (h / 2)) * gain[0] * h
+            box = ((piece.size * (h * h / 4) + piece.second * h) * column(gain[1])).entries()
+        return Load(centre=piece.gathered * column(middle), radius=spread, generators=generators, box=box)
+
+    def _check_remainder(
+        self, k: int, bounds: Supports, levels: Sequence[arb], outputs: Sequence[OutputRemainder]
+    ) -> None:
+        """beta lies in B on piece k, where Z and M keep to their levels; s lies in H."""
+        data = self._data(k)
+        low, high = [], []
+        for d, level in enumerate(levels):
+            size = bounds.reach[k][d] + level
+            low.append(bounds.low[k][d] - size)
+            high.append(bounds.high[k][d] + size)
+        if self.state is not None and not self.state.holds(k, low, high):
+            raise Unproved(f"the state was not shown to stay in the set over which its noise is bounded on piece {k}")
+        sides = {unit: (low[d], high[d]) for d, unit in enumerate(self.shared.units)}
+        for i, output in enumerate(outputs):
+            output.prepare(data)
+            hidden = self.shared.hidden[i]
+            bounded = all(slot > self.model.dimension or slot - 1 in sides for slot in hidden)
+            if hidden and not (bounded and output.is_decided(sides)):
+                names = ", ".join(self.model.dynamics.inputs[slot] for slot in hidden)
+                raise Unproved(f"{self.model.states[i]} may jump with {names}, in which it is linear otherwise")
+            polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=self.frames[i])
+            if not output.prove(polytope, arb(self.low[k][i]), arb(self.high[k][i]), self.budget):
+                name = self.model.states[i]
+                at = f"piece {k}" if self.model.continuous else f"step {k}"
+                raise Unproved(f"the remainder of {name} was not shown to stay in its box on {at}")
+
+    def _data(self, k: int) -> PieceData:
+        """The parameters of the remainder's expressions."""
+        shared, n = self.shared, self.model.dimension
+        if self.model.continuous:
+            h = shared.length
+            values = [h * (2 * k + 1) / 2]
+            for j in range(n):
+                a, b, c, d = (arb(point[j]) for point in self.nominal[k])
+                values += [
+                    (a + 3 * (b + c) + d) / 8, (d + c - b - a) * 3 / (4 * h),
+                    (a - b - c + d) * 3 / (2 * h * h), (d - a + 3 * (b - c)) / (h * h * h),
+                ]  # fmt: skip
+            values += [arb(a) + arb(b) * h / 2 for a, b in zip(self.slopes[k], self.drifts[k])]
+            values += [arb(b) for b in self.drifts[k]]
+        else:
+            h = arb(0)
+            values = [arb(k), *map(arb, self.nominal[k]), *map(arb, self.nominal[k + 1])]
+            values += [arb(a) for a in self.slopes[k]]
+        values += [*map(arb, self.gains[k]), *self.middle, *shared.inputs(k)]
+        return PieceData(values=values, half=h / 2, disturbance=self.middle, disturbance_radius=self.reach)
+
+    def _rooms(self, bounds: Supports) -> list[list[arb | None]]:
+        """What y and R leave of every demand, piece by piece."""
+        count, inner = self.shared.count, len(self.rows[0])
+        result: list[list[arb | None]] = []
+        for number_, demand in enumerate(self.demands):
+            self.budget.check()
+            rooms: list[arb | None] = []
+            for k, room in enumerate(demand.rooms):
+                place = number_ + (inner if k < count else 0)
+                used = bounds.reach[k][place] + bounds.high[k][place]
+                rooms.append(None if room is None else (room - used).lower())
+            result.append(rooms)
+        return result
+
+    def _events(
+        self, values: list[arb_mat], rooms: list[list[arb | None]], found: tuple[arb, list[Along]] | None
+    ) -> arb:
+        """Probability that Z or M leave their levels, or exceed what the demands leave."""
+        count, inner = self.shared.count, len(self.rows[0])
+        families = []
+        for d in range(inner):
+            rows = [self.rows[k][d] for k in range(count)]
+            levels = [level[d] for level in self.levels]
+            families.append(Family(label="the levels", rows=rows, levels=levels, both=True))
+        for number_, (demand, left) in enumerate(zip(self.demands, rooms)):
+            if found is not None:
+                part = found[1][inner + number_]
+                left = [None if room is None else (room - part.at(k)).lower() for k, room in enumerate(left)]
+            families.append(Family(label=demand.label, rows=demand.rows, levels=left))
+        total = self._leaving(values, families)
+        if found is None:
+            return total
+        sizes = [part.probability * (2 if d < inner else 1) for d, part in enumerate(found[1])]
+        return upper(sum(sizes, total + found[0]))
+
+    def _leaving(self, values: list[arb_mat], families: list[Family]) -> arb:
+        """The probability of all families of events together."""
+        model, budget = self.model, self.budget
+        if not model.continuous:
+            if self.record["window_levels"] is not None:
+                raise CertificateError(f"`{self.record.at('window_levels')}` must be null in discrete time.")
+            if not model.noise.gaussian:
+                return leaving(
+                    families, lambda family: sub_gaussian(family.rows, family.levels, values, budget), budget
+                )
+            moves = [piece.transition for piece in self.pieces]
+            return leaving(
+                families, lambda family: chain(family.rows, family.levels, moves, values, budget), budget, normal=True
+            )
+        given = self.record.array("window_levels", len(self.shared.windows), model.dimension)
+        windows = Windows(self.pieces, values, self.shared.windows, budget)
+        paid = windows.coordinates([[arb(x) for x in item] for item in given])
+        return leaving(families, lambda family: windows.exceedance(family.rows, family.levels), budget, paid=paid)

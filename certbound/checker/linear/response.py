@@ -1,0 +1,265 @@
+"""The linear response of one cell in ball arithmetic: transition matrices, covariances, supports along rows.
+
+On piece k of length h the slope is J(tau) = A + tau K, tau in [0, h]; Phi is its transition matrix. With
+|J| h at most J_ = |A| h + |K| h^2 entry by entry,
+
+- F = Phi(h, 0), Gamma = int_0^h Phi(h, u) du and Q = int_0^h Phi(h, u) W Phi(h, u)^T du are power series in h whose
+  rests are bounded by scalar majorants;
+- |Phi(s, u) - I| <= D = exp(J_) - I, and |Phi(h, u) - I - (h - u) A| <= S = D - |A| h, for all s, u in the piece.
+
+Discrete time: F = A, Gamma = I, Q = W, D = S = 0. Source: Thm K7 of docs/theory.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from flint import arb, arb_mat
+
+from certbound.checker.balls import column, identity, magnitude, row_sums
+from certbound.checker.report import Budget, Unproved
+
+__all__ = [
+    "Load", "Piece", "Supports", "continuous_piece", "covariances", "discrete_piece", "over_piece", "supports",
+]  # fmt: skip
+
+_TERMS = 60
+_SMALL = arb(2) ** -100
+_BLOCK = 3e6
+"""Products of numbers between two looks at the clock."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Piece:
+    """Linear data of one piece: the matrices of the module's docstring, and |A| and |K| themselves."""
+
+    length: arb
+    transition: arb_mat
+    gathered: arb_mat
+    noise: arb_mat
+    deviation: arb_mat
+    second: arb_mat
+    slope: arb_mat
+    size: arb_mat
+    drift: arb_mat
+
+
+def _tail(older: arb, newer: arb, alpha: arb, kappa: arb, count: int) -> arb | None:
+    """Bound of the terms beyond ``count`` of m_{i+1} = (alpha m_i + kappa m_{i-1})/(i + 1); None if not yet small."""
+    ratio = (alpha + kappa) / (count + 1)
+    if not ratio < 0.5:
+        return None
+    return (4 * ratio * arb.max(older, newer)).upper()
+
+
+def _series(
+    a: arb_mat, k: arb_mat, start: arb_mat, force: arb_mat | None, *, twosided: bool
+) -> arb_mat:
+    """Sum of X_{i+1} = (a X_i + k X_{i-1} [+ transposes] + [i = 0] force)/(i + 1), with its rest."""
+    n = a.nrows()
+    alpha, kappa = row_sums(a), row_sums(k)
+    if twosided:
+        alpha, kappa = alpha + row_sums(a.transpose()), kappa + row_sums(k.transpose())
+    older, newer, total = start * 0, start, start
+    small, big = arb(0), row_sums(start)
+    for i in range(_TERMS):
+        term = a * newer + k * older
+        if twosided:
+            term = term + term.transpose()
+        size = alpha * big + kappa * small
+        if i == 0 and force is not None:
+            term, size = term + force, size + row_sums(force)
+        older, newer = newer, term * (arb(1) / (i + 1))
+        small, big = big, (size / (i + 1)).upper()
+        total = total + newer
+        rest = _tail(small, big, alpha, kappa, i + 1)
+        if rest is not None and rest < _SMALL * (1 + row_sums(total)):
+            return total + arb_mat(n, n, [arb(0, rest)] * (n * n))
+    raise Unproved("the pieces are too long for the slope: its norm times a piece's length is beyond all use")
+
+
+def continuous_piece(slope: arb_mat, drift: arb_mat, length: arb, noise: arb_mat) -> Piece:
+    """The data of one piece in continuous time; ``noise`` is g g^T."""
+    n = slope.nrows()
+    a, k, one = slope * length, drift * (length * length), identity(n)
+    size = magnitude(slope)
+    whole = size * length + magnitude(drift) * (length * length)
+    if not row_sums(whole) < 20:
+        raise Unproved("the pieces are too long for the slope: its norm times a piece's length is beyond 20")
+    deviation = magnitude(whole.exp() - one)
+    return Piece(
+        length=length,
+        transition=_series(a, k, one, None, twosided=False),
+        gathered=_series(a, k, one * 0, one * length, twosided=False),
+        noise=_series(a, k, one * 0, noise * length, twosided=True),
+        deviation=deviation,
+        second=magnitude(deviation - size * length),
+        slope=slope,
+        size=size,
+        drift=magnitude(drift),
+    )
+
+
+def discrete_piece(slope: arb_mat, noise: arb_mat) -> Piece:
+    """The data of one step in discrete time; ``noise`` is the covariance of what is added."""
+    one = identity(slope.nrows())
+    nothing = one * 0
+    return Piece(
+        length=arb(1), transition=slope, gathered=one, noise=noise, deviation=nothing, second=nothing, slope=slope,
+        size=magnitude(slope), drift=nothing,
+    )
+
+
+def covariances(pieces: Sequence[Piece], start: arb_mat, budget: Budget) -> list[arb_mat]:
+    """Covariances of Z at the nodes: V_{k+1} = F V_k F^T + Q."""
+    result = [start]
+    budget.hold(len(pieces) * start.nrows() ** 2)
+    for piece in pieces:
+        budget.check()
+        v = piece.transition * result[-1] * piece.transition.transpose() + piece.noise
+        result.append((v + v.transpose()) * arb(0.5))
+    return result
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Load:
+    """What one piece adds at its end: R gets ``centre`` +- ``radius``, y the segments ``generators`` and +- ``box``."""
+
+    centre: arb_mat
+    radius: list[arb]
+    generators: arb_mat | None
+    box: list[arb]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Supports:
+    """Along every row of every node: bounds ``low`` <= row . R <= ``high`` and |row . y| <= ``reach``."""
+
+    low: list[list[arb]]
+    high: list[list[arb]]
+    reach: list[list[arb]]
+
+
+def supports(
+    transitions: Sequence[arb_mat], rows: Sequence[Sequence[Sequence[arb]]], loads: Sequence[Load],
+    start: Sequence[arb], budget: Budget,
+) -> Supports:
+    """Bounds at the nodes along ``rows[k]`` (a list of rows at node k), by the adjoint rows of every earlier piece.
+
+    Parameters
+    ----------
+    transitions : sequence of arb_mat
+        F of every piece.
+    rows : sequence
+        N + 1 lists of rows.
+    loads : sequence of Load
+        One a piece.
+    start : sequence of arb
+        Half-widths of the box of y at node 0.
+    budget : Budget
+    """
+    n = transitions[0].nrows()
+    budget.hold(3 * (n + 1) * sum(map(len, rows)))
+    flat: list[arb] = []
+    nodes: list[int] = []
+    centre: list[arb] = []
+    radius: list[arb] = []
+    reach: list[arb] = []
+
+    def take(node: int) -> None:
+        for row in rows[node]:
+            flat.extend(row)
+            nodes.append(node)
+            for values in (centre, radius, reach):
+                values.append(arb(0))
+
+    for j in range(len(transitions) - 1, -1, -1):
+        budget.check()
+        take(j + 1)
+        count = len(nodes)
+        if not count:
+            continue
+        load = loads[j]
+        middle = _products(flat, load.centre, budget)
+        boxes = [value for pair in zip(load.radius, load.box) for value in pair]
+        spread = _products([x.abs_upper() for x in flat], arb_mat(n, 2, boxes), budget)
+        for i in range(count):
+            centre[i] += middle[i]
+            radius[i] += spread[2 * i]
+            reach[i] += spread[2 * i + 1]
+        if load.generators is not None:
+            columns = load.generators.ncols()
+            shares = _products(flat, load.generators, budget)
+            for i in range(count):
+                reach[i] += sum((x.abs_upper() for x in shares[i * columns : (i + 1) * columns]), arb(0))
+        flat = _products(flat, transitions[j], budget)
+    take(0)
+    count = len(nodes)
+    if count:
+        spread = _products([x.abs_upper() for x in flat], arb_mat(n, 1, list(start)), budget)
+        reach = [a + b for a, b in zip(reach, spread)]
+    low: list[list[arb]] = [[] for _ in rows]
+    high: list[list[arb]] = [[] for _ in rows]
+    size: list[list[arb]] = [[] for _ in rows]
+    for i, node in enumerate(nodes):
+        low[node].append((centre[i] - radius[i]).lower())
+        high[node].append((centre[i] + radius[i]).upper())
+        size[node].append(reach[i].upper())
+    return Supports(low=low, high=high, reach=size)
+
+
+def _products(flat: list[arb], matrix: arb_mat, budget: Budget) -> list[arb]:
+    """Rows, one after another, times a matrix, block by block."""
+    n, columns = matrix.nrows(), matrix.ncols()
+    block = n * max(1, int(_BLOCK / (n * columns)))
+    result: list[arb] = []
+    for start in range(0, len(flat), block):
+        budget.check()
+        part = flat[start : start + block]
+        result += (arb_mat(len(part) // n, n, part) * matrix).entries()
+    return result
+
+
+def over_piece(
+    piece: Piece, rows: Sequence[Sequence[arb]], found: Supports, k: int, box: tuple[list[arb], list[arb]],
+    gain: list[arb] | None,
+) -> tuple[list[arb], list[arb], list[arb]]:
+    """From a piece's start to all of it: the chord between both ends, its bulge, and what the piece adds.
+
+    Parameters
+    ----------
+    piece : Piece
+    rows : sequence of rows
+    found : Supports
+        At node k: along the unit rows, ``rows``, and ``rows`` times the transition matrix.
+    k : int
+    box : (list, list) of arb
+        Middle and radius of the remainder's box.
+    gain : list of arb, optional
+        Bound of |E (d - d0)|.
+
+    Returns
+    -------
+    low, high, reach : list of arb
+    """
+    n, count = piece.transition.nrows(), len(rows)
+    h, one = piece.length, identity(n)
+    whole = piece.size + piece.drift * h
+    bend = (piece.drift + whole * whole) * (one + piece.deviation) * (h * h / 8)
+    middle, radius = box
+    sizes = [arb.max(abs(a), abs(b)) for a, b in zip(found.low[k][:n], found.high[k][:n])]
+    added_r = (piece.deviation * column([abs(m) + r for m, r in zip(middle, radius)]) + column(radius)) * h
+    columns = [bend * column(sizes) + added_r, bend * column(found.reach[k][:n])]
+    if gain is not None:
+        columns[1] = columns[1] + (one + piece.deviation) * column(gain) * h
+    low, high, reach = [], [], []
+    for i, row in enumerate(rows):
+        weights = arb_mat(1, n, [x.abs_upper() for x in row])
+        rest, spread = ((weights * item)[0, 0] for item in columns)
+        linear = (arb_mat(1, n, list(row)) * column(middle))[0, 0] * h
+        first, last = n + i, n + count + i
+        low.append((arb.min(found.low[k][first], found.low[k][last]) + arb.min(linear, arb(0)) - rest).lower())
+        high.append((arb.max(found.high[k][first], found.high[k][last]) + arb.max(linear, arb(0)) + rest).upper())
+        reach.append((arb.max(found.reach[k][first], found.reach[k][last]) + spread).upper())
+    return low, high, reach

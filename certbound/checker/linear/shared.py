@@ -1,0 +1,75 @@
+"""What the cells of a linear-response proof share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+from flint import arb, arb_mat
+
+from certbound.checker.reading import Record, wholes
+from certbound.checker.report import Unproved
+from certbound.checker.statement import Model, Structure
+from certbound.errors import CertificateError
+
+__all__ = ["Shared"]
+
+MOST_PIECES = 4000
+
+
+class Shared:
+    """What all cells have in common: the grid, the windows, which entries of the Jacobians the file states."""
+
+    def __init__(self, model: Model, structure: Structure, record: Record) -> None:
+        self.model, self.structure = model, structure
+        self.count = record.whole("pieces", 1, MOST_PIECES)
+        if not model.continuous and self.count != model.steps:
+            raise CertificateError("`proof.pieces` must be the number of steps.")
+        if model.continuous and model.plan is not None and self.count % len(model.plan):
+            raise CertificateError("`proof.pieces` must be a multiple of the plan's rows.")
+        for name, expected in (("varying", structure.varying), ("moving", structure.moving)):
+            given = [tuple(wholes(item, record.at(name), 0, 10**6)) for item in record.items(name)]
+            if given != expected:
+                raise Unproved(f"`proof.{name}` does not list the entries of the Jacobian that vary")
+        self.units = wholes(record["units"], record.at("units"), 0, model.dimension - 1)
+        if len(set(self.units)) != len(self.units):
+            raise CertificateError("`proof.units` must be different states.")
+        self.hidden = [structure.hidden(model, output) for output in range(model.dimension)]
+        self.windows: list[int] = []
+        if model.continuous:
+            self.windows = wholes(record["windows"], record.at("windows"), 0, self.count - 1)
+            if self.windows[:1] != [0] or any(a >= b for a, b in pairwise(self.windows)):
+                raise CertificateError("`proof.windows` must rise from 0.")
+        elif record["windows"] is not None:
+            raise CertificateError("`proof.windows` must be null in discrete time.")
+
+    @property
+    def length(self) -> arb:
+        """Length of a piece."""
+        return arb(self.model.horizon) / self.count if self.model.continuous else arb(1)
+
+    def inputs(self, k: int) -> list[arb]:
+        """The plan's inputs on piece k."""
+        plan = self.model.plan
+        if plan is None:
+            return []
+        return [arb(x) for x in plan[k * len(plan) // self.count if self.model.continuous else k]]
+
+    def full(self, values: Sequence[float], *, gains: bool = False) -> arb_mat:
+        """A Jacobian from its varying entries and the model's own constant ones."""
+        structure, n = self.structure, self.model.dimension
+        columns = len(self.model.disturbance) if gains else n
+        entries = [arb(0)] * (n * columns)
+        for (i, j), fixed in (structure.held if gains else structure.fixed).items():
+            entries[i * columns + j] = fixed
+        for (i, j), value in zip(structure.moving if gains else structure.varying, values):
+            entries[i * columns + j] = arb(value)
+        return arb_mat(n, columns, entries)
+
+    def drift(self, values: Sequence[float]) -> arb_mat:
+        """The slope's rate of change: constant entries have none."""
+        n = self.model.dimension
+        entries = [arb(0)] * (n * n)
+        for (i, j), value in zip(self.structure.varying, values):
+            entries[i * n + j] = arb(value)
+        return arb_mat(n, n, entries)

@@ -1,0 +1,23 @@
+"""What a certificate states: the problem, its constraints, its cells, and what they ask for."""
+
+from __future__ import annotations
+
+from certbound.checker.statement.comparison import first_difference
+from certbound.checker.statement.partition import cells_of
+from certbound.checker.statement.problem import Model, read_model
+from certbound.checker.statement.rooms import Grid, demands, round_demands
+from certbound.checker.statement.safe_set import SafeSet
+from certbound.checker.statement.structure import Structure, structure_of
+
+__all__ = [
+    "cells_of",
+    "demands",
+    "first_difference",
+    "Grid",
+    "Model",
+    "read_model",
+    "round_demands",
+    "SafeSet",
+    "Structure",
+    "structure_of",
+]

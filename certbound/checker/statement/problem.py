@@ -1,0 +1,291 @@
+"""The problem that a certificate speaks of, read from its data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from flint import arb, arb_mat
+
+from certbound.checker.balls import diagonal, is_positive_definite, matrix
+from certbound.checker.reading import Record, number, numbers, text
+from certbound.checker.reading import entries as listed
+from certbound.checker.report import Budget
+from certbound.checker.statement.regions import Constraint, read_constraint
+from certbound.checker.statement.tapes import read_tape
+from certbound.errors import CertificateError
+from certbound.problem.model import Tape
+
+__all__ = ["Initial", "Model", "Noise", "read_model"]
+
+MOST_STATES = 400
+MOST_STEPS = 100_000
+_SLACK = arb(2) ** -39
+"""How far a covariance may miss semidefiniteness where every variance is 1."""
+_FIELDS = (
+    "name", "time", "horizon", "delta", "states", "inputs", "disturbances", "dynamics", "plan", "disturbance_set",
+    "noise", "initial", "constraints", "domain",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Noise:
+    """The noise: ``diffusion`` is the matrix g (CT) or G (DT), or a tape over (t, states).
+
+    ``proxy`` is the covariance (or variance proxy) of w in discrete time, the identity in continuous time.
+    ``gaussian`` says whether it is exactly normal.
+    """
+
+    diffusion: arb_mat | Tape
+    proxy: arb_mat
+    gaussian: bool
+
+    def covariance(self) -> arb_mat:
+        """g g^T, or G S G^T; a constant matrix only."""
+        if isinstance(self.diffusion, Tape):
+            raise CertificateError("this proof needs a constant diffusion matrix.")
+        return self.diffusion * self.proxy * self.diffusion.transpose()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Initial:
+    """The initial set: its box hull, and the covariance of a random start (None otherwise).
+
+    ``kind`` and the exact data stay for proofs that use a ball or an ellipsoid itself.
+    """
+
+    kind: str
+    low: tuple[arb, ...]
+    high: tuple[arb, ...]
+    covariance: arb_mat | None = None
+    centre: tuple[float, ...] = ()
+    radius: float = 0.0
+    shape: arb_mat | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Model:
+    """A problem as the checker knows it; ``constraints`` ends with the domain where there is one."""
+
+    name: str
+    continuous: bool
+    horizon: float
+    delta: float
+    dynamics: Tape
+    plan: list[list[float]] | None
+    disturbance: list[tuple[float, float]]
+    noise: Noise
+    initial: Initial
+    constraints: tuple[Constraint, ...]
+    domain: list[tuple[float | None, float | None]] | None
+    states: tuple[str, ...] = field(default=())
+
+    @property
+    def dimension(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def steps(self) -> int:
+        """Steps of a discrete-time horizon."""
+        return int(self.horizon)
+
+
+def _names(record: Record, name: str, least: int) -> tuple[str, ...]:
+    found = tuple(text(item, record.at(name), 200) for item in record.items(name, least, MOST_STATES))
+    if len(set(found)) != len(found):
+        raise CertificateError(f"`{record.at(name)}` must hold different names.")
+    return found
+
+
+def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
+    """The problem in a certificate.
+
+    Raises
+    ------
+    CertificateError
+        If a field is missing, has the wrong size, or makes no sense.
+    Unproved
+        If it is too large for the budget.
+    """
+    record = Record(value, path, _FIELDS)
+    time = record["time"]
+    if time not in ("continuous", "discrete"):
+        raise CertificateError(f"`{path}.time` must be \"continuous\" or \"discrete\".")
+    continuous = time == "continuous"
+    horizon, delta = record.number("horizon"), record.number("delta")
+    if not horizon > 0 or (not continuous and (horizon != int(horizon) or horizon > MOST_STEPS)):
+        raise CertificateError(f"`{path}.horizon` must be positive (whole steps in discrete time), got {horizon:g}.")
+    if not 0 < delta < 1:
+        raise CertificateError(f"`{path}.delta` must lie in (0, 1), got {delta:g}.")
+    states = _names(record, "states", 1)
+    inputs, disturbances = _names(record, "inputs", 0), _names(record, "disturbances", 0)
+    n = len(states)
+    dynamics = read_tape(record["dynamics"], record.at("dynamics"), ("t", *states, *inputs, *disturbances), (n,))
+    domain = _ranges(record["domain"], record.at("domain"), n) if record["domain"] is not None else None
+    constraints = [
+        read_constraint(item, f"{path}.constraints[{index}]", n, horizon, budget)
+        for index, item in enumerate(record.items("constraints", 0, 1000))
+    ]
+    if domain is not None:
+        budget.hold(n * n // 4 + 1)
+        constraints.append(Constraint.of_domain(domain))
+    return Model(
+        name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
+        plan=_plan(record, len(inputs), continuous, horizon), states=states,
+        disturbance=_disturbance(record, len(disturbances)),
+        noise=_noise(record["noise"], path + ".noise", states, time, budget),
+        initial=_initial(record["initial"], path + ".initial", n, budget), constraints=tuple(constraints),
+        domain=domain,
+    )
+
+
+def _plan(record: Record, inputs: int, continuous: bool, horizon: float) -> list[list[float]] | None:
+    if not inputs:
+        if record["plan"] is not None:
+            raise CertificateError(f"`{record.at('plan')}` must be null: the model has no inputs left.")
+        return None
+    rows: list[list[float]] = record.array("plan", None, inputs)
+    if not rows or (not continuous and len(rows) != int(horizon)):
+        raise CertificateError(f"`{record.at('plan')}` must have one row a step.")
+    return rows
+
+
+def _ranges(value: object, path: str, count: int) -> list[tuple[float | None, float | None]]:
+    """Pairs [low, high]; null is an end at infinity."""
+    result: list[tuple[float | None, float | None]] = []
+    for index, pair in enumerate(listed(value, path, count, count)):
+        ends = [None if end is None else number(end, f"{path}[{index}]") for end in listed(pair, path, 2, 2)]
+        if ends[0] is not None and ends[1] is not None and ends[0] > ends[1]:
+            raise CertificateError(f"`{path}[{index}]` must rise.")
+        result.append((ends[0], ends[1]))
+    return result
+
+
+def _disturbance(record: Record, count: int) -> list[tuple[float, float]]:
+    path = record.at("disturbance_set")
+    result = []
+    for low, high in _ranges(record["disturbance_set"], path, count):
+        if low is None or high is None:
+            raise CertificateError(f"`{path}` must be bounded.")
+        result.append((low, high))
+    return result
+
+
+def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget: Budget) -> Noise:
+    n = len(states)
+    if time == "continuous":
+        record = Record(value, path, ("law", "diffusion"))
+        if record["law"] != "wiener":
+            raise CertificateError(f"`{path}.law` must be \"wiener\" in continuous time.")
+        if isinstance(record["diffusion"], dict):
+            inner = Record(record["diffusion"], path + ".diffusion", ("columns", "nodes", "outputs"))
+            m = inner.whole("columns", 1, MOST_STATES)
+            tape = {name: inner[name] for name in ("nodes", "outputs")}
+            return Noise(
+                diffusion=read_tape(tape, inner.path, ("t", *states), (n, m)), proxy=diagonal([arb(1)] * m),
+                gaussian=True,
+            )
+        rows = record.array("diffusion", n, None)
+        m = len(rows[0])
+        return Noise(diffusion=matrix(_same_length(rows, path)), proxy=diagonal([arb(1)] * m), gaussian=True)
+    record = Record(value, path, ("law", "level", "values", "matrix"), ("independent",))
+    rows = _same_length(record.array("matrix", n, None), path)
+    m = len(rows[0])
+    return Noise(diffusion=matrix(rows), proxy=_proxy(record, m, budget), gaussian=record["law"] == "gaussian")
+
+
+def _same_length(rows: list[list[float]], path: str) -> list[list[float]]:
+    if not 1 <= len(rows[0]) <= MOST_STATES or any(len(row) != len(rows[0]) for row in rows):
+        raise CertificateError(f"`{path}` must hold a matrix of at most {MOST_STATES} columns.")
+    return rows
+
+
+def _proxy(record: Record, m: int, budget: Budget) -> arb_mat:
+    """The variance proxy that a law has by its name (Hoeffding's lemma for bounded ones)."""
+    law, level = record.text("law"), record.text("level")
+    levels = {
+        "gaussian": ("std", "variance", "covariance"),
+        "subgaussian": ("std", "variance", "covariance"),
+        "uniform": ("halfwidth",),
+        "rademacher": ("scale",),
+        "bounded": ("halfwidth",),
+    }
+    if level not in levels.get(law, ()):
+        raise CertificateError(f"`{record.path}` has the unknown law {law[:40]!r} with {level[:40]!r}.")
+    if level == "covariance":
+        rows = record.array("values", m, m)
+        if any(rows[i][j] != rows[j][i] for i in range(m) for j in range(i)):
+            raise CertificateError(f"`{record.at('values')}` must be symmetric.")
+        return _semidefinite(matrix(rows), record.at("values"), budget)
+    values = [arb(number(item, record.at("values"), least=0.0)) for item in record.items("values", m, m)]
+    if level == "variance":
+        return diagonal(values)
+    squares = [value * value for value in values]
+    if law == "uniform":
+        squares = [square / 3 for square in squares]
+    if law == "bounded" and not record.flag("independent"):
+        total = sum(squares[1:], squares[0])
+        squares = [total] * m
+    return diagonal(squares)
+
+
+def _semidefinite(a: arb_mat, path: str, budget: Budget) -> arb_mat:
+    """A covariance that is positive semidefinite but for rounding; what is missing is added in proportion to variances.
+
+    It is judged in units in which every variance is 1, so that a large one hides nothing of a small one.
+    """
+    n = a.nrows()
+    variances = [a[i, i] for i in range(n)]
+    if not all(value >= 0 for value in variances):
+        raise CertificateError(f"`{path}` must not have a negative variance.")
+    kept = [i for i, value in enumerate(variances) if value > 0]
+    if len(kept) < n and any(not a[i, j].is_zero() for i in range(n) if variances[i].is_zero() for j in range(n)):
+        raise CertificateError(f"`{path}` must be positive semidefinite: what has no variance has no covariance.")
+    scales = {i: 1 / variances[i].sqrt() for i in kept}
+    scaled = matrix([[a[i, j] * scales[i] * scales[j] for j in kept] for i in kept])
+    if is_positive_definite(scaled, budget):
+        return a
+    if not is_positive_definite(scaled + diagonal([_SLACK] * len(kept)), budget):
+        raise CertificateError(f"`{path}` must be positive semidefinite.")
+    return a + diagonal([value * _SLACK for value in variances])
+
+
+def _initial(value: object, path: str, n: int, budget: Budget) -> Initial:
+    kinds = {
+        "box": ("low", "high"), "ball": ("center", "radius"), "ellipsoid": ("center", "shape"),
+        "gaussian": ("mean", "covariance"),
+    }  # fmt: skip
+    kind = value.get("kind") if isinstance(value, dict) else None
+    if not isinstance(kind, str) or kind not in kinds:
+        raise CertificateError(f"`{path}.kind` must be one of {', '.join(kinds)}.")
+    record = Record(value, path, ("kind", *kinds[kind]))
+    if kind == "box":
+        low, high = record.array("low", n), record.array("high", n)
+        if any(a > b for a, b in zip(low, high)):
+            raise CertificateError(f"`{path}.low` must not exceed `high`.")
+        return Initial(kind=kind, low=tuple(map(arb, low)), high=tuple(map(arb, high)))
+    centre = record.array("mean" if kind == "gaussian" else "center", n)
+    points = [arb(x) for x in centre]
+    if kind == "gaussian":
+        covariance = _semidefinite(matrix(_symmetric(record, "covariance", n)), record.at("covariance"), budget)
+        return Initial(kind=kind, low=tuple(points), high=tuple(points), covariance=covariance, centre=tuple(centre))
+    if kind == "ball":
+        radius = record.number("radius", least=0.0)
+        reach, shape = [arb(radius)] * n, None
+    else:
+        rows: Any = _symmetric(record, "shape", n)
+        if not is_positive_definite(matrix(rows), budget):
+            raise CertificateError(f"`{path}.shape` must be positive definite.")
+        reach, shape, radius = [arb(rows[i][i]).sqrt() for i in range(n)], matrix(rows), 0.0
+    return Initial(
+        kind=kind, low=tuple(p - r for p, r in zip(points, reach)), high=tuple(p + r for p, r in zip(points, reach)),
+        centre=tuple(centre), radius=radius, shape=shape,
+    )
+
+
+def _symmetric(record: Record, name: str, n: int) -> list[list[float]]:
+    rows: list[list[float]] = numbers(record[name], record.at(name), n, n)
+    if any(rows[i][j] != rows[j][i] for i in range(n) for j in range(i)):
+        raise CertificateError(f"`{record.at(name)}` must be symmetric.")
+    return rows

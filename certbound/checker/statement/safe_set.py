@@ -1,0 +1,208 @@
+"""The set on which no constraint is broken, as inequalities phi_j(x) <= 0 that are decided on boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from flint import arb
+
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.statement.problem import Model
+from certbound.checker.statement.regions import Constraint
+from certbound.problem.model import Tape
+
+__all__ = ["Part", "SafeSet"]
+
+_MOST_BOXES = 20_000
+_DEEPEST = 40
+
+Side = tuple[arb, arb]
+Form = list[tuple[int, arb]]
+Skip = Callable[[list[arb], list[arb]], bool]
+
+
+def _over(form: Form, offset: arb, centre: Sequence[arb], radius: Sequence[arb]) -> tuple[arb, arb]:
+    """Ends of form . x - offset over a box."""
+    value, reach = -offset, arb(0)
+    for place, factor in form:
+        value += factor * centre[place]
+        reach += abs(factor) * radius[place]
+    return (value - reach).lower(), (value + reach).upper()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Shape:
+    """One constraint: phi = max_i (form_i . x - offset_i), or sum_i (form_i . x - offset_i)^2 - bound^2 if round.
+
+    An obstacle has the other sign.
+    """
+
+    forms: list[Form]
+    offsets: list[arb]
+    outside: bool
+    bound: arb | None = None
+
+    def over(self, centre: Sequence[arb], radius: Sequence[arb]) -> tuple[arb, arb]:
+        """Ends that enclose phi over a box."""
+        ends = [_over(form, offset, centre, radius) for form, offset in zip(self.forms, self.offsets)]
+        if self.bound is None:
+            low, high = ends[0]
+            for a, b in ends[1:]:
+                low, high = arb.max(low, a), arb.max(high, b)
+        else:
+            low = high = -self.bound * self.bound
+            for a, b in ends:
+                high += arb.max(a * a, b * b)
+                if a > 0 or b < 0:
+                    low += arb.min(a * a, b * b)
+            low, high = low.lower(), high.upper()
+        return (-high, -low) if self.outside else (low, high)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Part:
+    """A part of the boundary: the points of ``box`` that ``skip`` does not rule out; ``exact``: that lie in the set."""
+
+    box: list[Side]
+    skip: Skip
+    exact: bool
+
+
+class SafeSet:
+    """The constraints of a model at rest.
+
+    Parameters
+    ----------
+    model : Model
+
+    Raises
+    ------
+    Unproved
+        If a constraint has a window or moves, or nothing bounds a state.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.n = model.dimension
+        self.shapes: list[_Shape] = []
+        low: list[arb | None] = [None] * self.n
+        high: list[arb | None] = [None] * self.n
+        for constraint in model.constraints:
+            shape = self._shape(constraint)
+            if shape is not None:
+                self.shapes.append(shape)
+                self._narrow(shape, low, high)
+        self.hull: list[Side] = []
+        for j, (a, b) in enumerate(zip(low, high)):
+            if a is None or b is None:
+                raise Unproved(f"no constraint that a barrier can use bounds {model.states[j]}")
+            if not a <= b:
+                raise Unproved(f"no value of {model.states[j]} is safe")
+            self.hull.append((a, b))
+
+    def _shape(self, constraint: Constraint) -> _Shape | None:
+        region = constraint.region
+        if constraint.during is not None:
+            raise Unproved(f"'{constraint.label}' has a time window, which this proof does not treat")
+        if isinstance(region.center, Tape):
+            raise Unproved(f"'{constraint.label}' moves, which this proof does not treat")
+        middle = [arb(0)] * self.n
+        for place, value in zip(region.coordinates, region.center):
+            middle[place] = arb(value)
+        if region.round:
+            image, bound = region.image(self.n)
+            rows = [[image[i, j] for j in range(self.n)] for i in range(image.nrows())]
+            bounds = [arb(0)] * len(rows)
+        else:
+            rows = [region.lift(region.face(number), self.n) for number in range(len(region.faces))]
+            bounds, bound = [arb(b) for b in region.bounds], None
+            if not rows and not constraint.inside:
+                raise Unproved(f"'{constraint.label}' leaves nothing")
+            if not rows:
+                return None
+        forms = [[(j, x) for j, x in enumerate(row) if not x.is_zero()] for row in rows]
+        offsets = [b + sum((x * middle[j] for j, x in form), arb(0)) for form, b in zip(forms, bounds)]
+        return _Shape(forms=forms, offsets=offsets, outside=not constraint.inside, bound=bound)
+
+    def _narrow(self, shape: _Shape, low: list[arb | None], high: list[arb | None]) -> None:
+        """Take what a constraint says about single states."""
+        if shape.outside and (shape.bound is not None or len(shape.forms) > 1):
+            return
+        reach = shape.bound
+        for form, offset in zip(shape.forms, shape.offsets):
+            if len(form) != 1:
+                continue
+            (j, factor), = form
+            sides = [(factor, offset)] if reach is None else [(factor, offset + reach), (-factor, reach - offset)]
+            sign = -1 if shape.outside else 1
+            for a, b in [(sign * a, sign * b) for a, b in sides]:
+                if a > 0:
+                    end, known = (b / a).upper(), high[j]
+                    high[j] = end if known is None else arb.min(known, end)
+                elif a < 0:
+                    end, known = (b / a).lower(), low[j]
+                    low[j] = end if known is None else arb.max(known, end)
+
+    # ---- on boxes ----------------------------------------------------------------------------------------
+
+    def excludes(self, centre: Sequence[arb], radius: Sequence[arb]) -> bool:
+        """Whether every point of a box surely breaks a constraint, the same one."""
+        return any(shape.over(centre, radius)[0] > 0 for shape in self.shapes)
+
+    def holds(self, centre: Sequence[arb], radius: Sequence[arb]) -> bool:
+        """Whether no point of a box breaks a constraint."""
+        return all(shape.over(centre, radius)[1] <= 0 for shape in self.shapes)
+
+    def contains(self, box: Sequence[Side], budget: Budget) -> bool:
+        """Whether a box is proved to lie in the set, cut into parts where need be."""
+        stack = [(list(box), 0)]
+        for _ in range(_MOST_BOXES):
+            if not stack:
+                return True
+            budget.box()
+            sides, depth = stack.pop()
+            centre = [((a + b) / 2).mid() for a, b in sides]
+            radius = [arb.max(b - c, c - a).upper() for (a, b), c in zip(sides, centre)]
+            if self.holds(centre, radius):
+                continue
+            widest = max(range(self.n), key=lambda j: float(radius[j]))
+            a, b = sides[widest]
+            cut = centre[widest]
+            if depth > _DEEPEST * self.n or not a < cut < b or self.excludes(centre, [arb(0)] * self.n):
+                return False
+            stack += [([*sides[:widest], side, *sides[widest + 1 :]], depth + 1) for side in ((a, cut), (cut, b))]
+        return not stack
+
+    def boundary(self) -> list[Part]:
+        """Parts that together hold every point of the set where a constraint is about to be broken (phi_j = 0)."""
+        parts = []
+        for shape in self.shapes:
+            for number, form in enumerate(shape.forms if shape.bound is None else shape.forms[:1]):
+                flat = self._flat(shape, number) if shape.bound is None and len(form) == 1 else self.hull
+                if flat is not None:
+                    parts.append(Part(box=flat, skip=self._beside(shape, number), exact=flat is not self.hull))
+        return parts
+
+    def _flat(self, shape: _Shape, number: int) -> list[Side] | None:
+        """The hull cut down to a face across one state; None where they do not meet."""
+        (j, factor), = shape.forms[number]
+        value = shape.offsets[number] / factor
+        low, high = self.hull[j]
+        if value > high or value < low:
+            return None
+        return [*self.hull[:j], (value.lower(), value.upper()), *self.hull[j + 1 :]]
+
+    def _beside(self, shape: _Shape, number: int) -> Skip:
+        """Rules out boxes beside the face, and outside of the set."""
+        form, offset = shape.forms[number], shape.offsets[number]
+
+        def skip(centre: list[arb], radius: list[arb]) -> bool:
+            low, high = shape.over(centre, radius)
+            if low > 0 or high < 0 or self.excludes(centre, radius):
+                return True
+            if shape.bound is not None:
+                return False
+            first, last = _over(form, offset, centre, radius)
+            return bool(first > 0 or last < 0)
+
+        return skip

@@ -1,0 +1,114 @@
+"""What the dynamics look like to first order: which entries of its Jacobians are constant, which states matter.
+
+Where an entry of D_x f depends on nothing, the linearisation uses the model's own (exact) value: the remainder does
+not depend on that state through that entry, whatever the floats of the certificate say. That is false where f jumps
+(the derivative of a step is 0) or is not defined: what decides that must be seen apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flint import arb
+
+from certbound.checker.expressions import Graph, Program, Undecided
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.statement.problem import Model
+from certbound.problem.model import JUMPS
+
+__all__ = ["Structure", "structure_of"]
+
+_PARTIAL = {"sqrt", "log", "tan", "asin", "acos", "atan2", "div", "pow"}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Structure:
+    """Entries of the Jacobians of f by state and by disturbance.
+
+    ``state_nodes[i, j]`` and ``disturbance_nodes[i, l]`` are the derivative's nodes in ``graph`` (absent where it is
+    exactly 0); ``varying`` and ``moving`` list those that depend on an input, row by row, and ``fixed`` and ``held``
+    hold the values of the others.
+    """
+
+    graph: Graph
+    outputs: list[int]
+    state_nodes: dict[tuple[int, int], int]
+    disturbance_nodes: dict[tuple[int, int], int]
+    varying: list[tuple[int, int]]
+    moving: list[tuple[int, int]]
+    fixed: dict[tuple[int, int], arb]
+    held: dict[tuple[int, int], arb]
+
+    def active_states(self, output: int) -> list[int]:
+        """States on which the remainder of an output may depend."""
+        return [j for i, j in self.varying if i == output]
+
+    def active_disturbances(self, output: int) -> list[int]:
+        """Disturbances on which the remainder of an output may depend."""
+        return [j for i, j in self.moving if i == output]
+
+    def hidden(self, model: Model, output: int) -> list[int]:
+        """Inputs that decide a jump of an output, or whether it is defined, and are none of its remainder's."""
+        self.graph.budget.check()
+        count, n = len(model.dynamics.inputs), model.dimension
+        first = count - len(model.disturbance)
+        asked = sum(1 << slot for slot in [*range(1, n + 1), *range(first, count)])
+        asked &= ~sum(1 << 1 + j for j in self.active_states(output))
+        asked &= ~sum(1 << first + j for j in self.active_disturbances(output))
+        deciding = 0
+        for index in self.graph.reachable([self.outputs[output]]):
+            deciding |= _deciding(self.graph, index)
+        return [slot for slot in range(count) if deciding & asked & 1 << slot]
+
+
+def structure_of(model: Model, budget: Budget) -> Structure:
+    """Differentiate the model once."""
+    graph = Graph(budget)
+    n, q = model.dimension, len(model.disturbance)
+    slots = [graph.input(slot) for slot in range(len(model.dynamics.inputs))]
+    nodes = graph.include(model.dynamics, slots)
+    outputs = [nodes[output] for output in model.dynamics.outputs]
+    first = len(slots) - q
+    by_state = _derivatives(graph, outputs, range(1, n + 1), budget)
+    by_disturbance = _derivatives(graph, outputs, range(first, first + q), budget)
+    varying = sorted(entry for entry, node in by_state.items() if graph.masks[node])
+    moving = sorted(entry for entry, node in by_disturbance.items() if graph.masks[node])
+    return Structure(
+        graph=graph, outputs=outputs, state_nodes=by_state, disturbance_nodes=by_disturbance, varying=varying,
+        moving=moving, fixed=_values(graph, by_state), held=_values(graph, by_disturbance),
+    )  # fmt: skip
+
+
+def _deciding(graph: Graph, index: int) -> int:
+    """The inputs that decide on which side of a jump an operation is, or whether it is defined."""
+    op, args, value = graph.node(index)
+    if op == "if_else_zero":
+        return graph.masks[args[0]]
+    if op == "div":
+        return graph.masks[args[1]]
+    if op == "pow" and value >= 0 and value == int(value):
+        return 0
+    return graph.masks[index] if op in JUMPS or op in _PARTIAL else 0
+
+
+def _derivatives(graph: Graph, outputs: list[int], slots: range, budget: Budget) -> dict[tuple[int, int], int]:
+    found = {}
+    for i, output in enumerate(outputs):
+        for j, slot in enumerate(slots):
+            if graph.masks[output] >> slot & 1:
+                budget.check()
+                node = graph.derivative(output, slot)
+                if not graph.is_const(node, 0.0):
+                    found[i, j] = node
+    return found
+
+
+def _values(graph: Graph, nodes: dict[tuple[int, int], int]) -> dict[tuple[int, int], arb]:
+    """Values of the entries that depend on nothing."""
+    constant = {entry: node for entry, node in nodes.items() if not graph.masks[node]}
+    program = Program(graph, list(constant.values()), variables=0)
+    program.prepare([])
+    try:
+        return dict(zip(constant, program.run([])))
+    except Undecided as error:
+        raise Unproved("a derivative of the dynamics that depends on nothing is not defined") from error

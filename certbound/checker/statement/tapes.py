@@ -1,0 +1,91 @@
+"""Tapes as data: reading them, and telling whether two are the same function up to the order of their nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from certbound.checker.reading import Record, number, whole, wholes
+from certbound.checker.reading import entries as listed
+from certbound.errors import CertificateError
+from certbound.problem.model import Node, Tape
+
+__all__ = ["canonical", "read_tape"]
+
+
+def read_tape(value: object, path: str, inputs: tuple[str, ...], shape: tuple[int, ...]) -> Tape:
+    """A tape over the given inputs: {"nodes": [[op, ...arguments]], "outputs": [...]}.
+
+    Raises
+    ------
+    CertificateError
+        If it is no straight-line program over known operations, or has another number of outputs.
+    """
+    record = Record(value, path, ("nodes", "outputs"))
+    nodes = []
+    for index, entry in enumerate(record.items("nodes", 0, 50_000)):
+        items = listed(entry, f"{path}.nodes[{index}]", 1, 3)
+        op, rest = items[0], items[1:]
+        place = f"{path}.nodes[{index}]"
+        if op == "const" and len(rest) == 1:
+            nodes.append(Node("const", (), number(rest[0], place)))
+        elif op == "pow" and len(rest) == 2:
+            nodes.append(Node("pow", (whole(rest[0], place, 0, index - 1),), number(rest[1], place)))
+        elif isinstance(op, str) and op not in ("const", "pow", "kink"):  # a kink is part of a derivative only
+            nodes.append(Node(op, tuple(whole(arg, place, 0, 10**6) for arg in rest)))
+        else:
+            raise CertificateError(f"`{place}` is no operation.")
+    outputs = wholes(record["outputs"], record.at("outputs"), 0, max(len(nodes) - 1, 0))
+    count = 1
+    for length in shape:
+        count *= length
+    if len(outputs) != count:
+        raise CertificateError(f"`{path}.outputs` must have {count} entries, got {len(outputs)}.")
+    try:
+        return Tape(inputs=inputs, nodes=tuple(nodes), outputs=tuple(outputs), shape=shape)
+    except ValueError as error:
+        raise CertificateError(f"`{path}` is no tape: {error}") from error
+
+
+
+def canonical(data: Mapping[str, Any]) -> list[Any]:
+    """A tape's data in a form that does not depend on the order of its nodes, nor on unused or repeated ones.
+
+    Examples
+    --------
+    >>> first = {"nodes": [["input", 0], ["input", 1], ["add", 0, 1]], "outputs": [2]}
+    >>> second = {"nodes": [["input", 1], ["input", 0], ["sq", 0], ["add", 1, 0]], "outputs": [3]}
+    >>> canonical(first) == canonical(second)
+    True
+    """
+    nodes, outputs = data["nodes"], data["outputs"]
+    numbers: dict[tuple[Any, ...], int] = {}
+    place: list[int] = []
+    for op, *rest in nodes:
+        if op in ("const", "input"):
+            key: tuple[Any, ...] = (op, *rest)
+        elif op == "pow":
+            key = (op, place[rest[0]], rest[1])
+        else:
+            key = (op, *(place[arg] for arg in rest))
+        place.append(numbers.setdefault(key, len(numbers)))
+    keys = list(numbers)
+    found: dict[int, int] = {}
+    result: list[Any] = []
+    for output in outputs:
+        stack = [place[output]]
+        while stack:
+            number_ = stack[-1]
+            key = keys[number_]
+            args = [] if key[0] in ("const", "input") else [key[1]] if key[0] == "pow" else list(key[1:])
+            missing = [arg for arg in args if arg not in found]
+            if number_ in found:
+                stack.pop()
+            elif missing:
+                stack.append(missing[0])
+            else:
+                found[number_] = len(result)
+                own = [found[arg] for arg in args]
+                result.append([key[0], *own, *([key[2]] if key[0] == "pow" else key[1:] if not args else [])])
+                stack.pop()
+    return [result, [found[place[output]] for output in outputs]]

@@ -1,0 +1,167 @@
+"""``certbound check``: prove a certificate again, and that it speaks of a given problem."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certbound.cli.messages import InputError
+from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, examples, load_problem
+from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.errors import CertificateError, EngineError, SolverError, contained
+
+if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
+    from certbound.safety.verification import Verdict
+
+__all__ = ["proved_certificate", "register"]
+
+ATTEMPTS = 3
+
+CertificateArgument = Annotated[
+    Path, typer.Argument(metavar="CERT", help="The file of verify --certificate.", show_default=False)
+]
+ProblemOption = Annotated[
+    str | None,
+    typer.Option("--problem", metavar="PROBLEM", help="Prove also that it speaks of this problem.", show_default=False),
+]
+AllowOption = Annotated[
+    bool,
+    typer.Option("--allow-assumptions", help="Exit with 0 also where the proof rests on the assumptions it names."),
+]
+WORDS = {
+    "valid": "[bold green]VALID[/]",
+    "valid under assumptions": "[bold yellow]VALID UNDER ASSUMPTIONS[/]",
+    "not proved": "[bold red]NOT PROVED[/]",
+}
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command(
+        "check",
+        epilog=examples(
+            "certbound check unicycle.json --problem unicycle",
+            "certbound check my_system.json --problem my_system.toml --json",
+            "certbound check stated.json --allow-assumptions",
+        ),
+    )(check)
+
+
+def check(
+    certificate: CertificateArgument,
+    problem: ProblemOption = None,
+    pairs: SetOption = None,
+    delta: DeltaOption = None,
+    horizon: HorizonOption = None,
+    allow: AllowOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Prove every inequality of a certificate again, in ball arithmetic, from the file alone."""
+    from certbound.checker import check_data, read
+
+    started = time.perf_counter()
+    data = read(certificate)
+    given = _stated(problem, pairs, delta, horizon)
+    with spinner(f"checking {certificate.name}"):
+        report = check_data(data, given, allow_assumptions=allow)
+    result = {
+        "valid": report.valid,
+        "claim": report.claim,
+        "reason": report.reason,
+        "seconds": time.perf_counter() - started,
+        "outcome": report.outcome,
+        "assumptions": list(report.assumptions),
+    }
+    if as_json:
+        print_json(result)
+    else:
+        _print(result)
+    raise typer.Exit(0 if report.valid else 1)
+
+
+def _stated(
+    problem: str | None, pairs: list[str] | None, delta: float | None, horizon: float | None
+) -> dict[str, Any] | None:
+    """The data of the problem that the certificate must speak of."""
+    if problem is None:
+        if pairs or delta is not None or horizon is not None:
+            raise InputError("`--set`, `--delta` and `--horizon` change a problem, and none is given", "add --problem")
+        return None
+    from certbound.safety.certificates import problem_data
+
+    return problem_data(load_problem(problem, pairs, horizon=horizon, delta=delta))
+
+
+def proved_certificate(problem: Problem, verdict: Verdict) -> str:
+    """The text of a verdict's certificate, which the checker has proved again; it claims what was proved.
+
+    Assumptions of the verdict are assumptions of the certificate, which names them. Where the checker proves no
+    certificate of one engine, at any effort, the other engines' are tried.
+
+    Raises
+    ------
+    CertificateError
+        If the verdict bounds no probability.
+    SolverError
+        If the checker did not prove what was written.
+    """
+    left, reasons = dict(verdict.answers), list[str]()
+    while left:
+        try:
+            found, engine, reason = _proved(problem, replace(verdict, answers=left))
+        except EngineError as error:
+            if not reasons:
+                raise CertificateError(str(error)) from error
+            break
+        if found is not None:
+            return found
+        reasons.append(f"{engine}: {reason}")
+        if left.pop(engine, None) is None:
+            break
+    if not reasons:
+        raise CertificateError(f"no probability was bounded that a certificate could state: {verdict.reason}")
+    raise SolverError(f"the certificate could not be proved again by the checker: {' '.join(reasons)}")
+
+
+def _proved(problem: Problem, verdict: Verdict) -> tuple[str | None, str, str]:
+    """A certificate that the checker has proved (None: it proved none), its engine, and what stood in the way.
+
+    Raises
+    ------
+    EngineError
+        If no certificate could be written.
+    """
+    from certbound.checker import check_data, parse
+    from certbound.safety.certificates import problem_data, restated
+
+    engine = reason = ""
+    for attempt in range(ATTEMPTS):
+        try:
+            with contained("certificate"):
+                text = verdict.certificate_text(problem, attempt=attempt)
+        except EngineError as error:
+            if attempt + 1 == ATTEMPTS and not engine:
+                raise
+            reason = str(error)
+            continue
+        data = parse(text)
+        engine = str(data["claim"]["method"])
+        report = check_data(data, problem_data(problem), allow_assumptions=True)
+        if report.valid and report.log10_proved is not None:
+            return restated(text, report.log10_proved), engine, ""
+        reason = report.reason
+    return None, engine, reason
+
+
+def _print(result: dict[str, Any]) -> None:
+    screen = console()
+    screen.print(WORDS[result["outcome"]])
+    if SETTINGS.quiet:
+        return
+    screen.print(f"claim: {result['claim']}", markup=False)
+    screen.print(f"{result['reason']}  ({result['seconds']:.1f} s)", markup=False)

@@ -1,0 +1,275 @@
+"""``certbound simulate``: exit probabilities by Monte Carlo, beside what was certified."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certbound.cli.clock import Clock, TimeLimitOption
+from certbound.cli.messages import InputError
+from certbound.cli.options import (
+    HorizonOption,
+    JsonOption,
+    ProblemArgument,
+    SetOption,
+    check_writable,
+    examples,
+    integer,
+    load_problem,
+    number,
+)
+from certbound.cli.output import SETTINGS, console, print_json
+from certbound.display import one_line, rounded
+
+if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
+    from certbound.simulation.executors import Progress
+
+__all__ = ["register"]
+
+EXAMPLES = examples(
+    "certbound simulate ou --paths 1e6 --seed 1",
+    "certbound simulate unicycle --paths 1e9 --time-limit 60",
+    "certbound simulate chain --paths 1e7 --checkpoint run.npz --against chain.json",
+    "certbound simulate ou --paths 1e4 --rare",
+)
+FIRST = 2000
+
+PathsOption = Annotated[
+    int, typer.Option("--paths", parser=integer, metavar="N", help="Paths to simulate, such as 3e6.")
+]
+SeedOption = Annotated[
+    int | None,
+    typer.Option(
+        "--seed", parser=integer, metavar="S", help="The same seed gives the same counts.", show_default=False
+    ),
+]
+StepOption = Annotated[
+    float | None,
+    typer.Option(
+        "--step", parser=number, metavar="H", help="Time step in seconds; T/1000 if left out.", show_default=False
+    ),
+]
+ConfidenceOption = Annotated[float, typer.Option("--confidence", parser=number, metavar="C", help="Of the limits.")]
+RareOption = Annotated[bool, typer.Option("--rare", help="Importance splitting, for rare exits.")]
+CheckpointOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--checkpoint", metavar="FILE", help="Keep finished work here, and go on from it.", show_default=False
+    ),
+]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option("--cluster", metavar="ADDRESS", help="A dask scheduler, tcp://host:port.", show_default=False),
+]
+AgainstOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--against", metavar="CERT", help="Does the simulation contradict this certificate?", show_default=False
+    ),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command("simulate", epilog=EXAMPLES)(simulate)
+
+
+def simulate(
+    problem: ProblemArgument,
+    paths: PathsOption,
+    pairs: SetOption = None,
+    horizon: HorizonOption = None,
+    seed: SeedOption = None,
+    step: StepOption = None,
+    confidence: ConfidenceOption = 0.99,
+    rare: RareOption = False,
+    checkpoint: CheckpointOption = None,
+    cluster: ClusterOption = None,
+    against: AgainstOption = None,
+    time_limit: TimeLimitOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Count how many random paths leave the safe set or the domain, with confidence limits."""
+    check_writable(checkpoint)
+    if seed is not None and seed < 0:
+        raise InputError(f"`--seed` must not be negative, got {seed}", "give a whole number such as 1")
+    if time_limit is not None and checkpoint is not None:
+        raise InputError(
+            "`--time-limit` and `--checkpoint` exclude each other", "stop a run with Ctrl-C and go on later"
+        )
+    subject = load_problem(problem, pairs, horizon=horizon)
+    claim = None if against is None else _claimed(against)
+    options: dict[str, Any] = {"paths": paths, "steps": _steps(subject, step), "confidence": confidence}
+    if seed is not None or checkpoint is None:
+        import numpy as np
+
+        options["rng"] = np.random.default_rng(seed)
+    with _executor(cluster) as executor, _progress_bar(paths) as progress:
+        options |= {"executor": executor, "progress": progress, "checkpoint": checkpoint}
+        result = _within(Clock(time_limit), _rare if rare else _plain, subject, options)
+    if claim is not None:
+        contradicted = result["lower"] > 10.0**claim
+        result["against"] = {"certificate": str(against), "log10_delta": claim, "contradicted": contradicted}
+    if as_json:
+        print_json(result)
+    else:
+        _print(result)
+    raise typer.Exit(1 if claim is not None and result["against"]["contradicted"] else 0)
+
+
+def _within(
+    clock: Clock, count: Callable[[Problem, dict[str, Any]], dict[str, Any]], problem: Problem, options: dict[str, Any]
+) -> dict[str, Any]:
+    """A run of all paths, or of as many as are expected to fit into the time.
+
+    Trial runs of growing size measure the speed and are thrown away, so that the number of paths of the run that
+    counts does not depend on what it finds.
+    """
+    if clock.limit is None:
+        return count(problem, options)
+    asked = options["paths"]
+    number = min(asked, FIRST)
+    while True:
+        result = count(problem, options | {"paths": number})
+        affordable = int(0.8 * max(clock.left, 0.0) / max(result["seconds"], 1e-3) * number)
+        if number == asked or affordable < 2 * number:
+            return result | {"asked": asked}
+        number = min(asked, affordable, 30 * number)
+
+
+def _steps(problem: Problem, step: float | None) -> int | None:
+    """Number of steps that a time step means; None for the default."""
+    if step is None:
+        return None
+    if problem.system.time == "discrete":
+        raise InputError("`--step` has no meaning in discrete time", "leave it out")
+    if not 0.0 < step <= problem.horizon:
+        raise InputError(
+            f"`--step` must lie in (0, {problem.horizon:g}], got {step:g}", f"try --step {problem.horizon / 1000:g}"
+        )
+    count = float(problem.horizon) / step
+    return round(count) if math.isclose(count, round(count), rel_tol=1e-9) else math.ceil(count)
+
+
+def _plain(problem: Problem, options: dict[str, Any]) -> dict[str, Any]:
+    from certbound.simulation.estimates import simulate_exits
+
+    found = simulate_exits(problem, **options)
+    return {
+        "paths": found.paths,
+        "exits": found.exits,
+        "probability": found.probability,
+        "lower": found.lower,
+        "upper": found.upper,
+        "confidence": found.confidence,
+        "by_constraint": found.by_constraint,
+        "steps": found.steps,
+        "scheme": found.scheme,
+        "path_steps_per_second": found.path_steps_per_second,
+        "seconds": found.seconds,
+    }
+
+
+def _rare(problem: Problem, options: dict[str, Any]) -> dict[str, Any]:
+    from certbound.simulation.estimates import simulate_rare_exits
+
+    found = simulate_rare_exits(problem, **options)
+    return {
+        "paths": found.paths,
+        "exits": found.exits,
+        "probability": found.probability,
+        "standard_error": found.standard_error,
+        "lower": found.lower,
+        "upper": found.upper,
+        "confidence": found.confidence,
+        "replicas": found.replicas,
+        "steps": found.steps,
+        "scheme": found.scheme,
+        "path_steps_per_second": found.path_steps_per_second,
+        "seconds": found.seconds,
+    }
+
+
+def _claimed(path: Path) -> float:
+    """log10 of the probability that a certificate claims."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"`{path}` is no certificate: {error}", "give the file of verify --certificate") from error
+    for part in (content, content.get("claim") if isinstance(content, dict) else None):
+        value = part.get("log10_delta") if isinstance(part, dict) else None
+        if isinstance(value, str):
+            with contextlib.suppress(ValueError):
+                value = float.fromhex(value)
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and value <= 0:
+            return float(value)
+    raise InputError(f"`{path}` claims no probability (`log10_delta`)", "give the file of verify --certificate")
+
+
+@contextlib.contextmanager
+def _executor(address: str | None) -> Iterator[Any]:
+    """A dask client for the address, closed again; None for threads."""
+    if address is None:
+        yield None
+        return
+    from certbound.simulation.executors import connect
+
+    client = connect(address)
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+@contextlib.contextmanager
+def _progress_bar(paths: int) -> Iterator[Callable[[Progress], None] | None]:
+    """A bar with rate and time left on standard error, on a terminal only."""
+    if SETTINGS.quiet or SETTINGS.verbose or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"))
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("compiling", total=paths)
+
+        def update(state: Progress) -> None:
+            text = f"{state.rate:.3g} path-steps/s, {state.remaining:.0f} s left"
+            bar.update(task, description=text, completed=state.paths, total=state.total)
+
+        yield update
+
+
+def _print(result: dict[str, Any]) -> None:
+    screen = console()
+    low, high = result["lower"], result["upper"]
+    least, most = rounded(low, up=False, digits=4), rounded(high, up=True, digits=4)
+    sure = f"{100 * result['confidence']:g} %"
+    screen.print(f"exit probability {result['probability']:.4g}  ({sure} limits {least} ... {most})")
+    if SETTINGS.quiet:
+        return
+    steps = f"{result['steps']} steps of the {result['scheme']} scheme"
+    if "standard_error" in result:
+        error, replicas = result["standard_error"], result["replicas"]
+        screen.print(f"standard error {error:.2g}, from {replicas} runs of importance splitting, {steps}")
+    else:
+        screen.print(f"{result['exits']} of {result['paths']} paths left, {steps}")
+    for label, count in result.get("by_constraint", {}).items():
+        screen.print(f"  {count:>9}  {one_line(label)}", markup=False)
+    screen.print(f"a claim of less than {least} is refuted; the smallest delta supported is {most}")
+    if result.get("asked", result["paths"]) != result["paths"]:
+        screen.print(f"the time was enough for {result['paths']} of {result['asked']} paths")
+    if "against" in result:
+        word = "contradicts" if result["against"]["contradicted"] else "does not contradict"
+        screen.print(f"the simulation {word} the certificate (10^{rounded(result['against']['log10_delta'], up=True)})")
+    screen.print(f"{result['seconds']:.2f} s, {result['path_steps_per_second']:.3g} path-steps per second")

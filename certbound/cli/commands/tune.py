@@ -1,0 +1,175 @@
+"""``certbound tune``: every valid tube of a problem, side by side."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
+from certbound.cli.describe import describe_parameters
+from certbound.cli.messages import computing
+from certbound.cli.options import (
+    DeltaOption,
+    HorizonOption,
+    JsonOption,
+    ProblemArgument,
+    SetOption,
+    check_picture,
+    check_writable,
+    examples,
+    load_problem,
+)
+from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
+from certbound.display import name_text
+from certbound.errors import SolverError
+
+if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
+    from certbound.tubes.constants import Constants
+    from certbound.tubes.tube import Tube
+
+__all__ = ["register"]
+
+SAMPLES = 513
+PATHS = 60
+EXAMPLES = examples(
+    "certbound tune ou --json",
+    "certbound tune ou --plot tubes.png",
+    "certbound tune chain_rest --delta 1e-6 --time-limit 30",
+)
+PlotOption = Annotated[
+    Path | None,
+    typer.Option("--plot", metavar="FILE", help="Draw all the tubes with simulated paths.", show_default=False),
+]
+_log = logging.getLogger(__name__)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command("tune", epilog=EXAMPLES)(tune)
+
+
+def tune(
+    problem: ProblemArgument,
+    pairs: SetOption = None,
+    horizon: HorizonOption = None,
+    delta: DeltaOption = None,
+    time_limit: TimeLimitOption = None,
+    plot: PlotOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compute the probabilistic tube by every method that applies, and say which is smallest."""
+    check_writable(plot)
+    check_picture(plot)
+    subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
+    rows: list[dict[str, Any]] = []
+    tubes: dict[str, Tube] = {}
+    constants: Constants | None = None
+    with contextlib.suppress(OutOfTime), Clock(time_limit).running(), computing("constants", subject):
+        from certbound.constants.bounds import bound_constants
+
+        with spinner(f"bounding the constants of {name_text(subject.name)}"):
+            constants = bound_constants(subject)
+        for tube, row in _rows(constants, subject.horizon, subject.delta):
+            rows.append(row)
+            tubes.setdefault(row["method"], tube)
+    valid = [row for row in rows if row["level"] == "trajectory" and not row["method"].endswith("_as_printed")]
+    if (constants is None or not valid) and time_limit is not None:
+        raise SolverError(f"no tube was computed within {time_limit:g} s; give a larger --time-limit")
+    if constants is None or not valid:
+        raise SolverError(f"no tube along whole trajectories was found for {subject.name}; try verify, it has others")
+    best = min(valid, key=lambda row: row["maximum"])["method"]
+    if plot is not None:
+        _draw(subject, tubes, best, plot)
+    if as_json:
+        print_json({"method": best, "rows": rows})
+    else:
+        _print(best, rows, "" if constants.metric is None else " (radii in the norm of the certified metric)")
+
+
+def _draw(problem: Problem, tubes: dict[str, Tube], best: str, path: Path) -> None:
+    from certbound.plotting import draw_tubes
+    from certbound.simulation.estimates import sample_paths
+
+    sizes = None
+    with spinner("drawing"):
+        try:
+            states = sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0), deviation=True)
+        except ValueError as error:
+            _log.info("no sample paths are drawn: %s", error)
+        else:
+            metric = tubes[best].constants.metric
+            weighted = states if metric is None else states @ np.linalg.cholesky(metric)
+            sizes = np.linalg.norm(weighted, axis=-1)
+        stream = BytesIO()
+        draw_tubes(tubes, best, sizes).savefig(stream, format=path.suffix.lstrip(".") or "png", dpi=150)
+        write_file(path, stream.getvalue())
+
+
+def _rows(constants: Constants, horizon: float, delta: float) -> Iterator[tuple[Tube, dict[str, Any]]]:
+    """Every method whose hypotheses hold, its parameters tuned; the paper's windows also with its own ones."""
+    from certbound.tubes.tuning import METHODS, tune_tube
+
+    asked: list[tuple[str, dict[str, float]]] = [(method, {}) for method in METHODS if method != "auto"]
+    window = horizon / 100 if constants.continuous else 1
+    asked += [(method, {"epsilon": 15 / 16, "step": window}) for method in ("thm3", "thm5")]
+    for method, fixed in asked:
+        started = time.perf_counter()
+        try:
+            with spinner(f"tuning {method}"):
+                tube = tune_tube(constants, horizon=horizon, delta=delta, method=method, **fixed)  # type: ignore[arg-type]  # floats by name
+        except (ValueError, ArithmeticError) as error:
+            _log.debug("%s does not apply: %s", method, error)
+            continue
+        yield tube, _row(tube, method, horizon, time.perf_counter() - started, constants.continuous)
+
+
+def _row(tube: Tube, method: str, horizon: float, seconds: float, continuous: bool) -> dict[str, Any]:
+    times = np.linspace(0.0, horizon, SAMPLES) if continuous else np.arange(int(horizon) + 1.0)
+    radii = np.asarray(tube.radius(times))
+    mean = float(np.trapezoid(radii, times) / horizon) if continuous else float(radii[1:].mean())
+    return {
+        "method": method,
+        "level": tube.level,
+        "final": float(radii[-1]),
+        "maximum": float(max(tube.bound(0.0, horizon), radii.max())),
+        "mean": mean,
+        "parameters": describe_parameters(tube),
+        "seconds": seconds,
+    }
+
+
+def _print(best: str, rows: list[dict[str, Any]], norm: str) -> None:
+    screen = console()
+    if SETTINGS.quiet:
+        screen.print(best)
+        return
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    table.add_column("method")
+    table.add_column("level")
+    for heading in ("largest", "final", "mean"):
+        table.add_column(heading, justify="right")
+    table.add_column("parameters", overflow="fold")
+    for row in sorted(rows, key=lambda row: row["maximum"]):
+        name = f"[bold]{row['method']}[/]" if row["method"] == best else row["method"]
+        numbers = (f"{row[key]:.4f}" for key in ("maximum", "final", "mean"))
+        parameters = ", ".join(f"{key} {_short(value)}" for key, value in row["parameters"].items())
+        table.add_row(name, row["level"], *numbers, parameters)
+    screen.print(table)
+    screen.print(f"smallest trajectory-level tube: {best}{norm}")
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return f"({len(value)})"
+    return f"{value:.4g}" if isinstance(value, (int, float)) else str(value)

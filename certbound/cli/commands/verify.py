@@ -1,0 +1,301 @@
+"""``certbound verify``: the verdict on a problem, with its certificate, report and picture."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import shlex
+import sys
+import time
+from dataclasses import asdict, replace
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
+from certbound.cli.commands.check import proved_certificate
+from certbound.cli.describe import describe_constants, describe_deviation
+from certbound.cli.options import (
+    DeltaOption,
+    HorizonOption,
+    JsonOption,
+    ProblemArgument,
+    SetOption,
+    check_picture,
+    check_writable,
+    examples,
+    integer,
+    load_problem,
+)
+from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
+from certbound.display import log10_text, name_text, one_line, rounded
+from certbound.errors import CertificateError, EngineError, SolverError, contained
+
+if TYPE_CHECKING:
+    from certbound.plotting import Scene
+    from certbound.problem.problem import Problem
+    from certbound.reach.sets import ReachTube
+    from certbound.safety.answers import EngineAnswer
+    from certbound.safety.verification import Verdict
+
+__all__ = ["register"]
+
+PATHS = 60
+EXAMPLES = examples(
+    "certbound verify unicycle --horizon 2 --plot tube.png",
+    "certbound verify my_system.toml --set sigma=0.1 --delta 1e-6 --json",
+    "certbound verify chain --certificate chain.json --report chain.html",
+    "certbound verify unicycle --smallest --time-limit 60",
+)
+_log = logging.getLogger(__name__)
+
+MethodOption = Annotated[
+    str, typer.Option("--method", metavar="M", help="auto, linear, or a tube method such as kummer or thm3.")
+]
+CellsOption = Annotated[
+    int | None,
+    typer.Option("--cells", parser=integer, metavar="K", help="Cells per side of the initial set.", show_default=False),
+]
+CertificateOption = Annotated[
+    Path | None,
+    typer.Option("--certificate", metavar="FILE", help="Write the certificate.", show_default=False),
+]
+ReportOption = Annotated[
+    Path | None, typer.Option("--report", metavar="FILE", help="Write one HTML page.", show_default=False)
+]
+PlotOption = Annotated[
+    Path | None,
+    typer.Option("--plot", metavar="FILE", help="Draw tube, sets and sample paths.", show_default=False),
+]
+ExplainOption = Annotated[
+    bool, typer.Option("--explain", help="Show what each engine found, and for UNKNOWN what would be SAFE.")
+]
+SmallestOption = Annotated[
+    bool, typer.Option("--smallest", help="Once SAFE, go on to the smallest probability that can be proved.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command("verify", epilog=EXAMPLES)(verify)
+
+
+def verify(
+    problem: ProblemArgument,
+    pairs: SetOption = None,
+    delta: DeltaOption = None,
+    horizon: HorizonOption = None,
+    method: MethodOption = "auto",
+    cells: CellsOption = None,
+    certificate: CertificateOption = None,
+    report: ReportOption = None,
+    plot: PlotOption = None,
+    explain: ExplainOption = False,
+    smallest: SmallestOption = False,
+    time_limit: TimeLimitOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Decide whether the system stays safe but for a probability of delta, and prove it."""
+    check_writable(certificate, report, plot)
+    check_picture(plot)
+    subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
+    started = time.perf_counter()
+    with spinner(f"verifying {name_text(subject.name)}"):
+        clock = Clock(time_limit)
+        verdict = _verdict(subject, method, cells, clock)
+        if smallest and verdict.status == "SAFE":
+            verdict = _smallest(verdict, method, cells, clock)
+    seconds = time.perf_counter() - started
+    result = _result(subject, verdict, seconds)
+    if explain:
+        result["engines"] = _engines(verdict)
+    if not as_json:  # the verdict comes first: it stands, whatever becomes of the rest
+        _print(subject, result)
+    if explain and verdict.status == "UNKNOWN":
+        result["limits"] = _limits(verdict, cells, clock)
+        if not as_json and not SETTINGS.quiet:
+            console().print(result["limits"]["summary"], markup=False)
+    proof = ""
+    if certificate is not None:
+        proof, result["certificate"] = _certify(subject, verdict, certificate)
+    _write(subject, verdict, proof, report=report, plot=plot)
+    if as_json:
+        print_json(result)
+    raise typer.Exit(0 if verdict.status == "SAFE" else 1)
+
+
+def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> Verdict:
+    """The verdict; with a limit, the best one of the engines that finished in time."""
+    from certbound.safety.verification import ENGINES, Verdict, verify_safety
+
+    if clock.limit is None:
+        return verify_safety(problem, method=method, cells=cells)
+    best: Verdict | None = None
+    answers: dict[str, EngineAnswer] = {}
+    over = f"The search was stopped after {clock.limit:g} s."
+    try:
+        for engine in ENGINES if method == "auto" else (method,):
+            if engine == "barrier" and best is not None and best.status == "SAFE":
+                break
+            with clock.running():
+                found = verify_safety(problem, method=engine, cells=cells)
+            answers |= found.answers
+            if best is None or (found.status != "SAFE", found.log10_delta) < (best.status != "SAFE", best.log10_delta):
+                best = found
+            if found.status == "UNSAFE_NOMINAL":
+                return found
+    except OutOfTime:
+        if best is not None:
+            return replace(best, reason=f"{best.reason} {over}", answers=answers)
+    if best is not None:
+        return replace(best, answers=answers)
+    cure = "Give it more time, fewer --cells or a shorter --horizon."
+    return Verdict(
+        status="UNKNOWN", log10_delta=0.0, margin=None, time=None, constraint=None, reason=f"{over} {cure}",
+        method=method, problem=problem,
+    )  # fmt: skip
+
+
+def _smallest(verdict: Verdict, method: str, cells: int | None, clock: Clock) -> Verdict:
+    """The last of ever smaller probabilities that time allows."""
+    from certbound.safety.limits import smaller_verdicts
+
+    with contextlib.suppress(OutOfTime), clock.running():
+        for found in smaller_verdicts(verdict, method=method, cells=cells):
+            verdict = found
+    return verdict
+
+
+def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any]:
+    return {
+        "status": verdict.status,
+        "log10_delta": verdict.log10_delta,
+        "delta": problem.delta,
+        "margin": verdict.margin,
+        "time": verdict.time,
+        "constraint": verdict.constraint,
+        "reason": verdict.reason,
+        "method": verdict.method,
+        "constants": None if verdict.constants is None else describe_constants(verdict.constants),
+        "tube": describe_deviation(verdict),
+        "seconds": seconds,
+    }
+
+
+def _engines(verdict: Verdict) -> list[dict[str, Any]]:
+    """What each engine answered, for --explain."""
+    rows = []
+    for name, answer in verdict.answers.items():
+        found = {key: getattr(answer, key) for key in ("log10_delta", "margin", "constraint", "time", "reason")}
+        rows.append({"engine": name, "method": answer.method, "applicable": answer.applicable, **found})
+    return rows
+
+
+def _limits(verdict: Verdict, cells: int | None, clock: Clock) -> dict[str, Any]:
+    """What would be SAFE, for --explain, as far as time allows."""
+    from certbound.safety.limits import Limits, find_limits
+
+    nothing = asdict(Limits(delta=None, horizon=None, noise=None, widening=None))
+    try:
+        with spinner("looking for what would be SAFE"), contained("search for limits"), clock.running():
+            found = find_limits(verdict, cells=cells)
+    except OutOfTime:
+        return nothing | {"summary": "The time was over before it was known what would be SAFE."}
+    except EngineError as error:
+        return nothing | {"summary": f"What would be SAFE is not known: {error}"}
+    return asdict(found) | {"summary": found.summary()}
+
+
+def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | None, plot: Path | None) -> None:
+    if plot is None and report is None:
+        return
+    if verdict.reach is None:
+        sys.stderr.write("certbound: nothing was drawn or reported: no set was proved that could be\n")
+        return
+    scene = _scene(problem, verdict, verdict.reach)
+    if plot is not None:
+        from certbound.plotting import draw_scene
+
+        with spinner("drawing"):
+            stream = BytesIO()
+            draw_scene(scene).savefig(stream, format=plot.suffix.lstrip(".") or "png", dpi=150)
+            write_file(plot, stream.getvalue())
+    if report is not None:
+        from certbound.html_report import report_page
+
+        with spinner("writing the report"):
+            command = shlex.join(["certbound", *(word for word in sys.argv[1:])])
+            probability = log10_text(verdict.log10_delta)
+            write_file(report, report_page(scene, verdict, command=command, probability=probability, certificate=proof))
+
+
+def _certify(problem: Problem, verdict: Verdict, path: Path) -> tuple[str, dict[str, Any]]:
+    """Write a certificate that the checker has proved; its text, and what ``--json`` says of it.
+
+    What it misses is said in one line on standard error: that none was written, or that it proves less than delta.
+    """
+    try:
+        with spinner("writing and checking the certificate"):
+            text = proved_certificate(problem, verdict)
+    except (CertificateError, SolverError) as error:
+        reason = " ".join(str(error).split())
+        sys.stderr.write(f"certbound: no certificate was written: {reason}\n")
+        return "", {"path": None, "log10_delta": None, "reason": reason}
+    write_file(path, text)
+    from certbound.safety.answers import is_at_most
+
+    proved, reason = float.fromhex(json.loads(text)["claim"]["log10_delta"]), ""
+    if verdict.status == "SAFE" and not is_at_most(min(proved, 0.0), problem.delta):
+        reason = f"the certificate proves {log10_text(proved)}, not the {problem.delta:g} of the verdict"
+        sys.stderr.write(f"certbound: {reason}\n")
+    return text, {"path": str(path), "log10_delta": proved, "reason": reason}
+
+
+def _scene(problem: Problem, verdict: Verdict, reach: ReachTube) -> Scene:
+    """What is drawn, with sample paths where the noise has a law to sample from."""
+    import numpy as np
+
+    from certbound.plotting import Scene, noisy_reach
+    from certbound.simulation.estimates import sample_paths
+
+    try:
+        paths = sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0))
+    except ValueError as error:
+        _log.info("no sample paths are drawn: %s", error)
+        paths = None
+    times = None if paths is None else np.linspace(0.0, float(problem.horizon), paths.shape[1])
+    title = f"{name_text(problem.name)}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
+    tube = noisy_reach(verdict)
+    return Scene(problem=problem, reach=reach, tube=tube, times=times, paths=paths, title=title)
+
+
+def _print(problem: Problem, result: dict[str, Any]) -> None:
+    screen = console()
+    colors = {"SAFE": "bold green", "UNSAFE_NOMINAL": "bold red", "UNKNOWN": "bold yellow"}
+    unit = "s" if problem.system.time == "continuous" else "steps"
+    color = colors[result["status"]]
+    screen.print(f"[{color}]{result['status']}[/]  ", end="")
+    screen.print(
+        f"{name_text(problem.name)}: P(leaving within {problem.horizon:g} {unit}) <= "
+        f"{log10_text(result['log10_delta'])}, asked {result['delta']!r}",
+        markup=False,
+    )
+    if SETTINGS.quiet:
+        return
+    if result["margin"] is not None and result["constraint"]:
+        when = "" if result["time"] is None else f" at {'t' if unit == 's' else 'step'} = {result['time']:.4g}"
+        margin = rounded(result["margin"], up=False, digits=4)
+        screen.print(f"margin {margin}{when}, constraint: {one_line(result['constraint'])}", markup=False)
+    if result["reason"]:
+        screen.print(one_line(result["reason"]), markup=False)
+    tube = result["tube"]
+    if tube is not None:
+        largest = rounded(float(max(tube["radius"])), up=True, digits=4)
+        screen.print(f"stochastic deviation: at most {largest} with that probability", markup=False)
+    screen.print(f"method {result['method']}, {result['seconds']:.1f} s", markup=False)
+    for row in result.get("engines", ()):
+        bound = f"<= {log10_text(row['log10_delta'])}" if row["applicable"] else "does not apply"
+        screen.print(f"  {row['engine']} ({row['method']}): {bound}. {one_line(row['reason'])}", markup=False)

@@ -1,0 +1,190 @@
+"""Interval enclosures of traced functions: the tape read in outward-rounded arithmetic.
+
+An enclosure is refused where the function (or the function that a derivative belongs to) is undefined or
+jumps on the box: division by an interval that contains 0, log or sqrt of negatives, an undecided comparison,
+sign or floor, atan2 across its cut. A kink (abs, min, max) is no obstacle: its generalised derivative is
+enclosed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.errors import EnclosureError
+from certbound.problem.model import JUMPS, Node, Tape
+from certbound.rigor.intervals import ARITHMETIC, UNDEFINED, Interval, sq
+
+__all__ = ["enclose"]
+
+Mask = NDArray[np.bool_]
+CHUNK = 8192
+"""Boxes evaluated at a time: the intermediate results stay in the processor's cache."""
+
+
+class Refusal(NamedTuple):
+    """A node that is undefined or jumps on some members of the batch."""
+
+    node: int
+    mask: Mask
+
+
+def enclose(tape: Tape, inputs: Sequence[Interval], *, undefined: Literal["raise", "infinite"] = "raise") -> Interval:
+    """Enclose the range of a traced function over boxes.
+
+    Proves: the result contains f(z) for every z with z_i in inputs[i], member by member of the batch.
+
+    Parameters
+    ----------
+    tape : Tape
+        The function, or a Jacobian (whose nodes include those of the function, so that its jumps are seen).
+    inputs : sequence of Interval
+        One per input slot, shapes broadcastable to a common batch shape.
+    undefined : {"raise", "infinite"}
+        What to do where the function is undefined or jumps: raise, or return [-inf, inf] in all outputs of
+        that member.
+
+    Returns
+    -------
+    Interval, shape (*batch, *tape.shape)
+
+    Raises
+    ------
+    EnclosureError
+        Undefined or jumping somewhere, and ``undefined="raise"``; the message names the expression and the
+        box.
+    ValueError
+        If the number of inputs is wrong.
+
+    Examples
+    --------
+    >>> from certbound.problem.model import trace
+    >>> tape = trace(lambda x: [x[0] ** 2 + 1], {"x": ["a"]})
+    >>> enclose(tape, [Interval([-1.0], [2.0])]).contains([[3.0]]).tolist()
+    [[True]]
+    """
+    if len(inputs) != len(tape.inputs):
+        raise ValueError(f"`inputs` must hold {len(tape.inputs)} intervals, got {len(inputs)}.")
+    if undefined not in ("raise", "infinite"):
+        raise ValueError(f'`undefined` must be "raise" or "infinite", got {undefined!r}.')
+    batch = np.broadcast_shapes(*(x.shape for x in inputs)) if inputs else ()
+    size = int(np.prod(batch))
+    flat = [x if x.ndim == 0 else x.broadcast_to(batch).reshape(size) for x in inputs]
+    lo, hi = np.empty((size, len(tape.outputs))), np.empty((size, len(tape.outputs)))
+    for start in range(0, size, CHUNK):
+        part = [x if x.ndim == 0 else x[start : start + CHUNK] for x in flat]
+        count = min(CHUNK, size - start)
+        outputs, refusals = _evaluate(tape, part)
+        if refusals and undefined == "raise":
+            raise EnclosureError(_message(tape, part, refusals[0]))
+        for column, value in enumerate(outputs):
+            lo[start : start + count, column] = value.lo
+            hi[start : start + count, column] = value.hi
+        for refusal in refusals:
+            bad = start + np.flatnonzero(np.broadcast_to(refusal.mask, (count,)))
+            lo[bad], hi[bad] = -np.inf, np.inf
+    shape = (*batch, *tape.shape)
+    return Interval(lo.reshape(shape), hi.reshape(shape))
+
+
+def _evaluate(tape: Tape, inputs: Sequence[Interval]) -> tuple[list[Interval], list[Refusal]]:
+    """Outputs, and the nodes at which members of the batch are refused.
+
+    An undecided jump is refused wherever it stands. An undefined operation is refused where an output or an
+    unused node depends on it, save through a branch that the box switches off.
+    """
+    values: list[Interval] = []
+    spoilt: list[Mask | None] = []  # members whose value here rests on an undefined operation
+    refusals: list[Refusal] = []
+    origins: list[Refusal] = []
+    used = {arg for node in tape.nodes if node.op != "input" for arg in node.args}
+    for index, node in enumerate(tape.nodes):
+        if node.op == "input":
+            values.append(inputs[node.args[0]])
+            spoilt.append(None)
+            continue
+        args = [values[arg] for arg in node.args]
+        value = _apply(node, args)
+        values.append(value)
+        if _jumps(node, args, value, index, refusals):
+            spoilt.append(None)
+            continue
+        mask = _inherited(node, args, [spoilt[arg] for arg in node.args])
+        own = _undefined(node, args)
+        if own is not None:
+            origins.append(Refusal(index, own))
+            mask = own if mask is None else mask | own
+        spoilt.append(mask)
+    ends = set(tape.outputs) | (set(range(len(tape.nodes))) - used)
+    broken = [mask for index in sorted(ends) if (mask := spoilt[index]) is not None and mask.any()]
+    if broken:
+        total = broken[0]
+        for mask in broken[1:]:
+            total = total | mask
+        refusals.extend(Refusal(node, mask & total) for node, mask in origins if np.any(mask & total))
+    return [values[output] for output in tape.outputs], refusals
+
+
+def _apply(node: Node, args: Sequence[Interval]) -> Interval:
+    if node.op == "const":
+        return Interval.point(node.value)
+    if node.op == "pow":
+        return ARITHMETIC["pow"](args[0], node.value)
+    if len(node.args) == 2 and node.args[0] == node.args[1]:  # x*x and x-x: not independent
+        if node.op == "mul":
+            return sq(args[0])
+        if node.op == "sub":
+            return Interval.point(np.zeros(args[0].shape))
+    return ARITHMETIC[node.op](*args)
+
+
+def _jumps(node: Node, args: Sequence[Interval], value: Interval, index: int, refusals: list[Refusal]) -> bool:
+    """Whether the node can jump; undecided members are added to the refusals."""
+    if node.op not in JUMPS and node.op != "atan2":
+        return False
+    if node.op == "atan2":
+        mask = UNDEFINED["atan2"](*args)
+    elif node.op == "if_else_zero":
+        condition = args[0]
+        mask = (condition.lo <= 0) & (condition.hi >= 0) & ~((condition.lo == 0) & (condition.hi == 0))
+    else:
+        mask = value.lo != value.hi
+    if np.any(mask):
+        refusals.append(Refusal(index, np.asarray(mask)))
+    return node.op not in ("if_else_zero", "atan2")
+
+
+def _undefined(node: Node, args: Sequence[Interval]) -> Mask | None:
+    if node.op not in UNDEFINED or node.op == "atan2":
+        return None
+    mask = UNDEFINED["pow"](args[0], node.value) if node.op == "pow" else UNDEFINED[node.op](*args)
+    return np.asarray(mask) if np.any(mask) else None
+
+
+def _inherited(node: Node, args: Sequence[Interval], masks: Sequence[Mask | None]) -> Mask | None:
+    present = [mask for mask in masks if mask is not None]
+    if node.op == "if_else_zero" and masks[1] is not None:
+        off = (args[0].lo == 0) & (args[0].hi == 0)
+        inner: Mask = masks[1] & ~off
+        return inner if masks[0] is None else inner | masks[0]
+    if not present:
+        return None
+    return present[0] if len(present) == 1 else present[0] | present[1]
+
+
+def _message(tape: Tape, inputs: Sequence[Interval], refusal: Refusal) -> str:
+    node = tape.nodes[refusal.node]
+    member = int(np.flatnonzero(refusal.mask)[0]) if refusal.mask.ndim else 0
+    box = []
+    for name, x in zip(tape.inputs, inputs, strict=True):
+        lo, hi = (float(end if end.ndim == 0 else end[member]) for end in (x.lo, x.hi))
+        box.append(f"{name} in [{lo:.6g}, {hi:.6g}]" if lo < hi else f"{name} = {lo:.6g}")
+    jump = node.op in JUMPS or node.op == "atan2"
+    what = "may jump (no derivative bounds it)" if jump else "is undefined somewhere"
+    return (
+        f"`{tape.describe(refusal.node)}` {what} on the box {', '.join(box)}; "
+        "restrict the domain so that this does not happen, or change the model."
+    )

@@ -1,0 +1,28 @@
+"""Semidefinite programs that propose metrics; what they propose is certified elsewhere."""
+
+from __future__ import annotations
+
+from certbound.constants.programs.centers import center_multipliers
+from certbound.constants.programs.least_erosion import RadiusModel, Rooms, erosion_factors
+from certbound.constants.programs.lmi import design_feedback
+from certbound.constants.programs.proposals import Proposal, erosion_proposals, rate_proposals, sampled_polytope
+from certbound.constants.programs.sectors import centred, varying
+from certbound.constants.programs.targets import constraint_targets, cut_rooms, rooms_of, stated_rooms
+
+__all__ = [
+    "center_multipliers",
+    "centred",
+    "constraint_targets",
+    "cut_rooms",
+    "design_feedback",
+    "erosion_factors",
+    "erosion_proposals",
+    "Proposal",
+    "RadiusModel",
+    "rate_proposals",
+    "Rooms",
+    "rooms_of",
+    "sampled_polytope",
+    "stated_rooms",
+    "varying",
+]

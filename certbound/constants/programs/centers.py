@@ -1,0 +1,385 @@
+"""Method of centres: the smallest c or L^2 over P and diagonal multipliers, by a log barrier.
+
+A general semidefinite solver treats the unknown entries of P as unrelated columns; here the Hessian of
+-log det F is assembled from products of W = F^-1 with the rows of [A B], so that a Newton step costs O(n^4)
+numbers and one Cholesky factor of size n(n+1)/2. That is what makes n = 60 a matter of a minute. The result
+proposes P and Lambda; ``recheck`` proves. With P given, the multipliers alone are found (k + 1 unknowns).
+
+Symbols: F = v E'PE - H'PH - Chat'Lam Chat + Qhat'Lam Qhat in discrete time (v = L^2), with 2v E'PE - E'PH -
+H'PE for the first two terms in continuous time (v = c); E = [I 0], H = [A B], Chat = [C 0], Qhat = [0 I].
+Source: Boyd and El Ghaoui, "Method of centers for minimizing generalized eigenvalues" (1993); Sec. 6.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.constants.jacobians import JacobianSet, frozen
+from certbound.constants.programs.sectors import Sector, contraction_value, lmi_blocks, transformed
+
+__all__ = ["Center", "center_metric", "center_multipliers", "lyapunov_metric", "reachable_value", "starting_metric"]
+
+Array = NDArray[np.float64]
+
+_SHRINK = 0.1
+"""Share of the distance to the current value that the next target keeps."""
+
+_FLOOR = 1e-5
+"""Smallest eigenvalue of P (the largest is below 1) in the coordinates of the start."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Center:
+    """A metric with multipliers (one array per block) that reach ``value`` in floating point."""
+
+    metric: Array
+    multipliers: tuple[Array, ...]
+    value: float
+    steps: int
+
+
+class _Block:
+    """One inequality F > 0 and the derivatives of -log det F."""
+
+    def __init__(self, block: Array | Sector, *, continuous: bool) -> None:
+        sector = block if isinstance(block, Sector) else None
+        A = np.asarray(block.A if isinstance(block, Sector) else block, dtype=float)
+        n, k = len(A), 0 if sector is None else sector.B.shape[1]
+        self.continuous, self.n, self.k = continuous, n, k
+        self.E = np.eye(n, n + k)
+        self.H = A if sector is None else np.concatenate([A, sector.B], axis=1)
+        self.Chat = np.zeros((k, n + k))
+        if sector is not None:
+            self.Chat[:, :n] = sector.C
+        self.Qhat = np.eye(n + k)[n:]
+
+    def terms(self, value: float) -> list[tuple[float, Array, Array]]:
+        """(coefficient, X, Y) with the part of F that is linear in P equal to sum coefficient X' P Y."""
+        if self.continuous:
+            return [(2 * value, self.E, self.E), (-1.0, self.E, self.H), (-1.0, self.H, self.E)]
+        return [(value, self.E, self.E), (-1.0, self.H, self.H)]
+
+    def matrix(self, value: float, P: Array, multipliers: Array) -> Array:
+        F = np.zeros(2 * self.H.shape[1:])
+        for c, X, Y in self.terms(value):
+            F += c * X.T @ P @ Y
+        F += (self.Qhat.T * multipliers) @ self.Qhat - (self.Chat.T * multipliers) @ self.Chat
+        return np.asarray((F + F.T) / 2)
+
+    def smallest_value(self, P: Array, multipliers: Array) -> float:
+        """The infimum of the values with F >= 0 at the given P and multipliers (inf when there is none)."""
+        from scipy.linalg import cho_factor, cho_solve, eigh
+
+        F = self.matrix(0.0, P, multipliers)
+        n, corner = self.n, F[self.n :, self.n :]
+        schur = F[:n, :n]
+        if self.k:
+            try:
+                factor = cho_factor(corner)
+            except np.linalg.LinAlgError:
+                return float(np.inf)
+            schur = schur - F[:n, n:] @ cho_solve(factor, F[n:, :n])
+        top = float(eigh(-schur, P, eigvals_only=True, subset_by_index=[n - 1, n - 1])[0])
+        return top / 2 if self.continuous else top
+
+
+class _Pairs:
+    """Symmetric matrices by their upper triangle: gradients and the Hessian of tr(K dP L dP)."""
+
+    def __init__(self, n: int) -> None:
+        self.i, self.j = np.triu_indices(n)
+        self.scale = np.where(self.i == self.j, 0.5, 1.0)
+        self.n, self.size = n, len(self.i)
+
+    def gradient(self, D: Array) -> Array:
+        """Derivative of tr(D P) with respect to the entries of the upper triangle."""
+        return np.asarray((D + D.T)[self.i, self.j] * self.scale)
+
+    def matrix(self, entries: Array) -> Array:
+        P = np.zeros((self.n, self.n))
+        P[self.i, self.j] = entries
+        P[self.j, self.i] = entries
+        return P
+
+    def hessian(self, K: Array, L: Array) -> Array:
+        """Second derivative tr(K S_p L S_q) over basis pairs, symmetric part."""
+        i, j = self.i, self.j
+        total = K.T[np.ix_(i, j)] * L[np.ix_(j, i)]
+        total += K.T[np.ix_(i, i)] * L[np.ix_(j, j)]
+        total += K.T[np.ix_(j, j)] * L[np.ix_(i, i)]
+        total += K.T[np.ix_(j, i)] * L[np.ix_(i, j)]
+        total *= self.scale[:, None]
+        total *= self.scale
+        return total
+
+
+def center_metric(
+    blocks: Sequence[Array | Sector],
+    *,
+    continuous: bool,
+    lower: float = -np.inf,
+    tolerance: float = 1e-6,
+    max_steps: int = 150,
+) -> Center:
+    """P and diagonal multipliers that nearly minimise c or L^2 over the blocks.
+
+    Parameters
+    ----------
+    blocks : sequence of ndarray or Sector
+    continuous : bool
+        The value is c (continuous time) or L^2 (discrete time).
+    lower : float
+        A known lower bound of the value (spectral), which lets the search stop.
+    tolerance : float
+        The search stops once the value is this close to ``lower``, or once the gains from one centre to the
+        next, extrapolated, have less than this to go.
+    max_steps : int
+        Limit on Newton steps.
+    """
+    root = np.asarray(np.linalg.cholesky(starting_metric(blocks, continuous=continuous)).T)
+    inverse = np.asarray(np.linalg.inv(root), dtype=float)
+    work = [_Block(transformed(block, root, inverse), continuous=continuous) for block in blocks]
+    n = work[0].n
+    P = np.eye(n) / 2
+    multipliers = [_first_multipliers(block, P) for block in work]
+    value = max(block.smallest_value(P, lam) for block, lam in zip(work, multipliers))
+    center = _descend(work, P, multipliers, value, lower, tolerance, max_steps, _Pairs(n))
+    return replace(center, metric=frozen(root.T @ center.metric @ root))
+
+
+def starting_metric(blocks: Sequence[Array | Sector], *, continuous: bool) -> Array:
+    """The best Lyapunov metric of the mean Jacobian, or the identity: of the right order of magnitude."""
+    middle = np.mean([block.A if isinstance(block, Sector) else block for block in blocks], axis=0)
+    n = len(middle)
+    best, chosen = np.inf, np.eye(n)
+    for share in (0.0, 0.1, 0.3, 1.0, 3.0, 10.0):
+        try:
+            metric = np.eye(n) if share == 0 else lyapunov_metric(middle, share, continuous=continuous)
+        except np.linalg.LinAlgError:
+            continue
+        half = metric / 2
+        value = -np.inf
+        for block in blocks:
+            work = _Block(block, continuous=continuous)
+            first = _first_multipliers(work, half)
+            value = max(value, min(work.smallest_value(half, s * first) for s in (1.0, 4.0, 16.0, 64.0)))
+        if value < best:
+            best, chosen = value, metric
+    return chosen
+
+
+def lyapunov_metric(matrix: Array, share: float, *, continuous: bool) -> Array:
+    """P of largest eigenvalue 1 in which one Jacobian contracts, with a margin of ``share`` of its decay.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the equation is singular in floating point (a Jordan block on the stability limit, very unlike units).
+    """
+    from scipy.linalg import LinAlgWarning, solve_continuous_lyapunov, solve_discrete_lyapunov
+
+    n = len(matrix)
+    eigenvalues = np.linalg.eigvals(matrix)
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("error")
+            if continuous:
+                top = float(eigenvalues.real.max())
+                shift = top + share * max(abs(top), 1e-3 * float(np.abs(eigenvalues).max()), 1e-9)
+                metric = solve_continuous_lyapunov((matrix - shift * np.eye(n)).T, -np.eye(n))
+            else:
+                top = float(np.abs(eigenvalues).max()) ** 2
+                scale = top + share * max(abs(1 - top), 1e-6)
+                metric = solve_discrete_lyapunov(matrix.T / np.sqrt(scale), np.eye(n))
+    except (LinAlgWarning, RuntimeWarning) as warning:
+        raise np.linalg.LinAlgError(str(warning)) from warning
+    metric = (metric + metric.T) / 2
+    np.linalg.cholesky(metric)  # refuses what is positive definite on paper only
+    return np.asarray(metric / np.linalg.norm(metric, 2))
+
+
+def center_multipliers(
+    metric: Array, block: Sector, *, continuous: bool, tolerance: float = 1e-7, max_steps: int = 200
+) -> Center:
+    """Diagonal multipliers that nearly minimise c or L^2 of a sector in a given metric (k + 1 unknowns)."""
+    work = _Block(block, continuous=continuous)
+    P = np.asarray(metric, dtype=float)
+    P = P / (2 * np.linalg.norm(P, 2))
+    first = _first_multipliers(work, P)
+    value = work.smallest_value(P, first)
+    if not len(first):
+        return Center(metric=frozen(P), multipliers=(frozen(first),), value=value, steps=0)
+    return _descend([work], P, [first], value, -np.inf, tolerance, max_steps, None)
+
+
+def reachable_value(metric: Array, jacobians: JacobianSet, *, continuous: bool) -> float:
+    """c or L^2 that a metric reaches on the set, in floating point (by vertices, or by its multipliers)."""
+    values = []
+    for block in lmi_blocks(jacobians):
+        if isinstance(block, Sector):
+            values.append(center_multipliers(metric, block, continuous=continuous).value)
+        else:
+            reached = contraction_value(metric, block[None], continuous=continuous)
+            values.append(reached if continuous else reached**2)
+    return max(values)
+
+
+def _first_multipliers(block: _Block, P: Array) -> Array:
+    inner = block.H[:, block.n :].T @ P @ block.H[:, block.n :]
+    size = np.linalg.norm(inner, 2) if block.k else 0.0
+    return np.full(block.k, 2 * float(size) + 1e-6)
+
+
+def _descend(
+    blocks: Sequence[_Block],
+    P: Array,
+    multipliers: list[Array],
+    value: float,
+    lower: float,
+    tolerance: float,
+    max_steps: int,
+    pairs: _Pairs | None,
+) -> Center:
+    """Shrink the target towards the value reached, and centre again, until it no longer pays."""
+    best = P, multipliers, value
+    steps, target, before, last = 0, value + max(1e-3, 0.1 * abs(value)), np.inf, np.inf
+    while steps < max_steps:
+        P, multipliers, used = _recenter(blocks, P, multipliers, target, max_steps - steps, pairs)
+        steps += used
+        reached = max(block.smallest_value(P, lam) for block, lam in zip(blocks, multipliers))
+        if reached < best[2]:
+            best = P, multipliers, reached
+        gain = before - reached
+        # gains shrink geometrically: what is left to gain is about gain * ratio / (1 - ratio)
+        left = gain * gain / (last - gain) if 0 <= gain < last < np.inf else np.inf
+        if best[2] <= lower + tolerance or left <= tolerance or gain <= 1e-3 * tolerance:
+            break
+        before, last = reached, gain
+        target = reached + _SHRINK * (target - reached)
+    P, multipliers, value = best
+    frozen_multipliers = tuple(frozen(lam) for lam in multipliers)
+    return Center(metric=frozen(P), multipliers=frozen_multipliers, value=value, steps=steps)
+
+
+def _recenter(
+    blocks: Sequence[_Block],
+    P: Array,
+    multipliers: list[Array],
+    value: float,
+    budget: int,
+    pairs: _Pairs | None,
+) -> tuple[Array, list[Array], int]:
+    """Damped Newton steps to the analytic centre of {F > 0, floor < P < I} at a fixed value."""
+    from scipy.linalg import cho_factor, cho_solve
+
+    for step in range(1, min(budget, 30) + 1):
+        try:
+            gradient, hessian = _derivatives(blocks, P, multipliers, value, pairs)
+            direction = -cho_solve(cho_factor(hessian + 1e-14 * np.diag(np.diag(hessian))), gradient)
+        except np.linalg.LinAlgError:
+            return P, multipliers, step
+        decrement = float(np.sqrt(max(-float(gradient @ direction), 0.0)))
+        length = 1.0 if decrement < 0.25 else 1 / (1 + decrement)
+        if decrement >= 0.25:  # a longer step where it stays feasible and descends
+            length = _search(blocks, P, multipliers, value, pairs, direction, length, gradient)
+        P, multipliers = _moved(P, multipliers, pairs, direction, length)
+        if decrement < 0.1:
+            return P, multipliers, step
+    return P, multipliers, step
+
+
+def _moved(
+    P: Array, multipliers: list[Array], pairs: _Pairs | None, direction: Array, length: float
+) -> tuple[Array, list[Array]]:
+    offset = 0
+    if pairs is not None:
+        offset = pairs.size
+        P = P + length * pairs.matrix(direction[:offset])
+    moved = []
+    for lam in multipliers:
+        moved.append(lam + length * direction[offset : offset + len(lam)])
+        offset += len(lam)
+    return P, moved
+
+
+def _barrier(blocks: Sequence[_Block], P: Array, multipliers: list[Array], value: float) -> float:
+    matrices = [block.matrix(value, P, lam) for block, lam in zip(blocks, multipliers)]
+    total = 0.0
+    identity = np.eye(len(P))
+    for matrix in (P - _FLOOR * identity, identity - P, *matrices):
+        try:
+            total -= 2 * float(np.log(np.diagonal(np.linalg.cholesky(matrix))).sum())
+        except np.linalg.LinAlgError:
+            return float(np.inf)
+    return total
+
+
+def _search(
+    blocks: Sequence[_Block],
+    P: Array,
+    multipliers: list[Array],
+    value: float,
+    pairs: _Pairs | None,
+    direction: Array,
+    safe: float,
+    gradient: Array,
+) -> float:
+    """Backtracking from 1 down to the step that self-concordance guarantees."""
+    here = _barrier(blocks, P, multipliers, value)
+    slope = float(gradient @ direction)
+    length = 1.0
+    while length > safe:
+        if _barrier(blocks, *_moved(P, multipliers, pairs, direction, length), value) <= here + 0.1 * length * slope:
+            return length
+        length *= 0.6
+    return safe
+
+
+def _derivatives(
+    blocks: Sequence[_Block], P: Array, multipliers: list[Array], value: float, pairs: _Pairs | None
+) -> tuple[Array, Array]:
+    size = 0 if pairs is None else pairs.size
+    total = size + sum(len(lam) for lam in multipliers)
+    gradient, hessian = np.zeros(total), np.zeros((total, total))
+    if pairs is not None:
+        identity = np.eye(len(P))
+        for sign, matrix in ((1.0, P - _FLOOR * identity), (-1.0, identity - P)):
+            inverse = _inverse(matrix)
+            gradient[:size] -= sign * pairs.gradient(inverse)
+            hessian[:size, :size] += pairs.hessian(inverse, inverse)
+    offset = size
+    for block, lam in zip(blocks, multipliers):
+        W = _inverse(block.matrix(value, P, lam))
+        terms = block.terms(value)
+        here = slice(offset, offset + block.k)
+        WC, WQ = W @ block.Chat.T, W @ block.Qhat.T
+        cc, cq, qq = block.Chat @ WC, block.Chat @ WQ, block.Qhat @ WQ
+        gradient[here] -= np.diag(qq) - np.diag(cc)
+        hessian[here, here] += cc**2 - cq**2 - cq.T**2 + qq**2
+        if pairs is not None:
+            for a, (c, X, Y) in enumerate(terms):
+                gradient[:size] -= c * pairs.gradient(Y @ W @ X.T)
+                for b in range(a + 1):
+                    d, U, V = terms[b]
+                    part = pairs.hessian(V @ W @ X.T, Y @ W @ U.T)
+                    part *= c * d
+                    hessian[:size, :size] += part if a == b else part + part.T
+                for sign, factor in ((1.0, WQ), (-1.0, WC)):
+                    left, right = X @ factor, Y @ factor
+                    cross = left[pairs.i] * right[pairs.j] + left[pairs.j] * right[pairs.i]
+                    hessian[:size, here] += sign * c * pairs.scale[:, None] * cross
+        offset += block.k
+    hessian[size:, :size] = hessian[:size, size:].T
+    return gradient, hessian
+
+
+def _inverse(matrix: Array) -> Array:
+    from scipy.linalg import cho_factor, cho_solve
+
+    inverse = cho_solve(cho_factor(matrix), np.eye(len(matrix)))
+    return np.asarray((inverse + inverse.T) / 2)

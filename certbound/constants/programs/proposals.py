@@ -1,0 +1,171 @@
+"""Metrics that are worth certifying: of least c or L, and of least erosion. Proposals, in floating point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.constants.jacobians import AffineForm, AffineSet, JacobianSet, VertexPolytope
+from certbound.constants.programs.centers import center_metric, reachable_value, starting_metric
+from certbound.constants.programs.least_erosion import RadiusModel, Rooms, tighten
+from certbound.constants.programs.lmi import RateProgram
+from certbound.constants.programs.sectors import VERTEX_LIMIT, lmi_blocks
+from certbound.errors import SolverError
+
+__all__ = ["Proposal", "erosion_proposals", "rate_proposals", "sampled_polytope", "smallest_value", "spectral_bound"]
+
+Array = NDArray[np.float64]
+
+_FEW_BLOCKS = 4
+"""Up to so many inequalities the method of centres is used; beyond, a semidefinite solver."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Proposal:
+    """A metric and what proposed it."""
+
+    metric: Array
+    status: str
+
+
+def rate_proposals(members: JacobianSet, *, continuous: bool, share: float = 5e-3) -> list[Proposal]:
+    """A metric of nearly least c or L: the method of centres, or semidefinite programs where it stalls.
+
+    The sector form comes first: one inequality. Where it stays short of what the spectrum allows, few vertices
+    are tried as well, for it may be conservative.
+    """
+    lower = spectral_bound(members, continuous=continuous)
+    tolerance = share * max(abs(lower if continuous else 1 - lower), 1e-6)
+    found: list[tuple[float, Proposal]] = []
+    structured = isinstance(members, AffineSet | AffineForm)
+    for form in ("sector", "vertices") if structured else ("vertices",):
+        if form == "vertices" and structured and members.vertex_count > VERTEX_LIMIT:
+            continue
+        blocks = lmi_blocks(members, form=form)
+        if len(blocks) <= _FEW_BLOCKS:
+            center = center_metric(blocks, continuous=continuous, lower=lower, tolerance=tolerance)
+            metric, value, status = center.metric, center.value, "method of centres"
+        else:
+            start = starting_metric(blocks, continuous=continuous)
+            program = RateProgram(members, continuous=continuous, form=form, max_condition=1e5, start=start)
+            metric, value = smallest_value(program, members, continuous=continuous, lower=lower, tolerance=tolerance)
+            status = f"semidefinite program: {program.status}"
+        scaled = normalised(metric)
+        if scaled is not None:
+            found.append((value, Proposal(metric=scaled, status=status)))
+        if value <= lower + 4 * tolerance:
+            break
+    if not found:
+        raise SolverError("no program returned a positive definite metric; scale the states, or give a metric.")
+    return [min(found, key=lambda pair: pair[0])[1]]
+
+
+def sampled_polytope(matrices: Array, *, limit: int = 24) -> VertexPolytope:
+    """Convex hull of the extreme ones among sampled Jacobians: no superset of anything, but as tight as it gets.
+
+    A metric proposed for it is certified over the whole domain like any other.
+    """
+    flat = matrices.reshape(len(matrices), -1)
+    spread = flat.max(axis=0) - flat.min(axis=0)
+    varying = np.flatnonzero(spread > 1e-12 * (1 + np.abs(flat).max()))
+    directions = np.random.default_rng(0).normal(size=(2 * limit, len(varying)))
+    directions = np.concatenate([np.eye(len(varying)), -np.eye(len(varying)), directions])
+    scaled = flat[:, varying] / spread[varying]
+    chosen = list(dict.fromkeys(int(k) for k in np.argmax(scaled @ directions.T, axis=0)))
+    return VertexPolytope(matrices=matrices[chosen[:limit] or [0]])
+
+
+def erosion_proposals(
+    members: JacobianSet, targets: Rooms, noise: Sequence[Array], radius: RadiusModel
+) -> list[Proposal]:
+    """The tightened metric, and the one of least c or L that it was searched from."""
+    start = rate_proposals(members, continuous=radius.continuous, share=2e-3)[0]
+    result = tighten(members, targets, noise, radius, start.metric, form=_form(members))
+    metric = normalised(result.metric)
+    first = [] if metric is None else [Proposal(metric=metric, status=f"tightening: {result.status}")]
+    return [*first, start]
+
+
+def _form(members: JacobianSet) -> str:
+    """Sector form where there are many vertices and a sector form exists."""
+    structured = isinstance(members, AffineSet | AffineForm)
+    return "sector" if structured and members.vertex_count > 16 else "vertices"
+
+
+def spectral_bound(members: JacobianSet, *, continuous: bool) -> float:
+    """A lower bound of c or L^2 in every metric: spectral abscissa or radius over some members."""
+    matrices = members.sample(np.random.default_rng(0), 64)
+    if members.vertex_count <= 512:
+        matrices = np.concatenate([matrices, members.vertices()])
+    elif isinstance(members, AffineSet):
+        ends = np.tensordot(members.box, members.M, axes=1) + members.J0
+        matrices = np.concatenate([matrices, ends])
+    eigenvalues = np.linalg.eigvals(matrices)
+    return float(eigenvalues.real.max() if continuous else (np.abs(eigenvalues) ** 2).max())
+
+
+def normalised(metric: Array) -> Array | None:
+    """P scaled to smallest eigenvalue 1, exactly symmetric; None where it is not positive definite."""
+    symmetric = (metric + metric.T) / 2
+    if not np.all(np.isfinite(symmetric)):
+        return None
+    values = np.linalg.eigvalsh(symmetric)
+    if values[0] <= 1e-12 * values[-1]:
+        return None
+    return np.asarray(symmetric / values[0])
+
+
+def smallest_value(
+    program: RateProgram,
+    jacobians: JacobianSet,
+    *,
+    continuous: bool,
+    lower: float,
+    tolerance: float,
+    max_solves: int = 30,
+) -> tuple[Array, float]:
+    """Bisection: a metric of nearly least c or L^2, and the value that it reaches in floating point.
+
+    Parameters
+    ----------
+    program : RateProgram
+        The program of ``jacobians``.
+    jacobians : JacobianSet
+    continuous : bool
+    lower : float
+        A lower bound of the value: the spectral abscissa, or the squared spectral radius, of a member.
+    tolerance : float
+        Width at which the bisection stops.
+    max_solves : int
+
+    Raises
+    ------
+    SolverError
+        From the first solve; a later one ends the search at the best metric so far.
+    """
+    metric = np.eye(jacobians.dimension)
+    upper = reachable_value(metric, jacobians, continuous=continuous)
+    low = lower
+    for count in range(max_solves):
+        if upper - low <= tolerance:
+            break
+        target = low + (0.02 if count == 0 else 0.5) * (upper - low)
+        try:
+            proposal, margin = program.propose(target)
+        except SolverError:
+            if count == 0:
+                raise
+            break
+        if normalised(proposal) is None:
+            break  # the solver's accuracy ends here
+        reached = reachable_value(proposal, jacobians, continuous=continuous)
+        if reached < upper:
+            metric, upper = proposal, reached
+        if margin <= 0:
+            low = target
+        elif reached >= upper and reached > target:
+            break  # a positive margin that the metric does not keep
+    return metric, upper

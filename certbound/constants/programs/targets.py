@@ -1,0 +1,221 @@
+"""What a problem's constraints ask of a metric: directions along which erosion hurts, and the room over time.
+
+All in floating point: the numbers only weigh the proposals. The room at a time is the smallest distance of
+sampled noise-free paths to the constraint then; a safety proof measures it again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.constants.programs.least_erosion import Rooms
+from certbound.problem.model import compile_numpy
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
+
+__all__ = ["Target", "constraint_targets", "cut_rooms", "nominal_paths", "rooms_of", "stated_rooms"]
+
+Array = NDArray[np.float64]
+
+_STEPS = 400
+_PATHS = 33
+_SMALLEST_SHARE = 0.02
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Target:
+    """A direction of erosion.
+
+    Parameters
+    ----------
+    direction : ndarray, shape (n, r)
+        a (r = 1) or the coordinates of a round constraint: the erosion is r_t sqrt(lambda_max(a^T P^-1 a)).
+    rooms : ndarray, shape (K,)
+        Room along it at the times behind the start; inf outside the constraint's window.
+    constraint : int
+        Index into ``problem.constraints``.
+    """
+
+    direction: Array
+    rooms: Array
+    constraint: int
+
+
+def constraint_targets(problem: Problem) -> tuple[Array, list[Target]]:
+    """Times (K,) behind the start, and one target per half-space, ball, ellipsoid or obstacle.
+
+    Parallel half-spaces of one constraint (the two sides of a box) share a target.
+
+    Raises
+    ------
+    ValueError
+        If no constraint bounds anything.
+    """
+    times, paths = nominal_paths(problem)
+    found: list[Target] = []
+    for index, constraint in enumerate(problem.constraints):
+        during = (0.0, float(times[-1])) if constraint.during is None else constraint.during
+        window = (times >= during[0] - 1e-9) & (times <= during[1] + 1e-9)
+        if not window[1:].any():
+            window = np.arange(len(times)) == max(int(np.searchsorted(times, during[0])), 1)
+        for direction, room in _faces(constraint, times, paths):
+            inside = np.where(window, room, np.inf)[1:]
+            found.append(Target(direction=direction, rooms=inside, constraint=index))
+    found = _joined(found)
+    if not found:
+        raise ValueError('`objective="erosion"` needs a constraint with a bound; give `directions=`.')
+    return times[1:], found
+
+
+def rooms_of(times: Array, targets: list[Target]) -> Rooms:
+    """The targets as one record; a room that is gone already is replaced by a small one."""
+    rooms = np.stack([target.rooms for target in targets])
+    largest = float(np.max(rooms, where=np.isfinite(rooms), initial=0.0))
+    floor = _SMALLEST_SHARE * largest if largest > 0 else 1.0
+    directions = tuple(target.direction for target in targets)
+    return Rooms(directions=directions, times=times, rooms=np.maximum(rooms, floor))
+
+
+def cut_rooms(rooms: Rooms, horizon: float) -> Rooms:
+    """The rooms up to another horizon; beyond the last time the least room is asked."""
+    if horizon == rooms.times[-1]:
+        return rooms
+    least = np.min(rooms.rooms, axis=1, keepdims=True)
+    return Rooms(directions=rooms.directions, times=np.array([float(horizon)]), rooms=least)
+
+
+def stated_rooms(
+    directions: Sequence[ArrayLike] | None, clearances: ArrayLike | None, dimension: int, horizon: float
+) -> Rooms:
+    """Directions and constant rooms that a caller states, checked; rooms of 1 when omitted."""
+    if not directions:
+        raise ValueError('`objective="erosion"` needs `directions=`, at least one.')
+    normals = []
+    for direction in directions:
+        a = np.asarray(direction, dtype=float)
+        if a.ndim not in (1, 2) or len(a) != dimension or not np.all(np.isfinite(a)) or not a.any():
+            raise ValueError(f"`directions` must be finite, not zero, of {dimension} entries, got {direction!r}.")
+        normals.append(a.reshape(dimension, -1))
+    room = np.ones(len(normals)) if clearances is None else np.asarray(clearances, dtype=float)
+    if room.shape != (len(normals),) or not np.all(room > 0):
+        raise ValueError(f"`clearances` must hold {len(normals)} positive numbers, got {clearances!r}.")
+    return Rooms(directions=tuple(normals), times=np.array([horizon]), rooms=room[:, None])
+
+
+def nominal_paths(problem: Problem, *, paths: int = _PATHS) -> tuple[Array, Array]:
+    """Times (K + 1,) and sampled noise-free paths (paths, K + 1, n), the first from the middle of everything."""
+    system, tape = problem.system, problem.closed_loop
+    rng = np.random.default_rng(0)
+    x = np.concatenate([_middle(problem.initial)[None], problem.initial.sample(rng, paths - 1)])
+    box = system.disturbance
+    d = np.zeros((paths, 0)) if box is None else box.sample(rng, paths)
+    if box is not None:
+        d[0] = (box.low + box.high) / 2
+    function = compile_numpy(tape)
+    rows = problem.input_sequence
+    horizon = float(problem.horizon)
+    discrete = system.time == "discrete"
+    steps = int(horizon) if discrete else _STEPS
+    times = np.linspace(0.0, horizon, steps + 1)
+
+    def rate(t: float, state: Array) -> Array:
+        inputs: list[Any] = []
+        if rows is not None:
+            row = int(t) if discrete else int(t / horizon * len(rows))
+            inputs = list(rows[min(row, len(rows) - 1)])
+        value = function(t, *state.T, *inputs, *d.T)
+        return np.broadcast_to(np.asarray(value, dtype=float), state.shape)
+
+    result = np.empty((paths, steps + 1, system.dimension))
+    result[:, 0] = x
+    h = horizon / steps
+    with np.errstate(all="ignore"):
+        for k, t in enumerate(times[:-1]):
+            if discrete:
+                x = rate(float(t), x)
+            else:
+                k1 = rate(t, x)
+                k2 = rate(t + h / 2, x + h / 2 * k1)
+                k3 = rate(t + h / 2, x + h / 2 * k2)
+                x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(t + h * (1 - 1e-12), x + h * k3))
+            result[:, k + 1] = x
+    good = np.asarray(np.isfinite(result).all(axis=(1, 2)))
+    good[0] = True
+    return times, np.nan_to_num(result[good])
+
+
+def _middle(initial: Any) -> Array:
+    if isinstance(initial, Box):
+        return np.asarray((initial.low + initial.high) / 2)
+    return np.asarray(getattr(initial, "mean", None) if not hasattr(initial, "center") else initial.center)
+
+
+def _faces(constraint: Inside, times: Array, paths: Array) -> list[tuple[Array, Array]]:
+    """(direction, room at each time) of each face."""
+    region, n = constraint.region, paths.shape[-1]
+    places = list(range(n) if region.coordinates is None else region.coordinates)
+    select = np.eye(n)[:, places]
+    if region.moving:
+        local = paths[..., places] - np.array([region.center_at(float(t)) for t in times])
+    else:
+        local = paths[..., places]
+    outside = isinstance(constraint, Outside)
+    if isinstance(region, Box | HalfSpace | Polytope):
+        A, b = _halfspaces(region)
+        room = np.asarray(b - local @ A.T)
+        if not outside:
+            return [(select @ a[:, None], room[..., j].min(axis=0)) for j, a in enumerate(A)]
+        # the face that separates best where the paths come nearest
+        distance = -room / np.linalg.norm(A, axis=1)
+        nearest = distance.max(axis=-1)
+        face = int(np.argmax(distance.reshape(-1, len(b))[int(np.argmin(nearest))]))
+        return [(select @ A[face][:, None], nearest.min(axis=0) * float(np.linalg.norm(A[face])))]
+    offset = local if region.moving else local - region.center_at(0.0)
+    size, scale = 1.0, np.eye(len(places))
+    if isinstance(region, Ball):
+        size = float(region.radius)
+    else:
+        assert isinstance(region, Ellipsoid)
+        values, vectors = np.linalg.eigh(np.asarray(region.shape, dtype=float))
+        scale = np.asarray((vectors / np.sqrt(values)) @ vectors.T)
+    distance = np.linalg.norm(offset @ scale, axis=-1)
+    if not outside:
+        return [(select @ scale, np.asarray((size - distance).min(axis=0)))]
+    closest = offset.reshape(-1, offset.shape[-1])[int(np.argmin(distance))] @ scale
+    normal = closest / max(float(np.linalg.norm(closest)), 1e-300)
+    return [(select @ scale @ normal[:, None], np.asarray((distance - size).min(axis=0)))]
+
+
+def _halfspaces(region: Any) -> tuple[Array, Array]:
+    """Faces of a polyhedron in its own coordinates, without its (moving) centre."""
+    if isinstance(region, Box):
+        eye = np.eye(region.dimension)
+        upper, lower = np.isfinite(region.high), np.isfinite(region.low)
+        return np.concatenate([eye[upper], -eye[lower]]), np.concatenate([region.high[upper], -region.low[lower]])
+    return region.halfspaces()  # type: ignore[no-any-return]  # sets hold Any
+
+
+def _joined(targets: list[Target]) -> list[Target]:
+    """Parallel directions of one constraint (the two sides of a box) as one, with the smaller room."""
+    kept: list[Target] = []
+    for target in targets:
+        size = float(np.linalg.norm(target.direction))
+        if size == 0:
+            continue
+        for place, other in enumerate(kept):
+            if other.constraint != target.constraint or other.direction.shape != target.direction.shape:
+                continue
+            ratio = size / float(np.linalg.norm(other.direction))
+            same = other.direction * ratio
+            if np.allclose(same, target.direction) or np.allclose(same, -target.direction):
+                room = np.minimum(other.rooms, target.rooms / ratio)
+                kept[place] = Target(direction=other.direction, rooms=room, constraint=other.constraint)
+                break
+        else:
+            kept.append(target)
+    return kept

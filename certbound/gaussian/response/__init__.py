@@ -1,0 +1,39 @@
+"""Exceedances of the Gaussian response of a linear equation along rows, in discrete and continuous time."""
+
+from __future__ import annotations
+
+from certbound.gaussian.response.clocks import ClockEvents, SteadyEvent
+from certbound.gaussian.response.events import WindowEvents
+from certbound.gaussian.response.levels import level_along, level_scale
+from certbound.gaussian.response.linear_response import (
+    LinearResponse,
+    RowResponse,
+    continuous_response,
+    discrete_response,
+)
+from certbound.gaussian.response.martingale_windows import logsumexp
+from certbound.gaussian.response.martingales import MartingaleEvent, Martingales, SplitEvents, Windowed, quantile
+from certbound.gaussian.response.occupancy import log_occupancy
+from certbound.gaussian.response.overlaps import log_any_exceedance
+from certbound.gaussian.response.step_events import StepEvents
+
+__all__ = [
+    "ClockEvents",
+    "continuous_response",
+    "discrete_response",
+    "level_along",
+    "level_scale",
+    "LinearResponse",
+    "log_any_exceedance",
+    "log_occupancy",
+    "logsumexp",
+    "MartingaleEvent",
+    "Martingales",
+    "quantile",
+    "RowResponse",
+    "SplitEvents",
+    "SteadyEvent",
+    "StepEvents",
+    "Windowed",
+    "WindowEvents",
+]

@@ -1,0 +1,394 @@
+"""Slepian's comparison of a rough Gaussian process with an Ornstein-Uhlenbeck process in a clock of its own.
+
+Let x_t = xi_t/s_t (unit variance) and psi(s, t) = -log corr(xi_s, xi_t). If a nondecreasing clock satisfies
+clock(t) - clock(s) >= psi(s, t) for **all** s < t of a block, then P(exists t in the block: x_t > q_t) is
+at most the probability that the stationary Ornstein-Uhlenbeck process exceeds q in that clock (Slepian's
+inequality).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.gaussian.scalar.normal import EPS, lift, log_tail
+from certbound.gaussian.scalar.ornstein_uhlenbeck import log_polygon_crossing
+from certbound.gaussian.scalar.pairs import Bounds, ends, total
+from certbound.rigor.intervals import Interval
+from certbound.rigor.rounding import quiet
+
+__all__ = ["Clock", "Windows", "clock_crossing", "decorrelation_rates", "group_windows", "markov_clock", "node_clock"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_WEIGHT = 2.0  # window clock times the square of the least level: near the optimum for levels of 3 to 6
+_MOST_WINDOWS = 2000
+_LEAST_CLOCK = 1e-9  # a piece of less clock is given this much
+_MISFIT, _FAR_BELOW, _SPLITS = 0.1, 0.5, 6  # a chord may pass a node this much above or below, times the level
+_FAR_ABOVE = 20.0  # levels with (z/s)^2 this much above the least do not matter
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Clock:
+    """A clock on K pieces, linear in time on each: clock(t) - clock(s) >= -log corr within every block.
+
+    Parameters
+    ----------
+    increments : ndarray, shape (K,)
+        Clock of each piece.
+    starts : ndarray of int
+        First piece of each block, beginning with 0.
+    """
+
+    increments: Array
+    starts: Index
+
+
+@quiet
+def decorrelation_rates(variance: Bounds, noise: Bounds, covariance: Bounds, drift: Bounds) -> Array:
+    """Upper bounds of d psi(s, t)/dt over pairs of pieces, the ``rates`` of `markov_clock`.
+
+    Proves: for d xi = eta dt + dN with a martingale N of intensity ``noise``, d psi(s, t)/dt = cov(xi_t,
+    eta_t)/s_t^2 + noise_t/(2 s_t^2) - cov(xi_s, eta_t)/cov(xi_s, xi_t) for s < t, in interval arithmetic;
+    +inf where cov(xi_s, xi_t) may vanish. For xi_t = a_t^T Z_t, dZ = J Z dt + g dW: eta_t = (da/dt + J^T
+    a)^T Z_t, noise = |g^T a|^2.
+
+    Parameters
+    ----------
+    variance, noise : Bounds, shape (K,)
+        Enclosures of s_t^2 > 0 and of the intensity over each piece.
+    covariance, drift : Bounds, shape (K, K)
+        Enclosures of cov(xi_s, xi_t) and cov(xi_s, eta_t) for s in piece i and t in piece j, s <= t (entries
+        below the diagonal are not read).
+
+    Returns
+    -------
+    ndarray, shape (K, K)
+
+    Raises
+    ------
+    ValueError
+        If a variance or a covariance within one piece may vanish: begin later, or take shorter pieces.
+
+    Examples
+    --------
+    >>> one = np.ones((1, 1))
+    >>> decorrelation_rates([1.0], [2.0], one, -one).tolist()[0][0] - 1.0 < 1e-12
+    True
+    """
+    v, n = Interval(*ends(variance, "variance")), Interval(*ends(noise, "noise", least=0.0))
+    c, d = Interval(*ends(covariance, "covariance")), Interval(*ends(drift, "drift"))
+    count = len(v.lo)
+    if c.shape != (count, count) or d.shape != (count, count):
+        raise ValueError(f"`covariance` and `drift` must have shape ({count}, {count}), got {c.shape}, {d.shape}.")
+    if not (np.all(v.lo > 0) and np.all(np.diagonal(c.lo) > 0)):
+        raise ValueError("`variance` and `covariance` must be positive within each piece; use shorter pieces.")
+    own = Interval(np.diagonal(d.lo), np.diagonal(d.hi))
+    safe = c.lo > 0
+    ratio = d / Interval(np.where(safe, c.lo, 1.0), np.where(safe, c.hi, 1.0))
+    rate: Interval = ((own + n * 0.5) / v)[None, :] - ratio
+    return np.where(safe, rate.hi, np.inf)
+
+
+def markov_clock(durations: ArrayLike, rates: ArrayLike, *, limit: float = 0.35) -> Clock:
+    """The least clock that rates of decorrelation allow, by a forward maximum over the nodes.
+
+    Proves: clock(t) - clock(s) >= psi(s, t) = -log corr(xi_s, xi_t) for all s < t in one block, given
+    ``rates[i, j]`` >= d psi(s, t)/dt for all s in piece i and t in piece j with s < t (almost every t;
+    psi(., s) is absolutely continuous and psi(s, s) = 0). For s in piece i and t in piece j the integral of
+    the rates is at most rates[i, i] (t_{i+1} - s) + sum_{i<l<j} rates[i, l] h_l + rates[i, j] (t - t_j),
+    which is linear in t on piece j: a clock of slope >= rates[i, i] on each piece i that satisfies the
+    inequality at the nodes t_{j+1}, from every t_{i+1}, satisfies it throughout. Such is the smallest one
+    found going forward.
+
+    `decorrelation_rates` computes such rates from covariances.
+
+    Parameters
+    ----------
+    durations : array_like, shape (K,)
+        Lengths h of the pieces, > 0.
+    rates : array_like, shape (K, K) or (K,)
+        Upper bounds as above (entries below the diagonal are not read); +inf allowed off the diagonal. One
+        row of K means bounds that hold for every earlier s.
+    limit : float
+        A new block begins at the piece at whose end psi may exceed it: short blocks have a slower clock and
+        sum more probabilities.
+
+    Returns
+    -------
+    Clock
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, a duration is not positive, or a diagonal rate is not finite.
+
+    Examples
+    --------
+    >>> markov_clock([0.5, 0.5], [2.0, 2.0]).increments.round(9).tolist()
+    [1.0, 1.0]
+    """
+    h = np.atleast_1d(np.asarray(durations, dtype=np.float64))
+    rate = np.asarray(rates, dtype=np.float64)
+    count = len(h)
+    if h.ndim != 1 or not np.all((h > 0) & (h < np.inf)):
+        raise ValueError("`durations` must be a row of positive numbers.")
+    if rate.shape not in ((count,), (count, count)):
+        raise ValueError(f"`rates` must have shape ({count},) or ({count}, {count}), got {rate.shape}.")
+    own = rate if rate.ndim == 1 else np.diagonal(rate)
+    if np.any(np.isnan(rate)) or not np.all(own < np.inf):
+        raise ValueError("`rates` must not be NaN, and finite on the diagonal; split the first pieces.")
+    slope = np.maximum(own, 0.0)
+    if rate.ndim == 1:
+        return Clock(increments=_frozen(slope * h * (1 + 2 * EPS)), starts=np.zeros(1, dtype=np.intp))
+    increments = slope * h * (1 + 2 * EPS)
+    starts, block = [0], 0
+    clock = np.zeros(count + 1)
+    debt = np.zeros(count)  # debt[i]: bound of psi(s, t_j) - rates[i, i] (t_{i+1} - s)
+    for j in range(count):
+        before = slice(block, j)
+        step = rate[before, j] * h[j]
+        debt[before] = debt[before] + step + 4 * EPS * (np.abs(debt[before]) + np.abs(step))
+        if j > block and not np.all(debt[before] <= limit):
+            starts.append(j)
+            block = j
+        needed = clock[block + 1 : j + 1] + debt[block:j]
+        ahead = float(np.max(needed)) - clock[j] if j > block else 0.0
+        increments[j] = max(increments[j], ahead + 8 * EPS * (1 + abs(clock[j])))
+        clock[j + 1] = clock[j] + increments[j]
+    return Clock(increments=_frozen(increments), starts=np.asarray(starts, dtype=np.intp))
+
+
+def node_clock(durations: ArrayLike, near: ArrayLike, needs: ArrayLike, *, limit: float = 0.35) -> Clock:
+    """The least clock that decorrelations at the nodes allow, by a forward maximum over them.
+
+    Proves: clock(t) - clock(s) >= psi(s, t) for all s < t in one block, given that for s < t in one part k, and for s
+    in part k - 1 and t in part k, d psi/dt <= near[k]; and that for s in part i and t in part j >= i + 2 psi(s, t)
+    is at most the bilinear interpolation of ``needs`` at the four corners (t_i or t_{i+1}, t_j or t_{j+1}). The
+    clock is linear on each part, so clock(t) - clock(s) is such an interpolation itself: it suffices that it is at
+    least ``needs`` at the nodes, and grows by near[k] h_k on part k (the integral of d psi/dt from s on).
+
+    Parameters
+    ----------
+    durations : array_like, shape (K,)
+        Lengths h of the parts, > 0.
+    near : array_like, shape (K,)
+        Finite upper bounds as above.
+    needs : array_like, shape (K + 1, K + 1)
+        Entries a < b are read; +inf allowed beyond the first upper diagonal: no block goes that far.
+    limit : float
+        A new block begins at the part at whose end a need exceeds it.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, a duration is not positive, or a near rate or a need of neighbours is not finite.
+
+    Examples
+    --------
+    >>> needs = [[0, 0.5, 0.9], [0, 0, 0.5], [0, 0, 0]]
+    >>> node_clock([0.5, 0.5], [1.0, 1.0], needs, limit=1.0).increments.round(9).tolist()
+    [0.5, 0.5]
+    """
+    h, rate = (np.atleast_1d(np.asarray(v, dtype=np.float64)) for v in (durations, near))
+    need = np.asarray(needs, dtype=np.float64)
+    count = len(h)
+    if h.ndim != 1 or not np.all((h > 0) & (h < np.inf)):
+        raise ValueError("`durations` must be a row of positive numbers.")
+    if rate.shape != (count,) or need.shape != (count + 1, count + 1):
+        raise ValueError(f"`near` and `needs` must have shapes ({count},) and ({count + 1}, {count + 1}).")
+    if not (np.all(np.isfinite(rate)) and np.all(np.isfinite(np.diagonal(need, 1))) and not np.any(np.isnan(need))):
+        raise ValueError("`near` and the `needs` of neighbours must be finite; take shorter parts.")
+    increments = np.maximum(rate, 0.0) * h * (1 + 2 * EPS)
+    clock = np.zeros(count + 1)
+    starts, block = [0], 0
+    for j in range(count):
+        asked = need[block : j + 1, j + 1]
+        if j > block and not np.all(asked <= limit):
+            starts.append(j)
+            block = j
+            asked = asked[-1:]
+        ahead = float(np.max(clock[block : j + 1] + asked)) - clock[j]
+        increments[j] = max(increments[j], ahead + 8 * EPS * (1 + abs(clock[j])))
+        clock[j + 1] = clock[j] + increments[j]
+    return Clock(increments=_frozen(increments), starts=np.asarray(starts, dtype=np.intp))
+
+
+def _frozen(array: Array) -> Array:
+    array = np.array(array, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+NO_CUTS: Index = np.zeros(1, dtype=np.intp)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Windows:
+    """Lines below a boundary: first piece, clock and end levels of each window."""
+
+    first: Index
+    spans: Array
+    starts: Array
+    stops: Array
+
+
+@quiet
+def group_windows(
+    clock: Array, left: Array, right: Array, span: float, forced: Index = NO_CUTS
+) -> Windows:
+    """Windows of about ``span`` over the nodes of ``clock``, cut at ``forced``, split where a line fits badly.
+
+    Proves: each line, a chord in Brownian coordinates, lies below the boundary that on piece l runs at or
+    above the chord from ``left[l]`` to ``right[l]`` (see `_lines`).
+    """
+    first = _cut(clock, span, forced)
+    cap = np.sqrt(min(float(np.min(left)), float(np.min(right))) ** 2 + _FAR_ABOVE)
+    lines, line = _lines(clock, left, right, first)
+    for _ in range(_SPLITS):
+        last = np.append(first[1:], len(left))
+        room = np.minimum(np.minimum(left[1:], right[:-1]), cap) - line  # at the nodes inside
+        inside = np.ones(len(room), dtype=bool)
+        inside[first[1:] - 1] = False
+        misfit = np.where(inside, np.abs(room) * np.maximum(cap, line), 0.0)
+        misfit = np.where(room > 0, misfit / _FAR_BELOW, misfit / _MISFIT)
+        window = np.repeat(np.arange(len(first)), last - first)[1:]
+        worst = np.zeros(len(first))
+        np.maximum.at(worst, window, misfit)
+        bad = (worst > 1) & (lines.spans > _LEAST_CLOCK)
+        if not np.any(bad):
+            break
+        more = [int(i) + 1 + int(np.argmax(misfit[i : j - 1])) for i, j in zip(first[bad], last[bad])]
+        first = np.unique(np.concatenate([first, np.asarray(more, dtype=np.intp)]))
+        lines, line = _lines(clock, left, right, first)
+    return lines
+
+
+def _lines(clock: Array, left: Array, right: Array, first: Index) -> tuple[Windows, Array]:
+    """One line per window from node ``first[k]`` to the next; the levels of the chords at the inner nodes.
+
+    The chord between the window's ends is lowered by its largest excess over the nodes inside, and by 1e-12
+    relative for rounding.
+    """
+    count = len(left)
+    last = np.append(first[1:], count)
+    window = np.repeat(np.arange(len(first)), last - first)
+    origin = clock[first]
+    spans = clock[last] - origin
+    low, high = left[first], right[last - 1] * np.exp(spans)
+    slope = (high - low) / np.expm1(2 * spans)
+    excess = np.zeros(len(first))
+    for node, level in ((np.arange(count), left), (np.arange(1, count + 1), right)):
+        offset = clock[node] - origin[window]
+        chord = low[window] + slope[window] * np.expm1(2 * offset)
+        if level is left:
+            line = (chord * np.exp(-offset))[1:]
+        excess = np.maximum(excess, np.maximum.reduceat(chord - level * np.exp(offset), first))
+    excess = excess + 1e-12 * (low + high)
+    stops = (high - excess) * np.exp(-spans)
+    stops = stops - 32 * EPS * np.abs(stops)
+    return Windows(first=first, spans=spans, starts=low - excess, stops=stops), line
+
+
+def _cut(clock: Array, span: float, forced: Index) -> Index:
+    """First pieces of windows of about ``span`` between forced cuts, none but whole blocks below a tenth."""
+    nodes, first, start = clock.tolist(), [0], 0.0
+    blocks = {*forced.tolist(), len(nodes) - 1}
+    fresh = True
+    for k in range(1, len(nodes)):
+        if k in blocks:
+            if not fresh and nodes[k] - start < 0.1 * span:
+                first.pop()
+            fresh = True
+        elif nodes[k] - start >= (1 - 1e-9) * span:
+            fresh = False
+        else:
+            continue
+        first.append(k)
+        start = nodes[k]
+    return np.asarray(first[:-1], dtype=np.intp)
+
+
+@quiet
+def clock_crossing(
+    clock: Clock, levels: ArrayLike, *, continuous: ArrayLike = True, weight: float = _WEIGHT
+) -> float:
+    """Upper bound of log10 P(exists t: xi_t > z_t) for a process compared with an OU process by its `Clock`.
+
+    Proves: with A_k the exceedance in block k and x continuous at the block's start, P <= P(A_0) + sum_k
+    [P(A_k) - P(A_k, x > q at the end of block k - 1)], and P(A_k) by Slepian and the window sums of
+    `log_polygon_crossing`; a boundary linear in the clock and >= 0 is concave in Brownian coordinates,
+    hence above its chords.
+
+    Parameters
+    ----------
+    clock : Clock
+        From `markov_clock`.
+    levels : array_like, shape (K,) or (K, 2)
+        Lower bounds of z_t/s_t on each piece: one number, or its two ends when z_t/s_t is at least the
+        linear interpolation (in t) between them. +inf allowed.
+    continuous : array_like of bool
+        Per block start after the first (or one for all): xi is the same process across it. Where False,
+        nothing is subtracted.
+    weight : float
+        Clock of a window times the square of the least level.
+
+    Returns
+    -------
+    float
+        0.0 (probability 1) where a level is negative.
+
+    Notes
+    -----
+    Where xi starts from rest the rates grow like 1/(2t): begin at a small t_0, let the pieces grow
+    geometrically, and add a bound for [0, t_0] (`log_window`, or any crude one: z/s is large there).
+
+    Examples
+    --------
+    >>> clock = markov_clock([0.5] * 10, [1.0] * 10)
+    >>> bool(-2.59 < clock_crossing(clock, [4.0] * 10) < -2.54)  # -2.592 by the differential equation
+    True
+    """
+    d = np.asarray(clock.increments, dtype=np.float64)
+    q = np.asarray(levels, dtype=np.float64)
+    if q.ndim == 1:
+        q = np.stack([q, q], axis=-1)
+    if q.shape != (len(d), 2) or np.any(np.isnan(q)):
+        raise ValueError(f"`levels` must have shape ({len(d)},) or ({len(d)}, 2) without NaN, got {q.shape}.")
+    least = float(np.min(q))
+    if least < 0:
+        return 0.0
+    if least == np.inf:
+        return -np.inf
+    q = np.minimum(q, 3 * least + 40)
+    span = max(weight / max(least, 0.5) ** 2, float(np.sum(d)) / _MOST_WINDOWS)
+    linked = np.broadcast_to(np.asarray(continuous, dtype=bool), (len(clock.starts) - 1,))
+    parts = np.maximum(np.ceil(3 * d / span), 1).astype(np.intp)
+    nodes, left, right = _subdivide(d, q, parts)
+    forced = (np.cumsum(parts) - parts)[clock.starts]
+    lines = group_windows(nodes, left, right, span, forced)
+    fresh = np.isin(lines.first, forced)
+    logs = log_polygon_crossing(lines.spans, lines.starts, lines.stops, fresh=fresh)
+    restart = np.searchsorted(lines.first, forced[1:][~linked])
+    logs[1 + restart] = lift(np.logaddexp(logs[1 + restart], log_tail(lines.starts[restart])), 8)
+    return float(total(logs))
+
+
+def _subdivide(d: Array, q: Array, parts: Index) -> tuple[Array, Array, Array]:
+    """Each piece cut into equal parts: the clock at the nodes, and levels at the two ends of each part.
+
+    The clock grows by at least d/parts on each part, whatever the rounding of its sum.
+    """
+    piece = np.repeat(np.arange(len(d)), parts)
+    index = np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts)
+    share = 1.0 / parts[piece]
+    base, rise = q[piece, 0], (q[:, 1] - q[:, 0])[piece]
+    guard = 32 * EPS * (q[piece, 0] + q[piece, 1])
+    left = np.where(index == 0, base, base + rise * index * share - guard)
+    right = np.where(index + 1 == parts[piece], q[piece, 1], base + rise * (index + 1) * share - guard)
+    steps = np.maximum((d / parts)[piece] * (1 + 8 * EPS), _LEAST_CLOCK)
+    steps = steps + 8 * EPS * float(np.sum(steps))
+    return np.concatenate([[0.0], np.cumsum(steps)]), left, right

@@ -1,0 +1,8 @@
+"""Problem files: read, checked, written."""
+
+from __future__ import annotations
+
+from certbound.problem.files.loading import load, save
+from certbound.problem.files.writing import content_of
+
+__all__ = ["content_of", "load", "save"]

@@ -1,0 +1,89 @@
+"""From a tape back to expressions, for saving a model in a problem file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from certbound.problem.files.parser import FUNCTIONS
+from certbound.problem.model import Tape
+
+__all__ = ["formulas"]
+
+_INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2)}
+_CALLS = frozenset(FUNCTIONS)
+_DEEPEST = 12
+_ATOM = 5
+
+
+def formulas(tape: Tape, names: Iterator[str]) -> tuple[dict[str, str], list[str]]:
+    """Expressions that give the tape's outputs, with definitions for what is used twice or nested deeply.
+
+    Parameters
+    ----------
+    tape : Tape
+        The function.
+    names : iterator of str
+        Fresh names for definitions.
+
+    Returns
+    -------
+    (dict, list)
+        Definitions in order, and one expression per output. Read again, they give the same operations on the
+        same numbers.
+
+    Raises
+    ------
+    ValueError
+        If the tape uses an operation that problem files do not have (where, sign, floor, comparisons).
+    """
+    uses = [0] * len(tape.nodes)
+    for node in tape.nodes:
+        if node.op != "input":
+            for arg in node.args:
+                uses[arg] += 1
+    definitions: dict[str, str] = {}
+    texts: list[tuple[str, int, int]] = []
+    for index, node in enumerate(tape.nodes):
+        text, strength = _text(tape, index, texts)
+        depth = 0 if node.op == "input" else 1 + max((texts[arg][2] for arg in node.args), default=-1)
+        if node.op not in ("input", "const") and (uses[index] > 1 or depth >= _DEEPEST or len(text) > 400):
+            name = next(names)
+            definitions[name] = text
+            text, strength, depth = name, _ATOM, 0
+        texts.append((text, strength, depth))
+    return definitions, [texts[output][0] for output in tape.outputs]
+
+
+def _text(tape: Tape, index: int, texts: list[tuple[str, int, int]]) -> tuple[str, int]:
+    """Text of a node, and how strongly it binds."""
+    node = tape.nodes[index]
+    if node.op == "input":
+        return tape.inputs[node.args[0]], _ATOM
+    if node.op == "const":
+        return _number(node.value), _ATOM if node.value >= 0 else 3
+    if node.op in _INFIX:
+        symbol, strength = _INFIX[node.op]
+        left = _bracketed(texts[node.args[0]], strength)
+        right = _bracketed(texts[node.args[1]], strength + 1)
+        space = " " if strength == 1 else ""
+        return f"{left}{space}{symbol}{space}{right}", strength
+    if node.op == "neg":
+        return f"-{_bracketed(texts[node.args[0]], 4)}", 3
+    if node.op in ("sq", "pow"):
+        exponent = 2.0 if node.op == "sq" else node.value
+        power = _number(exponent) if exponent >= 0 else f"({_number(exponent)})"
+        return f"{_bracketed(texts[node.args[0]], _ATOM)}**{power}", 4
+    if node.op in _CALLS:
+        return f"{node.op}({', '.join(texts[arg][0] for arg in node.args)})", _ATOM
+    raise ValueError(
+        f"the model uses {tape.describe(index)}, and {node.op} does not exist in problem files; keep the "
+        "model in Python and load it by module:name."
+    )
+
+
+def _bracketed(entry: tuple[str, int, int], least: int) -> str:
+    return entry[0] if entry[1] >= least else f"({entry[0]})"
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if value == int(value) and abs(value) < 1e15 else repr(float(value))

@@ -1,0 +1,221 @@
+"""Expressions in problem files: a small language with a parser of its own, safe on a stranger's file.
+
+Numbers, names, ``+ - * / **``, parentheses and the functions below; nothing else exists, so nothing else can
+be reached. ``**`` binds tighter than a sign on its left, as in Python.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from certbound.checks import nearest
+from certbound.problem.model import NUMPY, Graph
+
+__all__ = ["CONSTANTS", "FUNCTIONS", "constant", "parse"]
+
+FUNCTIONS: Mapping[str, int] = {
+    "sin": 1, "cos": 1, "tan": 1, "asin": 1, "acos": 1, "atan": 1, "atan2": 2, "sinh": 1, "cosh": 1,
+    "tanh": 1, "exp": 1, "log": 1, "sqrt": 1, "abs": 1, "min": 2, "max": 2, "hypot": 2,
+}  # fmt: skip
+"""Function name to its number of arguments (min and max take two or more)."""
+
+CONSTANTS: Mapping[str, float] = {"pi": math.pi}
+
+_LONGEST, _DEEPEST = 20_000, 60
+_TOKEN = re.compile(
+    r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)|(?P<name>[^\W\d]\w*)"
+    r"|(?P<symbol>\*\*|[-+*/(),]))"
+)
+_CURES = {
+    ".": "attribute access does not exist here",
+    "[": "indexing does not exist here; use the states' names",
+    "{": "braces do not exist here",
+    "^": "write ** for powers",
+    "=": "an expression has no assignment; use [definitions]",
+    "'": "text does not exist here",
+    '"': "text does not exist here",
+}
+_BINDING = {"+": 1, "-": 1, "*": 2, "/": 2, "**": 4}
+_SIGN = 3
+
+
+class _Token(NamedTuple):
+    kind: str
+    text: str
+    place: int
+
+
+def parse(text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str) -> int:
+    """Read an expression into a graph.
+
+    Parameters
+    ----------
+    text : str
+        The expression.
+    graph : Graph
+        Where its operations go.
+    names : mapping
+        Name to a node of the graph, or to a function that makes the node when the name is first used.
+    where : str
+        What the expression belongs to, for messages.
+
+    Returns
+    -------
+    int
+        Node of the value.
+
+    Raises
+    ------
+    ValueError
+        If the text is no expression, or uses an unknown name or function; the message names the nearest known
+        one.
+
+    Examples
+    --------
+    >>> graph = Graph(["x"])
+    >>> node = parse("2*sin(x)**2", graph, {"x": graph.input(0)}, "dynamics.x")
+    >>> graph.tape([node], (1,)).describe(-1)
+    '(2 * sin(x)**2)'
+    """
+    if len(text) > _LONGEST:
+        size = f"at most {_LONGEST} characters, got {len(text)}"
+        raise ValueError(f"`{where}` must have {size}; use [definitions].")
+    return _Parser(text, graph, names, where).result()
+
+
+class _Parser:
+    def __init__(self, text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str) -> None:
+        self.text, self.graph, self.names, self.where = text, graph, names, where
+        self.tokens = self._split()
+        self.next = 0
+        self.depth = 0
+
+    def fail(self, message: str, place: int | None = None) -> ValueError:
+        at = "" if place is None else f" (position {place + 1})"
+        shown = self.text if len(self.text) <= 80 else self.text[:77] + "..."
+        return ValueError(f"`{self.where}` must be an expression, got {shown!r}{at}: {message}")
+
+    def result(self) -> int:
+        node = self.expression(0)
+        token = self.peek()
+        if token.kind != "end":
+            raise self.fail(f"unexpected {token.text!r}", token.place)
+        return node
+
+    def _split(self) -> list[_Token]:
+        tokens: list[_Token] = []
+        place, end = 0, len(self.text.rstrip())
+        while place < end:
+            match = _TOKEN.match(self.text, place)
+            if match is None:
+                blank = len(self.text[place:]) - len(self.text[place:].lstrip())
+                character = self.text[place + blank]
+                cure = _CURES.get(character, "such a character does not exist here")
+                raise self.fail(f"{cure} ({character!r})", place + blank)
+            kind = match.lastgroup or "symbol"
+            tokens.append(_Token(kind, match.group(kind), match.start(kind)))
+            place = match.end()
+        return [*tokens, _Token("end", "the end", end)]
+
+    def peek(self) -> _Token:
+        return self.tokens[self.next]
+
+    def take(self) -> _Token:
+        self.next += 1
+        return self.tokens[self.next - 1]
+
+    def expect(self, symbol: str) -> None:
+        token = self.take()
+        if token.text != symbol or token.kind != "symbol":
+            raise self.fail(f"expected {symbol!r}, got {token.text!r}", token.place)
+
+    def expression(self, least: int) -> int:
+        self.depth += 1
+        if self.depth > _DEEPEST:
+            raise self.fail(f"nested deeper than {_DEEPEST} levels; use [definitions]", self.peek().place)
+        node = self.prefix()
+        while True:
+            token = self.peek()
+            strength = _BINDING.get(token.text, 0) if token.kind == "symbol" else 0
+            if strength <= least:
+                break
+            self.next += 1
+            node = self.combine(token, node, strength)
+        self.depth -= 1
+        return node
+
+    def combine(self, token: _Token, left: int, strength: int) -> int:
+        if token.text == "**":
+            return self.power(left, self.expression(_SIGN - 1))
+        right = self.expression(strength)
+        if token.text == "/" and self.graph.number(right) == 0:
+            raise self.fail("division by 0", token.place)
+        op = {"+": "add", "-": "sub", "*": "mul", "/": "div"}[token.text]
+        return self.graph.apply(op, left, right)
+
+    def power(self, base: int, exponent: int) -> int:
+        value = constant(self.graph, exponent)
+        if value is not None:
+            return self.graph.pow(base, value)
+        return self.graph.apply("exp", self.graph.apply("mul", exponent, self.graph.apply("log", base)))
+
+    def prefix(self) -> int:
+        token = self.take()
+        if token.kind == "number":
+            value = float(token.text)
+            if math.isinf(value):
+                raise self.fail(f"{token.text} is too large", token.place)
+            return self.graph.const(value)
+        if token.kind == "name":
+            return self.call(token) if self.peek().text == "(" else self.variable(token)
+        if token.text == "(" and token.kind == "symbol":
+            node = self.expression(0)
+            self.expect(")")
+            return node
+        if token.text in ("-", "+"):
+            node = self.expression(_SIGN)
+            return self.graph.apply("neg", node) if token.text == "-" else node
+        raise self.fail(f"expected a value, got {token.text!r}", token.place)
+
+    def variable(self, token: _Token) -> int:
+        name = token.text
+        if name in self.names:
+            value = self.names[name]
+            return value if isinstance(value, int) else value()
+        if name in CONSTANTS:
+            return self.graph.const(CONSTANTS[name])
+        if name in FUNCTIONS:
+            raise self.fail(f"{name} is a function; write {name}(...)", token.place)
+        raise self.fail(f"unknown name {name!r}{nearest(name, [*self.names, *CONSTANTS])}", token.place)
+
+    def call(self, token: _Token) -> int:
+        name = token.text
+        if name not in FUNCTIONS:
+            if name in self.names or name in CONSTANTS:
+                raise self.fail(f"{name!r} is not a function; write * to multiply", token.place)
+            raise self.fail(f"unknown function {name!r}{nearest(name, FUNCTIONS)}", token.place)
+        self.expect("(")
+        arguments = [self.expression(0)]
+        while self.peek().text == ",":
+            self.next += 1
+            arguments.append(self.expression(0))
+        self.expect(")")
+        count = FUNCTIONS[name]
+        if len(arguments) != count and not (name in ("min", "max") and len(arguments) > 2):
+            wanted = f"{count} argument{'s' * (count > 1)}"
+            raise self.fail(f"{name} takes {wanted}, got {len(arguments)}", token.place)
+        node = self.graph.apply(name, *arguments[:count])
+        for argument in arguments[count:]:
+            node = self.graph.apply(name, node, argument)
+        return node
+
+
+def constant(graph: Graph, node: int) -> float | None:
+    """Value of a node that depends on no input, rounded; None for any other."""
+    tape = graph.tape([node], (1,))
+    if any(entry.op == "input" for entry in tape.nodes):
+        return None
+    return float(tape.evaluate(NUMPY, [0.0] * len(tape.inputs))[0])

@@ -1,0 +1,384 @@
+"""From the content of a problem file to a ``Problem``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.checks import names as checked_names
+from certbound.checks import nearest
+from certbound.problem import noise, sets
+from certbound.problem.files.parser import CONSTANTS, FUNCTIONS, constant, parse
+from certbound.problem.files.plans import read_plan
+from certbound.problem.files.schema import BallTable, Constraint, EllipsoidTable, Noise, Specification, Start
+from certbound.problem.model import Graph, Tape
+from certbound.problem.problem import Problem
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
+
+__all__ = ["LEVELS", "RESERVED", "read_problem"]
+
+Array = NDArray[np.float64]
+
+RESERVED = frozenset({"t", *FUNCTIONS, *CONSTANTS})
+"""Names that no state, input, disturbance, parameter or definition may have."""
+
+_LAWS: Mapping[str, tuple[Callable[..., noise.Law], tuple[str, ...]]] = {
+    "gaussian": (noise.Gaussian, ("std", "variance", "covariance")),
+    "uniform": (noise.Uniform, ("halfwidth",)),
+    "rademacher": (noise.Rademacher, ("scale",)),
+    "bounded": (noise.Bounded, ("halfwidth",)),
+    "subgaussian": (noise.SubGaussian, ("proxy_std", "proxy_variance", "proxy_covariance")),
+}
+LEVELS = tuple(dict.fromkeys(level for _, levels in _LAWS.values() for level in levels))
+"""Every key that states how large the noise of a discrete-time problem is."""
+
+
+class _ForbiddenError(ValueError):
+    """An expression uses a name that exists, but not here."""
+
+
+def read_problem(
+    spec: Specification, folder: Path | None, source: Mapping[str, Any] | None = None
+) -> Problem:
+    """Build the problem that a specification describes.
+
+    Parameters
+    ----------
+    spec : Specification
+        Validated content of a file.
+    folder : Path or None
+        Folder of the file, from which ``plan.file`` is read; None forbids it.
+    source : mapping, optional
+        The raw content, kept for saving.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Naming the key, the rule and the value.
+    """
+    return _Reader(spec, folder).problem(source)
+
+
+class _Reader:
+    def __init__(self, spec: Specification, folder: Path | None) -> None:
+        self.spec, self.folder = spec, folder
+        self.states = checked_names("states", spec.states, RESERVED)
+        self.inputs = checked_names("inputs", list(spec.inputs), {*RESERVED, *self.states})
+        taken = {*RESERVED, *self.states, *self.inputs}
+        self.disturbances = checked_names("disturbances", list(spec.disturbances), taken)
+        taken |= set(self.disturbances)
+        self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
+        self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
+        checked_names("definitions", list(spec.definitions), taken | set(self.parameters))
+
+    def problem(self, source: Mapping[str, Any] | None) -> Problem:
+        spec = self.spec
+        system = self.system()
+        safe = [self.constraint(sets.Inside, entry, f"stay.{k}") for k, entry in enumerate(spec.stay)]
+        safe += [self.constraint(sets.Outside, entry, f"avoid.{k}") for k, entry in enumerate(spec.avoid)]
+        return Problem(
+            system,
+            initial=self.start(spec.initial),
+            safe=safe,
+            horizon=self.number(spec.horizon, "horizon"),
+            delta=self.number(spec.delta, "delta"),
+            plan=self.plan(),
+            cost=None if spec.cost is None else (self.weight("Q"), self.weight("R")),
+            domain=None if spec.domain is None else self.box(spec.domain.box, "domain.box", np.inf),
+            name=spec.name,
+            parameters=self.parameters,
+            source=source,
+        )
+
+    # numbers and functions
+
+    def number(self, value: float | str, where: str) -> float:
+        """A number, or the value of an expression in the parameters."""
+        if not isinstance(value, str):
+            if np.isnan(value):
+                raise ValueError(f"`{where}` must be a number, got nan.")
+            return float(value)
+        graph = Graph(())
+        node = parse(value, graph, {name: graph.const(p) for name, p in self.parameters.items()}, where)
+        result = constant(graph, node)
+        if result is None or not np.isfinite(result):
+            raise ValueError(f"`{where}` must be finite, got {value!r} = {result}.")
+        return result
+
+    def array(self, value: Any, where: str) -> Any:
+        """A number, vector or matrix of numbers or expressions in the parameters."""
+        if isinstance(value, list):
+            return [self.array(entry, f"{where}.{k}") for k, entry in enumerate(value)]
+        return self.number(value, where)
+
+    def matrix(self, value: Any, where: str) -> Array:
+        rows = self.array(value, where)
+        if isinstance(rows, list) and len({len(row) if isinstance(row, list) else 0 for row in rows}) > 1:
+            raise ValueError(f"`{where}` must have rows of equal length.")
+        return np.array(rows, dtype=float)
+
+    def function(
+        self,
+        texts: Sequence[float | str],
+        inputs: Sequence[str],
+        where: Sequence[str],
+        shape: tuple[int, ...],
+    ) -> Tape:
+        """The tape of expressions over ``inputs``, with the parameters put in and the definitions used."""
+        graph = Graph(inputs)
+        names: dict[str, int | Callable[[], int]] = {}
+        for name in ("t", *self.states, *self.inputs, *self.disturbances):
+            slot = graph.inputs.index(name) if name in graph.inputs else None
+            names[name] = _forbidden(name, inputs) if slot is None else graph.input(slot)
+        names |= {name: graph.const(value) for name, value in self.parameters.items()}
+        for name, text in self.spec.definitions.items():
+            try:
+                names[name] = self._node(text, graph, names, f"definitions.{name}")
+            except _ForbiddenError as error:
+                names[name] = _raise(error)
+        nodes = [self._node(text, graph, names, place) for text, place in zip(texts, where)]
+        return graph.tape(nodes, shape)
+
+    @staticmethod
+    def _node(
+        text: float | str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str
+    ) -> int:
+        try:
+            return parse(text, graph, names, where) if isinstance(text, str) else graph.const(text)
+        except _ForbiddenError as error:
+            raise _ForbiddenError(f"`{where}`: {error}") from None
+
+    def by_state(self, table: Any, where: str) -> tuple[list[Any], tuple[int, ...] | None]:
+        """Entries given by state name or as a list, and the states' indices (None: all, in order)."""
+        if isinstance(table, list):
+            if len(table) != len(self.states):
+                raise ValueError(f"`{where}` must have {len(self.states)} entries, got {len(table)}.")
+            return table, None
+        for key in table:
+            if key not in self.states:
+                known = nearest(key, self.states)
+                raise ValueError(f"`{where}` must use the states' names, got {key!r}{known}")
+        indices = tuple(self.states.index(key) for key in table)
+        if not indices:
+            raise ValueError(f"`{where}` must not be empty.")
+        return list(table.values()), None if indices == tuple(range(len(self.states))) else indices
+
+    # the system
+
+    def system(self) -> ContinuousSystem | DiscreteSystem:
+        spec = self.spec
+        options: dict[str, Any] = {
+            "states": self.states,
+            "inputs": self.signal(spec.inputs, "inputs"),
+            "disturbance": self.signal(spec.disturbances, "disturbances"),
+            "input_names": self.inputs or None,
+            "disturbance_names": self.disturbances or None,
+        }
+        options |= self.diffusion() if spec.time == "continuous" else self.law()
+        keys = set(spec.dynamics)
+        if "A" in keys and "A" not in self.states:
+            for key in keys - {"A", "B", "b", "E"}:
+                raise ValueError(f"unknown key {key!r} in [dynamics]{nearest(key, ['A', 'B', 'b', 'E'])}")
+            options |= {key: self.matrix(value, f"dynamics.{key}") for key, value in spec.dynamics.items()}
+            return linear_system(time=spec.time, **options)
+        for key in keys - set(self.states):
+            raise ValueError(f"unknown key {key!r} in [dynamics]{nearest(key, self.states)}")
+        for name in self.states:
+            if not isinstance(spec.dynamics.get(name), (str, int, float)):
+                got = spec.dynamics.get(name, "nothing")
+                raise ValueError(f"`dynamics.{name}` must be an expression, got {got!r}.")
+        where = [f"dynamics.{name}" for name in self.states]
+        inputs = ("t", *self.states, *self.inputs, *self.disturbances)
+        texts = [spec.dynamics[name] for name in self.states]
+        tape = self.function(texts, inputs, where, (len(self.states),))
+        return (ContinuousSystem if spec.time == "continuous" else DiscreteSystem)(tape, **options)
+
+    def signal(self, table: Mapping[str, list[Any]], where: str) -> sets.Box | None:
+        if not table:
+            return None
+        ends = np.array([self.array(pair, f"{where}.{name}") for name, pair in table.items()])
+        return sets.Box(ends[:, 0], ends[:, 1])
+
+    def diffusion(self) -> dict[str, Any]:
+        table = self.spec.noise
+        if table is None:
+            return {}
+        extra = sorted(table.model_fields_set - {"diffusion"})
+        if extra or table.diffusion is None:
+            raise ValueError(
+                "`noise` must hold `diffusion` alone in continuous time, a matrix with "
+                f"{len(self.states)} rows; got {', '.join(extra) or 'nothing'}."
+            )
+        value = table.diffusion
+        if not isinstance(value, list):
+            value = [[value]] if len(self.states) == 1 else value
+        if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
+            return {"diffusion": self.array(value, "noise.diffusion")}
+        rows: list[list[float | str]] = [list(row) for row in value if isinstance(row, list)]
+        texts = [entry for row in rows for entry in row]
+        shape = (len(rows), len(rows[0]))
+        if len(texts) != shape[0] * shape[1] or any(len(row) != shape[1] for row in rows):
+            raise ValueError("`noise.diffusion` must have rows of equal length.")
+        where = [f"noise.diffusion.{k // shape[1]}.{k % shape[1]}" for k in range(len(texts))]
+        return {"diffusion": self.function(texts, ("t", *self.states), where, shape)}
+
+    def law(self) -> dict[str, Any]:
+        table = self.spec.noise
+        if table is None:
+            return {}
+        if table.diffusion is not None or table.law is None:
+            raise ValueError(
+                f"`noise` must hold `law` ({', '.join(_LAWS)}), one level and at most `matrix` in discrete "
+                "time; `diffusion` is for continuous time."
+            )
+        build, levels = _LAWS[table.law]
+        given = _given(table)
+        if len(given) != 1 or given[0] not in levels:
+            raise ValueError(
+                f"`noise` with law {table.law!r} needs exactly one of {', '.join(levels)}; "
+                f"got {given or 'none'}."
+            )
+        if table.independent is not None and table.law != "bounded":
+            raise ValueError(f"`noise.independent` must be omitted for law {table.law!r}.")
+        level = {given[0]: self.array(getattr(table, given[0]), f"noise.{given[0]}")}
+        extra = {} if table.independent is None else {"independent": table.independent}
+        result: dict[str, Any] = {"noise": build(**level, **extra)}
+        if table.matrix is not None:
+            result["noise_matrix"] = self.matrix(table.matrix, "noise.matrix")
+        return result
+
+    # the plan, the cost, the sets
+
+    def plan(self) -> Any:
+        table = self.spec.plan
+        if table is None:
+            return None
+        if set(table) == {"file"} and "file" not in self.inputs:
+            return read_plan(self.plan_path(table["file"]), self.inputs)
+        for key in table:
+            if key not in self.inputs:
+                raise ValueError(f"unknown key {key!r} in [plan]{nearest(key, [*self.inputs, 'file'])}")
+        for name in self.inputs:
+            if name not in table:
+                raise ValueError(f"`plan` must give every input, {name!r} is missing.")
+        where = [f"plan.{name}" for name in self.inputs]
+        texts = [table[name] for name in self.inputs]
+        return self.function(texts, ("t", *self.states), where, (len(self.inputs),))
+
+    def plan_path(self, value: Any) -> Path:
+        path = Path(str(value))
+        if self.folder is None or path.is_absolute() or ".." in path.parts or not isinstance(value, str):
+            raise ValueError(f"`plan.file` must be a file in the problem file's folder, got {value!r}.")
+        return self.folder / path
+
+    def weight(self, name: str) -> Array:
+        return self.matrix(getattr(self.spec.cost, name), f"cost.{name}")
+
+    def place(self, table: Any, where: str) -> tuple[Any, tuple[int, ...] | None]:
+        """A centre (a tape where it moves), and the coordinates that it is in."""
+        texts, coordinates = self.by_state(table, where)
+        places = [f"{where}.{k}" for k in range(len(texts))]
+        return self.function(texts, ("t",), places, (len(texts),)), coordinates
+
+    def box(self, table: Any, where: str, missing: float | None, center: Any = None) -> sets.Box:
+        pairs, coordinates = self.by_state(table, where)
+        ends = [self.array(pair, f"{where}.{k}") for k, pair in enumerate(pairs)]
+        indices = range(len(self.states)) if coordinates is None else coordinates
+        if missing is None and len(ends) != len(self.states):
+            absent = [name for k, name in enumerate(self.states) if k not in indices]
+            raise ValueError(f"`{where}` must bound every state, {', '.join(absent)} is missing.")
+        low, high = np.full(len(self.states), -np.inf), np.full(len(self.states), np.inf)
+        for index, pair in zip(indices, ends):
+            if pair[0] > pair[1]:
+                state = self.states[index]
+                got = f"{pair[0]:g} > {pair[1]:g}"
+                raise ValueError(f"`{where}.{state}` must be [low, high], got {got}; swap the two.")
+            low[index], high[index] = pair
+        return sets.Box(low, high, center=center)
+
+    def start(self, table: Start) -> Any:
+        match table.chosen:
+            case "point":
+                values, coordinates = self.by_state(table.point, "initial.point")
+                return self.array(self._ordered(values, coordinates, "initial.point"), "initial.point")
+            case "box":
+                return self.box(table.box, "initial.box", None)
+            case "gaussian":
+                assert table.gaussian is not None
+                mean = self.array(table.gaussian.mean, "initial.gaussian.mean")
+                covariance = self.matrix(table.gaussian.covariance, "initial.gaussian.covariance")
+                return sets.GaussianStart(mean, covariance)
+        region = self.round(getattr(table, table.chosen), f"initial.{table.chosen}")
+        if region.moving:
+            raise ValueError(f"`initial.{table.chosen}` must not move with t.")
+        if region.coordinates is not None:
+            order = np.argsort(region.coordinates)
+            if len(order) != len(self.states):
+                raise ValueError(f"`initial.{table.chosen}` must give every state.")
+            if isinstance(region, sets.Ball):
+                return sets.Ball(region.center[order], region.radius)
+            return sets.Ellipsoid(region.center[order], region.shape[np.ix_(order, order)])
+        return region
+
+    def _ordered(self, values: list[Any], coordinates: tuple[int, ...] | None, where: str) -> list[Any]:
+        if coordinates is None:
+            return values
+        if len(coordinates) != len(self.states):
+            raise ValueError(f"`{where}` must give every state.")
+        return [values[coordinates.index(k)] for k in range(len(values))]
+
+    def round(self, table: BallTable | EllipsoidTable, where: str) -> Any:
+        center, coordinates = self.place(table.center, f"{where}.center")
+        if isinstance(table, BallTable):
+            radius = self.number(table.radius, f"{where}.radius")
+            return sets.Ball(center, radius, coordinates=coordinates)
+        shape = self.matrix(table.shape, f"{where}.shape")
+        return sets.Ellipsoid(center, shape, coordinates=coordinates)
+
+    def constraint(self, kind: Callable[..., Any], table: Constraint, where: str) -> Any:
+        during = None if table.during is None else self.array(table.during, f"{where}.during")
+        return kind(self.region(table, f"{where}.{table.chosen}"), during=during, label=table.label)
+
+    def region(self, table: Constraint, where: str) -> Any:
+        if table.box is not None:
+            center = None
+            if table.center is not None:
+                texts, coordinates = self.by_state(table.center, f"{where}.center")
+                indices = range(len(self.states)) if coordinates is None else coordinates
+                moves = dict(zip(indices, texts))
+                full = [moves.get(k, 0.0) for k in range(len(self.states))]
+                center = self.place(full, f"{where}.center")[0]
+            return self.box(table.box, where, np.inf, center)
+        if table.ball is not None or table.ellipsoid is not None:
+            chosen = table.ball or table.ellipsoid
+            assert chosen is not None
+            return self.round(chosen, where)
+        if table.halfspace is not None:
+            values, coordinates = self.by_state(table.halfspace.normal, f"{where}.normal")
+            normal = np.zeros(len(self.states))
+            normal[list(range(len(self.states)) if coordinates is None else coordinates)] = self.array(
+                values, f"{where}.normal"
+            )
+            return sets.HalfSpace(normal, self.number(table.halfspace.bound, f"{where}.bound"))
+        assert table.polytope is not None
+        faces = self.matrix(table.polytope.A, f"{where}.A")
+        return sets.Polytope(faces, self.array(table.polytope.b, f"{where}.b"))
+
+
+def _given(table: Noise) -> list[str]:
+    return [level for level in LEVELS if getattr(table, level) is not None]
+
+
+def _forbidden(name: str, inputs: Sequence[str]) -> Callable[[], int]:
+    return _raise(_ForbiddenError(f"{name!r} must not be used here, only {', '.join(inputs)}"))
+
+
+def _raise(error: ValueError) -> Callable[[], int]:
+    def use() -> int:
+        raise error
+
+    return use

@@ -1,0 +1,211 @@
+"""The shape of a problem file: which keys exist, and what may stand there.
+
+Wherever a number is wanted, an expression in the parameters may stand instead. Unknown keys are errors that
+name the nearest known one. What the values mean is decided in ``reading``.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from certbound.checks import nearest
+
+__all__ = ["Constraint", "Noise", "Specification", "Start", "explain"]
+
+
+def _no_boolean(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError(f"must be a number or an expression, got {str(value).lower()}")
+    return value
+
+
+Number = Annotated[float | str, BeforeValidator(_no_boolean)]
+Vector = list[Number]
+Matrix = list[list[Number]]
+Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Place = dict[str, Number] | Vector
+Intervals = dict[str, Pair] | list[Pair]
+
+
+class _Table(BaseModel):
+    """A table without unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    title: ClassVar[str] = "the problem file"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
+            raise ValueError(f"{cls.title} must be a table of keys, got {value!r}")
+        for key in value:
+            if key not in cls.model_fields:
+                raise ValueError(f"unknown key {key!r} in {cls.title}{nearest(str(key), cls.model_fields)}")
+        return value
+
+
+class BallTable(_Table):
+    """A ball: centre by name or for all states."""
+
+    title: ClassVar[str] = "ball"
+    center: Place
+    radius: Number
+
+
+class EllipsoidTable(_Table):
+    """An ellipsoid {(x - center)' shape^-1 (x - center) <= 1}."""
+
+    title: ClassVar[str] = "ellipsoid"
+    center: Place
+    shape: Matrix
+
+
+class HalfSpaceTable(_Table):
+    """A half-space {normal.x <= bound}."""
+
+    title: ClassVar[str] = "halfspace"
+    normal: Place
+    bound: Number
+
+
+class PolytopeTable(_Table):
+    """A polytope {A x <= b}."""
+
+    title: ClassVar[str] = "polytope"
+    A: Matrix
+    b: Vector
+
+
+class GaussianTable(_Table):
+    """A random start."""
+
+    title: ClassVar[str] = "gaussian"
+    mean: Vector
+    covariance: Matrix
+
+
+class DomainTable(_Table):
+    """Where the model is meant."""
+
+    title: ClassVar[str] = "[domain]"
+    box: Intervals
+
+
+class _Choice(_Table):
+    """A table with exactly one of some keys."""
+
+    choices: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="after")
+    def _one_choice(self) -> Any:
+        given = [name for name in self.choices if getattr(self, name) is not None]
+        if len(given) != 1:
+            choices = ", ".join(self.choices)
+            raise ValueError(f"{self.title} needs exactly one of {choices}; got {given or 'none'}")
+        return self
+
+    @property
+    def chosen(self) -> str:
+        """The key that is given."""
+        return next(name for name in self.choices if getattr(self, name) is not None)
+
+
+class Start(_Choice):
+    """Where the state starts."""
+
+    title: ClassVar[str] = "[initial]"
+    choices: ClassVar[tuple[str, ...]] = ("point", "box", "ball", "ellipsoid", "gaussian")
+    point: Place | None = None
+    box: Intervals | None = None
+    ball: BallTable | None = None
+    ellipsoid: EllipsoidTable | None = None
+    gaussian: GaussianTable | None = None
+
+
+class Constraint(_Choice):
+    """One region to stay in or to avoid; ``center`` moves a box."""
+
+    title: ClassVar[str] = "[[stay]] or [[avoid]]"
+    choices: ClassVar[tuple[str, ...]] = ("box", "ball", "ellipsoid", "halfspace", "polytope")
+    box: Intervals | None = None
+    ball: BallTable | None = None
+    ellipsoid: EllipsoidTable | None = None
+    halfspace: HalfSpaceTable | None = None
+    polytope: PolytopeTable | None = None
+    center: Place | None = None
+    during: Pair | None = None
+    label: str | None = None
+
+    @model_validator(mode="after")
+    def _center_of_box(self) -> Any:
+        if self.center is not None and self.box is None:
+            raise ValueError("`center` beside the region moves a box; a ball has one of its own")
+        return self
+
+
+class Cost(_Table):
+    """Weights of the states and of the inputs: diagonals or matrices."""
+
+    title: ClassVar[str] = "[cost]"
+    Q: Vector | Matrix
+    R: Vector | Matrix
+
+
+class Noise(_Table):
+    """CT: diffusion. DT: a law, its one level, and a matrix."""
+
+    title: ClassVar[str] = "[noise]"
+    diffusion: Matrix | Number | Vector | None = None
+    law: Literal["gaussian", "uniform", "rademacher", "bounded", "subgaussian"] | None = None
+    std: Number | Vector | None = None
+    variance: Number | Vector | None = None
+    covariance: Matrix | None = None
+    halfwidth: Number | Vector | None = None
+    scale: Number | Vector | None = None
+    proxy_std: Number | Vector | None = None
+    proxy_variance: Number | Vector | None = None
+    proxy_covariance: Matrix | None = None
+    independent: bool | None = None
+    matrix: Matrix | Number | Vector | None = None
+
+
+class Specification(_Table):
+    """A problem file."""
+
+    time: Literal["continuous", "discrete"]
+    horizon: Number
+    states: Annotated[list[str], Field(min_length=1)]
+    dynamics: dict[str, Any]
+    initial: Start
+    name: str = "problem"
+    delta: Number = 1e-3
+    parameters: dict[str, Annotated[float, BeforeValidator(_no_boolean)]] = {}
+    inputs: dict[str, Pair] = {}
+    disturbances: dict[str, Pair] = {}
+    definitions: dict[str, Number] = {}
+    plan: dict[str, Number] | None = None
+    cost: Cost | None = None
+    noise: Noise | None = None
+    stay: list[Constraint] = []
+    avoid: list[Constraint] = []
+    domain: DomainTable | None = None
+
+
+def explain(error: ValidationError) -> str:
+    """The faults of a problem file in one line each, without the machinery."""
+    lines: list[str] = []
+    for fault in error.errors():
+        keys = [str(part) for part in fault["loc"] if not (isinstance(part, str) and _is_machinery(part))]
+        message = fault["msg"].removeprefix("Value error, ")
+        message = message[:1].lower() + message[1:]
+        line = f"`{'.'.join(keys)}`: {message}" if keys else message
+        if line not in lines:
+            lines.append(line)
+    return ", and ".join(lines[:4]) + (", and more" if len(lines) > 4 else "") + "."
+
+
+def _is_machinery(part: str) -> bool:
+    """True for pydantic's names of the alternatives of a union."""
+    return any(mark in part for mark in "[(") or part in ("float", "str")

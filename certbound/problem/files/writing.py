@@ -1,0 +1,174 @@
+"""From a ``Problem`` to the content of a problem file."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from certbound.problem import sets
+from certbound.problem.files.formulas import formulas
+from certbound.problem.files.reading import LEVELS, RESERVED
+from certbound.problem.model import Tape
+from certbound.problem.noise import check_law
+from certbound.problem.problem import Problem
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem
+
+__all__ = ["content_of", "describe_problem"]
+
+
+def content_of(problem: Problem, plan_file: str) -> dict[str, Any]:
+    """Content of a problem's file: as it was in its own file, or with the traced model as expressions.
+
+    Raises
+    ------
+    ValueError
+        As for ``describe_problem``.
+    """
+    if problem.source is None:
+        return describe_problem(problem, plan_file)
+    content = copy.deepcopy(dict(problem.source))
+    if isinstance(problem.plan, np.ndarray):
+        content["plan"] = {"file": plan_file}
+    return content
+
+
+def describe_problem(problem: Problem, plan_file: str) -> dict[str, Any]:
+    """Content of the problem file of any problem, with its model as expressions.
+
+    Parameters
+    ----------
+    problem : Problem
+        What to describe.
+    plan_file : str
+        Name to put under ``plan.file`` where the plan is an array (the caller writes it).
+
+    Raises
+    ------
+    ValueError
+        If the model uses what problem files do not have (np.where, np.sign, ...).
+    """
+    content = _Writer(problem, plan_file).content()
+    return {key: value for key, value in content.items() if value not in ({}, [], None)}
+
+
+class _Writer:
+    def __init__(self, problem: Problem, plan_file: str) -> None:
+        self.problem, self.system, self.plan_file = problem, problem.system, plan_file
+        self.states = problem.system.states
+        self.definitions: dict[str, str] = {}
+        self.fresh = self._fresh()
+
+    def _fresh(self) -> Iterator[str]:
+        system = self.system
+        taken = {*RESERVED, *self.states, *system.input_names, *system.disturbance_names}
+        number = 0
+        while True:
+            number += 1
+            if f"s{number}" not in taken:
+                yield f"s{number}"
+
+    def texts(self, tape: Tape) -> list[str]:
+        definitions, texts = formulas(tape, self.fresh)
+        self.definitions |= definitions
+        return texts
+
+    def content(self) -> dict[str, Any]:
+        problem, system = self.problem, self.system
+        dynamics = dict(zip(self.states, self.texts(system.dynamics)))
+        noise, plan, cost = self.noise(), self.plan(), problem.cost
+        stay = [self.constraint(c) for c in problem.safe if not isinstance(c, sets.Outside)]
+        avoid = [self.constraint(c) for c in problem.safe if isinstance(c, sets.Outside)]
+        return {
+            "name": problem.name,
+            "time": system.time,
+            "horizon": problem.horizon,
+            "delta": problem.delta,
+            "states": list(self.states),
+            "inputs": self.signal(system.inputs, system.input_names),
+            "disturbances": self.signal(system.disturbance, system.disturbance_names),
+            "definitions": self.definitions,
+            "dynamics": dynamics,
+            "plan": plan,
+            "cost": cost and {"Q": _rows(cost[0]), "R": _rows(cost[1])},
+            "noise": noise,
+            "initial": self.start(),
+            "domain": None if problem.domain is None else {"box": self.intervals(problem.domain)},
+            "stay": stay,
+            "avoid": avoid,
+        }
+
+    @staticmethod
+    def signal(box: sets.Box | None, names: tuple[str, ...]) -> dict[str, Any]:
+        if box is None:
+            return {}
+        return {name: [low, high] for name, low, high in zip(names, box.low.tolist(), box.high.tolist())}
+
+    def plan(self) -> dict[str, Any] | None:
+        plan = self.problem.plan
+        if plan is None or isinstance(plan, np.ndarray):
+            return None if plan is None else {"file": self.plan_file}
+        return dict(zip(self.system.input_names, self.texts(plan)))
+
+    def noise(self) -> dict[str, Any]:
+        system = self.system
+        if isinstance(system, ContinuousSystem):
+            if not isinstance(system.diffusion, Tape):
+                return {"diffusion": _rows(system.diffusion)}
+            texts, columns = self.texts(system.diffusion), system.diffusion.shape[1]
+            return {"diffusion": [texts[k : k + columns] for k in range(0, len(texts), columns)]}
+        assert isinstance(system, DiscreteSystem)
+        check_law(system.noise, "be written")
+        given = {level: getattr(system.noise, level, None) for level in LEVELS}
+        table: dict[str, Any] = {"law": system.noise.name}
+        table |= {level: value.tolist() for level, value in given.items() if value is not None}
+        if getattr(system.noise, "independent", True) is False:
+            table["independent"] = False
+        return table | {"matrix": _rows(system.noise_matrix)}
+
+    def intervals(self, box: sets.Box) -> dict[str, Any]:
+        used = self.states if box.coordinates is None else [self.states[k] for k in box.coordinates]
+        return {name: [low, high] for name, low, high in zip(used, box.low.tolist(), box.high.tolist())}
+
+    def place(self, region: Any) -> dict[str, Any]:
+        used = self.states if region.coordinates is None else [self.states[k] for k in region.coordinates]
+        moving = isinstance(region.center, Tape)
+        return dict(zip(used, self.texts(region.center) if moving else region.center.tolist()))
+
+    def region(self, region: Any) -> dict[str, Any]:
+        if isinstance(region, sets.Box):
+            table = {"box": self.intervals(region)}
+            return table | ({} if region.center is None else {"center": self.place(region)})
+        if isinstance(region, sets.Ball):
+            return {"ball": {"center": self.place(region), "radius": region.radius}}
+        if isinstance(region, sets.Ellipsoid):
+            return {"ellipsoid": {"center": self.place(region), "shape": _rows(region.shape)}}
+        if isinstance(region, sets.HalfSpace):
+            normal = {name: value for name, value in zip(self.states, region.normal.tolist()) if value}
+            return {"halfspace": {"normal": normal, "bound": region.bound}}
+        if isinstance(region, sets.Polytope):
+            return {"polytope": {"A": _rows(region.A), "b": region.b.tolist()}}
+        raise TypeError(f"a {type(region).__name__} cannot be written; use a set of this package.")
+
+    def constraint(self, constraint: sets.Inside) -> dict[str, Any]:
+        table = self.region(constraint.region)
+        if constraint.during is not None:
+            table["during"] = list(constraint.during)
+        usual = type(constraint)(constraint.region, constraint.during).named(self.states).label
+        return table if constraint.label == usual else table | {"label": constraint.label}
+
+    def start(self) -> Mapping[str, Any]:
+        initial = self.problem.initial
+        if isinstance(initial, sets.GaussianStart):
+            return {"gaussian": {"mean": initial.mean.tolist(), "covariance": _rows(initial.covariance)}}
+        if isinstance(initial, sets.Box):
+            if self.problem.fixed_start:
+                return {"point": initial.low.tolist()}
+            return {"box": [[low, high] for low, high in zip(initial.low.tolist(), initial.high.tolist())]}
+        return self.region(initial)
+
+
+def _rows(matrix: Any) -> list[list[float]]:
+    return [[float(entry) for entry in row] for row in np.asarray(matrix)]

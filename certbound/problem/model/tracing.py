@@ -1,0 +1,164 @@
+"""From a NumPy-style Python function to a tape, and the tools that every reader of a tape shares."""
+
+from __future__ import annotations
+
+import inspect
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from certbound.problem.model.graph import Graph
+from certbound.problem.model.tape import Tape
+from certbound.problem.model.tracer import Scalar, Traced, UntraceableError
+
+__all__ = ["trace"]
+
+
+def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) -> Tape:
+    """Record a NumPy-style function as a tape.
+
+    The function is called once, with traced values. It may use Python's operators, indexing, loops over a
+    fixed range, ``@`` with constant matrices, and NumPy's elementary functions (np.sin, np.where, np.maximum,
+    np.linalg.norm, ...).
+
+    Parameters
+    ----------
+    function : callable
+        Takes any of the arguments, by name. Parameters that have a default and are not among ``arguments``
+        keep it.
+    arguments : mapping
+        Argument name to the names of its scalar entries. ``t`` is passed as a scalar, everything else as an
+        array of one dimension. The order fixes the input slots.
+
+    Returns
+    -------
+    Tape
+        With inputs in the order of ``arguments`` and the shape of what the function returned (``(1,)`` for a
+        scalar).
+
+    Raises
+    ------
+    TypeError
+        If the function takes other arguments, or does what cannot be traced (``if x > 0``, ``math.sin(x)``,
+        ``float(x)``); the message names the line and the cure.
+    ValueError
+        If the function returns nothing, a ragged list, or a value that is not finite.
+
+    Examples
+    --------
+    >>> tape = trace(lambda t, x: [x[1], -np.sin(x[0])], {"t": ["t"], "x": ["angle", "speed"]})
+    >>> tape.inputs, tape.shape
+    (('t', 'angle', 'speed'), (2,))
+    """
+    inputs = [name for names in arguments.values() for name in names]
+    if len(set(inputs)) != len(inputs):
+        repeated = sorted({name for name in inputs if inputs.count(name) > 1})
+        raise ValueError(f"names must be distinct, got {repeated} more than once.")
+    graph = Graph(inputs)
+    values: dict[str, Any] = {}
+    slot = 0
+    for key, names in arguments.items():
+        entries = [Scalar(graph, graph.input(slot + k)) for k in range(len(names))]
+        slot += len(names)
+        values[key] = entries[0] if key == "t" else _array(entries).view(Traced)
+    name = getattr(function, "__name__", type(function).__name__)
+    chosen = {key: values[key] for key in _parameters(function, name, list(arguments))}
+    try:
+        result = function(**chosen)
+    except UntraceableError as error:
+        raise TypeError(f"`{name}` cannot be traced{_place(error)}: {error}.") from error
+    except (TypeError, AttributeError) as error:
+        cure = (
+            "use NumPy's elementary functions on the entries (np.sin, np.where, np.maximum), or on x itself"
+        )
+        raise TypeError(f"`{name}` cannot be traced{_place(error)}: {error}; {cure}.") from error
+    return _finish(graph, result, name)
+
+
+def _array(entries: Sequence[Any]) -> np.ndarray[Any, np.dtype[Any]]:
+    array = np.empty(len(entries), dtype=object)
+    array[:] = entries
+    return array
+
+
+def _parameters(function: Callable[..., Any], name: str, known: list[str]) -> list[str]:
+    if not callable(function):
+        raise TypeError(f"`{name}` must be a function of {', '.join(known)}, got {function!r}.")
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`{name}` must be a Python function of {', '.join(known)}: {error}.") from error
+    chosen: list[str] = []
+    for parameter in signature.parameters.values():
+        positional = parameter.kind in (
+            parameter.POSITIONAL_ONLY,
+            parameter.VAR_POSITIONAL,
+            parameter.VAR_KEYWORD,
+        )
+        if parameter.name in known and not positional:
+            chosen.append(parameter.name)
+        elif positional or parameter.default is parameter.empty:
+            raise TypeError(
+                f"`{name}` must take its arguments by name, from {', '.join(known)}; got `{parameter}`"
+                + (
+                    " (a system with u needs `inputs=`, one with d needs `disturbance=`)."
+                    if parameter.name in "ud"
+                    else "."
+                )
+            )
+    return chosen
+
+
+def _place(error: Exception) -> str:
+    """Where in the user's code an error arose."""
+    here, numpy = Path(__file__).parent, Path(np.__file__).parent
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if here != path.parent and numpy not in path.parents:
+            return f" (line {frame.lineno} of {path.name}: {frame.line})" if frame.line else ""
+    return ""
+
+
+def _finish(graph: Graph, result: Any, name: str) -> Tape:
+    array = _collected(result, name)
+    outputs: list[int] = []
+    for place, entry in enumerate(array.reshape(-1)):
+        if isinstance(entry, Scalar):
+            if entry.graph is not graph:
+                raise TypeError(
+                    f"`{name}` returned a value of another call; it must depend on its arguments only."
+                )
+            outputs.append(entry.index)
+            continue
+        try:
+            outputs.append(graph.const(float(entry)))
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"`{name}` must return finite numbers, got {entry!r} at position {place}."
+            ) from error
+    return graph.tape(outputs, array.shape or (1,))
+
+
+def _collected(result: Any, name: str) -> np.ndarray[Any, np.dtype[Any]]:
+    if result is None:
+        raise ValueError(f"`{name}` must return its value, got None; add a return statement.")
+    try:
+        array = np.array(_listed(result), dtype=object)
+    except ValueError as error:
+        raise ValueError(
+            f"`{name}` must return a vector or a matrix of scalars, got a ragged list."
+        ) from error
+    if array.ndim > 2 or any(isinstance(entry, (list, tuple)) for entry in array.reshape(-1)):
+        raise ValueError(
+            f"`{name}` must return a vector or a matrix of scalars, got a ragged or deeper list."
+        )
+    return array
+
+
+def _listed(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist() if value.dtype != object else _listed(list(value) if value.ndim else value[()])
+    return [_listed(item) for item in value] if isinstance(value, (list, tuple)) else value

@@ -1,0 +1,22 @@
+"""Sets of states, the constraints made of them, random starts, and distances to them."""
+
+from __future__ import annotations
+
+from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
+from certbound.problem.sets.distances import clearance
+from certbound.problem.sets.initial import check_start
+from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope, Region
+
+__all__ = [
+    "Ball",
+    "Box",
+    "check_start",
+    "clearance",
+    "Ellipsoid",
+    "GaussianStart",
+    "HalfSpace",
+    "Inside",
+    "Outside",
+    "Polytope",
+    "Region",
+]

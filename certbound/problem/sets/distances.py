@@ -1,0 +1,97 @@
+"""How far a state is from a constraint, in a weighted norm (plain floats: for proposals and pictures).
+
+The tube around x is {x + y: ‖y‖_P <= r}; ``clearance`` is a radius r up to which it respects the constraint.
+What a verdict needs is proved elsewhere, with outward rounding.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.problem.sets.constraints import Inside, Outside
+from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
+
+__all__ = ["clearance", "face_erosion", "round_erosion"]
+
+Array = NDArray[np.float64]
+
+
+def face_erosion(normals: ArrayLike, inverse_metric: ArrayLike | None = None) -> Array:
+    """sqrt(a' P^-1 a) for rows a: what a unit tube takes from {a.x <= b}.
+
+    Parameters
+    ----------
+    normals : array_like, shape (..., n)
+        Directions a.
+    inverse_metric : array_like, shape (n, n), optional
+        P^-1; the identity when omitted.
+    """
+    a = np.asarray(normals, dtype=float)
+    spread = a if inverse_metric is None else a @ np.asarray(inverse_metric, dtype=float)
+    return np.asarray(np.sqrt(np.maximum(np.sum(a * spread, axis=-1), 0.0)))
+
+
+def round_erosion(block: ArrayLike) -> float:
+    """sqrt(lambda_max(C P^-1 C')): what a unit tube takes from a ball, given that block of P^-1."""
+    return float(np.sqrt(np.linalg.eigvalsh(np.asarray(block, dtype=float))[-1]))
+
+
+def clearance(
+    constraint: Inside, x: ArrayLike, inverse_metric: ArrayLike | None = None, t: float = 0.0
+) -> Array:
+    """Signed distance of states to a constraint: every x + y with ‖y‖_P below it satisfies the constraint.
+
+    Exact for half-spaces, for staying inside a polyhedron, and for balls and ellipsoids where P is a multiple
+    of the identity on their coordinates; a lower bound in magnitude of safety elsewhere. Negative where x
+    violates.
+
+    Parameters
+    ----------
+    constraint : Inside or Outside
+        At time ``t``, whatever its window.
+    x : array_like, shape (..., n)
+        States.
+    inverse_metric : array_like, shape (n, n), optional
+        P^-1 of the norm sqrt(y' P y); the identity when omitted.
+    t : float
+        Time, for a moving centre.
+
+    Returns
+    -------
+    ndarray, shape (...)
+
+    Examples
+    --------
+    >>> from certbound.problem.sets import Ball, Outside
+    >>> float(clearance(Outside(Ball([0.0, 0.0], 1.0)), [3.0, 4.0]))
+    4.0
+    """
+    region = constraint.region
+    y = region.local(x) - region.center_at(t)
+    block = _block(region, np.shape(x)[-1], inverse_metric)
+    inside = not isinstance(constraint, Outside)
+    if isinstance(region, (Box, HalfSpace, Polytope)):
+        normals, bounds = region.halfspaces()
+        if not len(bounds):
+            return np.full(y.shape[:-1], np.inf if inside else -np.inf)
+        room = (bounds - y @ normals.T) / face_erosion(normals, block)
+        return np.asarray(np.min(room, axis=-1) if inside else np.max(-room, axis=-1))
+    if isinstance(region, Ball):
+        room = region.radius - np.linalg.norm(y, axis=-1)
+    elif isinstance(region, Ellipsoid):
+        factor = np.linalg.inv(np.linalg.cholesky(region.shape))
+        room, block = 1.0 - np.linalg.norm(y @ factor.T, axis=-1), factor @ block @ factor.T
+    else:
+        raise TypeError(f"`constraint` must hold a set of this package, got {type(region).__name__}.")
+    return np.asarray((room if inside else -room) / round_erosion(block))
+
+
+def _block(region: object, dimension: int, inverse_metric: ArrayLike | None) -> Array:
+    inverse = np.eye(dimension) if inverse_metric is None else np.asarray(inverse_metric, dtype=float)
+    if inverse.shape != (dimension, dimension):
+        raise ValueError(f"`inverse_metric` must have shape {(dimension, dimension)}, got {inverse.shape}.")
+    coordinates = getattr(region, "coordinates", None)
+    if coordinates is None:
+        return inverse
+    return np.asarray(inverse[np.ix_(list(coordinates), list(coordinates))])

@@ -1,0 +1,27 @@
+"""The linear-response engine (Thm K7): nominal, Gaussian response, proved remainder."""
+
+from __future__ import annotations
+
+from certbound.reach.linear.answer import LinearAnswer, linear_answer, linear_reach, refusal
+from certbound.reach.linear.deviation_tube import DeviationTube
+from certbound.reach.linear.diffusion import Accepted, DiffusionRun, Reference, depends_on_state
+from certbound.reach.linear.inclusion import Supports
+from certbound.reach.linear.linearisation import Linearisation
+from certbound.reach.linear.run import Events, LinearRun, correlated
+
+__all__ = [
+    "Accepted",
+    "correlated",
+    "depends_on_state",
+    "DeviationTube",
+    "DiffusionRun",
+    "Events",
+    "linear_answer",
+    "linear_reach",
+    "LinearAnswer",
+    "Linearisation",
+    "LinearRun",
+    "Reference",
+    "refusal",
+    "Supports",
+]

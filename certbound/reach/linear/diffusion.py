@@ -1,0 +1,245 @@
+"""Thm K7 where the noise depends on the state: X = p + y + Z + M + R.
+
+Z answers a chosen diffusion ghat(t) exactly, M' = Jhat M dt + (g(t, X) - ghat) dW the rest of the noise, stopped when
+the state leaves a tube. `DiffusionRun` guesses the tube, bounds g - ghat over it, grants Z and M their levels, encloses
+the remainder, and accepts when what follows lies strictly inside the guess. Two choices of ghat compete: g along the
+nominal curve (M is of second order), and 0 (all noise in M: better where the state moves g a lot).
+
+M is a martingale only if the start and the disturbance do not see coming noise: every answer says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.constants.enclosures import enclose
+from certbound.gaussian.response import (
+    ClockEvents,
+    LinearResponse,
+    Martingales,
+    SplitEvents,
+    Windowed,
+    WindowEvents,
+    continuous_response,
+    level_along,
+)
+from certbound.problem.model import Tape
+from certbound.problem.problem import Problem
+from certbound.problem.systems import ContinuousSystem
+from certbound.reach.linear.linearisation import Linearisation
+from certbound.reach.linear.run import LinearRun, Outcome
+from certbound.reach.sets import Requirement
+from certbound.rigor.intervals import Interval
+
+__all__ = ["DiffusionRun", "depends_on_state"]
+
+Array = NDArray[np.float64]
+
+_ROUNDS = 12
+_SETTLE = 6
+_GROWTH = 0.03
+_ENOUGH = 0.5  # levels of M below this share of those of Z: all noise in M cannot be better
+_HALF = float(np.log(0.5)) * (1 + 1e-15)
+
+
+def depends_on_state(problem: Problem) -> bool:
+    """Whether the diffusion is a function of the state or of time."""
+    return isinstance(problem.system, ContinuousSystem) and isinstance(problem.system.diffusion, Tape)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Reference:
+    """One choice of ghat: its Gaussian response, ghat itself (B, N, n, m), and what is computed once for it."""
+
+    response: LinearResponse
+    value: Array
+    gaussian: bool
+    memory: dict[int, dict[bytes, Any]] = field(default_factory=dict)
+    events: dict[tuple[int, float], ClockEvents] = field(default_factory=dict)
+    levels: dict[tuple[int, int, float], Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Accepted:
+    """A reference and the bounds of g - ghat, one (N, n, m) a cell, over a tube that closed."""
+
+    reference: Reference
+    excess: list[Interval]
+
+
+class DiffusionRun(LinearRun):
+    """`LinearRun` for a diffusion g(t, x).
+
+    ``probability`` finds the tube for a given delta_N; the other methods use the tube found for it.
+    """
+
+    def __init__(self, engine: Linearisation) -> None:
+        super().__init__(engine)
+        assert isinstance(engine.system, ContinuousSystem)
+        assert isinstance(engine.system.diffusion, Tape)
+        self.tape = engine.system.diffusion
+        cells, pieces, n = len(engine.centres), engine.pieces, engine.n
+        slope, drift, _ = engine.slopes
+        silent = np.zeros((cells, pieces, n, self.tape.shape[1]))
+        still = continuous_response(
+            slope, drift, engine.step, np.zeros((n, 1)), engine.start_covariance, slope_error=engine.slope_error
+        )
+        self.references = [
+            Reference(response=engine.response, value=engine.diffusion, gaussian=True),
+            Reference(response=still, value=silent, gaussian=bool(engine.start_covariance.any())),
+        ]
+        self.frames = [Windowed(engine.response, cell) for cell in range(cells)]
+        self.outcomes: dict[float, Outcome] = {}
+        self.accepted: dict[float, Accepted] = {}
+        self.held = Accepted(reference=self.references[0], excess=[])
+
+    # ---- the noise over a tube ---------------------------------------------------------------------------
+
+    def excess(self, reference: Reference, low: Array, high: Array) -> list[Interval] | None:
+        """g - ghat over p + [low, high] in the active coordinates (B N, active); None where g is not defined."""
+        engine, frame = self.engine, self.engine.frame
+        active = engine.model.active
+        reach = frame.spread * (1 + 1e-15)
+        lower, upper = -reach, reach.copy()
+        lower[:, active] += low - 4e-16 * np.abs(low)
+        upper[:, active] += high + 4e-16 * np.abs(high)
+        state = frame.middle + Interval(np.nextafter(lower, -np.inf), np.nextafter(upper, np.inf))
+        slots = [frame.span, *(state[:, i] for i in range(engine.n))]
+        value = enclose(self.tape, slots, undefined="infinite").broadcast_to((len(low), *self.tape.shape))
+        finite = np.isfinite(value.lo) & np.isfinite(value.hi)
+        if not finite.all():
+            cells = finite.all(axis=(1, 2)).reshape(-1, engine.pieces).all(axis=0)
+            self.failed_at = int(np.argmin(cells))
+            return None
+        value = value - reference.value.reshape(value.shape)
+        shape = (engine.pieces, *self.tape.shape)
+        return [value[k * engine.pieces : (k + 1) * engine.pieces].reshape(*shape) for k in range(len(self.supports))]
+
+    def events(self, cell: int, shared_log: float) -> SplitEvents:
+        """Scalar events of Z + M of one cell; half of the shared probability is granted to each."""
+        engine, reference = self.engine, self.held.reference
+        gaussian = None
+        share = shared_log
+        if reference.gaussian:
+            share = shared_log + _HALF
+            if (cell, share) not in reference.events:
+                windows = WindowEvents(reference.response, cell, engine.window, share)
+                found = ClockEvents(windows, reference.value[cell], reference.memory.setdefault(cell, {}))
+                reference.events[cell, share] = found
+            gaussian = reference.events[cell, share]
+        excess = self.held.excess[cell]
+        return SplitEvents(
+            gaussian=gaussian,
+            martingales=Martingales(reference.response, cell, excess, share, self.frames[cell]),
+        )
+
+    def levels(self, log_nonlinear: float) -> tuple[Array, list[Any]]:
+        """Levels of |Z + M| along the inner rows that together cost exp(log_nonlinear), and the events.
+
+        A tenth of it goes to the coordinates that all rows share; the rest is divided between the rows, and in equal
+        parts between Z and M.
+        """
+        self.held = self.accepted.get(log_nonlinear, self.held)
+        cells, pieces, count = self.rows.shape[:3]
+        result = np.zeros((cells, pieces, count))
+        share = log_nonlinear + float(np.log(0.9 / (4 * max(count, 1))))
+        events = [self.events(cell, log_nonlinear + float(np.log(0.1))) for cell in range(cells)]
+        for cell, d in np.ndindex(cells, count):
+            level = events[cell].martingales.along(self.rows[cell, :, d]).level(share)
+            result[cell, :, d] = level * (1 + 1e-12) + self._gaussian_level(events[cell], cell, d, share)
+        return result, list(events)
+
+    def _gaussian_level(self, events: SplitEvents, cell: int, d: int, share: float) -> Array:
+        """Levels of w . Z along an inner row that cost exp(share)."""
+        found, key = self.held.reference.levels, (cell, d, share)
+        if key not in found:
+            event = None if events.gaussian is None else events.gaussian.along(self.rows[cell, :, d])
+            found[key] = np.zeros(self.rows.shape[1])
+            if event is not None and event.profile.max() > 0:
+                found[key] = level_along(event, share)
+        return found[key]
+
+    def tightest(self, outcome: Outcome) -> tuple[Requirement | None, int, float]:
+        """See `LinearRun.tightest`."""
+        self.held = self.accepted.get(outcome.log_nonlinear, self.held)
+        return super().tightest(outcome)
+
+    # ---- the fixed point ---------------------------------------------------------------------------------
+
+    def probability(self, log_nonlinear: float, effort: int = 2) -> Outcome:
+        """Thm K7' with delta_N = exp(log_nonlinear), by the better of both references."""
+        if log_nonlinear in self.outcomes:
+            return self.outcomes[log_nonlinear]
+        best = Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None)
+        for reference in self.references:
+            found = self._close(reference, log_nonlinear, effort)
+            if found is None:
+                continue
+            accepted, bounds, share = found
+            _, events = self.levels(log_nonlinear)
+            outcomes = [self._cell(k, bounds, events[k], log_nonlinear) for k in range(len(self.supports))]
+            worst = max(outcomes, key=lambda outcome: outcome.log_probability)
+            if best.bounds is None or worst.log_probability < best.log_probability:
+                best, kept = worst, accepted
+            if share < _ENOUGH:
+                break
+        if best.bounds is not None:
+            self.accepted[log_nonlinear] = self.held = kept
+        self.outcomes[log_nonlinear] = best
+        return best
+
+    def promise(self, log_nonlinear: float, effort: int) -> float:
+        """What `probability` finds, in logarithms: nothing can be guessed before a tube has closed."""
+        return self.probability(log_nonlinear, effort).log_probability
+
+    def _close(
+        self, reference: Reference, log_nonlinear: float, effort: int
+    ) -> tuple[Accepted, tuple[Array, Array], float] | None:
+        """Bounds of g - ghat and of the remainder over a tube that contains what follows from them.
+
+        The third entry is the largest share of M in the levels (1 where there is no Z).
+        """
+        engine = self.engine
+        count = len(engine.model.active)
+        shape = (len(engine.centres), engine.pieces, engine.n)
+        low = high = np.zeros((shape[0] * shape[1], count))
+        bounds: tuple[Array, Array] = (np.zeros(shape), np.zeros(shape))
+        fresh = False
+        for _ in range(_ROUNDS):
+            for _ in range(_SETTLE):
+                excess = self.excess(reference, low, high)
+                if excess is None:
+                    return None
+                self.held = Accepted(reference=reference, excess=excess)
+                levels, events = self.levels(log_nonlinear)
+                levels = levels * (1 + 1e-12) + 1e-280  # the state then stays strictly inside
+                reached = self.deviations(levels, *bounds) if np.isfinite(levels).all() else None
+                if reached is None:
+                    return None
+                inner = reached[0][:, :count], reached[1][:, :count]
+                if np.all((inner[0] >= low) & (inner[1] <= high)):
+                    if fresh:
+                        return self.held, bounds, self._share(events)
+                    break
+                wider = _GROWTH * (inner[1] - inner[0])
+                low, high = np.minimum(low, inner[0] - wider), np.maximum(high, inner[1] + wider)
+                fresh = False
+            found = self.include(levels, effort)
+            if found is None:
+                return None
+            bounds, fresh = found, True
+        return None
+
+    def _share(self, events: list[Any]) -> float:
+        """The largest ratio of M's levels to Z's along the inner rows."""
+        ratios = [1.0]
+        for cell, own in enumerate(events):
+            for d in range(len(self.engine.model.active)):
+                event = own.along(self.rows[cell, :, d])
+                size = 0.0 if event.gaussian is None else float(event.gaussian.profile.max())
+                ratios.append(float(event.martingale.profile.max()) / size if size > 0 else 1.0)
+        return max(ratios[1:], default=1.0)

@@ -1,0 +1,388 @@
+"""A problem linearised along nominal curves: the data of Thm K7, for a batch of cells of the initial set."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.errors import EngineError
+from certbound.gaussian.response import LinearResponse, continuous_response, discrete_response
+from certbound.problem.model import Tape, compile_numpy
+from certbound.problem.problem import Problem
+from certbound.problem.sets import GaussianStart
+from certbound.problem.systems import ContinuousSystem
+from certbound.reach.linear.inclusion import Gathering
+from certbound.reach.nominal import initial_cells
+from certbound.reach.remainder import Frame, Remainder
+from certbound.reach.sets import NominalPieces
+from certbound.rigor.intervals import Interval
+
+__all__ = ["WINDOW", "WINDOW_TURN", "Linearisation"]
+
+Array = NDArray[np.float64]
+
+_FEWEST_PIECES, _MOST_PIECES = 50, 2000
+_STEP = 0.1  # ||J|| h of a piece
+_ROUND = 1 + 1e-13
+_LARGE = 40  # states
+WINDOW = 0.05
+"""Time of the martingale windows that bound rows which turn."""
+WINDOW_TURN = 8.0
+"""||J|| times that time, at most: the transition matrix of a window is inverted, and next to singular beyond."""
+
+
+class Linearisation:
+    """Thm K7 for one problem, on a grid of pieces, for a batch of cells of the initial set.
+
+    Parameters
+    ----------
+    problem : Problem
+        Additive noise (a constant diffusion matrix, or any discrete-time law).
+    cells : int, optional
+        Cells along each side of the initial set.
+    pieces : int, optional
+        Pieces of the horizon (continuous time).
+    noise : bool
+        False: the noise-free reachable set.
+    """
+
+    def __init__(
+        self, problem: Problem, *, cells: int | None = None, pieces: int | None = None, noise: bool = True,
+    ) -> None:
+        self.problem, self.noise = problem, noise
+        self.correction: Array | None = None
+        self.system = problem.system
+        self.continuous = self.system.time == "continuous"
+        self.n = self.system.dimension
+        self.model = Remainder(problem)
+        self.pieces = self._pieces(pieces)
+        self.step = float(problem.horizon) / self.pieces if self.continuous else 1.0
+        split = initial_cells(problem, cells)
+        self.centres = np.asarray(split.centres)
+        self.radii = np.asarray((split.boxes - self.centres).mag)
+        random = noise and isinstance(problem.initial, GaussianStart)
+        self.start_covariance = (
+            np.asarray(problem.initial.covariance) if random else np.zeros((self.n, self.n))
+        )
+        low, high = (
+            (self.system.disturbance.low, self.system.disturbance.high)
+            if self.system.disturbance is not None else (np.zeros(0), np.zeros(0))
+        )
+        self.d_low, self.d_high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+        self.d_middle = (self.d_low + self.d_high) / 2
+        self.d_radius = np.maximum(self.d_high - self.d_middle, self.d_middle - self.d_low) * (1 + 1e-15)
+
+    def _pieces(self, pieces: int | None) -> int:
+        if not self.continuous:
+            return int(self.problem.horizon)
+        count = _FEWEST_PIECES if pieces is None else pieces
+        if self.problem.input_sequence is not None:
+            rows = len(self.problem.input_sequence)
+            count = rows * int(np.ceil(count / rows))
+        return count
+
+    @classmethod
+    def of(cls, problem: Problem, *, cells: int | None = None, noise: bool = True) -> Linearisation:
+        """The linearisation on a grid that resolves the nominal Jacobians: ||J|| h at most 0.1."""
+        if problem.system.time == "discrete":
+            return cls(problem, cells=cells, noise=noise)
+        trial = cls(problem, noise=noise)
+        while trial.lost and 4 * trial.pieces <= _MOST_PIECES:  # a coarse grid loses a stiff system's nominal at once
+            trial = cls(problem, pieces=4 * trial.pieces, noise=noise)
+        size = float(np.linalg.norm(np.nan_to_num(trial.slopes[0]), axis=(-2, -1)).max())
+        pieces = int(np.clip(np.ceil(problem.horizon * size / _STEP), _FEWEST_PIECES, _MOST_PIECES))
+        alike = (cells is None or cells == 1) and trial._pieces(pieces) == trial.pieces
+        return trial if alike else cls(problem, cells=cells, pieces=pieces, noise=noise)
+
+    # ---- nominal data ------------------------------------------------------------------------------------
+
+    @cached_property
+    def inputs(self) -> Array:
+        """Input of every piece: shape (N, m)."""
+        sequence = self.problem.input_sequence
+        if sequence is None:
+            return np.zeros((self.pieces, 0))
+        return np.repeat(sequence, self.pieces // len(sequence), axis=0)
+
+    @cached_property
+    def times(self) -> Array:
+        """Nodes."""
+        return np.asarray(np.arange(self.pieces + 1) * self.step, dtype=float)
+
+    def _evaluate(self, k: int, time: float, state: Array) -> Array:
+        return self._compiled(time, *state.T, *self.inputs[k], *self.d_middle)
+
+    @cached_property
+    def _compiled(self) -> Callable[..., Array]:
+        return compile_numpy(self.problem.closed_loop)
+
+    @cached_property
+    def lost(self) -> bool:
+        """Whether the nominal overflows on this grid."""
+        return not bool(np.isfinite(self._followed).all())
+
+    @cached_property
+    def _followed(self) -> Array:
+        """The nominal states, finite or not."""
+        x = np.array(self.centres)
+        states = [x]
+        with np.errstate(all="ignore"):
+            for k in range(self.pieces):
+                x = self._advance(k, x) if self.continuous else self._evaluate(k, float(k), x)
+                states.append(x)
+        return np.stack(states, axis=1)
+
+    @cached_property
+    def nodes(self) -> Array:
+        """Nominal states at the nodes: shape (B, N + 1, n)."""
+        nodes = self._followed
+        lost = ~np.isfinite(nodes).all(axis=(0, 2))
+        if lost.any():
+            last, sizes = int(np.argmax(lost)) - 1, np.abs(nodes).max(axis=(0, 2))
+            while last > 0 and sizes[last] > 100 * (1 + sizes[last - 1]):  # finite, but no longer meant
+                last -= 1
+            end = last * self.step
+            raise EngineError(
+                f"the noise-free trajectory is lost after t = {end:.4g}, before the horizon {self.problem.horizon:g}; "
+                "shorten the horizon, or check the model there."
+            )
+        return nodes
+
+    def _advance(self, k: int, x: Array) -> Array:
+        """Two steps of the classical Runge-Kutta method."""
+        h = self.step / 2
+        for half in range(2):
+            t = self.times[k] + half * h
+            k1 = self._evaluate(k, t, x)
+            k2 = self._evaluate(k, t + h / 2, x + h / 2 * k1)
+            k3 = self._evaluate(k, t + h / 2, x + h / 2 * k2)
+            k4 = self._evaluate(k, t + h, x + h * k3)
+            x = x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+        return x
+
+    @cached_property
+    def controls(self) -> Array:
+        """Bezier points of the nominal curve (CT, shape (B, N, 4, n)) or its nodes (DT, (B, N + 1, 1, n))."""
+        x = self.nodes
+        if not self.continuous:
+            return x[:, :, None, :]
+        start, end = (
+            self._compiled(t, *np.moveaxis(ends, -1, 0), *self.inputs.T, *self.d_middle)
+            for t, ends in ((self.times[:-1], x[:, :-1]), (self.times[1:], x[:, 1:])))
+        third = self.step / 3
+        return np.stack([x[:, :-1], x[:, :-1] + third * start, x[:, 1:] - third * end, x[:, 1:]], axis=2)
+
+    def nominal(self, cell: int) -> NominalPieces:
+        """The nominal curve of one cell, with about the spread of the noise and of the initial set along it."""
+        count = len(self.controls[cell])
+        extent, reached = np.empty((count, self.n)), np.diag(self.radii[cell])
+        for k in range(count):
+            extent[k] = np.abs(reached).sum(axis=1)
+            reached = self.response.transition[cell, min(k, self.pieces - 1)] @ reached
+        covariance = self.response.covariance[cell, self.continuous :][:count]
+        return NominalPieces(
+            times=self.times, controls=self.controls[cell], continuous=self.continuous, covariance=covariance,
+            extent=extent,
+        )  # fmt: skip
+
+    def on_grid(self, pieces: int) -> Linearisation:
+        """The same cells and correction on another grid of pieces (continuous time)."""
+        along = max(len(np.unique(self.centres[:, j])) for j in range(self.n))
+        other = Linearisation(self.problem, cells=along if along > 1 else None, pieces=pieces, noise=self.noise)
+        if self.correction is None:
+            return other
+        place = np.clip(other.times / self.step, 0.0, self.pieces)
+        left = np.minimum(place.astype(int), self.pieces - 1)
+        weight = (place - left)[:, None, None]
+        return other.corrected((1 - weight) * self.correction[:, left] + weight * self.correction[:, left + 1])
+
+    def corrected(self, correction: Array) -> Linearisation:
+        """The same with ``correction`` added to the slope: (B, N + 1, n, n) at the nodes, linear in between.
+
+        In discrete time the last node counts for nothing.
+        """
+        other = copy.copy(self)
+        for name in ("slopes", "response", "frame", "gathering", "sizes", "window"):
+            vars(other).pop(name, None)
+        other.correction = correction
+        return other
+
+    @cached_property
+    def slopes(self) -> tuple[Array, Array, Array]:
+        """A, K and E of every piece: shapes (B, N, n, n), (B, N, n, n), (B, N, n, q)."""
+        first, drift, gain = self.tangents
+        extra = self.correction
+        if extra is None:
+            return first, drift, gain
+        if not self.continuous:
+            return first + extra[:, :-1], drift, gain
+        return first + extra[:, :-1], drift + (extra[:, 1:] - extra[:, :-1]) / self.step, gain
+
+    @cached_property
+    def tangents(self) -> tuple[Array, Array, Array]:
+        """The same without the correction: derivatives along the nominal curve."""
+        cells = len(self.centres)
+        x = self.nodes
+        inputs = np.broadcast_to(self.inputs, (cells, *self.inputs.shape))
+
+        def at(nodes: Array, times: Array) -> Array:
+            shape = nodes.shape[:2]
+            value = self.model.reference_slope(
+                np.broadcast_to(times, shape).ravel(), nodes.reshape(-1, self.n),
+                inputs.reshape(cells * self.pieces, -1), self.d_middle,
+            )
+            return value.reshape(*shape, self.n, self.n)
+
+        first = at(x[:, :-1], self.times[:-1])
+        gain = self.model.reference_gain(
+            np.broadcast_to(self.times[:-1], (cells, self.pieces)).ravel(), x[:, :-1].reshape(-1, self.n),
+            inputs.reshape(cells * self.pieces, -1), self.d_middle,
+        ).reshape(cells, self.pieces, self.n, len(self.d_middle))
+        if not self.continuous:
+            return first, np.zeros_like(first), gain
+        last = at(x[:, 1:], self.times[1:])
+        return first, (last - first) / self.step, gain
+
+    @property
+    def slope_error(self) -> float:
+        """Entrywise bound of |Jhat - its floats|: the model's constant entries need not be floats."""
+        return float(self.model.constant_slope.rad.max(initial=0.0))
+
+    @cached_property
+    def diffusion(self) -> Array:
+        """g of a continuous-time problem (0 without noise); along the nominal, (B, N, n, m), where it is a function."""
+        assert isinstance(self.system, ContinuousSystem)
+        g = self.system.diffusion
+        if isinstance(g, Tape):
+            shape = (len(self.centres), self.pieces, *g.shape)
+            middle = (self.nodes[:, :-1] + self.nodes[:, 1:]) / 2
+            time = np.broadcast_to((self.times[:-1] + self.times[1:]) / 2, shape[:2])
+            with np.errstate(all="ignore"):
+                g = np.broadcast_to(compile_numpy(g)(time, *np.moveaxis(middle, -1, 0)), shape)
+            g = np.where(np.isfinite(g), g, 0.0)
+        return np.asarray(g, dtype=float) * (1.0 if self.noise else 0.0)
+
+    @cached_property
+    def response(self) -> LinearResponse:
+        """Linear data of all cells."""
+        slope, drift, _ = self.slopes
+        start = self.start_covariance
+        if isinstance(self.system, ContinuousSystem):
+            return continuous_response(slope, drift, self.step, self.diffusion, start,
+                                       slope_error=self.slope_error)
+        g = np.asarray(self.system.noise_matrix, dtype=float)
+        proxy = np.asarray(self.system.noise.proxy, dtype=float) * (1.0 if self.noise else 0.0)
+        covariance = g @ proxy @ g.T
+        covariance = (covariance + covariance.T) / 2
+        bound = 8 * (len(proxy) + 2) * 2.0**-53 * float((np.abs(g) @ np.abs(proxy) @ np.abs(g).T).max(initial=0.0))
+        return discrete_response(slope, covariance, bound, start, slope_error=self.slope_error)
+
+    @property
+    def _slope_slack(self) -> Interval:
+        return self.model.constant_slope - self.model.constant_slope.mid
+
+    @cached_property
+    def frame(self) -> Frame:
+        """Enclosures of the nominal data, cells and pieces in one batch (piece index fastest)."""
+        slope, drift, gain = self.slopes
+        cells, pieces, n = len(self.centres), self.pieces, self.n
+
+        def flat(a: Array) -> Array:
+            return a.reshape(cells * pieces, *a.shape[2:])
+
+        if self.continuous:
+            c = [Interval.point(flat(self.controls[:, :, i])) for i in range(4)]
+            h = Interval(np.nextafter(self.step, 0), np.nextafter(self.step, np.inf))
+            middle = (c[0] + 3.0 * (c[1] + c[2]) + c[3]) / 8.0
+            spread = np.max([(p - middle).mag for p in c], axis=0)
+            velocities = [3.0 * (c[i + 1] - c[i]) / h for i in range(3)]
+            accelerations = [6.0 * (c[i + 2] - 2.0 * c[i + 1] + c[i]) / (h * h) for i in range(2)]
+            jerk = 6.0 * (c[3] - c[0] + 3.0 * (c[1] - c[2])) / (h * h * h)
+            velocity = velocities[0].hull(velocities[1]).hull(velocities[2])
+            middle_velocity = (velocities[0] + 2.0 * velocities[1] + velocities[2]) / 4.0
+            acceleration = accelerations[0].hull(accelerations[1])
+            middle_acceleration = (accelerations[0] + accelerations[1]) / 2.0
+            half = float(np.nextafter(h.hi / 2, np.inf))
+            middle_slope = Interval.point(flat(slope)) + (h * 0.5) * flat(drift) + self._slope_slack
+            slip = 8e-16 * float(self.problem.horizon)
+            middles = np.tile((self.times[:-1] + self.times[1:]) / 2, cells)
+            time = Interval.around(middles, np.full(cells * pieces, slip))
+            span = Interval(time.lo - half - slip, time.hi + half + slip)
+        else:
+            zero = np.zeros((cells * pieces, n))
+            middle = Interval.point(flat(self.nodes[:, :-1]))
+            middle_velocity = Interval.point(flat(self.nodes[:, 1:]))
+            velocity = acceleration = middle_acceleration = jerk = Interval.point(zero)
+            spread, half = zero, 0.0
+            middle_slope = Interval.point(flat(slope)) + self._slope_slack
+            time = span = Interval.point(np.tile(self.times[:-1], cells))
+        return Frame(
+            half=half, middle_time=time, span=span, middle=middle, spread=spread, middle_velocity=middle_velocity,
+            velocity=velocity, middle_acceleration=middle_acceleration, acceleration=acceleration, jerk=jerk,
+            slope=middle_slope, drift=flat(drift), input_gain=flat(gain),
+            inputs=np.tile(self.inputs, (cells, 1)), disturbance_middle=self.d_middle,
+            disturbance_low=self.d_low, disturbance_high=self.d_high,
+        )
+
+    @cached_property
+    def sizes(self) -> Array:
+        """A typical size of every state, (n,): of the nominal, the initial set and the noise; always positive."""
+        variance = np.diagonal(self.response.covariance, axis1=-2, axis2=-1).max(axis=(0, 1))
+        deviation = np.sqrt(np.maximum(np.where(np.isfinite(variance), variance, 0.0), 0.0))
+        found = np.abs(self.nodes).max(axis=(0, 1)) + self.radii.max(axis=0) + deviation
+        return np.asarray(np.maximum(found, max(1e-6 * float(found.max()), 1e-100)))
+
+    @property
+    def remainder_sizes(self) -> Array:
+        """The same for the dynamics: in continuous time a tenth of the size in the time of a piece."""
+        return self.sizes * (0.1 / self.step if self.continuous else 1.0)
+
+    @cached_property
+    def window(self) -> int:
+        """Pieces of a martingale window."""
+        slope = self.slopes[0]
+        turn = float(np.abs(np.where(np.isfinite(slope), slope, 0.0)).sum(axis=-1).max()) * self.step
+        return max(1, min(round(WINDOW / self.step), int(WINDOW_TURN / max(turn, 1e-6))))
+
+    # ---- supports ----------------------------------------------------------------------------------------
+
+    @cached_property
+    def gathering(self) -> Gathering:
+        """How a disturbance and a remainder on one piece reach its end."""
+        slope, _, gain = self.slopes
+        response, h, n = self.response, self.step, self.n
+        size_e = np.abs(gain) @ self.d_radius
+        if not self.continuous:
+            generators = gain * self.d_radius
+            loss = np.abs(generators).sum(-1) * 4 * 2.0**-53
+            zero = np.zeros((*slope.shape[:2], n, n))
+            return Gathering(centre=zero + np.eye(n), second=zero, first=zero, curve=zero,
+                             generators=np.swapaxes(generators, -1, -2), box=loss, size=size_e)
+        identity = np.eye(n)
+        middle = identity + (h / 2) * slope
+        second = np.maximum(response.deviation - h * np.abs(slope), 0.0) + 4e-16 * response.deviation
+        box = (h * h / 4 * np.abs(slope) + h * second) @ size_e[..., None]
+        generators = h * (middle @ gain) * self.d_radius
+        rounding = 16 * (n + 4) * 2.0**-53 * h * (np.abs(middle) @ size_e[..., None])
+        bend = np.abs(response.drift) + _square(np.abs(slope) + h * np.abs(response.drift))
+        return Gathering(
+            centre=h * middle, second=h * second, first=response.deviation,
+            curve=h * h / 8 * (bend @ (identity + response.deviation)) * _ROUND,
+            generators=np.swapaxes(generators, -1, -2), box=(box + rounding)[..., 0] * _ROUND, size=size_e * _ROUND,
+        )
+
+    @cached_property
+    def moved(self) -> NDArray[np.int64] | None:
+        """States that the remainder or a disturbance moves by more than a rounding error; None for all."""
+        if self.continuous or self.n < _LARGE:
+            return None
+        found = {i for i, _ in self.model.entries} | set(np.flatnonzero((self.slopes[2] != 0).any(axis=(0, 1, 3))))
+        return np.array(sorted(found), dtype=np.int64)
+
+
+def _square(a: Array) -> Array:
+    return np.asarray(a @ a * (1 + 1e-13))

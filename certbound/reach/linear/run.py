@@ -1,0 +1,422 @@
+"""The linear-response engine (Thm K7): nominal + zonotope + exact Gaussian response + proved remainder.
+
+X = p + y + Z + R: y answers the initial set and the disturbance linearly, Z is Gaussian, and R gathers what the
+linearisation leaves over. The event that Z stays within levels along the coordinates that enter nonlinearly costs
+delta_N; on it R obeys an inclusion that `LinearRun.include` guesses and proves. What each constraint then leaves
+to Z is a scalar event, so that P(unsafe) <= delta_N + sum_j P_j (Thm K7').
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.gaussian.response import (
+    ClockEvents,
+    SplitEvents,
+    SteadyEvent,
+    StepEvents,
+    WindowEvents,
+    level_along,
+    log_any_exceedance,
+    log_occupancy,
+    logsumexp,
+    quantile,
+)
+from certbound.problem.systems import ContinuousSystem
+from certbound.reach.linear.inclusion import Supports
+from certbound.reach.linear.linearisation import Linearisation
+from certbound.reach.linear.rows import inner_rows
+from certbound.reach.remainder import sampled_range
+from certbound.reach.sets import Requirement, requirements
+
+__all__ = ["Events", "LinearRun", "Outcome", "correlated"]
+
+Array = NDArray[np.float64]
+Events = StepEvents | ClockEvents | SplitEvents
+_LOG = logging.getLogger(__name__)
+
+_GUESSES = 30
+_PICARD = 12
+_HUGE = 1e6  # times what a row sees of the nominal states, the initial set and the noise: beyond all use
+_ROUNDING = 1e-12  # share of a typical remainder that its guess is widened by, so that it may be 0
+_PADS = (0.15, 0.1, 0.06, 0.04)  # how much wider than the sampled range the first guess is, by effort
+_REPAIRS, _REPAIRED = 4, 0.03  # times that pieces are tried again, each with so much more room
+_WIDER = 0.05  # of the remainder's share in a polytope
+_MARGIN = 2.0  # times that width is what a proof is expected to need
+_OVERLAPPING = -8.0  # from which on constraints that are broken together are counted once
+_LIKELY = -4.0  # log of a probability from which on a product is worth more than a sum
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Outcome:
+    """What one run proved.
+
+    Parameters
+    ----------
+    log_probability : float
+        Natural logarithm of a bound on P(unsafe); 0 when nothing was proved.
+    log_nonlinear : float
+        Logarithm of delta_N.
+    bounds : (ndarray, ndarray), shape (B, N, n), or None
+        The proved enclosure of the remainder beta, None when it fed itself.
+    cell : int
+        The worst cell.
+    logs : tuple of float
+        What every requirement costs there.
+    """
+
+    log_probability: float
+    log_nonlinear: float
+    bounds: tuple[Array, Array] | None
+    cell: int = 0
+    logs: tuple[float, ...] = ()
+
+
+class LinearRun:
+    """One evaluation of the engine: supports of all cells, the inclusion for the remainder, the events.
+
+    Parameters
+    ----------
+    engine : Linearisation
+    asked : bool
+        Whether the constraints' rows are wanted.
+    """
+
+    def __init__(self, engine: Linearisation, *, asked: bool = True) -> None:
+        self.engine = engine
+        self.rows, self.extra = inner_rows(engine)
+        cells = range(len(engine.centres))
+        self.requirements = [requirements(engine.problem, engine.nominal(cell)) if asked else [] for cell in cells]
+        self.supports: list[Supports] = []
+        for cell in cells:
+            nothing = np.zeros((engine.nodes.shape[1] - engine.continuous, 0, engine.n))
+            outer = np.concatenate([nothing, *(r.rows[:, None] for r in self.requirements[cell])], axis=1)
+            inner = self.rows[cell]
+            if not engine.continuous:
+                inner = np.concatenate([inner, np.zeros((1, *inner.shape[1:]))])
+            self.supports.append(Supports(
+                engine.response, engine.gathering.of_cell(cell), cell, np.concatenate([inner, outer], axis=1),
+                np.diag(engine.radii[cell])[engine.radii[cell] > 0], continuous=engine.continuous, outputs=engine.moved,
+            ))
+        self.inner = self.rows.shape[2]
+        self.memory: dict[int, dict[bytes, Any]] = {}
+        self.steps: dict[int, StepEvents] = {}
+        self.kept: dict[float, tuple[Array, list[Events]]] = {}
+        self.spent: dict[float, bool] = {}
+        self.failed_at = 0
+
+    def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+        """Bounds of s = y + Z + R along the inner rows over all pieces: (B N, D)."""
+        n = self.engine.pieces
+        lows, highs = [], []
+        for support, level, (r_lo, r_hi) in zip(self.supports, levels, remainder, strict=True):
+            y = support.y[:n, : self.inner]
+            lows.append(-y - level + r_lo[:n, : self.inner])
+            highs.append(y + level + r_hi[:n, : self.inner])
+        low, high = np.concatenate(lows), np.concatenate(highs)
+        slack = 4e-16 * (np.abs(low) + np.abs(high))
+        return low - slack, high + slack
+
+    def include(self, levels: Array, effort: int) -> tuple[Array, Array] | None:
+        """beta's bounds (B, N, n) that prove themselves, or None (``failed_at`` then names a piece)."""
+        engine = self.engine
+        shape = (len(engine.centres), engine.pieces, engine.n)
+        self.failed_at = engine.pieces - 1
+        # what the proof needs beyond the sampled range
+        least = _ROUNDING * engine.remainder_sizes
+        below = above = engine.model.defect(engine.frame).reshape(shape) * 1.05 + least
+        low, high = np.zeros(shape), np.zeros(shape)
+        for attempt in range(_PICARD):
+            guess = self.guess(levels, (low, high), (below, above), _PADS[effort] if attempt == 0 else 0.02)
+            if guess is None:
+                return None
+            low, high = guess
+            implied = self.deviations(levels, low, high)
+            if implied is None:
+                return None
+            polytope = self._wider(levels, implied)
+            found = self._closed(levels, polytope, guess, effort)
+            if found is None:
+                return None
+            closed, b_low, b_high = found
+            if closed:
+                return b_low, b_high
+            _LOG.debug("inclusion %d: widths %s, beyond the guess by %.3g", attempt, (b_high - b_low).max(
+                axis=(0, 2))[:: max(1, engine.pieces // 8)].round(4), max(np.max(low - b_low), np.max(b_high - high)))
+            sample = self.sampled(polytope)
+            below = np.maximum(1.02 * (sample[0] - b_low), 0.0) + least
+            above = np.maximum(1.02 * (b_high - sample[1]), 0.0) + least
+        return None
+
+    def _closed(
+        self, levels: Array, polytope: tuple[Array, Array], hoped: tuple[Array, Array], effort: int
+    ) -> tuple[bool, Array, Array] | None:
+        """Bounds of beta over a polytope, and whether what they imply lies in it: then they prove themselves.
+
+        Pieces on which it does not are tried again over a larger part. None where a bound is infinite.
+        """
+        engine, shape = self.engine, hoped[0].shape
+        (p_low, p_high), target = polytope, [b.reshape(-1, engine.n) for b in hoped]
+        low, high = (np.zeros(shape).reshape(-1, engine.n) for _ in range(2))
+        again = np.arange(len(p_low))
+        for _ in range(_REPAIRS):
+            found = engine.model.bound(
+                engine.frame, p_low, p_high, self.flat_extra, effort, (target[0], target[1]), again)
+            low[again], high[again] = found[0][again], found[1][again]
+            b_low, b_high = low.reshape(shape), high.reshape(shape)
+            implied = self.deviations(levels, b_low, b_high) if self._all_finite(b_low, b_high) else None
+            if implied is None:
+                return None
+            again = np.flatnonzero(((implied[0] < p_low) | (implied[1] > p_high)).any(axis=1))
+            if not len(again):
+                return True, b_low, b_high
+            if 2 * len(again) > len(p_low):
+                break
+            wider = self._wider(levels, implied)
+            p_low, p_high = p_low.copy(), p_high.copy()
+            p_low[again], p_high[again] = wider[0][again], wider[1][again]
+            room = _REPAIRED * (high - low)
+            target = [low - room, high + room]
+        return False, b_low, b_high
+
+    def _wider(self, levels: Array, implied: tuple[Array, Array]) -> tuple[Array, Array]:
+        """A polytope with the remainder's share enlarged a little: room for bounds that differ a little."""
+        nothing = np.zeros((len(self.supports), self.engine.pieces, self.engine.n))
+        base = self.deviations(levels, nothing, nothing)
+        if base is None:
+            return implied
+        return implied[0] - _WIDER * np.abs(implied[0] - base[0]), implied[1] + _WIDER * np.abs(implied[1] - base[1])
+
+    def guess(
+        self, levels: Array, start: tuple[Array, Array], widening: tuple[Array, Array], share: float
+    ) -> tuple[Array, Array] | None:
+        """The fixed point of the sampled range of beta, widened by ``share`` of itself and by what a proof needed."""
+        low, high = start
+        for _ in range(_GUESSES):
+            polytope = self.deviations(levels, low, high)
+            if polytope is None:
+                return None
+            old = low, high
+            sample = self.sampled(polytope)
+            pad = share * (sample[1] - sample[0])
+            low, high = sample[0] - widening[0] - pad, sample[1] + widening[1] + pad
+            if not self._all_finite(low, high):
+                return None
+            change = max(float(np.max(old[0] - low)), float(np.max(high - old[1])))
+            if change <= 1e-3 * float(np.max(high - low)):
+                break
+        return low, high
+
+    @property
+    def flat_extra(self) -> Array:
+        """The extra rows over the active coordinates, cells and pieces in one batch."""
+        return self.extra.reshape(self.extra.shape[0] * self.extra.shape[1], *self.extra.shape[2:])
+
+    def sampled(self, polytope: tuple[Array, Array]) -> list[Array]:
+        """Range of beta over sample points: two arrays (B, N, n)."""
+        engine = self.engine
+        found = sampled_range(engine.model, engine.frame, *polytope, self.flat_extra)
+        return [b.reshape(len(engine.centres), engine.pieces, engine.n) for b in found]
+
+    def _all_finite(self, low: Array, high: Array) -> bool:
+        """Whether all bounds are finite; if not, ``failed_at`` names the first piece."""
+        finite = np.isfinite(low) & np.isfinite(high)
+        if not finite.all():
+            self.failed_at = int(np.argmax((~finite).any(axis=(0, 2))))
+        return bool(finite.all())
+
+    def deviations(self, levels: Array, low: Array, high: Array) -> tuple[Array, Array] | None:
+        """The polytope that bounds on beta imply, or None where it is beyond all use."""
+        reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(self.supports, low, high, strict=True)]
+        p_low, p_high = self.polytope(levels, reach)
+        with np.errstate(invalid="ignore"):
+            beyond = ~(np.isfinite(p_low) & np.isfinite(p_high)) | (p_high - p_low > self._limit(levels))
+        if beyond.any():
+            self.failed_at = int(np.argmax(beyond.any(axis=1).reshape(len(low), -1).any(axis=0)))
+            return None
+        return p_low, p_high
+
+    def _limit(self, levels: Array) -> Array:
+        """The widest polytope that is of any use, in the units of every row: (B N, D)."""
+        count = self.engine.pieces
+        moved = np.stack([2 * support.y[:count, : self.inner] for support in self.supports]) + 2 * levels
+        size = np.abs(self.rows) @ self.engine.sizes + moved
+        widest = np.broadcast_to(size.max(axis=(0, 1), initial=0.0), (size.shape[0] * count, self.inner))
+        return np.where(widest > 0, _HUGE * widest, np.inf)
+
+    # ---- probabilities -----------------------------------------------------------------------------------
+
+    def events(self, cell: int, shared_log: float) -> Events:
+        """Scalar events of one cell; ``shared_log`` is the log probability that they may share."""
+        engine = self.engine
+        if isinstance(engine.system, ContinuousSystem):
+            windows = WindowEvents(engine.response, cell, engine.window, shared_log)
+            diffusion = engine.diffusion if engine.diffusion.ndim == 2 else engine.diffusion[cell]
+            return ClockEvents(windows, diffusion, self.memory.setdefault(cell, {}))
+        if cell not in self.steps:
+            self.steps[cell] = StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
+        return self.steps[cell]
+
+    def levels(self, log_nonlinear: float) -> tuple[Array, list[Events]]:
+        """Levels of |Z| along the inner rows costing exp(log_nonlinear) together (B, N, D); no events without noise."""
+        if log_nonlinear in self.kept:
+            return self.kept[log_nonlinear]
+        cells, pieces, count = self.rows.shape[:3]
+        result = np.zeros((cells, pieces, count))
+        if not self.engine.noise:
+            return result, []
+        share = log_nonlinear + np.log(0.9 / (2 * max(count, 1)))
+        found = []
+        for cell in range(cells):
+            events = self.events(cell, self._shared(log_nonlinear))
+            found.append(events)
+            for d in range(count):
+                event = events.along(self.rows[cell, :, d])
+                if event.profile.max() > 0:
+                    result[cell, :, d] = level_along(event, share)
+        self.kept[log_nonlinear] = result, found
+        return result, found
+
+    def hopeless(self, log_nonlinear: float) -> bool:
+        """Whether the remainder feeds itself at levels that are too small already (``failed_at`` names a piece).
+
+        Z leaves a level of q standard deviations with probability 2 Q(q) at one time alone, so that all levels that
+        cost exp(log_nonlinear) are larger; in continuous time they are dear, and not asked for where this is enough.
+        """
+        if not (self.engine.continuous and self.engine.noise and len(self.engine.model.active)):
+            return False
+        if log_nonlinear not in self.spent:
+            q = quantile(log_nonlinear - float(np.log(2.0)))
+            v = self.engine.response.covariance[:, 1:]
+            variance = np.einsum("bkdi,bkij,bkdj->bkd", self.rows, v, self.rows)
+            levels = 0.99 * q * np.sqrt(np.maximum(variance, 0.0))
+            nothing = np.zeros((len(levels), self.engine.pieces, self.engine.n))
+            self.spent[log_nonlinear] = self.guess(levels, (nothing, nothing), (nothing, nothing), 0.0) is None
+        return self.spent[log_nonlinear]
+
+    def promise(self, log_nonlinear: float, effort: int) -> float:
+        """What `probability` is likely to find, in logarithms: from a guess of the remainder that is not proved."""
+        shape = (len(self.engine.centres), self.engine.pieces, self.engine.n)
+        if self.hopeless(log_nonlinear):
+            return 0.0
+        levels, events = self.levels(log_nonlinear)
+        nothing = np.zeros(shape), np.zeros(shape)
+        guess = self.guess(levels, nothing, nothing, _MARGIN * _PADS[effort])
+        if guess is None:
+            return 0.0
+        cells = range(len(self.supports))
+        return max(self._cell(cell, guess, events[cell], log_nonlinear).log_probability for cell in cells)
+
+    def probability(self, log_nonlinear: float, effort: int = 2) -> Outcome:
+        """Thm K7' with delta_N = exp(log_nonlinear): the outcome of the worst cell."""
+        if self.hopeless(log_nonlinear):
+            return Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None)
+        levels, events = self.levels(log_nonlinear)
+        bounds = self.include(levels, effort)
+        if bounds is None:
+            return Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None)
+        if not events:  # the noise-free reachable set alone
+            return Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=bounds)
+        outcomes = [self._cell(cell, bounds, events[cell], log_nonlinear) for cell in range(len(self.supports))]
+        return max(outcomes, key=lambda outcome: outcome.log_probability)
+
+    def rooms(self, cell: int, bounds: tuple[Array, Array]) -> Array:
+        """Room that each requirement leaves to Z on each piece: (pieces, requirements), rounded down."""
+        support = self.supports[cell]
+        _, high, _ = support.remainder(bounds[0][cell], bounds[1][cell])
+        used = support.y[:, self.inner :] + high[:, self.inner :]
+        room = np.concatenate([used[:, :0], *(r.room[:, None] for r in self.requirements[cell])], axis=1)
+        with np.errstate(invalid="ignore"):  # where nothing is asked
+            left = room - used - 4e-16 * (np.abs(room) + np.abs(used))
+        return np.asarray(np.where(np.isinf(room), np.inf, left))
+
+    def _cell(self, cell: int, bounds: tuple[Array, Array], events: Events, log_nonlinear: float) -> Outcome:
+        rooms = self.rooms(cell, bounds)
+        shared = log_nonlinear if len(self.engine.model.active) else events.shared_log
+        asked = self.requirements[cell]
+        along = [events.along(r.rows) for r in asked]
+        logs = [event.log_exceedance(rooms[:, i]) for i, event in enumerate(along)]
+        if isinstance(events, StepEvents) and events.gaussian:
+            logs = [self._entered(cell, r, log, bounds) for r, log in zip(asked, logs, strict=True)]
+        total = logsumexp(np.array([shared, *logs]))
+        steady = [event for event in along if isinstance(event, SteadyEvent)]
+        if asked and not len(self.engine.model.active) and len(steady) == len(along):
+            total = min(total, logsumexp(np.array([e.log_unshared(rooms[:, i]) for i, e in enumerate(steady)])))
+        if total > _LIKELY and isinstance(events, StepEvents) and events.gaussian:
+            total = min(total, correlated(events, asked, rooms, shared, logs))
+        if total > _OVERLAPPING and isinstance(events, StepEvents) and events.gaussian and asked:
+            joined = log_any_exceedance(events, [r.rows for r in asked], list(rooms.T))
+            total = min(total, logsumexp(np.array([shared, joined])))
+        return Outcome(
+            log_probability=min(total, 0.0), log_nonlinear=log_nonlinear, bounds=bounds, cell=cell, logs=tuple(logs),
+        )
+
+    def _entered(self, cell: int, asked: Requirement, log: float, bounds: tuple[Array, Array]) -> float:
+        """What a requirement costs, or the time spent in its obstacle, if that is less and the cost is too much."""
+        engine, constraints = self.engine, self.engine.problem.constraints
+        if log <= float(np.log(engine.problem.delta)) or not 0 <= asked.constraint < len(constraints):
+            return log
+        support = self.supports[cell]
+        remainder = support.remainder(bounds[0][cell], bounds[1][cell])[2]
+        return min(log, log_occupancy(
+            constraints[asked.constraint], engine.response, cell, nominal=engine.nodes[cell], moved=support.y_nodes,
+            remainder=remainder, disturbed=bool(np.any(engine.d_radius))))
+
+    def tightest(self, outcome: Outcome) -> tuple[Requirement | None, int, float]:
+        """The requirement with the least room at the problem's delta (shared evenly), its piece, and that room."""
+        if outcome.bounds is None:
+            return None, self.failed_at, -np.inf
+        asked = self.requirements[outcome.cell]
+        if not asked:
+            return None, 0, np.inf
+        rooms = self.rooms(outcome.cell, outcome.bounds)
+        kept = self.kept.get(outcome.log_nonlinear, (None, []))[1]
+        events = kept[outcome.cell] if kept else self.events(outcome.cell, self._shared(outcome.log_nonlinear))
+        target = float(np.log(self.engine.problem.delta / len(asked)))
+        left = np.empty_like(rooms)
+        for index, requirement in enumerate(asked):
+            event = events.along(requirement.rows)
+            left[:, index] = rooms[:, index] - (level_along(event, target) if event.profile.max() > 0 else 0.0)
+        piece, tightest = divmod(int(np.argmin(left)), len(asked))
+        return asked[tightest], piece, float(left[piece, tightest])
+
+    def _shared(self, log_nonlinear: float) -> float:
+        """The log probability that all events share: a tenth of exp(log_nonlinear) if levels take the rest."""
+        return log_nonlinear + float(np.log(0.1 if self.rows.shape[2] else 1.0))
+
+
+def correlated(events: StepEvents, asked: list[Requirement], rooms: Array, shared: float, logs: list[float]) -> float:
+    """Logarithm of the probability of leaving, by the Gaussian correlation inequality.
+
+    Requirements along w and -w with equal rooms keep Z in a symmetric convex set, and so do the levels along the inner
+    rows: the probability of their intersection is at least the product of theirs (Royen, 2014). Requirements
+    without a partner are added by the union bound.
+    """
+    lone = dict(enumerate(asked))
+    if shared > -1e-6:
+        return 0.0
+    stay, rest = np.log1p(-np.exp(shared) * (1 + 1e-14)), []
+    for i, requirement in enumerate(asked):
+        partner = next((j for j in lone if j > i and np.array_equal(asked[j].rows, -requirement.rows)), None)
+        if i not in lone:
+            continue
+        del lone[i]
+        if partner is None:
+            rest.append(logs[i])
+            continue
+        del lone[partner]
+        room = np.minimum(rooms[:, i], rooms[:, partner])
+        both = np.log(2.0) + events.along(requirement.rows).log_exceedance(room)
+        if both > logsumexp(np.array([logs[i], logs[partner], np.log(1e-3)])):
+            rest += [logs[i], logs[partner]]
+        elif both > -1e-6:  # next to nothing is left, and its logarithm is lost in rounding
+            return 0.0
+        else:
+            stay += np.log1p(-np.exp(both) * (1 + 1e-14))
+    stay = stay * (1 + 1e-12) - 1e-300
+    return logsumexp(np.array([np.log(-np.expm1(stay)) + 1e-14, *rest]))

@@ -1,0 +1,195 @@
+"""What the linear response leaves over: rigorous bounds of the remainder beta of Thm K7.
+
+On a piece with nominal curve p and slope Jhat(t) = J_m + (t - t_m) K,
+
+    beta = f(t, p + s, d) - p' - Jhat s - E (d - d0),
+
+over s in a polytope. The polytope is cut into boxes of the coordinates that enter the dynamics nonlinearly; on each
+box beta is expanded to second order (`certbound.reach.remainder.expansion`), and boxes that reach beyond what is asked
+for are cut further. Coordinates that no second derivative couples are handled side by side.
+
+Symbols: H second derivatives of f, J first ones; Thm K7 and "Bounding beta" of docs/theory.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.constants.enclosures import enclose
+from certbound.problem.model import adds_plainly, selected
+from certbound.reach.remainder.derivatives import Derivatives
+from certbound.reach.remainder.expansion import Expansion, Parts
+from certbound.reach.remainder.frame import Frame
+from certbound.reach.remainder.polytope import cull, grid, halve
+from certbound.rigor.intervals import Interval
+
+__all__ = ["Remainder"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Target = tuple[Array, Array]
+
+_GRID = {1: 16, 2: 6, 3: 4}
+_MOST = 300  # boxes per piece that one round may cut
+_STALLED = 0.995  # cutting a box must make it exceed less
+_EFFORT = ((0, np.inf), (8, 0.5), (12, 0.2), (20, 0.08))  # rounds of bisection, tolerated excess over the range
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder(Derivatives):
+    """Bounds of beta over pieces of time; ``recent`` keeps the expansions of the last frame."""
+
+    recent: list[tuple[Frame, Expansion]] = field(init=False, default_factory=list)
+
+    def bound(
+        self, frame: Frame, low: Array, high: Array, rows: Array, effort: int = 2, target: Target | None = None,
+        only: Indices | None = None,
+    ) -> tuple[Array, Array]:
+        """Enclosure of beta over every piece of ``frame``.
+
+        Parameters
+        ----------
+        low, high : ndarray, shape (M, D)
+            Bounds of s along the active coordinates (first) and along ``rows``.
+        rows : ndarray, shape (M, D - active, active)
+            Further directions, over the active coordinates.
+        effort : int
+            0 (one grid of boxes) to 3 (the boxes that matter are cut in many rounds).
+        target : (ndarray, ndarray), shape (M, n), optional
+            Bounds hoped for: boxes are cut no further than it takes to prove them.
+        only : ndarray of int, optional
+            The pieces asked for; what is returned for the others means nothing.
+
+        Returns
+        -------
+        lower, upper : ndarray, shape (M, n)
+            Infinite where the dynamics is not defined on the whole polytope.
+        """
+        m, count = len(frame), len(self.active)
+        expansion = self._expansion(frame)
+        extra = self._disturbance(frame, low[:, :count], high[:, :count]) if self.gain is not None else None
+        if target is not None and extra is not None:
+            target = target[0] - extra.lo, target[1] - extra.hi
+        if len(self.blocks) == 1:
+            lower, upper = self._group(expansion, self.blocks[0], low, high, rows, effort, target, only)
+        else:
+            origin = np.zeros((m, count))
+            base = Interval(*expansion.plain_range(expansion.boxes(np.arange(m), origin, origin), origin))
+            total = base
+            for group in self.blocks:
+                total = total + (Interval(*self._group(expansion, group, low, high, rows, effort, None, only)) - base)
+            lower, upper = total.lo, total.hi
+        if extra is not None:
+            total = Interval(lower, upper) + extra
+            lower, upper = total.lo, total.hi
+        return lower, upper
+
+    def defect(self, frame: Frame) -> Array:
+        """What no cutting of boxes takes off a bound of beta, on either side: its motion over the piece, (M, n)."""
+        origin = np.zeros((len(frame), len(self.active)))
+        expansion = self._expansion(frame)
+        lower, upper = expansion.plain_range(expansion.boxes(np.arange(len(frame)), origin, origin), origin)
+        return np.nan_to_num((upper - lower) / 2, nan=0.0, posinf=0.0)
+
+    def _expansion(self, frame: Frame) -> Expansion:
+        """The expansions over ``frame``; those of the last frame are kept."""
+        if not self.recent or self.recent[0][0] is not frame:
+            self.recent[:] = [(frame, Expansion(self, frame))]
+        return self.recent[0][1]
+
+    def _disturbance(self, frame: Frame, low: Array, high: Array) -> Interval:
+        """(D_d f - E)(d - d0) over the whole polytope's box."""
+        n, q = frame.spread.shape[1], len(frame.disturbance_middle)
+        assert self.gain is not None
+        if adds_plainly(self.value, self.gain, q):
+            point = [Interval.point(np.zeros(1))] * len(self.value.inputs)
+            gain = enclose(selected(self.gain, list(range(n * q)), None), point).reshape(1, n, q)
+        else:
+            shift, size = np.zeros(frame.spread.shape), frame.spread.copy()
+            shift[:, self.active] = (low + high) / 2
+            size[:, self.active] += (high - low) / 2 * (1 + 1e-12) + 1e-15 * (np.abs(low) + np.abs(high)) + 1e-300
+            size = size * (1 + 1e-15)
+            state = frame.middle + shift + Interval(-size, size)
+            widths = (frame.disturbance_low, frame.disturbance_high)
+            slots = self.slots(frame.span, state, frame.inputs, frame.disturbance_middle, widths)
+            gain = enclose(self.gain, slots, undefined="infinite").broadcast_to((len(frame), n, q))
+        reach = Interval(frame.disturbance_low, frame.disturbance_high) - frame.disturbance_middle
+        return ((gain - frame.input_gain) * reach[None, None, :]).sum(axis=-1)
+
+    def _group(
+        self, expansion: Expansion, group: list[list[int]], low: Array, high: Array, rows: Array, effort: int,
+        target: Target | None, only: Indices | None,
+    ) -> tuple[Array, Array]:
+        """Bounds over the boxes of one group of blocks, displaced together."""
+        m, count, n = len(low), len(self.active), expansion.frame.spread.shape[1]
+        size, alone = len(group[0]), len(group) == 1
+        divisions = _GRID.get(size, 2 if size <= 8 else 1)
+        each = divisions**size
+        items = np.repeat(np.arange(m), each)
+        centre, radius = np.zeros((m, each, count)), np.zeros((m, each, count))
+        for block in group:
+            centre[..., block], radius[..., block] = grid(low[:, :count], high[:, :count], block, divisions)
+        centre, radius = centre.reshape(-1, count), radius.reshape(-1, count)
+        if only is not None:
+            chosen = np.isin(items, only)
+            items, centre, radius = items[chosen], centre[chosen], radius[chosen]
+        lower, upper = np.full((m, n), np.inf), np.full((m, n), -np.inf)
+        inner_lo, inner_hi = lower.copy(), upper.copy()
+        rounds, tolerance = _EFFORT[effort]
+        bound = (low[:, count:], high[:, count:], rows)
+        curbed = alone and rows.shape[1] > 0
+        before = np.full(len(items), np.inf)  # by how much the box that a box was cut from exceeded
+        for step in range(rounds + 1):
+            inside = np.ones(len(items), dtype=bool)
+            if curbed:
+                keep, inside = cull(items, centre, radius, *bound)
+                items, centre, radius, inside = items[keep], centre[keep], radius[keep], inside[keep]
+                before = before[keep]
+            if not len(items):
+                break
+            parts = expansion.boxes(items, centre, radius)
+            if curbed:
+                lo, hi = expansion.polytope_range(items, parts, centre, radius, *bound)
+            else:
+                lo, hi = expansion.plain_range(parts, radius)
+            np.fmax.at(inner_hi, items[inside], parts.middle[inside])
+            np.fmin.at(inner_lo, items[inside], parts.middle[inside])
+            if step == rounds or not alone or size > 6:
+                excess = np.full((len(items), n), -np.inf)
+            elif target is None:
+                span = np.maximum(inner_hi - inner_lo, 1e-300)[items]
+                excess = np.maximum(hi - inner_hi[items], inner_lo[items] - lo) / span - tolerance
+            else:
+                span = np.maximum(target[1] - target[0], 1e-300)[items]
+                excess = np.maximum(hi - target[1][items], target[0][items] - lo) / span
+            excess = np.where(np.isfinite(excess) | (excess < 0), excess, np.inf)
+            largest = excess.max(axis=1)
+            worst = (largest > 0) & ((largest < _STALLED * before) | np.isinf(before))
+            if worst.sum() > _MOST * m:
+                worst &= largest > np.partition(largest, -_MOST * m)[-_MOST * m]
+            done = ~worst
+            np.minimum.at(lower, items[done], lo[done])
+            np.maximum.at(upper, items[done], hi[done])
+            if not worst.any():
+                break
+            along = _costliest(expansion, parts, radius, excess)[worst]
+            items, centre, radius = halve(items[worst], centre[worst], radius[worst], along)
+            before = np.tile(largest[worst], 2)
+        # a polytope without any box left is empty: nothing can leave it, and 0 stands for the empty set
+        empty = lower > upper
+        return np.where(empty, 0.0, lower), np.where(empty, 0.0, upper)
+
+
+def _costliest(expansion: Expansion, parts: Parts, radius: Array, excess: Array) -> Indices:
+    """The coordinate of every box whose width costs most in the output that exceeds most."""
+    worst = np.argmax(excess, axis=1)
+    number = np.arange(len(radius))
+    cost = np.where(np.isfinite(parts.spend[number, worst]), parts.spend[number, worst], 0.0)
+    for entry, (i, a) in enumerate(expansion.entries):
+        linear = (0.25 * np.abs(parts.gradient[:, entry]) + parts.blur[:, entry]) * radius[:, a]
+        cost[:, a] += np.where((worst == i) & np.isfinite(linear), linear, 0.0)
+    usable = radius > 0
+    return np.asarray(np.argmax(np.where(usable, np.where(parts.bad[:, None], radius, cost), -1.0), axis=1))

@@ -1,0 +1,230 @@
+"""Constraints as one-sided requirements on linear functionals, piece by piece.
+
+A safe set {a . x <= b} asks a . S <= b - a . p of the deviation S from the nominal curve p; a convex obstacle is
+kept off by the direction that separates it from the nominal piece; a round safe set is replaced by a polygon
+inside it. Every room below is a proved lower bound over the whole piece.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.constants.enclosures import enclose
+from certbound.problem.model import Tape
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
+from certbound.reach.sets.separation import polyhedral_weights
+from certbound.rigor.definite import is_positive_definite
+from certbound.rigor.intervals import Interval
+
+__all__ = ["NominalPieces", "Requirement", "requirements"]
+
+Array = NDArray[np.float64]
+
+_POLYGON = 24
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NominalPieces:
+    """A nominal curve, piece by piece: every p_t of a piece lies in the convex hull of its control points.
+
+    Parameters
+    ----------
+    times : ndarray, shape (N + 1,) in continuous time, (N,) steps in discrete time
+    controls : ndarray, shape (N, C, n)
+    continuous : bool
+    covariance : ndarray, shape (N, n, n), optional
+        About that of the deviation: where an obstacle is a corner, it decides how its faces are mixed.
+    extent : ndarray, shape (N, n), optional
+        About how far the state lies from the curve without noise.
+    """
+
+    times: Array
+    controls: Array
+    continuous: bool
+    covariance: Array | None = None
+    extent: Array | None = None
+
+    @property
+    def pieces(self) -> int:
+        """Number of pieces (continuous time) or of time steps, the first and the last included."""
+        return len(self.controls)
+
+    def span(self) -> Interval:
+        """The time interval of every piece."""
+        if self.continuous:
+            slip = 1e-15 * float(self.times[-1])  # the nodes are floats near k h
+            return Interval(self.times[:-1] - slip, self.times[1:] + slip)
+        return Interval.point(self.times)
+
+    def required(self, during: tuple[float, float] | None) -> NDArray[np.bool_]:
+        """Pieces that meet the time window ``during``."""
+        span = self.span()
+        if during is None:
+            return np.ones(self.pieces, dtype=bool)
+        return np.asarray((span.hi >= during[0]) & (span.lo <= during[1]))
+
+    def least(self, rows: Array, offset: Interval) -> Array:
+        """Lower bound over each piece of offset - rows . p (rows of shape (N, n))."""
+        value = (Interval.point(rows)[:, None, :] * self.controls).sum(axis=-1)
+        return (offset - Interval(value.lo.max(axis=1), value.hi.max(axis=1))).lo
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Requirement:
+    """rows[k] . S_t <= room[k] on piece k keeps constraint number ``constraint`` (room is inf where not asked)."""
+
+    label: str
+    constraint: int
+    rows: Array
+    room: Array
+
+
+def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
+    """Every constraint of the problem (its domain last, numbered -1) as requirements along ``curve``."""
+    found = []
+    for number, constraint in enumerate(problem.safe):
+        needed = curve.required(constraint.during)
+        for label, rows, room in _constraint(constraint, curve):
+            found.append(Requirement(
+                label=label, constraint=number, rows=rows, room=np.where(needed, room, np.inf)
+            ))
+    if problem.domain is not None:
+        for label, rows, room in _constraint(Inside(problem.domain, label="the model's domain"), curve):
+            found.append(Requirement(label=label, constraint=-1, rows=rows, room=room))
+    return found
+
+
+Rows = Iterator[tuple[str, Array, Array]]
+
+
+def _constraint(constraint: Inside, curve: NominalPieces) -> Rows:
+    region, label = constraint.region, str(constraint.label)
+    if not isinstance(constraint, Outside):
+        if isinstance(region, Ball | Ellipsoid):
+            yield from _inside_round(region, label, curve)
+            return
+        a, b = _facets(region, curve)
+        for index in range(len(a)):
+            rows = np.broadcast_to(a[index], (curve.pieces, a.shape[1])).copy()
+            text = label if len(a) == 1 else f"{label} [side {index + 1}]"
+            yield text, rows, curve.least(rows, b[:, index])
+    elif isinstance(region, HalfSpace):
+        rows = np.broadcast_to(-region.normal, (curve.pieces, len(region.normal))).copy()
+        yield label, rows, curve.least(rows, Interval.point(np.full(curve.pieces, -region.bound)))
+    elif isinstance(region, Box | Polytope):
+        yield _outside_facet(region, label, curve)
+    else:
+        yield _outside_round(region, label, curve)
+
+
+def _outside_facet(region: Box | Polytope, label: str, curve: NominalPieces) -> tuple[str, Array, Array]:
+    """The facet that the piece keeps farthest away from; for a box a mixture of facets, weighed by the noise."""
+    a, b = _facets(region, curve)
+    if not len(a):
+        raise ValueError(f"`safe` must not keep outside all states ({label}); give the box a finite side.")
+    norms = np.linalg.norm(a, axis=1)
+    middle = curve.controls.mean(axis=1)
+    best = np.argmax((middle @ a.T - b.mid) / norms, axis=1)
+    rows = -a[best]
+    if isinstance(region, Box) and curve.covariance is not None and len(a) > 1:
+        taken = 0.0 if curve.extent is None else curve.extent @ np.abs(a).T
+        mixed = _mixed(middle, a, b.mid + taken, curve.covariance)
+        rows = np.where(np.isfinite(mixed).all(axis=1, keepdims=True), mixed, rows)
+    weights = np.maximum(-rows @ a.T, 0.0) if isinstance(region, Box) else np.eye(len(a))[best]
+    return label, rows, curve.least(rows, -(b * weights).sum(axis=1))
+
+
+def _mixed(points: Array, faces: Array, bounds: Array, covariance: Array) -> Array:
+    """Rows (N, n) that keep off a box's corner with the most standard deviations to spare.
+
+    Every face reads one state, so that a row tells the weight of each face without rounding.
+    """
+    size = np.trace(covariance, axis1=1, axis2=2)[:, None, None]
+    spread = covariance + (1e-9 * size + 1e-280) * np.eye(covariance.shape[1])
+    scores, options = [], []
+    with np.errstate(all="ignore"):
+        for weights in polyhedral_weights(points, faces, bounds, spread):
+            row = weights @ faces
+            deviation = np.sqrt(np.einsum("ki,kij,kj->k", row, spread, row))
+            scores.append(np.sum(weights * (points @ faces.T - bounds), axis=1) / deviation)
+            options.append(-row)
+    best = np.nanargmax(np.where(np.isfinite(scores), scores, -1e300), axis=0)
+    return np.asarray(np.stack(options)[best, np.arange(len(points))])
+
+
+def _facets(region: Box | HalfSpace | Polytope, curve: NominalPieces) -> tuple[Array, Interval]:
+    """Rows (F, n) over all states and bounds (N, F) with the set equal to {rows . x <= bounds} on every piece."""
+    a, b = region.halfspaces()
+    rows = _embed(region, a, curve.controls.shape[2])
+    bounds = Interval.point(np.broadcast_to(b, (curve.pieces, len(b))))
+    if region.center is None:
+        return rows, bounds
+    centre = _centre(region, curve)
+    return rows, bounds + (Interval.point(a)[None] * centre[:, None, :]).sum(axis=-1)
+
+
+def _centre(region: Ball | Ellipsoid | Box | HalfSpace | Polytope, curve: NominalPieces) -> Interval:
+    """Enclosure of the centre over each piece: shape (N, k)."""
+    if isinstance(region.center, Tape):
+        values = enclose(region.center, [curve.span()])
+        return values.broadcast_to((curve.pieces, values.shape[-1]))
+    return Interval.point(np.broadcast_to(region.center_at(), (curve.pieces, region.dimension)))
+
+
+def _embed(region: Ball | Ellipsoid | Box | HalfSpace | Polytope, rows: Array, dimension: int) -> Array:
+    coordinates = range(dimension) if region.coordinates is None else region.coordinates
+    full = np.zeros((len(rows), dimension))
+    full[:, list(coordinates)] = rows
+    return full
+
+
+def _outside_round(region: Ball | Ellipsoid, label: str, curve: NominalPieces) -> tuple[str, Array, Array]:
+    """Separation by the direction from the centre (for an ellipsoid: the normal of its level set)."""
+    centre = _centre(region, curve)
+    coordinates = list(range(curve.controls.shape[2]) if region.coordinates is None else region.coordinates)
+    offset = curve.controls.mean(axis=1)[:, coordinates] - centre.mid
+    normal = np.linalg.solve(region.shape, offset.T).T if isinstance(region, Ellipsoid) else offset
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.where(length > 0, normal / np.maximum(length, 1e-300), np.eye(len(coordinates))[0])
+    direction = Interval.point(normal)
+    if isinstance(region, Ellipsoid):
+        square = ((direction[:, :, None] * region.shape[None]).sum(axis=1) * direction).sum(axis=-1)
+        support = Interval(np.zeros(len(square)), np.sqrt(np.maximum(square.hi, 0)) * (1 + 1e-15))
+    else:
+        square = (direction * direction).sum(axis=-1)
+        support = region.radius * Interval(np.zeros(len(square)), np.sqrt(square.hi) * (1 + 1e-15))
+    offset_bound = -((direction * centre).sum(axis=-1) + Interval(support.hi, support.hi))
+    rows = _embed(region, -normal, curve.controls.shape[2])
+    return label, rows, curve.least(rows, offset_bound)
+
+
+def _inside_round(region: Ball | Ellipsoid, label: str, curve: NominalPieces) -> Rows:
+    """A polygon (in one dimension an interval, beyond two a cross-polytope's dual) inside the round set."""
+    centre = _centre(region, curve)
+    k = centre.shape[-1]
+    if k == 1:
+        directions, scale = np.array([[1.0], [-1.0]]), 1.0
+    elif k == 2:
+        angles = 2 * np.pi * np.arange(_POLYGON) / _POLYGON
+        directions, scale = np.stack([np.cos(angles), np.sin(angles)], 1), np.cos(np.pi / _POLYGON) * (1 - 1e-9)
+    else:
+        directions, scale = np.concatenate([np.eye(k), -np.eye(k)]), (1 - 1e-12) / np.sqrt(k)
+    if isinstance(region, Ellipsoid):
+        matrix = np.linalg.inv(np.linalg.cholesky(region.shape))
+        scale *= 1 - 1e-9
+        image = Interval.point(matrix) @ Interval.point(region.shape) @ Interval.point(matrix.T)
+        if not bool(np.all(is_positive_definite(image - (1 - 1e-9) ** 2 * np.eye(k)))):
+            raise ValueError(f"`shape` of {label} is too badly conditioned; rescale the states.")
+        directions, radius = directions @ matrix, 1.0
+    else:
+        radius = region.radius
+    for index, direction in enumerate(directions):
+        rows = np.broadcast_to(direction, (curve.pieces, k))
+        offset = (Interval.point(rows) * centre).sum(axis=-1) + float(radius * scale)
+        full = _embed(region, rows, curve.controls.shape[2])
+        yield f"{label} [direction {index + 1}]", full, curve.least(full, offset)

@@ -1,0 +1,222 @@
+"""The constants proof as data: metric, constants, nominal curves, defects, radii, rooms, Kummer parameters (Thm K2).
+
+Every stated number has a little room, so that the checker's own enclosures need not be the same as the prover's. The
+stated probability is Thm K2's for exactly these numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.errors import CertificateError
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Ball, Ellipsoid, Inside, Region
+from certbound.reach.contraction import bound_forcing, integrate_radius, jump_sizes, random_start
+from certbound.reach.nominal import Curve, Flow, initial_cells
+from certbound.reach.sets import ReachTube, polyhedral_weights, round_directions
+from certbound.rigor.norms import Norm
+from certbound.safety.answers import EngineAnswer
+from certbound.safety.certificates.parts import Proof, exact, needs_direction
+from certbound.safety.engines import Erosion, erode, joined
+from certbound.tubes.constants import Constants
+from certbound.tubes.kummer import Search, Start, exit_level
+from certbound.tubes.objective import Clearance, Objective, read_clearance
+from certbound.tubes.schedule import Schedule, make_schedule
+
+__all__ = ["STATED", "constants_proof"]
+
+STATED = "the stated constants hold"
+"""The assumption as a certificate names it; the checker derives which constants those are."""
+
+Array = NDArray[np.float64]
+
+_TINY = (1e-7, 1e-5, 1e-3)
+_ROOM = (1e-3, 0.1, 3.0)
+_SLACK = 0.005
+
+
+def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
+    """The proof's data, the claimed log10 of the probability, and the assumptions it rests on.
+
+    Raises
+    ------
+    CertificateError
+        If the constants are local, or leave no room once they have been rounded for the checker.
+    """
+    given = answer.constants
+    if given is None:
+        raise CertificateError("no constants were found.")
+    if given.times is not None:
+        raise CertificateError("constants along a tube are not stated in certificates; use --method linear.")
+    effort = min(attempt, len(_TINY) - 1)
+    slack = _TINY[effort]
+    start = random_start(problem, given)
+    if start != Start():
+        given = given.with_full_dimension()
+    constants = _rounded(given, slack)
+    flow = Flow(problem)
+    reach = answer.reach
+    if reach is None:
+        raise CertificateError("there is no reach tube.")
+    curve = reach.curve
+    norm = Norm(flow.dimension, constants.metric)
+    cells = initial_cells(problem, _cells_along(curve))
+    eta = bound_forcing(flow, curve, norm) * (1 + _ROOM[effort]) + _smallest(curve, norm, answer) * slack
+    slope = float(np.max(np.asarray(constants.rate if constants.rate is not None else constants.gain, dtype=float)))
+    rho = cells.radii(norm, curve.initial())
+    slopes = np.full(curve.pieces, slope)
+    radius, _ = integrate_radius(curve, jump_sizes(curve, norm), rho, slopes, eta)
+    radius = radius * (1 + 10 * slack) + 1e-300
+    tube = ReachTube(curve=curve, radius=radius, metric=constants.metric)
+    erosion = erode(tube, problem, norm)
+    rooms = np.where(np.isfinite(erosion.least), erosion.least * (1 - 10 * slack), np.inf)
+    if np.any(rooms[0 if flow.continuous else 1 :] <= 0):
+        raise CertificateError("the reach tube leaves no room once its numbers have been rounded for the checker.")
+    log10, kummer = _search(constants, _with_rooms(erosion, rooms), flow.horizon, start)
+    log10 += _SLACK * (1 + 0.1 * abs(log10))
+    data = {
+        "engine": "constants",
+        "assumed": not given.certified,
+        "metric": None if constants.metric is None else exact(constants.metric),
+        "region": "everywhere" if problem.domain is None else "domain",
+        "times": exact(np.append(curve.starts, curve.ends[-1])) if flow.continuous else None,
+        "middles": exact(curve.middles) if flow.continuous else None,
+        "rate": exact(slope),
+        "sigma": exact(float(np.max(constants.sigma))),
+        "nu": exact(float(constants.nu)),
+        "start_sigma": exact(float(start.sigma)),
+        "splits": exact(_edges(cells.boxes.lo, cells.boxes.hi)),
+        "rooms": [None if not np.isfinite(room) else exact(float(room)) for room in rooms],
+        "kummer": kummer,
+        "cells": [
+            {
+                "nominal": exact(curve.coefficients[cell]),
+                "eta": exact(eta[cell] if flow.continuous else eta[cell][: curve.pieces - 1]),
+                "radius": exact(radius[cell]),
+                "separations": _separations(problem, curve, norm, cell),
+            }
+            for cell in range(curve.cells)
+        ],
+    }
+    return data, min(log10, 0.0), [] if given.certified else [STATED]
+
+
+def _rounded(given: Constants, slack: float) -> Constants:
+    """Slightly larger constants: strict inequalities are what a positive-definiteness test can prove."""
+    rate = gain = None
+    if given.rate is not None:
+        largest = float(np.max(given.rate))
+        rate = largest + slack * (1e-3 + abs(largest))
+    else:
+        gain = float(np.max(np.asarray(given.gain, dtype=float))) * (1 + slack)
+    return Constants(
+        rate=rate,
+        gain=gain,
+        sigma=float(np.max(given.sigma)) * (1 + slack),
+        dimension=given.dimension,
+        effective_dimension=given.effective_dimension,
+        metric=given.metric,
+        gaussian=given.gaussian,
+    )
+
+
+def _smallest(curve: Curve, norm: Norm, answer: EngineAnswer) -> float:
+    """A unit for what is nearly 0: the size of the nominal states and of the deviation from them."""
+    deviation = 0.0 if answer.deviation is None else float(np.max(answer.deviation.radius, initial=0.0))
+    return 1e-3 * float(np.max(norm.dual(np.eye(curve.dimension)))) * (
+        float(np.abs(curve.coefficients[..., 0, :]).max()) + deviation or 1.0
+    )
+
+
+def _cells_along(curve: Curve) -> int:
+    first = curve.coefficients[:, 0, 0]
+    return max(len(np.unique(first[:, j])) for j in range(curve.dimension))
+
+
+def _edges(low: Array, high: Array) -> list[list[float]]:
+    """Edges of the cells along every state."""
+    result = []
+    for j in range(low.shape[1]):
+        inner = np.unique(low[:, j])[1:]
+        result.append([float(low[:, j].min()), *inner.tolist(), float(high[:, j].max())])
+    return result
+
+
+def _with_rooms(erosion: Erosion, rooms: Array) -> Erosion:
+    return Erosion(
+        labels=("all",), continuous=erosion.continuous, starts=erosion.starts, ends=erosion.ends, radius=rooms[None],
+        factor=np.ones((1, len(rooms))),
+    )  # fmt: skip
+
+
+def _search(constants: Constants, erosion: Erosion, horizon: float, start: Start) -> tuple[float, dict[str, Any]]:
+    """log10 of Thm K2's bound at the best parameters found, and these parameters."""
+    profile = joined(erosion.profile(random_start=start != Start()), 1e-9)
+    if not np.any(np.isfinite(profile[1])):
+        return -1e12, {"form": "kummer", "a": exact(1.0), "v0": exact(1.0)}
+    schedule = make_schedule(constants, horizon)
+    held = read_clearance(profile, horizon, continuous=schedule.continuous)
+    cut = schedule.refined(held.ends(schedule))
+    best, chosen = 0.0, None
+    for bessel, a, v0 in _candidates(cut, held, start):
+        level = exit_level(cut, held, a=a, v0=v0, bessel=bessel, start=start)
+        if level < best:
+            best, chosen = level, (bessel, a, v0 * schedule.unit**2)
+    if chosen is None:
+        raise CertificateError("Thm K2 bounds nothing for the rounded constants.")
+    bessel, a, v0 = chosen
+    # in the Bessel form a belongs to squares in units of `unit`, as v0 does: a z is the same number
+    return best, {"form": "bessel" if bessel else "kummer", "a": exact(float(a)), "v0": exact(float(v0))}
+
+
+def _candidates(cut: Schedule, held: Clearance, start: Start) -> Iterator[tuple[bool, float, float]]:
+    """Parameters to try: what a search finds, and a coarse grid in case it loses its way."""
+    graded = cut.graded(6)
+    weights = Objective(None, "scale", held).weights(graded)
+    for bessel in (False, True) if np.max(cut.rates) >= 0 and cut.any_power else (False,):
+        a, v0 = Search(schedule=graded, kind="probability", weights=weights, bessel=bessel, start=start).solve()
+        yield bessel, a, v0
+    limit = math.inf if cut.any_power else cut.nu / 2 * (1 - 1e-9)
+    scale = float(np.max(np.where(np.isfinite(cut.nodes[1]), cut.nodes[1], 0.0))) or 1.0
+    for power in sorted({min(power, limit) for power in (0.4, 5.0, 50.0)}):
+        for ratio in 10.0 ** np.arange(-3.0, 3.1, 0.5):
+            yield False, power, float(ratio * scale)
+
+
+def _separations(problem: Problem, curve: Curve, norm: Norm, cell: int) -> list[Any]:
+    """For every obstacle the direction with the most room in the metric; null for other constraints."""
+    points = curve.coefficients[cell, :, 0]
+    found = [
+        _separation(constraint, points, curve, norm) if needs_direction(constraint) else None
+        for constraint in problem.safe
+    ]
+    return found if problem.domain is None else [*found, None]
+
+
+def _separation(constraint: Inside, points: Array, curve: Curve, norm: Norm) -> Any:
+    region: Region = constraint.region
+    states = list(range(points.shape[1]) if region.coordinates is None else region.coordinates)
+    centres = np.array([region.center_at(float(t)) for t in curve.middles])
+    offsets = points[:, states] - centres
+    matrices = [norm.shape[np.ix_(states, states)], np.eye(len(states))]
+    if isinstance(region, (Ball, Ellipsoid)):
+        shape = region.shape if isinstance(region, Ellipsoid) else float(region.radius) ** 2 * np.eye(len(states))
+        options = [round_directions(offsets, shape, m) for m in matrices]
+        rooms = [_room(a, offsets, np.sqrt(np.einsum("ki,ij,kj->k", a, shape, a)), matrices[0]) for a in options]
+        return exact(np.array(options)[np.argmax(rooms, axis=0), np.arange(len(offsets))])
+    faces, bounds = region.halfspaces()
+    options = [w for m in matrices for w in polyhedral_weights(offsets, faces, bounds, m)]
+    rooms = [_room(w @ faces, offsets, w @ bounds, matrices[0]) for w in options]
+    best = np.argmax(rooms, axis=0)
+    return exact(np.array(options)[best, np.arange(len(offsets))])
+
+
+def _room(rows: Array, offsets: Array, heights: Array, inverse: Array) -> Array:
+    """(a . offset - height)/|a|_P* for one row a a piece."""
+    length = np.sqrt(np.einsum("ki,ij,kj->k", rows, inverse, rows))
+    return np.asarray(((rows * offsets).sum(axis=1) - heights) / np.maximum(length, 1e-300))

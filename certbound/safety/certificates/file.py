@@ -1,0 +1,250 @@
+"""Certificates: a proof as data, for a program that shares nothing with the one that found it.
+
+The file holds the problem (model tape, sets, noise, horizon, delta), the claimed probability and the numbers that
+prove it; every number is exact (hexadecimal). `certbound.checker` proves the claim again from the file alone. Its
+schema is docs/certificate.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from certbound.errors import CertificateError
+from certbound.problem.model import Tape
+from certbound.problem.noise import Law, check_law
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, HalfSpace, Outside, Polytope
+from certbound.problem.systems import ContinuousSystem
+from certbound.safety.answers import Answered, EngineAnswer, is_at_most
+from certbound.safety.certificates.parts import Proof, exact
+
+__all__ = ["FORMAT", "VERSION", "certificate_data", "certificate_text", "problem_data", "restated"]
+
+FORMAT = "certbound certificate"
+VERSION = 1
+_ROUNDING = 1e-6  # other versions of the ball arithmetic may round otherwise
+
+def certificate_text(problem: Problem, verdict: Answered, *, attempt: int = 0) -> str:
+    """The certificate of a verdict as the text of a JSON file; see `certificate_data`."""
+    return json.dumps(certificate_data(problem, verdict, attempt=attempt), separators=(",", ":")) + "\n"
+
+
+def restated(text: str, log10_proved: float) -> str:
+    """The certificate claiming what the checker proved of it, where that is less than it claimed.
+
+    The writer leaves itself room, and its own bounds of the events are coarser in places than the checker's.
+    """
+    data = json.loads(text)
+    claimed = float.fromhex(data["claim"]["log10_delta"])
+    proved = log10_proved + _ROUNDING * (1.0 + abs(log10_proved))
+    if not proved < claimed:
+        return text
+    data["claim"]["log10_delta"] = exact(proved)
+    return json.dumps(data, separators=(",", ":")) + "\n"
+
+
+def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -> dict[str, Any]:
+    """The certificate of a verdict: P(some constraint is broken) <= 10**claim, with what proves it.
+
+    The claim rests on inequalities that the checker knows, and may be weaker than the verdict's ``log10_delta``. Where
+    it would be weaker than SAFE, other engines are tried.
+
+    Parameters
+    ----------
+    problem : Problem
+    verdict : Verdict
+        Of this problem.
+    attempt : int
+        0, 1, ...: how much effort to spend (finer pieces, wider boxes).
+
+    Raises
+    ------
+    CertificateError
+        If the verdict bounds no probability, or no proof of it can be stated.
+    """
+    refusals: list[str] = []
+    best: tuple[str, Proof] | None = None
+    for name, answer in _answers(problem, verdict):
+        try:
+            found = _writer(name)(problem, answer, attempt)
+        except CertificateError as error:
+            refusals.append(f"{name}: {error}")
+            continue
+        if best is None or found[1] < best[1][1]:
+            best = name, found
+        if verdict.status != "SAFE" or is_at_most(min(best[1][1], 0.0), problem.delta):
+            break
+    if best is not None:
+        name, (proof, log10, assumptions) = best
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "claim": {"log10_delta": exact(min(log10, 0.0)), "method": name, "assumptions": assumptions},
+            "problem": problem_data(problem),
+            "proof": proof,
+        }
+    why = " ".join(refusals) or verdict.reason
+    raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
+
+
+def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineAnswer]]:
+    """Engines that bounded a probability, the best first; then a barrier, where that was not asked for.
+
+    What a certificate states can be weaker than what its engine proved, so that another engine's may be needed.
+    """
+
+    def rank(name: str) -> tuple[bool, float]:
+        return not verdict.answers[name].certified, verdict.answers[name].log10_delta
+
+    useful = [name for name, answer in verdict.answers.items() if answer.applicable and answer.log10_delta < 0]
+    for name in sorted(useful, key=rank):
+        yield name, verdict.answers[name]
+    asked = verdict.answers.get("barrier")
+    if verdict.status == "SAFE" and asked is not None and not asked.applicable:
+        from certbound.safety.engines import barrier_engine
+
+        answer = barrier_engine(problem)
+        if answer.applicable and answer.log10_delta < 0:
+            yield "barrier", answer
+
+
+def _writer(name: str) -> Callable[[Problem, EngineAnswer, int], Proof]:
+    if name == "linear":
+        return _linear_proof
+    if name == "barrier":
+        from certbound.safety.certificates.barrier import barrier_proof
+
+        return barrier_proof
+    if name == "values":
+        raise CertificateError("certificates do not state value functions yet.")
+    from certbound.safety.certificates.constants import constants_proof
+
+    return constants_proof
+
+
+def _linear_proof(problem: Problem, answer: EngineAnswer, attempt: int) -> Proof:
+    from certbound.reach.linear import depends_on_state
+
+    if depends_on_state(problem):
+        from certbound.safety.certificates.diffusion import diffusion_proof
+
+        return diffusion_proof(problem, answer, attempt)
+    from certbound.safety.certificates.linear import linear_proof
+
+    return linear_proof(problem, answer, attempt)
+
+
+# ---- the problem -------------------------------------------------------------------------------------------
+
+
+def problem_data(problem: Problem) -> dict[str, Any]:
+    """The problem as a certificate states it, under its plan.
+
+    Raises
+    ------
+    ValueError
+        If the system has inputs and no plan.
+    """
+    system, tape = problem.system, problem.closed_loop
+    continuous = system.time == "continuous"
+    rows = problem.input_sequence
+    inputs = () if rows is None else system.input_names
+    box = system.disturbance
+    return {
+        "name": problem.name,
+        "time": system.time,
+        "horizon": exact(float(problem.horizon)),
+        "delta": exact(float(problem.delta)),
+        "states": list(system.states),
+        "inputs": list(inputs),
+        "disturbances": list(system.disturbance_names),
+        "dynamics": tape_data(tape),
+        "plan": None if rows is None else exact(rows if continuous else rows[: int(problem.horizon)]),
+        "disturbance_set": [] if box is None else _ranges(zip(box.low, box.high)),
+        "noise": _noise(system),
+        "initial": _initial(problem.initial),
+        "constraints": [
+            {
+                "kind": "outside" if isinstance(constraint, Outside) else "inside",
+                "region": _region(constraint.region),
+                "during": None if constraint.during is None else exact([float(end) for end in constraint.during]),
+                "label": str(constraint.label),
+            }
+            for constraint in problem.safe
+        ],
+        "domain": None if problem.domain is None else _ranges(zip(problem.domain.low, problem.domain.high)),
+    }
+
+
+def tape_data(tape: Tape) -> dict[str, Any]:
+    """A tape's operations: [op, ...arguments], ["const", value], ["pow", argument, exponent]."""
+    nodes: list[list[Any]] = []
+    for node in tape.nodes:
+        if node.op == "const":
+            nodes.append(["const", exact(float(node.value))])
+        elif node.op == "pow":
+            nodes.append(["pow", node.args[0], exact(float(node.value))])
+        else:
+            nodes.append([node.op, *node.args])
+    return {"nodes": nodes, "outputs": list(tape.outputs)}
+
+
+def _ranges(pairs: Iterable[tuple[float, float]]) -> list[list[Any]]:
+    return [[_end(low), _end(high)] for low, high in pairs]
+
+
+def _end(value: float) -> str | None:
+    """null is an end at infinity."""
+    return float(value).hex() if np.isfinite(value) else None
+
+
+def _noise(system: Any) -> dict[str, Any]:
+    if isinstance(system, ContinuousSystem):
+        g = system.diffusion
+        if isinstance(g, Tape):
+            return {"law": "wiener", "diffusion": {"columns": int(g.shape[1]), **tape_data(g)}}
+        return {"law": "wiener", "diffusion": exact(np.asarray(g, dtype=float))}
+    law: Law = system.noise
+    try:
+        check_law(law, "be certified")
+    except TypeError as error:
+        raise CertificateError(str(error)) from error
+    level = next(name for name in law.levels if getattr(law, name) is not None)
+    data = {
+        "law": law.name,
+        "level": level.removeprefix("proxy_"),
+        "values": exact(np.asarray(getattr(law, level), dtype=float)),
+        "matrix": exact(np.asarray(system.noise_matrix, dtype=float)),
+    }
+    return {**data, "independent": bool(law.independent)} if hasattr(law, "independent") else data
+
+
+def _initial(start: Any) -> dict[str, Any]:
+    if isinstance(start, GaussianStart):
+        return {"kind": "gaussian", "mean": exact(start.mean), "covariance": exact(start.covariance)}
+    if isinstance(start, Ball):
+        return {"kind": "ball", "center": exact(start.center), "radius": exact(float(start.radius))}
+    if isinstance(start, Ellipsoid):
+        return {"kind": "ellipsoid", "center": exact(start.center), "shape": exact(start.shape)}
+    return {"kind": "box", "low": exact(start.low), "high": exact(start.high)}
+
+
+def _region(region: Any) -> Mapping[str, Any]:
+    if isinstance(region, HalfSpace):
+        return {"kind": "halfspace", "normal": exact(region.normal), "bound": exact(float(region.bound))}
+    if isinstance(region, Polytope):
+        return {"kind": "polytope", "A": exact(region.A), "b": exact(region.b)}
+    where = {"coordinates": None if region.coordinates is None else [int(i) for i in region.coordinates]}
+    center = region.center
+    if center is not None:
+        center = tape_data(center) if isinstance(center, Tape) else exact(center)
+    if isinstance(region, Box):
+        ends = {"low": [_end(x) for x in region.low], "high": [_end(x) for x in region.high]}
+        return {"kind": "box", **ends, "center": center, **where}
+    if isinstance(region, Ball):
+        return {"kind": "ball", "center": center, "radius": exact(float(region.radius)), **where}
+    return {"kind": "ellipsoid", "center": center, "shape": exact(region.shape), **where}

@@ -1,0 +1,21 @@
+"""The engines that bound a probability: linear, constants, barrier."""
+
+from __future__ import annotations
+
+from certbound.safety.engines.barrier import Barrier, barrier_engine
+from certbound.safety.engines.constants import constants_engine
+from certbound.safety.engines.erosion import Erosion, erode
+from certbound.safety.engines.linear import linear_engine
+from certbound.safety.engines.rooms import joined
+from certbound.safety.engines.values import values_engine
+
+__all__ = [
+    "Barrier",
+    "barrier_engine",
+    "constants_engine",
+    "erode",
+    "Erosion",
+    "joined",
+    "linear_engine",
+    "values_engine",
+]

@@ -1,0 +1,379 @@
+"""The barrier engine: exp(V) of a polynomial V, found by a convex program and proved by intervals.
+
+Let D be the set where no constraint is broken, and let V be twice differentiable with
+    grad V . f + 1/2 tr(g g^T Hess V) + 1/2 |g^T grad V|^2 <= kappa   on [0, T] x D, for every d in its set.
+Then exp(V(X) - kappa t), stopped when X leaves D, is a supermartingale (Ito; it is positive), and a path that leaves
+does so on the boundary of D, where V >= u; X_0 lies in D, which is proved too. So
+    P(leaving within T) <= exp(max over X_0 of V - u + max(kappa, 0) T).
+The disturbance may react to the state and the past, but must not see coming noise: Ito's formula needs an adapted d.
+
+The condition is convex in V: for a polynomial each point of a grid gives a second-order cone, and the exponent is
+linear, so that the best polynomial is one conic program. What it proposes is then bounded over all of D, from above
+and below, by branch and bound with centred forms.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.constants.enclosures import bound_supremum, enclose
+from certbound.errors import EngineError
+from certbound.problem.model import Tape, compile_numpy, jacobian, substitute, trace
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Ball, Box, GaussianStart, HalfSpace, Polytope
+from certbound.problem.systems import ContinuousSystem
+from certbound.reach.nominal import initial_cells
+from certbound.rigor.intervals import Interval
+from certbound.safety.answers import EngineAnswer
+from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
+
+__all__ = ["Barrier", "barrier_engine"]
+
+Array = NDArray[np.float64]
+
+_MOST_STATES = 3
+_DEGREES = {1: (4, 6), 2: (4, 6), 3: (4,)}
+_GRID = {1: 201, 2: 41, 3: 13}
+_ROUNDS = 3
+_FAR = 1 / 3  # share of the exponent asked for, from which on the next degree is worth its time
+_CLOSE = 0.1  # of log10: what is proved may be that far from what the program hoped for
+_BUDGET = 20_000
+_TOLERANCE = 0.02  # of kappa T, of V at the start and of V at the boundary: a loss of 0.03 in log10
+_LOG10 = math.log(10.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Barrier:
+    """A polynomial V and what was proved of it.
+
+    Parameters
+    ----------
+    exponents : ndarray of int, shape (K, n)
+    coefficients : ndarray, shape (K,)
+        V(x) = sum_k coefficients[k] prod_i ((x_i - center_i)/scale_i)**exponents[k, i].
+    center, scale : ndarray, shape (n,)
+    start : float
+        Upper bound of V over the initial set.
+    boundary : float
+        Lower bound of V where a constraint is about to be broken.
+    growth : float
+        Upper bound kappa of the generator's expression.
+    """
+
+    exponents: NDArray[np.int64]
+    coefficients: Array
+    center: Array
+    scale: Array
+    start: float
+    boundary: float
+    growth: float
+
+    def log10_probability(self, horizon: float) -> float:
+        """log10 of the bound on the probability of leaving within ``horizon``, rounded up."""
+        exponent = Interval.point(self.start) - self.boundary + Interval.point(max(self.growth, 0.0)) * horizon
+        value = float(exponent.hi) / _LOG10
+        return value + 4e-16 * abs(value)
+
+
+def barrier_engine(problem: Problem, *, quick: bool = False, **_: Any) -> EngineAnswer:
+    """The smallest probability that an exponential polynomial barrier proves (options of other engines are ignored).
+
+    It covers the disturbances that do not see coming noise.
+    ``quick`` leaves the search out: another engine has proved enough.
+    """
+    refused = "another engine is enough." if quick else _refusal(problem)
+    if refused is not None:
+        return EngineAnswer(applicable=False, reason=refused, method="barrier")
+    assert isinstance(problem.system, ContinuousSystem)
+    work = _Work(problem, problem.system)
+    if not lies_inside(work.gaps, work.start):
+        return EngineAnswer(
+            applicable=False, method="barrier",
+            reason="the box around the initial set was not proved to lie inside the safe set.",
+        )  # fmt: skip
+    best: Barrier | None = None
+    level = 0.0
+    for degree in _DEGREES[work.n]:
+        try:
+            found = work.search(degree)
+        except EngineError:
+            if best is None:
+                raise
+            break
+        if found is not None and found.log10_probability(problem.horizon) < level:
+            best, level = found, found.log10_probability(problem.horizon)
+        if level <= math.log10(problem.delta) or 0 > level > _FAR * math.log10(problem.delta):
+            break
+    if best is None:
+        return EngineAnswer(reason="no polynomial barrier was found.", method="barrier")
+    return EngineAnswer(
+        log10_delta=level,
+        reason=f"exp(V) - V a polynomial of degree {int(best.exponents.sum(axis=1).max())} - grows by at most "
+        f"{max(best.growth, 0.0) * problem.horizon:.3g} in logarithm within the horizon, from {best.start:.3g} to "
+        f"{best.boundary:.3g} at the boundary.",
+        method="barrier",
+        details=best,
+    )
+
+
+def _refusal(problem: Problem) -> str | None:
+    system = problem.system
+    if not isinstance(system, ContinuousSystem):
+        return "the barrier engine needs continuous time."
+    if system.dimension > _MOST_STATES:
+        return f"the barrier engine searches in at most {_MOST_STATES} states."
+    if problem.input_sequence is not None:
+        return "the barrier engine needs a plan without steps in time."
+    if isinstance(problem.initial, GaussianStart):
+        return "the barrier engine needs a bounded initial set."
+    for constraint in problem.constraints:
+        region = constraint.region
+        if constraint.during is not None or region.moving or not isinstance(region, Ball | Box | HalfSpace | Polytope):
+            return f"the barrier engine does not treat windows, moving sets and ellipsoids ('{constraint.label}')."
+    if not np.isfinite(hull_of(gaps_of(problem))).all():
+        return "the barrier engine needs safe sets or a domain that bound every state."
+    return None
+
+
+class _Work:
+    """One problem: its sets, its tapes, the points that the search asks for."""
+
+    def __init__(self, problem: Problem, system: ContinuousSystem) -> None:
+        self.problem, self.system = problem, system
+        self.n = system.dimension
+        self.gaps = gaps_of(problem)
+        low, high = hull_of(self.gaps)
+        self.hull = Interval(low, high)
+        self.center, self.scale = (low + high) / 2, (high - low) / 2
+        self.size = float(np.max(self.scale))
+        self.start = initial_cells(problem).boxes[0]
+        disturbance = system.disturbance
+        free = [(0.0, float(problem.horizon)), *zip(low.tolist(), high.tolist())]
+        if disturbance is not None:
+            free += list(zip(np.asarray(disturbance.low).tolist(), np.asarray(disturbance.high).tolist()))
+        self.ranges = Interval(*(np.array(ends) for ends in zip(*free)))
+        self.noises = int(system.diffusion.shape[1])
+
+    # ---- the search ------------------------------------------------------------------------------------------
+
+    def search(self, degree: int) -> Barrier | None:
+        """The best polynomial of the convex program, and what is proved of it."""
+        exponents = np.array([e for e in itertools.product(range(degree + 1), repeat=self.n) if 0 < sum(e) <= degree])
+        points = self._points()
+        best: Barrier | None = None
+        for _ in range(_ROUNDS):
+            coefficients, hoped = self._program(exponents, *points)
+            if coefficients is None:
+                return best
+            found, worst = self._certified(exponents, coefficients)
+            horizon = self.problem.horizon
+            if found is not None and (
+                best is None or found.log10_probability(horizon) < best.log10_probability(horizon)
+            ):
+                best = found
+            if best is not None and best.log10_probability(horizon) <= hoped + _CLOSE:
+                return best
+            points = tuple(np.concatenate([have, more]) for have, more in zip(points, worst))  # type: ignore[assignment]
+        return best
+
+    def _points(self) -> tuple[Array, Array, Array]:
+        """Points (t, x, d) of the safe set, points x of the initial set, points x of the boundary."""
+        count = _GRID[self.n]
+        axes = [np.linspace(a, b, count) for a, b in zip(self.hull.lo, self.hull.hi)]
+        grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
+        inside = self._gap(grid) <= 1e-12 * self.size
+        shaped = inside.reshape([count] * self.n)
+        boundary = [grid[inside & (self._gap(grid) >= -1e-9 * self.size)]]
+        index = np.arange(len(grid)).reshape(shaped.shape)
+        for axis in range(self.n):
+            first, second = (np.take(index, range(k, count - 1 + k), axis=axis).ravel() for k in (0, 1))
+            crossing = inside[first] != inside[second]
+            a, b = first[crossing], second[crossing]
+            safe, unsafe = grid[np.where(inside[a], a, b)], grid[np.where(inside[a], b, a)]
+            for _ in range(30):
+                middle = (safe + unsafe) / 2
+                held = (self._gap(middle) <= 0)[:, None]
+                safe, unsafe = np.where(held, middle, safe), np.where(held, unsafe, middle)
+            boundary.append(safe)
+        extra = [(a, b) if a < b else (a,) for a, b in zip(self.ranges.lo[self.n + 1 :], self.ranges.hi[self.n + 1 :])]
+        times = (0.0, 0.5, 1.0) if self._uses_time() else (0.0,)
+        signals = np.array([(t * self.problem.horizon, *d) for t in times for d in itertools.product(*extra)])
+        states = np.repeat(grid[inside], len(signals), axis=0)
+        signals = np.tile(signals, (int(inside.sum()), 1))
+        inner = np.concatenate([signals[:, :1], states, signals[:, 1:]], axis=1)
+        start = [np.linspace(a, b, 9 if a < b else 1) for a, b in zip(self.start.lo, self.start.hi)]
+        initial = np.stack([axis.ravel() for axis in np.meshgrid(*start, indexing="ij")], axis=1)
+        return inner, initial, np.concatenate(boundary)
+
+    def _uses_time(self) -> bool:
+        tapes = [self.problem.closed_loop]
+        tapes += [self.system.diffusion] if isinstance(self.system.diffusion, Tape) else []
+        used = {argument for tape in tapes for node in tape.nodes for argument in node.args}
+        return any(tape.inputs[0] == "t" and 0 in used for tape in tapes)
+
+    def _gap(self, states: Array) -> Array:
+        """The largest phi at points."""
+        return np.asarray(np.max([gap.over(Interval.point(states)).mid for gap in self.gaps], axis=0))
+
+    def _program(
+        self, exponents: NDArray[np.int64], inner: Array, initial: Array, boundary: Array
+    ) -> tuple[Array | None, float]:
+        """Coefficients (the constant last) that minimise the exponent on the points, and log10 of that bound."""
+        import cvxpy
+
+        cp: Any = cvxpy
+        states = inner[:, 1 : self.n + 1]
+        drift = compile_numpy(self.problem.closed_loop)(*inner.T)
+        diffusion = self.system.diffusion
+        given = compile_numpy(diffusion)(*inner[:, : self.n + 1].T) if isinstance(diffusion, Tape) else diffusion
+        spread = np.broadcast_to(given, (len(inner), self.n, self.noises))
+        slopes = np.stack([self._monomials(exponents, states, (i,)) for i in range(self.n)])
+        linear = np.einsum("pi,ipk->pk", drift, slopes)
+        square = np.einsum("pij,pkj->pik", spread, spread)
+        for i, j in itertools.product(range(self.n), repeat=2):
+            linear = linear + 0.5 * square[:, i, j, None] * self._monomials(exponents, states, (i, j))
+        c, constant, top, growth = cp.Variable(len(exponents)), cp.Variable(), cp.Variable(), cp.Variable(nonneg=True)
+        quadratic = sum(cp.square(np.einsum("pi,ipk->pk", spread[:, :, j], slopes) @ c) for j in range(self.noises))
+        rows = [
+            linear @ c + 0.5 * quadratic <= growth,
+            self._monomials(exponents, initial, ()) @ c + constant <= top,
+            self._monomials(exponents, boundary, ()) @ c + constant >= 0,
+        ]
+        program = cp.Problem(cp.Minimize(top + growth * self.problem.horizon), rows)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # an inaccurate proposal is a proposal
+                program.solve(solver=cp.CLARABEL)
+        except cp.SolverError:
+            return None, 0.0
+        if c.value is None or not np.isfinite(program.value) or program.value >= 0:
+            return None, 0.0
+        return np.append(np.asarray(c.value, dtype=float), float(constant.value)), float(program.value) / _LOG10
+
+    def _monomials(self, exponents: NDArray[np.int64], states: Array, along: tuple[int, ...]) -> Array:
+        """Monomials in the scaled states, differentiated along the given states: (points, K)."""
+        y = (states - self.center) / self.scale
+        powers, factor = exponents.copy(), np.ones(len(exponents))
+        for i in along:
+            factor = factor * powers[:, i] / self.scale[i]
+            powers[:, i] -= 1
+        powers = np.maximum(powers, 0)
+        return np.asarray(factor * np.prod(y[:, None, :] ** powers, axis=-1))
+
+    # ---- the proof -------------------------------------------------------------------------------------------
+
+    def _certified(
+        self, exponents: NDArray[np.int64], coefficients: Array
+    ) -> tuple[Barrier | None, tuple[Array, Array, Array]]:
+        """What holds for the polynomial, and the points where its three bounds are tight."""
+        names = list(self.system.states)
+        powers = np.vstack([exponents, np.zeros((1, self.n), dtype=np.int64)])
+
+        def polynomial(x: Any) -> Any:
+            total = 0.0
+            for factor, power in zip(coefficients.tolist(), powers.tolist()):
+                term = factor
+                for i, exponent in enumerate(power):
+                    if exponent:
+                        term = term * ((x[i] - self.center[i]) / self.scale[i]) ** exponent
+                total = total + term
+            return total
+
+        value = trace(polynomial, {"x": names})
+        tolerance = _TOLERANCE
+        growth = self._supremum(
+            self._generator(value), self.ranges, 1, self._safe, tolerance / float(self.problem.horizon)
+        )
+        if not np.isfinite(growth.upper):  # V is finite everywhere: no other one would help
+            raise EngineError(
+                "the dynamics have no finite enclosure near ("
+                + ", ".join(f"{x:.4g}" for x in growth.worst.mid[1 : self.n + 1])
+                + "), a part of the safe set: they are undefined there, or jump."
+            )
+        start = self._supremum(value, self.start, 0, _anywhere, tolerance)
+        negative = substitute(trace(lambda v: -v[0], {"v": ["v"]}), names, {"v": value})
+        exit_ = self._supremum(negative, self.hull, 0, self._leaving, tolerance)
+        points = growth.point[None], start.point[None], exit_.point[None]
+        if not all(np.isfinite([growth.upper, start.upper, exit_.upper])):
+            return None, points
+        return Barrier(
+            exponents=powers, coefficients=coefficients, center=self.center, scale=self.scale,
+            start=start.upper, boundary=-exit_.upper, growth=growth.upper,
+        ), points  # fmt: skip
+
+    def _generator(self, value: Tape) -> Tape:
+        """grad V . f + 1/2 tr(g g^T Hess V) + 1/2 |g^T grad V|^2 over (t, states, disturbances)."""
+        n, m = self.n, self.noises
+        slope = jacobian(value)
+        curvature = jacobian(slope)
+        names = {"v": _named("v", n), "h": _named("h", n * n), "f": _named("f", n), "g": _named("g", n * m)}
+
+        def expression(v: Any, h: Any, f: Any, g: Any) -> Any:
+            total = sum(v[i] * f[i] for i in range(n))
+            for j in range(m):
+                column = [g[i * m + j] for i in range(n)]
+                total = total + 0.5 * sum(column[i] * v[i] for i in range(n)) ** 2
+                total = total + 0.5 * sum(column[i] * column[k] * h[i * n + k] for i in range(n) for k in range(n))
+            return total
+
+        replaced: dict[str, Any] = {name: (slope, i) for i, name in enumerate(names["v"])}
+        replaced |= {name: (curvature, i) for i, name in enumerate(names["h"])}
+        replaced |= {name: (self.problem.closed_loop, i) for i, name in enumerate(names["f"])}
+        diffusion = self.system.diffusion
+        for i, name in enumerate(names["g"]):
+            replaced[name] = (diffusion, i) if isinstance(diffusion, Tape) else float(np.ravel(diffusion)[i])
+        return substitute(trace(expression, names), self.problem.closed_loop.inputs, replaced)
+
+    def _supremum(
+        self, tape: Tape, box: Interval, first: int, keep: Callable[[Interval], NDArray[np.bool_]], tolerance: float
+    ) -> Any:
+        """Bound a function over the part of a box that ``keep`` does not rule out; states begin at ``first``."""
+        slope, function = jacobian(tape), compile_numpy(tape)
+        count = len(box)
+
+        def bound(boxes: Interval, _: float) -> tuple[Array, Array]:
+            middle = Interval.point(boxes.mid)
+            inputs = [boxes[:, k] for k in range(count)]
+            whole = enclose(tape, inputs, undefined="infinite")[:, 0]
+            at = enclose(tape, [middle[:, k] for k in range(count)], undefined="infinite")[:, 0]
+            gradient = enclose(slope, inputs, undefined="infinite")[:, 0]
+            with np.errstate(invalid="ignore"):
+                centred = at + (gradient * (boxes - middle)).sum(axis=-1)
+                weights = np.nan_to_num(gradient.mag * boxes.rad, nan=np.inf, posinf=np.inf)
+            upper = np.fmin(whole.hi, np.where(np.isnan(centred.hi), np.inf, centred.hi))
+            held = keep(boxes[:, first : first + self.n])
+            return np.where(held, np.where(np.isnan(upper), np.inf, upper), -np.inf), weights
+
+        def value(points: Array) -> Array:
+            with np.errstate(all="ignore"):
+                found = function(*points.T)[:, 0]
+            held = keep(Interval.point(points[:, first : first + self.n]))
+            return np.where(held, found, np.nan)
+
+        return bound_supremum(bound, value, box, tolerance=tolerance, budget=_BUDGET)
+
+    def _safe(self, boxes: Interval) -> NDArray[np.bool_]:
+        """Boxes that may meet the safe set."""
+        return np.asarray(np.all([gap.over(boxes).lo <= 0 for gap in self.gaps], axis=0))
+
+    def _leaving(self, boxes: Interval) -> NDArray[np.bool_]:
+        """Boxes that may meet the safe set where some constraint is about to be broken."""
+        gaps = [gap.over(boxes) for gap in self.gaps]
+        near = np.any([gap.hi >= 0 for gap in gaps], axis=0)
+        return np.asarray(np.all([gap.lo <= 0 for gap in gaps], axis=0) & near)
+
+
+def _anywhere(boxes: Interval) -> NDArray[np.bool_]:
+    return np.ones(len(boxes), dtype=bool)
+
+
+def _named(letter: str, count: int) -> list[str]:
+    return [f"{letter} {k}" for k in range(count)]

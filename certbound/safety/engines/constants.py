@@ -1,0 +1,373 @@
+"""The constants engine: c or L, sigma and a metric -> a tube by formula -> set erosion.
+
+- Global constants: the reach tube of Thm K5 in the constants' metric leaves every constraint some room r_k on piece
+  k; Thm K2 bounds P(exists t: ||S_t||_P > r_t), which bounds the probability of breaking a constraint. Constants that
+  hold on the model's domain only serve as well: until the state leaves the domain they hold, and leaving it is among
+  the events that are bounded.
+- Local constants (Thm K4): the room is cut to what a tube needs, the constants are taken on reach + that room, and
+  K2 is applied to the cut room.
+- A method of the paper by name: its tube at delta must fit into the room; delta is then made as small as it goes.
+
+All of them cover the disturbances that do not see coming noise, and no others: they rest on supermartingales.
+
+Source: Thms K1, K2, K4, K5 of theory; Table I and Prop 4 (paper).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.constants.bounds import bound_constants
+from certbound.constants.metrics import bound_metrics
+from certbound.constants.stated import proved_or_stated, refuse_contradiction
+from certbound.display import log10_text, rounded
+from certbound.errors import CertboundError, EnclosureError, InfeasibleError
+from certbound.problem.problem import Problem
+from certbound.problem.sets import GaussianStart
+from certbound.reach.contraction import (
+    contraction_tube,
+    local_constants,
+    local_contraction_tube,
+    needed_radius,
+    radius_over_pieces,
+    random_start,
+)
+from certbound.reach.nominal import Curve, Flow, initial_cells, nominal_curve
+from certbound.reach.sets import ReachTube
+from certbound.rigor.norms import Norm
+from certbound.safety.answers import Deviation, EngineAnswer
+from certbound.safety.engines.erosion import Erosion, Tightest, erode
+from certbound.safety.engines.rooms import (
+    BELOW,
+    deviation_pieces,
+    joined,
+    log10_sum,
+    room_level,
+    smallest_level,
+)
+from certbound.tubes.constants import Constants
+from certbound.tubes.kummer import Start
+from certbound.tubes.tube import Tube
+from certbound.tubes.tuning import tune_tube
+
+__all__ = ["ONE_TIME", "constants_engine"]
+
+Array = NDArray[np.float64]
+
+ONE_TIME = ("prop1", "prop1_cosh", "prop2", "markov", "chebyshev")
+"""Methods that bound one time at a time: never SAFE."""
+BY_CLEARANCE = ("auto", "kummer", "bessel")
+"""Methods that go from rooms to a probability directly (Thm K2)."""
+NO_START = Start()
+SEGMENTS, SEGMENTS_BY_NAME = 48, 16
+"""Pieces of local constants: the paper's window bounds take time that grows with their square."""
+SHARES = (1.15, 1.6, 2.4, 4.0)
+"""Room tried with local constants, in units of the tube at the target probability."""
+NEAR_MISS = 2.0
+"""Metrics of their own for the constraints are tried where the tube takes at most so many times the room."""
+QUICK_BUDGET = 250
+"""Boxes spent on global constants when another engine has proved SAFE already."""
+
+
+def constants_engine(
+    problem: Problem,
+    *,
+    method: str = "auto",
+    cells: int | None = None,
+    constants: Constants | None = None,
+    quick: bool = False,
+    **_: Any,
+) -> EngineAnswer:
+    """The best answer from constants: global ones, or local ones along the reach tube where none are global.
+
+    It covers the disturbances that do not see coming noise. Options of other engines are ignored.
+
+    Parameters
+    ----------
+    problem : Problem
+    method : str
+        "auto" (Thm K2), or a tube method by name.
+    cells : int, optional
+        Parts along each side of the initial set.
+    constants : Constants, optional
+        Stated constants, used instead of certified ones.
+    quick : bool
+        Leave out what is slow and then seldom decides: proposed metrics and local constants.
+
+    Raises
+    ------
+    ValueError
+        If stated constants contradict the problem's own noise.
+    EnclosureError
+        If the Jacobian is unbounded or undefined on the domain that the user gave.
+    EngineError
+        If the nominal is lost before the horizon.
+    """
+    if constants is not None:
+        refuse_contradiction(problem, constants)
+        constants = proved_or_stated(problem, constants)
+    work = _Work(problem, method, cells)
+    by_clearance, target = method in BY_CLEARANCE, math.log10(problem.delta)
+    best: EngineAnswer | None = None
+    reason = ""
+    try:
+        for candidate in [constants] if constants is not None else _proposals(problem, quick=quick):
+            answer = work.global_answer(candidate)
+            best = answer if best is None else _better(best, answer)
+            if best.certified and best.log10_delta <= target:
+                return best
+        if best is not None and constants is None and not quick:
+            best = work.with_own_metrics(best)
+    except (InfeasibleError, EnclosureError) as error:
+        if problem.domain is not None and best is None:
+            raise EnclosureError(f"`domain` must lie where the model is defined and smooth: {error}") from error
+        reason = str(error)
+    if best is not None and (not by_clearance or quick or constants is not None or best.log10_delta <= target):
+        return best
+    if method in ONE_TIME:
+        reason = f"{reason} A bound for one time must not be combined with local constants."
+    if method in ONE_TIME or quick or constants is not None:
+        return EngineAnswer(applicable=False, reason=reason, method=work.name)
+    local = work.local_answer(reason)
+    return local if best is None or (local.applicable and local.log10_delta < best.log10_delta) else best
+
+
+def _proposals(problem: Problem, *, quick: bool) -> Iterator[Constants]:
+    """Certified global constants: Euclidean first, then in the metric that the erosion asks for."""
+    if quick:
+        yield bound_constants(problem, metric="euclidean", budget=QUICK_BUDGET)
+        return
+    euclidean = bound_constants(problem, metric="euclidean")
+    yield euclidean
+    if problem.system.dimension == 1:
+        return
+    proposed = bound_constants(problem, objective="erosion")
+    if proposed.metric is not None:
+        yield proposed
+
+
+def _better(first: EngineAnswer, second: EngineAnswer) -> EngineAnswer:
+    if second.log10_delta != first.log10_delta:
+        return second if second.log10_delta < first.log10_delta else first
+    margins = (-math.inf if a.margin is None else a.margin for a in (first, second))
+    return first if next(margins) >= next(margins) else second
+
+
+class _Work:
+    """One problem, one method; the nominal curves are shared by all constants."""
+
+    def __init__(self, problem: Problem, method: str, cells: int | None) -> None:
+        self.problem, self.method, self.cells = problem, method, cells
+        self.flow = Flow(problem)
+        self.name = "kummer" if method == "auto" else method
+        self.segments = SEGMENTS if method in BY_CLEARANCE else SEGMENTS_BY_NAME
+
+    @cached_property
+    def curve(self) -> Curve:
+        """The nominal curves, one a cell."""
+        return nominal_curve(self.flow, initial_cells(self.problem, self.cells).centres)
+
+    def global_answer(self, constants: Constants) -> EngineAnswer:
+        """With constants that hold everywhere, or on the domain."""
+        reach = contraction_tube(self.flow, constants, cells=self.cells, curve=self.curve)
+        erosion = erode(reach, self.problem, reach.norm)
+        start = random_start(self.problem, constants)
+        if start != NO_START:
+            constants = constants.with_full_dimension()
+        answer = EngineAnswer(reach=reach, constants=constants, method=self.name, assumption=_assumption(constants))
+        refused = self._refused(reach, erosion, answer)
+        if refused is not None:
+            return refused
+        return self._decided(answer, erosion, constants, start)
+
+    def with_own_metrics(self, common: EngineAnswer) -> EngineAnswer:
+        """The better one of ``common`` and the union bound over the constraints, each in a metric of its own.
+
+        While no constraint is broken the state is in the domain, so that all constants hold up to the first event.
+        """
+        count = len(self.problem.constraints)
+        if (
+            self.method != "auto"
+            or count < 2
+            or not common.applicable
+            or isinstance(self.problem.initial, GaussianStart)
+        ):
+            return common
+        if common.tube is not None and common.reach is not None:
+            erosion = erode(common.reach, self.problem, common.reach.norm)
+            if _taken(erosion, needed_radius(common.tube, common.reach.curve, NO_START)) > NEAR_MISS:
+                return common
+        answers = []
+        for index, constants in enumerate(bound_metrics(self.problem)):
+            reach = contraction_tube(self.flow, constants, cells=self.cells, curve=self.curve)
+            erosion = erode(reach, self.problem, reach.norm).only(index)
+            answer = EngineAnswer(reach=reach, constants=constants, method=self.name)
+            if self._refused(reach, erosion, answer) is not None:
+                return common
+            answers.append(self._decided(answer, erosion, constants, share=1 / count))
+        level = log10_sum([answer.log10_delta for answer in answers])
+        if level >= common.log10_delta:
+            return common
+        worst = min(answers, key=lambda answer: math.inf if answer.margin is None else answer.margin)
+        parts = [answer.deviation for answer in answers if answer.deviation is not None]
+        deviation = Deviation(
+            times=parts[0].times,
+            radius=np.min([part.radius for part in parts], axis=0),
+            extent=np.min([part.extent for part in parts], axis=0),
+        )
+        fits = level <= math.log10(self.problem.delta)
+        margin = None if worst.margin is None else max(worst.margin, 0.0) if fits else worst.margin
+        reason = f"with a metric of its own for each constraint: {worst.reason}"
+        return replace(worst, log10_delta=level, margin=margin, reason=reason, deviation=deviation, details=answers)
+
+    def local_answer(self, why: str) -> EngineAnswer:
+        """With constants along the reach tube plus the room that the tube needs (Thm K4)."""
+        if isinstance(self.problem.initial, GaussianStart):
+            return EngineAnswer(
+                applicable=False, reason=f"{why} Local constants need a bounded initial set.", method=self.name
+            )
+        try:
+            reach = local_contraction_tube(self.flow, cells=self.cells, curve=self.curve)
+        except EnclosureError as error:
+            return EngineAnswer(applicable=False, reason=str(error), method=self.name)
+        erosion = erode(reach, self.problem, reach.norm)
+        answer = EngineAnswer(reach=reach, method=self.name)
+        refused = self._refused(reach, erosion, answer)
+        if refused is not None:
+            return refused
+        best: EngineAnswer | None = None
+        for cut, constants in self._cuts(reach, erosion):
+            found = self._decided(answer, cut, constants)
+            best = found if best is None else _better(best, found)
+        if best is None:
+            tightest = erosion.tightest()
+            return replace(
+                answer, margin=tightest.margin, time=tightest.time, constraint=tightest.label,
+                reason="no local constants hold on the reach tube and its surroundings; use more cells or method "
+                '"linear".',
+            )  # fmt: skip
+        return best
+
+    def _cuts(self, reach: ReachTube, erosion: Erosion) -> Iterator[tuple[Erosion, Constants]]:
+        """Rooms cut to multiples of what a tube needs, with the constants that hold there."""
+        try:
+            first = local_constants(self.problem, reach, segments=self.segments)
+            tube = tune_tube(first, horizon=reach.end, delta=self.problem.delta, method="kummer")
+        except (CertboundError, ValueError):
+            return
+        needed = radius_over_pieces(tube, reach.curve)
+        for share in SHARES:
+            limit = share * needed
+            if not reach.curve.continuous:
+                limit[0] = math.inf
+            cut = erosion.capped(limit)
+            room = np.where(np.isfinite(cut.least), cut.least, 0.0)
+            try:
+                yield cut, local_constants(self.problem, reach, np.maximum(room, 0.0), segments=self.segments)
+            except (CertboundError, ValueError):
+                return
+
+    def _refused(self, reach: ReachTube, erosion: Erosion, answer: EngineAnswer) -> EngineAnswer | None:
+        """An answer where the reach tube ends early or leaves no room; None where it serves."""
+        worst = erosion.tightest()
+        held = replace(answer, margin=worst.margin, time=worst.time, constraint=worst.label or None)
+        if reach.end < self.flow.horizon:
+            return replace(
+                held, time=reach.end, reach=reach,
+                reason=f"the reach tube could not be proved beyond t = {reach.end:.4g}; use more cells of the initial "
+                "set, a smaller disturbance, or a shorter horizon.",
+            )  # fmt: skip
+        if erosion.broken():
+            return replace(
+                held,
+                reason=f"the noise-free reach tube already leaves no room for '{worst.label}' at "
+                f"{self._when(worst.time)} (short by {-worst.margin:.3g}); use more cells of the initial set, or "
+                'method "linear".',
+            )
+        return None
+
+    def _when(self, time: float) -> str:
+        return f"t = {time:.4g}" if self.flow.continuous else f"step {time:g}"
+
+    def _decided(
+        self, answer: EngineAnswer, erosion: Erosion, constants: Constants, start: Start = NO_START, share: float = 1.0
+    ) -> EngineAnswer:
+        """Probability of the rooms of ``erosion``, and the margin of the tube at ``share`` of the target."""
+        target, horizon = self.problem.delta * share, self.flow.horizon
+        profile = erosion.profile(random_start=start != NO_START)
+        curve = answer.reach.curve if answer.reach is not None else self.curve
+        by_name = self.method not in BY_CLEARANCE
+        objective = joined(profile, 0.02) if np.any(np.isfinite(profile[1])) else "max"
+        name = self.method if by_name else "kummer"
+
+        def tube_at(delta: float) -> Tube:
+            return tune_tube(constants, horizon=horizon, delta=delta, objective=objective, method=name, start=start)
+
+        def fit(tube: Tube) -> bool:
+            return bool(np.all(needed_radius(tube, curve, start) <= erosion.least))
+
+        tube = tube_at(target)
+        needed = needed_radius(tube, curve, start)
+        fits = bool(np.all(needed <= erosion.least))
+        if by_name:
+            closely = constants.times is None
+            level = smallest_level(tube_at, fit, target, tube if fits else None, closely=closely)
+        else:
+            rooms = joined(profile, 1e-7)
+            level = room_level(constants, horizon=horizon, profile=rooms, start=start, fits=fits)
+            if fits and level > math.log10(target) - BELOW:
+                closer = tube_at(target * 10**-BELOW)
+                level = min(level, (closer if fit(closer) else tube).log10_delta)
+            fits = level <= math.log10(target)
+        worst = erosion.tightest(needed)
+        margin = max(worst.margin, 0.0) if fits else worst.margin
+        return replace(
+            answer,
+            log10_delta=level,
+            margin=margin,
+            time=worst.time,
+            constraint=worst.label or None,
+            reason=self._explained(erosion, needed, worst, level, fits),
+            tube=tube,
+            constants=constants,
+            deviation=Deviation.of_ball(*deviation_pieces(curve, needed), Norm(self.flow.dimension, constants.metric)),
+            certified=tube.certified and tube.level == "trajectory",
+            method=self.name,
+        )
+
+    def _explained(self, erosion: Erosion, needed: Array, worst: Tightest, level: float, fits: bool) -> str:
+        """The reason, in words."""
+        if not worst.label:
+            return "no constraint asks anything."
+        ratio = _taken(erosion, needed)
+        if fits:
+            return f"the tube takes {rounded(100 * ratio, up=True, digits=3)} % of the room that the constraints leave."
+        quieter = rounded(1 / ratio, up=False, digits=2)
+        larger = f"delta >= {log10_text(level)}, or " if level < -0.01 else ""
+        return (
+            f"at delta = {self.problem.delta!r} the tube takes {ratio:.3g} times the room that '{worst.label}' leaves "
+            f"at {self._when(worst.time)}; what would do: {larger}noise at most {quieter} times as large."
+        )
+
+
+def _taken(erosion: Erosion, needed: Array) -> float:
+    """Largest share of the room that a tube takes."""
+    room = erosion.least
+    first = 0 if erosion.continuous else 1
+    with np.errstate(all="ignore"):
+        shares = np.where(room > 0, needed / room, np.inf)[first:]
+    return float(np.max(shares, initial=0.0))
+
+
+def _assumption(constants: Constants) -> str:
+    if constants.certified:
+        return ""
+    name, value = ("rate", constants.rate) if constants.continuous else ("gain", constants.gain)
+    return f"the stated constants ({name} = {value}, sigma = {constants.sigma}) are assumed, not proved"

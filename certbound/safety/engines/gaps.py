@@ -1,0 +1,101 @@
+"""A problem's constraints as functions of the state, for branch and bound over boxes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.constants.enclosures import split_boxes
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Ball, Outside
+from certbound.rigor.intervals import Interval, sq
+
+__all__ = ["Gap", "gaps_of", "hull_of", "lies_inside"]
+
+Array = NDArray[np.float64]
+
+_CUTS = 12  # halvings of every side of a set
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Gap:
+    """A constraint as phi(x) <= 0; on its boundary phi = 0.
+
+    phi is max(rows x - bounds) or, ``round``, |x - bounds|^2 - radius^2 over the coordinates that ``rows`` picks; with
+    the other sign for an obstacle.
+    """
+
+    rows: Array
+    bounds: Array
+    outside: bool
+    radius: float | None = None
+
+    def over(self, boxes: Interval) -> Interval:
+        """phi over boxes: (N, n) to (N,)."""
+        values = (Interval.point(self.rows) * boxes[:, None, :]).sum(axis=-1) - self.bounds
+        if self.radius is not None:
+            value = sq(values).sum(axis=-1) - sq(Interval.point(self.radius))
+        else:
+            value = Interval(values.lo.max(axis=-1), values.hi.max(axis=-1))
+        return -value if self.outside else value
+
+
+def gaps_of(problem: Problem) -> list[Gap]:
+    """The constraints that ask anything."""
+    n = problem.system.dimension
+    found = []
+    for constraint in problem.constraints:
+        region = constraint.region
+        places = list(range(n)) if region.coordinates is None else [int(place) for place in region.coordinates]
+        rows, bounds = (np.eye(len(places)), region.center_at()) if isinstance(region, Ball) else region.halfspaces()
+        if not len(rows) and not isinstance(constraint, Outside):
+            continue  # a box without finite sides
+        full = np.zeros((len(rows), n))
+        full[:, places] = rows
+        found.append(Gap(
+            rows=full, bounds=np.asarray(bounds), outside=isinstance(constraint, Outside),
+            radius=region.radius if isinstance(region, Ball) else None,
+        ))  # fmt: skip
+    return found
+
+
+def hull_of(gaps: list[Gap]) -> Array:
+    """A box that contains the safe set: shape (2, n), infinite where nothing bounds a state."""
+    n = gaps[0].rows.shape[1] if gaps else 1
+    low, high = np.full(n, -np.inf), np.full(n, np.inf)
+    for gap in gaps:
+        sign = -1.0 if gap.outside else 1.0
+        if gap.outside and (gap.radius is not None or len(gap.rows) > 1):
+            continue
+        for row, bound in zip(gap.rows, gap.bounds):
+            places = np.flatnonzero(row)
+            if len(places) != 1:
+                continue
+            place, factor = int(places[0]), sign * float(row[places[0]])
+            if gap.radius is not None:
+                ends = Interval.point(bound) + Interval(-gap.radius, gap.radius)
+                low[place], high[place] = max(low[place], float(ends.lo)), min(high[place], float(ends.hi))
+                continue
+            end = Interval.point(sign * bound) / Interval.point(factor)
+            if factor > 0:
+                high[place] = min(high[place], float(end.hi))
+            else:
+                low[place] = max(low[place], float(end.lo))
+    return np.array([low, high])
+
+
+def lies_inside(gaps: list[Gap], box: Interval) -> bool:
+    """Whether every point of a box (n,) provably satisfies every constraint."""
+    boxes = box.reshape(1, -1)
+    for _ in range(_CUTS * len(box) + 1):
+        undecided = np.any([gap.over(boxes).hi > 0 for gap in gaps], axis=0)
+        if not undecided.any():
+            return True
+        boxes = boxes[np.asarray(undecided)]
+        middle = Interval.point(boxes.mid)
+        if np.any([gap.over(middle).lo > 0 for gap in gaps]) or len(boxes) > 4096:
+            return False
+        boxes = split_boxes(boxes, boxes.rad)
+    return False

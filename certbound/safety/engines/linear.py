@@ -1,0 +1,51 @@
+"""The linear-response engine (Thm K7) as one of the engines of ``verify_safety``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from certbound.problem.problem import Problem
+from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state, linear_answer
+from certbound.reach.remainder import hidden_jump
+from certbound.safety.answers import Deviation, EngineAnswer
+
+__all__ = ["linear_engine"]
+
+
+def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool = True, **_: Any) -> EngineAnswer:
+    """Smallest probability that Thm K7' proves for the problem (options of other engines are ignored).
+
+    With additive noise it covers every disturbance, even one that sees coming noise; with noise that depends on the
+    state, those that do not.
+
+    Without ``thorough`` the initial set is one cell unless ``cells`` says otherwise.
+    """
+    hidden = hidden_jump(problem)
+    if hidden is not None:
+        return EngineAnswer(applicable=False, reason=hidden, method="linear")
+    answer = linear_answer(problem, cells=cells, thorough=thorough)
+    tube = answer.tube
+    return EngineAnswer(
+        log10_delta=answer.log10_delta,
+        margin=answer.margin if np.isfinite(answer.margin) else None,
+        time=answer.time,
+        constraint=answer.constraint,
+        reason=answer.reason,
+        tube=tube,
+        reach=answer.noise_free_reach,
+        deviation=None if tube is None else _deviation(answer, tube),
+        method="linear",
+        details=answer,
+        conclusive=answer.exact and answer.margin > -np.inf,
+        foresight=not depends_on_state(problem),
+    )
+
+
+def _deviation(answer: LinearAnswer, tube: DeviationTube) -> Deviation:
+    """Bounds per piece; in discrete time a piece is a step and the next one."""
+    half, times = tube.half_widths, tube.times
+    if not answer.run.engine.continuous:
+        half, times = np.maximum(half[:-1], half[1:]), times[:-1]
+    return Deviation(times=times, radius=np.linalg.norm(half, axis=1) * (1 + 1e-14), extent=half)

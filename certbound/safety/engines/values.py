@@ -1,0 +1,96 @@
+"""The engine of value functions (Thm K8): the probability of failing itself, from both sides, for few states."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from certbound.errors import EnclosureError, InfeasibleError
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Region
+from certbound.problem.systems import DiscreteSystem
+from certbound.safety.answers import EngineAnswer
+from certbound.values.continuous import ExitBounds, bound_exits
+from certbound.values.discrete import FailureBounds, bound_failure
+
+__all__ = ["values_engine"]
+
+_SECONDS = 20.0
+_FLOOR = -300.0
+_CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
+
+
+def values_engine(
+    problem: Problem,
+    *,
+    target: Region | None = None,
+    quick: bool = False,
+    thorough: bool = True,
+    ratio: float = 1.05,
+    seconds: float = _SECONDS,
+    **_: Any,
+) -> EngineAnswer:
+    """Certified bounds of the probability of failing, on finer and finer grids (options of other engines are ignored).
+
+    Proves: log10_lower <= log10 of the largest probability of failing over starts and disturbances <= log10_delta.
+
+    Parameters
+    ----------
+    problem : Problem
+    target : Region, optional
+        Set that ends the danger; never to enter it counts as failing.
+    quick : bool
+        Another engine has answered: nothing is done.
+    thorough : bool
+        Without it the grids stop being refined after a quarter of the time.
+    ratio : float
+        Refine until the upper bound is at most that many times the lower one.
+    seconds : float
+        About what may be spent.
+    """
+    if quick:
+        return EngineAnswer(applicable=False, method="values", reason="left out, since another engine has answered.")
+    limit = seconds if thorough else seconds / 4
+    try:
+        if not isinstance(problem.system, DiscreteSystem):
+            return _continuous(problem, target=target, seconds=limit)
+        found = bound_failure(problem, target=target, ratio=ratio, seconds=limit, delta=problem.delta)
+    except (InfeasibleError, EnclosureError) as error:
+        return EngineAnswer(applicable=False, method="values", reason=str(error))
+    return _answer(problem, found)
+
+
+def _continuous(problem: Problem, *, target: Region | None, seconds: float) -> EngineAnswer:
+    found: ExitBounds = bound_exits(problem, target=target, seconds=seconds)
+    close = found.lower is not None and found.upper <= found.lower + math.log10(_CLOSE)
+    return EngineAnswer(
+        log10_delta=found.upper,
+        log10_lower=found.lower,
+        reason=found.words,
+        method="values",
+        details=found,
+        conclusive=close,
+    )
+
+
+def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
+    cells = " x ".join(str(count) for count in found.cells)
+    below = f"at least {found.lower:.4g}" if found.lower > 0 else "no lower bound"
+    reason = f"the probability of failing is at most {found.upper:.4g} and {below}, on a grid of {cells} cells"
+    if found.lower > problem.delta:
+        reason += f": more than the {problem.delta:g} that is asked, from some start"
+    return EngineAnswer(
+        log10_delta=log10_outward(found.upper, up=True),
+        log10_lower=None if found.lower < 10.0**_FLOOR else log10_outward(found.lower, up=False),
+        reason=reason + ".",
+        method="values",
+        details=found,
+        conclusive=found.upper <= _CLOSE * found.lower,
+    )
+
+
+def log10_outward(probability: float, *, up: bool) -> float:
+    """log10 rounded up or down, at least -300."""
+    value = math.log10(max(probability, 10.0**_FLOOR))
+    slack = 1e-14 * abs(value) + 1e-15
+    return min(value + slack, 0.0) if up else min(value - slack, 0.0)

@@ -1,0 +1,190 @@
+"""Exit probabilities by plain Monte Carlo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.simulation.blocks import Counts, Work, check_count, entropy_of
+from certbound.simulation.checkpoint import stored_entropy
+from certbound.simulation.estimates.preparation import Setting, prepare
+from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
+from certbound.simulation.executors import Progress, run_work
+from certbound.simulation.gap_tests import Barrier, barriers_of
+from certbound.simulation.kernel_source import kernel_source
+from certbound.simulation.stepping import Scenario
+from certbound.simulation.tasks import Task
+
+__all__ = ["ExitCounts", "simulate_exits"]
+
+Array = NDArray[np.float64]
+
+_TIME_BINS = 200
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ExitCounts:
+    """How many simulated paths left the safe set or the domain.
+
+    Parameters
+    ----------
+    paths, exits : int
+        Paths simulated, and those that left.
+    probability : float
+        Their ratio.
+    lower, upper : float
+        Clopper-Pearson limits: each misses the true probability (of the time-discretised model) with chance
+        at most (1 - confidence)/2.
+    confidence : float
+    by_constraint : dict
+        Label to the number of paths that left through this constraint first.
+    times : ndarray, shape (bins + 1,)
+        Ends of time bins.
+    exits_by_time : ndarray of int, shape (constraints, bins + 1)
+        First exits by constraint: column 0 at the start, column k + 1 within bin k.
+    steps : int
+        Time steps per path.
+    scheme : str
+        ``exact``, ``milstein``, ``euler`` or ``discrete``.
+    seconds, path_steps_per_second : float
+        Compilation left out.
+    """
+
+    paths: int
+    exits: int
+    probability: float
+    lower: float
+    upper: float
+    confidence: float
+    by_constraint: dict[str, int]
+    times: Array = field(repr=False)
+    exits_by_time: Counts = field(repr=False)
+    steps: int
+    scheme: str
+    seconds: float
+    path_steps_per_second: float
+
+    @property
+    def largest_refuted(self) -> float:
+        """Every claim "the exit probability is below delta" with a delta below this number is refuted."""
+        return self.lower
+
+    @property
+    def smallest_supported(self) -> float:
+        """The smallest delta that the simulation supports: the true probability lies below it."""
+        return self.upper
+
+    def refutes(self, delta: float) -> bool:
+        """Whether the exit probability exceeds ``delta``, with error probability (1 - confidence)/2."""
+        return self.lower > delta
+
+
+def simulate_exits(
+    problem: Any,
+    *,
+    paths: int,
+    rng: np.random.Generator | int | None = None,
+    steps: int | None = None,
+    confidence: float = 0.99,
+    executor: Any = None,
+    checkpoint: str | Path | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    scenario: Scenario | None = None,
+) -> ExitCounts:
+    """Estimate the probability that a path leaves the safe set, or the domain, within the horizon.
+
+    Parameters
+    ----------
+    problem : Problem
+    paths : int
+        Number of independent paths. Memory does not depend on it.
+    rng : numpy.random.Generator, optional
+        The same state gives the same counts, on any executor.
+    steps : int, optional
+        Time steps over the horizon; 1000 in continuous time, the horizon itself in discrete time.
+    confidence : float
+        Of the limits.
+    executor : concurrent.futures.Executor or dask Client, optional
+        Threads of this process when omitted.
+    checkpoint : path, optional
+        File that keeps finished chunks. An existing one is continued, with its seed where ``rng`` is omitted.
+    progress : callable, optional
+        Called now and then with a `Progress`.
+    scenario : Scenario, optional
+        Starts, disturbances, scheme.
+
+    Returns
+    -------
+    ExitCounts
+
+    Raises
+    ------
+    ValueError
+        If an argument is malformed, the noise has no law, or the model gives a state that is not finite.
+    SolverError
+        If the executor breaks down.
+
+    Notes
+    -----
+    Nothing is certified: the limits hold for the time-discretised model, up to the stated confidence.
+
+    Examples
+    --------
+    >>> import certbound as cb
+    >>> problem = cb.load("ou", radius=0.8)
+    >>> result = cb.simulate_exits(problem, paths=20000, rng=np.random.default_rng(1))
+    >>> bool(result.lower < 0.136 < result.upper), result.paths
+    (True, 20000)
+    """
+    paths, confidence = check_count("paths", paths), check_confidence(confidence)
+    setting = prepare(problem, steps, scenario)
+    barriers = barriers_of(problem, setting.times)
+    entropy = stored_entropy(checkpoint) if checkpoint is not None and rng is None else None
+    work = _exit_work(setting, barriers, paths, entropy_of(rng) if entropy is None else entropy)
+    outcome = run_work(work, executor, checkpoint, progress)
+    counts = outcome.tally.counts
+    exits = int(counts.sum())
+    lower, upper = bound_binomial(exits, paths, confidence)
+    by_constraint: dict[str, int] = {}
+    for barrier, count in zip(barriers, counts.sum(axis=1)):
+        by_constraint[barrier.label] = by_constraint.get(barrier.label, 0) + int(count)
+    return ExitCounts(
+        paths=paths,
+        exits=exits,
+        probability=exits / paths,
+        lower=float(lower),
+        upper=float(upper),
+        confidence=confidence,
+        by_constraint=by_constraint,
+        times=_bin_ends(setting, counts.shape[1] - 1),
+        exits_by_time=counts,
+        steps=setting.steps,
+        scheme=setting.model.scheme,
+        seconds=outcome.seconds,
+        path_steps_per_second=outcome.rate,
+    )
+
+
+def _exit_work(setting: Setting, barriers: list[Barrier], paths: int, entropy: int) -> Work:
+    source, p = kernel_source(setting.model, Task(kind="exits", barriers=barriers))
+    moving = [barrier.offset for barrier in barriers if barrier.moving]
+    return setting.work(
+        source=source,
+        p=p,
+        moving=np.hstack(moving) if moving else np.zeros((0, 0)),
+        windows=np.array([[b.first, b.last] for b in barriers], dtype=np.int64).reshape(-1, 2),
+        counts_shape=(len(barriers), 1 + min(setting.steps, _TIME_BINS)),
+        paths=paths,
+        entropy=entropy,
+    )
+
+
+def _bin_ends(setting: Setting, bins: int) -> Array:
+    """Times that separate the bins: bin k holds the steps j with j bins // steps = k."""
+    firsts = -(-np.arange(bins + 1) * setting.steps // bins)
+    return np.asarray(setting.times[np.minimum(firsts, setting.steps)])

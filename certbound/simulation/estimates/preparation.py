@@ -1,0 +1,144 @@
+"""From a problem to what all simulations share: grid, step, starts, disturbances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.model import compile_scalar
+from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
+from certbound.simulation.stepping import Scenario, StepModel, step_model
+
+__all__ = ["FixedStart", "Setting", "nominal_path", "prepare"]
+
+Array = NDArray[np.float64]
+
+_DEFAULT_STEPS = 1000
+_LONGEST_NOMINAL = 20_000  # steps; longer paths are advanced by the kernel
+
+
+@dataclass(frozen=True, eq=False)
+class FixedStart:
+    """The same start for every path."""
+
+    point: Array
+
+    def __call__(self, rng: np.random.Generator, count: int) -> Array:
+        return np.tile(self.point, (count, 1))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Setting:
+    """Grid, step and starts of a simulation.
+
+    Parameters
+    ----------
+    model : StepModel
+    steps : int
+    times : ndarray, shape (steps + 1,)
+    start : callable
+        ``start(rng, count)`` draws starts.
+    fixed : ndarray, shape (n,), or None
+        The start, if all paths share one.
+    """
+
+    model: StepModel
+    steps: int
+    times: Array
+    start: Callable[[np.random.Generator, int], Array]
+    fixed: Array | None
+
+    @property
+    def shared_nominal(self) -> bool:
+        """Whether all paths use one table of the noise-free path."""
+        return self.fixed is not None and not self.model.own_disturbance and self.steps <= _LONGEST_NOMINAL
+
+    def work(self, kind: type[Work] = Work, **fields: Any) -> Work:
+        """A piece of work on this setting; ``fields`` are those that differ from task to task."""
+        model = self.model
+        drawn = model.signal is None and model.switching == 0.0
+        none = np.zeros(0)
+        defaults: dict[str, Any] = {
+            "sample_start": self.start,
+            "low": model.low if drawn and model.disturbance_count else np.zeros(model.disturbance_count),
+            "high": model.high if drawn and model.disturbance_count else np.zeros(model.disturbance_count),
+            "inputs": model.table,
+            "moving": np.zeros((0, 0)),
+            "nominal": np.zeros((0, 0)),
+            "windows": np.zeros((0, 2), dtype=np.int64),
+            "profile": none,
+            "marks": np.zeros(0, dtype=np.int64),
+            "steps": self.steps,
+            "interval": model.interval,
+            "dimension": model.dimension,
+        }
+        return kind(**(defaults | fields))
+
+
+def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = None) -> Setting:
+    """Check the arguments that all simulations share.
+
+    Raises
+    ------
+    ValueError
+        If ``steps`` is malformed or its tables overflow the memory limit, the start lies elsewhere than said,
+        or the noise has no law.
+    """
+    scenario = scenario or Scenario()
+    if not isinstance(scenario, Scenario):
+        raise TypeError(f"`scenario` must be a certbound.simulation.stepping.Scenario, got {scenario!r}.")
+    count = _steps(problem, steps)
+    columns = 2 + 2 * problem.system.dimension + len(problem.closed_loop.inputs) + 4 * len(problem.safe)
+    fit = MEMORY_LIMIT // (8 * columns)
+    if count > fit:
+        raise ValueError(
+            f"`steps` must be at most {fit} for this problem, got {count}: its tables over time would take "
+            f"more than {MEMORY_LIMIT // 2**20} MiB; take a longer step."
+        )
+    times = np.linspace(0.0, float(problem.horizon), count + 1)
+    start, fixed = _start(problem, scenario)
+    return Setting(model=step_model(problem, count, scenario), steps=count, times=times, start=start, fixed=fixed)
+
+
+def _steps(problem: Any, steps: int | None) -> int:
+    if problem.system.time == "discrete":
+        horizon = int(problem.horizon)
+        if steps is not None and check_count("steps", steps) != horizon:
+            raise ValueError(f"`steps` must be {horizon}, the horizon of this discrete-time problem, or left out.")
+        return horizon
+    if steps is not None:
+        return check_count("steps", steps)
+    pieces = 1 if problem.input_sequence is None else len(problem.input_sequence)
+    return -(-_DEFAULT_STEPS // pieces) * pieces
+
+
+def _start(problem: Any, scenario: Scenario) -> tuple[Callable[[np.random.Generator, int], Array], Array | None]:
+    initial, n = problem.initial, problem.system.dimension
+    if scenario.initial is not None:
+        point = np.asarray(scenario.initial, dtype=float)
+        if point.shape != (n,) or not np.all(np.isfinite(point)):
+            raise ValueError(f"`initial` must hold {n} finite numbers, got {scenario.initial!r}.")
+        return FixedStart(point), point
+    if initial.kind == "box" and np.array_equal(initial.low, initial.high):
+        return FixedStart(np.asarray(initial.low)), np.asarray(initial.low)
+    return initial.sample, None
+
+
+def nominal_path(setting: Setting, start: Array) -> Array:
+    """The noise-free path of the discretised model from one start, shape (steps + 1, n).
+
+    Only for models whose disturbance is fixed.
+    """
+    model = setting.model
+    drift = compile_scalar(model.drift)
+    path = [np.asarray(start, dtype=float).tolist()]
+    inputs = model.table.tolist() if model.table.size else [()] * setting.steps
+    with np.errstate(all="ignore"):
+        for k in range(setting.steps):
+            value = drift(k * model.interval, *path[k], *inputs[k])
+            path.append([x + model.step * v for x, v in zip(path[k], value)] if model.step > 0.0 else value)
+    return np.array(path, dtype=float)

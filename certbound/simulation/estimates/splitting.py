@@ -1,0 +1,311 @@
+"""Probabilities of rare exits by adaptive multilevel splitting.
+
+N particles run to the horizon. Again and again the tenth with the lowest scores (see `score`) is discarded
+and each replaced by a copy of a survivor up to the first step at which that one exceeded the level, continued
+with new noise. The product of the surviving shares, times the final share of exits, is an unbiased estimate
+of the exit probability (Brehier, Gazeau, Goudenege, Lelievre, Rousset: Unbiasedness of some generalized
+adaptive multilevel splitting algorithms, 2016), whatever the score; a good score makes its variance small.
+Independent replicas give the standard error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.simulation.blocks import MEMORY_LIMIT, Tally, Work, check_count, entropy_of
+from certbound.simulation.checkpoint import stored_entropy
+from certbound.simulation.estimates.preparation import nominal_path, prepare
+from certbound.simulation.estimates.score import score_source
+from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
+from certbound.simulation.executors import Progress, run_work
+from certbound.simulation.gap_tests import Barrier, barriers_of
+from certbound.simulation.kernel_source import (
+    SIGNATURE,
+    close_noise,
+    indent,
+    load_lines,
+    module_head,
+    nominal_lines,
+    open_noise,
+    step_lines,
+)
+from certbound.simulation.stepping import Scenario, StepModel
+from certbound.simulation.tape_text import Parameters
+
+__all__ = ["RareExits", "simulate_rare_exits"]
+
+Array = NDArray[np.float64]
+
+_PARTICLES = 500
+_DISCARDED = 0.1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class RareExits:
+    """An exit probability from importance splitting.
+
+    Parameters
+    ----------
+    probability : float
+        Mean of the replicas' estimates: unbiased for the time-discretised model.
+    standard_error : float
+        Of the mean, from the scatter of the replicas.
+    lower, upper : float
+        Student interval of the mean, cut off at 0 (approximate, unlike Clopper-Pearson limits). If no
+        particle of any replica left, ``lower`` is 0 and ``upper`` the Clopper-Pearson limit of the first
+        generation alone.
+    confidence : float
+    paths : int
+        Particles in all replicas.
+    exits : int
+        Particles that had left in the end, in all replicas.
+    replicas : int
+    steps : int
+    scheme : str
+    path_steps : int
+        Path-steps done, copies included.
+    seconds, path_steps_per_second : float
+        Compilation left out.
+    """
+
+    probability: float
+    standard_error: float
+    lower: float
+    upper: float
+    confidence: float
+    paths: int
+    exits: int
+    replicas: int
+    steps: int
+    scheme: str
+    path_steps: int
+    seconds: float
+    path_steps_per_second: float
+
+
+def simulate_rare_exits(
+    problem: Any,
+    *,
+    paths: int = 200 * _PARTICLES,
+    particles: int = _PARTICLES,
+    rng: np.random.Generator | int | None = None,
+    steps: int | None = None,
+    confidence: float = 0.99,
+    executor: Any = None,
+    checkpoint: str | Path | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    scenario: Scenario | None = None,
+) -> RareExits:
+    """Estimate a small probability that a path leaves the safe set, or the domain.
+
+    Parameters
+    ----------
+    problem : Problem
+    paths : int
+        Particles in all; ``paths // particles`` independent replicas run, at least ten.
+    particles : int
+        Particles per replica, at least 20.
+    rng, steps, confidence, executor, checkpoint, progress, scenario
+        As in `certbound.simulate_exits`; a switching disturbance is refused.
+
+    Returns
+    -------
+    RareExits
+
+    Raises
+    ------
+    ValueError
+        If an argument is malformed, the particles' stored paths exceed the memory limit (the message says
+        what fits), the noise has no law, or the model gives a state that is not finite.
+
+    Examples
+    --------
+    >>> import certbound as cb
+    >>> found = simulate_rare_exits(cb.load("ou", radius=1.9), paths=10000, rng=np.random.default_rng(4))
+    >>> bool(1e-8 < found.probability < 1e-6)
+    True
+    """
+    paths, particles = check_count("paths", paths), check_count("particles", particles)
+    confidence = check_confidence(confidence)
+    if particles < 20:
+        raise ValueError(f"`particles` must be at least 20, got {particles}.")
+    replicas = max(10, paths // particles)
+    setting = prepare(problem, steps, scenario)
+    model = setting.model
+    if model.switching > 0.0:
+        raise ValueError("`disturbance` must not be 'switching' for rare exits; give a constant, an array or d(t, x).")
+    own = not setting.shared_nominal
+    size = 8 * (setting.steps + 1) * (1 + model.dimension * (2 if own else 1))
+    if particles * size > MEMORY_LIMIT // 4:
+        raise ValueError(
+            f"`particles` must be at most {MEMORY_LIMIT // 4 // size} with {setting.steps} steps of {model.dimension} "
+            f"states, got {particles}; lower `particles` or `steps`."
+        )
+    barriers = barriers_of(problem, setting.times)
+    source, p = _kernel_source(model, barriers, own)
+    moving = [barrier.offset for barrier in barriers if barrier.moving]
+    shared = setting.fixed if setting.shared_nominal else None
+    entropy = stored_entropy(checkpoint) if checkpoint is not None and rng is None else None
+    work = setting.work(
+        RareWork,
+        source=source,
+        p=p,
+        nominal=np.zeros((0, 0)) if shared is None else nominal_path(setting, shared),
+        moving=np.hstack(moving) if moving else np.zeros((0, 0)),
+        windows=np.array([[b.first, b.last] for b in barriers], dtype=np.int64).reshape(-1, 2),
+        counts_shape=(replicas, 2),
+        paths=replicas * particles,
+        block=particles,
+        entropy=entropy_of(rng) if entropy is None else entropy,
+    )
+    outcome = run_work(work, executor, checkpoint, progress)
+    estimates = outcome.tally.counts[:, 0].copy().view(np.float64)
+    probability, error, lower, upper = _summary(estimates, replicas * particles, confidence)
+    return RareExits(
+        probability=probability,
+        standard_error=error,
+        lower=lower,
+        upper=upper,
+        confidence=confidence,
+        paths=replicas * particles,
+        exits=int(outcome.tally.counts[:, 1].sum()),
+        replicas=replicas,
+        steps=setting.steps,
+        scheme=model.scheme,
+        path_steps=outcome.tally.steps,
+        seconds=outcome.seconds,
+        path_steps_per_second=outcome.rate,
+    )
+
+
+def _summary(estimates: Array, paths: int, confidence: float) -> tuple[float, float, float, float]:
+    """Mean, its standard error, and an interval."""
+    from scipy.special import stdtrit
+
+    count = len(estimates)
+    mean = math.fsum(estimates) / count
+    if mean == 0.0:
+        return 0.0, 0.0, 0.0, float(bound_binomial(0, paths, confidence)[1])
+    error = math.sqrt(math.fsum((estimates - mean) ** 2) / (count - 1) / count)
+    width = float(stdtrit(count - 1, 0.5 * (1.0 + confidence))) * error
+    return mean, error, max(mean - width, 0.0), min(mean + width, 1.0)
+
+
+class RareWork(Work):
+    """One replica a block.
+
+    A tally's row holds the bits of a replica's estimate, and its exits: adding tallies joins their rows.
+    """
+
+    def run_block(self, block: int, tally: Tally, out: Array | None = None) -> int:
+        result = np.zeros((1, 1, 2))
+        done = super().run_block(block, tally, result)
+        tally.counts[block, 0] = result[0, 0].view(np.int64)[0]
+        tally.counts[block, 1] = int(result[0, 0, 1])
+        return done
+
+
+_FOLLOW = """
+@njit(nogil=True, error_model="numpy")
+def follow(
+    stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path, first
+):
+    done = 0
+"""
+
+_REPLICA = """\
+    count, dimension = starts.shape
+    states = np.empty((count, steps + 1, dimension))
+    frees = np.empty(({frees}, steps + 1, dimension))
+    tops = np.zeros((count, steps + 1))
+    scores = np.empty(count)
+    alive = np.empty(count, dtype=np.int64)
+    done = 0
+    for path in range(count):
+        states[path, 0] = starts[path]
+        if {own}:
+            frees[path, 0] = starts[path]
+        moved = follow(
+            stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path, 0
+        )
+        if moved < 0:
+            return -1
+        done += moved
+        scores[path] = tops[path, steps]
+    weight = 1.0
+    while count > 0:
+        level = np.sort(scores)[int({discarded} * count) - 1]
+        if level >= 1.0:
+            break
+        survivors = 0
+        for path in range(count):
+            if scores[path] > level:
+                alive[survivors] = path
+                survivors += 1
+        if survivors == 0:
+            break
+        weight *= survivors / count
+        for path in range(count):
+            if scores[path] > level:
+                continue
+            parent = alive[min(int(uniform(stream) * survivors), survivors - 1)]
+            first = 0
+            while not tops[parent, first] > level:
+                first += 1
+            signals[path] = signals[parent]
+            for k in range(first + 1):
+                tops[path, k] = tops[parent, k]
+                states[path, k] = states[parent, k]
+                if {own}:
+                    frees[path, k] = frees[parent, k]
+            moved = follow(
+                stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path,
+                first,
+            )
+            if moved < 0:
+                return -1
+            done += moved
+        for path in range(count):
+            scores[path] = tops[path, steps]
+    left = 0
+    for path in range(count):
+        if scores[path] >= 1.0:
+            left += 1
+    if count > 0:
+        out[0, 0, 0] = weight * left / count
+        out[0, 0, 1] = left
+    return done
+"""
+
+
+def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tuple[str, Array]:
+    """Source of the splitting kernel; ``run`` writes the estimate to ``out[0, 0, 0]``."""
+    p = Parameters()
+    head = module_head(model, "splitting", p)
+    step, bridge = step_lines(model, p)
+    begin, within, end = score_source(barriers, bridge, p)
+    n = range(model.dimension)
+    load = [*load_lines(model, "states[path, first, {0}]"), "top = tops[path, first]"]
+    free = [f"b_{i} = nominal[k + 1, {i}]" for i in n]
+    store = [f"states[path, k + 1, {i}] = y_{i}" for i in n] + ["tops[path, k + 1] = top"]
+    if own:
+        load += [f"a_{i} = frees[path, first, {i}]" for i in n]
+        free = nominal_lines(model, p)
+        store += [f"frees[path, k + 1, {i}] = b_{i}" for i in n]
+        end = [*end, *[f"a_{i} = b_{i}" for i in n]]
+    full = ["tops[path, k + 1:] = top", "break"]
+    loop = [*step, *free, *within, *store, "if top >= 1.0:", *indent(full), *[f"x_{i} = y_{i}" for i in n], *end]
+    out = ["if top >= 1.0:", "    tops[path, first:] = top", "    return done"]
+    body = [*load, *begin, *out, *open_noise(model), "for k in range(first, steps):", *indent(loop)]
+    body += [close_noise(), "return done"]
+    fields = {"{own}": str(own), "{frees}": "count" if own else "0", "{discarded}": str(_DISCARDED)}
+    run = SIGNATURE + _REPLICA
+    for name, value in fields.items():
+        run = run.replace(name, value)
+    return head + _FOLLOW + "\n".join(indent(body)) + "\n" + run, np.array([*p.values, 0.0])

@@ -1,0 +1,309 @@
+"""Constraints as a kernel sees them: gaps that are positive while a path is safe, and the test between two
+steps.
+
+Between two grid times a path of a continuous system may leave and return. Given its values g and g' of a gap
+at both ends, a Brownian bridge of variance v h touches 0 with probability exp(-2 g g'/(v h)): exact for a
+half-space and constant diffusion, first-order accurate for smooth boundaries (Gobet, 2000). For a set of the
+kind "outside a polytope" the least of its faces' probabilities is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.sets import Outside
+from certbound.simulation.tape_text import Parameters, linear_form
+
+__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "window_test"]
+
+Array = NDArray[np.float64]
+
+EXPONENT = 40.0
+"""A bridge is looked at only where it exits with probability above exp(-40)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Barrier:
+    """One constraint on the steps ``first`` .. ``last``.
+
+    Parameters
+    ----------
+    label : str
+        Text for humans.
+    stay : bool
+        True: inside the region; False: outside it.
+    round : bool
+        True: the region is {‖matrix x - offset‖ <= radius}; False: it is {matrix x <= offset}.
+    matrix : ndarray, shape (rows, n)
+    offset : ndarray, shape (rows,) or (steps + 1, rows)
+        The second shape: one row per step, for a region that moves.
+    radius : float
+    first, last : int
+    always : bool
+        Whether these are all steps: then the kernel asks no further.
+    """
+
+    label: str
+    stay: bool
+    round: bool
+    matrix: Array
+    offset: Array
+    radius: float = 0.0
+    first: int
+    last: int
+    always: bool = False
+
+    @property
+    def moving(self) -> bool:
+        """Whether the region depends on time."""
+        return self.offset.ndim == 2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Bridge:
+    """How the noise of one step spreads: the columns are ``spread`` numbers, or variables named by
+    ``entries``.
+
+    ``spread`` already holds the factor sqrt(h). Where it is None, ``entries[i][j]`` is the expression of the
+    entry (i, j), to be multiplied by the square root of the step.
+    """
+
+    spread: Array | None
+    entries: Sequence[Sequence[str]] = ()
+
+    def variance(self, row: Sequence[float], parameters: Parameters) -> str:
+        """Expression of |row . G|^2 h for a fixed row."""
+        if self.spread is not None:
+            return parameters.add(float(np.sum((np.asarray(row) @ self.spread) ** 2)))
+        return self.squares([linear_form(row, column, parameters) for column in zip(*self.entries, strict=True)])
+
+    def moving_variance(self, names: Sequence[str], parameters: Parameters) -> str:
+        """Expression of |w . G|^2 h for a row w of variables."""
+        if self.spread is not None:
+            return self.squares([linear_form(column, names, parameters) for column in self.spread.T])
+        columns = zip(*self.entries, strict=True)
+        return self.squares(
+            [" + ".join(f"{n} * {e}" for n, e in zip(names, column) if e != "0.0") or "0.0" for column in columns]
+        )
+
+    def even_variance(self, matrix: Array) -> float:
+        """|u . matrix . G|^2 h where it is the same for all unit vectors u, else 0."""
+        if self.spread is None:
+            return 0.0
+        image = matrix @ self.spread
+        square = image @ image.T
+        even = np.allclose(square, square[0, 0] * np.eye(len(square)), rtol=1e-12, atol=1e-14 * square[0, 0])
+        return float(square[0, 0]) if even else 0.0
+
+    @staticmethod
+    def squares(terms: Sequence[str]) -> str:
+        return " + ".join(f"({term}) ** 2" for term in terms if term != "0.0") or "0.0"
+
+
+def barriers_of(problem: Any, times: Array) -> list[Barrier]:
+    """The constraints of a problem on the grid ``times``, its domain (which must not be left either) last.
+
+    A window that holds no grid time is watched at the nearest one.
+    """
+    barriers = []
+    for constraint in problem.constraints:
+        region, last = constraint.region, len(times) - 1
+        start, stop = constraint.during if constraint.during is not None else (times[0], times[-1])
+        slack = 1e-9 * max(abs(float(times[-1])), 1.0)
+        first = int(np.searchsorted(times, start - slack))
+        end = int(np.searchsorted(times, stop + slack, side="right")) - 1
+        if first > end:
+            first = end = int(np.argmin(np.abs(times - 0.5 * (start + stop))))
+        embed = np.eye(problem.system.dimension)
+        if region.coordinates is not None:
+            embed = embed[list(region.coordinates)]
+        centers = np.array([region.center_at(t) for t in times]) if region.moving else region.center_at()
+        fields = _round_fields(region, embed, centers) if region.kind in _ROUND else None
+        if fields is None:
+            faces, bounds = region.halfspaces()
+            if len(bounds) == 0:
+                continue
+            fields = {"round": False, "matrix": faces @ embed, "offset": bounds + centers @ faces.T}
+        fields |= {"label": constraint.label, "stay": not isinstance(constraint, Outside)}
+        fields |= {"first": min(first, last), "last": min(end, last), "always": first == 0 and end >= last}
+        barriers.append(Barrier(**fields))
+    return barriers
+
+
+_ROUND = ("ball", "ellipsoid")
+
+
+def _round_fields(region: Any, embed: Array, centers: Array) -> dict[str, Any]:
+    """A ball or ellipsoid as ‖matrix x - offset‖ <= radius; an interval, in one dimension, as two faces."""
+    whiten, radius = np.eye(region.dimension), 1.0
+    if region.kind == "ball":
+        radius = float(region.radius)
+    else:
+        whiten = np.linalg.inv(np.linalg.cholesky(region.shape))
+    matrix, offset = whiten @ embed, centers @ whiten.T
+    if region.dimension == 1:
+        both = np.concatenate([radius + offset, radius - offset], axis=-1)
+        return {"round": False, "matrix": np.vstack([matrix, -matrix]), "offset": both}
+    return {"round": True, "matrix": matrix, "offset": offset, "radius": radius}
+
+
+def barrier_source(
+    number: int, barrier: Barrier, bridge: Bridge | None, parameters: Parameters, column: int
+) -> tuple[list[str], list[str], list[str]]:
+    """Source lines (before the first step, within a step, at the end of a step) that watch one constraint.
+
+    The lines read the old state ``x_i``, the new state ``y_i`` and the step number ``k``, and set ``left`` to
+    the number of the constraint when the path leaves. ``column`` is the first column of ``moving`` that it
+    may use.
+    """
+    if barrier.round:
+        return _round(number, barrier, bridge, parameters, column)
+    return _faces(number, barrier, bridge, parameters, column)
+
+
+def window_test(number: int, barrier: Barrier, start: str) -> list[str]:
+    """Conditions for a constraint to hold from step ``start`` to step k + 1; none if it always does."""
+    if barrier.always:
+        return []
+    return [f"windows[{number}, 0] <= {start}", f"k + 1 <= windows[{number}, 1]"]
+
+
+def if_all(*conditions: str, word: str = "if") -> str:
+    """``if a and b:``, or ``if True:`` without conditions."""
+    return f"{word} {' and '.join(condition for condition in conditions if condition) or 'True'}:"
+
+
+def _starts(number: int, barrier: Barrier) -> str:
+    return "" if barrier.always else f"windows[{number}, 0] == 0"
+
+
+def _names(letter: str, count: int) -> list[str]:
+    return [f"{letter}_{i}" for i in range(count)]
+
+
+def _touch(exponent: str, number: int) -> list[str]:
+    """Leave with probability exp(-e), which is below 1/(1 + e + e^2/2): that saves most exponentials."""
+    return [
+        f"exponent = {exponent}",
+        "chance = uniform(stream)",
+        "if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0 and chance < math.exp(-exponent):",
+        f"    left = {number}",
+    ]
+
+
+def _indent(lines: Sequence[str], levels: int = 1) -> list[str]:
+    return ["    " * levels + line for line in lines]
+
+
+def _faces(
+    number: int, barrier: Barrier, bridge: Bridge | None, p: Parameters, column: int
+) -> tuple[list[str], list[str], list[str]]:
+    rows, dimension = barrier.matrix.shape
+    old, new = _names(f"g_{number}", rows), _names(f"n_{number}", rows)
+
+    def gaps(targets: list[str], state: str, step: str) -> list[str]:
+        lines = []
+        for f, target in enumerate(targets):
+            bound = f"moving[{step}, {column + f}]" if barrier.moving else p.add(float(barrier.offset[f]))
+            value = linear_form(barrier.matrix[f].tolist(), _names(state, dimension), p)
+            lines.append(f"{target} = " + (f"{bound} - ({value})" if barrier.stay else f"{value} - {bound}"))
+        return lines
+
+    def out(names: list[str]) -> str:
+        return (" or " if barrier.stay else " and ").join(f"{name} < 0.0" for name in names)
+
+    start = [*gaps(old, "x", "0"), if_all(_starts(number, barrier), f"({out(old)})"), f"    left = {number}"]
+    step = [
+        *gaps(new, "y", "k + 1"),
+        if_all(f"({out(new)})", *window_test(number, barrier, "k + 1")),
+        f"    left = {number}",
+    ]
+    end: list[str] = []
+    if bridge is not None:
+        end = [f"{g} = {n}" for g, n in zip(old, new)]
+        spreads = [bridge.variance(row.tolist(), p) for row in barrier.matrix]
+        active = window_test(number, barrier, "k")
+        step += (_bridge_stay if barrier.stay else _bridge_avoid)(number, active, old, new, spreads, p)
+    return start, step, end
+
+
+def _bridge_stay(
+    number: int, active: list[str], old: list[str], new: list[str], spreads: list[str], p: Parameters
+) -> list[str]:
+    """Each face may be touched."""
+    lines = []
+    for g, n, spread in zip(old, new, spreads):
+        if not p.is_zero(spread):
+            near = f"0.0 <= {g} and {g} * {n} < {0.5 * EXPONENT} * ({spread})"
+            lines += [if_all(near, "left < 0", *active)]
+            lines += _indent(_touch(f"2.0 * {g} * {n} / ({spread})", number))
+    return lines
+
+
+def _bridge_avoid(
+    number: int, active: list[str], old: list[str], new: list[str], spreads: list[str], p: Parameters
+) -> list[str]:
+    """All faces must be crossed: the least likely one decides; without one, the straight line does."""
+    near = " and ".join(
+        f"({n} < 0.0 or {g} * {n} < {0.5 * EXPONENT} * ({spread}))" for g, n, spread in zip(old, new, spreads)
+    )
+    lines = ["worst, enter, leave = -1.0, 0.0, 1.0"]
+    for g, n, spread in zip(old, new, spreads):
+        lines += [f"if {g} > 0.0 and {n} > 0.0:", f"    worst = max(worst, 2.0 * {g} * {n} / ({spread}))"]
+        lines += [f"elif {g} > 0.0:", f"    enter = max(enter, {g} / ({g} - {n}))"]
+        lines += [f"elif {n} > 0.0:", f"    leave = min(leave, {g} / ({g} - {n}))"]
+    lines += ["if worst >= 0.0:", *_indent(_touch("worst", number))]
+    lines += ["elif enter < leave:", f"    left = {number}"]
+    return [if_all(near, "left < 0", *active), *_indent(lines)]
+
+
+def _round(
+    number: int, barrier: Barrier, bridge: Bridge | None, p: Parameters, column: int
+) -> tuple[list[str], list[str], list[str]]:
+    rows, dimension = barrier.matrix.shape
+    old, new = f"q_{number}", f"r_{number}"
+    radius = p.add(barrier.radius)
+    legs = _names(f"e_{number}", rows)
+
+    def distance(target: str, state: str, step: str) -> list[str]:
+        lines = []
+        for i, leg in enumerate(legs):
+            center = f"moving[{step}, {column + i}]" if barrier.moving else p.add(float(barrier.offset[i]))
+            value = linear_form(barrier.matrix[i].tolist(), _names(state, dimension), p)
+            lines += [f"{leg} = {value} - {center}"]
+        return [*lines, f"{target} = {' + '.join(f'{leg} * {leg}' for leg in legs)}"]
+
+    beyond = f"{'>' if barrier.stay else '<'} {radius} * {radius}"
+    start = distance(old, "x", "0")
+    start += [if_all(_starts(number, barrier), f"{old} {beyond}"), f"    left = {number}"]
+    step = distance(new, "y", "k + 1")
+    step += [if_all(f"{new} {beyond}", *window_test(number, barrier, "k + 1")), f"    left = {number}"]
+    end = [f"{old} = {new}"]
+    if bridge is None:
+        return start, step, []
+    near = _near(barrier, bridge, old, new, p)
+    gap = f"{radius} - math.sqrt({{0}})" if barrier.stay else f"math.sqrt({{0}}) - {radius}"
+    lines = [f"before, after = {gap.format(old)}, {gap.format(new)}"]
+    weights = [linear_form(column_.tolist(), legs, p) for column_ in barrier.matrix.T]
+    lines += [f"w_{i} = {weight}" for i, weight in enumerate(weights)]
+    spread = bridge.moving_variance(_names("w", dimension), p)
+    lines += [f"spread = ({spread}) / {new} if {new} > 0.0 else 0.0"]
+    lines += [f"if before >= 0.0 and before * after < {0.5 * EXPONENT} * spread:"]
+    lines += _indent(_touch("2.0 * before * after / spread", number))
+    test = if_all(near, *window_test(number, barrier, "k"), word="elif")
+    return start, [*step, test, *_indent(lines)], end
+
+
+def _near(barrier: Barrier, bridge: Bridge, old: str, new: str, p: Parameters) -> str:
+    """Test, on squared radii, whether a bridge can matter; none where the noise depends on the state."""
+    if bridge.spread is None:
+        return ""
+    band = np.sqrt(0.5 * EXPONENT) * np.linalg.norm(barrier.matrix @ bridge.spread, 2)
+    near = max(barrier.radius - band, 0.0) if barrier.stay else barrier.radius + band
+    limit = p.add(float(near**2))
+    return f"max({old}, {new}) > {limit}" if barrier.stay else f"min({old}, {new}) < {limit}"

@@ -1,0 +1,188 @@
+"""Tape to Python source: straight-line code over scalars that numba compiles.
+
+Numbers of the tape become entries of a parameter array, so that the source (and its compiled form on disk)
+depends on the structure of a model alone: a sweep over a parameter compiles once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from certbound.problem.model import Node, Tape
+
+__all__ = ["Parameters", "function_source", "linear_form", "live_nodes"]
+
+_UNARY = {
+    "neg": "-{0}",
+    "sq": "{0} * {0}",
+    "sqrt": "math.sqrt({0})",
+    "exp": "math.exp({0})",
+    "log": "math.log({0})",
+    "sin": "math.sin({0})",
+    "cos": "math.cos({0})",
+    "tan": "math.tan({0})",
+    "asin": "math.asin({0})",
+    "acos": "math.acos({0})",
+    "atan": "math.atan({0})",
+    "sinh": "math.sinh({0})",
+    "cosh": "math.cosh({0})",
+    "tanh": "tanh({0})",
+    "abs": "abs({0})",
+    "floor": "np.floor({0})",
+    "sign": "(1.0 if {0} > 0.0 else -1.0 if {0} < 0.0 else {0})",
+    "kink": "(1.0 if {0} > 0.0 else -1.0 if {0} < 0.0 else {0})",
+    "not": "(1.0 if {0} == 0.0 else 0.0)",
+}
+_BINARY = {
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+    "atan2": "atan2({0}, {1})",
+    "hypot": "math.hypot({0}, {1})",
+    "min": "({0} if {0} < {1} or {0} != {0} else {1})",
+    "max": "({0} if {0} > {1} or {0} != {0} else {1})",
+    "lt": "(1.0 if {0} < {1} else 0.0)",
+    "le": "(1.0 if {0} <= {1} else 0.0)",
+    "eq": "(1.0 if {0} == {1} else 0.0)",
+    "ne": "(1.0 if {0} != {1} else 0.0)",
+    "and": "(1.0 if {0} != 0.0 and {1} != 0.0 else 0.0)",
+    "or": "(1.0 if {0} != 0.0 or {1} != 0.0 else 0.0)",
+    "if_else_zero": "({1} if {0} != 0.0 else 0.0)",
+}
+
+
+@dataclass(eq=False, slots=True)
+class Parameters:
+    """The array ``p`` of numbers that a kernel reads, filled while its source is written."""
+
+    values: list[float] = field(default_factory=list)
+
+    def add(self, value: float) -> str:
+        """Append a number; returns the expression that reads it."""
+        self.values.append(float(value))
+        return f"p[{len(self.values) - 1}]"
+
+    def value_of(self, expression: str) -> float | None:
+        """The number behind an expression, None unless it is one of these parameters or "0.0"."""
+        if expression.startswith("p[") and expression[2:-1].isdigit():
+            return self.values[int(expression[2:-1])]
+        return 0.0 if expression == "0.0" else None
+
+    def is_zero(self, expression: str) -> bool:
+        """Whether an expression is known to be 0."""
+        return self.value_of(expression) == 0.0
+
+
+def live_nodes(tape: Tape) -> list[int]:
+    """Indices of the nodes that the outputs need, in order."""
+    needed = set(tape.outputs)
+    for index in range(len(tape.nodes) - 1, -1, -1):
+        node = tape.nodes[index]
+        if index in needed and node.op != "input":
+            needed.update(node.args)
+    return sorted(needed)
+
+
+def function_source(name: str, tape: Tape, arguments: Sequence[str], parameters: Parameters) -> list[str]:
+    """Source lines of ``name(p, *arguments)``, which returns the tape's outputs as a tuple.
+
+    Parameters
+    ----------
+    name : str
+        Name of the function.
+    tape : Tape
+        Function of ``len(arguments)`` scalars.
+    arguments : sequence of str
+        Variable name of each input slot, in the generated source.
+    parameters : Parameters
+        Receives the tape's numbers.
+
+    Examples
+    --------
+    >>> tape = Tape(inputs=("a",), nodes=(Node("input", (0,)), Node("sin", (0,))), outputs=(1,), shape=(1,))
+    >>> print(*function_source("drift", tape, ["x_0"], Parameters()), sep="\\n")
+    def drift(p, x_0):
+        v1 = math.sin(x_0)
+        return (v1,)
+    """
+    lines = [f"def {name}({', '.join(['p', *arguments])}):"]
+    names: dict[int, str] = {}
+    live = live_nodes(tape)
+    pairs = _pairs(tape, live)
+    for index in live:
+        node = tape.nodes[index]
+        if node.op == "input":
+            names[index] = arguments[node.args[0]]
+        elif node.op == "const":
+            names[index] = parameters.add(node.value)
+        elif index in pairs:
+            sine, cosine = pairs[index]
+            if index == min(sine, cosine):
+                lines.append(f"    v{sine}, v{cosine} = sincos({names[node.args[0]]})")
+            names[index] = f"v{index}"
+        else:
+            names[index] = f"v{index}"
+            operands = [names[arg] for arg in node.args]
+            lines.append(f"    v{index} = {_operation(node, operands, parameters)}")
+    results = "".join(f"{names[output]}, " for output in tape.outputs).rstrip()
+    lines.append(f"    return ({results[:-1] if len(tape.outputs) > 1 else results})")
+    return lines
+
+
+def _pairs(tape: Tape, live: Sequence[int]) -> dict[int, tuple[int, int]]:
+    """Sines and cosines of the same argument, computed together: node to (sine, cosine)."""
+    places: dict[tuple[str, int], int] = {}
+    for index in live:
+        node = tape.nodes[index]
+        if node.op in ("sin", "cos"):
+            places.setdefault((node.op, node.args[0]), index)
+    pairs: dict[int, tuple[int, int]] = {}
+    for (op, argument), index in places.items():
+        if op == "sin" and ("cos", argument) in places:
+            other = places["cos", argument]
+            pairs[index] = pairs[other] = (index, other)
+    return pairs
+
+
+def _operation(node: Node, operands: list[str], parameters: Parameters) -> str:
+    if node.op == "pow":
+        return _power(operands[0], node.value, parameters)
+    pattern = _UNARY.get(node.op) or _BINARY[node.op]
+    return pattern.format(*operands)
+
+
+def _power(base: str, exponent: float, parameters: Parameters) -> str:
+    """Small whole exponents become products, which are ten times faster than a call of pow."""
+    if exponent == 0.5:
+        return f"math.sqrt({base})"
+    if exponent == int(exponent) and 1 <= abs(exponent) <= 12:
+        product = _product(base, int(abs(exponent)))
+        return product if exponent > 0 else f"1.0 / ({product})"
+    return f"{base} ** {parameters.add(exponent)}"
+
+
+def _product(base: str, count: int) -> str:
+    if count == 1:
+        return base
+    half = _product(base, count // 2)
+    squared = f"({half}) * ({half})" if count > 3 else " * ".join([base] * (count // 2 * 2))
+    return f"{squared} * {base}" if count % 2 else squared
+
+
+def linear_form(row: Sequence[float], names: Sequence[str], parameters: Parameters) -> str:
+    """Expression of ``row . names``, with zero entries left out ("0.0" where all are).
+
+    Examples
+    --------
+    >>> linear_form([2.0, 0.0, 1.0], ["a", "b", "c"], Parameters())
+    'p[0] * a + c'
+    """
+    terms = []
+    for weight, name in zip(row, names, strict=True):
+        if weight == 1.0:
+            terms.append(name)
+        elif weight != 0.0:
+            terms.append(f"{parameters.add(weight)} * {name}")
+    return " + ".join(terms) if terms else "0.0"

@@ -1,0 +1,54 @@
+"""The energy of the averaged moment generating function (Def. 5 and Lemma 2 of the paper).
+
+Phi_{n,lam}(x) = E exp(lam <l, x>) over l uniform on the unit sphere = 0F1(; n/2; (lam ||x||)^2/4), which is
+cosh(lam x) for n = 1.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from certbound.tubes.excess import log_excess
+
+__all__ = ["log_energy", "log_energy_growth"]
+
+Array = NDArray[np.float64]
+
+
+def log_energy(x: ArrayLike, rate: float) -> Any:
+    """log Phi_{n,lam}(x) for vectors ``x`` of shape (..., n) and lam = ``rate``, at any size, in floating point.
+
+    It depends on ||x|| only, rises with it, is at least :func:`log_energy_growth`, and for a sub-Gaussian w with
+    proxy variance s^2 obeys E Phi(x + w) <= exp(lam^2 s^2/2) Phi(x) (Lemma 2 of the paper).
+
+    Raises
+    ------
+    ValueError
+        If ``x`` has no axis, or a value is not finite.
+
+    Examples
+    --------
+    >>> bool(abs(log_energy([2.0], 3.0) - np.log(np.cosh(6.0))) < 1e-12)
+    True
+    """
+    vectors = np.asarray(x, dtype=float)
+    if vectors.ndim == 0 or not np.all(np.isfinite(vectors)) or not np.isfinite(rate):
+        raise ValueError("`x` must be finite, of shape (..., n), and `rate` finite; a scalar is [x].")
+    size = np.linalg.norm(vectors, axis=-1) * abs(rate)
+    excess, _ = log_excess(np.ones_like(size), vectors.shape[-1] / 2, size**2 / 4, bessel=True)
+    result = np.logaddexp(0.0, excess)
+    return float(result) if result.ndim == 0 else result
+
+
+def log_energy_growth(x: ArrayLike, rate: float, epsilon: float) -> Any:
+    """Lower bound (n/2) log(1 - e^2) + e lam ||x|| of log Phi_{n,lam}(x), e = ``epsilon`` in (0, 1) (Lemma 2-3)."""
+    if not 0 < epsilon < 1:
+        raise ValueError(f"`epsilon` must lie in (0, 1), got {epsilon}.")
+    vectors = np.asarray(x, dtype=float)
+    if vectors.ndim == 0:
+        raise ValueError("`x` must have shape (..., n); a scalar is [x].")
+    size = np.linalg.norm(vectors, axis=-1) * abs(rate)
+    return vectors.shape[-1] / 2 * np.log1p(-(epsilon**2)) + epsilon * size

@@ -1,0 +1,319 @@
+"""Bounds of the probability of failing within the horizon, from above and from below, refined until they are close."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Box, GaussianStart, Inside, Region
+from certbound.problem.systems import DiscreteSystem
+from certbound.rigor.intervals import Interval
+from certbound.values.discrete.fields import Tables
+from certbound.values.discrete.functions import ValueFunction
+from certbound.values.discrete.induction import (
+    AnyTransition,
+    Zones,
+    back_above,
+    back_below,
+    final,
+    values_above,
+    zones_of,
+)
+from certbound.values.discrete.layout import Boxes, boxes_of, grid_of, widths_of
+from certbound.values.discrete.shocks import Inapplicable, Shocks, gaussian_shocks, shocks_of
+from certbound.values.discrete.steps import Dynamics, Step
+from certbound.values.discrete.transitions import Transition
+from certbound.values.discrete.uniform_noise import UniformTables, UniformTransition
+from certbound.values.grids import Grid, corners
+from certbound.values.sets import active_at, box_around, contains, respected
+
+__all__ = ["FailureBounds", "bound_failure"]
+
+Array = NDArray[np.float64]
+
+MOST_STATES = 3
+_SHARES = {
+    1: (0.33, 0.15, 0.07, 0.035, 0.0175, 0.01),
+    2: (0.5, 0.33, 0.22, 0.15, 0.1, 0.07, 0.05, 0.035),
+    3: (0.4, 0.17, 0.1, 0.07),
+}
+"""Sizes of the cells that are tried, relative to the lengths over which the solution changes."""
+_UNIFORM_FLOOR = 1e-9  # means over boxes are known up to an absolute error
+_UNIFORM_SHARES = {
+    1: (0.2, 0.07, 0.025, 0.01, 0.005),
+    2: (0.3, 0.15, 0.07, 0.035, 0.02, 0.012),
+    3: (0.5, 0.3, 0.2, 0.12),
+}
+_MOST_NODES = 3_000_000
+_PATIENCE = 1.0  # seconds for which grids are refined although the question is answered
+_FLOOR = 1e-16  # where what lies beyond ten standard deviations begins to count
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FailureBounds:
+    """lower <= largest P(failure within the horizon) over starts and disturbances <= upper; a random start is averaged.
+
+    Parameters
+    ----------
+    upper, lower : float
+        Certified.
+    cells : tuple of int
+        Of the finest grid.
+    share : float
+        Its cells' size, relative to the lengths over which the solution changes.
+    seconds : float
+        Spent on all grids.
+    tried : tuple of (float, float, float)
+        Share, upper and lower of every grid.
+    """
+
+    upper: float
+    lower: float
+    cells: tuple[int, ...]
+    share: float
+    seconds: float
+    tried: tuple[tuple[float, float, float], ...]
+
+
+def bound_failure(
+    problem: Problem,
+    *,
+    target: Region | None = None,
+    ratio: float = 1.05,
+    delta: float | None = None,
+    seconds: float = 20.0,
+    parts: int = 4,
+) -> FailureBounds:
+    """Bound the probability of failing, on finer and finer grids.
+
+    Failing is to break a constraint at a step of its window; with a ``target``, to break one before the target was
+    entered, or never to enter it.
+
+    Parameters
+    ----------
+    problem : Problem
+        In discrete time, with at most three states and Gaussian noise on each.
+    target : Region, optional
+        Set that ends the danger.
+    ratio : float
+        Stop once upper <= ratio * lower.
+    delta : float, optional
+        Stop also once upper is a hundredth of it, or lower a hundred times (or half).
+    seconds : float
+        Stop before a grid that is expected to end later than this after the beginning.
+    parts : int
+        Parts along each side of the set of disturbances.
+
+    Raises
+    ------
+    Inapplicable
+        If value functions do not fit the problem; the message says why.
+    """
+    work = _Work(problem, target, parts)
+    begun = time.perf_counter()
+    upper, lower = 1.0, 0.0
+    tried: list[tuple[float, float, float]] = []
+    spent: list[tuple[int, float]] = []
+    cells: tuple[int, ...] = ()
+    for share in (_UNIFORM_SHARES if work.shocks.uniform else _SHARES)[work.n]:
+        layout = work.layout(share)
+        if layout is None:
+            if not tried:
+                raise Inapplicable(work.too_large)
+            break
+        finest = max((grid.shape for grid in layout), key=math.prod)
+        if tried and time.perf_counter() - begun + _expected(spent, math.prod(finest)) > seconds:
+            break
+        start = time.perf_counter()
+        try:
+            found = work.bounds(layout, share)
+        except Inapplicable:
+            if not tried:
+                raise
+            break
+        spent.append((math.prod(finest), time.perf_counter() - start))
+        upper, lower, cells = min(upper, found[0]), max(lower, found[1]), finest
+        tried.append((share, *found))
+        settled = time.perf_counter() - begun > _PATIENCE and _settled(upper, lower, delta)
+        if upper <= ratio * lower or settled or upper < (_UNIFORM_FLOOR if work.shocks.uniform else _FLOOR):
+            break
+    return FailureBounds(
+        upper=upper,
+        lower=lower,
+        cells=cells,
+        share=tried[-1][0],
+        seconds=time.perf_counter() - begun,
+        tried=tuple(tried),
+    )
+
+
+def _expected(spent: list[tuple[int, float]], cells: int) -> float:
+    """Seconds that so many cells will take: a straight line through the last two grids, or half in proportion."""
+    (count, last) = spent[-1]
+    if len(spent) == 1:
+        return last * (0.5 + 0.5 * cells / count)
+    before, earlier = spent[-2]
+    return last + max(last - earlier, 0.0) / max(count - before, 1) * max(cells - count, 0)
+
+
+def _settled(upper: float, lower: float, delta: float | None) -> bool:
+    """Whether the question is answered with room to spare."""
+    return delta is not None and (upper <= delta / 100 or lower >= min(100 * delta, 0.5))
+
+
+class _Work:
+    """One problem: its noise, its boxes, its steps."""
+
+    too_large = (
+        f"value functions would need more than {_MOST_NODES} nodes: the safe set is very many standard "
+        "deviations of the noise wide. Use another engine, which is at its best there."
+    )
+
+    def __init__(self, problem: Problem, target: Region | None, parts: int) -> None:
+        system = problem.system
+        if not isinstance(system, DiscreteSystem):
+            raise Inapplicable("this engine's backward induction needs discrete time.")
+        if system.dimension > MOST_STATES:
+            raise Inapplicable(f"value functions on grids take at most {MOST_STATES} states, not {system.dimension}.")
+        self.problem, self.target, self.n = problem, target, system.dimension
+        self.horizon = int(problem.horizon)
+        self.shocks = shocks_of(system.noise, system.noise_matrix)
+        self.dynamics = Dynamics(problem, parts)
+        self.boxes: Boxes = boxes_of(problem, self.shocks, self.dynamics)
+        self.random = isinstance(problem.initial, GaussianStart)
+        self.start_shocks = self._start_shocks()
+        self._lengths: dict[int, list[tuple[Array, Array]]] = {}
+
+    def _start_shocks(self) -> Shocks | None:
+        initial = self.problem.initial
+        if not isinstance(initial, GaussianStart):
+            return None
+        if not np.any(initial.covariance):
+            self.random = False
+            return None
+        try:
+            return gaussian_shocks(Interval.point(initial.covariance))
+        except Inapplicable as error:
+            raise Inapplicable(
+                "value functions need a random start with a covariance that is diagonal, or diagonal plus one common "
+                "factor, and positive in every state."
+            ) from error
+
+    # ---- grids -----------------------------------------------------------------------------------------------
+
+    def layout(self, share: float) -> list[Grid] | None:
+        """The grids of all steps (step 0 is used for random starts only); None if they are too large."""
+        grids: list[Grid] = []
+        made: dict[bytes, Grid] = {}
+        for t in range(self.horizon + 1):
+            low, high = self.boxes.low[t], self.boxes.high[t]
+            active = active_at(self.problem.constraints, t)
+            moving = any(c.region.moving for c in active) or (self.target is not None and self.target.moving)
+            key = b"".join([low.tobytes(), high.tobytes(), repr([id(c) for c in active]).encode()])
+            key += repr(t if moving else 0).encode()
+            if key not in made:
+                when = 0 if self.dynamics.steady else min(t, self.horizon - 1)
+                lengths = self._lengths_at(when, t)
+                made[key] = grid_of(low, high, lengths, share, active, self.target, self.shocks, t)
+            grids.append(made[key])
+            if math.prod(grids[-1].node_shape) > _MOST_NODES:
+                return None
+        return grids
+
+    def _lengths_at(self, when: int, t: int) -> list[tuple[Array, Array]]:
+        if t not in self._lengths:
+            self._lengths[t] = widths_of(self.problem, self.dynamics, self.shocks, self.boxes, t, when)
+        return self._lengths[t]
+
+    # ---- both bounds -----------------------------------------------------------------------------------------
+
+    def bounds(self, grids: list[Grid], share: float) -> tuple[float, float]:
+        """(upper, lower) from the grids."""
+        last = self.horizon
+        zones = [self._zones(grids, t) for t in range(last + 1)]
+        above = final(grids[last], zones[last], above=True)
+        below = final(grids[last], zones[last], above=False)
+        kept: tuple[object, AnyTransition] | None = None
+        end = 0 if self.random else 1
+        for t in range(last - 1, end - 1, -1):
+            key = (id(grids[t]), id(grids[t + 1])) if self.dynamics.steady else t
+            if kept is None or kept[0] != key:
+                kept = (key, self._transition(t, grids[t], grids[t + 1], share))
+            above = back_above(kept[1], above, zones[t])
+            below = back_below(kept[1], below, zones[t])
+        upper, lower = self._at_random(above, below) if self.random else self._over_start(above, below, share)
+        leak = self.boxes.leak * (1 + 1e-9)
+        return min(max(upper, 0.0), 1.0), max(lower - leak, 0.0)
+
+    def _zones(self, grids: list[Grid], t: int) -> Zones:
+        return zones_of(grids[t], active_at(self.problem.constraints, t), self.target, t)
+
+    def _transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
+        step = self.dynamics.step(t, grid)
+        if self.shocks.uniform:
+            return UniformTransition(
+                step, UniformTables(after, self.shocks, *step.hull(), fineness=max(2 / share, 4.0))
+            )
+        return Transition(step, Tables(after, self.shocks, *step.hull()))
+
+    def _at_random(self, above: ValueFunction, below: ValueFunction) -> tuple[float, float]:
+        """Mean over a Gaussian start: one more convolution, read at the mean."""
+        assert self.start_shocks is not None
+        assert isinstance(self.problem.initial, GaussianStart)
+        mean = self.problem.initial.mean
+        tables = Tables(above.grid, self.start_shocks, mean, mean)
+        point = Grid(axes=tuple(np.array([value]) for value in mean))
+        image = (Interval.point(mean[None]), np.ones(1, dtype=bool))
+        transition = Transition(Step(grid=point, vertices=[image], cells=[], pieces=np.empty((0, 0))), tables)
+        ((high, error),) = transition.at_nodes(tables.field(above, order=0))
+        ((low, other),) = transition.at_nodes(tables.field(below, order=0))
+        return float(high.item() + error.item()), float(low.item() - other.item())
+
+    def _over_start(self, above: ValueFunction, below: ValueFunction, share: float) -> tuple[float, float]:
+        """Largest value over the initial set, on a grid of its own."""
+        region = self._start_region()
+        grid = self._start_grid(region, share)
+        cells = grid.cells()
+        meets = ~contains(region, cells, 0)[1]
+        safe, _ = respected(active_at(self.problem.constraints, 0), cells, 0)
+        if not np.all(safe[meets]):
+            upper = 1.0
+        else:
+            transition = self._transition(0, grid, above.grid, share)
+            upper = self._highest(transition, above, meets)
+        transition = self._transition(0, grid, below.grid, share)
+        field: Any = transition.tables.field(below, order=0)
+        values = np.maximum.reduce([at - error for at, error in transition.at_nodes(field)])
+        inside = contains(region, Interval.point(grid.nodes()), 0)[0]
+        if self.target is not None:
+            inside &= contains(self.target, Interval.point(grid.nodes()), 0)[1]
+        values = values.ravel()[inside]
+        return upper, float(values.max()) if len(values) else 0.0
+
+    def _highest(self, transition: AnyTransition, above: ValueFunction, meets: NDArray[np.bool_]) -> float:
+        nodal, bend, known = values_above(transition, above)
+        top = np.maximum.reduce(corners(nodal))
+        for i in range(self.n):
+            top = top + np.maximum(-bend[i], 0.0) * transition.step.grid.widths(i) ** 2 / 8 * (1 + 1e-12)
+        top = np.where(known, top, 1.0).ravel()[meets]
+        return float(top.max())
+
+    def _start_region(self) -> Region:
+        initial = self.problem.initial
+        return Box(initial.mean, initial.mean) if isinstance(initial, GaussianStart) else initial
+
+    def _start_grid(self, region: Region, share: float) -> Grid:
+        low, high = box_around([Inside(region)], self.n, 0)
+        least = 1 if isinstance(region, Box) else {1: 1, 2: 24, 3: 10}[self.n]
+        axes = []
+        for i, (places, lengths) in enumerate(self._lengths_at(0, 0)):
+            near = lengths[max(np.searchsorted(places, low[i]) - 1, 0) : np.searchsorted(places, high[i]) + 1]
+            count = max(least, math.ceil((high[i] - low[i]) / (0.7 * share * float(near.min()))))
+            axes.append(np.linspace(low[i], high[i], count + 1) if low[i] < high[i] else np.array([low[i], high[i]]))
+        return Grid(axes=tuple(axes))

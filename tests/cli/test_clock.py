@@ -1,0 +1,175 @@
+"""``--time-limit`` gives the best answer so far; bars and colours stay on terminals."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from certbound.cli.app import run
+from certbound.cli.clock import Clock, OutOfTime
+
+
+def answer(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any]]:
+    code = run([*words, "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def slowed(monkeypatch: pytest.MonkeyPatch, module: str, name: str, when: Any) -> None:
+    """Let a function take for ever where ``when(arguments)`` holds."""
+    import importlib
+
+    home = importlib.import_module(module)
+    original = getattr(home, name)
+
+    def slow(*args: Any, **options: Any) -> Any:
+        while when(options):
+            time.sleep(0.01)
+        return original(*args, **options)
+
+    monkeypatch.setattr(home, name, slow)
+
+
+def test_a_clock_stops_the_work_and_leaves_no_timer() -> None:
+    before = signal.getsignal(signal.SIGALRM)
+    clock = Clock(0.05)
+    with pytest.raises(OutOfTime), clock.running():
+        time.sleep(5)
+    assert clock.left < 0
+    with pytest.raises(OutOfTime), clock.running():
+        raise AssertionError("the time was over before")
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert signal.getsignal(signal.SIGALRM) is before
+    with Clock(None).running():
+        assert Clock(None).left == float("inf")
+
+
+def test_a_verdict_in_time_is_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("verify", "ou", "--method", "kummer")
+    assert answer(capsys, *words, "--time-limit", "60")[1].keys() == answer(capsys, *words)[1].keys()
+
+
+def test_the_engine_that_finished_answers_for_the_one_that_did_not(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slowed(monkeypatch, "certbound.safety.verification", "verify_safety", lambda o: o["method"] == "constants")
+    code, found = answer(capsys, "verify", "ou", "--time-limit", "4")
+    assert code == 0
+    assert found["status"] == "SAFE"
+    assert found["method"] == "linear"
+    assert found["reason"].endswith("The search was stopped after 4 s.")
+
+
+def test_no_engine_in_time_is_unknown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slowed(monkeypatch, "certbound.safety.verification", "verify_safety", lambda _: True)
+    monkeypatch.chdir(tmp_path)
+    code, found = answer(capsys, "verify", "ou", "--time-limit", "0.2", "--plot", "ou.png", "--certificate", "ou.json")
+    assert code == 1
+    assert (found["status"], found["log10_delta"], found["tube"]) == ("UNKNOWN", 0.0, None)
+    assert "stopped after 0.2 s. Give it more time" in found["reason"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_constants_fall_back_to_the_quick_ones(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slowed(monkeypatch, "certbound.constants.bounds", "bound_constants", lambda o: "metric" not in o)
+    code, found = answer(capsys, "derive", "ou", "--time-limit", "2")
+    assert code == 0
+    assert found["rate"] == -0.5
+    assert found["metrics"] == []
+
+
+def test_tubes_that_were_computed_are_compared(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slowed(monkeypatch, "certbound.tubes.tuning", "tune_tube", lambda o: o["method"] == "prop1")
+    code, found = answer(capsys, "tune", "ou", "--time-limit", "2.5")
+    assert code == 0
+    assert found["method"] in {row["method"] for row in found["rows"]}
+    assert "prop1" not in {row["method"] for row in found["rows"]}
+
+
+@pytest.mark.parametrize("command", ["derive", "tune"])
+def test_nothing_in_time_is_a_failure(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slowed(monkeypatch, "certbound.constants.bounds", "bound_constants", lambda _: True)
+    assert run([command, "ou", "--time-limit", "0.1"]) == 3
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 3
+    assert "within 0.1 s" in lines[1]
+    assert "--time-limit" in lines[2]
+
+
+def test_as_many_paths_are_simulated_as_fit(
+    request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CERTBOUND_CACHE", str(request.config.cache.mkdir("kernels")))  # type: ignore[union-attr]
+    words = ("simulate", "ou", "--set", "radius=0.8", "--seed", "1")
+    assert run([*words, "--paths", "10"]) == 0  # compiles
+    capsys.readouterr()
+    started = time.perf_counter()
+    code, found = answer(capsys, *words, "--paths", "1e12", "--time-limit", "2")
+    assert code == 0
+    assert 2000 < found["paths"] < 1e12 == found["asked"]
+    assert time.perf_counter() - started < 15
+    assert found["lower"] < 0.136 < found["upper"]
+    assert run([*words, "--paths", "1e12", "--time-limit", "1"]) == 0
+    assert "of 1000000000000 paths" in capsys.readouterr().out
+    assert answer(capsys, *words, "--paths", "500", "--time-limit", "30")[1]["paths"] == 500
+
+
+COMMAND = [sys.executable, "-m", "certbound.cli", "verify", "ou", "--method", "kummer"]
+
+
+def test_nothing_but_text_reaches_a_pipe(tmp_path: Path) -> None:
+    result = subprocess.run(COMMAND, capture_output=True, text=True, cwd=tmp_path)
+    assert result.returncode == 0
+    assert "\x1b" not in result.stdout
+    assert result.stderr == ""
+
+
+def test_a_terminal_gets_colours_and_a_bar(tmp_path: Path) -> None:
+    leader, follower = pty.openpty()
+    environment = {key: value for key, value in os.environ.items() if key not in ("NO_COLOR", "CI")}
+    environment |= {"TERM": "xterm-256color", "COLUMNS": "80"}
+    with subprocess.Popen(COMMAND, stdout=follower, stderr=follower, cwd=tmp_path, env=environment) as process:
+        os.close(follower)
+        shown = b""
+        while True:
+            try:
+                piece = os.read(leader, 4096)
+            except OSError:
+                break
+            shown += piece
+            if not piece:
+                break
+    os.close(leader)
+    assert process.returncode == 0
+    assert b"SAFE" in shown
+    assert b"\x1b[1;32mSAFE" in shown
+    assert b"verifying ou" in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "count", "expected"),
+    [("certbound ver", 1, ["verify"]), ("certbound verify un", 2, ["unicycle"]), ("certbound sim", 1, ["simulate"])],
+)
+def test_the_shell_completes_commands_and_problems(words: str, count: int, expected: list[str]) -> None:
+    environment = os.environ | {
+        "_CERTBOUND_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(count),
+    }  # fmt: skip
+    code = "from certbound.cli import main; main()"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert result.stdout.split() == expected

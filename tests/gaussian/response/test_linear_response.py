@@ -1,0 +1,67 @@
+"""Adjoint rows of many states: sparse products and chosen columns against the plain ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from certbound.gaussian.response.linear_response import RowResponse, discrete_response
+from certbound.gaussian.response.step_events import StepEvents
+
+
+@pytest.mark.parametrize("n", [5, 60])
+def test_chosen_columns_and_repeated_rows_bound_what_is_driven(n: int) -> None:
+    rng = np.random.default_rng(3)
+    steps, moved = 6, np.array([1, 3])
+    slope = 0.9 * np.eye(n) + 0.2 * np.eye(n, k=1) + 0.1 * np.eye(n, k=-1)
+    response = discrete_response(np.tile(slope, (1, steps, 1, 1)), 1e-2 * np.eye(n), 0.0, np.zeros((n, n)))
+    rows = rng.normal(size=(steps + 1, 3, n))
+    rows = np.concatenate([rows, rows[:, :1]], axis=1)
+    low, high = np.full((steps, n), -1e-16), np.full((steps, n), 1e-16)
+    low[:, moved], high[:, moved] = rng.uniform(-0.2, 0.1, (steps, 2)), rng.uniform(0.1, 0.4, (steps, 2))
+    middle, radius = (low + high) / 2, (high - low) / 2
+    bounds = []
+    for columns in (None, moved):
+        found = RowResponse(response, 0, rows, columns)
+        value, slack = found.centres(middle)
+        reach = found.boxes(radius) + slack + found.errors(np.ones((steps + 1, n)))
+        bounds.append((value - reach, value + reach))
+        np.testing.assert_array_equal(bounds[-1][1][:, 0], bounds[-1][1][:, 3])
+    np.testing.assert_allclose(bounds[1], bounds[0], atol=1e-11)
+    for _ in range(200):
+        state = np.zeros(n)
+        for k in range(steps):
+            state = slope @ state + np.where(rng.random(n) < 0.5, low[k], high[k])
+            along = rows[k + 1] @ state
+            for below, above in bounds:
+                assert np.all(along <= above[k + 1] + 1e-13)
+                assert np.all(along >= below[k + 1] - 1e-13)
+    # and the bound is attained
+    k, row = steps, rows[steps, 0]
+    best, adjoint = 0.0, row
+    for j in range(k - 1, -1, -1):
+        best += float(np.maximum(adjoint * low[j], adjoint * high[j]).sum())
+        adjoint = adjoint @ slope
+    assert bounds[1][1][k, 0] == pytest.approx(best, abs=1e-10)
+
+
+def test_variances_along_few_states_need_only_those() -> None:
+    n, rng = 30, np.random.default_rng(4)
+    a = np.tile(0.8 * np.eye(n) + 0.1 * np.eye(n, k=1), (1, 4, 1, 1))
+    response = discrete_response(a, np.diag(rng.uniform(0.5, 1.0, n)), 0.0, np.zeros((n, n)))
+    row = np.zeros((1, 5, n))
+    row[..., 2], row[..., 3] = 1.0, -0.5
+    low, high = response.variance(row, np.arange(5))
+    exact = np.einsum("bmi,bmij,bmj->bm", row, response.covariance, row)
+    assert np.all(low <= exact)
+    assert np.all(high >= exact)
+    np.testing.assert_allclose(high, exact, rtol=1e-10, atol=1e-200)
+
+
+def test_an_event_is_found_once() -> None:
+    response = discrete_response(np.full((1, 4, 1, 1), 0.5), np.eye(1), 0.0, np.zeros((1, 1)))
+    events = StepEvents(response, 0, True)
+    rows = np.ones((5, 1))
+    assert events.along(rows) is events.along(rows.copy())
+    assert events.along(-rows) is events.along(rows)  # the same law
+    assert events.along(2 * rows) is not events.along(rows)

@@ -1,0 +1,86 @@
+"""Martingales of bounded quadratic variation against closed forms and simulation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from certbound.gaussian.response.linear_response import LinearResponse, continuous_response
+from certbound.gaussian.response.martingales import MartingaleEvent, Martingales, quantile
+from certbound.rigor.intervals import Interval
+
+Array = NDArray[np.float64]
+
+
+def response(matrix: Array, horizon: float, pieces: int) -> LinearResponse:
+    slope = np.broadcast_to(matrix, (1, pieces, *matrix.shape))
+    return continuous_response(
+        slope, np.zeros_like(slope), horizon / pieces, np.zeros((len(matrix), 1)), np.zeros(matrix.shape)
+    )
+
+
+def test_the_quadratic_variation_of_a_decaying_state_has_its_closed_form() -> None:
+    found = Martingales(response(np.array([[-1.0]]), 2.0, 100), 0, Interval(*np.full((2, 100, 1, 1), 0.3)), -9.0)
+    kappa, _ = found.variation(np.ones((len(found.frame.ends), 1)))
+    end = found.frame.ends * 0.02
+    exact = 0.3 * np.sqrt((1 - np.exp(-2 * end)) / 2)
+    assert np.all(kappa >= exact * (1 - 1e-12))
+    assert kappa == pytest.approx(exact, rel=1e-3)
+
+
+def test_excess_over_a_tube_counts_with_its_larger_end() -> None:
+    base = response(np.array([[0.0, 1.0], [-1.0, 0.0]]), 1.0, 50)
+    low, high = np.full((50, 2, 1), -0.2), np.full((50, 2, 1), 0.1)
+    wide = Martingales(base, 0, Interval(low, high), -9.0)
+    for value in (low, high, (low + high) / 2):
+        thin = Martingales(base, 0, Interval(value, value), -9.0)
+        for row in ([1.0, 0.0], [0.3, -0.8]):
+            rows = np.broadcast_to(row, (len(wide.frame.ends), 2))
+            assert np.all(wide.variation(rows)[0] >= thin.variation(rows)[0] - 1e-12)
+
+
+def test_the_event_bounds_a_rotating_martingale() -> None:
+    """M' = J M dt + c dW with a rotation J: the worst of the admissible integrands."""
+    matrix = np.array([[0.0, 2.0], [-2.0, 0.0]])
+    horizon, pieces, paths, fine = 1.0, 50, 20_000, 10
+    found = Martingales(response(matrix, horizon, pieces), 0, Interval(*np.full((2, pieces, 2, 1), 0.5)), np.log(1e-7))
+    event = found.along(np.broadcast_to([1.0, 0.0], (pieces, 2)))
+    rng = np.random.default_rng(0)
+    h = horizon / pieces / fine
+    turn = np.array([[np.cos(2 * h), np.sin(2 * h)], [-np.sin(2 * h), np.cos(2 * h)]])
+    state, top = np.zeros((paths, 2)), np.zeros(paths)
+    for _ in range(pieces * fine):
+        state = state @ turn.T + 0.5 * np.sqrt(h) * rng.standard_normal((paths, 1))
+        top = np.maximum(top, state[:, 0])
+    for share in (0.1, 0.01):
+        level = float(np.quantile(top, 1 - share))
+        assert np.exp(event.log_exceedance(np.full(pieces, level))) >= share - 3 * np.sqrt(share / paths)
+    level = event.level(np.log(0.01))
+    assert event.log_exceedance(level) <= np.log(0.01)
+    assert level.max() < 3 * float(np.quantile(top, 0.99))
+    assert event.log_exceedance(np.full(pieces, -0.1)) == 0.0
+
+
+def test_every_window_costs_the_tail_of_a_reflected_brownian_motion() -> None:
+    event = MartingaleEvent(
+        kappa=np.array([1.0, 0.5]), window=np.repeat([0, 1], 3), starts=np.array([0, 3]), cost=np.zeros(6)
+    )
+    found = event.log_exceedance(np.full(6, 3.0))
+    assert found == pytest.approx(np.log(2 * norm.sf(3.0) + 2 * norm.sf(6.0)), abs=1e-9)
+    assert event.log_exceedance(event.level(-9.0)) <= -9.0
+
+
+def test_without_excess_nothing_is_exceeded() -> None:
+    found = Martingales(response(-np.eye(2), 1.0, 50), 0, Interval(*np.zeros((2, 50, 2, 1))), -9.0)
+    event = found.along(np.ones((50, 2)))
+    assert event.log_exceedance(np.zeros(50)) == -np.inf
+    assert not event.level(-5.0).any()
+
+
+@pytest.mark.parametrize("log", [-0.1, -1.0, -20.0, -4000.0])
+def test_the_quantile_is_a_level_of_the_normal_tail(log: float) -> None:
+    level = quantile(log)
+    assert norm.logsf(level) <= max(log, np.log(0.5)) + 1e-9
+    assert level == 0 or norm.logsf(level * (1 - 1e-6)) > log

@@ -1,0 +1,75 @@
+"""Fitted slopes leave less to the remainder, and change nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.reach.linear.answer import linear_answer
+from certbound.reach.linear.fit import fitted
+from certbound.reach.linear.linearisation import Linearisation
+from certbound.reach.linear.run import LinearRun
+
+LOG = float(np.log(1e-3))
+
+
+def cubic(width: float = 0.6, sigma: float = 0.05) -> cb.Problem:
+    system = cb.ContinuousSystem(lambda x: [x[1], -x[0] - x[1] - x[0] ** 3], states=2, diffusion=sigma * np.eye(2))
+    start = cb.Box([-width] * 2, [width] * 2)
+    safe = [cb.Inside(cb.Box([-3, -3], [3, 3]))]
+    return cb.Problem(system, initial=start, safe=safe, horizon=1.5, delta=1e-3)
+
+
+def test_the_fit_halves_the_remainder_and_keeps_constant_entries() -> None:
+    plain = Linearisation(cubic(), pieces=50)
+    engine = fitted(plain, LOG)
+    assert engine.correction is not None
+    assert np.all(engine.correction[..., 1, 0] < 0)  # the cubic spring is stiffer away from 0
+    assert not np.any(engine.correction[..., [0, 0, 1], [0, 1, 1]])
+    widths = []
+    for own in (plain, engine):
+        run = LinearRun(own)
+        bounds = run.include(run.levels(LOG)[0], 2)
+        assert bounds is not None
+        widths.append(float(np.max(bounds[1] - bounds[0])))
+    assert widths[1] < 0.5 * widths[0]
+
+
+def test_discrete_time_is_fitted_too() -> None:
+    system = cb.DiscreteSystem(lambda x: [x[0] - 0.3 * np.tanh(2 * x[0])], states=1, noise=cb.Gaussian(std=0.05))
+    problem = cb.Problem(system, initial=cb.Box([-1.0], [1.0]), safe=[], horizon=6, delta=1e-2)
+    engine = fitted(Linearisation(problem), float(np.log(1e-2)))
+    assert np.all(engine.slopes[0][0, :3] > engine.tangents[0][0, :3] + 0.05)
+
+
+def test_a_linear_model_is_left_alone() -> None:
+    engine = Linearisation(cb.load("ou"), pieces=10)
+    assert fitted(engine, LOG) is engine
+
+
+def test_another_grid_keeps_the_fit() -> None:
+    engine = fitted(Linearisation(cubic(), pieces=60), LOG)
+    coarse = engine.on_grid(20)
+    assert coarse.pieces == 20
+    assert coarse.correction is not None
+    assert engine.correction is not None
+    np.testing.assert_allclose(coarse.correction, engine.correction[:, ::3], atol=1e-12)
+    np.testing.assert_allclose(coarse.slopes[0], engine.slopes[0][:, ::3], atol=1e-6)
+
+
+def test_a_fit_that_would_be_too_steep_is_not_used() -> None:
+    system = cb.ContinuousSystem(lambda x: -x - 50 * x**3, states=1, diffusion=[[0.05]])
+    problem = cb.Problem(system, initial=cb.Box([-4.0], [4.0]), safe=[], horizon=2.0, delta=1e-3)
+    engine = Linearisation(problem, pieces=50)
+    assert fitted(engine, LOG) is engine
+
+
+@pytest.mark.parametrize(("horizon", "sigma"), [
+    (2.0, 0.1), pytest.param(5.0, 0.03, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_the_unicycle_is_safe_at_ten_times_its_noise(horizon: float, sigma: float) -> None:
+    problem = cb.load("unicycle", sigma=sigma).replace(horizon=horizon)
+    answer = linear_answer(problem)
+    assert len(answer.run.engine.centres) == 1
+    assert answer.log10_delta <= -3

@@ -1,0 +1,76 @@
+"""Rows for the remainder, what windows charge for their turning, and levels along them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import certbound as cb
+from certbound.gaussian.response.events import WindowEvent, WindowEvents
+from certbound.gaussian.response.levels import level_along, level_scale
+from certbound.gaussian.response.linear_response import LinearResponse, continuous_response
+from certbound.reach.linear.linearisation import WINDOW, Linearisation
+from certbound.reach.linear.rows import inner_rows
+
+TURN = np.array([[-0.2, -3.0], [3.0, -0.1]])
+PIECES, STEP = 24, 0.025
+
+
+def turning() -> LinearResponse:
+    shape = (1, PIECES, 2, 2)
+    slope = np.broadcast_to(TURN, shape).copy()
+    return continuous_response(slope, np.zeros(shape), STEP, np.diag([0.1, 0.2]), 0.01 * np.eye(2))
+
+
+def test_a_row_seen_from_the_windows_end_stays_between_its_ends_up_to_the_stated_error() -> None:
+    events = WindowEvents(turning(), 0, 4, np.log(1e-4))
+    last, first, error = events.chords
+    rng = np.random.default_rng(0)
+    tight = 0.0
+    for k in range(PIECES):
+        end = events.bounds[np.searchsorted(events.bounds, k, side="right")] * STEP
+        for t in STEP * (k + rng.uniform(0, 1, 40)):
+            row = rng.normal(size=2)
+            seen = row @ expm(TURN * (t - end))  # Phi(t, t_e): the flow backwards
+            ends = row @ first[k], row @ last[k]
+            low, high = np.minimum(*ends), np.maximum(*ends)
+            slack = np.abs(row) @ error[k]
+            assert np.all(seen >= low - slack)
+            assert np.all(seen <= high + slack)
+            tight = max(tight, float(np.max((np.maximum(low - seen, seen - high)) / slack)))
+    assert tight > 0.3  # the bound is needed, and not loose by much
+
+
+def event(rows: np.ndarray) -> WindowEvent:
+    return WindowEvents(turning(), 0, 4, np.log(1e-4)).along(rows)
+
+
+def test_levels_along_a_row_cost_what_was_granted() -> None:
+    turned = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 6, PIECES) ** 1.5])
+    found = event(turned)
+    levels = level_along(found, np.log(1e-5))
+    assert np.log(1e-5) - 0.5 < found.log_exceedance(levels) <= np.log(1e-5)
+
+
+def test_the_piece_that_turns_fastest_does_not_raise_the_levels_of_all() -> None:
+    angle = np.where(np.arange(PIECES) < 4, 1.5 * np.arange(PIECES), 6.0)
+    found = event(np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    levels = level_along(found, np.log(1e-5))
+    even = level_scale(found, found.profile, np.log(1e-5)) * found.profile
+    assert np.mean(levels[8:] / even[8:]) < 0.95
+    assert np.all(levels[8:] < 1.02 * even[8:])
+
+
+@pytest.mark.parametrize("share", [-6.0, -12.0])
+def test_rows_that_move_with_the_flow_cost_little_in_every_window(share: float) -> None:
+    engine = Linearisation.of(cb.load("unicycle").replace(horizon=1.0))
+    rows, extra = inner_rows(engine)
+    assert rows.shape[2] == 3 + extra.shape[2]
+    assert extra.shape[2] == 6
+    windows = WindowEvents(engine.response, 0, max(1, round(WINDOW / engine.step)), share)
+    covariance = engine.response.covariance[0, 1:]
+    for d in range(3, 9):
+        own = rows[0, :, d]
+        deviation = np.sqrt(np.einsum("ki,kij,kj->k", own, covariance, own))
+        assert np.median(windows.along(own).cost / deviation) < 0.5

@@ -1,0 +1,185 @@
+"""What is written into certificates, and what is not."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.checker import check_data, parse
+from certbound.errors import CertificateError
+from certbound.safety.answers import EngineAnswer
+from certbound.safety.certificates.file import certificate_data, certificate_text, problem_data, restated
+from certbound.safety.certificates.parts import exact
+from certbound.safety.verification import verify_safety
+
+
+def small(**changes: Any) -> cb.Problem:
+    system = cb.DiscreteSystem(lambda x: [0.5 * x[0] + 0.1 * np.sin(x[0])], states=1, noise=cb.Gaussian(std=0.1))
+    values = {"initial": [0.1], "safe": [cb.Inside(cb.Box([-1], [1]))], "horizon": 3, "delta": 1e-3}
+    return cb.Problem(system, **(values | changes))
+
+
+def test_numbers_are_exact() -> None:
+    values = [0.1, -1e-300, np.float64(1 / 3), 0.0]
+    assert [float.fromhex(text) for text in exact(values)] == values
+    assert exact(np.array([[0.5]])) == [["0x1.0000000000000p-1"]]
+    with pytest.raises(CertificateError, match="nan"):
+        exact(float("nan"))
+
+
+def test_a_verdict_carries_its_certificate_as_data() -> None:
+    problem = small()
+    verdict = verify_safety(problem, method="linear")
+    data = verdict.certificate
+    assert data is not None
+    assert data["claim"]["method"] == "linear"
+    assert float.fromhex(data["claim"]["log10_delta"]) <= np.log10(problem.delta)
+    assert verdict.certificate is data
+    assert json.loads(verdict.certificate_text(problem)) == json.loads(json.dumps(data))
+
+
+@pytest.mark.parametrize("method", ["linear", "constants"])
+def test_a_certificate_claims_no_more_than_the_verdict(method: str) -> None:
+    problem = small()
+    verdict = verify_safety(problem, method=method)
+    data = certificate_data(problem, verdict)
+    assert float.fromhex(data["claim"]["log10_delta"]) >= verdict.log10_delta
+    assert check_data(parse(json.dumps(data))).valid
+
+
+def test_a_certificate_restated_claims_what_was_proved_of_it() -> None:
+    problem = small()
+    text = certificate_text(problem, verify_safety(problem, method="linear"))
+    proved = check_data(parse(text)).log10_proved
+    assert proved is not None
+    data = parse(restated(text, proved))
+    claim = float.fromhex(data["claim"]["log10_delta"])
+    assert proved < claim <= float.fromhex(parse(text)["claim"]["log10_delta"])
+    assert claim == pytest.approx(proved, rel=1e-5)
+    assert check_data(data).valid
+    assert restated(text, 0.0) == text
+    data["claim"]["log10_delta"] = (claim - 1e-4).hex()
+    assert not check_data(data).valid
+
+
+def test_an_unsafe_nominal_has_no_certificate() -> None:
+    system = cb.DiscreteSystem(lambda x: [2.0 * x[0]], states=1, noise=cb.Gaussian(std=0.01))
+    problem = cb.Problem(system, initial=[0.5], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=4)
+    verdict = verify_safety(problem)
+    assert verdict.status == "UNSAFE_NOMINAL"
+    assert verdict.certificate is None
+    with pytest.raises(CertificateError, match="no probability was bounded"):
+        verdict.certificate_text(problem)
+
+
+def test_more_attempts_spend_more_room() -> None:
+    problem = small()
+    verdict = verify_safety(problem, method="linear")
+    claims = []
+    for attempt in range(4):
+        data = parse(certificate_text(problem, verdict, attempt=attempt))
+        assert check_data(data).valid
+        claims.append(float.fromhex(data["claim"]["log10_delta"]))
+    assert claims == sorted(claims)
+
+
+def test_everything_that_a_problem_states_is_in_its_data() -> None:
+    base = problem_data(small())
+    changes = [
+        {"horizon": 4}, {"delta": 1e-2}, {"initial": [0.2]}, {"initial": cb.Ball([0.1], 0.01)},
+        {"safe": [cb.Outside(cb.Box([1], [2]))]}, {"safe": [cb.Inside(cb.Box([-1], [1]), during=(1, 2))]},
+        {"domain": cb.Box([-3], [3])}, {"safe": [cb.Inside(cb.Ball(lambda t: [0.1 * t], 1.0))]},
+    ]  # fmt: skip
+    for change in changes:
+        assert problem_data(small(**change)) != base
+    assert problem_data(small(name="another")) != base
+    assert problem_data(small()) == base
+
+
+def test_the_law_of_the_noise_is_stated_by_name() -> None:
+    def noise(law: Any) -> dict[str, Any]:
+        system = cb.DiscreteSystem(lambda x: 0.5 * x, states=2, noise=law)
+        found: dict[str, Any] = problem_data(cb.Problem(system, initial=[0, 0], safe=[], horizon=1))["noise"]
+        return found
+
+    assert noise(cb.Gaussian(std=0.5))["level"] == "std"
+    assert noise(cb.SubGaussian(proxy_variance=0.5))["level"] == "variance"
+    assert noise(cb.Rademacher(scale=0.5))["law"] == "rademacher"
+    assert noise(cb.Bounded(halfwidth=0.5, independent=False))["independent"] is False
+    flowing = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=lambda t, x: np.array([[x[0]], [1.0]]))
+    data = problem_data(cb.Problem(flowing, initial=[0, 0], safe=[], horizon=1))["noise"]
+    assert data["law"] == "wiener"
+    assert data["diffusion"]["columns"] == 1
+
+
+@pytest.mark.parametrize(("name", "method"), [("chain", "linear"), ("chain_rest", "linear"), ("ou", "constants")])
+def test_quick_bundled_problems_are_proved_again(name: str, method: str) -> None:
+    _bundled(name, method)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ou", "unicycle", "chain", "chain_rest", "pendulum"])
+def test_every_bundled_problem_is_proved_again_in_time(name: str) -> None:
+    _bundled(name, "auto")
+
+
+def _bundled(name: str, method: str) -> None:
+    problem = cb.load(name)
+    started = time.perf_counter()
+    verdict = verify_safety(problem, method=method)
+    proving = time.perf_counter() - started
+    assert verdict.status == "SAFE"
+    data = parse(certificate_text(problem, verdict))
+    started = time.perf_counter()
+    report = check_data(data, json.loads(json.dumps(problem_data(problem))))
+    assert report.valid, report.reason
+    assert report.log10_delta <= np.log10(problem.delta)
+    assert time.perf_counter() - started < max(10 * proving, 20.0)
+
+
+def test_a_barrier_states_what_the_linear_response_proved_by_sharper_events() -> None:
+    """The linear response proves SAFE with events that certificates do not know; theirs alone leave delta behind."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -x[0] - x[1] - 0.5 * x[0] ** 3], states=["x1", "x2"], diffusion=[[0.0], [0.2]]
+    )
+    problem = cb.Problem(
+        system, initial=cb.Box([-0.2, -0.2], [0.2, 0.2]), horizon=1.0, delta=1e-4,
+        safe=[cb.Inside(cb.HalfSpace([0, 1], 1.1))], domain=cb.Box([-2, -2], [2, 2]),
+    )  # fmt: skip
+    answer = EngineAnswer(log10_delta=-4.5, method="linear", details=None)
+    quick = EngineAnswer(applicable=False, reason="another engine is enough.", method="barrier")
+    verdict = verify_safety(problem, method="linear")
+    assert verdict.status == "SAFE"
+    weak = replace(verdict, answers={"linear": answer, "barrier": quick})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("certbound.safety.certificates.linear.linear_proof", lambda *_: ({}, -2.0, []))
+        data = certificate_data(problem, weak)
+    assert data["claim"]["method"] == "barrier"
+    assert float.fromhex(data["claim"]["log10_delta"]) < -4
+
+
+def test_windows_of_a_linear_flow_cost_little_of_a_small_probability() -> None:
+    system = cb.ContinuousSystem(lambda x: [-x[0]], states=1, diffusion=[[0.1**0.5]])
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.4], [1.4]))], horizon=2.0)
+    verdict = verify_safety(problem, method="linear")
+    claim = float.fromhex(certificate_data(problem, verdict)["claim"]["log10_delta"])
+    assert verdict.log10_delta < -7
+    assert claim < 0.85 * verdict.log10_delta
+
+
+def test_a_law_of_an_unknown_class_is_stated_by_no_certificate() -> None:
+    class Triangular(cb.Uniform):
+        """Draws otherwise than its parent."""
+
+    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=1, noise=Triangular(halfwidth=0.01))
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3)
+    verdict = cb.verify_safety(problem)
+    assert verdict.status == "SAFE"
+    with pytest.raises(CertificateError, match="got the class Triangular"):
+        verdict.certificate_text(problem)

@@ -1,0 +1,162 @@
+"""Polynomial barriers: what is proved holds at every point, and the bound is above the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import certbound as cb
+from certbound.checker import check_data, parse
+from certbound.errors import CertificateError
+from certbound.rigor.intervals import Interval
+from certbound.safety.answers import EngineAnswer
+from certbound.safety.certificates.barrier import barrier_proof
+from certbound.safety.certificates.file import problem_data
+from certbound.safety.engines.barrier import Barrier, barrier_engine
+from certbound.safety.engines.gaps import gaps_of, lies_inside
+
+
+def scalar(**changes: object) -> cb.Problem:
+    """Brownian motion with an inward drift in an interval."""
+    system = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=[[0.3]])
+    given = {"initial": [0.0], "safe": [cb.Inside(cb.Box([-1.0], [1.0]))], "horizon": 2.0, "delta": 1e-2}
+    return cb.Problem(system, **{**given, **changes})  # type: ignore[arg-type]
+
+
+def oscillator(sigma: float) -> cb.Problem:
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -x[0] - x[1] - 0.5 * x[0] ** 3], states=["x1", "x2"], diffusion=[[0.0], [sigma]]
+    )
+    return cb.Problem(
+        system, initial=cb.Box([-1, -1], [1, 1]), safe=[cb.Inside(cb.HalfSpace([0, 1], 2.25))], horizon=5.0,
+        delta=1e-3, domain=cb.Box([-3, -3], [3, 3]),
+    )  # fmt: skip
+
+
+def values(barrier: Barrier, x: np.ndarray) -> np.ndarray:
+    y = (x - barrier.center) / barrier.scale
+    return np.sum(barrier.coefficients * np.prod(y[:, None, :] ** barrier.exponents, axis=-1), axis=-1)
+
+
+def test_the_bound_is_above_the_probability_and_not_far_above() -> None:
+    found = barrier_engine(scalar())
+    exits = cb.simulate_exits(scalar(), paths=200_000, rng=1, steps=400)
+    assert 10**found.log10_delta >= exits.probability
+    stationary = 2 * norm.sf(1 / (0.3 / np.sqrt(2)))
+    assert 10**found.log10_delta < 100 * stationary
+
+
+def test_a_hardening_spring_is_certified_at_large_noise() -> None:
+    problem = oscillator(0.5)
+    verdict = cb.verify_safety(problem, method="barrier")
+    assert verdict.status == "SAFE"
+    assert verdict.method == "barrier"
+    barrier = verdict.answers["barrier"].details
+    rng = np.random.default_rng(3)
+    x = rng.uniform([-3, -3], [3, 2.25], (100_000, 2))
+    step = 1e-4
+    slope = np.stack([(values(barrier, x + e) - values(barrier, x - e)) / (2 * step) for e in step * np.eye(2)], axis=1)
+    up = np.array([0.0, step])
+    bend = (values(barrier, x + up) - 2 * values(barrier, x) + values(barrier, x - up)) / step**2
+    drift = np.stack([x[:, 1], -x[:, 0] - x[:, 1] - 0.5 * x[:, 0] ** 3], axis=1)
+    generator = np.sum(slope * drift, axis=1) + 0.125 * bend + 0.125 * slope[:, 1] ** 2
+    assert generator.max() <= barrier.growth + 1e-4
+    assert generator.max() > barrier.growth - 0.05
+    assert values(barrier, rng.uniform(-1, 1, (50_000, 2))).max() <= barrier.start
+    sides = np.concatenate([
+        np.stack([rng.uniform(-3, 3, 5000), np.full(5000, 2.25)], axis=1),
+        np.stack([np.full(5000, 3.0), rng.uniform(-3, 2.25, 5000)], axis=1),
+        np.stack([np.full(5000, -3.0), rng.uniform(-3, 2.25, 5000)], axis=1),
+        np.stack([rng.uniform(-3, 3, 5000), np.full(5000, -3.0)], axis=1),
+    ])  # fmt: skip
+    assert values(barrier, sides).min() >= barrier.boundary
+
+
+def test_noise_that_depends_on_the_state_a_disturbance_and_an_obstacle() -> None:
+    system = cb.ContinuousSystem(
+        lambda x, d: [-x[0] + d[0], -2 * x[1]], states=["a", "b"], disturbance=cb.Box([-0.1], [0.1]),
+        diffusion=lambda t, x: np.array([[0.1 + 0.1 * x[0] ** 2, 0.0], [0.0, 0.15]]),
+    )  # fmt: skip
+    problem = cb.Problem(
+        system, initial=cb.Ball([0.0, 0.0], 0.05), horizon=1.0, delta=0.05,
+        safe=[cb.Inside(cb.Box([-1, -1], [1, 1])), cb.Outside(cb.Ball([0.7, 0.7], 0.2))],
+    )  # fmt: skip
+    found = barrier_engine(problem)
+    exits = cb.simulate_exits(problem, paths=20_000, rng=1, steps=200)
+    assert found.log10_delta < -1.5
+    assert 10**found.log10_delta >= exits.lower
+
+
+@pytest.mark.parametrize(
+    ("problem", "why"),
+    [
+        (cb.load("chain"), "continuous time"),
+        (scalar(safe=[cb.Inside(cb.HalfSpace([1.0], 1.0))]), "bound every state"),
+        (scalar(safe=[cb.Inside(cb.Box([-1.0], [1.0]), during=(1.0, 2.0))]), "windows"),
+        (scalar(initial=cb.GaussianStart([0.0], [[0.01]])), "bounded initial set"),
+    ],
+)
+def test_what_it_does_not_treat_it_names(problem: cb.Problem, why: str) -> None:
+    found = barrier_engine(problem)
+    assert not found.applicable
+    assert why in found.reason
+
+
+def test_its_certificate_is_proved_again_and_claims_little_less() -> None:
+    problem = scalar()
+    verdict = cb.verify_safety(problem, method="barrier")
+    data = parse(verdict.certificate_text(problem))
+    report = check_data(data, problem_data(problem))
+    assert report.valid, report.reason
+    assert verdict.log10_delta <= report.log10_delta <= verdict.log10_delta + 0.02
+    assert report.log10_delta <= np.log10(problem.delta)
+    assert "exponential of a polynomial" in report.reason
+    other = check_data(data, problem_data(scalar(horizon=2.5)))
+    assert not other.valid
+    assert "another problem" in other.reason
+
+
+def test_a_certificate_next_to_delta_still_says_safe() -> None:
+    """Of the room between the bound and delta at most half is given away to the checker."""
+    problem = scalar()
+    verdict = cb.verify_safety(problem, method="barrier")
+    close = problem.replace(delta=float(10 ** (verdict.log10_delta + 1e-3)))
+    data, log10, assumptions = barrier_proof(close, verdict.answers["barrier"])
+    assert verdict.log10_delta < log10 < verdict.log10_delta + 6e-4
+    assert assumptions == []
+    assert data["engine"] == "barrier"
+
+
+def test_a_barrier_without_room_has_no_certificate() -> None:
+    weak = Barrier(
+        exponents=np.array([[2]]), coefficients=np.ones(1), center=np.zeros(1), scale=np.ones(1), start=0.0,
+        boundary=1e-9, growth=0.0,
+    )  # fmt: skip
+    for details in (weak, None):
+        with pytest.raises(CertificateError, match="barrier"):
+            barrier_proof(scalar(), EngineAnswer(method="barrier", details=details))
+
+
+def test_a_start_that_may_touch_the_obstacle_is_not_answered() -> None:
+    system = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=0.05 * np.eye(2))
+    corner = cb.Polytope([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]], [-0.5, 1.0, 1.0])  # {a + b >= .5}
+
+    def problem(width: float) -> cb.Problem:
+        return cb.Problem(
+            system, initial=cb.Box([-width] * 2, [width] * 2), horizon=0.5, delta=0.5,
+            safe=[cb.Inside(cb.Box([-1, -1], [1, 1])), cb.Outside(corner)],
+        )  # fmt: skip
+
+    found = gaps_of(problem(0.2))
+    assert lies_inside(found, Interval(np.full(2, -0.24), np.full(2, 0.24)))
+    assert not lies_inside(found, Interval(np.full(2, -0.26), np.full(2, 0.26)))
+    assert not lies_inside(found, Interval(np.full(2, 0.3), np.full(2, 0.3)))
+    assert lies_inside(found, Interval(np.zeros(2), np.zeros(2)))
+
+
+def test_an_initial_set_that_was_not_proved_safe_gets_no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("certbound.safety.engines.barrier.lies_inside", lambda gaps, box: False)
+    found = barrier_engine(scalar())
+    assert not found.applicable
+    assert "initial set" in found.reason

@@ -1,0 +1,71 @@
+"""The engine of value functions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.errors import CertificateError
+from certbound.problem.problem import Problem
+from certbound.safety.engines.values import log10_outward, values_engine
+from certbound.safety.verification import verify_safety
+
+
+def logistic(**changes: object) -> Problem:
+    system = cb.DiscreteSystem(lambda x: 2.8 * x * (1 - x), states=1, noise=cb.Gaussian(std=0.04))
+    problem = Problem(system, initial=cb.Box([0.6], [0.7]), safe=[cb.Inside(cb.Box([0.35], [0.95]))], horizon=20)
+    return problem.replace(**changes)
+
+
+def test_both_sides_are_answered() -> None:
+    answer = values_engine(logistic())
+    assert answer.applicable
+    assert answer.log10_lower is not None
+    assert answer.log10_lower < math.log10(8.24e-4) < answer.log10_delta < answer.log10_lower + 0.03
+    assert "at most 0.0008" in answer.reason
+
+
+def test_a_verdict_by_name_is_safe_or_says_that_it_cannot_be() -> None:
+    assert verify_safety(logistic(), method="values").status == "SAFE"
+    strict = verify_safety(logistic(delta=5e-4), method="values")
+    assert strict.status == "UNKNOWN"
+    assert "more than the 0.0005 that is asked" in strict.reason
+
+
+def test_auto_takes_the_engine_where_the_others_prove_too_little() -> None:
+    system = cb.DiscreteSystem(lambda x: x - 0.3 * x**3, states=1, noise=cb.Gaussian(std=0.2))
+    problem = Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.6], [1.6]))], horizon=10)
+    verdict = verify_safety(problem)
+    assert verdict.status == "SAFE"
+    assert verdict.method == "values"
+    with pytest.raises(CertificateError, match="do not state value functions yet"):
+        verdict.certificate_text(problem)
+
+
+def test_it_is_left_out_when_another_engine_has_answered() -> None:
+    assert not values_engine(logistic(), quick=True).applicable
+
+
+@pytest.mark.parametrize(
+    ("problem", "words"),
+    [
+        (Problem(cb.DiscreteSystem(lambda x: 0.5 * x, states=4, noise=cb.Gaussian(std=0.1)), initial=np.zeros(4),
+                 safe=[cb.Inside(cb.Box([-1] * 4, [1] * 4))], horizon=2), "at most 3 states"),
+        (Problem(cb.DiscreteSystem(lambda x: 0.5 * x, states=1, noise=cb.SubGaussian(proxy_std=0.1)), initial=[0.0],
+                 safe=[cb.Inside(cb.Box([-1], [1]))], horizon=2), "class of laws"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_said_in_words(problem: Problem, words: str) -> None:
+    answer = values_engine(problem)
+    assert not answer.applicable
+    assert words in answer.reason
+
+
+@pytest.mark.parametrize("probability", [1.0, 0.3, 1e-3, 2.5e-11, 0.0])
+def test_logarithms_are_rounded_outward(probability: float) -> None:
+    up, down = log10_outward(probability, up=True), log10_outward(probability, up=False)
+    assert 10.0**up >= probability * (1 - 1e-15)
+    assert down <= up <= 0.0
