@@ -110,7 +110,7 @@ MANY_DOORS = {
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
     "checker.expressions": (9, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),
-    "reach.contraction": (9, "the constants certificate restates the scalar equation piece by piece"),
+    "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (7, "to and from each library"),
     "safety.engines": (9, "three engines, and the rooms that their certificates restate"),
     "reach.sets": (7, "tubes, requirements, and directions for the certificate"),

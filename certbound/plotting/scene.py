@@ -67,8 +67,9 @@ class Scene:
 
 def noisy_reach(verdict: Verdict) -> ReachTube | None:
     """The reach tube of a verdict with the stochastic deviation at the problem's delta, where there is one."""
-    from certbound.reach.contraction import radius_over_pieces
+    from certbound.reach.contraction import needed_radius
     from certbound.reach.sets import ReachTube
+    from certbound.tubes.kummer import Start
     from certbound.tubes.tube import Tube
 
     if verdict.reach is None or verdict.deviation is None:
@@ -79,7 +80,10 @@ def noisy_reach(verdict: Verdict) -> ReachTube | None:
             return whole
     if not isinstance(verdict.tube, Tube):
         return None
-    radius = radius_over_pieces(verdict.tube, verdict.reach.curve)
+    start = getattr(verdict.tube.profile, "start", Start())
+    radius = needed_radius(verdict.tube, verdict.reach.curve, start)
+    if not np.all(np.isfinite(radius)):
+        return None
     return verdict.reach.grown(radius, log10_delta=verdict.tube.log10_delta, method=verdict.method)
 
 

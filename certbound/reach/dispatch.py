@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from certbound.constants.bounds import bound_constants
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, contained
 from certbound.problem.problem import Problem
-from certbound.reach.contraction import contraction_tube, local_contraction_tube, local_tube, radius_over_pieces
+from certbound.reach.contraction import (
+    contraction_tube,
+    local_contraction_tube,
+    local_tube,
+    needed_radius,
+    random_start,
+)
 from certbound.reach.nominal import Flow, initial_cells
 from certbound.reach.sets import ReachTube
+from certbound.tubes.kummer import Start
 from certbound.tubes.tuning import tune_tube
 
 __all__ = ["bound_reach"]
@@ -26,9 +35,9 @@ def bound_reach(
 ) -> ReachTube:
     """A tube that contains the state at every time up to its ``end``.
 
-    Proves, for ``noise=False``: every noise-free trajectory from the initial set, under every disturbance, lies in
-    the tube. For ``noise=True``: with probability at least 1 - delta (the problem's) the noisy one does, at all
-    times at once.
+    Proves, for ``noise=False``: every noise-free trajectory from the initial set (from the mean of a random start),
+    under every disturbance, lies in the tube. For ``noise=True``: with probability at least 1 - delta (the problem's)
+    the noisy one does, at all times at once.
 
     Parameters
     ----------
@@ -100,10 +109,34 @@ def contraction_reach(problem: Problem, *, noise: bool = True, cells: int | None
         return reach.grown(radius, log10_delta=tube.log10_delta, method=f"{reach.method}, {tube.method}")
     reach = contraction_tube(problem, constants, cells=cells)
     if not noise:
+        return _while_in_domain(problem, reach)
+    start = random_start(problem, constants)
+    if start != Start():  # its spread belongs to the deviation, whose tube then needs nu = n
+        constants = constants.with_full_dimension()
+    tube = tune_tube(constants, horizon=float(problem.horizon), delta=problem.delta, start=start)
+    radius = needed_radius(tube, reach.curve, start)
+    grown = reach.grown(radius, log10_delta=tube.log10_delta, method=f"{reach.method}, {tube.method}")
+    return _while_in_domain(problem, grown)
+
+
+def _while_in_domain(problem: Problem, reach: ReachTube) -> ReachTube:
+    """The pieces that constants of the domain prove: up to the first that leaves it.
+
+    That one itself is proved in discrete time only, where its constants are those of the step before.
+    """
+    if problem.domain is None:
         return reach
-    tube = tune_tube(constants, horizon=float(problem.horizon), delta=problem.delta)
-    radius = radius_over_pieces(tube, reach.curve)
-    return reach.grown(radius, log10_delta=tube.log10_delta, method=f"{reach.method}, {tube.method}")
+    low, high, hull = problem.domain.low, problem.domain.high, reach.hull
+    left = np.any((hull.lo < low) | (hull.hi > high), axis=1)
+    if not left.any():
+        return reach
+    proved = int(np.argmax(left)) + (0 if reach.curve.continuous else 1)
+    if proved == 0:
+        raise EnclosureError(
+            "the tube leaves the model's domain on its first piece, and the constants hold in the domain only; give a "
+            "larger `domain`, or use more cells or less noise."
+        )
+    return reach.until(proved)
 
 
 def response_reach(problem: Problem, *, noise: bool = True, cells: int | None = None) -> ReachTube:

@@ -13,7 +13,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.patches import Circle
 
 import certbound as cb
-from certbound.plotting import Scene, draw_scene
+from certbound.plotting import Scene, draw_scene, noisy_reach
 from certbound.plotting.panels import panels_of
 from certbound.plotting.plane import outlines, plane_of, supports
 from certbound.problem.problem import Problem
@@ -130,3 +130,14 @@ assert "matplotlib.pyplot" not in sys.modules
 """
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([sys.executable, "-W", "error", "-c", code, f"{folder}/a.pdf"], check=True)
+
+
+def test_the_noisy_tube_of_a_random_start_has_its_spread_at_step_0():
+    system = cb.DiscreteSystem(lambda x: [0.5 * x[0]], states=1, noise=cb.Gaussian(std=0.1))
+    start = cb.GaussianStart([0.0], covariance=[[0.01]])
+    problem = cb.Problem(system, initial=start, safe=[cb.Inside(cb.Box([-2], [2]))], horizon=2, delta=0.1)
+    tube = noisy_reach(cb.verify_safety(problem, method="constants"))
+    assert tube is not None
+    assert tube.radius[0, 0] > 0.1
+    quiet = problem.replace(system=cb.DiscreteSystem(lambda x: [0.5 * x[0]], states=1, noise=cb.Gaussian(std=1e-5)))
+    assert not np.isinf(getattr(noisy_reach(cb.verify_safety(quiet, method="constants")), "radius", 0.0)).any()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.errors import InfeasibleError
+from certbound.errors import EngineError, InfeasibleError
 from certbound.problem.library import MODELS
 from certbound.reach.contraction.local import local_constants, local_contraction_tube, local_tube, radius_over_pieces
 
@@ -121,3 +121,44 @@ def test_fewer_pieces_keep_the_largest_values_and_the_proof():
         rate=coarse.rate - 1e-9, sigma=coarse.sigma, dimension=1, times=coarse.times, proof=coarse.proof
     )
     assert not altered.certified
+
+
+@pytest.mark.parametrize("continuous", [True, False])
+def test_the_contraction_tube_holds_the_spread_of_a_random_start(continuous):
+    start = cb.GaussianStart([1.0, 0.0], covariance=[[0.04, 0.0], [0.0, 0.01]])
+    law = {"states": 2, "diffusion": 1e-3 * np.eye(2)} if continuous else {"states": 2, "noise": cb.Gaussian(std=1e-3)}
+    kind = cb.ContinuousSystem if continuous else cb.DiscreteSystem
+    system = kind(lambda x: [-0.5 * x[0] if continuous else 0.5 * x[0], 0.2 * np.sin(x[1])], **law)
+    problem = cb.Problem(system, initial=start, safe=[], horizon=2, delta=0.05)
+    reach = cb.bound_reach(problem, method="contraction")
+    points = start.mean + np.random.default_rng(0).standard_normal((2000, 2)) * [0.2, 0.1]
+    outside = np.any((points < reach.hull.lo[0]) | (points > reach.hull.hi[0]), axis=1)
+    assert outside.mean() < problem.delta
+    assert cb.bound_reach(problem, noise=False, method="contraction").hull.hi[0, 0] == pytest.approx(1.0)
+
+
+def test_local_constants_make_no_tube_of_a_random_start():
+    system = cb.DiscreteSystem(lambda x: [0.5 * x[0] + 0.1 * x[0] ** 3], states=["x"], noise=cb.Gaussian(std=1e-3))
+    start = cb.GaussianStart([0.1], covariance=[[0.01]])
+    problem = cb.Problem(system, initial=start, safe=[], horizon=3)
+    with pytest.raises(InfeasibleError, match="`initial` is a GaussianStart"):
+        cb.bound_reach(problem, method="contraction")
+
+
+@pytest.mark.parametrize("continuous", [True, False])
+def test_constants_of_the_domain_prove_a_tube_while_it_is_in_the_domain(continuous):
+    law = {"diffusion": 1e-3} if continuous else {"noise": cb.Gaussian(std=1e-3)}
+    kind = cb.ContinuousSystem if continuous else cb.DiscreteSystem
+    system = kind(lambda x: [x[0] + x[0] ** 3], states=1, **law)
+    start, domain = cb.Box([0.5], [0.7]), cb.Box([-1], [1])
+    problem = cb.Problem(system, initial=start, safe=[], horizon=0.5 if continuous else 3, domain=domain)
+    for noise in (False, True):
+        reach = cb.bound_reach(problem, noise=noise, method="contraction")
+        assert 0 < reach.end < problem.horizon
+        assert np.all(reach.hull.hi[: None if continuous else -1] <= 1.0)
+        wide = cb.bound_reach(problem.replace(domain=cb.Box([-1e3], [1e3])), noise=noise, method="linear")
+        assert wide.end == problem.horizon
+    tiny = problem.replace(domain=cb.Box([0.5 - 1e-6], [0.7 + 1e-6]))
+    if continuous:
+        with pytest.raises(EngineError, match="leaves the model's domain on its first piece"):
+            cb.bound_reach(tiny, method="contraction")

@@ -332,3 +332,13 @@ def test_an_unbounded_jacobian_on_the_users_domain_is_the_constants_engines_reas
 def test_a_verdict_is_no_boolean():
     with pytest.raises(TypeError, match="compare"):
         bool(by_constants(brownian()))
+
+
+def test_a_random_start_far_wider_than_the_noise_is_answered():
+    start = cb.GaussianStart([0.0], covariance=[[0.01]])
+    for std in (1e-6, 1e-3, 0.1):
+        system = cb.DiscreteSystem(lambda x: [0.5 * x[0]], states=1, noise=cb.Gaussian(std=std))
+        safe = [cb.Inside(cb.Box([-0.5], [0.5]))]
+        verdict = by_constants(cb.Problem(system, initial=start, safe=safe, horizon=2, delta=0.01))
+        assert verdict.status == "SAFE"
+        assert verdict.log10_delta > -6.25  # log10 of 2 Q(5), of the start alone

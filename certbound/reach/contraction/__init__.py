@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from certbound.reach.contraction.local import local_constants, local_contraction_tube, local_tube, radius_over_pieces
+from certbound.reach.contraction.local import (
+    local_constants,
+    local_contraction_tube,
+    local_tube,
+    needed_radius,
+    radius_over_pieces,
+    random_start,
+)
 from certbound.reach.contraction.uniform import (
     bound_forcing,
     contraction_tube,
@@ -19,6 +26,8 @@ __all__ = [
     "local_constants",
     "local_contraction_tube",
     "local_tube",
+    "needed_radius",
     "radius_over_pieces",
+    "random_start",
     "values_on_pieces",
 ]

@@ -10,6 +10,7 @@ Source: Thms K4, K5 (theory).
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -18,17 +19,27 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.constants.bounds import constants_along
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
+from certbound.problem.sets import GaussianStart
 from certbound.reach.contraction.slopes import LocalSlopes
 from certbound.reach.contraction.uniform import bound_forcing, integrate_radius, jump_sizes
 from certbound.reach.nominal import Curve, Flow, initial_cells, nominal_curve
 from certbound.reach.sets import ReachTube
+from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
+from certbound.tubes.kummer import Start
 from certbound.tubes.tube import Tube, supremum
 from certbound.tubes.tuning import tune_tube
 
-__all__ = ["local_constants", "local_contraction_tube", "local_tube", "radius_over_pieces"]
+__all__ = [
+    "local_constants",
+    "local_contraction_tube",
+    "local_tube",
+    "needed_radius",
+    "radius_over_pieces",
+    "random_start",
+]
 
 Array = NDArray[np.float64]
 
@@ -186,10 +197,15 @@ def local_tube(
     Raises
     ------
     InfeasibleError
-        If no guess confirmed itself.
+        If no guess confirmed itself, or the initial state is random: its spread is no part of ``reach``.
     ValueError
         If the method's level is one time: such a bound must not be combined with local constants (7.7).
     """
+    if isinstance(problem.initial, GaussianStart) and np.any(problem.initial.covariance):
+        raise InfeasibleError(
+            "no local tube: local constants need a bounded initial set, and `initial` is a GaussianStart; use "
+            'method "linear", or give `domain=cb.Box(low, high)` for constants that hold on a domain.'
+        )
     guess = np.zeros(reach.curve.pieces)
     for _ in range(GUESSES):
         try:
@@ -224,6 +240,34 @@ def radius_over_pieces(tube: Tube, curve: Curve) -> Array:
     starts, ends = curve.starts[edges[:-1]].tolist(), curve.ends[edges[1:] - 1].tolist()
     values = np.array([_supremum(tube, start, end) for start, end in zip(starts, ends)])
     return np.repeat(values, np.diff(edges))
+
+
+def needed_radius(tube: Tube, curve: Curve, start: Start) -> Array:
+    """Radius of a tube over each piece; step 0 of discrete time owes nothing unless the start is random."""
+    radius = radius_over_pieces(tube, curve)
+    if not curve.continuous and start != Start():
+        radius[0] = tube.bound(0.0, 0.0)
+    return radius
+
+
+def random_start(problem: Problem, constants: Constants) -> Start:
+    """X_0 - mean as isotropic sub-Gaussian noise: the least s found with covariance <= s^2 P^-1 (item 7.4).
+
+    Proved through s^2 P - P C P > 0. The tube then needs nu = n, see `Constants.effective_dimension`.
+    """
+    if not isinstance(problem.initial, GaussianStart) or not np.any(problem.initial.covariance):
+        return Start()
+    covariance = np.asarray(problem.initial.covariance, dtype=float)
+    n = len(covariance)
+    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric, dtype=float)
+    root = np.linalg.cholesky(metric)
+    square = float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1])
+    inner = Interval.point(metric) @ Interval.point(covariance) @ Interval.point(metric)
+    for slack in 10.0 ** np.arange(-12.0, 1.0):
+        factor = square * (1 + slack)
+        if bool(is_positive_definite(Interval.point(metric) * factor - inner)):
+            return Start(sigma=math.nextafter(math.sqrt(factor), math.inf))
+    raise EnclosureError("the random start could not be bounded in the metric; it is too ill-conditioned.")
 
 
 def _supremum(tube: Tube, start: float, end: float) -> float:

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Ellipsoid, Inside, Region
-from certbound.reach.contraction import bound_forcing, integrate_radius, jump_sizes
+from certbound.reach.contraction import bound_forcing, integrate_radius, jump_sizes, random_start
 from certbound.reach.nominal import Curve, Flow, initial_cells
 from certbound.reach.sets import ReachTube, polyhedral_weights, round_directions
 from certbound.rigor.norms import Norm
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificates.parts import Proof, exact, needs_direction
-from certbound.safety.engines import Erosion, erode, joined, random_start
+from certbound.safety.engines import Erosion, erode, joined
 from certbound.tubes.constants import Constants
 from certbound.tubes.kummer import Search, Start, exit_level
 from certbound.tubes.objective import Clearance, Objective, read_clearance

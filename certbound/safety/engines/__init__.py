@@ -6,7 +6,7 @@ from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.constants import constants_engine
 from certbound.safety.engines.erosion import Erosion, erode
 from certbound.safety.engines.linear import linear_engine
-from certbound.safety.engines.rooms import joined, random_start
+from certbound.safety.engines.rooms import joined
 from certbound.safety.engines.values import values_engine
 
 __all__ = [
@@ -17,6 +17,5 @@ __all__ = [
     "Erosion",
     "joined",
     "linear_engine",
-    "random_start",
     "values_engine",
 ]

@@ -31,7 +31,14 @@ from certbound.display import log10_text, rounded
 from certbound.errors import CertboundError, EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
-from certbound.reach.contraction import contraction_tube, local_constants, local_contraction_tube, radius_over_pieces
+from certbound.reach.contraction import (
+    contraction_tube,
+    local_constants,
+    local_contraction_tube,
+    needed_radius,
+    radius_over_pieces,
+    random_start,
+)
 from certbound.reach.nominal import Curve, Flow, initial_cells, nominal_curve
 from certbound.reach.sets import ReachTube
 from certbound.rigor.norms import Norm
@@ -42,8 +49,6 @@ from certbound.safety.engines.rooms import (
     deviation_pieces,
     joined,
     log10_sum,
-    needed_radius,
-    random_start,
     room_level,
     smallest_level,
 )

@@ -1,4 +1,4 @@
-"""From rooms to numbers: the probability of given rooms, the tube at a given probability, random starts.
+"""From rooms to numbers: the probability of given rooms, the tube at a given probability.
 
 Thm K2 turns the rooms r_k into a bound of P(exists t: ||S_t||_P > r_t); a tube of the paper, which has no such
 converse, is tried at several delta. Everything that ends in a probability is evaluated in ball arithmetic by the
@@ -14,14 +14,8 @@ import numpy as np
 from flint import arb
 from numpy.typing import NDArray
 
-from certbound.errors import EnclosureError
-from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart
-from certbound.reach.contraction import radius_over_pieces
 from certbound.reach.nominal import Curve
 from certbound.rigor.balls import precision, upper
-from certbound.rigor.definite import is_positive_definite
-from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants
 from certbound.tubes.kummer import Start, exit_level
 from certbound.tubes.objective import read_clearance
@@ -34,8 +28,6 @@ __all__ = [
     "deviation_pieces",
     "joined",
     "log10_sum",
-    "needed_radius",
-    "random_start",
     "room_level",
     "smallest_level",
 ]
@@ -130,14 +122,6 @@ def smallest_level(
     return best
 
 
-def needed_radius(tube: Tube, curve: Curve, start: Start) -> Array:
-    """Radius of a tube over each piece; step 0 of discrete time owes nothing unless the start is random."""
-    radius = radius_over_pieces(tube, curve)
-    if not curve.continuous and start != Start():
-        radius[0] = tube.bound(0.0, 0.0)
-    return radius
-
-
 def deviation_pieces(curve: Curve, radius: Array) -> tuple[Array, Array]:
     """Times (K + 1,) and the radius between them; in discrete time the larger one of both steps."""
     if curve.continuous:
@@ -167,23 +151,3 @@ def log10_sum(levels: list[float]) -> float:
         ten = arb(10).log()
         total = sum(((arb(level) * ten).exp() for level in levels), arb(0))
         return min(0.0, upper(total.log() / ten))
-
-
-def random_start(problem: Problem, constants: Constants) -> Start:
-    """X_0 - mean as isotropic sub-Gaussian noise: the least s found with covariance <= s^2 P^-1 (item 7.4).
-
-    Proved through s^2 P - P C P > 0. The tube then needs nu = n, see `Constants.effective_dimension`.
-    """
-    if not isinstance(problem.initial, GaussianStart) or not np.any(problem.initial.covariance):
-        return Start()
-    covariance = np.asarray(problem.initial.covariance, dtype=float)
-    n = len(covariance)
-    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric, dtype=float)
-    root = np.linalg.cholesky(metric)
-    square = float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1])
-    inner = Interval.point(metric) @ Interval.point(covariance) @ Interval.point(metric)
-    for slack in 10.0 ** np.arange(-12.0, 1.0):
-        factor = square * (1 + slack)
-        if bool(is_positive_definite(Interval.point(metric) * factor - inner)):
-            return Start(sigma=math.nextafter(math.sqrt(factor), math.inf))
-    raise EnclosureError("the random start could not be bounded in the metric; it is too ill-conditioned.")

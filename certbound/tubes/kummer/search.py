@@ -68,7 +68,12 @@ class Search:
         gain, variance = self.schedule.nodes
         finite = np.isfinite(variance) & np.isfinite(gain)
         top = float(np.max(variance[finite] / np.maximum(gain[finite], 1.0)))
-        return max(top, 1e-290)
+        return max(top + self._spread, 1e-290)
+
+    @property
+    def _spread(self) -> float:
+        """Variance of a random start, which v_0 must exceed, in the schedule's unit."""
+        return min((self.start.sigma / self.schedule.unit) ** 2, _OVERFLOWING)
 
     @cached_property
     def _least(self) -> float:
@@ -294,7 +299,10 @@ class Search:
 
     def _typical(self) -> float:
         """A scale of the right size: Gaussian tail at the node of the largest variance."""
-        variance = np.where(np.isfinite(self.schedule.nodes[1]), self.schedule.nodes[1], 0.0)
+        gain, variance = self.schedule.nodes
+        with np.errstate(over="ignore", invalid="ignore"):
+            variance = variance + gain * self._spread if self._spread > 0 else variance
+        variance = np.where(np.isfinite(variance), variance, 0.0)
         roots = np.sqrt(variance) * (self.schedule.unit / self.weights)
         size = roots[-1] if self.kind == "final" else np.max(roots)
         tail = max(1e-3, -self.log_delta)
