@@ -216,19 +216,37 @@ def _best(run: LinearRun, target: float) -> tuple[Outcome, int]:
     Where a guess of the remainder tells which of them has a chance, only those are proved, and the last one if none.
     """
     guessed = bool(len(run.engine.model.active)) and not isinstance(run, DiffusionRun)
-    shares = _GUESSED if guessed else _SHARES if len(run.engine.model.active) else _LINEAR_SHARES
+    shares = _SHARES if len(run.engine.model.active) else _LINEAR_SHARES
     best: Outcome | None = None
-    for share, effort in shares:
-        log_nonlinear = target + float(np.log(share))
-        last = (share, effort) == shares[-1]
-        if guessed and not (last and best is None) and run.promise(log_nonlinear, effort) > target:
-            continue
-        found = run.probability(log_nonlinear, effort)
+    for share, effort in _hopes(run, target) if guessed else shares:
+        found = run.probability(target + float(np.log(share)), effort)
         best = found if best is None else _least(best, found)
         if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
-            break
-    assert best is not None
+            return best, effort
+    share, effort = _GUESSED[-1] if guessed else shares[-1]
+    if best is None:
+        best = run.probability(target + float(np.log(share)), effort)
     return best, effort
+
+
+def _hopes(run: LinearRun, target: float) -> Iterator[tuple[float, int]]:
+    """The shares of the target with which a guess of the remainder says that it is within reach.
+
+    Of all of them the last one has the least levels, and so the least remainder. Where the first has no chance, it is
+    looked at next: if the noise takes more than the target with it as well, the others need no look.
+    """
+    for index, (share, effort) in enumerate(_GUESSED):
+        if run.promise(target + float(np.log(share)), effort, limit=target) <= target:
+            yield share, effort
+        elif index == 0 and not _within_reach(run, target):
+            return
+
+
+def _within_reach(run: LinearRun, target: float) -> bool:
+    """Whether the noise alone, next to the least remainder that is tried, may cost no more than the target."""
+    share, effort = _GUESSED[-1]
+    limit = target + float(np.log1p(share))
+    return run.promise(target + float(np.log(share)), effort, limit=limit) <= limit
 
 
 def _splits(problem: Problem, run: LinearRun) -> Iterator[LinearRun]:
@@ -242,7 +260,7 @@ def _splits(problem: Problem, run: LinearRun) -> Iterator[LinearRun]:
 
 def _promising(run: LinearRun, target: float) -> bool:
     """Whether a guess of the remainder says that the target is within reach."""
-    return any(run.promise(target + float(np.log(share)), effort) <= target for share, effort in _GUESSED)
+    return _within_reach(run, target) and any(True for _ in _hopes(run, target))
 
 
 def _least(first: Outcome, second: Outcome) -> Outcome:

@@ -299,8 +299,11 @@ class LinearRun:
             self.spent[log_nonlinear] = self.guess(levels, (nothing, nothing), (nothing, nothing), 0.0) is None
         return self.spent[log_nonlinear]
 
-    def promise(self, log_nonlinear: float, effort: int) -> float:
-        """What `probability` is likely to find, in logarithms: from a guess of the remainder that is not proved."""
+    def promise(self, log_nonlinear: float, effort: int, limit: float = 0.0) -> float:
+        """What `probability` is likely to find, in logarithms: from a guess of the remainder that is not proved.
+
+        A value beyond ``limit`` says no more than that: the cells that come after such a one are left out.
+        """
         shape = (len(self.engine.centres), self.engine.pieces, self.engine.n)
         if self.hopeless(log_nonlinear):
             return 0.0
@@ -309,8 +312,12 @@ class LinearRun:
         guess = self.guess(levels, nothing, nothing, _MARGIN * _PADS[effort])
         if guess is None:
             return 0.0
-        cells = range(len(self.supports))
-        return max(self._cell(cell, guess, events[cell], log_nonlinear).log_probability for cell in cells)
+        worst = -np.inf
+        for cell in range(len(self.supports)):
+            worst = max(worst, self._cell(cell, guess, events[cell], log_nonlinear).log_probability)
+            if worst > limit:
+                break
+        return worst
 
     def probability(self, log_nonlinear: float, effort: int = 2) -> Outcome:
         """Thm K7' with delta_N = exp(log_nonlinear): the outcome of the worst cell."""
@@ -381,7 +388,9 @@ class LinearRun:
         left = np.empty_like(rooms)
         for index, requirement in enumerate(asked):
             event = events.along(requirement.rows)
-            left[:, index] = rooms[:, index] - (level_along(event, target) if event.profile.max() > 0 else 0.0)
+            level = level_along(event, target) if event.profile.max() > 0 else np.zeros(len(rooms))
+            asking = np.isfinite(rooms[:, index])  # elsewhere no level, however large, takes the room
+            left[:, index] = np.where(asking, rooms[:, index] - np.where(asking, level, 0.0), rooms[:, index])
         piece, tightest = divmod(int(np.argmin(left)), len(asked))
         return asked[tightest], piece, float(left[piece, tightest])
 
