@@ -236,7 +236,7 @@ def verify_safety(
     first = answers["linear"] if method == "auto" and cells is None else None
     proved = any(_is_safe(answer, problem) for answer in answers.values())
     if first is not None and first.applicable and not first.conclusive and not proved:
-        second = _asked("linear", problem)
+        second = _asked("linear", problem, before=first.details)
         if second.applicable:
             answers["linear"] = min(first, second, key=lambda answer: answer.log10_delta)
     return _verdict(problem, answers)

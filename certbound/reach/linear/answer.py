@@ -163,7 +163,9 @@ def refusal(problem: Problem) -> str | None:
     return None
 
 
-def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool = True) -> LinearAnswer:
+def linear_answer(
+    problem: Problem, *, cells: int | None = None, thorough: bool = True, before: LinearAnswer | None = None
+) -> LinearAnswer:
     """Bound the probability of leaving the safe set by the linear response (Thm K7').
 
     Parameters
@@ -173,11 +175,13 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
         Cells along each side of the initial set; as few as serve when omitted.
     thorough : bool
         False: one cell when omitted, and no larger shares where nothing was proved.
+    before : LinearAnswer, optional
+        What was found for the same problem without ``thorough`` and ``cells``; it is not looked for again.
     """
     target = float(np.log(problem.delta))
     first = target + float(np.log(_SHARES[0][0]))
-    run = _run(problem, cells=1 if cells is None else cells)
-    best, effort = _best(run, target)
+    run = _run(problem, cells=1 if cells is None else cells) if before is None else before.run
+    best, effort = _best(run, target) if before is None else (before.outcome, _SHARES[-1][1])
     closes = best.bounds is not None
     near = best.log_probability < target + _NEAR and len(run.engine.model.active) and not isinstance(run, DiffusionRun)
     if thorough and cells is None and best.log_probability > target and (near or not closes):

@@ -283,3 +283,13 @@ def test_a_target_out_of_reach_is_told_by_one_look(monkeypatch: pytest.MonkeyPat
     assert len(looks) == 2
     assert looks[1] == (pytest.approx(np.log(0.85e-3)), 3)
     assert answer.outcome.bounds is not None
+
+
+def test_leaving_costs_no_less_than_the_noise_at_one_time() -> None:
+    for half in (0.45, 0.7, 1.2):
+        box = cb.Box([-half, -2.0], [half, 2.0])
+        problem = oscillator(initial=cb.Box([0.3, -0.1], [0.4, 0.1]), safe=[cb.Inside(box)], delta=1e-3)
+        run = linear_answer(problem, thorough=False).run
+        least = run._one_time(np.log(1e-4))
+        assert -np.inf < least <= run.promise(np.log(1e-4), 3)
+        assert run.promise(np.log(1e-4), 3, limit=least - 1.0) == least
