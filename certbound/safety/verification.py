@@ -204,7 +204,7 @@ def verify_safety(
         for name in (name for name, row in ENGINES.items() if row.again):
             first = answers[name]
             if first.applicable and not first.conclusive:
-                second = _asked(name, problem)
+                second = _asked(name, problem, before=first.details)
                 if second.applicable:
                     answers[name] = min(first, second, key=lambda answer: answer.log10_delta)
     return _verdict(problem, answers)

@@ -13,18 +13,17 @@ import certbound as cb
 from certbound.cli.app import run
 from certbound.cli.commands import check, verify
 from certbound.cli.commands.check import proved_certificate
-from certbound.errors import CertificateError, SolverError
+from certbound.errors import CertificateError
 from certbound.safety.verification import verify_safety
 
 OU = ["verify", "ou", "--method", "constants"]
 
 
-@pytest.mark.parametrize("kind", [SolverError, CertificateError])
 def test_a_certificate_that_fails_takes_nothing_from_the_verdict(
-    kind: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def failing(*_: Any) -> str:
-        raise kind("nothing is left\nfor the noise")
+        raise CertificateError("nothing is left\nfor the noise")
 
     monkeypatch.setattr(verify, "proved_certificate", failing)
     path = tmp_path / "ou.json"
@@ -110,3 +109,17 @@ def test_a_search_for_limits_stops_when_the_time_is_over(
     monkeypatch.setattr("certbound.safety.limits.find_limits", slow)
     assert run(["verify", "ou", "--delta", "1e-90", "--method", "constants", "--explain"]) == 1
     assert "The time was over before it was known what would be SAFE." in capsys.readouterr().out
+
+
+def test_what_the_checker_does_not_prove_is_no_certificate(monkeypatch: pytest.MonkeyPatch) -> None:
+    from certbound import checker
+    from certbound.checker import check_data
+
+    def strict(*arguments: Any, **options: Any) -> Any:
+        return replace(check_data(*arguments, **options), valid=False, reason="nothing is left for the noise.")
+
+    monkeypatch.setattr(checker, "check_data", strict)
+    monkeypatch.setattr(check, "ATTEMPTS", 1)
+    problem = cb.load("ou")
+    with pytest.raises(CertificateError, match=r"no certificate could be proved .* nothing is left for the noise"):
+        proved_certificate(problem, verify_safety(problem, method="constants"))

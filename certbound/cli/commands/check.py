@@ -12,7 +12,7 @@ import typer
 from certbound.cli.messages import InputError
 from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, examples, load_problem
 from certbound.cli.output import SETTINGS, console, print_json, spinner
-from certbound.errors import CertificateError, EngineError, SolverError, contained
+from certbound.errors import CertificateError, EngineError, contained
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
@@ -106,9 +106,7 @@ def proved_certificate(problem: Problem, verdict: Verdict) -> str:
     Raises
     ------
     CertificateError
-        If the verdict bounds no probability.
-    SolverError
-        If the checker did not prove what was written.
+        If the verdict bounds no probability, or the checker did not prove what was written.
     """
     left, reasons = dict(verdict.answers), list[str]()
     while left:
@@ -125,7 +123,7 @@ def proved_certificate(problem: Problem, verdict: Verdict) -> str:
             break
     if not reasons:
         raise CertificateError(f"no probability was bounded that a certificate could state: {verdict.reason}")
-    raise SolverError(f"the certificate could not be proved again by the checker: {' '.join(reasons)}")
+    raise CertificateError(f"no certificate could be proved again by the checker: {' '.join(reasons)}")
 
 
 def _proved(problem: Problem, verdict: Verdict) -> tuple[str | None, str, str]:

@@ -32,7 +32,7 @@ from certbound.cli.options import (
 )
 from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
 from certbound.display import log10_text, name_text, one_line, rounded
-from certbound.errors import CertificateError, EngineError, SolverError, contained
+from certbound.errors import CertificateError, EngineError, contained
 
 if TYPE_CHECKING:
     from certbound.plotting import Scene
@@ -244,7 +244,7 @@ def _certify(problem: Problem, verdict: Verdict, path: Path) -> tuple[str, dict[
     try:
         with spinner("writing and checking the certificate"):
             text = proved_certificate(problem, verdict)
-    except (CertificateError, SolverError) as error:
+    except CertificateError as error:
         reason = " ".join(str(error).split())
         sys.stderr.write(f"certbound: no certificate was written: {reason}\n")
         return "", {"path": None, "log10_delta": None, "reason": reason}

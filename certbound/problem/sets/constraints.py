@@ -79,7 +79,7 @@ def _describe(constraint: Inside, states: tuple[str, ...]) -> str:
     center = "a moving centre" if region.moving else _listed(region.center_at())
     among = "" if region.coordinates is None else f" in ({', '.join(used)})"
     if isinstance(region, Box):
-        ends = zip(used, region.low, region.high)
+        ends = sorted(zip(used, region.low, region.high), key=lambda end: states.index(end[0]))
         parts = [_interval(*end) for end in ends if np.isfinite(end[1:]).any()] or ["everywhere"]
         text = ", ".join(parts if len(parts) <= 4 else [*parts[:2], f"... ({len(parts)} intervals)"])
         text += " (moving)" if region.moving else ""

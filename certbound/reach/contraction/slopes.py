@@ -110,7 +110,8 @@ class LocalSlopes:
             return values, boxes.width / np.maximum(boxes.width.max(axis=0, initial=0.0), 1e-300)
         values = np.minimum(values, measure(*form))
         slopes = np.where(np.isfinite(form[1].slopes.mag), form[1].slopes.mag, 1e100)
-        return values, np.sum(slopes, axis=(-1, -2)) * form[1].reach
+        with np.errstate(over="ignore"):  # the weights choose what is halved: an infinite one comes first
+            return values, np.sum(slopes, axis=(-1, -2)) * form[1].reach
 
     def _sampled(self, boxes: Interval) -> Array:
         jacobians = self.jacobian.values(boxes.mid)

@@ -163,7 +163,9 @@ def refusal(problem: Problem) -> str | None:
     return None
 
 
-def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool = True) -> LinearAnswer:
+def linear_answer(
+    problem: Problem, *, cells: int | None = None, thorough: bool = True, before: LinearAnswer | None = None
+) -> LinearAnswer:
     """Bound the probability of leaving the safe set by the linear response (Thm K7').
 
     Parameters
@@ -173,11 +175,13 @@ def linear_answer(problem: Problem, *, cells: int | None = None, thorough: bool 
         Cells along each side of the initial set; as few as serve when omitted.
     thorough : bool
         False: one cell when omitted, and no larger shares where nothing was proved.
+    before : LinearAnswer, optional
+        What was found for the same problem without ``thorough`` and ``cells``; it is not looked for again.
     """
     target = float(np.log(problem.delta))
     first = target + float(np.log(_SHARES[0][0]))
-    run = _run(problem, cells=1 if cells is None else cells)
-    best, effort = _best(run, target)
+    run = _run(problem, cells=1 if cells is None else cells) if before is None else before.run
+    best, effort = _best(run, target) if before is None else (before.outcome, _SHARES[-1][1])
     closes = best.bounds is not None
     near = best.log_probability < target + _NEAR and len(run.engine.model.active) and not isinstance(run, DiffusionRun)
     if thorough and cells is None and best.log_probability > target and (near or not closes):
@@ -216,19 +220,37 @@ def _best(run: LinearRun, target: float) -> tuple[Outcome, int]:
     Where a guess of the remainder tells which of them has a chance, only those are proved, and the last one if none.
     """
     guessed = bool(len(run.engine.model.active)) and not isinstance(run, DiffusionRun)
-    shares = _GUESSED if guessed else _SHARES if len(run.engine.model.active) else _LINEAR_SHARES
+    shares = _SHARES if len(run.engine.model.active) else _LINEAR_SHARES
     best: Outcome | None = None
-    for share, effort in shares:
-        log_nonlinear = target + float(np.log(share))
-        last = (share, effort) == shares[-1]
-        if guessed and not (last and best is None) and run.promise(log_nonlinear, effort) > target:
-            continue
-        found = run.probability(log_nonlinear, effort)
+    for share, effort in _hopes(run, target) if guessed else shares:
+        found = run.probability(target + float(np.log(share)), effort)
         best = found if best is None else _least(best, found)
         if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
-            break
-    assert best is not None
+            return best, effort
+    share, effort = _GUESSED[-1] if guessed else shares[-1]
+    if best is None:
+        best = run.probability(target + float(np.log(share)), effort)
     return best, effort
+
+
+def _hopes(run: LinearRun, target: float) -> Iterator[tuple[float, int]]:
+    """The shares of the target with which a guess of the remainder says that it is within reach.
+
+    Of all of them the last one has the least levels, and so the least remainder. Where the first has no chance, it is
+    looked at next: if the noise takes more than the target with it as well, the others need no look.
+    """
+    for index, (share, effort) in enumerate(_GUESSED):
+        if run.promise(target + float(np.log(share)), effort, limit=target) <= target:
+            yield share, effort
+        elif index == 0 and not _within_reach(run, target):
+            return
+
+
+def _within_reach(run: LinearRun, target: float) -> bool:
+    """Whether the noise alone, next to the least remainder that is tried, may cost no more than the target."""
+    share, effort = _GUESSED[-1]
+    limit = target + float(np.log1p(share))
+    return run.promise(target + float(np.log(share)), effort, limit=limit) <= limit
 
 
 def _splits(problem: Problem, run: LinearRun) -> Iterator[LinearRun]:
@@ -242,7 +264,7 @@ def _splits(problem: Problem, run: LinearRun) -> Iterator[LinearRun]:
 
 def _promising(run: LinearRun, target: float) -> bool:
     """Whether a guess of the remainder says that the target is within reach."""
-    return any(run.promise(target + float(np.log(share)), effort) <= target for share, effort in _GUESSED)
+    return _within_reach(run, target) and any(True for _ in _hopes(run, target))
 
 
 def _least(first: Outcome, second: Outcome) -> Outcome:

@@ -192,7 +192,7 @@ class DiffusionRun(LinearRun):
         self.outcomes[log_nonlinear] = best
         return best
 
-    def promise(self, log_nonlinear: float, effort: int) -> float:
+    def promise(self, log_nonlinear: float, effort: int, limit: float = 0.0) -> float:
         """What `probability` finds, in logarithms: nothing can be guessed before a tube has closed."""
         return self.probability(log_nonlinear, effort).log_probability
 

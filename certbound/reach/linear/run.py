@@ -27,6 +27,7 @@ from certbound.gaussian.response import (
     logsumexp,
     quantile,
 )
+from certbound.gaussian.scalar import log_tail_below
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear.inclusion import Supports
 from certbound.reach.linear.linearisation import Linearisation
@@ -107,7 +108,7 @@ class LinearRun:
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
         self.kept: dict[float, tuple[Array, list[Events]]] = {}
-        self.spent: dict[float, bool] = {}
+        self.spent: dict[float, tuple[Array, Array] | None] = {}
         self.failed_at = 0
 
     def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
@@ -290,27 +291,56 @@ class LinearRun:
         """
         if not (self.engine.continuous and self.engine.noise and len(self.engine.model.active)):
             return False
+        return self._at_least(log_nonlinear) is None
+
+    def _at_least(self, log_nonlinear: float) -> tuple[Array, Array] | None:
+        """A guess of the remainder at those levels: less than what any proof finds; None where it feeds itself."""
         if log_nonlinear not in self.spent:
             q = quantile(log_nonlinear - float(np.log(2.0)))
             v = self.engine.response.covariance[:, 1:]
             variance = np.einsum("bkdi,bkij,bkdj->bkd", self.rows, v, self.rows)
             levels = 0.99 * q * np.sqrt(np.maximum(variance, 0.0))
             nothing = np.zeros((len(levels), self.engine.pieces, self.engine.n))
-            self.spent[log_nonlinear] = self.guess(levels, (nothing, nothing), (nothing, nothing), 0.0) is None
+            self.spent[log_nonlinear] = self.guess(levels, (nothing, nothing), (nothing, nothing), 0.0)
         return self.spent[log_nonlinear]
 
-    def promise(self, log_nonlinear: float, effort: int) -> float:
-        """What `probability` is likely to find, in logarithms: from a guess of the remainder that is not proved."""
+    def _one_time(self, log_nonlinear: float) -> float:
+        """Logarithm of what leaving costs at least, by the guess: the noise beyond the room of one row at one time."""
+        if not (self.engine.continuous and self.engine.noise and len(self.engine.model.active)):
+            return -np.inf
+        guess, worst = self._at_least(log_nonlinear), -np.inf
+        for cell, asked in enumerate(self.requirements if guess is not None else ()):
+            assert guess is not None
+            rooms, v = self.rooms(cell, guess), self.engine.response.covariance[cell, 1:]
+            for i, requirement in enumerate(asked):
+                deviation = np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", requirement.rows, v, requirement.rows), 0.0))
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    sizes = np.where(deviation > 0, rooms[:, i] / deviation, np.inf)
+                worst = max(worst, float(log_tail_below(np.clip(np.min(sizes), -1e3, 1e100))))
+        return worst
+
+    def promise(self, log_nonlinear: float, effort: int, limit: float = 0.0) -> float:
+        """What `probability` is likely to find, in logarithms: from a guess of the remainder that is not proved.
+
+        A value beyond ``limit`` says no more than that: the cells that come after such a one are left out.
+        """
         shape = (len(self.engine.centres), self.engine.pieces, self.engine.n)
         if self.hopeless(log_nonlinear):
             return 0.0
+        least = self._one_time(log_nonlinear)
+        if least > limit:
+            return least
         levels, events = self.levels(log_nonlinear)
         nothing = np.zeros(shape), np.zeros(shape)
         guess = self.guess(levels, nothing, nothing, _MARGIN * _PADS[effort])
         if guess is None:
             return 0.0
-        cells = range(len(self.supports))
-        return max(self._cell(cell, guess, events[cell], log_nonlinear).log_probability for cell in cells)
+        worst = -np.inf
+        for cell in range(len(self.supports)):
+            worst = max(worst, self._cell(cell, guess, events[cell], log_nonlinear).log_probability)
+            if worst > limit:
+                break
+        return worst
 
     def probability(self, log_nonlinear: float, effort: int = 2) -> Outcome:
         """Thm K7' with delta_N = exp(log_nonlinear): the outcome of the worst cell."""
@@ -381,7 +411,9 @@ class LinearRun:
         left = np.empty_like(rooms)
         for index, requirement in enumerate(asked):
             event = events.along(requirement.rows)
-            left[:, index] = rooms[:, index] - (level_along(event, target) if event.profile.max() > 0 else 0.0)
+            level = level_along(event, target) if event.profile.max() > 0 else np.zeros(len(rooms))
+            asking = np.isfinite(rooms[:, index])  # elsewhere no level, however large, takes the room
+            left[:, index] = np.where(asking, rooms[:, index] - np.where(asking, level, 0.0), rooms[:, index])
         piece, tightest = divmod(int(np.argmin(left)), len(asked))
         return asked[tightest], piece, float(left[piece, tightest])
 

@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 ORDER = 6
 ROUNDS = 5
 LARGEST_GRID = 4096
+MOST_EVALUATIONS = 400_000
+PATIENCE, LEAST_PROGRESS = 5000, 1e-4
+"""Evaluations within which the solver must advance, and by which share of the time."""
 
 
 def nominal_curve(
@@ -193,6 +196,23 @@ def _through(flow: Flow, grid: Array, states: Array) -> Curve:
     return Curve(continuous=True, starts=grid[:-1], ends=grid[1:], coefficients=coefficients)
 
 
+class _Patience:
+    """Ends a solver that chatters at a jump of the dynamics, or creeps: it would not come back."""
+
+    def __init__(self, flow: Flow, span: float) -> None:
+        self.flow, self.span = flow, span
+        self.count, self.mark = 0, -np.inf
+
+    def spend(self, t: float) -> None:
+        """Count an evaluation; raises EngineError where too many were spent on next to no time."""
+        self.count += 1
+        if self.count % PATIENCE:
+            return
+        if self.count >= MOST_EVALUATIONS or t - self.mark < LEAST_PROGRESS * self.span:
+            raise _lost(t, self.flow)
+        self.mark = t
+
+
 def _node_states(flow: Flow, grid: Array, states: Array) -> Array:
     from scipy.integrate import solve_ivp
 
@@ -202,8 +222,10 @@ def _node_states(flow: Flow, grid: Array, states: Array) -> Array:
     segments = np.unique(np.searchsorted(grid, flow.breaks))
     for first, last in itertools.pairwise(segments):
         row = flow.plan_rows(grid[first : first + 1])[0]
+        patience = _Patience(flow, float(grid[last] - grid[first]))
 
-        def slope(t: float, flat: Array, row: Array = row) -> Array:
+        def slope(t: float, flat: Array, row: Array = row, patience: _Patience = patience) -> Array:
+            patience.spend(t)
             return flow.value(t, flat.reshape(count, n), row).reshape(-1)
 
         start = nodes[:, first].reshape(-1)

@@ -14,18 +14,21 @@ from certbound.safety.answers import Deviation, EngineAnswer
 __all__ = ["linear_engine"]
 
 
-def linear_engine(problem: Problem, *, cells: int | None = None, thorough: bool = True, **_: Any) -> EngineAnswer:
+def linear_engine(
+    problem: Problem, *, cells: int | None = None, thorough: bool = True, before: LinearAnswer | None = None, **_: Any
+) -> EngineAnswer:
     """Smallest probability that Thm K7' proves for the problem (options of other engines are ignored).
 
     With additive noise it covers every disturbance, even one that sees coming noise; with noise that depends on the
     state, those that do not.
 
-    Without ``thorough`` the initial set is one cell unless ``cells`` says otherwise.
+    Without ``thorough`` the initial set is one cell unless ``cells`` says otherwise; what was found in that way can be
+    given as ``before``.
     """
     hidden = hidden_jump(problem)
     if hidden is not None:
         return EngineAnswer(applicable=False, reason=hidden, method="linear")
-    answer = linear_answer(problem, cells=cells, thorough=thorough)
+    answer = linear_answer(problem, cells=cells, thorough=thorough, before=before)
     tube = answer.tube
     return EngineAnswer(
         log10_delta=answer.log10_delta,

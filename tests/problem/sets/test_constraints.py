@@ -62,3 +62,9 @@ def test_a_random_start_is_checked():
         GaussianStart([0, 0], [[1, 2], [2, 1]])
     with pytest.raises(ValueError, match=r"`covariance` must have shape \(3, 3\)"):
         GaussianStart([0, 0, 0], np.eye(2))
+
+
+def test_a_label_names_the_states_in_their_order() -> None:
+    names = ("a", "b", "c")
+    box = Box([-2.0, -1.0], [2.0, 1.0], coordinates=(2, 0))
+    assert Outside(box).named(names).label == "outside -1 <= a <= 1, -2 <= c <= 2"

@@ -143,3 +143,10 @@ def test_twelve_states():
     tube = local_contraction_tube(problem)
     assert tube.end == 0.5
     assert float(tube.radius[0, -1]) < float(tube.radius[0, 0])
+
+
+def test_slopes_that_overflow_choose_what_is_halved_without_a_warning() -> None:
+    system = ContinuousSystem(lambda x: [-(x[0] ** 9), -x[1] * np.exp(3 * x[0])], states=2, diffusion=0.1 * np.eye(2))
+    problem = Problem(system, initial=Box([0.5, 0.0], [2.0, 2.0]), safe=[], horizon=2.0)
+    with pytest.raises(EnclosureError, match="on its first piece"):
+        local_contraction_tube(problem)

@@ -256,3 +256,40 @@ def test_more_cells_are_taken_where_one_proves_too_little() -> None:
     several = linear_answer(problem)
     assert len(several.run.engine.centres) > 1
     assert several.log10_delta <= -3
+
+
+def test_no_room_and_no_level_together_are_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    inside = cb.Inside(cb.Box([-2.0, -2.0], [2.0, 2.0]), during=(1.0, 2.0), label="the window")
+    answer = linear_answer(oscillator(safe=[inside]))
+    monkeypatch.setattr("certbound.reach.linear.run.level_along", lambda event, _: np.full(len(event.profile), np.inf))
+    requirement, piece, left = answer.run.tightest(answer.shown)
+    assert requirement is not None
+    assert requirement.label.startswith("the window")
+    assert (piece + 1) * answer.run.engine.step >= 1.0
+    assert piece * answer.run.engine.step <= 2.0
+    assert left == -np.inf
+
+
+def test_a_target_out_of_reach_is_told_by_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = []
+
+    def promise(run: LinearRun, log_nonlinear: float, effort: int, limit: float = 0.0) -> float:
+        looks.append((log_nonlinear, effort))
+        return limit + 1.0
+
+    monkeypatch.setattr(LinearRun, "promise", promise)
+    problem = oscillator(initial=cb.Box([0.3, -0.1], [0.5, 0.1]), delta=1e-3)
+    answer = linear_answer(problem, thorough=False)
+    assert len(looks) == 2
+    assert looks[1] == (pytest.approx(np.log(0.85e-3)), 3)
+    assert answer.outcome.bounds is not None
+
+
+def test_leaving_costs_no_less_than_the_noise_at_one_time() -> None:
+    for half in (0.45, 0.7, 1.2):
+        box = cb.Box([-half, -2.0], [half, 2.0])
+        problem = oscillator(initial=cb.Box([0.3, -0.1], [0.4, 0.1]), safe=[cb.Inside(box)], delta=1e-3)
+        run = linear_answer(problem, thorough=False).run
+        least = run._one_time(np.log(1e-4))
+        assert -np.inf < least <= run.promise(np.log(1e-4), 3)
+        assert run.promise(np.log(1e-4), 3, limit=least - 1.0) == least

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -175,3 +177,15 @@ def test_inputs_without_a_plan_are_refused():
     system = linear_system([[0.0]], [[1.0]], time="continuous", diffusion=1.0)
     with pytest.raises(ValueError, match="give `plan=`"):
         Flow(Problem(system, initial=[0.0], safe=[], horizon=1.0))
+
+
+def test_a_solver_that_chatters_at_a_jump_is_given_up_soon() -> None:
+    system = ContinuousSystem(lambda x: [-0.5 * np.sign(x[0]) - x[0]], states=1)
+    problem = Problem(system, initial=[0.2], safe=[], horizon=1.0)
+    started = time.process_time()
+    with pytest.raises(EngineError, match=r"cannot be followed beyond t = 0\.336"):
+        nominal_curve(problem, [0.2])
+    assert time.process_time() - started < 5.0
+    oscillator = ContinuousSystem(lambda x: [300.0 * x[1], -300.0 * x[0]], states=2)  # 50 periods are followed
+    curve = nominal_curve(Problem(oscillator, initial=[1.0, 0.0], safe=[], horizon=1.0), [1.0, 0.0])
+    assert curve.value(1.0)[0] == pytest.approx([np.cos(300.0), -np.sin(300.0)], abs=1e-8)
