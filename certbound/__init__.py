@@ -7,10 +7,59 @@ from __future__ import annotations
 
 import importlib
 import logging
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from certbound._version import __version__
 from certbound.display import connect
+
+if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the table below
+    from certbound.constants.bounds import bound_constants as bound_constants
+    from certbound.constants.metrics import bound_metrics as bound_metrics
+    from certbound.display import load_result as load_result
+    from certbound.errors import CertboundError as CertboundError
+    from certbound.errors import CertificateError as CertificateError
+    from certbound.errors import EnclosureError as EnclosureError
+    from certbound.errors import EngineError as EngineError
+    from certbound.errors import InfeasibleError as InfeasibleError
+    from certbound.errors import SolverError as SolverError
+    from certbound.problem.export import export_casadi as export_casadi
+    from certbound.problem.export import export_control as export_control
+    from certbound.problem.files import load as load
+    from certbound.problem.files import save as save
+    from certbound.problem.noise import Bounded as Bounded
+    from certbound.problem.noise import Gaussian as Gaussian
+    from certbound.problem.noise import Rademacher as Rademacher
+    from certbound.problem.noise import SubGaussian as SubGaussian
+    from certbound.problem.noise import Uniform as Uniform
+    from certbound.problem.problem import Problem as Problem
+    from certbound.problem.sets import Ball as Ball
+    from certbound.problem.sets import Box as Box
+    from certbound.problem.sets import Ellipsoid as Ellipsoid
+    from certbound.problem.sets import GaussianStart as GaussianStart
+    from certbound.problem.sets import HalfSpace as HalfSpace
+    from certbound.problem.sets import Inside as Inside
+    from certbound.problem.sets import Outside as Outside
+    from certbound.problem.sets import Polytope as Polytope
+    from certbound.problem.systems import ContinuousSystem as ContinuousSystem
+    from certbound.problem.systems import DiscreteSystem as DiscreteSystem
+    from certbound.problem.systems import from_control as from_control
+    from certbound.problem.systems import linear_system as linear_system
+    from certbound.reach import bound_reach as bound_reach
+    from certbound.reach.sets import ReachTube as ReachTube
+    from certbound.safety.verification import Verdict as Verdict
+    from certbound.safety.verification import verify_safety as verify_safety
+    from certbound.simulation.estimates import sample_paths as sample_paths
+    from certbound.simulation.estimates import simulate_exits as simulate_exits
+    from certbound.synthesis.controllers import ConvexPlanner as ConvexPlanner
+    from certbound.synthesis.controllers import PredictiveController as PredictiveController
+    from certbound.synthesis.controllers import SafetyFilter as SafetyFilter
+    from certbound.synthesis.controllers import simulate_closed_loop as simulate_closed_loop
+    from certbound.synthesis.plans import synthesize_plan as synthesize_plan
+    from certbound.synthesis.terminal import TerminalSet as TerminalSet
+    from certbound.tubes.constants import Constants as Constants
+    from certbound.tubes.tube import Tube as Tube
+    from certbound.tubes.tuning import bound_exit_probability as bound_exit_probability
+    from certbound.tubes.tuning import tune_tube as tune_tube
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 
@@ -39,6 +88,7 @@ _HOME = {
     "export_control": "problem.export",
     "load_result": "display",
     "Constants": "tubes.constants",
+    "Tube": "tubes.tube",
     "tune_tube": "tubes.tuning",
     "bound_exit_probability": "tubes.tuning",
     "simulate_exits": "simulation.estimates",
@@ -46,7 +96,9 @@ _HOME = {
     "bound_constants": "constants.bounds",
     "bound_metrics": "constants.metrics",
     "bound_reach": "reach",
+    "ReachTube": "reach.sets",
     "verify_safety": "safety.verification",
+    "Verdict": "safety.verification",
     "synthesize_plan": "synthesis.plans",
     "simulate_closed_loop": "synthesis.controllers",
     "PredictiveController": "synthesis.controllers",
@@ -56,6 +108,7 @@ _HOME = {
     "CertboundError": "errors",
     "CertificateError": "errors",
     "EnclosureError": "errors",
+    "EngineError": "errors",
     "InfeasibleError": "errors",
     "SolverError": "errors",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.metadata
 import subprocess
 import sys
@@ -24,6 +25,33 @@ def test_the_version_is_stated_once() -> None:
 @pytest.mark.parametrize("name", cb.__all__)
 def test_every_public_name_can_be_loaded(name: str) -> None:
     assert getattr(cb, name) is not None
+
+
+def test_editors_and_mypy_read_the_names_that_are_loaded() -> None:
+    tree = ast.parse((ROOT / "certbound" / "__init__.py").read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    read = {
+        alias.asname: f"{node.module}.{alias.name}"
+        for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    }  # fmt: skip
+    table = next(
+        ast.literal_eval(node.value)
+        for node in tree.body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id == "_HOME"
+    )
+    assert read == {name: f"certbound.{home}.{name}" for name, home in table.items()}
+
+
+@pytest.mark.slow
+def test_mypy_sees_real_types(tmp_path: Path) -> None:
+    file = tmp_path / "user.py"
+    file.write_text(
+        "import certbound as cb\ncb.Problem(1, 2, nonsense=3)\nreveal_type(cb.verify_safety(cb.load('ou')))\n"
+    )
+    words = [sys.executable, "-m", "mypy", "--strict", "--config-file", str(ROOT / "pyproject.toml"), str(file)]
+    said = subprocess.run(words, capture_output=True, text=True, cwd=ROOT).stdout
+    assert "Unexpected keyword argument" in said or "No overload" in said or "Too many positional arguments" in said
+    assert 'Revealed type is "certbound.safety.verification.Verdict"' in said
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
