@@ -181,6 +181,8 @@ class _Work:
                 best = found
             if best is not None and best.log10_probability(horizon) <= hoped + _CLOSE:
                 return best
+            if self.n == _MOST_STATES and hoped > _FAR * math.log10(self.problem.delta):
+                return best  # more points only raise what is hoped for, and here they take many seconds
             points = tuple(np.concatenate([have, more]) for have, more in zip(points, worst))  # type: ignore[assignment]
         return best
 

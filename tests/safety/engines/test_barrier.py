@@ -13,6 +13,7 @@ from certbound.rigor.intervals import Interval
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import problem_data
 from certbound.safety.certificates.barrier import barrier_proof
+from certbound.safety.engines import barrier as engine
 from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.gaps import gaps_of, lies_inside
 
@@ -160,3 +161,23 @@ def test_an_initial_set_that_was_not_proved_safe_gets_no_bound(monkeypatch: pyte
     found = barrier_engine(scalar())
     assert not found.applicable
     assert "initial set" in found.reason
+
+
+def test_a_target_far_out_of_reach_is_not_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    hopes, asked = list[float](), [0.0]
+
+    def program(_: object, exponents: np.ndarray, *points: np.ndarray) -> tuple[np.ndarray, float]:
+        hopes.append(asked[0])
+        return np.zeros(len(exponents) + 1), asked[0]
+
+    monkeypatch.setattr(engine._Work, "_program", program)
+    nothing = np.zeros((0, 4)), np.zeros((0, 3)), np.zeros((0, 3))
+    monkeypatch.setattr(engine._Work, "_certified", lambda *_: (None, nothing))
+    system = cb.ContinuousSystem(lambda x: -x, states=3, diffusion=0.3 * np.eye(3))
+    safe = [cb.Inside(cb.Box(-np.ones(3), np.ones(3)))]
+    problem = cb.Problem(system, initial=np.zeros(3), safe=safe, horizon=2.0, delta=1e-3)
+    for hoped, rounds in ((-0.2, 1), (-2.0, 3)):
+        hopes.clear()
+        asked[0] = hoped
+        assert barrier_engine(problem).log10_delta == 0.0
+        assert len(hopes) == rounds
