@@ -38,6 +38,7 @@ SENTENCES = {
     "SAFE": "Safe: with the constraints as stated, the probability of leaving the safe set at any time up to the "
     "horizon is proved to be at most the number below.",
     "UNKNOWN": "Not decided: the probability that could be certified is not small enough, or nothing could be.",
+    "UNSAFE": "Not safe: the probability exceeds what was asked from some start, proved.",
     "UNSAFE_NOMINAL": "Not safe: already without noise some trajectory leaves the safe set, by a rigorous enclosure.",
 }
 PACKAGES = ("numpy", "scipy", "casadi", "cvxpy", "clarabel", "python-flint", "numba", "plotly")
@@ -347,7 +348,7 @@ h1, #verdict {{ grid-column: 1 / -1; margin-bottom: 0; }}
 section {{ background: white; border-radius: 8px; padding: 0.5rem 1rem 1rem; min-width: 0;
   border-top: 4px solid #c7ccd3; }}
 section.SAFE {{ border-top-color: #009E73; }} section.UNKNOWN {{ border-top-color: #E69F00; }}
-section.UNSAFE_NOMINAL {{ border-top-color: #D55E00; }}
+section.UNSAFE, section.UNSAFE_NOMINAL {{ border-top-color: #D55E00; }}
 h2 {{ font-size: 1.1rem; }} .status {{ font-size: 1.8rem; font-weight: 700; margin: 0; }}
 figure {{ margin: 0; }} .plot {{ width: 100%; height: 360px; overflow: hidden; }}
 figcaption {{ color: #444; font-size: 0.9rem; }}

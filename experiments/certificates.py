@@ -19,7 +19,7 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.cli.commands.check import ATTEMPTS
 from certbound.errors import CertificateError
-from certbound.safety.certificates import problem_data
+from certbound.safety.certificate import problem_data
 
 __all__ = ["FACTOR", "LEAST", "Row", "main", "row", "subjects", "table"]
 

@@ -53,6 +53,8 @@ reach
 safety.answers
 safety.engines
 safety.certificates
+safety.portfolio
+safety.certificate
 safety
 synthesis
 synthesis.plans

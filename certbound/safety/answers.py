@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from certbound.display import Shown, rounded
 from certbound.reach.sets import ReachTube
-from certbound.rigor.balls import lower, precision
+from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
 
-__all__ = ["Answered", "Deviation", "EngineAnswer", "is_at_most", "settled"]
+__all__ = ["Answered", "Deviation", "EngineAnswer", "is_at_most", "is_more_than", "settled"]
 
 Array = NDArray[np.float64]
 
@@ -143,6 +143,12 @@ def is_at_most(log10_delta: float, target: float) -> bool:
     """Whether 10**log10_delta <= target is proved, in ball arithmetic."""
     with precision():
         return log10_delta <= lower(arb(target).log() / arb(10).log())
+
+
+def is_more_than(log10_lower: float, target: float) -> bool:
+    """Whether 10**log10_lower > target is proved, in ball arithmetic."""
+    with precision():
+        return log10_lower > upper(arb(target).log() / arb(10).log())
 
 
 def settled(log10_delta: float, target: float) -> float:

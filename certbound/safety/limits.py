@@ -20,7 +20,8 @@ from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, HalfSpace, Inside, Outside, Polytope, Region
 from certbound.problem.systems import ContinuousSystem, System
-from certbound.safety.verification import ENGINES, Verdict, verify_safety
+from certbound.safety.portfolio import ENGINES
+from certbound.safety.verification import Verdict, verify_safety
 
 __all__ = ["Limits", "find_limits", "find_smallest", "smaller_verdicts"]
 
@@ -80,7 +81,8 @@ def find_limits(verdict: Verdict, *, cells: int | None = None) -> Limits:
     problem = verdict.problem
     if problem is None or verdict.status == "SAFE":
         raise ValueError(f"`verdict` must be one that is not SAFE, of a problem; got {verdict.summary()}")
-    useful = [name for name in ENGINES if name in verdict.answers and verdict.answers[name].applicable]
+    asked = [name for name, row in ENGINES.items() if name in verdict.answers and not row.dear]
+    useful = [name for name in asked if verdict.answers[name].applicable]
     engine = min(useful, key=lambda name: verdict.answers[name].log10_delta, default="auto")
 
     def safe(changed: Callable[[], Problem]) -> bool:
@@ -115,12 +117,13 @@ def smaller_verdicts(verdict: Verdict, *, method: str = "auto", cells: int | Non
     level = min(verdict.log10_delta, math.log10(problem.delta))
     if method == "auto":
         method = min(verdict.answers, key=lambda name: verdict.answers[name].log10_delta)
-        barrier = verdict.answers.get("barrier")
-        if barrier is None or not barrier.applicable:  # left out so far, unless it refuses; its bound knows no delta
-            found = verify_safety(problem, method="barrier")
-            if found.log10_delta < level:
-                yield found
-                level = found.log10_delta
+        for name in (name for name, row in ENGINES.items() if row.reserve):
+            asked = verdict.answers.get(name)
+            if asked is None or not asked.applicable:  # left out so far, unless it refuses; its bound knows no delta
+                found = verify_safety(problem, method=name)
+                if found.log10_delta < level:
+                    yield found
+                    level = found.log10_delta
     step = max(-level, 1.0)
     while level > _LEAST_EXPONENT and step > 0.02 * -level:
         target = max(level - step, _LEAST_EXPONENT)

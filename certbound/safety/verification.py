@@ -4,68 +4,30 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from certbound.display import Shown, log10_text, name_text, rounded
-from certbound.errors import CertificateError, EngineError, contained
+from certbound.errors import CertificateError, EngineError, SolverError, contained
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
 from certbound.reach.sets import ReachTube
-from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, settled
-from certbound.safety.engines import linear_engine
+from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, is_more_than, settled
 from certbound.safety.falsification import Violation, find_violation
+from certbound.safety.portfolio import ENGINES, engine_named
 
 if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
 
-__all__ = ["ENGINES", "EngineAnswer", "Verdict", "verify_safety"]
+__all__ = ["EngineAnswer", "Verdict", "best_lower", "verify_safety"]
 
 _log = logging.getLogger(__name__)
 
 
-def _constants(problem: Problem, **options: Any) -> EngineAnswer:
-    from certbound.safety.engines import constants_engine
-
-    return constants_engine(problem, **options)
-
-
-def _linear(problem: Problem, **options: Any) -> EngineAnswer:
-    return linear_engine(problem, **options)
-
-
-def _barrier(problem: Problem, **options: Any) -> EngineAnswer:
-    from certbound.safety.engines import barrier_engine
-
-    return barrier_engine(problem, **options)
-
-
-def _values(problem: Problem, **options: Any) -> EngineAnswer:
-    from certbound.safety.engines import values_engine
-
-    return values_engine(problem, **options)
-
-
-_ENGINES: dict[str, Callable[..., EngineAnswer]] = {
-    "linear": _linear,
-    "constants": _constants,
-    "barrier": _barrier,
-    "values": _values,
-}
-"""Engines in the order in which they are tried: name to function(problem, **options).
-
-``quick`` says that another engine has proved SAFE or been conclusive: slow refinements may be left out; without
-``thorough`` the linear engine takes the initial set as one cell, since it is asked again if no engine proves SAFE."""
-
-
 _LARGE = 60  # states beyond which no other engine is asked once one has proved SAFE
-
-ENGINES = tuple(_ENGINES)
-"""Names of the engines, in the order in which they are tried."""
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Verdict(Shown):
@@ -73,12 +35,16 @@ class Verdict(Shown):
 
     Parameters
     ----------
-    status : {"SAFE", "UNSAFE_NOMINAL", "UNKNOWN"}
+    status : {"SAFE", "UNSAFE", "UNSAFE_NOMINAL", "UNKNOWN"}
         SAFE: the probability of breaking a constraint within the horizon is at most delta, proved.
+        UNSAFE: that probability exceeds delta from some start (of a normal start: in the mean), proved.
         UNSAFE_NOMINAL: a noise-free trajectory from the initial set provably leaves the safe set.
     log10_delta : float
         log10 of the smallest bound on that probability that was proved: finite, at most 0 (0: nothing was). SAFE
         exactly when it is at most log10 of the problem's delta.
+    log10_lower : float or None
+        log10 of a proved lower bound of the probability from the worst start, under the worst disturbance; None where
+        no engine has one.
     margin : float or None
         Least Euclidean distance to breaking a constraint that the tube at delta leaves; negative: it does not fit.
     time, constraint
@@ -110,6 +76,7 @@ class Verdict(Shown):
     deviation: Deviation | None = None
     problem: Problem | None = field(default=None, repr=False)
     answers: Mapping[str, EngineAnswer] = field(default_factory=dict, repr=False)
+    log10_lower: float | None = None
 
     @cached_property
     def certificate(self) -> dict[str, Any] | None:
@@ -119,7 +86,7 @@ class Verdict(Shown):
         """
         if self.problem is None:
             return None
-        from certbound.safety.certificates import certificate_data
+        from certbound.safety.certificate import certificate_data
 
         try:
             return certificate_data(self.problem, self)
@@ -134,7 +101,7 @@ class Verdict(Shown):
         CertificateError
             If no probability was bounded that a certificate could state.
         """
-        from certbound.safety.certificates import certificate_text
+        from certbound.safety.certificate import certificate_text
 
         return certificate_text(problem, self, attempt=attempt)
 
@@ -155,7 +122,7 @@ class Verdict(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """What ``certbound verify --json`` prints, but for the seconds."""
-        names = ("status", "log10_delta", "margin", "time", "constraint", "reason", "method")
+        names = ("status", "log10_delta", "log10_lower", "margin", "time", "constraint", "reason", "method")
         found: dict[str, Any] = {name: getattr(self, name) for name in names}
         found["delta"] = None if self.problem is None else self.problem.delta
         found["constants"] = None if self.constants is None else self.constants.to_dict()
@@ -191,9 +158,9 @@ def verify_safety(
     problem : Problem
         With a plan if its system has inputs.
     method : str
-        "auto" runs every engine that fits and keeps the smallest probability (the barrier engine and value functions
-        only where the others have not proved SAFE); "linear", "constants", "barrier" or "values" runs one; a tube
-        method such as "kummer" or "thm3" runs the constants engine with that tube.
+        "auto" runs every engine that fits and keeps the smallest probability (those in reserve only where the others
+        have not proved SAFE); an engine's name runs that one (`certbound.safety.portfolio`: linear, constants,
+        barrier, values); a tube method such as "kummer" or "thm3" runs the constants engine with that tube.
     cells : int, optional
         Parts along each side of the initial set.
     constants : Constants, optional
@@ -227,18 +194,19 @@ def verify_safety(
         return _unsafe(problem, violation)
     answers: dict[str, EngineAnswer] = {}
     for name in names:
-        inner = "auto" if method in _ENGINES else method
+        inner = "auto" if method in ENGINES else method
         quick = any(_is_safe(answer, problem) or answer.conclusive for answer in answers.values())
         if quick and problem.system.dimension > _LARGE:
             continue
         options = {"method": inner, "cells": cells, "constants": constants, "quick": quick}
         answers[name] = _asked(name, problem, **options, thorough=method != "auto")
-    first = answers["linear"] if method == "auto" and cells is None else None
-    proved = any(_is_safe(answer, problem) for answer in answers.values())
-    if first is not None and first.applicable and not first.conclusive and not proved:
-        second = _asked("linear", problem, before=first.details)
-        if second.applicable:
-            answers["linear"] = min(first, second, key=lambda answer: answer.log10_delta)
+    if method == "auto" and cells is None and not any(_is_safe(answer, problem) for answer in answers.values()):
+        for name in (name for name, row in ENGINES.items() if row.again):
+            first = answers[name]
+            if first.applicable and not first.conclusive:
+                second = _asked(name, problem, before=first.details)
+                if second.applicable:
+                    answers[name] = min(first, second, key=lambda answer: answer.log10_delta)
     return _verdict(problem, answers)
 
 
@@ -246,7 +214,7 @@ def _asked(name: str, problem: Problem, **options: Any) -> EngineAnswer:
     """What an engine answers; where it fails, that it does not apply, and why."""
     try:
         with contained(name):
-            return _ENGINES[name](problem, **options)
+            return ENGINES[name].prove(problem, **options)
     except EngineError as error:
         return EngineAnswer(applicable=False, reason=str(error), method=name)
 
@@ -292,14 +260,13 @@ def _is_safe(answer: EngineAnswer, problem: Problem) -> bool:
 
 def _chosen(method: str) -> tuple[str, ...]:
     if method == "auto":
-        return tuple(_ENGINES)
-    if method in _ENGINES:
-        return (method,)
+        return tuple(ENGINES)
+    name = engine_named(method)
+    if name is not None:
+        return (name,)
     from certbound.tubes.tuning import METHODS
 
-    if method in METHODS:
-        return ("constants",)
-    known = ", ".join(["auto", *_ENGINES, *(name for name in METHODS if name != "auto")])
+    known = ", ".join(["auto", *ENGINES, *(name for name in METHODS if name != "auto")])
     raise ValueError(f"`method` must be one of {known}, got {method!r}.")
 
 
@@ -326,10 +293,18 @@ def _verdict(problem: Problem, answers: Mapping[str, EngineAnswer]) -> Verdict:
         reason = f"{_sentence(reason)} {_covered(best)}"
     if best.assumption:
         reason = f"{_sentence(reason)} Assumption: {best.assumption}."
+    lower = best_lower(answers)
+    unsafe = lower is not None and is_more_than(lower, problem.delta)
+    if unsafe and safe:
+        raise SolverError(
+            f"two engines contradict each other: {name} proves at most 10^{level:.6g}, another one at least "
+            f"10^{lower:.6g}; this is a defect of certbound, and nothing is answered."
+        )
     others = [f"By {other}: {_sentence(answers[other].reason)}" for other in answers if other != name and not safe]
     return Verdict(
-        status="SAFE" if safe else "UNKNOWN",
+        status="SAFE" if safe else "UNSAFE" if unsafe else "UNKNOWN",
         log10_delta=level,
+        log10_lower=lower,
         margin=best.margin,
         time=best.time,
         constraint=best.constraint,
@@ -342,6 +317,12 @@ def _verdict(problem: Problem, answers: Mapping[str, EngineAnswer]) -> Verdict:
         problem=problem,
         answers=MappingProxyType(dict(answers)),
     )
+
+
+def best_lower(answers: Mapping[str, EngineAnswer]) -> float | None:
+    """The largest proved lower bound of log10 of the probability, None where no engine has one."""
+    found = [answer.log10_lower for answer in answers.values() if answer.applicable and answer.log10_lower is not None]
+    return max(found, default=None)
 
 
 def _covered(answer: EngineAnswer) -> str:

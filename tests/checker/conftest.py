@@ -12,7 +12,7 @@ from flint import ctx
 
 import certbound as cb
 from certbound.checker import parse
-from certbound.safety.certificates.file import certificate_text, problem_data
+from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
 
 

@@ -15,7 +15,7 @@ from certbound.checker import check_data, parse
 from certbound.checker.expressions.arithmetic import BALLS, Undecided, generalised_kink, power
 from certbound.errors import CertificateError
 from certbound.problem.model.tape import JUMPS, UNARY
-from certbound.safety.certificates.file import certificate_text, problem_data
+from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.certificates.parts import exact
 from certbound.safety.verification import verify_safety
 from tests.checker.mutations import rejected

@@ -13,7 +13,7 @@ import pytest
 import certbound as cb
 from certbound.checker import check_data
 from certbound.errors import CertificateError
-from certbound.safety.certificates.file import problem_data
+from certbound.safety.certificate import problem_data
 from certbound.safety.certificates.parts import exact
 
 

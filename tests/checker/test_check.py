@@ -13,7 +13,7 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.checker.statement.comparison import first_difference
 from certbound.errors import CertificateError
-from certbound.safety.certificates.file import certificate_text, problem_data
+from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
 
 INSIDE = [cb.Inside(cb.Box([-1, -1], [1, 1]))]

@@ -18,7 +18,7 @@ from certbound.checker import Report, check_data, parse
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.cli.app import run
 from certbound.errors import CertificateError
-from certbound.safety.certificates.file import certificate_text
+from certbound.safety.certificate import certificate_text
 from certbound.safety.verification import verify_safety
 from tests.checker.conftest import Case
 

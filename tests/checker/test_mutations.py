@@ -12,7 +12,7 @@ import pytest
 
 import certbound as cb
 from certbound.checker import check_data, parse
-from certbound.safety.certificates.file import certificate_text, problem_data
+from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
 from tests.checker.conftest import contraction, stirred
 from tests.checker.mutations import BARRIER, CONSTANTS, HARMLESS, LINEAR, STATE, mutated, rejected, stronger_claim

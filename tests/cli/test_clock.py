@@ -113,9 +113,8 @@ def test_nothing_in_time_is_a_failure(
 
 
 def test_as_many_paths_are_simulated_as_fit(
-    request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setenv("CERTBOUND_CACHE", str(request.config.cache.mkdir("kernels")))  # type: ignore[union-attr]
     words = ("simulate", "ou", "--set", "radius=0.8", "--seed", "1")
     assert run([*words, "--paths", "10"]) == 0  # compiles
     capsys.readouterr()

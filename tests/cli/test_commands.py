@@ -14,8 +14,8 @@ import certbound as cb
 from certbound.cli.app import app, run
 
 VERIFY_KEYS = {
-    "status", "log10_delta", "delta", "margin", "time", "constraint", "reason", "method", "constants", "tube",
-    "seconds",
+    "status", "log10_delta", "log10_lower", "delta", "margin", "time", "constraint", "reason", "method", "constants",
+    "tube", "seconds",
 }  # fmt: skip
 
 

@@ -37,11 +37,6 @@ def _cases() -> list[Any]:
     return cases
 
 
-@pytest.fixture(autouse=True)
-def _kernels(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CERTBOUND_CACHE", str(request.config.cache.mkdir("kernels")))  # type: ignore[union-attr]
-
-
 @pytest.mark.parametrize("page", _cases())
 def test_a_page_does_what_it_says(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -72,6 +72,14 @@ def test_the_page_of_commands_has_every_command_option_and_example() -> None:
     assert runpy.run_path(str(DOCS / "hooks" / "commands.py"))["on_page_markdown"]("text") == "text"
 
 
+def test_the_table_of_engines_says_what_their_rows_say() -> None:
+    from certbound.safety.portfolio import ENGINES
+
+    text = (DOCS / "explanation.md").read_text(encoding="utf-8")
+    table = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", text, flags=re.MULTILINE)
+    assert table == [(name, row.words) for name, row in ENGINES.items()]
+
+
 def test_every_page_is_reached_from_the_navigation() -> None:
     config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     for page in DOCS.rglob("*.md"):

@@ -144,7 +144,7 @@ class Run:
             return
         from certbound.checker import check_data, parse
         from certbound.cli.commands.check import proved_certificate
-        from certbound.safety.certificates.file import problem_data
+        from certbound.safety.certificate import problem_data
 
         made = self._attempt("certificate", lambda: proved_certificate(self.problem, self.verdict))
         text = getattr(made, "text", made)
@@ -253,7 +253,7 @@ class Run:
     def _difference(self, other: cb.Problem) -> str:
         """What differs from the problem: model, noise, start by their data, constraints by where they hold."""
         from certbound.checker.statement.comparison import first_difference
-        from certbound.safety.certificates.file import problem_data
+        from certbound.safety.certificate import problem_data
 
         mine, theirs = ({**problem_data(p), "constraints": []} for p in (self.problem, other))
         difference = first_difference(mine, theirs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from certbound.constants.bounds import bound_constants
 from certbound.constants.metrics import bound_metrics
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, SolverError, contained
 from certbound.reach.linear.linearisation import Linearisation
-from certbound.safety import verification
+from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import verify_safety
 
 
@@ -124,7 +125,7 @@ def test_whatever_goes_wrong_in_an_engine_becomes_its_answer(
 
     with pytest.raises(EngineError, match=words), contained("linear"):
         failing()
-    monkeypatch.setitem(verification._ENGINES, "linear", failing)
+    monkeypatch.setitem(ENGINES, "linear", replace(ENGINES["linear"], prove=failing))
     verdict = verify_safety(sine_map())
     assert verdict.status == "SAFE"
     assert verdict.answers["constants"].applicable
@@ -137,7 +138,7 @@ def test_what_one_engine_proved_outlives_the_failure_of_a_later_one(monkeypatch:
         raise KeyError("lost")
 
     alone = verify_safety(sine_map(), method="linear").log10_delta
-    monkeypatch.setitem(verification._ENGINES, "constants", failing)
+    monkeypatch.setitem(ENGINES, "constants", replace(ENGINES["constants"], prove=failing))
     verdict = verify_safety(sine_map())
     assert verdict.status == "SAFE"
     assert verdict.log10_delta == alone
@@ -147,8 +148,8 @@ def test_with_every_engine_failing_there_is_still_a_verdict(monkeypatch: pytest.
     def failing(*_: Any, **__: Any) -> Any:
         raise ZeroDivisionError
 
-    for name in verification._ENGINES:
-        monkeypatch.setitem(verification._ENGINES, name, failing)
+    for name in ENGINES:
+        monkeypatch.setitem(ENGINES, name, replace(ENGINES[name], prove=failing))
     verdict = verify_safety(sine_map())
     assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", 0.0)
     assert "the barrier engine failed (ZeroDivisionError)" in verdict.reason
@@ -158,7 +159,7 @@ def test_a_search_for_violations_that_fails_ends_nothing(monkeypatch: pytest.Mon
     def failing(_: Any) -> Any:
         raise AssertionError
 
-    monkeypatch.setattr(verification, "find_violation", failing)
+    monkeypatch.setattr("certbound.safety.verification.find_violation", failing)
     assert verify_safety(sine_map()).status == "SAFE"
 
 

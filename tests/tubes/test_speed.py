@@ -1,4 +1,4 @@
-"""Seconds of the tubes' two questions: ``pytest tests/tubes/test_speed.py --benchmark-only`` on a quiet machine."""
+"""Seconds of the two questions: ``pytest -n 0 tests/tubes/test_speed.py --benchmark-only`` on a quiet machine."""
 
 from __future__ import annotations
 

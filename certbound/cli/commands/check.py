@@ -92,7 +92,7 @@ def _stated(
         if pairs or delta is not None or horizon is not None:
             raise InputError("`--set`, `--delta` and `--horizon` change a problem, and none is given", "add --problem")
         return None
-    from certbound.safety.certificates import problem_data
+    from certbound.safety.certificate import problem_data
 
     return problem_data(load_problem(problem, pairs, horizon=horizon, delta=delta))
 
@@ -135,7 +135,7 @@ def _proved(problem: Problem, verdict: Verdict) -> tuple[str | None, str, str]:
         If no certificate could be written.
     """
     from certbound.checker import check_data, parse
-    from certbound.safety.certificates import problem_data, restated
+    from certbound.safety.certificate import problem_data, restated
 
     engine = reason = ""
     for attempt in range(ATTEMPTS):

@@ -246,7 +246,7 @@ def _answer(result: Synthesis, runs: ClosedLoop | None) -> dict[str, Any]:
 
 def _print(result: Synthesis, answer: dict[str, Any]) -> None:
     screen = console()
-    colors = {"SAFE": "bold green", "UNSAFE_NOMINAL": "bold red", "UNKNOWN": "bold yellow"}
+    colors = {"SAFE": "bold green", "UNSAFE_NOMINAL": "bold red", "UNSAFE": "bold red", "UNKNOWN": "bold yellow"}
     word = "a plan" if result.feasible else "no plan"
     screen.print(f"[{colors[result.status]}]{result.status}[/]  ", end="")
     screen.print(f"{name_text(result.source.name)}: {word} with tube ", end="", markup=False)

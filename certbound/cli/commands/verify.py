@@ -53,7 +53,8 @@ EXAMPLES = examples(
 _log = logging.getLogger(__name__)
 
 MethodOption = Annotated[
-    str, typer.Option("--method", metavar="M", help="auto, linear, or a tube method such as kummer or thm3.")
+    str,
+    typer.Option("--method", metavar="M", help="auto, linear, constants, barrier, values, or a tube's (kummer, thm3)."),
 ]
 CellsOption = Annotated[
     int | None,
@@ -129,7 +130,8 @@ def verify(
 
 def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> Verdict:
     """The verdict; with a limit, the best one of the engines that finished in time."""
-    from certbound.safety.verification import ENGINES, Verdict, verify_safety
+    from certbound.safety.portfolio import ENGINES
+    from certbound.safety.verification import Verdict, best_lower, verify_safety
 
     if clock.limit is None:
         return verify_safety(problem, method=method, cells=cells)
@@ -138,20 +140,20 @@ def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> 
     over = f"The search was stopped after {clock.limit:g} s."
     try:
         for engine in ENGINES if method == "auto" else (method,):
-            if engine == "barrier" and best is not None and best.status == "SAFE":
+            if engine in ENGINES and ENGINES[engine].reserve and best is not None and best.status == "SAFE":
                 break
             with clock.running():
                 found = verify_safety(problem, method=engine, cells=cells)
             answers |= found.answers
             if best is None or (found.status != "SAFE", found.log10_delta) < (best.status != "SAFE", best.log10_delta):
                 best = found
-            if found.status == "UNSAFE_NOMINAL":
+            if found.status.startswith("UNSAFE"):
                 return found
     except OutOfTime:
         if best is not None:
-            return replace(best, reason=f"{best.reason} {over}", answers=answers)
+            return replace(best, reason=f"{best.reason} {over}", answers=answers, log10_lower=best_lower(answers))
     if best is not None:
-        return replace(best, answers=answers)
+        return replace(best, answers=answers, log10_lower=best_lower(answers))
     cure = "Give it more time, fewer --cells or a shorter --horizon."
     return Verdict(
         status="UNKNOWN", log10_delta=0.0, margin=None, time=None, constraint=None, reason=f"{over} {cure}",
@@ -173,6 +175,7 @@ def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any
     return {
         "status": verdict.status,
         "log10_delta": verdict.log10_delta,
+        "log10_lower": verdict.log10_lower,
         "delta": problem.delta,
         "margin": verdict.margin,
         "time": verdict.time,
@@ -189,7 +192,8 @@ def _engines(verdict: Verdict) -> list[dict[str, Any]]:
     """What each engine answered, for --explain."""
     rows = []
     for name, answer in verdict.answers.items():
-        found = {key: getattr(answer, key) for key in ("log10_delta", "margin", "constraint", "time", "reason")}
+        keys = ("log10_delta", "log10_lower", "margin", "constraint", "time", "reason")
+        found = {key: getattr(answer, key) for key in keys}
         rows.append({"engine": name, "method": answer.method, "applicable": answer.applicable, **found})
     return rows
 
@@ -274,7 +278,7 @@ def _scene(problem: Problem, verdict: Verdict, reach: ReachTube) -> Scene:
 
 def _print(problem: Problem, result: dict[str, Any]) -> None:
     screen = console()
-    colors = {"SAFE": "bold green", "UNSAFE_NOMINAL": "bold red", "UNKNOWN": "bold yellow"}
+    colors = {"SAFE": "bold green", "UNSAFE_NOMINAL": "bold red", "UNSAFE": "bold red", "UNKNOWN": "bold yellow"}
     unit = "s" if problem.system.time == "continuous" else "steps"
     color = colors[result["status"]]
     screen.print(f"[{color}]{result['status']}[/]  ", end="")

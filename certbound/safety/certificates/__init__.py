@@ -1,7 +1,10 @@
-"""Proofs as data: one writer for each engine, and the file that holds them."""
+"""Proofs as data: one writer for each engine."""
 
 from __future__ import annotations
 
-from certbound.safety.certificates.file import certificate_data, certificate_text, problem_data, restated
+from certbound.safety.certificates.barrier import barrier_proof
+from certbound.safety.certificates.constants import constants_proof
+from certbound.safety.certificates.diffusion import response_proof
+from certbound.safety.certificates.parts import Proof, exact
 
-__all__ = ["certificate_data", "certificate_text", "problem_data", "restated"]
+__all__ = ["Proof", "barrier_proof", "constants_proof", "exact", "response_proof"]

@@ -16,12 +16,22 @@ from certbound.errors import CertificateError
 from certbound.gaussian.response import MartingaleEvent, Martingales, SplitEvents, WindowEvents, logsumexp
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
-from certbound.reach.linear import Accepted, DiffusionRun, Linearisation, Reference
+from certbound.reach.linear import Accepted, DiffusionRun, Linearisation, Reference, depends_on_state
 from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificates.linear import EFFORTS, PADS, SLACK, Stated, engine_of, grids, proof_data, widened
+from certbound.safety.certificates.linear import (
+    EFFORTS,
+    PADS,
+    SLACK,
+    Stated,
+    engine_of,
+    grids,
+    linear_proof,
+    proof_data,
+    widened,
+)
 from certbound.safety.certificates.parts import Proof, exact
 
-__all__ = ["diffusion_proof"]
+__all__ = ["diffusion_proof", "response_proof"]
 
 Array = NDArray[np.float64]
 
@@ -33,6 +43,18 @@ _LARGER = 1 + 1e-6  # the checker's own kappas differ by rounding
 _MOVED = 1.005  # its directions differ within a window
 _LOG10 = math.log(10.0)
 _ALL = 1e3
+
+
+def response_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
+    """The linear response as data: `diffusion_proof` where the noise depends on the state, else `linear_proof`.
+
+    Raises
+    ------
+    CertificateError
+        If the remainder feeds itself once its boxes are widened.
+    """
+    write = diffusion_proof if depends_on_state(problem) else linear_proof
+    return write(problem, answer, attempt)
 
 
 def diffusion_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:

@@ -10,7 +10,7 @@ from flint import arb, ctx
 import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.checker.constants.kummer import Kummer, lower_excess, partial_excess
-from certbound.safety.certificates.file import certificate_text, problem_data
+from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "experiments" / "benchmarks"

@@ -16,7 +16,7 @@ from certbound.checker.linear.events import Windows
 from certbound.checker.linear.response import continuous_piece
 from certbound.checker.report import Budget
 from certbound.errors import CertificateError
-from certbound.safety.certificates.file import certificate_text
+from certbound.safety.certificate import certificate_text
 from certbound.safety.verification import verify_safety
 
 Data = dict[str, Any]

@@ -14,7 +14,7 @@ from certbound.checker import check_data, parse
 from certbound.checker.linear.events import chain
 from certbound.checker.linear.families import Family, leaving
 from certbound.checker.report import Budget, Unproved
-from certbound.safety.certificates.file import certificate_text, problem_data
+from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
 
 

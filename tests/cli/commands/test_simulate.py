@@ -1,7 +1,6 @@
 """``certbound simulate``: one JSON object, reproducible counts, and every malformed input refused with exit code 2."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -10,14 +9,6 @@ from certbound.cli.app import run
 KEYS = {
     "paths", "exits", "probability", "lower", "upper", "confidence", "path_steps_per_second", "seconds",
 }  # fmt: skip
-
-
-@pytest.fixture(autouse=True, scope="session")
-def _kernel_cache(request: pytest.FixtureRequest):
-    folder = Path(request.config.cache.mkdir("kernels"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CERTBOUND_CACHE", str(folder))
-        yield
 
 
 def answer(capsys, *words, code=0):

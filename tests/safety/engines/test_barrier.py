@@ -11,8 +11,8 @@ from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
 from certbound.rigor.intervals import Interval
 from certbound.safety.answers import EngineAnswer
+from certbound.safety.certificate import problem_data
 from certbound.safety.certificates.barrier import barrier_proof
-from certbound.safety.certificates.file import problem_data
 from certbound.safety.engines import barrier as engine
 from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.gaps import gaps_of, lies_inside

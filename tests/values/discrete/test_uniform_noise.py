@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.values.discrete.test_bounds import limits
 
 import certbound as cb
 from certbound.problem.model.evaluation import compile_numpy
@@ -16,6 +15,7 @@ from certbound.values.discrete.steps import Dynamics
 from certbound.values.discrete.uniform_noise import UniformTables, UniformTransition
 from certbound.values.grids import Grid
 from tests.values.discrete.helpers import mean_over_boxes, random_function
+from tests.values.discrete.test_failures import limits
 from tests.values.discrete.test_transitions import STEPS
 
 HALF = np.array([0.4, 0.3])

@@ -14,8 +14,9 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
 from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificates.file import certificate_data, certificate_text, problem_data, restated
+from certbound.safety.certificate import certificate_data, certificate_text, problem_data, restated
 from certbound.safety.certificates.parts import exact
+from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import verify_safety
 
 
@@ -158,7 +159,7 @@ def test_a_barrier_states_what_the_linear_response_proved_by_sharper_events() ->
     assert verdict.status == "SAFE"
     weak = replace(verdict, answers={"linear": answer, "barrier": quick})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("certbound.safety.certificates.linear.linear_proof", lambda *_: ({}, -2.0, []))
+        patch.setitem(ENGINES, "linear", replace(ENGINES["linear"], write=lambda *_: ({}, -2.0, [])))
         data = certificate_data(problem, weak)
     assert data["claim"]["method"] == "barrier"
     assert float.fromhex(data["claim"]["log10_delta"]) < -4

@@ -8,7 +8,7 @@ schema is docs/certificate.md.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,8 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, HalfSpace, Outside, Polytope
 from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import Answered, EngineAnswer, is_at_most
-from certbound.safety.certificates.parts import Proof, exact
+from certbound.safety.certificates import Proof, exact
+from certbound.safety.portfolio import ENGINES
 
 __all__ = ["FORMAT", "VERSION", "certificate_data", "certificate_text", "problem_data", "restated"]
 
@@ -70,7 +71,7 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     best: tuple[str, Proof] | None = None
     for name, answer in _answers(problem, verdict):
         try:
-            found = _writer(name)(problem, answer, attempt)
+            found = _written(name, problem, answer, attempt)
         except CertificateError as error:
             refusals.append(f"{name}: {error}")
             continue
@@ -92,7 +93,7 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
 
 
 def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineAnswer]]:
-    """Engines that bounded a probability, the best first; then a barrier, where that was not asked for.
+    """Engines that bounded a probability, the best first; then those in reserve that were not asked.
 
     What a certificate states can be weaker than what its engine proved, so that another engine's may be needed.
     """
@@ -103,39 +104,19 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
     useful = [name for name, answer in verdict.answers.items() if answer.applicable and answer.log10_delta < 0]
     for name in sorted(useful, key=rank):
         yield name, verdict.answers[name]
-    asked = verdict.answers.get("barrier")
-    if verdict.status == "SAFE" and asked is not None and not asked.applicable:
-        from certbound.safety.engines import barrier_engine
-
-        answer = barrier_engine(problem)
-        if answer.applicable and answer.log10_delta < 0:
-            yield "barrier", answer
-
-
-def _writer(name: str) -> Callable[[Problem, EngineAnswer, int], Proof]:
-    if name == "linear":
-        return _linear_proof
-    if name == "barrier":
-        from certbound.safety.certificates.barrier import barrier_proof
-
-        return barrier_proof
-    if name == "values":
-        raise CertificateError("certificates do not state value functions yet.")
-    from certbound.safety.certificates.constants import constants_proof
-
-    return constants_proof
+    for name, row in ENGINES.items():
+        asked = verdict.answers.get(name)
+        if row.reserve and row.write and verdict.status == "SAFE" and asked is not None and not asked.applicable:
+            answer = row.prove(problem)
+            if answer.applicable and answer.log10_delta < 0:
+                yield name, answer
 
 
-def _linear_proof(problem: Problem, answer: EngineAnswer, attempt: int) -> Proof:
-    from certbound.reach.linear import depends_on_state
-
-    if depends_on_state(problem):
-        from certbound.safety.certificates.diffusion import diffusion_proof
-
-        return diffusion_proof(problem, answer, attempt)
-    from certbound.safety.certificates.linear import linear_proof
-
-    return linear_proof(problem, answer, attempt)
+def _written(name: str, problem: Problem, answer: EngineAnswer, attempt: int) -> Proof:
+    write = ENGINES[name].write
+    if write is None:
+        raise CertificateError("certificates do not state what this engine proves.")
+    return write(problem, answer, attempt)
 
 
 # ---- the problem -------------------------------------------------------------------------------------------

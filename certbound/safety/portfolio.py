@@ -1,0 +1,99 @@
+"""The engines of ``verify_safety``, one row each: whatever asks, explains, certifies or tests engines reads the rows.
+
+A new engine is a module in `certbound.safety.engines`, its row here, and, for certificates, a writer in
+`certbound.safety.certificates` with its proof in the checker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from certbound.problem.problem import Problem
+from certbound.safety.answers import EngineAnswer
+from certbound.safety.certificates import Proof, barrier_proof, constants_proof, response_proof
+from certbound.safety.engines import barrier_engine, constants_engine, linear_engine, values_engine
+
+__all__ = ["ENGINES", "Engine", "engine_named"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Engine:
+    """One way to bound the probability that a constraint is broken.
+
+    Parameters
+    ----------
+    name : str
+        What ``method=`` and ``--method`` take, and what certificates call it.
+    words : str
+        What it does, for tables and messages.
+    prove : callable
+        ``prove(problem, *, method, cells, constants, quick, thorough, before)`` to an `EngineAnswer`; an engine takes
+        the options that it knows. ``quick``: another one has proved SAFE or been conclusive, and what is slow may be
+        left out. Without ``thorough`` it may spare itself: it is asked again where that matters, with the ``details``
+        of its first answer as ``before``.
+    write : callable, optional
+        ``write(problem, answer, attempt)`` to a proof that the checker knows; None: no certificate states it.
+    methods : bool
+        Whether it takes the tube methods (``kummer``, ``thm3``, ...) as names of its own.
+    reserve : bool
+        Asked while nothing else has proved SAFE, and for the smallest probability, as its bound knows no delta.
+    again : bool
+        Asked a second time, thoroughly, where nothing was proved SAFE.
+    dear : bool
+        Too slow to be asked a dozen times for what would be SAFE.
+    """
+
+    name: str
+    words: str
+    prove: Callable[..., EngineAnswer]
+    write: Callable[[Problem, EngineAnswer, int], Proof] | None = None
+    methods: bool = False
+    reserve: bool = False
+    again: bool = False
+    dear: bool = False
+
+
+ENGINES: dict[str, Engine] = {
+    row.name: row
+    for row in (
+        Engine(
+            name="linear",
+            words="the exact Gaussian response of the linearised model with a rigorous remainder (Thm K7)",
+            prove=linear_engine,
+            write=response_proof,
+            again=True,
+        ),
+        Engine(
+            name="constants",
+            words="rate or gain, noise and a metric, a tube by formula, set erosion (Thms K1 to K5, Table I)",
+            prove=constants_engine,
+            write=constants_proof,
+            methods=True,
+        ),
+        Engine(
+            name="barrier",
+            words="the exponential of a polynomial that grows slowly in the mean (continuous time, few states)",
+            prove=barrier_engine,
+            write=barrier_proof,
+            reserve=True,
+        ),
+        Engine(
+            name="values",
+            words="the probability itself as a function on a grid, from both sides (Thm K8, up to three states)",
+            prove=values_engine,
+            reserve=True,
+            dear=True,
+        ),
+    )
+}
+"""By name, in the order in which they are asked."""
+
+
+def engine_named(method: str) -> str | None:
+    """The engine that a method's name asks for: its own, or the one that takes tube methods; None for no such name."""
+    from certbound.tubes.tuning import METHODS
+
+    if method in ENGINES:
+        return method
+    return next((name for name, row in ENGINES.items() if row.methods), None) if method in METHODS else None

@@ -1,0 +1,89 @@
+"""Every engine on every problem of the zoo: bounds hold, certificates are accepted, nothing gets worse with less."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.checker import check_data, parse
+from certbound.errors import CertificateError
+from certbound.safety.certificate import certificate_data, problem_data
+from certbound.safety.portfolio import ENGINES, engine_named
+from certbound.safety.verification import best_lower, verify_safety
+from tests.zoo import ZOO
+
+ROWS = [(engine, name) for engine in ENGINES for name in ZOO]
+
+
+def test_every_row_says_what_it_is() -> None:
+    for name, row in ENGINES.items():
+        assert name == row.name
+        assert len(row.words) > 20
+        assert engine_named(name) == name
+    assert engine_named("thm3") == "constants"
+    assert engine_named("prophecy") is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("engine", "name"), ROWS)
+def test_a_bound_holds_and_is_certified_and_grows_with_what_it_must(engine: str, name: str) -> None:
+    problem = ZOO[name](1.0, 1.0)
+    verdict = verify_safety(problem, method=engine)
+    answer = verdict.answers.get(engine)
+    if answer is None or not answer.applicable:
+        assert verdict.reason
+        return
+    found = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(0), confidence=1 - 1e-6)
+    assert 10**verdict.log10_delta >= found.lower
+    if verdict.log10_lower is not None and problem.system.disturbance is None:
+        corner = found.upper if name == "random_start" else 1.0
+        assert 10**verdict.log10_lower <= max(corner, found.upper * 3)
+    for factor in ((0.8, 1.0), (1.0, 0.5)):  # less noise, a shorter horizon
+        less = verify_safety(ZOO[name](*factor), method=engine)
+        assert less.log10_delta <= verdict.log10_delta * (1 - 0.02) + 0.02
+    looser = verify_safety(problem.replace(delta=0.1), method=engine)
+    assert (looser.status == "SAFE") >= (verdict.status == "SAFE")
+    if ENGINES[engine].write is None or verdict.log10_delta >= 0:
+        return
+    try:
+        data = certificate_data(problem, verdict)
+    except CertificateError:
+        return
+    report = check_data(parse(json.dumps(data)), problem_data(problem))
+    assert report.valid, report.reason
+
+
+@pytest.mark.parametrize("name", ["logistic", "relaxation"])
+def test_two_engines_agree_from_both_sides(name: str) -> None:
+    problem = ZOO[name](1.0, 1.0)
+    verdict = verify_safety(problem, method="values")
+    assert verdict.log10_lower is not None
+    assert verdict.log10_lower <= verdict.log10_delta
+    assert best_lower(verdict.answers) == verdict.log10_lower
+    assert verify_safety(problem, method="linear").log10_delta >= verdict.log10_lower
+
+
+def test_a_probability_that_is_proved_to_exceed_delta_is_unsafe() -> None:
+    problem = ZOO["logistic"](1.0, 1.0).replace(delta=1e-9)
+    verdict = verify_safety(problem, method="values")
+    assert verdict.status == "UNSAFE"
+    assert verdict.log10_lower is not None
+    assert -9 < verdict.log10_lower <= verdict.log10_delta
+    assert verdict.to_dict()["log10_lower"] == verdict.log10_lower
+
+
+def test_engines_that_contradict_each_other_answer_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    from dataclasses import replace
+
+    from certbound.errors import SolverError
+    from certbound.safety.answers import EngineAnswer
+
+    def lying(*_: object, **__: object) -> EngineAnswer:
+        return EngineAnswer(log10_delta=-1.0, log10_lower=-2.0, method="barrier")
+
+    monkeypatch.setitem(ENGINES, "barrier", replace(ENGINES["barrier"], prove=lying))
+    with pytest.raises(SolverError, match="contradict each other"):
+        verify_safety(ZOO["decay"](0.5, 1.0))
