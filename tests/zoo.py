@@ -41,7 +41,7 @@ ZOO: dict[str, Callable[[float, float], cb.Problem]] = {
         lambda x: 0.7 * x, 1, cb.Uniform(halfwidth=0.2 * s), [0.0], cb.Box([-0.6], [0.6]), int(5 * T)
     ),
     "coins": lambda s, T: _steps(
-        lambda x: 0.7 * x, 1, cb.Rademacher(std=0.1 * s), [0.0], cb.Box([-0.6], [0.6]), int(5 * T)
+        lambda x: 0.7 * x, 1, cb.Rademacher(scale=0.1 * s), [0.0], cb.Box([-0.6], [0.6]), int(5 * T)
     ),
     "pushed": lambda s, T: _steps(
         lambda x, d: 0.5 * x + d, 1, Noise(std=0.1 * s), [0.0], cb.Box([-1], [1]), int(5 * T),
@@ -71,7 +71,7 @@ ZOO: dict[str, Callable[[float, float], cb.Problem]] = {
         lambda x, d: -x + d, 1, 0.2 * s, [0.0], cb.HalfSpace([1.0], 1.0), 1.0 * T, disturbance=cb.Box([-0.2], [0.2])
     ),
     "window": lambda s, T: _flow(
-        lambda x: -x, 1, 0.2 * s, [0.8], [cb.Inside(cb.Box([-0.9], [0.9]), during=(0.5 * T, T))], 1.0 * T
+        lambda x: -x, 1, 0.2 * s, [0.8], [cb.Inside(cb.Box([-0.9], [0.9]), during=(0.2, 0.2 + 0.3 * T))], 1.0 * T
     ),
     "pendulum": lambda s, T: _flow(
         lambda x: [x[1], -np.sin(x[0]) - 0.5 * x[1]], 2, s * np.array([[0.0], [0.1]]), [0.2, 0.0],
