@@ -209,7 +209,7 @@ def log_polygon_crossing(
         h, p = float(origin[0]), float(origin[1])
         first = np.asarray(_log_from_origin(h, p))
         # seen backwards from u_1, the line from the origin rises with slope h for ever
-        before = tuple(np.append(x, y) for x, y in zip((p, h, np.inf), before))  # type: ignore[assignment]
+        before = tuple(np.append(x, y) for x, y in zip((p, h, np.inf), before))  # type: ignore[assignment]  # three
         after = (q0, forward, length)
     linked = single[len(single) - len(before[0]) :]
     jump = log_between(after[0], before[0])

@@ -16,7 +16,7 @@ __all__ = ["BINARY", "JUMPS", "UNARY", "Node", "Tape"]
 T = TypeVar("T")
 
 UNARY = frozenset(
-    "neg sq sqrt exp log sin cos tan asin acos atan sinh cosh tanh abs kink sign floor not".split()  # noqa: SIM905
+    "neg sq sqrt exp log sin cos tan asin acos atan sinh cosh tanh abs kink sign floor not".split()  # noqa: SIM905  (shorter)
 )
 """Operations of one argument (``sq`` is the square). ``pow`` has one argument too, and a constant exponent.
 
@@ -26,12 +26,12 @@ derivatives only.
 """
 
 BINARY = frozenset(
-    "add sub mul div atan2 hypot min max lt le eq ne and or if_else_zero".split()  # noqa: SIM905
+    "add sub mul div atan2 hypot min max lt le eq ne and or if_else_zero".split()  # noqa: SIM905  (shorter)
 )
 """Operations of two arguments. ``if_else_zero(c, y)`` is y where c holds, else 0; comparisons are 0 or 1."""
 
 JUMPS = frozenset(
-    "sign floor not lt le eq ne and or if_else_zero".split()  # noqa: SIM905
+    "sign floor not lt le eq ne and or if_else_zero".split()  # noqa: SIM905  (shorter)
 )
 """Operations that jump (``atan2`` too, across its cut): a reader that differentiates must decide them."""
 
@@ -119,7 +119,7 @@ class Tape:
         if depth == 0:
             return "..."
         parts = [self._expression(arg, depth - 1) for arg in node.args]
-        infix = dict(add="+", sub="-", mul="*", div="/", lt="<", le="<=", eq="==", ne="!=")  # noqa: C408
+        infix = dict(add="+", sub="-", mul="*", div="/", lt="<", le="<=", eq="==", ne="!=")  # noqa: C408  (shorter)
         if node.op in infix:
             return f"({parts[0]} {infix[node.op]} {parts[1]})"
         if node.op in ("pow", "sq"):

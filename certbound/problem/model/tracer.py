@@ -39,7 +39,7 @@ class Scalar:
     """One traced number: a node of a graph, with Python's and NumPy's operators."""
 
     __slots__ = ("graph", "index")
-    __hash__ = None  # type: ignore[assignment]
+    __hash__ = None  # type: ignore[assignment]  # as Python marks it
     __array_priority__ = 1000.0
 
     def __init__(self, graph: Graph, index: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from certbound.display import rounded
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Region
@@ -75,10 +76,11 @@ def _continuous(problem: Problem, *, target: Region | None, seconds: float) -> E
 
 def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
     cells = " x ".join(str(count) for count in found.cells)
-    below = f"at least {found.lower:.4g}" if found.lower > 0 else "no lower bound"
-    reason = f"the probability of failing is at most {found.upper:.4g} and {below}, on a grid of {cells} cells"
+    least, most = rounded(found.lower, up=False, digits=4), rounded(found.upper, up=True, digits=4)
+    below = f"at least {least}" if found.lower > 0 else "no lower bound"
+    reason = f"the probability of failing is at most {most} and {below}, on a grid of {cells} cells"
     if found.lower > problem.delta:
-        reason += f": more than the {problem.delta:g} that is asked, from some start"
+        reason += f": more than the {problem.delta!r} that is asked, from some start"
     return EngineAnswer(
         log10_delta=log10_outward(found.upper, up=True),
         log10_lower=None if found.lower < 10.0**_FLOOR else log10_outward(found.lower, up=False),

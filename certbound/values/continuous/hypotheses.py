@@ -98,7 +98,7 @@ def examine(surface: Surface, model: Model, need: Need) -> Proof:
         drifts, squares = fixed or interpolants(surface, model, first, last, counts)
         low, high = value_range(patches)
         size = coarse_size(patches, drifts, squares, place)
-        kept = np.flatnonzero((low < need.top) & ~(size <= need.free(high)))
+        kept = np.flatnonzero(~(low >= need.top) & ~(size <= need.free(high)))  # what is no number is looked at
         if len(kept):
             part = patches.take(kept)
             found.append(bound_ranges(part, drifts, squares, place[kept], counts, wanted=need.spare))
@@ -188,7 +188,7 @@ def _patched(proof: Proof, excess: Array, need: Need, steps: Array, lift: float 
     ranges, slack = proof.ranges, 1e-14 if lift else 0.0
     low, high = ranges.low + lift - slack * (1 + np.abs(ranges.low)), ranges.high + lift
     high = high + slack * (1 + np.abs(ranges.high))
-    due = (low < need.top) & ~(excess <= need.free(ranges.high))
+    due = ~(low >= need.top) & ~(excess <= need.free(ranges.high))
     return Patched(
         excess=excess[due], low=low[due], high=high[due], energy=ranges.energy[due],
         slab=proof.slab[due], steps=steps, spare=need.spare,
