@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
-    "Record", "Shown", "ask_later_room", "connect", "load_result", "log10_text", "name_text", "one_line", "plain",
-    "power_above", "rounded", "span_text",
+    "Record", "Shown", "ask_later_room", "at_least_text", "connect", "load_result", "log10_text", "name_text",
+    "one_line", "plain", "power_above", "rounded", "span_text",
 ]  # fmt: skip
 
 Rows = list[tuple[str, str]]
@@ -276,6 +276,19 @@ def power_above(log10: float) -> float:
     while value < 1 and (value == 0 or _EXACT.log10(Decimal(value)) < Decimal(log10)):
         value = math.nextafter(value, 1.0)
     return value
+
+
+def at_least_text(log10: float | None) -> str:
+    """A proved lower bound of a probability, rounded down, as words to add; empty where there is none.
+
+    Examples
+    --------
+    >>> at_least_text(-2.9999997), at_least_text(None), at_least_text(-1000.0)
+    (', at least 0.001', '', '')
+    """
+    if log10 is None or log10 < -300:
+        return ""
+    return f", at least {rounded(math.pow(10.0, log10) * (1 - 1e-12), up=False, digits=3)}"
 
 
 _EXACT = Context(prec=60)

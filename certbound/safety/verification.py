@@ -10,7 +10,7 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from certbound.display import Shown, log10_text, name_text, rounded
+from certbound.display import Shown, at_least_text, log10_text, name_text, rounded
 from certbound.errors import CertificateError, EngineError, SolverError, contained
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
@@ -109,7 +109,8 @@ class Verdict(Shown):
         """The verdict in one line."""
         asked = "" if self.problem is None else f"{name_text(self.problem.name)}: "
         target = "" if self.problem is None else f", asked {self.problem.delta!r}"
-        return f"{self.status}  {asked}P(leaving) <= {log10_text(self.log10_delta)}{target}"
+        bounds = f"{log10_text(self.log10_delta)}{at_least_text(self.log10_lower)}"
+        return f"{self.status}  {asked}P(leaving) <= {bounds}{target}"
 
     def rows(self) -> list[tuple[str, str]]:
         """Margin, method and reason."""

@@ -83,6 +83,8 @@ def test_a_probability_that_is_proved_to_exceed_delta_is_unsafe() -> None:
     assert verdict.log10_lower is not None
     assert -9 < verdict.log10_lower <= verdict.log10_delta
     assert verdict.to_dict()["log10_lower"] == verdict.log10_lower
+    shown = float(verdict.summary().split("at least ")[1].split(",")[0])
+    assert 0.9 * 10**verdict.log10_lower < shown <= 10**verdict.log10_lower
 
 
 def test_engines_that_contradict_each_other_answer_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

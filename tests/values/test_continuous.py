@@ -14,7 +14,7 @@ import certbound as cb
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model.tracing import trace
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous import exits
+from certbound.values.continuous import exits, hypotheses
 from certbound.values.continuous.coefficients import Cells, Reader, enclose, squared_diffusion
 from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
@@ -323,6 +323,22 @@ def test_noise_on_a_proposal_never_passes_the_truth() -> None:
             assert payment is None or payment.log <= truth + 1e-3
             seen.append(bound)
     assert min(seen) < truth + 1.5  # some of these say something
+
+
+def test_a_lower_bound_is_proved_of_a_function_that_is_nowhere_positive(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, starts, _, lower = proposals()
+    seen: list[float] = []
+    examine = hypotheses.examine
+
+    def watched(surface: Surface, *rest: Any) -> Any:
+        seen.append(max(float(hypotheses.value_range(surface.patches(*chunk))[1].max()) for chunk in surface.chunks()))
+        return examine(surface, *rest)
+
+    monkeypatch.setattr(hypotheses, "examine", watched)
+    for shift in (1e-4, 0.3):
+        prove_lower(lower.raised(shift), model, starts)
+    assert len(seen) == 2
+    assert max(seen) <= 0.0
 
 
 def test_scaled_and_bent_proposals_never_pass_the_truth() -> None:

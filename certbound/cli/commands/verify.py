@@ -31,7 +31,7 @@ from certbound.cli.options import (
     load_problem,
 )
 from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
-from certbound.display import log10_text, name_text, one_line, rounded
+from certbound.display import at_least_text, log10_text, name_text, one_line, rounded
 from certbound.errors import CertificateError, EngineError, contained
 
 if TYPE_CHECKING:
@@ -284,7 +284,7 @@ def _print(problem: Problem, result: dict[str, Any]) -> None:
     screen.print(f"[{color}]{result['status']}[/]  ", end="")
     screen.print(
         f"{name_text(problem.name)}: P(leaving within {problem.horizon:g} {unit}) <= "
-        f"{log10_text(result['log10_delta'])}, asked {result['delta']!r}",
+        f"{log10_text(result['log10_delta'])}{at_least_text(result['log10_lower'])}, asked {result['delta']!r}",
         markup=False,
     )
     if SETTINGS.quiet:
