@@ -49,7 +49,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
-    parser.add_argument("--limit", type=float, default=180.0, help="seconds after which a problem counts as hanging")
+    parser.add_argument("--limit", type=float, default=120.0, help="processor seconds of a problem")
     parser.add_argument("--out", type=Path, default=Path("fuzz.jsonl"), help="results; seeds in it are not run again")
     parser.add_argument("--show", type=int, help="run one seed here and print its record")
     parser.add_argument("--dump", type=Path, help="with --show: write the problem as a TOML file, and do not run it")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import json
 import multiprocessing
+import signal
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -15,6 +16,8 @@ __all__ = ["finished_seeds", "run_campaign"]
 
 RECYCLED = 100
 """Problems after which a worker is replaced by a fresh process."""
+PATIENCE, GRACE = 20.0, 60.0
+"""A problem hangs by the clock too, after so many times its processor time; seconds more for what is imported."""
 
 
 def finished_seeds(path: Path) -> dict[int, dict[str, Any]]:
@@ -35,21 +38,20 @@ def _work(connection: Any, trace: str, limit: float) -> None:
     from tests.fuzz.runner import run_seed
 
     with open(trace, "w+", encoding="utf-8") as stream:
+        faulthandler.register(signal.SIGPROF, file=stream, chain=True)  # where it was, and then the process ends
         while True:
             seed = connection.recv()
             if seed is None:
                 return
-            stream.seek(0)
-            stream.truncate()
-            faulthandler.dump_traceback_later(0.95 * limit, file=stream)
+            signal.setitimer(signal.ITIMER_PROF, limit)
             record = run_seed(seed)
-            faulthandler.cancel_dump_traceback_later()
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
             connection.send(record)
 
 
 class _Worker:
-    def __init__(self, limit: float, grace: float) -> None:
-        self.limit, self.grace = limit, grace
+    def __init__(self, limit: float) -> None:
+        self.limit = limit
         with tempfile.NamedTemporaryFile(suffix=".trace", delete=False) as file:
             self.trace = file.name
         context = multiprocessing.get_context("spawn")
@@ -64,12 +66,13 @@ class _Worker:
         self.connection.send(seed)
         self.done += 1
         try:
-            if self.connection.poll(self.limit + self.grace * (self.done == 1)):
+            if self.connection.poll(PATIENCE * self.limit + GRACE):
                 record: dict[str, Any] = self.connection.recv()
                 return record
             kind = "hang"
         except EOFError:
-            kind = "death"
+            self.process.join()
+            kind = "hang" if self.process.exitcode == -signal.SIGPROF else f"death by {self.process.exitcode}"
         self.done = RECYCLED
         said = Path(self.trace).read_text(encoding="utf-8")
         places = [line.strip() for line in said.splitlines() if "/certbound/" in line]
@@ -95,7 +98,6 @@ def run_campaign(
     jobs: int,
     limit: float,
     finished: Callable[[dict[str, Any]], None],
-    grace: float = 60.0,
 ) -> None:
     """Run seeds in ``jobs`` processes; ``finished`` is called with every record, one at a time.
 
@@ -105,10 +107,8 @@ def run_campaign(
     jobs : int
         Processes at a time.
     limit : float
-        Seconds of the clock after which a problem counts as hanging.
+        Seconds of processor time after which a problem counts as hanging.
     finished : callable
-    grace : float
-        Seconds more for the first problem of a process, which imports everything.
     """
     queue, lock = iter(seeds), threading.Lock()
 
@@ -119,7 +119,7 @@ def run_campaign(
                 if worker is not None and worker.done >= RECYCLED:
                     worker.close()
                     worker = None
-                worker = worker or _Worker(limit, grace)
+                worker = worker or _Worker(limit)
                 record = worker.run(seed)
                 with lock:
                     finished(record)
