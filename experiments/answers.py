@@ -20,6 +20,7 @@ from experiments.certificates import subjects
 
 __all__ = ["answer", "differences", "main"]
 
+
 def answer(problem: cb.Problem) -> dict[str, Any]:
     """The verdict on a problem as JSON would state it, and the certificate's hash (or why there is none)."""
     verdict = cb.verify_safety(problem)
