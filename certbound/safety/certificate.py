@@ -194,14 +194,13 @@ def _noise(system: Any) -> dict[str, Any]:
         check_law(law, "be certified")
     except TypeError as error:
         raise CertificateError(str(error)) from error
-    level = next(name for name in law.levels if getattr(law, name) is not None)
-    data = {
+    return {
         "law": law.name,
-        "level": level.removeprefix("proxy_"),
-        "values": exact(np.asarray(getattr(law, level), dtype=float)),
+        "level": law.level.removeprefix("proxy_"),
+        "values": exact(np.asarray(getattr(law, law.level), dtype=float)),
         "matrix": exact(np.asarray(system.noise_matrix, dtype=float)),
+        **{flag: bool(getattr(law, flag)) for flag in law.flags},
     }
-    return {**data, "independent": bool(law.independent)} if hasattr(law, "independent") else data
 
 
 def _initial(start: Any) -> dict[str, Any]:

@@ -6,11 +6,13 @@ name the nearest known one. What the values mean is decided in ``reading``.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from certbound.checks import nearest
+from certbound.problem.noise import LAWS
 
 __all__ = ["Constraint", "Noise", "Specification", "Start", "explain"]
 
@@ -40,10 +42,16 @@ class _Table(BaseModel):
     def _known_keys(cls, value: Any) -> Any:
         if not isinstance(value, dict):
             raise ValueError(f"{cls.title} must be a table of keys, got {value!r}")
+        known = [*cls.model_fields, *cls.further_keys()]
         for key in value:
-            if key not in cls.model_fields:
-                raise ValueError(f"unknown key {key!r} in {cls.title}{nearest(str(key), cls.model_fields)}")
+            if key not in known:
+                raise ValueError(f"unknown key {key!r} in {cls.title}{nearest(str(key), known)}")
         return value
+
+    @classmethod
+    def further_keys(cls) -> Iterable[str]:
+        """Keys that are known without being fields."""
+        return ()
 
 
 class BallTable(_Table):
@@ -153,22 +161,25 @@ class Cost(_Table):
     R: Vector | Matrix
 
 
-class Noise(_Table):
-    """CT: diffusion. DT: a law, its one level, and a matrix."""
+def _known_law(name: str) -> str:
+    if name not in LAWS:
+        raise ValueError(f"input should be {', '.join(map(repr, LAWS))}, got {name!r}")
+    return name
 
+
+class Noise(_Table):
+    """CT: diffusion. DT: a law, its one level, its flags, and a matrix."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Matrix | Number | Vector | bool]
     title: ClassVar[str] = "[noise]"
     diffusion: Matrix | Number | Vector | None = None
-    law: Literal["gaussian", "uniform", "rademacher", "bounded", "subgaussian"] | None = None
-    std: Number | Vector | None = None
-    variance: Number | Vector | None = None
-    covariance: Matrix | None = None
-    halfwidth: Number | Vector | None = None
-    scale: Number | Vector | None = None
-    proxy_std: Number | Vector | None = None
-    proxy_variance: Number | Vector | None = None
-    proxy_covariance: Matrix | None = None
-    independent: bool | None = None
+    law: Annotated[str, AfterValidator(_known_law)] | None = None
     matrix: Matrix | Number | Vector | None = None
+
+    @classmethod
+    def further_keys(cls) -> Iterable[str]:
+        return (key for law in LAWS.values() for key in (*law.levels, *law.flags))
 
 
 class Specification(_Table):

@@ -103,7 +103,7 @@ def test_a_thousand_chained_definitions_are_read():
         ('"v*cos(th)"', '"().__class__.__bases__"', r"`dynamics\.px` must be an expression"),
         ('"v*cos(th)"', '"__import__(1)"', "unknown function '__import__'"),
         ('"v*cos(th)"', '"th.real"', "attribute access does not exist here"),
-        ("diffusion", "std", r"`noise\.std`: input should be"),
+        ("diffusion", "std", "`noise` must hold `diffusion` alone in continuous time, .* got std"),
         ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', "0.1", r"got the scalar 0\.1; write 0\.1 \* np\.eye"),
         ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', "[1, 2, 3]", r"got a vector; write np\.diag"),
         ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', '[["sigma"]]', "must have 3 rows|must return 3 rows"),
