@@ -16,19 +16,21 @@ from fractions import Fraction
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from certbound.checks import frozen, positive_definite, vector
 from certbound.rigor.intervals import Interval, sq
 
-__all__ = ["LAWS", "Bounded", "BoxLaw", "Gaussian", "Law", "Rademacher", "SubGaussian", "Uniform", "check_law", "known_laws"]
+__all__ = [
+    "LAWS", "Bounded", "BoxLaw", "Gaussian", "Law", "Rademacher", "SubGaussian", "Uniform", "check_law", "known_laws",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
 LAWS: dict[str, type[Law]] = {}
 """Every law that has a name, by its name; a class enters when it is defined."""
 
-_VARIATES: dict[str, Callable[[np.random.Generator, tuple[int, ...]], Array]] = {
+_VARIATES: dict[str, Callable[[np.random.Generator, tuple[int, ...]], NDArray[Any]]] = {
     "normal": lambda rng, shape: rng.standard_normal(shape),
     "uniform": lambda rng, shape: rng.uniform(-1.0, 1.0, shape),
     "sign": lambda rng, shape: 2.0 * rng.integers(0, 2, shape) - 1.0,

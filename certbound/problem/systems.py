@@ -229,7 +229,8 @@ class DiscreteSystem(System):
         law = Gaussian(std=0.0) if noise is None else noise
         if not isinstance(law, Law):
             raise TypeError(
-                f"`noise` must be a law, got {noise!r}; a bare number does not say what it is: use one of {known_laws()}."
+                f"`noise` must be a law, got {noise!r}; a bare number does not say what it is: use one of "
+                f"{known_laws()}."
             )
         matrix_value = np.eye(self.dimension) if noise_matrix is None else noise_matrix
         gain = _noise_matrix("noise_matrix", matrix_value, self.states)
