@@ -44,28 +44,16 @@ class Law:
     Sizes are known once ``resolve`` has been called (systems do so). What a law is and how it is drawn (``name``,
     ``variate``, ``unit``, ``gaussian``, ``uniform``) is stated by each class itself and never inherited: a class made
     from another may draw otherwise.
-
-    Attributes
-    ----------
-    name : str
-        Its name in problem files and certificates. Without one it is neither simulated nor written.
-    levels : tuple of str
-        Fields of which exactly one is given and says how large the noise is: a matrix if it ends with
-        "covariance", otherwise a number or a vector.
-    flags : tuple of str
-        Further fields, true or false.
-    variate : str
-        What it is drawn from: "normal", "uniform" (on (-1, 1)) or "sign"; "" where it cannot be drawn.
-    gaussian, uniform : bool
-        Whether it is exactly normal; exactly uniform on the box of ``bound``.
     """
 
-    name = ""
-    levels: tuple[str, ...] = ()
-    flags: tuple[str, ...] = ()
-    variate = ""
-    gaussian = False
-    uniform = False
+    name = ""  # in problem files and certificates; a law without one is neither simulated nor written
+    levels: tuple[str, ...] = ()  # the fields of which one is given: a matrix if it ends with "covariance", or a vector
+    flags: tuple[str, ...] = ()  # further fields, true or false
+    variate = ""  # what it is drawn from: "normal", "uniform" (on (-1, 1)) or "sign"; "": it cannot be drawn
+    gaussian = False  # exactly normal, with ``proxy`` as covariance
+    exact_covariance: Callable[[], list[list[Fraction]]]  # of a Gaussian law
+    enclosed_covariance: Callable[[], Interval]  # the same, zeros that the structure gives exact
+    uniform = False  # exactly uniform on the box of ``bound``
 
     def __init_subclass__(cls) -> None:
         for fact in ("name", "variate", "unit", "gaussian", "uniform"):
@@ -75,7 +63,7 @@ class Law:
             return
         wanted = ["levels", "proxy", *(["factor"] if cls.variate else []), *(["bound"] if cls.uniform else [])]
         wanted += ["exact_covariance", "enclosed_covariance"] if cls.gaussian else []
-        lacking = [part for part in wanted if getattr(cls, part) is getattr(Law, part)]
+        lacking = [part for part in wanted if getattr(cls, part, None) is getattr(Law, part, None)]
         if lacking:
             raise TypeError(f"the law {cls.name!r} must state {' and '.join(lacking)}; {cls.__name__} does not.")
         if cls.variate and cls.variate not in _VARIATES:
@@ -121,8 +109,7 @@ class Law:
         kind, value = self.level, getattr(self, self.level)
         if kind.endswith("covariance"):
             if len(value) != dimension:
-                size = f"{len(value)} x {len(value)}"
-                raise ValueError(f"`{kind}` must be {dimension} x {dimension}, got {size}.")
+                raise ValueError(f"`{kind}` must be {dimension} x {dimension}, got {len(value)} x {len(value)}.")
             return self
         if len(value) not in (1, dimension):
             raise ValueError(f"`{kind}` must be a number or {dimension} numbers, got {len(value)}.")
@@ -155,14 +142,6 @@ class Law:
         """F, shape (m, m): the noise is F z, with z independent entries ``unit`` of ``variate``."""
         raise NotImplementedError
 
-    def exact_covariance(self) -> list[list[Fraction]]:
-        """The covariance of a Gaussian law in rational numbers, shape (m, m)."""
-        raise NotImplementedError
-
-    def enclosed_covariance(self) -> Interval:
-        """An enclosure of the covariance of a Gaussian law, shape (m, m); zeros that the structure gives are exact."""
-        raise NotImplementedError
-
     def unit(self, v: Array) -> Array:
         """z from a variate v, written as dynamics are (NumPy's elementary functions): kernels trace it."""
         return v
@@ -170,10 +149,8 @@ class Law:
     def check_drawable(self) -> None:
         """Refuse a law that does not say how it is drawn."""
         if not self.variate:
-            raise ValueError(
-                f"noise of the class {type(self).__name__} does not say how it is drawn (`variate`) and cannot be "
-                f"simulated; give a law to sample from, one of {known_laws()}."
-            )
+            name = type(self).__name__
+            raise ValueError(f"{name} has no `variate` and cannot be simulated; give a law to sample from.")
 
     def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
         """Independent draws, shape (*size, m)."""
@@ -183,16 +160,16 @@ class Law:
         return np.asarray(self.unit(_VARIATES[self.variate](rng, (*shape, factor.shape[1]))) @ factor.T)
 
 
-def check_law(law: Law, task: str) -> None:
+def check_law(law: Law, task: str, error: type[Exception] = TypeError) -> None:
     """Refuse a law that has no name of its own: a class made from another law may draw otherwise.
 
     Raises
     ------
-    TypeError
+    TypeError or ``error``
         If it has none; ``task`` says what it was wanted for.
     """
     if not law.name:
-        raise TypeError(
+        raise error(
             f"`noise` must be one of {known_laws()} or another law with a `name` to {task}, got the class "
             f"{type(law).__name__}: what it draws is not known; state what it keeps by cb.Bounded(halfwidth=...) or "
             "cb.SubGaussian(proxy_std=...)."
@@ -205,11 +182,15 @@ def known_laws() -> str:
     return ", ".join(f"cb.{law.__name__}({' | '.join(f'{level}=...' for level in law.levels)})" for law in own)
 
 
+def _up(value: Fraction) -> float:
+    """The least float that is not below."""
+    nearest = float(value)
+    return nearest if Fraction(nearest) >= value else float(np.nextafter(nearest, np.inf))
+
+
 def _square_up(value: Array) -> Array:
     """Squares of floats, rounded up."""
-    squares = [float(x) * float(x) for x in value]
-    exact = [Fraction(float(x)) ** 2 for x in value]
-    return frozen([s if Fraction(s) >= e else np.nextafter(s, np.inf) for s, e in zip(squares, exact)])
+    return frozen([_up(Fraction(float(x)) ** 2) for x in value])
 
 
 class _Quadratic(Law):
@@ -377,7 +358,5 @@ class Bounded(BoxLaw):
         squares = _square_up(self.halfwidth)
         if self.independent:
             return frozen(np.diag(squares))
-        total = sum(Fraction(float(s)) for s in squares)
-        rounded = float(total)
-        rounded = rounded if Fraction(rounded) >= total else float(np.nextafter(rounded, np.inf))
-        return frozen(rounded * np.eye(len(squares)))
+        total = sum((Fraction(float(s)) for s in squares), Fraction(0))
+        return frozen(_up(total) * np.eye(len(squares)))

@@ -190,10 +190,7 @@ def _noise(system: Any) -> dict[str, Any]:
             return {"law": "wiener", "diffusion": {"columns": int(g.shape[1]), **tape_data(g)}}
         return {"law": "wiener", "diffusion": exact(np.asarray(g, dtype=float))}
     law: Law = system.noise
-    try:
-        check_law(law, "be certified")
-    except TypeError as error:
-        raise CertificateError(str(error)) from error
+    check_law(law, "be certified", CertificateError)
     return {
         "law": law.name,
         "level": law.level.removeprefix("proxy_"),

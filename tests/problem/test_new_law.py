@@ -150,7 +150,7 @@ def test_what_a_law_lacks_is_said_when_its_class_is_defined():
 @pytest.mark.parametrize(
     ("facts", "error", "message"),
     [
-        ({}, ValueError, "does not say how it is drawn .* cannot be simulated"),
+        ({}, ValueError, "has no `variate` and cannot be simulated"),
         ({"variate": "normal", "unit": lambda law, v: v[0] if v[0] > 0 else v}, TypeError, "cannot be traced"),
         ({"variate": "normal", "unit": lambda law, v: [v[0], v[0]]}, ValueError, "must keep the shape of `v`"),
     ],

@@ -19,25 +19,16 @@ Squares = list[arb]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Law:
-    """What is proved of a law.
+    """What is proved of a law: E exp(l.w) <= exp(sum p_i l_i^2 / 2) for every l, given the past.
 
-    Parameters
-    ----------
-    levels : tuple of str
-        What it may be given by; "variance" and "covariance" are proxies as they are, any other is a vector to square.
-    proxies : callable
-        From the squared levels of the entries (and the law's data, for its flags) to proxies p_i of the entries:
-        E exp(l.w) <= exp(sum p_i l_i^2 / 2) for every l, given the past.
-    flags : tuple of str
-        Entries that are true or false.
-    gaussian : bool
-        Whether it is exactly normal.
+    It is given by one of ``levels``. ``proxies`` finds the p_i from the squared levels of the entries (a variance is
+    one already, and a covariance stands as it is) and from the law's data, if it has ``flags``, true or false.
     """
 
     levels: tuple[str, ...]
     proxies: Callable[[Squares, Record], Squares]
     flags: tuple[str, ...] = ()
-    gaussian: bool = False
+    gaussian: bool = False  # exactly normal
 
 
 def _as_they_are(squares: Squares, data: Record) -> Squares:

@@ -28,7 +28,6 @@ RESERVED = frozenset({"t", *FUNCTIONS, *CONSTANTS})
 """Names that no state, input, disturbance, parameter or definition may have."""
 
 
-
 class _ForbiddenError(ValueError):
     """An expression uses a name that exists, but not here."""
 
@@ -222,10 +221,10 @@ class _Reader:
         table = self.spec.noise
         if table is None:
             return {}
-        if table.diffusion is not None or table.law is None:
+        if table.diffusion is not None or table.law not in LAWS:
             raise ValueError(
                 f"`noise` must hold `law` ({', '.join(LAWS)}), one level and at most `matrix` in discrete "
-                "time; `diffusion` is for continuous time."
+                f"time, got {table.law!r}; `diffusion` is for continuous time."
             )
         build, entries = LAWS[table.law], dict(table.model_extra or {})
         flags = {key: entries.pop(key) for key in list(entries) if any(key in law.flags for law in LAWS.values())}

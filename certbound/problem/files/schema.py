@@ -6,10 +6,10 @@ name the nearest known one. What the values mean is decided in ``reading``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from certbound.checks import nearest
 from certbound.problem.noise import LAWS
@@ -36,22 +36,18 @@ class _Table(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     title: ClassVar[str] = "the problem file"
+    more_keys: ClassVar[Callable[[], Iterable[str]]] = tuple
 
     @model_validator(mode="before")
     @classmethod
     def _known_keys(cls, value: Any) -> Any:
         if not isinstance(value, dict):
             raise ValueError(f"{cls.title} must be a table of keys, got {value!r}")
-        known = [*cls.model_fields, *cls.further_keys()]
+        known = [*cls.model_fields, *cls.more_keys()]
         for key in value:
             if key not in known:
                 raise ValueError(f"unknown key {key!r} in {cls.title}{nearest(str(key), known)}")
         return value
-
-    @classmethod
-    def further_keys(cls) -> Iterable[str]:
-        """Keys that are known without being fields."""
-        return ()
 
 
 class BallTable(_Table):
@@ -161,25 +157,16 @@ class Cost(_Table):
     R: Vector | Matrix
 
 
-def _known_law(name: str) -> str:
-    if name not in LAWS:
-        raise ValueError(f"input should be {', '.join(map(repr, LAWS))}, got {name!r}")
-    return name
-
-
 class Noise(_Table):
     """CT: diffusion. DT: a law, its one level, its flags, and a matrix."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Matrix | Number | Vector | bool]
     title: ClassVar[str] = "[noise]"
+    more_keys = staticmethod(lambda: [key for law in LAWS.values() for key in (*law.levels, *law.flags)])
     diffusion: Matrix | Number | Vector | None = None
-    law: Annotated[str, AfterValidator(_known_law)] | None = None
+    law: str | None = None
     matrix: Matrix | Number | Vector | None = None
-
-    @classmethod
-    def further_keys(cls) -> Iterable[str]:
-        return (key for law in LAWS.values() for key in (*law.levels, *law.flags))
 
 
 class Specification(_Table):
