@@ -126,6 +126,9 @@ def test_the_row_alone_decides_what_is_proved(known, monkeypatch):
     worse = laws.Law(levels=("halfwidth",), proxies=lambda squares, data: squares)
     monkeypatch.setitem(laws.LAWS, "triangular", worse)
     assert not check_data(data).valid
+    data["problem"]["noise"]["independent"] = True
+    with pytest.raises(CertificateError, match="unknown entry `independent`"):
+        check_data(data)
 
 
 def test_value_functions_say_that_they_do_not_apply():
