@@ -52,7 +52,7 @@ def bound_noise(model: Model, norm: Metric, pieces: Interval | None = None) -> N
     if isinstance(system, DiscreteSystem):
         gain, proxy = system.noise_matrix, system.noise.proxy
         gaussian = system.noise.gaussian
-        exact = _exact_covariance(system) if gaussian else None
+        exact = _product(_fractions(gain), system.noise.exact_covariance()) if gaussian else None
     else:
         assert isinstance(system.diffusion, np.ndarray)
         gain, proxy, gaussian = system.diffusion, np.eye(system.noise_dimension), True
@@ -192,20 +192,6 @@ def _times(a: Rational, b: Rational) -> Rational:
 def _product(gain: Rational, covariance: Rational) -> Rational:
     """G C G^T in rational arithmetic."""
     return _times(_times(gain, covariance), [list(column) for column in zip(*gain)])
-
-
-def _exact_covariance(system: DiscreteSystem) -> Rational | None:
-    law = system.noise
-    deviation, variance = getattr(law, "std", None), getattr(law, "variance", None)
-    if deviation is not None:
-        covariance = [Fraction(float(s)) ** 2 for s in deviation]
-    elif variance is not None:
-        covariance = [Fraction(float(v)) for v in variance]
-    else:
-        return _product(_fractions(system.noise_matrix), _fractions(np.asarray(law.proxy)))
-    size = len(covariance)
-    matrix = [[covariance[i] if i == j else Fraction(0) for j in range(size)] for i in range(size)]
-    return _product(_fractions(system.noise_matrix), matrix)
 
 
 def _is_isotropic(norm: Metric, covariance: Rational) -> bool:

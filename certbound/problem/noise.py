@@ -3,30 +3,75 @@
 A level is never a bare number: standard deviation, variance and covariance are different things, and so are a
 law's covariance and a variance proxy. A matrix S is a **variance proxy** of w when
 E exp(l.w) <= exp(l' S l / 2) for every vector l, conditionally on the past.
+
+A law carries all that the package asks of it (see `Law`), so that a new one is a class, here or in a user's module,
+and a row in the checker's table (``certbound/checker/statement/laws.py``), which trusts nothing that is said here.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from certbound.checks import frozen, positive_definite, vector
+from certbound.rigor.intervals import Interval, sq
 
-__all__ = ["Bounded", "Gaussian", "Law", "Rademacher", "SubGaussian", "Uniform", "check_law"]
+__all__ = [
+    "LAWS", "Bounded", "BoxLaw", "Gaussian", "Law", "Rademacher", "SubGaussian", "Uniform", "check_law", "known_laws",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
+LAWS: dict[str, type[Law]] = {}
+"""Every law that has a name, by its name; a class enters when it is defined."""
+
+_VARIATES: dict[str, Callable[[np.random.Generator, tuple[int, ...]], NDArray[Any]]] = {
+    "normal": lambda rng, shape: rng.standard_normal(shape),
+    "uniform": lambda rng, shape: rng.uniform(-1.0, 1.0, shape),
+    "sign": lambda rng, shape: 2.0 * rng.integers(0, 2, shape) - 1.0,
+}
+"""The variates that everything is drawn from; compiled kernels draw the same ones."""
+
 
 class Law:
-    """What every law offers; sizes are known once ``resolve`` has been called (systems do so)."""
+    """What a law carries. A new one is a dataclass that derives from this class (or from `BoxLaw`).
 
-    name = "law"
-    gaussian = False
-    levels: tuple[str, ...] = ()
+    Sizes are known once ``resolve`` has been called (systems do so). What a law is and how it is drawn (``name``,
+    ``variate``, ``unit``, ``gaussian``, ``uniform``) is stated by each class itself and never inherited: a class made
+    from another may draw otherwise.
+    """
+
+    name = ""  # in problem files and certificates; a law without one is neither simulated nor written
+    levels: tuple[str, ...] = ()  # the fields of which one is given: a matrix if it ends with "covariance", or a vector
+    flags: tuple[str, ...] = ()  # further fields, true or false
+    variate = ""  # what it is drawn from: "normal", "uniform" (on (-1, 1)) or "sign"; "": it cannot be drawn
+    gaussian = False  # exactly normal, with ``proxy`` as covariance
+    exact_covariance: Callable[[], list[list[Fraction]]]  # of a Gaussian law
+    enclosed_covariance: Callable[[], Interval]  # the same, zeros that the structure gives exact
+    uniform = False  # exactly uniform on the box of ``bound``
+
+    def __init_subclass__(cls) -> None:
+        for fact in ("name", "variate", "unit", "gaussian", "uniform"):
+            if fact not in vars(cls):
+                setattr(cls, fact, getattr(Law, fact))
+        if not cls.name:
+            return
+        wanted = ["levels", "proxy", *(["factor"] if cls.variate else []), *(["bound"] if cls.uniform else [])]
+        wanted += ["exact_covariance", "enclosed_covariance"] if cls.gaussian else []
+        lacking = [part for part in wanted if getattr(cls, part, None) is getattr(Law, part, None)]
+        if lacking:
+            raise TypeError(f"the law {cls.name!r} must state {' and '.join(lacking)}; {cls.__name__} does not.")
+        if cls.variate and cls.variate not in _VARIATES:
+            raise TypeError(f"`variate` must be one of {', '.join(_VARIATES)}, got {cls.variate!r}.")
+        other = LAWS.setdefault(cls.name, cls)
+        if (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise TypeError(f"`name` {cls.name!r} is that of the law {other.__name__}; give another.")
+        LAWS[cls.name] = cls
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         if args:
@@ -34,9 +79,48 @@ class Law:
             raise TypeError(f"{cls.__name__} takes no bare value, got {args[0]!r}; say {levels}.")
         return super().__new__(cls)
 
-    def resolve(self, dimension: int) -> Law:
+    def __post_init__(self) -> None:
+        kind, value = self.level, getattr(self, self.level)
+        if kind.endswith("covariance"):
+            checked = positive_definite(kind, value, strict=False)
+        else:
+            matrices = [level for level in self.levels if level.endswith("covariance")]
+            if np.ndim(value) > 1 and matrices:
+                raise ValueError(f"`{kind}` must be a number or a vector; a matrix is a {matrices[0]}=.")
+            checked = vector(kind, value)
+            if np.any(checked < 0):
+                raise ValueError(f"`{kind}` must not be negative, got {checked.tolist()}.")
+        object.__setattr__(self, kind, checked)
+        for flag in self.flags:
+            if not isinstance(getattr(self, flag), bool | np.bool_):
+                raise ValueError(f"`{flag}` must be true or false, got {getattr(self, flag)!r}.")
+
+    @property
+    def level(self) -> str:
+        """The one level that is given."""
+        given = [level for level in self.levels if getattr(self, level) is not None]
+        if len(given) != 1:
+            ways = ", ".join(f"{level}=" for level in self.levels)
+            raise ValueError(f"{type(self).__name__} needs exactly one of {ways}; got {given or 'none'}.")
+        return given[0]
+
+    def resolve(self, dimension: int) -> Self:
         """The same law for noise of ``dimension`` entries: numbers become vectors."""
-        raise NotImplementedError
+        kind, value = self.level, getattr(self, self.level)
+        if kind.endswith("covariance"):
+            if len(value) != dimension:
+                raise ValueError(f"`{kind}` must be {dimension} x {dimension}, got {len(value)} x {len(value)}.")
+            return self
+        if len(value) not in (1, dimension):
+            raise ValueError(f"`{kind}` must be a number or {dimension} numbers, got {len(value)}.")
+        fields = {kind: frozen(np.broadcast_to(value, (dimension,)))}
+        return type(self)(**fields, **{flag: getattr(self, flag) for flag in self.flags})
+
+    def data(self) -> dict[str, Any]:
+        """Name, level, and the flags that are not at their defaults, as a problem file states them."""
+        flags = {flag: bool(getattr(self, flag)) for flag in self.flags}
+        changed = {flag: value for flag, value in flags.items() if value != getattr(type(self), flag, None)}
+        return {"law": self.name, self.level: getattr(self, self.level).tolist(), **changed}
 
     @property
     def dimension(self) -> int:
@@ -45,7 +129,7 @@ class Law:
 
     @property
     def proxy(self) -> Array:
-        """Variance proxy, shape (m, m), rounded up on its diagonal."""
+        """Variance proxy, shape (m, m), rounded up on its diagonal; the covariance where the law is normal."""
         raise NotImplementedError
 
     @property
@@ -53,65 +137,68 @@ class Law:
         """Almost-sure bounds of the entries' absolute values, shape (m,), or None."""
         return None
 
+    @property
+    def factor(self) -> Array:
+        """F, shape (m, m): the noise is F z, with z independent entries ``unit`` of ``variate``."""
+        raise NotImplementedError
+
+    def unit(self, v: Array) -> Array:
+        """z from a variate v, written as dynamics are (NumPy's elementary functions): kernels trace it."""
+        return v
+
+    def check_drawable(self) -> None:
+        """Refuse a law that does not say how it is drawn."""
+        if not self.variate:
+            name = type(self).__name__
+            raise ValueError(f"{name} has no `variate` and cannot be simulated; give a law to sample from.")
+
     def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
         """Independent draws, shape (*size, m)."""
-        raise NotImplementedError
+        self.check_drawable()
+        shape = (size,) if isinstance(size, int) else tuple(size)
+        factor = self.factor
+        return np.asarray(self.unit(_VARIATES[self.variate](rng, (*shape, factor.shape[1]))) @ factor.T)
+
+
+def check_law(law: Law, task: str, error: type[Exception] = TypeError) -> None:
+    """Refuse a law that has no name of its own: a class made from another law may draw otherwise.
+
+    Raises
+    ------
+    TypeError or ``error``
+        If it has none; ``task`` says what it was wanted for.
+    """
+    if not law.name:
+        raise error(
+            f"`noise` must be one of {known_laws()} or another law with a `name` to {task}, got the class "
+            f"{type(law).__name__}: what it draws is not known; state what it keeps by cb.Bounded(halfwidth=...) or "
+            "cb.SubGaussian(proxy_std=...)."
+        )
+
+
+def known_laws() -> str:
+    """The laws of this module and how each is given, in words."""
+    own = [law for law in LAWS.values() if law.__module__ == __name__]
+    return ", ".join(f"cb.{law.__name__}({' | '.join(f'{level}=...' for level in law.levels)})" for law in own)
+
+
+def _up(value: Fraction) -> float:
+    """The least float that is not below."""
+    nearest = float(value)
+    return nearest if Fraction(nearest) >= value else float(np.nextafter(nearest, np.inf))
 
 
 def _square_up(value: Array) -> Array:
     """Squares of floats, rounded up."""
-    squares = [float(x) * float(x) for x in value]
-    exact = [Fraction(float(x)) ** 2 for x in value]
-    return frozen([s if Fraction(s) >= e else np.nextafter(s, np.inf) for s, e in zip(squares, exact)])
-
-
-def _level(name: str, value: ArrayLike) -> Array:
-    level = vector(name, value)
-    if np.any(level < 0):
-        raise ValueError(f"`{name}` must not be negative, got {level.tolist()}.")
-    return level
-
-
-def _broadcast(name: str, level: Array, dimension: int) -> Array:
-    if len(level) not in (1, dimension):
-        raise ValueError(f"`{name}` must be a number or {dimension} numbers, got {len(level)}.")
-    return frozen(np.broadcast_to(level, (dimension,)))
-
-
-def _one_of(law: Law, levels: tuple[str, ...]) -> str:
-    given = [level for level in levels if getattr(law, level) is not None]
-    if len(given) != 1:
-        ways = ", ".join(f"{level}=" for level in levels)
-        raise ValueError(f"{type(law).__name__} needs exactly one of {ways}; got {given or 'none'}.")
-    return given[0]
+    return frozen([_up(Fraction(float(x)) ** 2) for x in value])
 
 
 class _Quadratic(Law):
     """A law given by a standard deviation, a variance or a covariance (or proxies of these)."""
 
-    def __post_init__(self) -> None:
-        kind = _one_of(self, self.levels)
-        value = getattr(self, kind)
-        if kind.endswith("covariance"):
-            object.__setattr__(self, kind, positive_definite(kind, value, strict=False))
-            return
-        if np.ndim(value) > 1:
-            raise ValueError(f"`{kind}` must be a number or a vector; a matrix is a {self.levels[2]}=.")
-        object.__setattr__(self, kind, _level(kind, value))
-
-    def resolve(self, dimension: int) -> Self:
-        kind = _one_of(self, self.levels)
-        value = getattr(self, kind)
-        if kind.endswith("covariance"):
-            if len(value) != dimension:
-                size = f"{len(value)} x {len(value)}"
-                raise ValueError(f"`{kind}` must be {dimension} x {dimension}, got {size}.")
-            return self
-        return type(self)(**{kind: _broadcast(kind, value, dimension)})
-
     @property
     def proxy(self) -> Array:
-        kind = _one_of(self, self.levels)
+        kind = self.level
         value: Array = getattr(self, kind)
         if kind.endswith("covariance"):
             return value
@@ -141,25 +228,30 @@ class Gaussian(_Quadratic):
     covariance: Any = None
 
     name = "gaussian"
-    gaussian = True
     levels = ("std", "variance", "covariance")
-
-    def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
-        return _normal(rng, size, self.factor)
+    variate = "normal"
+    gaussian = True
 
     @property
     def factor(self) -> Array:
         """A matrix F with F F' equal to the covariance, up to rounding."""
-        kind = _one_of(self, self.levels)
-        if kind == "covariance":
+        if self.level == "covariance":
             values, vectors = np.linalg.eigh(self.covariance)
             return frozen(vectors * np.sqrt(np.maximum(values, 0.0)))
-        return frozen(np.diag(self.std if kind == "std" else np.sqrt(self.variance)))
+        return frozen(np.diag(self.std if self.level == "std" else np.sqrt(self.variance)))
 
+    def exact_covariance(self) -> list[list[Fraction]]:
+        squares = [[Fraction(float(entry)) for entry in row] for row in self.proxy]
+        if self.level == "std":
+            for i, deviation in enumerate(self.std):
+                squares[i][i] = Fraction(float(deviation)) ** 2
+        return squares
 
-def _normal(rng: np.random.Generator, size: int | tuple[int, ...], factor: Array) -> Array:
-    shape = (size,) if isinstance(size, int) else tuple(size)
-    return np.asarray(rng.standard_normal((*shape, len(factor))) @ factor.T)
+    def enclosed_covariance(self) -> Interval:
+        if self.level != "std":
+            return Interval.point(self.proxy)
+        square = sq(Interval.point(self.std))
+        return Interval(np.diag(square.lo), np.diag(square.hi))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -181,41 +273,26 @@ class SubGaussian(_Quadratic):
     name = "subgaussian"
     levels = ("proxy_std", "proxy_variance", "proxy_covariance")
 
-    def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
-        raise ValueError(
-            "noise that is only known to be sub-Gaussian cannot be simulated; give a law (cb.Gaussian, "
-            "cb.Uniform, cb.Rademacher or cb.Bounded) to sample from."
-        )
 
-
-class _Box(Law):
-    """Noise in a box around 0."""
-
-    _level_name = "halfwidth"
-
-    def __post_init__(self) -> None:
-        value = getattr(self, self._level_name)
-        object.__setattr__(self, self._level_name, _level(self._level_name, value))
-
-    def resolve(self, dimension: int) -> Self:
-        value = _broadcast(self._level_name, getattr(self, self._level_name), dimension)
-        return type(self)(**(self._options() | {self._level_name: value}))
-
-    def _options(self) -> dict[str, Any]:
-        return {}
+class BoxLaw(Law):
+    """A law of independent entries with |w_i| <= h_i, where h is its only level; proxy h_i^2 (Hoeffding's lemma)."""
 
     @property
     def proxy(self) -> Array:
-        return frozen(np.diag(_square_up(getattr(self, self._level_name))))
+        return frozen(np.diag(_square_up(self.bound)))
 
     @property
     def bound(self) -> Array:
-        value: Array = getattr(self, self._level_name)
+        value: Array = getattr(self, self.level)
         return value
+
+    @property
+    def factor(self) -> Array:
+        return np.diag(self.bound)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Uniform(_Box):
+class Uniform(BoxLaw):
     """Independent entries, uniform on [-h_i, h_i]; proxy h_i^2 / 3, the variance (sinh(x)/x <= exp(x^2/6)).
 
     Parameters
@@ -228,18 +305,16 @@ class Uniform(_Box):
 
     name = "uniform"
     levels = ("halfwidth",)
+    variate = "uniform"
+    uniform = True
 
     @property
     def proxy(self) -> Array:
         return frozen(np.diag(np.nextafter(_square_up(self.halfwidth) / 3.0, np.inf)) * (self.halfwidth > 0))
 
-    def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
-        shape = (size,) if isinstance(size, int) else tuple(size)
-        return np.asarray(rng.uniform(-1.0, 1.0, (*shape, len(self.halfwidth))) * self.halfwidth)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Rademacher(_Box):
+class Rademacher(BoxLaw):
     """Independent entries, +s_i or -s_i with probability 1/2 each; proxy s_i^2 (cosh(x) <= exp(x^2/2)).
 
     Parameters
@@ -252,19 +327,11 @@ class Rademacher(_Box):
 
     name = "rademacher"
     levels = ("scale",)
-    _level_name = "scale"
-
-    def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
-        return _signs(rng, size, self.scale)
-
-
-def _signs(rng: np.random.Generator, size: int | tuple[int, ...], scale: Array) -> Array:
-    shape = (size,) if isinstance(size, int) else tuple(size)
-    return np.asarray((2.0 * rng.integers(0, 2, (*shape, len(scale))) - 1.0) * scale)
+    variate = "sign"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Bounded(_Box):
+class Bounded(BoxLaw):
     """Any zero-mean noise with |w_i| <= h_i, conditionally on the past (Hoeffding's lemma).
 
     The proxy is diag(h_i^2) for entries independent of each other, and (sum of h_i^2) I otherwise. Sampling
@@ -283,36 +350,13 @@ class Bounded(_Box):
 
     name = "bounded"
     levels = ("halfwidth",)
-
-    def _options(self) -> dict[str, Any]:
-        return {"independent": self.independent}
+    flags = ("independent",)
+    variate = "sign"
 
     @property
     def proxy(self) -> Array:
         squares = _square_up(self.halfwidth)
         if self.independent:
             return frozen(np.diag(squares))
-        total = sum(Fraction(float(s)) for s in squares)
-        rounded = float(total)
-        rounded = rounded if Fraction(rounded) >= total else float(np.nextafter(rounded, np.inf))
-        return frozen(rounded * np.eye(len(squares)))
-
-    def sample(self, rng: np.random.Generator, size: int | tuple[int, ...]) -> Array:
-        return _signs(rng, size, self.halfwidth)
-
-
-def check_law(law: Law, task: str) -> None:
-    """Refuse a law that is not exactly one of this module's: a class made from one of them may draw otherwise.
-
-    Raises
-    ------
-    TypeError
-        If the law is of any other class, a subclass included; ``task`` says what it was wanted for.
-    """
-    known = (Gaussian, Uniform, Rademacher, Bounded, SubGaussian)
-    if type(law) not in known:
-        names = ", ".join(f"cb.{one.__name__}" for one in known)
-        raise TypeError(
-            f"`noise` must be exactly one of {names} to {task}, got the class {type(law).__name__}: what it draws is "
-            "not known; state what it keeps by cb.Bounded(halfwidth=...) or cb.SubGaussian(proxy_std=...)."
-        )
+        total = sum((Fraction(float(s)) for s in squares), Fraction(0))
+        return frozen(_up(total) * np.eye(len(squares)))

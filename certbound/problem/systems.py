@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.checks import frozen, matrix, names, number, vector
 from certbound.problem.adapters import import_control, is_control_system, is_symbolic, read_model, symbol_names
 from certbound.problem.model import Tape, compile_numpy
-from certbound.problem.noise import Gaussian, Law
+from certbound.problem.noise import Gaussian, Law, known_laws
 from certbound.problem.sets import Box
 
 __all__ = ["ContinuousSystem", "DiscreteSystem", "System", "from_control", "linear_system"]
@@ -182,7 +182,7 @@ class DiscreteSystem(System):
         Bounds of the inputs u (infinite sides allowed); without it the system has none.
     disturbance : Box, optional
         Bounded set of the unknown signal d; without it there is none.
-    noise : Gaussian, Uniform, Rademacher, Bounded or SubGaussian, optional
+    noise : Law, optional
         Law of w; no noise when omitted.
     noise_matrix : array_like, shape (n, m), optional
         G; the identity when omitted.
@@ -229,10 +229,8 @@ class DiscreteSystem(System):
         law = Gaussian(std=0.0) if noise is None else noise
         if not isinstance(law, Law):
             raise TypeError(
-                f"`noise` must be a law, got {noise!r}; a bare number does not say what it is: use "
-                "cb.Gaussian(std=...), cb.Gaussian(variance=...), cb.Gaussian(covariance=...), "
-                "cb.Uniform(halfwidth=...), cb.Rademacher(scale=...), cb.Bounded(halfwidth=...) or "
-                "cb.SubGaussian(proxy_std=...)."
+                f"`noise` must be a law, got {noise!r}; a bare number does not say what it is: use one of "
+                f"{known_laws()}."
             )
         matrix_value = np.eye(self.dimension) if noise_matrix is None else noise_matrix
         gain = _noise_matrix("noise_matrix", matrix_value, self.states)

@@ -190,18 +190,14 @@ def _noise(system: Any) -> dict[str, Any]:
             return {"law": "wiener", "diffusion": {"columns": int(g.shape[1]), **tape_data(g)}}
         return {"law": "wiener", "diffusion": exact(np.asarray(g, dtype=float))}
     law: Law = system.noise
-    try:
-        check_law(law, "be certified")
-    except TypeError as error:
-        raise CertificateError(str(error)) from error
-    level = next(name for name in law.levels if getattr(law, name) is not None)
-    data = {
+    check_law(law, "be certified", CertificateError)
+    return {
         "law": law.name,
-        "level": level.removeprefix("proxy_"),
-        "values": exact(np.asarray(getattr(law, level), dtype=float)),
+        "level": law.level.removeprefix("proxy_"),
+        "values": exact(np.asarray(getattr(law, law.level), dtype=float)),
         "matrix": exact(np.asarray(system.noise_matrix, dtype=float)),
+        **{flag: bool(getattr(law, flag)) for flag in law.flags},
     }
-    return {**data, "independent": bool(law.independent)} if hasattr(law, "independent") else data
 
 
 def _initial(start: Any) -> dict[str, Any]:

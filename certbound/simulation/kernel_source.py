@@ -36,7 +36,6 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-_DRAW = {"normal": "draw_normal", "uniform": "draw_uniform", "sign": "draw_sign"}
 _WORDS = "word_0, word_1, word_2, word_3"  # the state of the noise's stream
 _STORED = "stream[4], stream[5], stream[6], stream[7]"
 
@@ -49,7 +48,7 @@ import numpy as np
 from numba import njit
 
 from certbound.simulation.compiled.elementary import atan2, sincos, tanh
-from certbound.simulation.compiled.streams import {draw}, uniform
+from certbound.simulation.compiled.streams import draw_{variate}, uniform
 from certbound.simulation.compiled.supremum import STRETCH, raise_top
 
 
@@ -101,11 +100,12 @@ def module_head(model: StepModel, kind: str, p: Parameters) -> str:
         ("diffusion", model.noise if isinstance(model.noise, Tape) else None),
         ("correction", model.correction),
         ("signal", model.signal),
+        ("unit", model.unit),
     ):
         if tape is not None:
-            names = _arguments(model, "x") if name == "drift" else ["t", *vector("x", model.dimension)]
+            names = {"drift": _arguments(model, "x"), "unit": ["v"]}.get(name, ["t", *vector("x", model.dimension)])
             functions += ["", _NJIT, *function_source(name, tape, names, p), ""]
-    return _HEAD.format(kind=kind, draw=_DRAW[model.variate], lowest=LOWEST) + "\n".join(functions)
+    return _HEAD.format(kind=kind, variate=model.variate, lowest=LOWEST) + "\n".join(functions)
 
 
 def open_noise(model: StepModel) -> list[str]:
@@ -176,9 +176,10 @@ def _noise(model: StepModel, p: Parameters) -> tuple[list[str], list[str], Bridg
     variates = vector("z", m)
     drawn = []
     if m:
-        draw = f"{_WORDS} = {_DRAW[model.variate]}({_WORDS})"
+        draw = f"{_WORDS} = draw_{model.variate}({_WORDS})"
         drawn = [f"for j in range({m}):", f"    noise[j], {draw}"] if m > 1 else [f"z_0, {draw}"]
         drawn += [f"z_{j} = noise[{j}]" for j in range(m)] if m > 1 else []
+        drawn += [f"z_{j}, = unit(p, z_{j})" for j in range(m)] if model.unit is not None else []
     if isinstance(model.noise, Tape):
         root = p.add(np.sqrt(model.step))
         entries = _entries(model.noise)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.problem.model import Node, Tape, compile_numpy, jacobian, trace
-from certbound.problem.noise import Bounded, Gaussian, Law, Rademacher, Uniform, check_law
+from certbound.problem.noise import Law, check_law
 from certbound.simulation.tape_text import live_nodes
 from certbound.simulation.transition import exact_transition
 
@@ -79,7 +79,9 @@ class StepModel:
     interval : float
         Time between two states (h, or 1 in discrete time).
     variate : str
-        Law of the m independent unit variates z: ``normal``, ``uniform`` on (-1, 1), ``sign``.
+        Law of the m independent variates v: ``normal``, ``uniform`` on (-1, 1), ``sign``.
+    unit : Tape, optional
+        z as a function of v, entry by entry; without it z = v.
     noise : ndarray, shape (n, m), or Tape
         What multiplies z. A tape (inputs t, states; shape (n, m)) is multiplied by sqrt(step) too.
     correction : Tape, optional
@@ -106,7 +108,8 @@ class StepModel:
     disturbance_count: int = 0
     step: float = 0.0
     interval: float = 1.0
-    variate: Literal["normal", "uniform", "sign"] = "normal"
+    variate: str = "normal"
+    unit: Tape | None = None
     noise: Array | Tape
     correction: Tape | None = None
     spread: Array | None = None
@@ -137,7 +140,7 @@ def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
     ValueError
         If the noise has no law, or the scheme does not fit the system.
     TypeError
-        If the noise's law is of a class that is not known.
+        If the noise's law has no name, or its ``unit`` cannot be traced.
     """
     system = problem.system
     tape: Tape = problem.closed_loop
@@ -153,9 +156,11 @@ def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
     fields |= {"input_count": inputs, "disturbance_count": disturbances}
     fields["table"] = np.hstack(rows) if rows else np.zeros((0, 0))
     if system.time == "discrete":
-        variate, factor = _unit_variates(system.noise)
-        noise = np.asarray(system.noise_matrix) @ factor
-        return StepModel(drift=tape, variate=variate, noise=_without_zeros(noise), **fields)
+        law: Law = system.noise
+        check_law(law, "be simulated")
+        law.check_drawable()
+        noise = _without_zeros(np.asarray(system.noise_matrix) @ law.factor)
+        return StepModel(drift=tape, variate=law.variate, unit=_unit(law), noise=noise, **fields)
     step = float(problem.horizon) / steps
     return _continuous(tape, system.diffusion, step, scenario, fields)
 
@@ -166,16 +171,14 @@ def _table(rows: Array, steps: int) -> Array:
     return np.asarray(rows, dtype=float)[(np.arange(steps) * pieces) // steps]
 
 
-def _unit_variates(law: Law) -> tuple[Literal["normal", "uniform", "sign"], Array]:
-    check_law(law, "be simulated")
-    if isinstance(law, Gaussian):
-        return "normal", law.factor
-    law.sample(np.random.default_rng(0), 1)  # refuses noise without a law
-    if isinstance(law, Uniform):
-        return "uniform", np.diag(law.bound)
-    if isinstance(law, Rademacher | Bounded):
-        return "sign", np.diag(law.bound)
-    raise TypeError(f"`noise` must be a law that the simulator knows, got {type(law).__name__}.")
+def _unit(law: Law) -> Tape | None:
+    """The law's ``unit`` as a tape; None where it leaves its variate as it is."""
+    if type(law).unit is Law.unit:
+        return None
+    tape = trace(law.unit, {"v": ["v"]})
+    if tape.shape != (1,):
+        raise ValueError(f"`unit` of {type(law).__name__} must keep the shape of `v`, got {tape.shape} for (1,).")
+    return tape
 
 
 def _disturbance(system: Any, count: int, steps: int, scenario: Scenario) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def _run_python(block: Block, where: str, names: dict[str, Any]) -> None:
     linecache.cache[where] = (len(block.text), None, block.text.splitlines(keepends=True), where)
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
-        exec(compile(block.text, where, "exec"), names)  # noqa: S102  (our own pages)
+        exec(compile(block.text, where, "exec", dont_inherit=True), names)  # noqa: S102  (our own pages)
     expected = [line.split("# -> ", 1)[1] for line in block.text.splitlines() if "# -> " in line]
     assert matches("\n".join(expected), printed.getvalue()), f"{where} printed:\n{printed.getvalue()}"
 

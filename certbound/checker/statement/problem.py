@@ -11,6 +11,7 @@ from certbound.checker.balls import diagonal, is_positive_definite, matrix
 from certbound.checker.reading import Record, number, numbers, text
 from certbound.checker.reading import entries as listed
 from certbound.checker.report import Budget
+from certbound.checker.statement.laws import LAWS, Law
 from certbound.checker.statement.regions import Constraint, read_constraint
 from certbound.checker.statement.tapes import read_tape
 from certbound.errors import CertificateError
@@ -189,10 +190,14 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
         rows = record.array("diffusion", n, None)
         m = len(rows[0])
         return Noise(diffusion=matrix(_same_length(rows, path)), proxy=diagonal([arb(1)] * m), gaussian=True)
-    record = Record(value, path, ("law", "level", "values", "matrix"), ("independent",))
+    name = text(value.get("law") if isinstance(value, dict) else None, f"{path}.law", 200)
+    if name not in LAWS:
+        raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {name[:40]!r}.")
+    law = LAWS[name]
+    record = Record(value, path, ("law", "level", "values", "matrix", *law.flags))
     rows = _same_length(record.array("matrix", n, None), path)
-    m = len(rows[0])
-    return Noise(diffusion=matrix(rows), proxy=_proxy(record, m, budget), gaussian=record["law"] == "gaussian")
+    proxy = _proxy(record, law, len(rows[0]), budget)
+    return Noise(diffusion=matrix(rows), proxy=proxy, gaussian=law.gaussian)
 
 
 def _same_length(rows: list[list[float]], path: str) -> list[list[float]]:
@@ -201,18 +206,11 @@ def _same_length(rows: list[list[float]], path: str) -> list[list[float]]:
     return rows
 
 
-def _proxy(record: Record, m: int, budget: Budget) -> arb_mat:
-    """The variance proxy that a law has by its name (Hoeffding's lemma for bounded ones)."""
-    law, level = record.text("law"), record.text("level")
-    levels = {
-        "gaussian": ("std", "variance", "covariance"),
-        "subgaussian": ("std", "variance", "covariance"),
-        "uniform": ("halfwidth",),
-        "rademacher": ("scale",),
-        "bounded": ("halfwidth",),
-    }
-    if level not in levels.get(law, ()):
-        raise CertificateError(f"`{record.path}` has the unknown law {law[:40]!r} with {level[:40]!r}.")
+def _proxy(record: Record, law: Law, m: int, budget: Budget) -> arb_mat:
+    """The variance proxy that is proved of a law."""
+    level = record.text("level")
+    if level not in law.levels:
+        raise CertificateError(f"`{record.at('level')}` must be one of {', '.join(law.levels)}, got {level[:40]!r}.")
     if level == "covariance":
         rows = record.array("values", m, m)
         if any(rows[i][j] != rows[j][i] for i in range(m) for j in range(i)):
@@ -221,13 +219,7 @@ def _proxy(record: Record, m: int, budget: Budget) -> arb_mat:
     values = [arb(number(item, record.at("values"), least=0.0)) for item in record.items("values", m, m)]
     if level == "variance":
         return diagonal(values)
-    squares = [value * value for value in values]
-    if law == "uniform":
-        squares = [square / 3 for square in squares]
-    if law == "bounded" and not record.flag("independent"):
-        total = sum(squares[1:], squares[0])
-        squares = [total] * m
-    return diagonal(squares)
+    return diagonal(law.proxies([value * value for value in values], record))
 
 
 def _semidefinite(a: arb_mat, path: str, budget: Budget) -> arb_mat:

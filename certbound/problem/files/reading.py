@@ -11,30 +11,21 @@ from numpy.typing import NDArray
 
 from certbound.checks import names as checked_names
 from certbound.checks import nearest
-from certbound.problem import noise, sets
+from certbound.problem import sets
 from certbound.problem.files.parser import CONSTANTS, FUNCTIONS, constant, parse
 from certbound.problem.files.plans import read_plan
-from certbound.problem.files.schema import BallTable, Constraint, EllipsoidTable, Noise, Specification, Start
+from certbound.problem.files.schema import BallTable, Constraint, EllipsoidTable, Specification, Start
 from certbound.problem.model import Graph, Tape
+from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
 
-__all__ = ["LEVELS", "RESERVED", "read_problem"]
+__all__ = ["RESERVED", "read_problem"]
 
 Array = NDArray[np.float64]
 
 RESERVED = frozenset({"t", *FUNCTIONS, *CONSTANTS})
 """Names that no state, input, disturbance, parameter or definition may have."""
-
-_LAWS: Mapping[str, tuple[Callable[..., noise.Law], tuple[str, ...]]] = {
-    "gaussian": (noise.Gaussian, ("std", "variance", "covariance")),
-    "uniform": (noise.Uniform, ("halfwidth",)),
-    "rademacher": (noise.Rademacher, ("scale",)),
-    "bounded": (noise.Bounded, ("halfwidth",)),
-    "subgaussian": (noise.SubGaussian, ("proxy_std", "proxy_variance", "proxy_covariance")),
-}
-LEVELS = tuple(dict.fromkeys(level for _, levels in _LAWS.values() for level in levels))
-"""Every key that states how large the noise of a discrete-time problem is."""
 
 
 class _ForbiddenError(ValueError):
@@ -230,23 +221,22 @@ class _Reader:
         table = self.spec.noise
         if table is None:
             return {}
-        if table.diffusion is not None or table.law is None:
+        if table.diffusion is not None or table.law not in LAWS:
             raise ValueError(
-                f"`noise` must hold `law` ({', '.join(_LAWS)}), one level and at most `matrix` in discrete "
-                "time; `diffusion` is for continuous time."
+                f"`noise` must hold `law` ({', '.join(LAWS)}), one level and at most `matrix` in discrete "
+                f"time, got {table.law!r}; `diffusion` is for continuous time."
             )
-        build, levels = _LAWS[table.law]
-        given = _given(table)
-        if len(given) != 1 or given[0] not in levels:
+        build, entries = LAWS[table.law], dict(table.model_extra or {})
+        flags = {key: entries.pop(key) for key in list(entries) if any(key in law.flags for law in LAWS.values())}
+        if len(entries) != 1 or not entries.keys() <= set(build.levels):
             raise ValueError(
-                f"`noise` with law {table.law!r} needs exactly one of {', '.join(levels)}; "
-                f"got {given or 'none'}."
+                f"`noise` with law {table.law!r} needs exactly one of {', '.join(build.levels)}; "
+                f"got {list(entries) or 'none'}."
             )
-        if table.independent is not None and table.law != "bounded":
-            raise ValueError(f"`noise.independent` must be omitted for law {table.law!r}.")
-        level = {given[0]: self.array(getattr(table, given[0]), f"noise.{given[0]}")}
-        extra = {} if table.independent is None else {"independent": table.independent}
-        result: dict[str, Any] = {"noise": build(**level, **extra)}
+        for flag in flags.keys() - set(build.flags):
+            raise ValueError(f"`noise.{flag}` must be omitted for law {table.law!r}.")
+        level = {key: self.array(value, f"noise.{key}") for key, value in entries.items()}
+        result: dict[str, Any] = {"noise": build(**level, **flags)}
         if table.matrix is not None:
             result["noise_matrix"] = self.matrix(table.matrix, "noise.matrix")
         return result
@@ -367,10 +357,6 @@ class _Reader:
         assert table.polytope is not None
         faces = self.matrix(table.polytope.A, f"{where}.A")
         return sets.Polytope(faces, self.array(table.polytope.b, f"{where}.b"))
-
-
-def _given(table: Noise) -> list[str]:
-    return [level for level in LEVELS if getattr(table, level) is not None]
 
 
 def _forbidden(name: str, inputs: Sequence[str]) -> Callable[[], int]:

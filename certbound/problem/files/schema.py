@@ -6,11 +6,13 @@ name the nearest known one. What the values mean is decided in ``reading``.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from certbound.checks import nearest
+from certbound.problem.noise import LAWS
 
 __all__ = ["Constraint", "Noise", "Specification", "Start", "explain"]
 
@@ -34,15 +36,17 @@ class _Table(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     title: ClassVar[str] = "the problem file"
+    more_keys: ClassVar[Callable[[], Iterable[str]]] = tuple
 
     @model_validator(mode="before")
     @classmethod
     def _known_keys(cls, value: Any) -> Any:
         if not isinstance(value, dict):
             raise ValueError(f"{cls.title} must be a table of keys, got {value!r}")
+        known = [*cls.model_fields, *cls.more_keys()]
         for key in value:
-            if key not in cls.model_fields:
-                raise ValueError(f"unknown key {key!r} in {cls.title}{nearest(str(key), cls.model_fields)}")
+            if key not in known:
+                raise ValueError(f"unknown key {key!r} in {cls.title}{nearest(str(key), known)}")
         return value
 
 
@@ -154,20 +158,14 @@ class Cost(_Table):
 
 
 class Noise(_Table):
-    """CT: diffusion. DT: a law, its one level, and a matrix."""
+    """CT: diffusion. DT: a law, its one level, its flags, and a matrix."""
 
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Matrix | Number | Vector | bool]
     title: ClassVar[str] = "[noise]"
+    more_keys = staticmethod(lambda: [key for law in LAWS.values() for key in (*law.levels, *law.flags)])
     diffusion: Matrix | Number | Vector | None = None
-    law: Literal["gaussian", "uniform", "rademacher", "bounded", "subgaussian"] | None = None
-    std: Number | Vector | None = None
-    variance: Number | Vector | None = None
-    covariance: Matrix | None = None
-    halfwidth: Number | Vector | None = None
-    scale: Number | Vector | None = None
-    proxy_std: Number | Vector | None = None
-    proxy_variance: Number | Vector | None = None
-    proxy_covariance: Matrix | None = None
-    independent: bool | None = None
+    law: str | None = None
     matrix: Matrix | Number | Vector | None = None
 
 

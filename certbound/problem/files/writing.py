@@ -10,7 +10,7 @@ import numpy as np
 
 from certbound.problem import sets
 from certbound.problem.files.formulas import formulas
-from certbound.problem.files.reading import LEVELS, RESERVED
+from certbound.problem.files.reading import RESERVED
 from certbound.problem.model import Tape
 from certbound.problem.noise import check_law
 from certbound.problem.problem import Problem
@@ -121,12 +121,7 @@ class _Writer:
             return {"diffusion": [texts[k : k + columns] for k in range(0, len(texts), columns)]}
         assert isinstance(system, DiscreteSystem)
         check_law(system.noise, "be written")
-        given = {level: getattr(system.noise, level, None) for level in LEVELS}
-        table: dict[str, Any] = {"law": system.noise.name}
-        table |= {level: value.tolist() for level, value in given.items() if value is not None}
-        if getattr(system.noise, "independent", True) is False:
-            table["independent"] = False
-        return table | {"matrix": _rows(system.noise_matrix)}
+        return system.noise.data() | {"matrix": _rows(system.noise_matrix)}
 
     def intervals(self, box: sets.Box) -> dict[str, Any]:
         used = self.states if box.coordinates is None else [self.states[k] for k in box.coordinates]

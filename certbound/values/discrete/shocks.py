@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import InfeasibleError
-from certbound.problem.noise import Bounded, Gaussian, Law, SubGaussian, Uniform
+from certbound.problem.noise import Law
 from certbound.rigor.intervals import Interval, sq, sqrt
 
 __all__ = ["Inapplicable", "Shocks", "gaussian_shocks", "shocks_of"]
@@ -58,39 +58,26 @@ def shocks_of(law: Law, gain: Array) -> Shocks:
     Inapplicable
         For other laws, and where G w leaves a state without noise of its own.
     """
-    if isinstance(law, Bounded | SubGaussian):
+    if law.uniform:
+        return _uniform_shocks(np.asarray(law.bound), gain)
+    if not law.gaussian:
         raise Inapplicable(
-            f"value functions need the noise's law; {type(law).__name__} names a class of laws (give cb.Gaussian "
-            "if that is what it is)."
+            "value functions take noise that is exactly Gaussian or uniform so far, no other law and no class of "
+            f"laws; got {type(law).__name__} (give cb.Gaussian if that is what it is)."
         )
-    if isinstance(law, Uniform):
-        return _uniform_shocks(law, gain)
-    if not isinstance(law, Gaussian):
-        raise Inapplicable(f"value functions take Gaussian and uniform noise so far, not {type(law).__name__}.")
-    return gaussian_shocks(_covariance(law, gain))
+    left = Interval.point(gain)
+    half = (left[:, :, None] * law.enclosed_covariance()[None, :, :]).sum(axis=1)
+    return gaussian_shocks((half[:, None, :] * left[None, :, :]).sum(axis=-1))
 
 
-def _uniform_shocks(law: Uniform, gain: Array) -> Shocks:
+def _uniform_shocks(halfwidth: Array, gain: Array) -> Shocks:
     n = len(gain)
     alone = gain.shape == (n, n) and np.all((gain != 0).sum(axis=1) == 1) and np.all((gain != 0).sum(axis=0) == 1)
-    if not alone or not np.all(np.asarray(law.halfwidth) > 0):
+    if not alone or not np.all(halfwidth > 0):
         raise Inapplicable("value functions need uniform noise that moves every state by an entry of its own.")
     place = np.argmax(gain != 0, axis=1)
-    sides = Interval.point(np.abs(gain[np.arange(n), place])) * Interval.point(np.asarray(law.halfwidth)[place])
+    sides = Interval.point(np.abs(gain[np.arange(n), place])) * Interval.point(halfwidth[place])
     return Shocks(sigma=sides, factor=Interval.point(np.zeros(n)), uniform=True)
-
-
-def _covariance(law: Gaussian, gain: Array) -> Interval:
-    """Enclosure of G Sigma G', shape (n, n); zeros that the structure gives are exact."""
-    if law.covariance is not None:
-        inner = Interval.point(np.asarray(law.covariance))
-    else:
-        level = np.asarray(law.variance if law.std is None else law.std, dtype=float)
-        square = Interval.point(level) if law.std is None else sq(Interval.point(level))
-        inner = Interval(np.diag(square.lo), np.diag(square.hi))
-    left = Interval.point(gain)
-    half = (left[:, :, None] * inner[None, :, :]).sum(axis=1)
-    return (half[:, None, :] * left[None, :, :]).sum(axis=-1)
 
 
 def gaussian_shocks(covariance: Interval) -> Shocks:
