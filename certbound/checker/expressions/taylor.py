@@ -14,7 +14,7 @@ from typing import TypeVar
 from flint import arb
 
 from certbound.checker.expressions.arithmetic import BALLS, Undecided, power
-from certbound.problem.model import BINARY
+from certbound.problem.model import ARITY
 
 __all__ = ["Model", "applied", "constant"]
 
@@ -370,7 +370,7 @@ def applied(op: str, value: float, first: Model | None, second: Model | None) ->
         if first is None:
             return None
         return second if BALLS["not"](first.range()).is_zero() else constant(_ZERO)
-    if first is None or (second is None and op in BINARY):
+    if first is None or (second is None and ARITY[op] == 2):
         return None
     given = [first] if second is None else [first, second]
     if all(model.fixed for model in given):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from certbound.problem.model.operations import OPERATIONS
 from certbound.problem.model.tape import JUMPS, Node, Tape
 
-__all__ = ["adds_plainly", "deciding", "is_zero", "selected", "sources", "varying_outputs", "watched"]
+__all__ = ["adds_plainly", "deciding", "edged", "is_zero", "selected", "sources", "varying_outputs", "watched"]
 
 
 def selected(tape: Tape, outputs: list[int], function: Tape | None) -> Tape:
@@ -76,6 +77,13 @@ def deciding(tape: Tape) -> dict[int, set[int]]:
         index: found[node.args[0]] if node.op == "if_else_zero" else found[index]
         for index, node in enumerate(tape.nodes) if node.op in JUMPS
     }  # fmt: skip
+
+
+def edged(tape: Tape) -> bool:
+    """Whether a node may jump (but for ``atan2``) or have a kink: derivatives do not tell all of such a function."""
+    return any(
+        node.op in JUMPS or (node.op in OPERATIONS and OPERATIONS[node.op].kink is not None) for node in tape.nodes
+    )
 
 
 def adds_plainly(tape: Tape, gain: Tape, count: int) -> bool:

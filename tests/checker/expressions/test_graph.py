@@ -13,10 +13,10 @@ from certbound.checker.expressions.graph import Graph
 from certbound.checker.expressions.program import Program
 from certbound.checker.expressions.series import expand
 from certbound.checker.report import Budget
-from certbound.problem.model.tape import BINARY, JUMPS, UNARY, Node, Tape
+from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape
 
-SMOOTH_ONE = sorted(UNARY - JUMPS - {"kink"})
-SMOOTH_TWO = sorted(BINARY - JUMPS)
+SMOOTH_ONE = sorted(op for op in BALLS.keys() - JUMPS - {"kink"} if ARITY[op] == 1)
+SMOOTH_TWO = sorted(op for op in BALLS.keys() - JUMPS if ARITY[op] == 2)
 REFERENCE = {
     "neg": lambda x: -x, "sq": lambda x: x * x, "sqrt": math.sqrt, "exp": math.exp, "log": math.log, "sin": math.sin,
     "cos": math.cos, "tan": math.tan, "asin": math.asin, "acos": math.acos, "atan": math.atan, "sinh": math.sinh,
