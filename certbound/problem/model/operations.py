@@ -32,7 +32,7 @@ class Builder(Protocol):
     def pow(self, base: int, exponent: float) -> int: ...
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class Operation:
     """What one operation means to each reader (``pow`` has its exponent as a further argument everywhere).
 
@@ -147,123 +147,102 @@ def _power_slope(g: Builder, a: int, exponent: float, node: int) -> int:
 
 def _step(numpy: Callable[..., Any], kernel: str, interval: Callable[..., Interval]) -> Operation:
     """An operation that jumps and is constant beside that."""
-    return Operation(numpy=numpy, kernel=kernel, interval=interval, series=ts.jump(interval), jump=_split)
+    return Operation(numpy, kernel, interval, ts.jump(interval), jump=_split)
+
+
+def _function(
+    numpy: Callable[..., Any], kernel: str, interval: Callable[..., Interval], series: Callable[..., ts.Series],
+    slope: Callable[..., int], *, undefined: Callable[..., Mask] | None = None, kink: Callable[..., Mask] | None = None,
+    at_zero: float | None = None,
+) -> Operation:
+    """An elementary function of one argument, which problem files may call."""
+    return Operation(
+        numpy, kernel, interval, series, (slope,), undefined=undefined, kink=kink, at_zero=at_zero, in_files=True
+    )
 
 
 _SIGN = "(1.0 if {0} > 0.0 else -1.0 if {0} < 0.0 else {0})"
 
 OPERATIONS: dict[str, Operation] = {
     "neg": Operation(
-        numpy=np.negative, kernel="-{0}", interval=Interval.__neg__, series=lambda x, order: [-value for value in x],
-        slopes=(lambda g, a, y: g.const(-1.0),),
+        np.negative, "-{0}", Interval.__neg__, lambda x, order: [-value for value in x],
+        (lambda g, a, y: g.const(-1.0),),
     ),
-    "sq": Operation(
-        numpy=np.square, kernel="{0} * {0}", interval=iv.sq, series=ts.sq,
-        slopes=(lambda g, a, y: g.apply("mul", g.const(2.0), a),),
+    "sq": Operation(np.square, "{0} * {0}", iv.sq, ts.sq, (lambda g, a, y: g.apply("mul", g.const(2.0), a),)),
+    "sqrt": _function(
+        np.sqrt, "math.sqrt({0})", iv.sqrt, ts.sqrt,
+        lambda g, a, y: g.apply("div", g.const(0.5), y), undefined=lambda x: x.lo < 0,
     ),
-    "sqrt": Operation(
-        numpy=np.sqrt, kernel="math.sqrt({0})", interval=iv.sqrt, series=ts.sqrt, in_files=True,
-        undefined=lambda x: x.lo < 0, slopes=(lambda g, a, y: g.apply("div", g.const(0.5), y),),
+    "exp": _function(np.exp, "math.exp({0})", iv.exp, ts.exp, lambda g, a, y: y, at_zero=1.0),
+    "log": _function(
+        np.log, "math.log({0})", iv.log, ts.log,
+        lambda g, a, y: g.apply("div", g.const(1.0), a), undefined=lambda x: x.lo <= 0,
     ),
-    "exp": Operation(
-        numpy=np.exp, kernel="math.exp({0})", interval=iv.exp, series=ts.exp, in_files=True, at_zero=1.0,
-        slopes=(lambda g, a, y: y,),
+    "sin": _function(np.sin, "math.sin({0})", iv.sin, ts.sin, lambda g, a, y: g.apply("cos", a), at_zero=0.0),
+    "cos": _function(
+        np.cos, "math.cos({0})", iv.cos, ts.cos, lambda g, a, y: g.apply("neg", g.apply("sin", a)), at_zero=1.0,
     ),
-    "log": Operation(
-        numpy=np.log, kernel="math.log({0})", interval=iv.log, series=ts.log, in_files=True,
-        undefined=lambda x: x.lo <= 0, slopes=(lambda g, a, y: g.apply("div", g.const(1.0), a),),
+    "tan": _function(
+        np.tan, "math.tan({0})", iv.tan, ts.tan,
+        lambda g, a, y: g.apply("add", g.const(1.0), g.apply("sq", y)), at_zero=0.0, undefined=iv.tan_undefined,
     ),
-    "sin": Operation(
-        numpy=np.sin, kernel="math.sin({0})", interval=iv.sin, series=ts.sin, in_files=True, at_zero=0.0,
-        slopes=(lambda g, a, y: g.apply("cos", a),),
+    "asin": _function(
+        np.arcsin, "math.asin({0})", iv.asin, ts.asin,
+        lambda g, a, y: _arc_slope(g, 1.0, a), at_zero=0.0, undefined=iv.beyond_one,
     ),
-    "cos": Operation(
-        numpy=np.cos, kernel="math.cos({0})", interval=iv.cos, series=ts.cos, in_files=True, at_zero=1.0,
-        slopes=(lambda g, a, y: g.apply("neg", g.apply("sin", a)),),
+    "acos": _function(
+        np.arccos, "math.acos({0})", iv.acos, ts.acos, lambda g, a, y: _arc_slope(g, -1.0, a), undefined=iv.beyond_one,
     ),
-    "tan": Operation(
-        numpy=np.tan, kernel="math.tan({0})", interval=iv.tan, series=ts.tan, in_files=True, at_zero=0.0,
-        undefined=iv.tan_undefined, slopes=(lambda g, a, y: g.apply("add", g.const(1.0), g.apply("sq", y)),),
+    "atan": _function(
+        np.arctan, "math.atan({0})", iv.atan, ts.atan,
+        lambda g, a, y: g.apply("div", g.const(1.0), g.apply("add", g.const(1.0), g.apply("sq", a))), at_zero=0.0,
     ),
-    "asin": Operation(
-        numpy=np.arcsin, kernel="math.asin({0})", interval=iv.asin, series=ts.asin, in_files=True, at_zero=0.0,
-        undefined=iv.beyond_one, slopes=(lambda g, a, y: _arc_slope(g, 1.0, a),),
+    "sinh": _function(np.sinh, "math.sinh({0})", iv.sinh, ts.sinh, lambda g, a, y: g.apply("cosh", a), at_zero=0.0),
+    "cosh": _function(np.cosh, "math.cosh({0})", iv.cosh, ts.cosh, lambda g, a, y: g.apply("sinh", a), at_zero=1.0),
+    "tanh": _function(
+        np.tanh, "tanh({0})", iv.tanh, ts.tanh,
+        lambda g, a, y: g.apply("sub", g.const(1.0), g.apply("sq", y)), at_zero=0.0,
     ),
-    "acos": Operation(
-        numpy=np.arccos, kernel="math.acos({0})", interval=iv.acos, series=ts.acos, in_files=True,
-        undefined=iv.beyond_one, slopes=(lambda g, a, y: _arc_slope(g, -1.0, a),),
-    ),
-    "atan": Operation(
-        numpy=np.arctan, kernel="math.atan({0})", interval=iv.atan, series=ts.atan, in_files=True, at_zero=0.0,
-        slopes=(lambda g, a, y: g.apply("div", g.const(1.0), g.apply("add", g.const(1.0), g.apply("sq", a))),),
-    ),
-    "sinh": Operation(
-        numpy=np.sinh, kernel="math.sinh({0})", interval=iv.sinh, series=ts.sinh, in_files=True, at_zero=0.0,
-        slopes=(lambda g, a, y: g.apply("cosh", a),),
-    ),
-    "cosh": Operation(
-        numpy=np.cosh, kernel="math.cosh({0})", interval=iv.cosh, series=ts.cosh, in_files=True, at_zero=1.0,
-        slopes=(lambda g, a, y: g.apply("sinh", a),),
-    ),
-    "tanh": Operation(
-        numpy=np.tanh, kernel="tanh({0})", interval=iv.tanh, series=ts.tanh, in_files=True, at_zero=0.0,
-        slopes=(lambda g, a, y: g.apply("sub", g.const(1.0), g.apply("sq", y)),),
-    ),
-    "abs": Operation(
-        numpy=np.abs, kernel="abs({0})", interval=iv.abs_, series=ts.abs_, in_files=True, kink=_holds_zero,
-        slopes=(lambda g, a, y: g.apply("kink", a),),
-    ),
-    "kink": Operation(numpy=np.sign, kernel=_SIGN, interval=iv.kink, series=ts.kink, kink=_holds_zero),
+    "abs": _function(np.abs, "abs({0})", iv.abs_, ts.abs_, lambda g, a, y: g.apply("kink", a), kink=_holds_zero),
+    "kink": Operation(np.sign, _SIGN, iv.kink, ts.kink, kink=_holds_zero),
     "sign": _step(np.sign, _SIGN, iv.sign),
     "floor": _step(np.floor, "np.floor({0})", iv.floor),
-    "not": _step(
-        lambda a: np.asarray(np.equal(a, 0), dtype=float)[()], "(1.0 if {0} == 0.0 else 0.0)", iv.not_
-    ),
+    "not": _step(lambda a: np.asarray(np.equal(a, 0), dtype=float)[()], "(1.0 if {0} == 0.0 else 0.0)", iv.not_),
     "pow": Operation(
-        numpy=lambda base, exponent: np.power(np.asarray(base, dtype=float), exponent), kernel="{0} ** {1}",
-        interval=iv.pow_, series=ts.power, undefined=iv.power_undefined, slopes=(_power_slope,),
+        lambda base, exponent: np.power(np.asarray(base, dtype=float), exponent), "{0} ** {1}", iv.pow_, ts.power,
+        (_power_slope,), undefined=iv.power_undefined,
     ),
     "add": Operation(
-        numpy=np.add, kernel="{0} + {1}", interval=ia.add, series=ts.add,
-        slopes=(lambda g, a, b, y: g.const(1.0), lambda g, a, b, y: g.const(1.0)),
+        np.add, "{0} + {1}", ia.add, ts.add, (lambda g, a, b, y: g.const(1.0), lambda g, a, b, y: g.const(1.0)),
     ),
     "sub": Operation(
-        numpy=np.subtract, kernel="{0} - {1}", interval=ia.subtract, series=ts.subtract,
-        slopes=(lambda g, a, b, y: g.const(1.0), lambda g, a, b, y: g.const(-1.0)),
+        np.subtract, "{0} - {1}", ia.subtract, ts.subtract,
+        (lambda g, a, b, y: g.const(1.0), lambda g, a, b, y: g.const(-1.0)),
     ),
-    "mul": Operation(
-        numpy=np.multiply, kernel="{0} * {1}", interval=ia.multiply, series=ts.product,
-        slopes=(lambda g, a, b, y: b, lambda g, a, b, y: a),
-    ),
+    "mul": Operation(np.multiply, "{0} * {1}", ia.multiply, ts.product, (lambda g, a, b, y: b, lambda g, a, b, y: a)),
     "div": Operation(
-        numpy=np.divide, kernel="{0} / {1}", interval=ia.divide, series=ts.divide,
+        np.divide, "{0} / {1}", ia.divide, ts.divide,
+        (lambda g, a, b, y: g.apply("div", g.const(1.0), b), lambda g, a, b, y: g.apply("neg", g.apply("div", y, b))),
         undefined=lambda x, y: np.broadcast_arrays(_holds_zero(y), x.lo)[0],
-        slopes=(
-            lambda g, a, b, y: g.apply("div", g.const(1.0), b),
-            lambda g, a, b, y: g.apply("neg", g.apply("div", y, b)),
-        ),
     ),
     "atan2": Operation(
-        numpy=np.arctan2, kernel="atan2({0}, {1})", interval=iv.atan2, series=ts.atan2, in_files=True,
-        undefined=iv.across_cut, jump=lambda _, y, x: iv.across_cut(y, x),
-        slopes=(
+        np.arctan2, "atan2({0}, {1})", iv.atan2, ts.atan2,
+        (
             lambda g, a, b, y: _angle_slope(g, lambda: b, a, b),
             lambda g, a, b, y: _angle_slope(g, lambda: g.apply("neg", a), a, b),
-        ),
+        ), in_files=True, undefined=iv.across_cut, jump=lambda _, y, x: iv.across_cut(y, x),
     ),
     "hypot": Operation(
-        numpy=np.hypot, kernel="math.hypot({0}, {1})", interval=iv.hypot, series=ts.hypot, in_files=True,
-        slopes=(lambda g, a, b, y: g.apply("div", a, y), lambda g, a, b, y: g.apply("div", b, y)),
+        np.hypot, "math.hypot({0}, {1})", iv.hypot, ts.hypot,
+        (lambda g, a, b, y: g.apply("div", a, y), lambda g, a, b, y: g.apply("div", b, y)), in_files=True,
     ),
     "min": Operation(
-        numpy=np.minimum, kernel="({0} if {0} < {1} or {0} != {0} else {1})", interval=iv.minimum, series=ts.minimum,
-        in_files=True, kink=_overlap,
-        slopes=(lambda g, a, b, y: _below(g, a, b), lambda g, a, b, y: _above(g, a, b)),
+        np.minimum, "({0} if {0} < {1} or {0} != {0} else {1})", iv.minimum, ts.minimum,
+        (lambda g, a, b, y: _below(g, a, b), lambda g, a, b, y: _above(g, a, b)), in_files=True, kink=_overlap,
     ),
     "max": Operation(
-        numpy=np.maximum, kernel="({0} if {0} > {1} or {0} != {0} else {1})", interval=iv.maximum, series=ts.maximum,
-        in_files=True, kink=_overlap,
-        slopes=(lambda g, a, b, y: _above(g, a, b), lambda g, a, b, y: _below(g, a, b)),
+        np.maximum, "({0} if {0} > {1} or {0} != {0} else {1})", iv.maximum, ts.maximum,
+        (lambda g, a, b, y: _above(g, a, b), lambda g, a, b, y: _below(g, a, b)), in_files=True, kink=_overlap,
     ),
     "lt": _step(_truth(np.less), "(1.0 if {0} < {1} else 0.0)", iv.less),
     "le": _step(_truth(np.less_equal), "(1.0 if {0} <= {1} else 0.0)", iv.less_equal),
@@ -272,8 +251,8 @@ OPERATIONS: dict[str, Operation] = {
     "and": _step(_truth(np.logical_and), "(1.0 if {0} != 0.0 and {1} != 0.0 else 0.0)", iv.and_),
     "or": _step(_truth(np.logical_or), "(1.0 if {0} != 0.0 or {1} != 0.0 else 0.0)", iv.or_),
     "if_else_zero": Operation(
-        numpy=lambda c, y: np.where(np.not_equal(c, 0), y, 0.0)[()], kernel="({1} if {0} != 0.0 else 0.0)",
-        interval=iv.if_else_zero, series=ts.if_else_zero, jump=lambda _, c, y: _holds_zero(c) & (c.lo != c.hi),
+        lambda c, y: np.where(np.not_equal(c, 0), y, 0.0)[()], "({1} if {0} != 0.0 else 0.0)", iv.if_else_zero,
+        ts.if_else_zero, jump=lambda _, c, y: _holds_zero(c) & (c.lo != c.hi),
     ),
 }  # fmt: skip
 """Operation name to its row (``const`` and ``input``, which compute nothing, have none)."""
