@@ -15,7 +15,7 @@ from certbound.checker.expressions import arithmetic as balls
 from certbound.checker.expressions import series as ts
 from certbound.checker.expressions import taylor as tm
 
-__all__ = ["OPERATIONS", "Operation", "is_partial"]
+__all__ = ["OPERATIONS", "Operation", "function", "is_partial"]
 
 
 class Builder(Protocol):
@@ -63,7 +63,7 @@ def is_partial(op: str) -> bool:
     return op in OPERATIONS and OPERATIONS[op].partial
 
 
-def _function(
+def function(
     ball: Callable[[arb], arb], series: Callable[[ts.Series], ts.Series], outer: Callable[..., int],
     derivatives: Callable[[arb, arb], tuple[arb, arb, arb, arb]], *, partial: bool = False,
 ) -> Operation:
@@ -111,22 +111,22 @@ OPERATIONS: dict[str, Operation] = {
     "sq": Operation(
         balls.square, ts.sq, _chain(lambda g, y, a: g.mul(g.const(2.0), a)), lambda x: tm.mul(x, x)
     ),
-    "sqrt": _function(balls.sqrt, ts.sqrt, lambda g, y, a: g.div(g.const(0.5), y), tm.sqrt, partial=True),
-    "exp": _function(balls.exp, ts.exp, lambda g, y, a: y, tm.exp),
-    "log": _function(balls.log, ts.log, lambda g, y, a: g.div(g.const(1.0), a), tm.log, partial=True),
-    "sin": _function(balls.sin, lambda x: ts.circular(x)[0], lambda g, y, a: g.apply("cos", a), tm.sin),
-    "cos": _function(balls.cos, lambda x: ts.circular(x)[1], lambda g, y, a: g.neg(g.apply("sin", a)), tm.cos),
-    "tan": _function(
+    "sqrt": function(balls.sqrt, ts.sqrt, lambda g, y, a: g.div(g.const(0.5), y), tm.sqrt, partial=True),
+    "exp": function(balls.exp, ts.exp, lambda g, y, a: y, tm.exp),
+    "log": function(balls.log, ts.log, lambda g, y, a: g.div(g.const(1.0), a), tm.log, partial=True),
+    "sin": function(balls.sin, lambda x: ts.circular(x)[0], lambda g, y, a: g.apply("cos", a), tm.sin),
+    "cos": function(balls.cos, lambda x: ts.circular(x)[1], lambda g, y, a: g.neg(g.apply("sin", a)), tm.cos),
+    "tan": function(
         arb.tan, ts.tan, lambda g, y, a: g.add(g.const(1.0), g.apply("sq", y)), tm.tan, partial=True
     ),
-    "asin": _function(balls.asin, ts.asin, lambda g, y, a: _arc_slope(g, 1.0, a), tm.asin, partial=True),
-    "acos": _function(balls.acos, ts.acos, lambda g, y, a: _arc_slope(g, -1.0, a), tm.acos, partial=True),
-    "atan": _function(
+    "asin": function(balls.asin, ts.asin, lambda g, y, a: _arc_slope(g, 1.0, a), tm.asin, partial=True),
+    "acos": function(balls.acos, ts.acos, lambda g, y, a: _arc_slope(g, -1.0, a), tm.acos, partial=True),
+    "atan": function(
         balls.atan, ts.atan, lambda g, y, a: g.div(g.const(1.0), g.add(g.const(1.0), g.apply("sq", a))), tm.atan
     ),
-    "sinh": _function(balls.sinh, lambda x: ts.hyperbolic(x)[0], lambda g, y, a: g.apply("cosh", a), tm.sinh),
-    "cosh": _function(balls.cosh, lambda x: ts.hyperbolic(x)[1], lambda g, y, a: g.apply("sinh", a), tm.cosh),
-    "tanh": _function(balls.tanh, ts.tanh, lambda g, y, a: g.sub(g.const(1.0), g.apply("sq", y)), tm.tanh),
+    "sinh": function(balls.sinh, lambda x: ts.hyperbolic(x)[0], lambda g, y, a: g.apply("cosh", a), tm.sinh),
+    "cosh": function(balls.cosh, lambda x: ts.hyperbolic(x)[1], lambda g, y, a: g.apply("sinh", a), tm.cosh),
+    "tanh": function(balls.tanh, ts.tanh, lambda g, y, a: g.sub(g.const(1.0), g.apply("sq", y)), tm.tanh),
     "abs": Operation(abs, ts.abs_, _chain(lambda g, y, a: g.apply("kink", a)), tm.abs_),
     "pow": Operation(balls.power, ts.power, _power_slope, tm.power, partial=True),
     "add": Operation(lambda x, y: x + y, ts.add, lambda g, y, a, b, da, db: g.add(da, db), tm.add),

@@ -16,6 +16,7 @@ from certbound.problem.model.operations import OPERATIONS, enclosed, operands, u
 from certbound.problem.model.tape import ARITY, JUMPS
 from certbound.reach.nominal.series import expand
 from certbound.rigor.intervals import Interval
+from tests.simulation.test_tape_text import run
 
 EXPONENT = 2.5
 TAME = [(0.3, 0.7), (0.8, 0.4), (0.45, 0.55)]
@@ -98,6 +99,14 @@ def test_what_is_decided_does_not_jump_and_has_no_kink(op: str) -> None:
         smooth = tame & ~row.kink(*args)
         assert 50 < smooth.sum() < len(smooth)
         np.testing.assert_array_equal(slopes[0][smooth], slopes[1][smooth])
+
+
+@every_operation
+def test_kernels_compute_the_values(op: str) -> None:
+    for point in [*TAME, (0.3, -1.2), (-1.2, 0.3), (0.5, 0.5), (0.0, 2.0)]:
+        expected = compile_numpy(tape_of(op))(*point)
+        if np.isfinite(expected):
+            np.testing.assert_allclose(run(tape_of(op), *point), expected, rtol=1e-14, atol=0)
 
 
 @every_operation
