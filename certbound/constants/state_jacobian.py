@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.constants.enclosures import Spread, enclose
-from certbound.problem.model import OPERATIONS, Node, Tape, compile_numpy, jacobian
+from certbound.problem.model import OPERATIONS, Node, Tape, compile_numpy, jacobian, sources
 from certbound.rigor.intervals import Interval
 
 __all__ = ["StateJacobian"]
@@ -159,17 +159,7 @@ def _is_risky(node: Node) -> bool:
 
 def _dependencies(tape: Tape) -> tuple[int, ...]:
     """Input slots on which the outputs depend."""
-    needed = set(tape.outputs)
-    slots = set()
-    for index in range(len(tape.nodes) - 1, -1, -1):
-        if index not in needed:
-            continue
-        node = tape.nodes[index]
-        if node.op == "input":
-            slots.add(node.args[0])
-        else:
-            needed.update(node.args)
-    return tuple(sorted(slots))
+    return tuple(sorted(set().union(*sources(tape))))
 
 
 def _folded(tape: Tape, ranges: Interval, active: Sequence[int]) -> Interval:

@@ -2,7 +2,8 @@
 
 A series [x_0, x_1, ..., x_m] stands for x(s) = x_0 + x_1 s + x_2 s^2 + ...; coefficients left out are 0. The
 recurrences are those of automatic differentiation: y = F(x) satisfies a linear relation between y' and x'. Every
-function takes its arguments and the highest order wanted, and encloses the coefficients for all values within theirs.
+function takes its arguments and the highest order wanted, and encloses the coefficients for all values within theirs;
+the names are those of the functions in ``elementary``.
 
 Where a kink (abs, min, max) is undecided the first coefficient is that of the generalised derivative and all later ones
 are unbounded; where a jump is undecided everything is unbounded.
@@ -19,9 +20,9 @@ from certbound.rigor import elementary as iv
 from certbound.rigor.arithmetic import Interval
 
 __all__ = [
-    "Series", "abs_", "acos", "add", "asin", "atan", "atan2", "cos", "cosh", "derivative", "divide", "exp", "hypot",
-    "if_else_zero", "integral", "jump", "kink", "log", "maximum", "minimum", "power", "product", "sin", "sinh", "sq",
-    "sqrt", "subtract", "tan", "tanh",
+    "Series", "abs_", "acos", "add", "asin", "atan", "atan2", "circular", "derivative", "divide", "exp", "hyperbolic",
+    "hypot", "if_else_zero", "integral", "jump", "kink", "log", "maximum", "minimum", "power", "product", "sq", "sqrt",
+    "subtract", "tan", "tanh",
 ]  # fmt: skip
 
 Series = list[Interval]
@@ -41,13 +42,11 @@ def _at(x: Series, k: int) -> Interval:
 
 
 def add(x: Series, y: Series, order: int) -> Series:
-    """x + y."""
     common = min(len(x), len(y))
     return [*(a + b for a, b in zip(x, y)), *x[common:], *y[common:]]
 
 
 def subtract(x: Series, y: Series, order: int) -> Series:
-    """x - y."""
     common = min(len(x), len(y))
     return [*(a - b for a, b in zip(x, y)), *x[common:], *(-b for b in y[common:])]
 
@@ -64,7 +63,6 @@ def product(x: Series, y: Series, order: int | None = None) -> Series:
 
 
 def divide(x: Series, y: Series, order: int) -> Series:
-    """x / y."""
     if len(y) == 1:
         return [coefficient / y[0] for coefficient in x]
     result: Series = []
@@ -75,7 +73,6 @@ def divide(x: Series, y: Series, order: int) -> Series:
 
 
 def sq(x: Series, order: int) -> Series:
-    """x^2."""
     result = product(x, x, order)
     result[0] = iv.sq(x[0])
     return result
@@ -91,7 +88,6 @@ def _root(x: Series, first: Interval, order: int) -> Series:
 
 
 def sqrt(x: Series, order: int) -> Series:
-    """Square root."""
     return _root(x, iv.sqrt(x[0]), order)
 
 
@@ -101,7 +97,6 @@ def _slopes(x: Series, order: int) -> list[tuple[int, Interval]]:
 
 
 def derivative(x: Series, order: int) -> Series:
-    """x'."""
     return [value for _, value in _slopes(x, order)] or [ZERO]
 
 
@@ -127,7 +122,6 @@ def _spoiled(undefined: Any, series: Series) -> Series:
 
 
 def exp(x: Series, order: int) -> Series:
-    """Exponential."""
     result, slopes = [iv.exp(x[0])], _slopes(x, order)
     for k in range(1, order + 1):
         result.append(_next(slopes, result, k))
@@ -135,7 +129,6 @@ def exp(x: Series, order: int) -> Series:
 
 
 def log(x: Series, order: int) -> Series:
-    """Natural logarithm."""
     return _spoiled(x[0].lo <= 0, integral(iv.log(x[0]), derivative(x, order), x, order))
 
 
@@ -149,24 +142,14 @@ def _pair(x: Series, first: Interval, second: Interval, sign: float, order: int)
     return one, two
 
 
-def sin(x: Series, order: int) -> Series:
-    """Sine."""
-    return _pair(x, iv.sin(x[0]), iv.cos(x[0]), -1.0, order)[0]
+def circular(x: Series, order: int) -> tuple[Series, Series]:
+    """Sine and cosine."""
+    return _pair(x, iv.sin(x[0]), iv.cos(x[0]), -1.0, order)
 
 
-def cos(x: Series, order: int) -> Series:
-    """Cosine."""
-    return _pair(x, iv.sin(x[0]), iv.cos(x[0]), -1.0, order)[1]
-
-
-def sinh(x: Series, order: int) -> Series:
-    """Hyperbolic sine."""
-    return _pair(x, iv.sinh(x[0]), iv.cosh(x[0]), 1.0, order)[0]
-
-
-def cosh(x: Series, order: int) -> Series:
-    """Hyperbolic cosine."""
-    return _pair(x, iv.sinh(x[0]), iv.cosh(x[0]), 1.0, order)[1]
+def hyperbolic(x: Series, order: int) -> tuple[Series, Series]:
+    """Hyperbolic sine and cosine."""
+    return _pair(x, iv.sinh(x[0]), iv.cosh(x[0]), 1.0, order)
 
 
 def _riccati(x: Series, first: Interval, sign: float, order: int) -> Series:
@@ -179,17 +162,14 @@ def _riccati(x: Series, first: Interval, sign: float, order: int) -> Series:
 
 
 def tan(x: Series, order: int) -> Series:
-    """Tangent."""
     return _riccati(x, iv.tan(x[0]), 1.0, order)
 
 
 def tanh(x: Series, order: int) -> Series:
-    """Hyperbolic tangent."""
     return _riccati(x, iv.tanh(x[0]), -1.0, order)
 
 
 def atan(x: Series, order: int) -> Series:
-    """Arc tangent."""
     first, *rest = sq(x, order)
     return integral(iv.atan(x[0]), derivative(x, order), [first + 1.0, *rest], order)
 
@@ -201,22 +181,18 @@ def _opposite(x: Series, order: int) -> Series:
 
 
 def asin(x: Series, order: int) -> Series:
-    """Arc sine."""
     return integral(iv.asin(x[0]), derivative(x, order), _opposite(x, order), order)
 
 
 def acos(x: Series, order: int) -> Series:
-    """Arc cosine."""
     return integral(iv.acos(x[0]), [-value for value in derivative(x, order)], _opposite(x, order), order)
 
 
 def hypot(x: Series, y: Series, order: int) -> Series:
-    """sqrt(x^2 + y^2)."""
     return _root(add(sq(x, order), sq(y, order), order), iv.hypot(x[0], y[0]), order)
 
 
 def atan2(y: Series, x: Series, order: int) -> Series:
-    """Angle of the points (x, y)."""
     first, second = product(x, derivative(y, order), order), product(y, derivative(x, order), order)
     squares = add(sq(x, order), sq(y, order), order)
     result = integral(iv.atan2(y[0], x[0]), subtract(first, second, order), squares, order)
@@ -278,22 +254,18 @@ def _selected(first: Any, second: Any, value: Interval, x: Series, y: Series) ->
 
 
 def abs_(x: Series, order: int) -> Series:
-    """Absolute value."""
     return _selected(x[0].lo >= 0, x[0].hi <= 0, iv.abs_(x[0]), x, [-value for value in x])
 
 
 def maximum(x: Series, y: Series, order: int) -> Series:
-    """Larger of two."""
     return _selected(x[0].lo >= y[0].hi, y[0].lo >= x[0].hi, iv.maximum(x[0], y[0]), x, y)
 
 
 def minimum(x: Series, y: Series, order: int) -> Series:
-    """Smaller of two."""
     return _selected(x[0].hi <= y[0].lo, y[0].hi <= x[0].lo, iv.minimum(x[0], y[0]), x, y)
 
 
 def kink(x: Series, order: int) -> Series:
-    """Generalised derivative of the absolute value."""
     value = iv.kink(x[0])
     decided = value.lo == value.hi
     if np.all(decided):
@@ -317,7 +289,6 @@ def jump(function: Callable[..., Interval]) -> Callable[..., Series]:
 
 
 def if_else_zero(condition: Series, x: Series, order: int) -> Series:
-    """x where the condition holds, else 0."""
     flag = condition[0]
     result = []
     for k in range(order + 1 if np.any(flag.lo != flag.hi) else len(x)):

@@ -178,9 +178,13 @@ OPERATIONS: dict[str, Operation] = {
         np.log, "math.log({0})", iv.log, ts.log,
         lambda g, a, y: g.apply("div", g.const(1.0), a), undefined=lambda x: x.lo <= 0,
     ),
-    "sin": _function(np.sin, "math.sin({0})", iv.sin, ts.sin, lambda g, a, y: g.apply("cos", a), at_zero=0.0),
+    "sin": _function(
+        np.sin, "math.sin({0})", iv.sin, lambda x, order: ts.circular(x, order)[0],
+        lambda g, a, y: g.apply("cos", a), at_zero=0.0,
+    ),
     "cos": _function(
-        np.cos, "math.cos({0})", iv.cos, ts.cos, lambda g, a, y: g.apply("neg", g.apply("sin", a)), at_zero=1.0,
+        np.cos, "math.cos({0})", iv.cos, lambda x, order: ts.circular(x, order)[1],
+        lambda g, a, y: g.apply("neg", g.apply("sin", a)), at_zero=1.0,
     ),
     "tan": _function(
         np.tan, "math.tan({0})", iv.tan, ts.tan,
@@ -197,8 +201,14 @@ OPERATIONS: dict[str, Operation] = {
         np.arctan, "math.atan({0})", iv.atan, ts.atan,
         lambda g, a, y: g.apply("div", g.const(1.0), g.apply("add", g.const(1.0), g.apply("sq", a))), at_zero=0.0,
     ),
-    "sinh": _function(np.sinh, "math.sinh({0})", iv.sinh, ts.sinh, lambda g, a, y: g.apply("cosh", a), at_zero=0.0),
-    "cosh": _function(np.cosh, "math.cosh({0})", iv.cosh, ts.cosh, lambda g, a, y: g.apply("sinh", a), at_zero=1.0),
+    "sinh": _function(
+        np.sinh, "math.sinh({0})", iv.sinh, lambda x, order: ts.hyperbolic(x, order)[0],
+        lambda g, a, y: g.apply("cosh", a), at_zero=0.0,
+    ),
+    "cosh": _function(
+        np.cosh, "math.cosh({0})", iv.cosh, lambda x, order: ts.hyperbolic(x, order)[1],
+        lambda g, a, y: g.apply("sinh", a), at_zero=1.0,
+    ),
     "tanh": _function(
         np.tanh, "tanh({0})", iv.tanh, ts.tanh,
         lambda g, a, y: g.apply("sub", g.const(1.0), g.apply("sq", y)), at_zero=0.0,
