@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from certbound.problem.model import OPERATIONS, Node, Tape
+from certbound.problem.model import OPERATIONS, Node, Tape, needed
 
 __all__ = ["Parameters", "function_source", "linear_form", "live_nodes"]
 
@@ -37,12 +37,7 @@ class Parameters:
 
 def live_nodes(tape: Tape) -> list[int]:
     """Indices of the nodes that the outputs need, in order."""
-    needed = set(tape.outputs)
-    for index in range(len(tape.nodes) - 1, -1, -1):
-        node = tape.nodes[index]
-        if index in needed and node.op != "input":
-            needed.update(node.args)
-    return sorted(needed)
+    return [index for index, live in enumerate(needed(tape.nodes, tape.outputs)) if live]
 
 
 def function_source(name: str, tape: Tape, arguments: Sequence[str], parameters: Parameters) -> list[str]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from certbound.problem.model.evaluation import compile_numpy, compile_scalar
     from certbound.problem.model.graph import Graph, substitute
     from certbound.problem.model.operations import OPERATIONS, arithmetic, enclosed, undefined_where
-    from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape
+    from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
     from certbound.problem.model.tracing import trace
 
 _HOME = {
@@ -39,6 +39,7 @@ _HOME = {
     "is_zero": "analysis",
     "jacobian": "derivative",
     "JUMPS": "tape",
+    "needed": "tape",
     "Node": "tape",
     "OPERATIONS": "operations",
     "selected": "analysis",
@@ -64,6 +65,7 @@ __all__ = [
     "is_zero",
     "jacobian",
     "JUMPS",
+    "needed",
     "Node",
     "OPERATIONS",
     "selected",

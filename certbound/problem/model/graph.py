@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 from certbound.problem.model.operations import OPERATIONS
-from certbound.problem.model.tape import ARITY, Node, Tape
+from certbound.problem.model.tape import ARITY, Node, Tape, needed
 
 __all__ = ["Graph", "substitute"]
 
@@ -55,17 +55,11 @@ class Graph:
 
     def tape(self, outputs: Sequence[int], shape: tuple[int, ...], keep: int = 0) -> Tape:
         """The finished tape, less the nodes that no output needs (the first ``keep`` nodes always stay)."""
-        needed = [index < keep for index in range(len(self.nodes))]
-        for output in outputs:
-            needed[output] = True
-        for index in range(len(self.nodes) - 1, -1, -1):
-            if needed[index] and self.nodes[index].op != "input":
-                for arg in self.nodes[index].args:
-                    needed[arg] = True
+        live = needed(self.nodes, outputs, keep)
         place: dict[int, int] = {}
         nodes: list[Node] = []
         for index, node in enumerate(self.nodes):
-            if needed[index]:
+            if live[index]:
                 place[index] = len(nodes)
                 nodes.append(
                     node if node.op == "input" else node._replace(args=tuple(place[a] for a in node.args))

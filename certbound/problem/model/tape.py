@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
-__all__ = ["ARITY", "JUMPS", "Node", "Tape"]
+__all__ = ["ARITY", "JUMPS", "Node", "Tape", "needed"]
 
 T = TypeVar("T")
 
@@ -123,3 +123,15 @@ class Tape:
         if node.op in ("pow", "sq"):
             return f"{parts[0]}**{2 if node.op == 'sq' else node.value:g}"
         return f"-{parts[0]}" if node.op == "neg" else f"{node.op}({', '.join(parts)})"
+
+
+def needed(nodes: Sequence[Node], outputs: Sequence[int], keep: int = 0) -> list[bool]:
+    """Whether each node is an output, one of the first ``keep``, or what one of these depends on."""
+    found = [index < keep for index in range(len(nodes))]
+    for output in outputs:
+        found[output] = True
+    for index in range(len(nodes) - 1, -1, -1):
+        if found[index] and nodes[index].op != "input":
+            for arg in nodes[index].args:
+                found[arg] = True
+    return found

@@ -128,16 +128,8 @@ def _like(value: Any, number: Any) -> Any:
     return Scalar(value.graph, _lift(value.graph, number)) if isinstance(value, Scalar) else number
 
 
-_add, _sub, _mul, _div, _neg = _node("add"), _node("sub"), _node("mul"), _node("div"), _node("neg")
-_exp, _log, _sqrt, _sq, _abs = _node("exp"), _node("log"), _node("sqrt"), _node("sq"), _node("abs")
-_min, _max, _lt, _le, _not, _floor = (
-    _node("min"),
-    _node("max"),
-    _node("lt"),
-    _node("le"),
-    _node("not"),
-    _node("floor"),
-)
+_add, _sub, _mul, _div, _neg, _exp, _log, _sqrt = map(_node, ("add", "sub", "mul", "div", "neg", "exp", "log", "sqrt"))
+_sq, _abs, _min, _max, _lt, _le, _not, _floor = map(_node, ("sq", "abs", "min", "max", "lt", "le", "not", "floor"))
 
 
 def _where(condition: Any, x: Any, y: Any) -> Any:
@@ -317,13 +309,8 @@ def _install() -> None:
         "mod": "remainder", "floordiv": "floor_divide", "and": "logical_and", "or": "logical_or",
     }  # fmt: skip
     comparisons = {
-        "lt": "less",
-        "le": "less_equal",
-        "gt": "greater",
-        "ge": "greater_equal",
-        "eq": "equal",
-        "ne": "not_equal",
-    }
+        "lt": "less", "le": "less_equal", "gt": "greater", "ge": "greater_equal", "eq": "equal", "ne": "not_equal",
+    }  # fmt: skip
 
     def method(name: str, reflected: bool = False) -> Callable[..., Any]:
         function = FUNCTIONS[name]
