@@ -27,7 +27,7 @@ import numpy as np
 
 import certbound.rigor.arithmetic
 import certbound.rigor.elementary
-from certbound.checker.expressions import arithmetic as balls
+from certbound.checker.expressions import OPERATIONS
 from certbound.constants.model_data import Model, model_of
 from certbound.constants.state_jacobian import StateJacobian
 from certbound.rigor.intervals import Interval, matmul
@@ -154,7 +154,7 @@ def immrax_version() -> str | None:
 
 def exact(jacobian: StateJacobian, points: np.ndarray) -> list[list[Any]]:
     """Jacobians at points (N, k) of the active slots, as balls of 200 bits."""
-    operations = {**balls.BALLS, "const": flint.arb, "pow": balls.power}
+    operations = {"const": flint.arb, **{op: row.ball for op, row in OPERATIONS.items()}}
     point = np.clip(0.0, jacobian.ranges.lo, jacobian.ranges.hi)
     rows = []
     with flint.ctx.workprec(200):

@@ -87,7 +87,7 @@ KNOWS_ONLY = {  # rooms that may be taken out and used elsewhere
     "values": GROUND | {"problem"},
 }
 CHECKER_MAY_IMPORT = {"certbound.errors", "certbound.problem.model", "flint"}
-CHECKER_TAKES = {"Tape", "Node", "JUMPS", "BINARY"}
+CHECKER_TAKES = {"Tape", "Node", "JUMPS"}
 """What the checker may take of ``problem.model``: the description of a tape."""
 
 ENTERED = {
@@ -98,17 +98,17 @@ ENTERED = {
 MOST_DOORS = 5
 MANY_DOORS = {
     "gaussian.scalar": (27, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
-    "problem.model": (18, "the one description of functions, which every room reads, differentiates and evaluates"),
+    "problem.model": (23, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),
     "reach.linear": (14, "certificates state the records of the search: its linearisation, rows, levels, references"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
     "constants.programs": (15, "one program each for rate, gain and erosion, with what it is asked"),
     "checker.balls": (13, "operations on ball matrices, as a library would offer them"),
     "problem.sets": (11, "the sets and constraints that users write"),
-    "reach.nominal": (11, "curves and series, which every kind of tube is made of"),
+    "reach.nominal": (10, "curves and series, which every kind of tube is made of"),
     "checker.statement": (10, "what a certificate states is read once and asked by three proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
-    "checker.expressions": (9, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
+    "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (7, "to and from each library"),
@@ -135,6 +135,7 @@ TWICE = {
     "graph": "expressions as a shared graph",
     "linear": "the linear-response engine, its certificate",
     "normal": "tails of the normal distribution",
+    "operations": "the table of the operations of a tape: the prover's, and the checker's own",
     "problem": "a safety problem",
     "proof": "the proof of a whole certificate of one kind",
     "reach_tube": "the noise-free reach tube",

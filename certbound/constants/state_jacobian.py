@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.constants.enclosures import Spread, enclose
-from certbound.problem.model import JUMPS, Node, Tape, compile_numpy, jacobian
-from certbound.rigor.intervals import UNDEFINED, Interval
+from certbound.problem.model import OPERATIONS, Node, Tape, compile_numpy, jacobian, sources
+from certbound.rigor.intervals import Interval
 
 __all__ = ["StateJacobian"]
 
@@ -146,24 +146,20 @@ def _is_affine(tape: Tape, slot: int) -> bool:
             continue
         inner = [depends[arg] for arg in node.args]
         depends.append(any(inner))
-        if (node.op in JUMPS or node.op in UNDEFINED) and (inner[-1] if node.op == "div" else any(inner)):
+        if _is_risky(node) and (inner[-1] if node.op == "div" else any(inner)):
             return False
     return slot not in _dependencies(jacobian(tape, [slot]))
 
 
+def _is_risky(node: Node) -> bool:
+    """Whether it may jump or be undefined."""
+    row = OPERATIONS.get(node.op)
+    return row is not None and (row.jump is not None or row.undefined is not None)
+
+
 def _dependencies(tape: Tape) -> tuple[int, ...]:
     """Input slots on which the outputs depend."""
-    needed = set(tape.outputs)
-    slots = set()
-    for index in range(len(tape.nodes) - 1, -1, -1):
-        if index not in needed:
-            continue
-        node = tape.nodes[index]
-        if node.op == "input":
-            slots.add(node.args[0])
-        else:
-            needed.update(node.args)
-    return tuple(sorted(slots))
+    return tuple(sorted(set().union(*sources(tape))))
 
 
 def _folded(tape: Tape, ranges: Interval, active: Sequence[int]) -> Interval:
@@ -186,7 +182,7 @@ def _is_angle(tape: Tape, slot: int) -> bool:
             turns.append(1 if node.args[0] == slot else 0)
             continue
         args = [turns[arg] for arg in node.args]
-        risky = node.op in JUMPS or node.op in UNDEFINED
+        risky = _is_risky(node)
         if risky and node.op != "tan" and any(args):
             return False
         turns.append(_turns(node.op, args, [tape.nodes[arg] for arg in node.args]))

@@ -1,24 +1,25 @@
-"""Elementary functions of intervals, and the arithmetic in which tapes are read.
+"""Elementary functions of intervals.
 
 NumPy's functions are not correctly rounded: their results are widened by `LIBRARY_ULPS` units and then cut to
 the function's range (sin and tanh to [-1, 1], exp to [0, inf)). An operation that is undefined somewhere on
-its argument gives [-inf, inf]; `UNDEFINED` says where. Re-exported by ``certbound.rigor.intervals``.
+its argument gives [-inf, inf]. Of an undecided jump a result encloses all values that the operation may take.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.rigor.arithmetic import Interval, add, divide, multiply, power, subtract
+from certbound.rigor.arithmetic import Interval, power
 from certbound.rigor.rounding import LIBRARY_ULPS, STEP, TINY, lower, quiet, upper
 
 __all__ = [
-    "ARITHMETIC", "UNDEFINED", "abs_", "acos", "asin", "atan", "atan2", "cos", "cosh", "exp", "hypot", "log",
-    "maximum", "minimum", "pow_", "sin", "sinh", "sq", "sqrt", "tan", "tanh",
+    "abs_", "across_cut", "acos", "and_", "asin", "atan", "atan2", "beyond_one", "cos", "cosh", "equal", "exp", "floor",
+    "hypot", "if_else_zero", "kink", "less", "less_equal", "log", "maximum", "minimum", "not_", "or_", "pow_",
+    "power_undefined", "sign", "sin", "sinh", "sq", "sqrt", "tan", "tan_undefined", "tanh",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -119,14 +120,14 @@ def asin(x: Interval) -> Interval:
     """Arc sine; undefined where x leaves [-1, 1]."""
     inside = Interval._raw(np.clip(x.lo, -1.0, 1.0), np.clip(x.hi, -1.0, 1.0))
     angle = _clip(_signed(_rising(np.arcsin, inside), x), -HALF_PI_UP, HALF_PI_UP)
-    return _everything_where(_beyond_one(x), angle)
+    return _everything_where(beyond_one(x), angle)
 
 
 @quiet
 def acos(x: Interval) -> Interval:
     """Arc cosine; undefined where x leaves [-1, 1]."""
     lo, hi = np.arccos(np.clip(x.hi, -1.0, 1.0)), np.arccos(np.clip(x.lo, -1.0, 1.0))
-    return _everything_where(_beyond_one(x), _clip(_widen(lo, hi), 0.0, PI_UP))
+    return _everything_where(beyond_one(x), _clip(_widen(lo, hi), 0.0, PI_UP))
 
 
 def _holds_multiple(x: Interval, period: float, shift: float) -> Mask:
@@ -178,7 +179,7 @@ def cos(x: Interval) -> Interval:
 @quiet
 def tan(x: Interval) -> Interval:
     """Tangent; undefined where x may hold a pole, and beyond 2^20."""
-    return _everything_where(_tan_undefined(x), _rising(np.tan, x))
+    return _everything_where(tan_undefined(x), _rising(np.tan, x))
 
 
 @quiet
@@ -193,7 +194,7 @@ def atan2(y: Interval, x: Interval) -> Interval:
     last_x = np.where(y_hi <= 0, x_hi, x_lo)
     last_y = np.where(last_x > 0, y_hi, y_lo)
     angle = _widen(np.arctan2(first_y, first_x), np.arctan2(last_y, last_x))
-    return _everything_where(_across_cut(y, x), _clip(angle, -PI_UP, PI_UP))
+    return _everything_where(across_cut(y, x), _clip(angle, -PI_UP, PI_UP))
 
 
 @quiet
@@ -225,7 +226,7 @@ def pow_(x: Interval, exponent: float) -> Interval:
     """x ** exponent for a constant exponent; for a non-integer one undefined where x reaches below 0."""
     if float(exponent).is_integer():
         return power(x, int(exponent))
-    mask = _power_undefined(x, exponent)
+    mask = power_undefined(x, exponent)
     lo, hi = np.maximum(x.lo, 0.0), np.maximum(x.hi, 0.0)
     if exponent < 0:
         lo, hi = hi, lo
@@ -240,15 +241,18 @@ def _truth(yes: Mask, no: Mask) -> Interval:
     return Interval._raw(np.where(yes, 1.0, 0.0), np.where(no, 0.0, 1.0))
 
 
-def _less(x: Interval, y: Interval) -> Interval:
+def less(x: Interval, y: Interval) -> Interval:
+    """x < y, as 0 or 1."""
     return _truth(x.hi < y.lo, x.lo >= y.hi)
 
 
-def _less_equal(x: Interval, y: Interval) -> Interval:
+def less_equal(x: Interval, y: Interval) -> Interval:
+    """x <= y, as 0 or 1."""
     return _truth(x.hi <= y.lo, x.lo > y.hi)
 
 
-def _equal(x: Interval, y: Interval) -> Interval:
+def equal(x: Interval, y: Interval) -> Interval:
+    """x == y, as 0 or 1."""
     return _truth((x.lo == y.hi) & (x.hi == y.lo), (x.hi < y.lo) | (x.lo > y.hi))
 
 
@@ -262,72 +266,65 @@ def _true(x: Interval) -> Mask:
     return result
 
 
-def _not(x: Interval) -> Interval:
+def not_(x: Interval) -> Interval:
+    """Whether x is 0, as 0 or 1."""
     return _truth(_false(x), _true(x))
 
 
-def _and(x: Interval, y: Interval) -> Interval:
+def and_(x: Interval, y: Interval) -> Interval:
+    """Whether neither is 0, as 0 or 1."""
     return _truth(_true(x) & _true(y), _false(x) | _false(y))
 
 
-def _or(x: Interval, y: Interval) -> Interval:
+def or_(x: Interval, y: Interval) -> Interval:
+    """Whether one is not 0, as 0 or 1."""
     return _truth(_true(x) | _true(y), _false(x) & _false(y))
 
 
-def _if_else_zero(condition: Interval, value: Interval) -> Interval:
+def if_else_zero(condition: Interval, value: Interval) -> Interval:
+    """The value where the condition is not 0, else 0."""
     yes, no = _true(condition), _false(condition)
     lo = np.where(no, 0.0, np.where(yes, value.lo, np.minimum(value.lo, 0.0)))
     hi = np.where(no, 0.0, np.where(yes, value.hi, np.maximum(value.hi, 0.0)))
     return Interval._raw(lo, hi)
 
 
-def _kink(x: Interval) -> Interval:
+def sign(x: Interval) -> Interval:
+    """-1, 0 or 1."""
+    return Interval._raw(np.sign(x.lo), np.sign(x.hi))
+
+
+def floor(x: Interval) -> Interval:
+    """Largest whole number below."""
+    return Interval._raw(np.floor(x.lo), np.floor(x.hi))
+
+
+def kink(x: Interval) -> Interval:
+    """Generalised derivative of the absolute value."""
     return Interval._raw(np.where(x.lo > 0, 1.0, -1.0), np.where(x.hi < 0, -1.0, 1.0))
 
 
-ARITHMETIC: Mapping[str, Callable[..., Interval]] = {
-    "const": Interval.point, "pow": pow_, "neg": Interval.__neg__, "sq": sq, "sqrt": sqrt, "exp": exp,
-    "log": log, "sin": sin, "cos": cos, "tan": tan, "asin": asin, "acos": acos, "atan": atan, "sinh": sinh,
-    "cosh": cosh, "tanh": tanh, "abs": abs_, "add": add, "sub": subtract, "mul": multiply, "div": divide,
-    "atan2": atan2, "hypot": hypot, "min": minimum, "max": maximum, "kink": _kink,
-    "sign": lambda x: Interval._raw(np.sign(x.lo), np.sign(x.hi)),
-    "floor": lambda x: Interval._raw(np.floor(x.lo), np.floor(x.hi)),
-    "not": _not, "lt": _less, "le": _less_equal, "eq": _equal, "ne": lambda x, y: _not(_equal(x, y)),
-    "and": _and, "or": _or, "if_else_zero": _if_else_zero,
-}  # fmt: skip
-"""Operation of a tape to interval function, for ``Tape.evaluate``. Every result encloses the operation's
-range; of an undecided jump it encloses all values that the operation may take."""
-
-
-def _beyond_one(x: Interval) -> Mask:
+def beyond_one(x: Interval) -> Mask:
+    """Where asin and acos are undefined."""
     result: Mask = (x.lo < -1) | (x.hi > 1)
     return result
 
 
-def _tan_undefined(x: Interval) -> Mask:
+@quiet
+def tan_undefined(x: Interval) -> Mask:
+    """Where the tangent is undefined, or not resolved."""
     result: Mask = (x.mag > FAR) | _holds_multiple(x, np.pi, 0.5)
     return result
 
 
-def _across_cut(y: Interval, x: Interval) -> Mask:
+def across_cut(y: Interval, x: Interval) -> Mask:
+    """Where atan2 meets its cut."""
     result: Mask = (y.lo <= 0) & (y.hi >= 0) & (x.lo <= 0)
     return result
 
 
-def _power_undefined(x: Interval, exponent: float) -> Mask:
+def power_undefined(x: Interval, exponent: float) -> Mask:
+    """Where a power is undefined."""
     if float(exponent).is_integer():
         return (x.lo <= 0) & (x.hi >= 0) if exponent < 0 else np.zeros(x.shape, dtype=bool)
     return x.lo < 0 if exponent > 0 else x.lo <= 0
-
-
-UNDEFINED: Mapping[str, Callable[..., Mask]] = {
-    "div": lambda x, y: np.broadcast_arrays((y.lo <= 0) & (y.hi >= 0), x.lo)[0],
-    "sqrt": lambda x: x.lo < 0,
-    "log": lambda x: x.lo <= 0,
-    "asin": _beyond_one,
-    "acos": _beyond_one,
-    "tan": quiet(_tan_undefined),
-    "atan2": _across_cut,
-    "pow": _power_undefined,
-}
-"""Operation to the mask of those boxes on which it is undefined somewhere (``atan2``: touches its cut)."""

@@ -6,14 +6,12 @@
 >>> iv.tanh(x).hi.tolist()[1], iv.cos(x).lo.tolist()[1]
 (1.0, -1.0)
 
-The parts: ``arithmetic`` (the type, + - * / @), ``elementary`` (functions, the arithmetic of tapes),
+The parts: ``arithmetic`` (the type, + - * / @), ``elementary`` (functions),
 ``rounding`` (the error model).
 """
 
 from certbound.rigor.arithmetic import Interval, IntervalLike, concatenate, matmul, stack
 from certbound.rigor.elementary import (
-    ARITHMETIC,
-    UNDEFINED,
     abs_,
     acos,
     asin,
@@ -37,7 +35,7 @@ from certbound.rigor.elementary import (
 from certbound.rigor.rounding import down, matmul_error, up
 
 __all__ = [
-    "ARITHMETIC", "UNDEFINED", "Interval", "IntervalLike", "abs_", "acos", "asin", "atan", "atan2",
-    "concatenate", "cos", "cosh", "down", "exp", "hypot", "log", "matmul", "matmul_error", "maximum",
-    "minimum", "pow_", "sin", "sinh", "sq", "sqrt", "stack", "tan", "tanh", "up",
+    "Interval", "IntervalLike", "abs_", "acos", "asin", "atan", "atan2", "concatenate", "cos", "cosh", "down", "exp",
+    "hypot", "log", "matmul", "matmul_error", "maximum", "minimum", "pow_", "sin", "sinh", "sq", "sqrt", "stack", "tan",
+    "tanh", "up",
 ]  # fmt: skip

@@ -9,49 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from certbound.problem.model import Node, Tape
+from certbound.problem.model import OPERATIONS, Node, Tape, needed
 
 __all__ = ["Parameters", "function_source", "linear_form", "live_nodes"]
-
-_UNARY = {
-    "neg": "-{0}",
-    "sq": "{0} * {0}",
-    "sqrt": "math.sqrt({0})",
-    "exp": "math.exp({0})",
-    "log": "math.log({0})",
-    "sin": "math.sin({0})",
-    "cos": "math.cos({0})",
-    "tan": "math.tan({0})",
-    "asin": "math.asin({0})",
-    "acos": "math.acos({0})",
-    "atan": "math.atan({0})",
-    "sinh": "math.sinh({0})",
-    "cosh": "math.cosh({0})",
-    "tanh": "tanh({0})",
-    "abs": "abs({0})",
-    "floor": "np.floor({0})",
-    "sign": "(1.0 if {0} > 0.0 else -1.0 if {0} < 0.0 else {0})",
-    "kink": "(1.0 if {0} > 0.0 else -1.0 if {0} < 0.0 else {0})",
-    "not": "(1.0 if {0} == 0.0 else 0.0)",
-}
-_BINARY = {
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "div": "{0} / {1}",
-    "atan2": "atan2({0}, {1})",
-    "hypot": "math.hypot({0}, {1})",
-    "min": "({0} if {0} < {1} or {0} != {0} else {1})",
-    "max": "({0} if {0} > {1} or {0} != {0} else {1})",
-    "lt": "(1.0 if {0} < {1} else 0.0)",
-    "le": "(1.0 if {0} <= {1} else 0.0)",
-    "eq": "(1.0 if {0} == {1} else 0.0)",
-    "ne": "(1.0 if {0} != {1} else 0.0)",
-    "and": "(1.0 if {0} != 0.0 and {1} != 0.0 else 0.0)",
-    "or": "(1.0 if {0} != 0.0 or {1} != 0.0 else 0.0)",
-    "if_else_zero": "({1} if {0} != 0.0 else 0.0)",
-}
-
 
 @dataclass(eq=False, slots=True)
 class Parameters:
@@ -77,12 +37,7 @@ class Parameters:
 
 def live_nodes(tape: Tape) -> list[int]:
     """Indices of the nodes that the outputs need, in order."""
-    needed = set(tape.outputs)
-    for index in range(len(tape.nodes) - 1, -1, -1):
-        node = tape.nodes[index]
-        if index in needed and node.op != "input":
-            needed.update(node.args)
-    return sorted(needed)
+    return [index for index, live in enumerate(needed(tape.nodes, tape.outputs)) if live]
 
 
 def function_source(name: str, tape: Tape, arguments: Sequence[str], parameters: Parameters) -> list[str]:
@@ -149,8 +104,7 @@ def _pairs(tape: Tape, live: Sequence[int]) -> dict[int, tuple[int, int]]:
 def _operation(node: Node, operands: list[str], parameters: Parameters) -> str:
     if node.op == "pow":
         return _power(operands[0], node.value, parameters)
-    pattern = _UNARY.get(node.op) or _BINARY[node.op]
-    return pattern.format(*operands)
+    return OPERATIONS[node.op].kernel.format(*operands)
 
 
 def _power(base: str, exponent: float, parameters: Parameters) -> str:
@@ -160,7 +114,7 @@ def _power(base: str, exponent: float, parameters: Parameters) -> str:
     if exponent == int(exponent) and 1 <= abs(exponent) <= 12:
         product = _product(base, int(abs(exponent)))
         return product if exponent > 0 else f"1.0 / ({product})"
-    return f"{base} ** {parameters.add(exponent)}"
+    return OPERATIONS["pow"].kernel.format(base, parameters.add(exponent))
 
 
 def _product(base: str, count: int) -> str:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.model import Tape
+from certbound.problem.model import Tape, arithmetic
 from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope, Region
-from certbound.rigor.intervals import ARITHMETIC, Interval, sq, sqrt, stack
+from certbound.rigor.intervals import Interval, sq, sqrt, stack
 
 __all__ = ["active_at", "box_around", "contains", "respected"]
 
@@ -68,7 +68,7 @@ def _center(region: Region, step: int) -> Interval:
     center = region.center
     if not isinstance(center, Tape):
         return Interval.point(center)
-    return stack(center.evaluate(ARITHMETIC, [Interval.point(float(step))]))
+    return stack(center.evaluate(arithmetic("interval"), [Interval.point(float(step))]))
 
 
 def _inverse(matrix: Array) -> Interval:

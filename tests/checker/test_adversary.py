@@ -12,9 +12,10 @@ from flint import arb
 
 import certbound as cb
 from certbound.checker import check_data, parse
-from certbound.checker.expressions.arithmetic import BALLS, Undecided, generalised_kink, power
+from certbound.checker.expressions.arithmetic import Undecided, generalised_kink, power
+from certbound.checker.expressions.operations import OPERATIONS
 from certbound.errors import CertificateError
-from certbound.problem.model.tape import JUMPS, UNARY
+from certbound.problem.model.tape import ARITY, JUMPS
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.certificates.parts import exact
 from certbound.safety.verification import verify_safety
@@ -292,19 +293,19 @@ def test_objects_nested_deeply_inside_a_valid_frame_are_refused(chain_data: Data
             chain_data[part][name] = kept
 
 
-@pytest.mark.parametrize("op", sorted(UNARY - {"kink"}))
+@pytest.mark.parametrize("op", sorted(op for op in OPERATIONS if ARITY[op] == 1 and op not in ("kink", "pow")))
 def test_no_operation_makes_a_number_of_what_is_undefined(op: str) -> None:
     for undefined in (arb.nan(), arb(0, 1).log(), 1 / arb(0, 1)):
         try:
-            assert BALLS[op](undefined).is_nan()
+            assert OPERATIONS[op].ball(undefined).is_nan()
         except Undecided:
             assert op in JUMPS
     assert all(power(arb.nan(), exponent).is_nan() for exponent in (0.0, 1.0, 2.0, -1.0, 0.5))
     assert generalised_kink(arb.nan()).is_nan()
     for second in ("add", "sub", "mul", "div", "hypot", "min", "max"):
-        assert BALLS[second](arb.nan(), arb(1)).is_nan()
-        assert BALLS[second](arb(0), arb.nan()).is_nan()
-    assert BALLS["atan2"](arb.nan(), arb(1)).is_nan()
+        assert OPERATIONS[second].ball(arb.nan(), arb(1)).is_nan()
+        assert OPERATIONS[second].ball(arb(0), arb.nan()).is_nan()
+    assert OPERATIONS["atan2"].ball(arb.nan(), arb(1)).is_nan()
 
 
 @pytest.mark.parametrize("rate", [lambda x: np.tanh(np.log(x)), lambda x: np.sin(np.sqrt(x - 0.05))])

@@ -426,3 +426,15 @@ def test_an_obstacle_bounds_the_safe_set_on_its_side() -> None:
     assert first.upper == pytest.approx(second.upper, abs=1e-3)
     room = safe_room(walls)
     assert room.inner_high == (1.0,)
+
+
+def test_a_disturbance_that_counts_between_the_ends_of_its_range_only_is_seen() -> None:
+    """A comparison used as a number has slope 0 wherever it has one, so the ends of D do not stand for the rest."""
+    system = cb.ContinuousSystem(
+        lambda x, d: [-x[0] + 5.0 * (d[0] > 0.2) * (d[0] < 0.5)],
+        states=1, disturbance=cb.Box([0], [1]), diffusion=[[0.2]],
+    )
+    safe = [cb.Inside(cb.Box([-1], [1]))]
+    verdict = cb.verify_safety(cb.Problem(system, initial=[0.0], safe=safe, horizon=0.5, delta=0.1), method="values")
+    assert verdict.status != "SAFE"
+    assert verdict.log10_delta == 0.0

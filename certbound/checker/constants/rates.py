@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from flint import arb, arb_mat
 
 from certbound.checker.balls import cholesky, identity, is_positive_definite, matrix
-from certbound.checker.expressions import Graph, Program, Undecided
+from certbound.checker.expressions import Graph, Program, Undecided, is_partial
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, Structure
 from certbound.problem.model import JUMPS, Tape
@@ -25,7 +25,6 @@ Box = list[tuple[arb, arb]]
 MOST_VERTICES = 4096
 _MOST_BOXES = 20_000
 _SLACK = arb(2) ** -30
-_PARTIAL = JUMPS | {"atan2", "sqrt", "log", "asin", "acos", "tan", "div", "pow", "hypot"}
 
 
 class Contraction:
@@ -55,7 +54,7 @@ class Contraction:
                 forms[atom][i][j] = factor
         self.atoms = sorted(forms)
         self.forms = [matrix(forms[atom]) for atom in self.atoms]
-        risky = [k for k in graph.reachable(structure.outputs) if graph.node(k).op in _PARTIAL]
+        risky = [k for k in graph.reachable(structure.outputs) if _is_risky(graph.node(k).op)]
         self.program = Program(
             graph, self.atoms, risky, variables=len(model.dynamics.inputs), generalised=True, unbounded=True
         )
@@ -109,6 +108,11 @@ class Contraction:
         if self.model.continuous:
             return is_positive_definite(metric * (2 * bound) - turned - turned.transpose(), self.budget)
         return is_positive_definite(metric * (bound * bound) - jacobian.transpose() * turned, self.budget)
+
+
+def _is_risky(op: str) -> bool:
+    """Whether an operation or its derivative may be undefined, or jump."""
+    return op in JUMPS or op == "hypot" or is_partial(op)
 
 
 def _affine(graph: Graph, node: int) -> tuple[arb, dict[int, arb]]:

@@ -6,8 +6,11 @@ from certbound.checker.expressions.arithmetic import Undecided
 from certbound.checker.expressions.ceiling import Ceiling, Side
 from certbound.checker.expressions.expansion import Expansion
 from certbound.checker.expressions.graph import Graph
-from certbound.checker.expressions.program import Program
+from certbound.checker.expressions.operations import OPERATIONS, is_partial
+from certbound.checker.expressions.program import Program, expand
 from certbound.checker.expressions.quadratic import Cut, Quadratic
-from certbound.checker.expressions.series import expand
 
-__all__ = ["Ceiling", "Cut", "expand", "Expansion", "Graph", "Program", "Quadratic", "Side", "Undecided"]
+__all__ = [
+    "Ceiling", "Cut", "expand", "Expansion", "Graph", "is_partial", "OPERATIONS", "Program", "Quadratic", "Side",
+    "Undecided",
+]  # fmt: skip

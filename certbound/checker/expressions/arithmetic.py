@@ -11,7 +11,11 @@ from collections.abc import Callable
 
 from flint import arb
 
-__all__ = ["BALLS", "Undecided", "generalised_kink", "is_wide", "kink", "power"]
+__all__ = [
+    "Undecided", "acos", "asin", "at_most", "atan", "atan2", "between", "cos", "cosh", "equal", "exp", "floor",
+    "generalised_kink", "holds", "hypot", "increasing", "is_wide", "kink", "less", "log", "power", "sign", "sin",
+    "sinh", "sqrt", "square", "tanh", "wave",
+]  # fmt: skip
 
 _WIDE = 1e-9
 
@@ -25,14 +29,16 @@ def is_wide(x: arb) -> bool:
     return bool(x.rad() > _WIDE * (1 + abs(x.mid())))
 
 
-def _increasing(function: Callable[[arb], arb]) -> Callable[[arb], arb]:
+def increasing(function: Callable[[arb], arb]) -> Callable[[arb], arb]:
+    """An increasing function, evaluated at both ends of wide balls."""
+
     def evaluate(x: arb) -> arb:
         return function(x.lower()).union(function(x.upper())) if is_wide(x) else function(x)
 
     return evaluate
 
 
-def _between(function: Callable[[arb], arb], size: Callable[[], arb]) -> Callable[[arb], arb]:
+def between(function: Callable[[arb], arb], size: Callable[[], arb]) -> Callable[[arb], arb]:
     """An increasing function with values in [-size, size], also on unbounded balls (but not of what is undefined)."""
 
     def evaluate(x: arb) -> arb:
@@ -43,27 +49,38 @@ def _between(function: Callable[[arb], arb], size: Callable[[], arb]) -> Callabl
     return evaluate
 
 
-def _square(x: arb) -> arb:
+def square(x: arb) -> arb:
+    """Square."""
     if x.contains(0) and not x.is_zero():
         return arb(0).union(x.abs_upper() ** 2)
     return x * x
 
 
-def _wave(function: Callable[[arb], arb]) -> Callable[[arb], arb]:
+def wave(function: Callable[[arb], arb]) -> Callable[[arb], arb]:
+    """A function with values in [-1, 1], also on unbounded balls (but not of what is undefined)."""
+
     def evaluate(x: arb) -> arb:
         return function(x) if x.is_finite() else x if x.is_nan() else arb(0, 1)
 
     return evaluate
 
 
-def _cosh(x: arb) -> arb:
+sqrt, exp, log = increasing(arb.sqrt), increasing(arb.exp), increasing(arb.log)
+sin, cos = wave(arb.sin), wave(arb.cos)
+asin, sinh = increasing(arb.asin), increasing(arb.sinh)
+atan, tanh = between(arb.atan, lambda: arb.pi() / 2), between(arb.tanh, lambda: arb(1))
+
+
+def cosh(x: arb) -> arb:
+    """Hyperbolic cosine."""
     if not is_wide(x):
         return x.cosh()
     top = x.abs_upper().cosh()
     return (arb(1) if x.contains(0) else x.abs_lower().cosh()).union(top)
 
 
-def _acos(x: arb) -> arb:
+def acos(x: arb) -> arb:
+    """Arc cosine."""
     return x.lower().acos().union(x.upper().acos()) if is_wide(x) else x.acos()
 
 
@@ -83,11 +100,13 @@ def generalised_kink(x: arb) -> arb:
     return arb(1) if x > 0 else arb(-1) if x < 0 else arb(0, 1)
 
 
-def _sign(x: arb) -> arb:
+def sign(x: arb) -> arb:
+    """-1, 0 or 1."""
     return arb(0) if x.is_zero() else kink(x)
 
 
-def _floor(x: arb) -> arb:
+def floor(x: arb) -> arb:
+    """Largest whole number below."""
     if not x.is_finite():
         raise Undecided
     low, high = x.lower().floor(), x.upper().floor()
@@ -96,7 +115,8 @@ def _floor(x: arb) -> arb:
     raise Undecided
 
 
-def _truth(x: arb) -> bool:
+def holds(x: arb) -> bool:
+    """Whether a condition holds (is not 0)."""
     if x.is_zero():
         return False
     if x.is_nan() or x.contains(0):
@@ -104,7 +124,8 @@ def _truth(x: arb) -> bool:
     return True
 
 
-def _less(x: arb, y: arb) -> arb:
+def less(x: arb, y: arb) -> arb:
+    """x < y, as 0 or 1."""
     if x < y:
         return arb(1)
     if x >= y:
@@ -112,7 +133,8 @@ def _less(x: arb, y: arb) -> arb:
     raise Undecided
 
 
-def _at_most(x: arb, y: arb) -> arb:
+def at_most(x: arb, y: arb) -> arb:
+    """x <= y, as 0 or 1."""
     if x <= y:
         return arb(1)
     if x > y:
@@ -120,7 +142,8 @@ def _at_most(x: arb, y: arb) -> arb:
     raise Undecided
 
 
-def _equal(x: arb, y: arb) -> arb:
+def equal(x: arb, y: arb) -> arb:
+    """x == y, as 0 or 1."""
     if x.is_exact() and y.is_exact() and x == y:
         return arb(1)
     if x < y or x > y:
@@ -128,18 +151,20 @@ def _equal(x: arb, y: arb) -> arb:
     raise Undecided
 
 
-def _atan2(y: arb, x: arb) -> arb:
+def atan2(y: arb, x: arb) -> arb:
+    """Angle of the point (x, y)."""
     if x > 0:
-        return BALLS["atan"](y / x)
+        return atan(y / x)
     if y > 0:
-        return arb.pi() / 2 - BALLS["atan"](x / y)
+        return arb.pi() / 2 - atan(x / y)
     if y < 0:
-        return -arb.pi() / 2 - BALLS["atan"](x / y)
+        return -arb.pi() / 2 - atan(x / y)
     raise Undecided  # the cut, or the origin
 
 
-def _hypot(x: arb, y: arb) -> arb:
-    squares = _square(x) + _square(y)
+def hypot(x: arb, y: arb) -> arb:
+    """sqrt(x^2 + y^2)."""
+    squares = square(x) + square(y)
     low = squares.lower()
     return (low if low > 0 else arb(0)).sqrt().union(squares.upper().sqrt())
 
@@ -177,42 +202,3 @@ def _whole_power(x: arb, n: int) -> arb:
 def _power_of_positive(x: arb, exponent: float) -> arb:
     p = arb(exponent)
     return (x.lower() ** p).union(x.upper() ** p) if is_wide(x) else x**p
-
-
-BALLS: dict[str, Callable[..., arb]] = {
-    "neg": lambda x: -x,
-    "sq": _square,
-    "sqrt": _increasing(lambda x: x.sqrt()),
-    "exp": _increasing(lambda x: x.exp()),
-    "log": _increasing(lambda x: x.log()),
-    "sin": _wave(lambda x: x.sin()),
-    "cos": _wave(lambda x: x.cos()),
-    "tan": lambda x: x.tan(),
-    "asin": _increasing(lambda x: x.asin()),
-    "acos": _acos,
-    "atan": _between(lambda x: x.atan(), lambda: arb.pi() / 2),
-    "sinh": _increasing(lambda x: x.sinh()),
-    "cosh": _cosh,
-    "tanh": _between(lambda x: x.tanh(), lambda: arb(1)),
-    "abs": abs,
-    "kink": kink,
-    "sign": _sign,
-    "floor": _floor,
-    "not": lambda x: arb(0 if _truth(x) else 1),
-    "add": lambda x, y: x + y,
-    "sub": lambda x, y: x - y,
-    "mul": lambda x, y: x * y,
-    "div": lambda x, y: x / y,
-    "atan2": _atan2,
-    "hypot": _hypot,
-    "min": arb.min,
-    "max": arb.max,
-    "lt": _less,
-    "le": _at_most,
-    "eq": _equal,
-    "ne": lambda x, y: 1 - _equal(x, y),
-    "and": lambda x, y: arb(1 if _truth(x) and _truth(y) else 0),
-    "or": lambda x, y: arb(1 if _truth(x) or _truth(y) else 0),
-    "if_else_zero": lambda c, y: y if _truth(c) else arb(0),
-}
-"""Operation name to its extension to balls (const and pow apart)."""

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 from flint import arb
 
-from certbound.checker.expressions.arithmetic import Undecided
+from certbound.checker.expressions.arithmetic import Undecided, holds
 from certbound.checker.expressions.graph import Graph
+from certbound.checker.expressions.operations import OPERATIONS
 from certbound.checker.expressions.quadratic import Quadratic
-from certbound.checker.expressions.taylor import Model, applied, constant
+from certbound.checker.expressions.taylor import Model, constant
 
 __all__ = ["Expansion"]
 
@@ -120,6 +121,27 @@ class Expansion:
 
 
 def _value(op: str, args: tuple[int, ...], value: float, values: list[Model | None]) -> Model | None:
+    """A node's model; None is what is not defined.
+
+    Raises
+    ------
+    Undecided
+        If a jump, a kink or a branch cut may lie in the box.
+    """
     if op == "const":
         return constant(arb(value))
-    return applied(op, value, values[args[0]], values[args[1]] if len(args) == 2 else None)
+    given = [model for model in (values[arg] for arg in args) if model is not None]
+    if op == "if_else_zero":
+        condition = values[args[0]]
+        if condition is None:
+            return None
+        return values[args[1]] if holds(condition.range()) else constant(_ZERO)
+    if len(given) < len(args):
+        return None
+    row, exponent = OPERATIONS[op], [value] if op == "pow" else []
+    if all(model.fixed for model in given):
+        known = row.ball(*(model.value for model in given), *exponent)
+        return constant(known) if known.is_finite() else None
+    if row.model is None:
+        return constant(row.ball(*(model.range() for model in given)))
+    return row.model(*given, *exponent)

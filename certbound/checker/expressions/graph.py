@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
+from certbound.checker.expressions.operations import OPERATIONS
 from certbound.checker.report import Budget, Unproved
-from certbound.problem.model import JUMPS, Node, Tape
+from certbound.problem.model import Node, Tape
 
 __all__ = ["Graph"]
 
@@ -176,81 +177,8 @@ class Graph:
         op, args, value = self.nodes[index]
         if op == "input":
             return self.const(1.0)
-        if op == "kink" or (op in JUMPS and op != "if_else_zero"):
+        slope = OPERATIONS[op].slope
+        if slope is None:
             return self.const(0.0)
         slopes = [self._known(arg, slot) for arg in args]
-        if len(args) == 2:
-            return self._binary(op, args[0], args[1], slopes[0], slopes[1], index)
-        if op == "neg":
-            return self.neg(slopes[0])
-        return self.mul(self._outer(op, args[0], value, index), slopes[0])
-
-    def _outer(self, op: str, a: int, value: float, index: int) -> int:
-        """The derivative of an operation of one argument."""
-        one = self.const(1.0)
-        match op:
-            case "sq":
-                return self.mul(self.const(2.0), a)
-            case "sqrt":
-                return self.div(self.const(0.5), index)
-            case "exp":
-                return index
-            case "log":
-                return self.div(one, a)
-            case "sin":
-                return self.apply("cos", a)
-            case "cos":
-                return self.neg(self.apply("sin", a))
-            case "tan":
-                return self.add(one, self.apply("sq", index))
-            case "asin":
-                return self.div(one, self.apply("sqrt", self.sub(one, self.apply("sq", a))))
-            case "acos":
-                return self.div(self.const(-1.0), self.apply("sqrt", self.sub(one, self.apply("sq", a))))
-            case "atan":
-                return self.div(one, self.add(one, self.apply("sq", a)))
-            case "sinh":
-                return self.apply("cosh", a)
-            case "cosh":
-                return self.apply("sinh", a)
-            case "tanh":
-                return self.sub(one, self.apply("sq", index))
-            case "abs":
-                return self.apply("kink", a)
-            case "pow":
-                return self._power(a, value, index)
-        raise Unproved(f"the operation `{op}` has no derivative")
-
-    def _power(self, a: int, exponent: float, index: int) -> int:
-        if exponent == 0.0:
-            return self.const(0.0)
-        if exponent == 1.0:
-            return self.const(1.0)
-        if exponent == int(exponent) and abs(exponent) <= 10_000:
-            lower = a if exponent == 2.0 else self.apply("pow", a, value=exponent - 1.0)
-            return self.mul(self.const(exponent), lower)
-        return self.mul(self.const(exponent), self.div(index, a))
-
-    def _binary(self, op: str, a: int, b: int, da: int, db: int, index: int) -> int:
-        match op:
-            case "add":
-                return self.add(da, db)
-            case "sub":
-                return self.sub(da, db)
-            case "mul":
-                return self.add(self.mul(da, b), self.mul(a, db))
-            case "div":
-                return self.div(self.sub(da, self.mul(index, db)), b)
-            case "atan2":
-                squares = self.add(self.apply("sq", a), self.apply("sq", b))
-                return self.div(self.sub(self.mul(b, da), self.mul(a, db)), squares)
-            case "hypot":
-                return self.div(self.add(self.mul(a, da), self.mul(b, db)), index)
-            case "min" | "max":
-                half, step = self.const(0.5), self.apply("kink", self.apply("sub", a, b))
-                mean = self.mul(half, self.add(da, db))
-                turn = self.mul(half, self.mul(step, self.sub(da, db)))
-                return self.add(mean, turn) if op == "max" else self.sub(mean, turn)
-            case "if_else_zero":
-                return self.const(0.0) if self.is_const(db, 0.0) else self.apply("if_else_zero", a, db)
-        raise Unproved(f"the operation `{op}` has no derivative")
+        return slope(self, index, *args, *slopes, *([value] if op == "pow" else []))

@@ -1,4 +1,7 @@
-"""Straight-line programs over balls, made from a graph: parameters are evaluated once, variables many times."""
+"""Straight-line programs over balls, made from a graph: parameters are evaluated once, variables many times.
+
+And tapes run once on Taylor series in time.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,14 @@ from collections.abc import Callable, Iterable, Sequence
 
 from flint import arb
 
-from certbound.checker.expressions.arithmetic import BALLS, Undecided, generalised_kink, power
+from certbound.checker.expressions.arithmetic import Undecided, generalised_kink
 from certbound.checker.expressions.graph import Graph
+from certbound.checker.expressions.operations import OPERATIONS
+from certbound.checker.expressions.series import Series, constant
+from certbound.checker.report import Budget
+from certbound.problem.model import Tape
 
-__all__ = ["Program"]
+__all__ = ["Program", "expand"]
 
 Step = tuple[int, Callable[..., arb], int, int]
 
@@ -38,7 +45,7 @@ class Program:
     ) -> None:
         self._unbounded, self._budget = unbounded, graph.budget
         self.variables = variables
-        self._operations = BALLS | {"kink": generalised_kink} if generalised else BALLS
+        self._special: dict[str, Callable[..., arb]] = {"kink": generalised_kink} if generalised else {}
         watched = sorted(set(guards))
         order = graph.reachable([*outputs, *watched])
         self._budget.check()
@@ -64,16 +71,17 @@ class Program:
         self._template: list[arb] = []
 
     def _step(self, number: int, op: str, args: list[int], value: float) -> Step:
+        ball = self._special.get(op, OPERATIONS[op].ball)
         if op == "pow":
-            return number, lambda x: power(x, value), args[0], -1
-        return number, self._operations[op], args[0], args[1] if len(args) == 2 else -1
+            return number, lambda x: ball(x, value), args[0], -1
+        return number, ball, args[0], args[1] if len(args) == 2 else -1
 
     def prepare(self, parameters: Sequence[arb]) -> None:
         """Set the parameters (inputs ``variables``, ``variables + 1``, ...)."""
         self._budget.check()
         values: list[arb] = [arb(0)] * self._size
-        for number, constant in self._constants:
-            values[number] = constant
+        for number, known in self._constants:
+            values[number] = known
         for number, slot in self._inputs:
             if slot >= self.variables:
                 values[number] = parameters[slot - self.variables]
@@ -114,3 +122,30 @@ class Program:
 def _execute(steps: list[Step], values: list[arb]) -> None:
     for number, function, first, second in steps:
         values[number] = function(values[first]) if second < 0 else function(values[first], values[second])
+
+
+def expand(tape: Tape, inputs: Sequence[Series], order: int, budget: Budget) -> list[Series]:
+    """Coefficients 0 .. ``order`` of a tape's outputs along series of its inputs.
+
+    Raises
+    ------
+    Undecided
+        If something jumps or is undefined there.
+    Unproved
+        If the time is used up.
+    """
+    values: list[Series] = []
+    for node in tape.nodes:
+        budget.check()
+        if node.op == "input":
+            given = list(inputs[node.args[0]])[: order + 1]
+            values.append(given + [arb(0)] * (order + 1 - len(given)))
+        elif node.op == "const":
+            values.append(constant(arb(node.value), order))
+        else:
+            exponent = [node.value] if node.op == "pow" else []
+            values.append(OPERATIONS[node.op].series(*(values[arg] for arg in node.args), *exponent))
+    result = [values[output] for output in tape.outputs]
+    if not all(c.is_finite() for series in result for c in series):
+        raise Undecided
+    return result

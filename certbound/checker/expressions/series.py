@@ -7,84 +7,46 @@ that coefficient times the last power (Lagrange's remainder).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from flint import arb
 
-from certbound.checker.expressions.arithmetic import BALLS, Undecided, kink, power
-from certbound.checker.report import Budget
-from certbound.problem.model import JUMPS, Tape
+from certbound.checker.expressions import arithmetic as balls
 
-__all__ = ["expand"]
+__all__ = [
+    "Series", "abs_", "acos", "add", "asin", "atan", "atan2", "circular", "constant", "div", "exp", "hyperbolic",
+    "hypot", "if_else_zero", "integrated", "known", "larger", "log", "mul", "power", "scale", "smaller", "sq", "sqrt",
+    "step", "sub", "tan", "tanh",
+]  # fmt: skip
 
 Series = list[arb]
 
 
-def expand(tape: Tape, inputs: Sequence[Series], order: int, budget: Budget) -> list[Series]:
-    """Coefficients 0 .. ``order`` of a tape's outputs along series of its inputs.
-
-    Raises
-    ------
-    Undecided
-        If something jumps or is undefined there.
-    Unproved
-        If the time is used up.
-    """
-    values: list[Series] = []
-    for node in tape.nodes:
-        budget.check()
-        if node.op == "input":
-            given = list(inputs[node.args[0]])[: order + 1]
-            values.append(given + [arb(0)] * (order + 1 - len(given)))
-        elif node.op == "const":
-            values.append(_constant(arb(node.value), order))
-        elif node.op == "pow":
-            values.append(_power(values[node.args[0]], node.value))
-        else:
-            values.append(_apply(node.op, [values[arg] for arg in node.args]))
-    result = [values[output] for output in tape.outputs]
-    if not all(c.is_finite() for series in result for c in series):
-        raise Undecided
-    return result
-
-
-def _constant(value: arb, order: int) -> Series:
+def constant(value: arb, order: int) -> Series:
     return [value] + [arb(0)] * order
 
 
-def _apply(op: str, args: list[Series]) -> Series:
-    x = args[0]
-    if op in _UNARY:
-        return _UNARY[op](x)
-    if op in JUMPS and op != "if_else_zero":
-        return _constant(BALLS[op](*(series[0] for series in args)), len(x) - 1)
-    y = args[1]
-    if op == "if_else_zero":
-        return y if BALLS["if_else_zero"](x[0], arb(1)) == 1 else _constant(arb(0), len(x) - 1)
-    return _BINARY[op](x, y)
-
-
-def _add(x: Series, y: Series) -> Series:
+def add(x: Series, y: Series) -> Series:
     return [a + b for a, b in zip(x, y)]
 
 
-def _sub(x: Series, y: Series) -> Series:
+def sub(x: Series, y: Series) -> Series:
     return [a - b for a, b in zip(x, y)]
 
 
-def _scale(x: Series, factor: arb) -> Series:
+def scale(x: Series, factor: arb) -> Series:
     return [a * factor for a in x]
 
 
-def _mul(x: Series, y: Series) -> Series:
+def mul(x: Series, y: Series) -> Series:
     return [sum((x[i] * y[k - i] for i in range(k + 1)), arb(0)) for k in range(len(x))]
 
 
-def _sq(x: Series) -> Series:
-    return [BALLS["sq"](x[0]), *_mul(x, x)[1:]]
+def sq(x: Series) -> Series:
+    return [balls.square(x[0]), *mul(x, x)[1:]]
 
 
-def _div(x: Series, y: Series) -> Series:
+def div(x: Series, y: Series) -> Series:
     result: Series = []
     for k in range(len(x)):
         rest = x[k] - sum((result[i] * y[k - i] for i in range(k)), arb(0))
@@ -97,7 +59,7 @@ def _slope(x: Series) -> Series:
     return [(k + 1) * x[k + 1] for k in range(len(x) - 1)]
 
 
-def _integrated(first: arb, slope: Callable[[Series], Series], x: Series) -> Series:
+def integrated(first: arb, slope: Callable[[Series], Series], x: Series) -> Series:
     """y with y_0 = first and y' = slope(y so far) x'."""
     result, rate = [first], _slope(x)
     for k in range(1, len(x)):
@@ -106,117 +68,118 @@ def _integrated(first: arb, slope: Callable[[Series], Series], x: Series) -> Ser
     return result
 
 
-def _known(outer: Series) -> Callable[[Series], Series]:
+def known(outer: Series) -> Callable[[Series], Series]:
     return lambda _: outer
 
 
-def _exp(x: Series) -> Series:
-    return _integrated(BALLS["exp"](x[0]), lambda y: y, x)
+def exp(x: Series) -> Series:
+    return integrated(balls.exp(x[0]), lambda y: y, x)
 
 
-def _log(x: Series) -> Series:
-    return _integrated(BALLS["log"](x[0]), _known(_div(_constant(arb(1), len(x) - 1), x)), x)
+def log(x: Series) -> Series:
+    return integrated(balls.log(x[0]), known(div(constant(arb(1), len(x) - 1), x)), x)
 
 
-def _sqrt(x: Series) -> Series:
-    result = [BALLS["sqrt"](x[0])]
+def sqrt(x: Series) -> Series:
+    result = [balls.sqrt(x[0])]
     for k in range(1, len(x)):
         rest = x[k] - sum((result[i] * result[k - i] for i in range(1, k)), arb(0))
         result.append(rest / (2 * result[0]))
     return result
 
 
-def _pair(x: Series, names: tuple[str, str], sign: int) -> tuple[Series, Series]:
+def _pair(x: Series, first: arb, second: arb, sign: int) -> tuple[Series, Series]:
     """sin and cos (sign -1), or sinh and cosh (sign 1)."""
-    s, c, rate = [BALLS[names[0]](x[0])], [BALLS[names[1]](x[0])], _slope(x)
+    s, c, rate = [first], [second], _slope(x)
     for k in range(1, len(x)):
-        first = sum((c[i] * rate[k - 1 - i] for i in range(k)), arb(0)) / k
-        second = sum((s[i] * rate[k - 1 - i] for i in range(k)), arb(0)) * sign / k
-        s.append(first)
-        c.append(second)
+        odd = sum((c[i] * rate[k - 1 - i] for i in range(k)), arb(0)) / k
+        even = sum((s[i] * rate[k - 1 - i] for i in range(k)), arb(0)) * sign / k
+        s.append(odd)
+        c.append(even)
     return s, c
 
 
-def _tanh(x: Series) -> Series:
-    def outer(y: Series) -> Series:
-        return _sub(_constant(arb(1), len(y) - 1), _sq(y))
-
-    return _integrated(BALLS["tanh"](x[0]), outer, x)
+def circular(x: Series) -> tuple[Series, Series]:
+    """sin and cos."""
+    return _pair(x, balls.sin(x[0]), balls.cos(x[0]), -1)
 
 
-def _tan(x: Series) -> Series:
-    return _integrated(BALLS["tan"](x[0]), lambda y: _add(_constant(arb(1), len(y) - 1), _sq(y)), x)
+def hyperbolic(x: Series) -> tuple[Series, Series]:
+    """sinh and cosh."""
+    return _pair(x, balls.sinh(x[0]), balls.cosh(x[0]), 1)
 
 
-def _arc(name: str) -> Callable[[Series], Series]:
-    def evaluate(x: Series) -> Series:
-        one = _constant(arb(1), len(x) - 1)
-        inner = _add(one, _sq(x)) if name == "atan" else _sqrt(_sub(one, _sq(x)))
-        outer = _div(one, inner)
-        return _integrated(BALLS[name](x[0]), _known(_scale(outer, arb(-1)) if name == "acos" else outer), x)
-
-    return evaluate
+def tanh(x: Series) -> Series:
+    return integrated(balls.tanh(x[0]), lambda y: sub(constant(arb(1), len(y) - 1), sq(y)), x)
 
 
-def _abs(x: Series) -> Series:
-    return _scale(x, kink(x[0]))
+def tan(x: Series) -> Series:
+    return integrated(x[0].tan(), lambda y: add(constant(arb(1), len(y) - 1), sq(y)), x)
 
 
-def _power(x: Series, exponent: float) -> Series:
+def atan(x: Series) -> Series:
+    one = constant(arb(1), len(x) - 1)
+    return integrated(balls.atan(x[0]), known(div(one, add(one, sq(x)))), x)
+
+
+def _arc(x: Series) -> Series:
+    """1/sqrt(1 - x^2)."""
+    one = constant(arb(1), len(x) - 1)
+    return div(one, sqrt(sub(one, sq(x))))
+
+
+def asin(x: Series) -> Series:
+    return integrated(balls.asin(x[0]), known(_arc(x)), x)
+
+
+def acos(x: Series) -> Series:
+    return integrated(balls.acos(x[0]), known(scale(_arc(x), arb(-1))), x)
+
+
+def abs_(x: Series) -> Series:
+    return scale(x, balls.kink(x[0]))
+
+
+def power(x: Series, exponent: float) -> Series:
     order = len(x) - 1
     if exponent == 0.0:
-        return _constant(x[0] if x[0].is_nan() else arb(1), order)
+        return constant(x[0] if x[0].is_nan() else arb(1), order)
     if exponent == int(exponent) and 1 <= exponent <= 64:
         result = x
         for _ in range(int(exponent) - 1):
-            result = _mul(result, x)
-        return [power(x[0], exponent), *result[1:]]
-    result, p = [power(x[0], exponent)], arb(exponent)
+            result = mul(result, x)
+        return [balls.power(x[0], exponent), *result[1:]]
+    result, p = [balls.power(x[0], exponent)], arb(exponent)
     for k in range(1, order + 1):
         total = sum(((p * i - (k - i)) * x[i] * result[k - i] for i in range(1, k + 1)), arb(0))
         result.append(total / (k * x[0]))
     return result
 
 
-def _atan2(y: Series, x: Series) -> Series:
-    first = BALLS["atan2"](y[0], x[0])
-    squares = _add(_sq(x), _sq(y))
-    rate = _sub(_mul(x[:-1], _slope(y)), _mul(y[:-1], _slope(x)))
-    quotient = _div(rate, squares[:-1]) if len(x) > 1 else []
+def atan2(y: Series, x: Series) -> Series:
+    first = balls.atan2(y[0], x[0])
+    squares = add(sq(x), sq(y))
+    rate = sub(mul(x[:-1], _slope(y)), mul(y[:-1], _slope(x)))
+    quotient = div(rate, squares[:-1]) if len(x) > 1 else []
     return [first, *(value / (k + 1) for k, value in enumerate(quotient))]
 
 
-def _hypot(x: Series, y: Series) -> Series:
-    return _sqrt(_add(_sq(x), _sq(y)))
+def hypot(x: Series, y: Series) -> Series:
+    return sqrt(add(sq(x), sq(y)))
 
 
-def _larger(x: Series, y: Series) -> Series:
-    return x if kink(x[0] - y[0]) == 1 else y
+def larger(x: Series, y: Series) -> Series:
+    return x if balls.kink(x[0] - y[0]) == 1 else y
 
 
-def _smaller(x: Series, y: Series) -> Series:
-    return y if kink(x[0] - y[0]) == 1 else x
+def smaller(x: Series, y: Series) -> Series:
+    return y if balls.kink(x[0] - y[0]) == 1 else x
 
 
-_UNARY: dict[str, Callable[[Series], Series]] = {
-    "neg": lambda x: [-a for a in x],
-    "sq": _sq,
-    "sqrt": _sqrt,
-    "exp": _exp,
-    "log": _log,
-    "sin": lambda x: _pair(x, ("sin", "cos"), -1)[0],
-    "cos": lambda x: _pair(x, ("sin", "cos"), -1)[1],
-    "tan": _tan,
-    "asin": _arc("asin"),
-    "acos": _arc("acos"),
-    "atan": _arc("atan"),
-    "sinh": lambda x: _pair(x, ("sinh", "cosh"), 1)[0],
-    "cosh": lambda x: _pair(x, ("sinh", "cosh"), 1)[1],
-    "tanh": _tanh,
-    "abs": _abs,
-    "kink": lambda x: _constant(kink(x[0]), len(x) - 1),
-}
-_BINARY: dict[str, Callable[[Series, Series], Series]] = {
-    "add": _add, "sub": _sub, "mul": _mul, "div": _div, "atan2": _atan2, "hypot": _hypot, "min": _smaller,
-    "max": _larger,
-}  # fmt: skip
+def if_else_zero(condition: Series, x: Series) -> Series:
+    return x if balls.holds(condition[0]) else constant(arb(0), len(x) - 1)
+
+
+def step(function: Callable[..., arb]) -> Callable[..., Series]:
+    """A piecewise constant function of one or more series."""
+    return lambda *args: constant(function(*(x[0] for x in args)), len(args[0]) - 1)

@@ -13,10 +13,13 @@ from typing import TypeVar
 
 from flint import arb
 
-from certbound.checker.expressions.arithmetic import BALLS, Undecided, power
-from certbound.problem.model import BINARY
+from certbound.checker.expressions import arithmetic as balls
+from certbound.checker.expressions.arithmetic import Undecided
 
-__all__ = ["Model", "applied", "constant"]
+__all__ = [
+    "Model", "abs_", "acos", "add", "asin", "atan", "atan2", "constant", "cos", "cosh", "div", "exp", "hypot", "log",
+    "maximum", "minimum", "mul", "neg", "power", "sin", "sinh", "smooth", "sqrt", "tan", "tanh",
+]  # fmt: skip
 
 _ZERO = arb(0)
 
@@ -103,20 +106,20 @@ def _shared(amount: arb, *parts: dict[int, arb]) -> dict[int, float]:
     return {a: size * weight / total for a, weight in weights.items()} if total > 0 else {}
 
 
-def _add(x: Model, y: Model) -> Model:
+def add(x: Model, y: Model) -> Model:
     return Model(
         x.value + y.value, _merged(x.linear, y.linear), _merged(x.squares, y.squares), x.error + y.error,
         _blamed(x.blame, y.blame),
     )  # fmt: skip
 
 
-def _neg(x: Model) -> Model:
+def neg(x: Model) -> Model:
     return Model(
         -x.value, {a: -c for a, c in x.linear.items()}, {p: -c for p, c in x.squares.items()}, x.error, x.blame
     )
 
 
-def _mul(x: Model, y: Model) -> Model:
+def mul(x: Model, y: Model) -> Model:
     if y.fixed:
         return x.scaled(y.value)
     if x.fixed:
@@ -170,85 +173,76 @@ def _composed(x: Model, value: arb, first: arb, half: arb, third: arb) -> Model 
 # ---- functions of one variable: phi(v), phi'(v), phi''(v)/2 and a bound of phi''' over a ball ---------------
 
 
-def _sqrt(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+def sqrt(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
     root = v.sqrt()
-    return root, 1 / (2 * root), -1 / (8 * root * v), power(r, -2.5) * 3 / 8
+    return root, 1 / (2 * root), -1 / (8 * root * v), balls.power(r, -2.5) * 3 / 8
 
 
-def _exp(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+def exp(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
     e = v.exp()
-    return e, e, e / 2, BALLS["exp"](r)
+    return e, e, e / 2, balls.exp(r)
 
 
-def _log(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
-    return v.log(), 1 / v, -1 / (2 * v * v), 2 * power(r, -3.0) if r > 0 else arb.nan()
+def log(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    return v.log(), 1 / v, -1 / (2 * v * v), 2 * balls.power(r, -3.0) if r > 0 else arb.nan()
 
 
-def _sin(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+def sin(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
     s, c = v.sin_cos()
     return s, c, -s / 2, r.cos()
 
 
-def _cos(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+def cos(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
     s, c = v.sin_cos()
     return c, -s, -c / 2, r.sin()
 
 
-def _tan(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+def tan(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
     t, whole = v.tan(), r.tan()
-    slope, square = 1 + t * t, power(whole, 2.0)
+    slope, square = 1 + t * t, balls.power(whole, 2.0)
     return t, slope, t * slope, 2 * (1 + square) * (1 + 3 * square)
 
 
-def _asin(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
-    left, whole = 1 - v * v, 1 - power(r, 2.0)
+def asin(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    left, whole = 1 - v * v, 1 - balls.power(r, 2.0)
     slope = 1 / left.sqrt()
-    return v.asin(), slope, v * slope / (2 * left), (1 + 2 * power(r, 2.0)) * power(whole, -2.5)
+    return v.asin(), slope, v * slope / (2 * left), (1 + 2 * balls.power(r, 2.0)) * balls.power(whole, -2.5)
 
 
-def _acos(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
-    _, slope, half, third = _asin(v, r)
+def acos(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    _, slope, half, third = asin(v, r)
     return v.acos(), -slope, -half, -third
 
 
-def _atan(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
-    slope, square = 1 / (1 + v * v), power(r, 2.0)
-    return v.atan(), slope, -v * slope * slope, (6 * square - 2) * power(1 + square, -3.0)
+def atan(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    slope, square = 1 / (1 + v * v), balls.power(r, 2.0)
+    return v.atan(), slope, -v * slope * slope, (6 * square - 2) * balls.power(1 + square, -3.0)
 
 
-def _sinh(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+def sinh(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
     s, c = v.sinh_cosh()
-    return s, c, s / 2, BALLS["cosh"](r)
+    return s, c, s / 2, balls.cosh(r)
 
 
-def _cosh(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+def cosh(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
     s, c = v.sinh_cosh()
-    return c, s, c / 2, BALLS["sinh"](r)
+    return c, s, c / 2, balls.sinh(r)
 
 
-def _tanh(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
-    t, square = v.tanh(), power(BALLS["tanh"](r), 2.0)
+def tanh(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
+    t, square = v.tanh(), balls.power(balls.tanh(r), 2.0)
     slope = 1 - t * t
     return t, slope, -t * slope, (1 - square) * (6 * square - 2)
 
 
-def _inverse(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
-    i = 1 / v
-    return i, -i * i, i * i * i, -6 * power(r, -4.0) if r > 0 or r < 0 else arb.nan()
+def smooth(
+    derivatives: Callable[[arb, arb], tuple[arb, arb, arb, arb]]
+) -> Callable[[Model], Model | None]:
+    """A function of one variable, given by phi(v), phi'(v), phi''(v)/2 and a bound of phi''' over a ball."""
+    return lambda x: _composed(x, *derivatives(x.value, x.range()))
 
 
-_UNARY: dict[str, Callable[[arb, arb], tuple[arb, arb, arb, arb]]] = {
-    "sqrt": _sqrt, "exp": _exp, "log": _log, "sin": _sin, "cos": _cos, "tan": _tan, "asin": _asin, "acos": _acos,
-    "atan": _atan, "sinh": _sinh, "cosh": _cosh, "tanh": _tanh, "inverse": _inverse,
-}  # fmt: skip
-_DECIDED = {"kink", "sign", "floor", "not", "lt", "le", "eq", "ne", "and", "or"}
-
-
-def _apply(op: str, x: Model) -> Model | None:
-    return _composed(x, *_UNARY[op](x.value, x.range()))
-
-
-def _power(x: Model, exponent: float) -> Model | None:
+def power(x: Model, exponent: float) -> Model | None:
     """x ** exponent; where a factor of a derivative is 0, x may be so too."""
     p = arb(exponent)
     whole = exponent == int(exponent) and abs(exponent) <= 10_000
@@ -257,7 +251,7 @@ def _power(x: Model, exponent: float) -> Model | None:
 
     def at(place: arb, k: int) -> arb:
         if whole:
-            return power(place, exponent - k)
+            return balls.power(place, exponent - k)
         return (place.lower() ** (p - k)).union(place.upper() ** (p - k))
 
     factors = [p, p * (p - 1) / 2, p * (p - 1) * (p - 2)]
@@ -296,7 +290,7 @@ def _moved(x: Model) -> Model:
     return Model(_ZERO, x.linear, x.squares, x.error, x.blame)
 
 
-def _div(x: Model, y: Model) -> Model | None:
+def div(x: Model, y: Model) -> Model | None:
     """x/y = q + n/y with q = v_x/v_y, n = x - q y, and 1/y = 1/v_y - d/v_y^2 + d^2/(v_y^2 y), d = y - v_y."""
     inverse = 1 / y.value
     if not inverse.is_finite():
@@ -307,87 +301,52 @@ def _div(x: Model, y: Model) -> Model | None:
     if not (whole > 0 or whole < 0):
         return None
     quotient = x.value * inverse
-    rest = _moved(_add(_moved(x), _moved(y).scaled(-quotient)))
-    found = _add(rest.scaled(inverse), _mul(rest, _moved(y)).scaled(-inverse * inverse))
+    rest = _moved(add(_moved(x), _moved(y).scaled(-quotient)))
+    found = add(rest.scaled(inverse), mul(rest, _moved(y)).scaled(-inverse * inverse))
     found.value = quotient
     size = y.reach() * inverse
     return _with_error(found, abs(rest.reach() * size * size) / whole.abs_lower(), y.linear, rest.linear)
 
 
-def _atan2(y: Model, x: Model) -> Model | None:
+def atan2(y: Model, x: Model) -> Model | None:
     """arg(z) = arg(z_0) + Im log(1 + w), w = (z - z_0)/z_0.
 
     |log(1 + w) - w + w^2/2| <= |w|^3/(3 (1 - |Re w|)^3).
     """
     if not x.range() > 0:
         _sign(y)
-    angle = BALLS["atan2"](y.value, x.value)
+    angle = balls.atan2(y.value, x.value)
     square = x.value * x.value + y.value * y.value
     across, up = x.value / square, y.value / square
     if not (across.is_finite() and up.is_finite()):
         return None
     right, top = _moved(x), _moved(y)
-    real = _add(right.scaled(across), top.scaled(up))
-    imaginary = _add(top.scaled(across), right.scaled(-up))
+    real = add(right.scaled(across), top.scaled(up))
+    imaginary = add(top.scaled(across), right.scaled(-up))
     one, two = real.reach(), imaginary.reach()
     if not one < 1:
         return None
-    found = _add(imaginary, _neg(_mul(real, imaginary)))
+    found = add(imaginary, neg(mul(real, imaginary)))
     found.value = angle
     size = (one * one + two * two).sqrt() / (1 - one)
     return _with_error(found, size * size * size / 3, imaginary.linear, real.linear)
 
 
-def _hypot(x: Model, y: Model) -> Model | None:
-    return _apply("sqrt", _add(_mul(x, x), _mul(y, y)))
+def hypot(x: Model, y: Model) -> Model | None:
+    return smooth(sqrt)(add(mul(x, x), mul(y, y)))
 
 
 def _larger(x: Model, y: Model) -> bool:
-    return _sign(_add(x, _neg(y))) > 0
+    return _sign(add(x, neg(y))) > 0
 
 
-_BINARY: dict[str, Callable[[Model, Model], Model | None]] = {
-    "add": _add,
-    "sub": lambda x, y: _add(x, _neg(y)),
-    "mul": _mul,
-    "div": _div,
-    "atan2": _atan2,
-    "hypot": _hypot,
-    "min": lambda x, y: y if _larger(x, y) else x,
-    "max": lambda x, y: x if _larger(x, y) else y,
-}
+def maximum(x: Model, y: Model) -> Model:
+    return x if _larger(x, y) else y
 
 
-def applied(op: str, value: float, first: Model | None, second: Model | None) -> Model | None:
-    """An operation of a tape on its one or two arguments; None is what is not defined.
+def minimum(x: Model, y: Model) -> Model:
+    return y if _larger(x, y) else x
 
-    Raises
-    ------
-    Undecided
-        If a jump, a kink or a branch cut may lie in the box.
-    """
-    if op == "if_else_zero":
-        if first is None:
-            return None
-        return second if BALLS["not"](first.range()).is_zero() else constant(_ZERO)
-    if first is None or (second is None and op in BINARY):
-        return None
-    given = [first] if second is None else [first, second]
-    if all(model.fixed for model in given):
-        known = power(first.value, value) if op == "pow" else BALLS[op](*(model.value for model in given))
-        return constant(known) if known.is_finite() else None
-    if op in _DECIDED:
-        return constant(BALLS[op](*(model.range() for model in given)))
-    if second is not None:
-        return _BINARY[op](first, second)
-    match op:
-        case "pow":
-            return _power(first, value)
-        case "neg":
-            return _neg(first)
-        case "sq":
-            return _mul(first, first)
-        case "abs":
-            return first if _sign(first) > 0 else _neg(first)
-        case _:
-            return _apply(op, first)
+
+def abs_(x: Model) -> Model:
+    return x if _sign(x) > 0 else neg(x)

@@ -11,14 +11,12 @@ from dataclasses import dataclass
 
 from flint import arb
 
-from certbound.checker.expressions import Graph, Program, Undecided
+from certbound.checker.expressions import Graph, Program, Undecided, is_partial
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.problem.model import JUMPS
 
 __all__ = ["Structure", "structure_of"]
-
-_PARTIAL = {"sqrt", "log", "tan", "asin", "acos", "atan2", "div", "pow"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,7 +86,7 @@ def _deciding(graph: Graph, index: int) -> int:
         return graph.masks[args[1]]
     if op == "pow" and value >= 0 and value == int(value):
         return 0
-    return graph.masks[index] if op in JUMPS or op in _PARTIAL else 0
+    return graph.masks[index] if op in JUMPS or is_partial(op) else 0
 
 
 def _derivatives(graph: Graph, outputs: list[int], slots: range, budget: Budget) -> dict[tuple[int, int], int]:

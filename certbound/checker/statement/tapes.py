@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from certbound.checker.expressions import OPERATIONS
 from certbound.checker.reading import Record, number, whole, wholes
 from certbound.checker.reading import entries as listed
 from certbound.errors import CertificateError
@@ -23,6 +24,7 @@ def read_tape(value: object, path: str, inputs: tuple[str, ...], shape: tuple[in
     """
     record = Record(value, path, ("nodes", "outputs"))
     nodes = []
+    known = OPERATIONS.keys() - {"pow", "kink"} | {"input"}  # a kink is part of a derivative only
     for index, entry in enumerate(record.items("nodes", 0, 50_000)):
         items = listed(entry, f"{path}.nodes[{index}]", 1, 3)
         op, rest = items[0], items[1:]
@@ -31,7 +33,7 @@ def read_tape(value: object, path: str, inputs: tuple[str, ...], shape: tuple[in
             nodes.append(Node("const", (), number(rest[0], place)))
         elif op == "pow" and len(rest) == 2:
             nodes.append(Node("pow", (whole(rest[0], place, 0, index - 1),), number(rest[1], place)))
-        elif isinstance(op, str) and op not in ("const", "pow", "kink"):  # a kink is part of a derivative only
+        elif isinstance(op, str) and op in known:
             nodes.append(Node(op, tuple(whole(arg, place, 0, 10**6) for arg in rest)))
         else:
             raise CertificateError(f"`{place}` is no operation.")

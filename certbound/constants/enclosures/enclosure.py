@@ -8,15 +8,15 @@ enclosed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import EnclosureError
-from certbound.problem.model import JUMPS, Node, Tape
-from certbound.rigor.intervals import ARITHMETIC, UNDEFINED, Interval, sq
+from certbound.problem.model import OPERATIONS, Node, Tape, enclosed, undefined_where
+from certbound.rigor.intervals import Interval
 
 __all__ = ["enclose"]
 
@@ -107,7 +107,7 @@ def _evaluate(tape: Tape, inputs: Sequence[Interval]) -> tuple[list[Interval], l
             spoilt.append(None)
             continue
         args = [values[arg] for arg in node.args]
-        value = _apply(node, args)
+        value = enclosed(node, args)
         values.append(value)
         if _jumps(node, args, value, index, refusals):
             spoilt.append(None)
@@ -128,40 +128,24 @@ def _evaluate(tape: Tape, inputs: Sequence[Interval]) -> tuple[list[Interval], l
     return [values[output] for output in tape.outputs], refusals
 
 
-def _apply(node: Node, args: Sequence[Interval]) -> Interval:
-    if node.op == "const":
-        return Interval.point(node.value)
-    if node.op == "pow":
-        return ARITHMETIC["pow"](args[0], node.value)
-    if len(node.args) == 2 and node.args[0] == node.args[1]:  # x*x and x-x: not independent
-        if node.op == "mul":
-            return sq(args[0])
-        if node.op == "sub":
-            return Interval.point(np.zeros(args[0].shape))
-    return ARITHMETIC[node.op](*args)
-
-
 def _jumps(node: Node, args: Sequence[Interval], value: Interval, index: int, refusals: list[Refusal]) -> bool:
     """Whether the node can jump; undecided members are added to the refusals."""
-    if node.op not in JUMPS and node.op != "atan2":
+    jump = _jump(node)
+    if jump is None:
         return False
-    if node.op == "atan2":
-        mask = UNDEFINED["atan2"](*args)
-    elif node.op == "if_else_zero":
-        condition = args[0]
-        mask = (condition.lo <= 0) & (condition.hi >= 0) & ~((condition.lo == 0) & (condition.hi == 0))
-    else:
-        mask = value.lo != value.hi
+    mask = jump(value, *args)
     if np.any(mask):
         refusals.append(Refusal(index, np.asarray(mask)))
     return node.op not in ("if_else_zero", "atan2")
 
 
+def _jump(node: Node) -> Callable[..., Mask] | None:
+    return OPERATIONS[node.op].jump if node.op in OPERATIONS else None
+
+
 def _undefined(node: Node, args: Sequence[Interval]) -> Mask | None:
-    if node.op not in UNDEFINED or node.op == "atan2":
-        return None
-    mask = UNDEFINED["pow"](args[0], node.value) if node.op == "pow" else UNDEFINED[node.op](*args)
-    return np.asarray(mask) if np.any(mask) else None
+    mask = undefined_where(node, args) if _jump(node) is None else None
+    return mask if np.any(mask) else None
 
 
 def _inherited(node: Node, args: Sequence[Interval], masks: Sequence[Mask | None]) -> Mask | None:
@@ -182,8 +166,7 @@ def _message(tape: Tape, inputs: Sequence[Interval], refusal: Refusal) -> str:
     for name, x in zip(tape.inputs, inputs, strict=True):
         lo, hi = (float(end if end.ndim == 0 else end[member]) for end in (x.lo, x.hi))
         box.append(f"{name} in [{lo:.6g}, {hi:.6g}]" if lo < hi else f"{name} = {lo:.6g}")
-    jump = node.op in JUMPS or node.op == "atan2"
-    what = "may jump (no derivative bounds it)" if jump else "is undefined somewhere"
+    what = "may jump (no derivative bounds it)" if _jump(node) else "is undefined somewhere"
     return (
         f"`{tape.describe(refusal.node)}` {what} on the box {', '.join(box)}; "
         "restrict the domain so that this does not happen, or change the model."

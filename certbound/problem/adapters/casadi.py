@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import partial
 from typing import Any
 
-from certbound.problem.model import Graph, Tape
+from certbound.problem.model import OPERATIONS, Graph, Tape
 
 __all__ = ["casadi_module", "from_casadi", "to_casadi"]
 
@@ -33,7 +33,7 @@ def to_casadi(tape: Tape, inputs: Sequence[Any]) -> Any:
     """
     ca = casadi_module()
     scalars = [entry for value in inputs for entry in _entries(ca, value)]
-    values = tape.evaluate(_casadi_arithmetic(), scalars)
+    values = tape.evaluate(_casadi_arithmetic(ca), scalars)
     stacked = ca.vertcat(*values) if values else ca.SX(0, 1)
     if len(tape.shape) < 2:
         return stacked
@@ -45,18 +45,15 @@ def _entries(ca: Any, value: Any) -> list[Any]:
     return [value] if count == 1 else [ca.vec(value)[k] for k in range(count)]
 
 
-@lru_cache(maxsize=1)
-def _casadi_arithmetic() -> dict[str, Callable[..., Any]]:
-    ca = casadi_module()
-    names = {
-        "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "tan": "tan",
-        "asin": "asin", "acos": "acos", "atan": "atan", "sinh": "sinh", "cosh": "cosh", "tanh": "tanh",
-        "abs": "fabs", "sign": "sign", "kink": "sign", "floor": "floor", "not": "logic_not",
-        "atan2": "atan2", "hypot": "hypot", "min": "fmin", "max": "fmax", "lt": "lt", "le": "le",
-        "eq": "eq", "ne": "ne", "and": "logic_and", "or": "logic_or", "add": "plus", "sub": "minus",
-        "mul": "times", "div": "rdivide",
-    }  # fmt: skip
-    table: dict[str, Callable[..., Any]] = {op: getattr(ca, name) for op, name in names.items()}
+_NAMES = {
+    "abs": "fabs", "kink": "sign", "not": "logic_not", "and": "logic_and", "or": "logic_or", "min": "fmin",
+    "max": "fmax", "add": "plus", "sub": "minus", "mul": "times", "div": "rdivide",
+}  # fmt: skip
+"""What CasADi calls operations that have another name on a tape."""
+
+
+def _casadi_arithmetic(ca: Any) -> dict[str, Callable[..., Any]]:
+    table = {op: getattr(ca, _NAMES.get(op, op), _refused(op)) for op in OPERATIONS}
     return table | {
         "neg": lambda a: -a,
         "sq": lambda a: a * a,
@@ -64,6 +61,13 @@ def _casadi_arithmetic() -> dict[str, Callable[..., Any]]:
         "const": float,
         "pow": lambda base, exponent: ca.power(base, exponent),
     }
+
+
+def _refused(op: str) -> Callable[..., Any]:
+    def refuse(*_: Any) -> Any:
+        raise ValueError(f"`tape` uses {op}, which CasADi does not have; write the model without it to plan with it.")
+
+    return refuse
 
 
 def from_casadi(expression: Any, inputs: Sequence[Any], names: Sequence[str], shape: tuple[int, ...]) -> Tape:
@@ -118,9 +122,6 @@ def from_casadi(expression: Any, inputs: Sequence[Any], names: Sequence[str], sh
 
 
 def _readers(ca: Any, graph: Graph) -> dict[int, Callable[..., int]]:
-    def simple(op: str) -> Callable[..., int]:
-        return lambda *args: graph.apply(op, *args)
-
     def power(base: int, exponent: int) -> int:
         number = graph.number(exponent)
         if number is not None:
@@ -128,17 +129,11 @@ def _readers(ca: Any, graph: Graph) -> dict[int, Callable[..., int]]:
         return graph.apply("exp", graph.apply("mul", exponent, graph.apply("log", base)))
 
     one = graph.const(1.0)
-    names = {
-        "ADD": "add", "SUB": "sub", "MUL": "mul", "DIV": "div", "NEG": "neg", "EXP": "exp", "LOG": "log",
-        "SQRT": "sqrt", "SQ": "sq", "SIN": "sin", "COS": "cos", "TAN": "tan", "ASIN": "asin",
-        "ACOS": "acos", "ATAN": "atan", "LT": "lt", "LE": "le", "EQ": "eq", "NE": "ne", "NOT": "not",
-        "AND": "and", "OR": "or", "FLOOR": "floor", "FABS": "abs", "SIGN": "sign",
-        "IF_ELSE_ZERO": "if_else_zero", "FMIN": "min", "FMAX": "max", "SINH": "sinh", "COSH": "cosh",
-        "TANH": "tanh", "ATAN2": "atan2", "HYPOT": "hypot",
-    }  # fmt: skip
-    table: dict[int, Callable[..., int]] = {
-        getattr(ca, f"OP_{name}"): simple(op) for name, op in names.items()
-    }
+    table: dict[int, Callable[..., int]] = {}
+    for op in OPERATIONS:
+        name = f"OP_{_NAMES[op] if op in ('abs', 'min', 'max') else op}".upper()
+        if hasattr(ca, name):
+            table[getattr(ca, name)] = partial(graph.apply, op)
     return table | {
         ca.OP_ASSIGN: lambda a: a,
         ca.OP_TWICE: lambda a: graph.apply("mul", graph.const(2.0), a),

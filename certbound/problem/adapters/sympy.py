@@ -6,14 +6,11 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import Any
 
-from certbound.problem.model import Graph, Tape
+from certbound.problem.model import ARITY, Graph, Tape
 
 __all__ = ["from_sympy"]
 
-_UNARY = {
-    "sin": "sin", "cos": "cos", "tan": "tan", "asin": "asin", "acos": "acos", "atan": "atan", "sinh": "sinh",
-    "cosh": "cosh", "tanh": "tanh", "exp": "exp", "log": "log", "Abs": "abs", "sign": "sign", "floor": "floor",
-}  # fmt: skip
+_RENAMED = {"Abs": "abs", "Not": "not"}
 _FOLDED = {"Max": "max", "Min": "min", "And": "and", "Or": "or"}
 _COMPARISONS = {
     "StrictLessThan": ("lt", False), "LessThan": ("le", False), "StrictGreaterThan": ("lt", True),
@@ -82,14 +79,11 @@ class _Reader:
             return self._fold("add" if expr.is_Add else "mul", args)
         if expr.is_Pow:
             return self._power(*args)
-        if kind in _UNARY:
-            return graph.apply(_UNARY[kind], self.read(args[0]))
         if kind in _FOLDED:
             return self._fold(_FOLDED[kind], args)
-        if kind == "atan2":
-            return graph.apply("atan2", self.read(args[0]), self.read(args[1]))
-        if kind == "Not":
-            return graph.apply("not", self.read(args[0]))
+        name = _RENAMED.get(kind, kind)
+        if ARITY.get(name) == len(args):
+            return graph.apply(name, *map(self.read, args))
         if kind in _COMPARISONS:
             op, swapped = _COMPARISONS[kind]
             pair = [self.read(arg) for arg in (reversed(args) if swapped else args)]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from certbound.problem.files.parser import FUNCTIONS
+from certbound.problem.files.parser import is_function
 from certbound.problem.model import Tape
 
 __all__ = ["formulas"]
 
 _INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2)}
-_CALLS = frozenset(FUNCTIONS)
 _DEEPEST = 12
 _ATOM = 5
 
@@ -73,7 +72,7 @@ def _text(tape: Tape, index: int, texts: list[tuple[str, int, int]]) -> tuple[st
         exponent = 2.0 if node.op == "sq" else node.value
         power = _number(exponent) if exponent >= 0 else f"({_number(exponent)})"
         return f"{_bracketed(texts[node.args[0]], _ATOM)}**{power}", 4
-    if node.op in _CALLS:
+    if is_function(node.op):
         return f"{node.op}({', '.join(texts[arg][0] for arg in node.args)})", _ATOM
     raise ValueError(
         f"the model uses {tape.describe(index)}, and {node.op} does not exist in problem files; keep the "

@@ -12,15 +12,9 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from certbound.checks import nearest
-from certbound.problem.model import NUMPY, Graph
+from certbound.problem.model import ARITY, OPERATIONS, Graph, arithmetic
 
-__all__ = ["CONSTANTS", "FUNCTIONS", "constant", "parse"]
-
-FUNCTIONS: Mapping[str, int] = {
-    "sin": 1, "cos": 1, "tan": 1, "asin": 1, "acos": 1, "atan": 1, "atan2": 2, "sinh": 1, "cosh": 1,
-    "tanh": 1, "exp": 1, "log": 1, "sqrt": 1, "abs": 1, "min": 2, "max": 2, "hypot": 2,
-}  # fmt: skip
-"""Function name to its number of arguments (min and max take two or more)."""
+__all__ = ["CONSTANTS", "constant", "is_function", "parse"]
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi}
 
@@ -187,23 +181,23 @@ class _Parser:
             return value if isinstance(value, int) else value()
         if name in CONSTANTS:
             return self.graph.const(CONSTANTS[name])
-        if name in FUNCTIONS:
+        if is_function(name):
             raise self.fail(f"{name} is a function; write {name}(...)", token.place)
         raise self.fail(f"unknown name {name!r}{nearest(name, [*self.names, *CONSTANTS])}", token.place)
 
     def call(self, token: _Token) -> int:
         name = token.text
-        if name not in FUNCTIONS:
+        if not is_function(name):
             if name in self.names or name in CONSTANTS:
                 raise self.fail(f"{name!r} is not a function; write * to multiply", token.place)
-            raise self.fail(f"unknown function {name!r}{nearest(name, FUNCTIONS)}", token.place)
+            raise self.fail(f"unknown function {name!r}{nearest(name, filter(is_function, OPERATIONS))}", token.place)
         self.expect("(")
         arguments = [self.expression(0)]
         while self.peek().text == ",":
             self.next += 1
             arguments.append(self.expression(0))
         self.expect(")")
-        count = FUNCTIONS[name]
+        count = ARITY[name]
         if len(arguments) != count and not (name in ("min", "max") and len(arguments) > 2):
             wanted = f"{count} argument{'s' * (count > 1)}"
             raise self.fail(f"{name} takes {wanted}, got {len(arguments)}", token.place)
@@ -213,9 +207,14 @@ class _Parser:
         return node
 
 
+def is_function(name: str) -> bool:
+    """Whether expressions may call it: min and max take two arguments or more, every other as many as on a tape."""
+    return name in OPERATIONS and OPERATIONS[name].in_files
+
+
 def constant(graph: Graph, node: int) -> float | None:
     """Value of a node that depends on no input, rounded; None for any other."""
     tape = graph.tape([node], (1,))
     if any(entry.op == "input" for entry in tape.nodes):
         return None
-    return float(tape.evaluate(NUMPY, [0.0] * len(tape.inputs))[0])
+    return float(tape.evaluate(arithmetic("numpy"), [0.0] * len(tape.inputs))[0])

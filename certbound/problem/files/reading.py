@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from certbound.checks import names as checked_names
 from certbound.checks import nearest
 from certbound.problem import sets
-from certbound.problem.files.parser import CONSTANTS, FUNCTIONS, constant, parse
+from certbound.problem.files.parser import CONSTANTS, constant, is_function, parse
 from certbound.problem.files.plans import read_plan
 from certbound.problem.files.schema import BallTable, Constraint, EllipsoidTable, Specification, Start
-from certbound.problem.model import Graph, Tape
+from certbound.problem.model import OPERATIONS, Graph, Tape
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
@@ -24,7 +24,7 @@ __all__ = ["RESERVED", "read_problem"]
 
 Array = NDArray[np.float64]
 
-RESERVED = frozenset({"t", *FUNCTIONS, *CONSTANTS})
+RESERVED = frozenset({"t", *filter(is_function, OPERATIONS), *CONSTANTS})
 """Names that no state, input, disturbance, parameter or definition may have."""
 
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from certbound.problem.model.analysis import (
         adds_plainly,
         deciding,
+        edged,
         is_zero,
         selected,
         sources,
@@ -19,49 +20,60 @@ if TYPE_CHECKING:
         watched,
     )
     from certbound.problem.model.derivative import jacobian
-    from certbound.problem.model.evaluation import NUMPY, compile_numpy, compile_scalar
+    from certbound.problem.model.evaluation import compile_numpy, compile_scalar
     from certbound.problem.model.graph import Graph, substitute
-    from certbound.problem.model.tape import BINARY, JUMPS, Node, Tape
+    from certbound.problem.model.operations import OPERATIONS, arithmetic, enclosed, undefined_where
+    from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
     from certbound.problem.model.tracing import trace
 
 _HOME = {
     "adds_plainly": "analysis",
-    "BINARY": "tape",
+    "arithmetic": "operations",
+    "ARITY": "tape",
     "compile_numpy": "evaluation",
     "compile_scalar": "evaluation",
     "deciding": "analysis",
+    "edged": "analysis",
+    "enclosed": "operations",
     "Graph": "graph",
     "is_zero": "analysis",
     "jacobian": "derivative",
     "JUMPS": "tape",
+    "needed": "tape",
     "Node": "tape",
-    "NUMPY": "evaluation",
+    "OPERATIONS": "operations",
     "selected": "analysis",
     "sources": "analysis",
     "substitute": "graph",
     "Tape": "tape",
     "trace": "tracing",
+    "undefined_where": "operations",
     "varying_outputs": "analysis",
     "watched": "analysis",
 }
 
 __all__ = [
     "adds_plainly",
-    "BINARY",
+    "arithmetic",
+    "ARITY",
     "compile_numpy",
     "compile_scalar",
     "deciding",
+    "edged",
+    "enclosed",
     "Graph",
     "is_zero",
     "jacobian",
     "JUMPS",
+    "needed",
     "Node",
-    "NUMPY",
+    "OPERATIONS",
     "selected",
     "sources",
     "substitute",
     "Tape",
     "trace",
+    "undefined_where",
     "varying_outputs",
     "watched",
 ]

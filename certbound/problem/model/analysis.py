@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from certbound.problem.model.tape import JUMPS, Node, Tape
+from certbound.problem.model.operations import OPERATIONS
+from certbound.problem.model.tape import JUMPS, Node, Tape, needed
 
-__all__ = ["adds_plainly", "deciding", "is_zero", "selected", "sources", "varying_outputs", "watched"]
+__all__ = ["adds_plainly", "deciding", "edged", "is_zero", "selected", "sources", "varying_outputs", "watched"]
 
 
 def selected(tape: Tape, outputs: list[int], function: Tape | None) -> Tape:
@@ -13,19 +14,12 @@ def selected(tape: Tape, outputs: list[int], function: Tape | None) -> Tape:
     Without ``function`` only what the outputs need is kept: jumps elsewhere are no longer seen.
     """
     base = 0 if function is None else len(function.nodes)
-    needed = [index < base for index in range(len(tape.nodes))]
-    for output in outputs:
-        needed[tape.outputs[output]] = True
-    for index in range(len(tape.nodes) - 1, -1, -1):
-        node = tape.nodes[index]
-        if needed[index] and node.op != "input":
-            for arg in node.args:
-                needed[arg] = True
+    live = needed(tape.nodes, [tape.outputs[output] for output in outputs], base)
     moved: dict[int, int] = {}
     seen: dict[tuple[str, tuple[int, ...], str], int] = {}
     nodes: list[Node] = []
     for index, node in enumerate(tape.nodes):
-        if not needed[index]:
+        if not live[index]:
             continue
         args = node.args if node.op == "input" else tuple(moved[arg] for arg in node.args)
         if node.op in ("add", "mul"):
@@ -76,6 +70,13 @@ def deciding(tape: Tape) -> dict[int, set[int]]:
         index: found[node.args[0]] if node.op == "if_else_zero" else found[index]
         for index, node in enumerate(tape.nodes) if node.op in JUMPS
     }  # fmt: skip
+
+
+def edged(tape: Tape) -> bool:
+    """Whether a node may jump (but for ``atan2``) or have a kink: derivatives do not tell all of such a function."""
+    return any(
+        node.op in JUMPS or (node.op in OPERATIONS and OPERATIONS[node.op].kink is not None) for node in tape.nodes
+    )
 
 
 def adds_plainly(tape: Tape, gain: Tape, count: int) -> bool:

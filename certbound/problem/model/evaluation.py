@@ -2,63 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.problem.model.operations import OPERATIONS
 from certbound.problem.model.tape import Tape
 
-__all__ = ["NUMPY", "compile_numpy", "compile_scalar"]
+__all__ = ["compile_numpy", "compile_scalar"]
 
 Array = NDArray[np.float64]
-
-
-def _truth(comparison: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    return lambda a, b: np.asarray(comparison(a, b), dtype=float)[()]
-
-
-NUMPY: Mapping[str, Callable[..., Any]] = {
-    "neg": np.negative,
-    "sq": np.square,
-    "sqrt": np.sqrt,
-    "exp": np.exp,
-    "log": np.log,
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "asin": np.arcsin,
-    "acos": np.arccos,
-    "atan": np.arctan,
-    "sinh": np.sinh,
-    "cosh": np.cosh,
-    "tanh": np.tanh,
-    "abs": np.abs,
-    "kink": np.sign,
-    "sign": np.sign,
-    "floor": np.floor,
-    "not": lambda a: np.asarray(np.equal(a, 0), dtype=float)[()],
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "atan2": np.arctan2,
-    "hypot": np.hypot,
-    "min": np.minimum,
-    "max": np.maximum,
-    "lt": _truth(np.less),
-    "le": _truth(np.less_equal),
-    "eq": _truth(np.equal),
-    "ne": _truth(np.not_equal),
-    "and": _truth(np.logical_and),
-    "or": _truth(np.logical_or),
-    "if_else_zero": lambda c, y: np.where(np.not_equal(c, 0), y, 0.0)[()],
-    "const": float,
-    "pow": lambda base, exponent: np.power(np.asarray(base, dtype=float), exponent),
-}
-"""Tape operation to NumPy function: the arithmetic of plain floats (``kink`` takes 0 at 0)."""
 
 
 @lru_cache(maxsize=256)
@@ -156,5 +112,5 @@ def _program(tape: Tape) -> tuple[list[_Step], int, dict[int, int]]:
             free += [register[arg] for arg in set(node.args) if last[arg] == index]
         register[index] = free.pop() if free else len(set(register.values()))
         number = node.value if node.op in ("const", "pow") else None
-        program.append((register[index], None if leaf else NUMPY[node.op], args, number))
+        program.append((register[index], None if leaf else OPERATIONS[node.op].numpy, args, number))
     return program, len(set(register.values())), register

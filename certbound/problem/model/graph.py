@@ -10,23 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
-from certbound.problem.model.tape import BINARY, UNARY, Node, Tape
+from certbound.problem.model.operations import OPERATIONS
+from certbound.problem.model.tape import ARITY, Node, Tape, needed
 
 __all__ = ["Graph", "substitute"]
 
-_AT_ZERO = {
-    "sin": 0.0,
-    "tan": 0.0,
-    "asin": 0.0,
-    "atan": 0.0,
-    "sinh": 0.0,
-    "tanh": 0.0,
-    "cos": 1.0,
-    "cosh": 1.0,
-    "exp": 1.0,
-}
 _COMPARE: dict[str, Callable[[float, float], bool]] = {
     "lt": lambda a, b: a < b,
     "le": lambda a, b: a <= b,
@@ -64,17 +55,11 @@ class Graph:
 
     def tape(self, outputs: Sequence[int], shape: tuple[int, ...], keep: int = 0) -> Tape:
         """The finished tape, less the nodes that no output needs (the first ``keep`` nodes always stay)."""
-        needed = [index < keep for index in range(len(self.nodes))]
-        for output in outputs:
-            needed[output] = True
-        for index in range(len(self.nodes) - 1, -1, -1):
-            if needed[index] and self.nodes[index].op != "input":
-                for arg in self.nodes[index].args:
-                    needed[arg] = True
+        live = needed(self.nodes, outputs, keep)
         place: dict[int, int] = {}
         nodes: list[Node] = []
         for index, node in enumerate(self.nodes):
-            if needed[index]:
+            if live[index]:
                 place[index] = len(nodes)
                 nodes.append(
                     node if node.op == "input" else node._replace(args=tuple(place[a] for a in node.args))
@@ -100,13 +85,10 @@ class Graph:
         return node.value if node.op == "const" else None
 
     def apply(self, op: str, *args: int) -> int:
-        """The node of ``op`` (see ``tape.UNARY``, ``tape.BINARY``) applied to earlier nodes, simplified."""
-        if len(args) == 1 and op in UNARY:
-            simple = self._simple_unary(op, args[0])
-        elif len(args) == 2 and op in BINARY:
-            simple = self._simple_binary(op, *args)
-        else:
+        """The node of ``op`` (see ``tape.ARITY``) applied to earlier nodes, simplified."""
+        if ARITY.get(op) != len(args) or op in ("const", "input", "pow"):
             raise ValueError(f"`op` must be a tape operation of {len(args)} arguments, got {op!r}.")
+        simple = self._simple_unary(op, *args) if len(args) == 1 else self._simple_binary(op, *args)
         if simple is not None:
             return simple
         if op in _COMMUTATIVE and Node(op, args[::-1]) in self._index:
@@ -137,11 +119,7 @@ class Graph:
 
     def arithmetic(self) -> dict[str, Callable[..., int]]:
         """The arithmetic with which ``Tape.evaluate`` copies a tape into this graph."""
-
-        def operation(op: str) -> Callable[..., int]:
-            return lambda *args: self.apply(op, *args)
-
-        table: dict[str, Callable[..., int]] = {op: operation(op) for op in UNARY | BINARY}
+        table: dict[str, Callable[..., int]] = {op: partial(self.apply, op) for op in OPERATIONS}
         return table | {"const": self.const, "pow": self.pow}
 
     def _intern(self, node: Node) -> int:
@@ -160,8 +138,9 @@ class Graph:
             if op in ("sq", "abs") and node.op in ("neg", "abs"):
                 return self.apply(op, node.args[0])
             return None
-        if op in _AT_ZERO and value == 0:
-            return self.const(_AT_ZERO[op])
+        known = OPERATIONS[op].at_zero
+        if known is not None and value == 0:
+            return self.const(known)
         exact: dict[str, Callable[[float], float]] = {
             "neg": lambda v: -v,
             "abs": abs,

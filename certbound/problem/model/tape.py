@@ -11,24 +11,23 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
-__all__ = ["BINARY", "JUMPS", "UNARY", "Node", "Tape"]
+__all__ = ["ARITY", "JUMPS", "Node", "Tape", "needed"]
 
 T = TypeVar("T")
 
-UNARY = frozenset(
-    "neg sq sqrt exp log sin cos tan asin acos atan sinh cosh tanh abs kink sign floor not".split()  # noqa: SIM905  (shorter)
-)
-"""Operations of one argument (``sq`` is the square). ``pow`` has one argument too, and a constant exponent.
+ARITY: dict[str, int] = {
+    "const": 0, "input": 1, "pow": 1,
+    "neg": 1, "sq": 1, "sqrt": 1, "exp": 1, "log": 1, "sin": 1, "cos": 1, "tan": 1, "asin": 1, "acos": 1, "atan": 1,
+    "sinh": 1, "cosh": 1, "tanh": 1, "abs": 1, "kink": 1, "sign": 1, "floor": 1, "not": 1,
+    "add": 2, "sub": 2, "mul": 2, "div": 2, "atan2": 2, "hypot": 2, "min": 2, "max": 2, "lt": 2, "le": 2, "eq": 2,
+    "ne": 2, "and": 2, "or": 2, "if_else_zero": 2,
+}  # fmt: skip
+"""Operations and their numbers of arguments (``sq`` is the square; the exponent of ``pow`` is a constant beside them).
 
 ``kink`` is the generalised derivative of abs: -1 left of 0, 1 right of it, and **all of [-1, 1]** at 0 (so
 that an interval reader encloses it by [-1, 1] on a box that contains 0, and refuses nothing). It occurs in
-derivatives only.
+derivatives only. ``if_else_zero(c, y)`` is y where c holds, else 0; comparisons are 0 or 1.
 """
-
-BINARY = frozenset(
-    "add sub mul div atan2 hypot min max lt le eq ne and or if_else_zero".split()  # noqa: SIM905  (shorter)
-)
-"""Operations of two arguments. ``if_else_zero(c, y)`` is y where c holds, else 0; comparisons are 0 or 1."""
 
 JUMPS = frozenset(
     "sign floor not lt le eq ne and or if_else_zero".split()  # noqa: SIM905  (shorter)
@@ -75,8 +74,7 @@ class Tape:
             limit = len(self.inputs) if node.op == "input" else index
             if any(not 0 <= arg < limit for arg in node.args):
                 raise ValueError(f"`nodes` must refer to earlier nodes only; node {index} is {node}.")
-            arity = {"const": 0, "input": 1, "pow": 1}.get(node.op, 1 if node.op in UNARY else 2)
-            if node.op not in UNARY | BINARY | {"const", "input", "pow"} or len(node.args) != arity:
+            if len(node.args) != ARITY.get(node.op):
                 raise ValueError(f"`nodes` holds an unknown operation or arity: node {index} is {node}.")
         if any(not 0 <= output < len(self.nodes) for output in self.outputs):
             raise ValueError("`outputs` must be indices of nodes.")
@@ -125,3 +123,15 @@ class Tape:
         if node.op in ("pow", "sq"):
             return f"{parts[0]}**{2 if node.op == 'sq' else node.value:g}"
         return f"-{parts[0]}" if node.op == "neg" else f"{node.op}({', '.join(parts)})"
+
+
+def needed(nodes: Sequence[Node], outputs: Sequence[int], keep: int = 0) -> list[bool]:
+    """Whether each node is an output, one of the first ``keep``, or what one of these depends on."""
+    found = [index < keep for index in range(len(nodes))]
+    for output in outputs:
+        found[output] = True
+    for index in range(len(nodes) - 1, -1, -1):
+        if found[index] and nodes[index].op != "input":
+            for arg in nodes[index].args:
+                found[arg] = True
+    return found

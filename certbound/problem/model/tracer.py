@@ -14,8 +14,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from certbound.problem.model.evaluation import NUMPY
 from certbound.problem.model.graph import Graph
+from certbound.problem.model.operations import OPERATIONS
 
 __all__ = ["FUNCTIONS", "Scalar", "Traced", "UntraceableError"]
 
@@ -107,7 +107,7 @@ def _node(op: str) -> Callable[..., Any]:
     def apply(*operands: Any) -> Any:
         graph = next((operand.graph for operand in operands if isinstance(operand, Scalar)), None)
         if graph is None:
-            return NUMPY[op](*operands)
+            return OPERATIONS[op].numpy(*operands)
         return Scalar(graph, graph.apply(op, *(_lift(graph, operand) for operand in operands)))
 
     return apply
@@ -128,16 +128,8 @@ def _like(value: Any, number: Any) -> Any:
     return Scalar(value.graph, _lift(value.graph, number)) if isinstance(value, Scalar) else number
 
 
-_add, _sub, _mul, _div, _neg = _node("add"), _node("sub"), _node("mul"), _node("div"), _node("neg")
-_exp, _log, _sqrt, _sq, _abs = _node("exp"), _node("log"), _node("sqrt"), _node("sq"), _node("abs")
-_min, _max, _lt, _le, _not, _floor = (
-    _node("min"),
-    _node("max"),
-    _node("lt"),
-    _node("le"),
-    _node("not"),
-    _node("floor"),
-)
+_add, _sub, _mul, _div, _neg, _exp, _log, _sqrt = map(_node, ("add", "sub", "mul", "div", "neg", "exp", "log", "sqrt"))
+_sq, _abs, _min, _max, _lt, _le, _not, _floor = map(_node, ("sq", "abs", "min", "max", "lt", "le", "not", "floor"))
 
 
 def _where(condition: Any, x: Any, y: Any) -> Any:
@@ -161,56 +153,35 @@ def _modulo(x: Any, y: Any) -> Any:
 
 
 FUNCTIONS: dict[str, Callable[..., Any]] = {
-    "add": _add,
-    "subtract": _sub,
-    "multiply": _mul,
-    "divide": _div,
+    row.numpy.__name__: _node(op)
+    for op, row in OPERATIONS.items()
+    if isinstance(row.numpy, np.ufunc) and op != "kink"
+} | {
     "true_divide": _div,
     "floor_divide": lambda x, y: _floor(_div(x, y)),
     "remainder": _modulo,
     "mod": _modulo,
     "power": _power,
     "float_power": _power,
-    "negative": _neg,
     "positive": lambda x: x,
     "conjugate": lambda x: x,
-    "absolute": _abs,
     "fabs": _abs,
-    "square": _sq,
-    "sqrt": _sqrt,
     "reciprocal": lambda x: _div(1.0, x),
-    "exp": _exp,
     "exp2": lambda x: _exp(_mul(_log(_like(x, 2.0)), x)),
     "expm1": lambda x: _sub(_exp(x), 1.0),
-    "log": _log,
     "log1p": lambda x: _log(_add(1.0, x)),
     "log2": lambda x: _div(_log(x), _log(_like(x, 2.0))),
     "log10": lambda x: _div(_log(x), _log(_like(x, 10.0))),
     "logaddexp": lambda x, y: _log(_add(_exp(x), _exp(y))),
-    "sin": _node("sin"),
-    "cos": _node("cos"),
-    "tan": _node("tan"),
-    "arcsin": _node("asin"),
-    "arccos": _node("acos"),
-    "arctan": _node("atan"),
-    "sinh": _node("sinh"),
-    "cosh": _node("cosh"),
-    "tanh": _node("tanh"),
     "arcsinh": lambda x: _log(_add(x, _sqrt(_add(_sq(x), 1.0)))),
     "arccosh": lambda x: _log(_add(x, _sqrt(_sub(_sq(x), 1.0)))),
     "arctanh": lambda x: _mul(0.5, _log(_div(_add(1.0, x), _sub(1.0, x)))),
-    "arctan2": _node("atan2"),
-    "hypot": _node("hypot"),
     "deg2rad": lambda x: _mul(math.pi / 180.0, x),
     "radians": lambda x: _mul(math.pi / 180.0, x),
     "rad2deg": lambda x: _mul(180.0 / math.pi, x),
     "degrees": lambda x: _mul(180.0 / math.pi, x),
-    "minimum": _min,
     "fmin": _min,
-    "maximum": _max,
     "fmax": _max,
-    "sign": _node("sign"),
-    "floor": _floor,
     "ceil": lambda x: _neg(_floor(_neg(x))),
     "heaviside": lambda x, half: _where(_lt(0.0, x), 1.0, _where(_node("eq")(x, 0.0), half, 0.0)),
     "less": _lt,
@@ -227,7 +198,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "invert": _not,
     "clip": _clip,
 }
-"""NumPy function name to its action on traced scalars."""
+"""NumPy function name to its action on traced scalars: the functions of the table, and what is made of them."""
 
 
 def _plain(value: Any) -> Any:
@@ -255,8 +226,9 @@ def _elementwise(function: Callable[..., Any], *operands: Any) -> Any:
 
 def _ufunc(ufunc: np.ufunc, method: str, inputs: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     name, out = ufunc.__name__, kwargs.pop("out", None)
-    if method == "__call__" and name in FUNCTIONS and not set(kwargs) - {"dtype", "casting"}:
-        result = _elementwise(FUNCTIONS[name], *inputs)
+    function = FUNCTIONS.get(name) or next((_node(op) for op, row in OPERATIONS.items() if row.numpy is ufunc), None)
+    if method == "__call__" and function is not None and not set(kwargs) - {"dtype", "casting"}:
+        result = _elementwise(function, *inputs)
     elif method == "__call__" and name in ("matmul", "vecdot", "matvec", "vecmat") and not kwargs:
         result = _wrapped(ufunc(*(np.asarray(_plain(value), dtype=object) for value in inputs)))
     elif method == "reduce" and name in ("add", "multiply", "maximum", "minimum"):
@@ -337,13 +309,8 @@ def _install() -> None:
         "mod": "remainder", "floordiv": "floor_divide", "and": "logical_and", "or": "logical_or",
     }  # fmt: skip
     comparisons = {
-        "lt": "less",
-        "le": "less_equal",
-        "gt": "greater",
-        "ge": "greater_equal",
-        "eq": "equal",
-        "ne": "not_equal",
-    }
+        "lt": "less", "le": "less_equal", "gt": "greater", "ge": "greater_equal", "eq": "equal", "ne": "not_equal",
+    }  # fmt: skip
 
     def method(name: str, reflected: bool = False) -> Callable[..., Any]:
         function = FUNCTIONS[name]

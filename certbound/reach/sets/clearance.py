@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 
 from certbound.problem.model import Tape
 from certbound.problem.sets import Ball, Ellipsoid, Inside, Outside, Region
-from certbound.reach.nominal import Curve, Series, expand, polynomial_range, series_product
+from certbound.reach.nominal import Curve, Series, expand, polynomial_range
 from certbound.reach.sets.separation import polyhedral_weights, round_directions
 from certbound.rigor import intervals as iv
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm, ball_root
+from certbound.rigor.series import product
 
 __all__ = ["Clearance", "constraint_clearance"]
 
@@ -197,7 +198,7 @@ def _inside_round(
     squared: Series = []
     for row in scale:
         series = _combine(relative, row)
-        squared = _added(squared, series_product(series, series))
+        squared = _added(squared, product(series, series))
     ranges = polynomial_range(squared, span)
     largest = iv.sqrt(Interval(np.maximum(ranges.lo, 0.0), np.maximum(ranges.hi, 0.0)))
     rows = np.zeros((size, n))

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import EnclosureError
-from certbound.problem.model import JUMPS, Graph, Node, Tape, jacobian
-from certbound.rigor.intervals import ARITHMETIC, UNDEFINED, Interval, sq
+from certbound.problem.model import OPERATIONS, Graph, Node, Tape, edged, enclosed, jacobian, undefined_where
+from certbound.rigor.intervals import Interval
 from certbound.values.continuous.polynomials import interpolation, node_product, nodes_of, norm
 
 __all__ = ["Cells", "Interpolant", "Reader", "enclose", "squared_diffusion"]
@@ -30,7 +30,6 @@ __all__ = ["Cells", "Interpolant", "Reader", "enclose", "squared_diffusion"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_EDGES = JUMPS | {"abs", "kink", "min", "max"}
 _HIGHEST = 6  # polynomials up to this degree are represented exactly
 _SMOOTH = 4  # degree of the interpolant of any other smooth function
 
@@ -53,39 +52,18 @@ def enclose(tape: Tape, inputs: Sequence[Interval]) -> tuple[list[Interval], Mas
         if node.op == "input":
             values.append(inputs[node.args[0]])
             continue
-        if node.op in UNDEFINED and np.any(_undefined(node, args)):
+        if np.any(undefined_where(node, args)):
             raise EnclosureError(
                 f"`{tape.describe(index)}` is undefined somewhere in the safe set; a value function needs the "
                 "model on all of it: add constraints (or a `domain`) that keep away from there."
             )
-        values.append(_applied(node, args))
-        if node.op in _EDGES:
-            edge = edge | _undecided(node.op, args, values[-1])
+        values.append(enclosed(node, args))
+        row = OPERATIONS.get(node.op)
+        if row is not None and row.kink is not None:
+            edge = edge | row.kink(*args)
+        elif row is not None and row.jump is not None:
+            edge = edge | row.jump(values[-1], *args)
     return [values[output] for output in tape.outputs], np.broadcast_to(edge, batch)
-
-
-def _undefined(node: Node, args: Sequence[Interval]) -> Mask:
-    return np.asarray(UNDEFINED["pow"](args[0], node.value) if node.op == "pow" else UNDEFINED[node.op](*args))
-
-
-def _applied(node: Node, args: Sequence[Interval]) -> Interval:
-    if node.op == "const":
-        return Interval.point(node.value)
-    if node.op == "pow":
-        return ARITHMETIC["pow"](args[0], node.value)
-    if node.op == "mul" and node.args[0] == node.args[1]:
-        return sq(args[0])
-    return ARITHMETIC[node.op](*args)
-
-
-def _undecided(op: str, args: Sequence[Interval], value: Interval) -> Mask:
-    if op in ("abs", "kink"):
-        return np.asarray((args[0].lo <= 0) & (args[0].hi >= 0))
-    if op in ("min", "max"):
-        return np.asarray((args[0].lo <= args[1].hi) & (args[1].lo <= args[0].hi))
-    if op == "if_else_zero":
-        return np.asarray((args[0].lo <= 0) & (args[0].hi >= 0) & ~((args[0].lo == 0) & (args[0].hi == 0)))
-    return np.asarray(value.lo != value.hi)
 
 
 def squared_diffusion(diffusion: Array | Tape, states: Sequence[str]) -> Tape:
@@ -168,7 +146,7 @@ class Reader:
 
     def __init__(self, tape: Tape, axes: int) -> None:
         self.tape, self.axes = tape, axes
-        self.edged = any(node.op in _EDGES for node in tape.nodes)
+        self.edged = edged(tape)
         self.degrees: list[int] = []
         self.derivatives: list[Tape | None] = []
         for axis in range(axes):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import InfeasibleError
-from certbound.problem.model import Node, Tape, compile_numpy, jacobian
+from certbound.problem.model import Node, Tape, compile_numpy, edged, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, GaussianStart
 from certbound.problem.systems import ContinuousSystem
@@ -146,8 +146,7 @@ def _branches(drift: Tape, disturbance: Box | None, first: int) -> tuple[tuple[I
     ends = list(zip(disturbance.low, disturbance.high))
     slots = list(range(first, first + len(ends)))
     curved = jacobian(jacobian(drift, slots), slots)
-    edged = any(node.op in ("abs", "kink", "min", "max", "sign", "floor", "if_else_zero") for node in drift.nodes)
-    if not edged and all(curved.nodes[output] == Node("const", (), 0.0) for output in curved.outputs):
+    if not edged(drift) and all(curved.nodes[output] == Node("const", (), 0.0) for output in curved.outputs):
         sides = [sorted({low, high}) for low, high in ends]
         return tuple(tuple(Interval.point(value) for value in corner) for corner in itertools.product(*sides))
     parts = max(1, round(16 ** (1 / len(ends))))

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.model import JUMPS, Tape, jacobian
+from certbound.problem.model import OPERATIONS, Tape, enclosed, jacobian, undefined_where
 from certbound.problem.problem import Problem
-from certbound.rigor.intervals import ARITHMETIC, UNDEFINED, Interval, sq
+from certbound.rigor.intervals import Interval
 from certbound.values.grids import Grid
 
 __all__ = ["CellImages", "Dynamics", "Step"]
@@ -226,27 +226,12 @@ def _run(tape: Tape, inputs: list[Interval], undefined: Mask, jumps: Mask) -> li
         if node.op == "input":
             values.append(inputs[node.args[0]])
             continue
-        if node.op == "const":
-            values.append(Interval.point(node.value))
-            continue
         args = [values[arg] for arg in node.args]
-        same = len(node.args) == 2 and node.args[0] == node.args[1]
-        if node.op == "pow":
-            value = ARITHMETIC["pow"](args[0], node.value)
-        elif same and node.op == "mul":
-            value = sq(args[0])
-        elif same and node.op == "sub":
-            value = Interval.point(np.zeros(args[0].shape))
-        else:
-            value = ARITHMETIC[node.op](*args)
-        if node.op in UNDEFINED:
-            mask = UNDEFINED["pow"](args[0], node.value) if node.op == "pow" else UNDEFINED[node.op](*args)
-            np.logical_or(
-                undefined if node.op != "atan2" else jumps, mask, out=undefined if node.op != "atan2" else jumps
-            )
-        if node.op == "if_else_zero":
-            np.logical_or(jumps, (args[0].lo <= 0) & (args[0].hi >= 0) & (args[0].lo != args[0].hi), out=jumps)
-        elif node.op in JUMPS:
-            np.logical_or(jumps, value.lo != value.hi, out=jumps)
+        value = enclosed(node, args)
+        row = OPERATIONS.get(node.op)
+        if row is not None and row.jump is not None:
+            np.logical_or(jumps, row.jump(value, *args), out=jumps)
+        elif (mask := undefined_where(node, args)) is not None:
+            np.logical_or(undefined, mask, out=undefined)
         values.append(value)
     return values
