@@ -51,6 +51,8 @@ _UNIFORM_SHARES = {
     3: (0.5, 0.3, 0.2, 0.12),
 }
 _MOST_NODES = 3_000_000
+_NODE_SECONDS = {False: 1e-4, True: 2e-3}
+"""Roughly what a node of a first grid takes, without and with a common factor in the noise; measured, for refusing."""
 _PATIENCE = 1.0  # seconds for which grids are refined although the question is answered
 _FLOOR = 1e-16  # where what lies beyond ten standard deviations begins to count
 
@@ -128,6 +130,8 @@ def bound_failure(
                 raise Inapplicable(work.too_large)
             break
         finest = max((grid.shape for grid in layout), key=math.prod)
+        if not tried:
+            work.check_first(math.prod(finest), seconds)
         if tried and time.perf_counter() - begun + _expected(spent, math.prod(finest)) > seconds:
             break
         start = time.perf_counter()
@@ -189,6 +193,17 @@ class _Work:
         self.random = isinstance(problem.initial, GaussianStart)
         self.start_shocks = self._start_shocks()
         self._lengths: dict[int, list[tuple[Array, Array]]] = {}
+
+    def check_first(self, nodes: int, seconds: float) -> None:
+        """Refuse a first grid that would take several times the ``seconds`` that may be spent."""
+        rounds = 1 if self.dynamics.steady else self.horizon
+        needed = nodes * rounds * _NODE_SECONDS[self.shocks.common]
+        if needed > 4 * seconds:
+            raise Inapplicable(
+                f"value functions would take about {needed:.0f} s on their coarsest grid, of {nodes} cells, and "
+                f"{seconds:g} s may be spent: the safe set is many standard deviations of the noise wide. Use another "
+                "engine, which is at its best there."
+            )
 
     def _start_shocks(self) -> Shocks | None:
         initial = self.problem.initial
