@@ -34,6 +34,7 @@ gaussian
 tubes.constants tubes.line_search
 tubes.tube tubes.schedule tubes.excess
 tubes.ballpath tubes.objective
+tubes.question
 tubes.paper tubes.kummer
 tubes.exact
 tubes

@@ -28,7 +28,7 @@ from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
-from certbound.tubes.kummer import Start
+from certbound.tubes.question import Start
 from certbound.tubes.tube import Tube, supremum
 from certbound.tubes.tuning import tune_tube
 

@@ -53,7 +53,7 @@ from certbound.safety.engines.rooms import (
     smallest_level,
 )
 from certbound.tubes.constants import Constants
-from certbound.tubes.kummer import Start
+from certbound.tubes.question import Start
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
