@@ -227,8 +227,7 @@ def make_schedule(constants: Constants, horizon: float) -> Schedule:
         raise ValueError(f"`horizon` must be positive and finite, got {horizon}.")
     if not constants.continuous and horizon != int(horizon):
         raise ValueError(f"`horizon` must be a whole number of steps in discrete time, got {horizon}.")
-    slope = constants.rate if constants.rate is not None else constants.gain
-    slopes, sigmas = np.atleast_1d(np.asarray(slope, float)), np.atleast_1d(np.asarray(constants.sigma, float))
+    slopes, sigmas = (np.atleast_1d(np.asarray(part, float)) for part in (constants.slope, constants.sigma))
     if constants.times is None:
         times = np.array([0.0, horizon])
     else:

@@ -189,8 +189,7 @@ def _slow_tube(question: Question, delta: float, method: str, *, seed: Tube | No
 def applicable_methods(constants: Constants) -> list[str]:
     """Names that ``auto`` compares for these constants: certified, trajectory level, hypotheses fulfilled."""
     time = "continuous" if constants.continuous else "discrete"
-    slope = constants.rate if constants.rate is not None else constants.gain
-    contracting = bool(np.all(np.asarray(slope) < (0 if constants.continuous else 1)))
+    contracting = constants.worst_slope < (0 if constants.continuous else 1)
     names = []
     for name in _QUICK:
         row = BASELINES.get(name)

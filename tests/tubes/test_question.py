@@ -43,3 +43,16 @@ def test_a_tube_states_what_was_asked(method: str) -> None:
     assert (tube.method, tube.delta, tube.horizon, tube.objective) == (method, 1e-2, 4.0, asked)
     assert tube.constants is constants
     assert np.isfinite(tube.maximum)
+
+
+def test_constants_know_their_metric_and_prove_its_root_once() -> None:
+    metric = [[2.0, 0.3], [0.3, 1.0]]
+    weighted = Constants(rate=[-0.5, 0.2], sigma=0.1, dimension=2, metric=metric, times=[0, 1, 2])
+    assert weighted.worst_slope == 0.2
+    assert np.allclose(weighted.inverse @ metric, np.eye(2))
+    assert weighted.norm is weighted.norm
+    assert np.array_equal(weighted.norm.matrix, weighted.matrix)
+    plain = Constants(gain=0.5, sigma=0.1, dimension=2)
+    assert plain.slope == plain.worst_slope == 0.5
+    assert plain.norm.root is None
+    assert np.array_equal(plain.matrix, np.eye(2))

@@ -258,8 +258,7 @@ def random_start(problem: Problem, constants: Constants) -> Start:
     if not isinstance(problem.initial, GaussianStart) or not np.any(problem.initial.covariance):
         return Start()
     covariance = np.asarray(problem.initial.covariance, dtype=float)
-    n = len(covariance)
-    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric, dtype=float)
+    metric = constants.matrix
     root = np.linalg.cholesky(metric)
     square = float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1])
     inner = Interval.point(metric) @ Interval.point(covariance) @ Interval.point(metric)

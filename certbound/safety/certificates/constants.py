@@ -62,10 +62,10 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
     if reach is None:
         raise CertificateError("there is no reach tube.")
     curve = reach.curve
-    norm = Norm(flow.dimension, constants.metric)
+    norm = constants.norm
     cells = initial_cells(problem, _cells_along(curve))
     eta = bound_forcing(flow, curve, norm) * (1 + _ROOM[effort]) + _smallest(curve, norm, answer) * slack
-    slope = float(np.max(np.asarray(constants.rate if constants.rate is not None else constants.gain, dtype=float)))
+    slope = constants.worst_slope
     rho = cells.radii(norm, curve.initial())
     slopes = np.full(curve.pieces, slope)
     radius, _ = integrate_radius(curve, jump_sizes(curve, norm), rho, slopes, eta)

@@ -41,7 +41,6 @@ from certbound.reach.contraction import (
 )
 from certbound.reach.nominal import Curve, Flow, initial_cells, nominal_curve
 from certbound.reach.sets import ReachTube
-from certbound.rigor.norms import Norm
 from certbound.safety.answers import Deviation, EngineAnswer
 from certbound.safety.engines.erosion import Erosion, Tightest, erode
 from certbound.safety.engines.rooms import (
@@ -337,7 +336,7 @@ class _Work:
             reason=self._explained(erosion, needed, worst, level, fits),
             tube=tube,
             constants=constants,
-            deviation=Deviation.of_ball(*deviation_pieces(curve, needed), Norm(self.flow.dimension, constants.metric)),
+            deviation=Deviation.of_ball(*deviation_pieces(curve, needed), constants.norm),
             certified=tube.certified and tube.level == "trajectory",
             method=self.name,
         )
