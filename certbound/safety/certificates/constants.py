@@ -7,6 +7,7 @@ stated probability is Thm K2's for exactly these numbers.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -146,10 +147,7 @@ def _edges(low: Array, high: Array) -> list[list[float]]:
 
 
 def _with_rooms(erosion: Erosion, rooms: Array) -> Erosion:
-    return Erosion(
-        labels=("all",), continuous=erosion.continuous, starts=erosion.starts, ends=erosion.ends, radius=rooms[None],
-        factor=np.ones((1, len(rooms))),
-    )  # fmt: skip
+    return replace(erosion, labels=("all",), radius=rooms[None], factor=np.ones((1, len(rooms))))
 
 
 def _search(constants: Constants, erosion: Erosion, horizon: float, start: Start) -> tuple[float, dict[str, Any]]:

@@ -19,7 +19,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +40,7 @@ from certbound.reach.contraction import (
 )
 from certbound.reach.nominal import Curve, Flow, initial_cells, nominal_curve
 from certbound.reach.sets import ReachTube
-from certbound.safety.answers import Deviation, EngineAnswer
+from certbound.safety.answers import AS_IT_IS, Deviation, EngineAnswer, Request
 from certbound.safety.engines.erosion import Erosion, Tightest, erode
 from certbound.safety.engines.rooms import (
     BELOW,
@@ -75,30 +74,11 @@ QUICK_BUDGET = 250
 """Boxes spent on global constants when another engine has proved SAFE already."""
 
 
-def constants_engine(
-    problem: Problem,
-    *,
-    method: str = "auto",
-    cells: int | None = None,
-    constants: Constants | None = None,
-    quick: bool = False,
-    **_: Any,
-) -> EngineAnswer:
+def constants_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     """The best answer from constants: global ones, or local ones along the reach tube where none are global.
 
-    It covers the disturbances that do not see coming noise. Options of other engines are ignored.
-
-    Parameters
-    ----------
-    problem : Problem
-    method : str
-        "auto" (Thm K2), or a tube method by name.
-    cells : int, optional
-        Parts along each side of the initial set.
-    constants : Constants, optional
-        Stated constants, used instead of certified ones.
-    quick : bool
-        Leave out what is slow and then seldom decides: proposed metrics and local constants.
+    It covers the disturbances that do not see coming noise. Where it is asked to be quick, proposed metrics and local
+    constants are left out.
 
     Raises
     ------
@@ -109,10 +89,11 @@ def constants_engine(
     EngineError
         If the nominal is lost before the horizon.
     """
+    method, constants, quick = asked.method, asked.constants, asked.quick
     if constants is not None:
         refuse_contradiction(problem, constants)
         constants = proved_or_stated(problem, constants)
-    work = _Work(problem, method, cells)
+    work = _Work(problem, asked)
     by_clearance, target = method in BY_CLEARANCE, math.log10(problem.delta)
     best: EngineAnswer | None = None
     reason = ""
@@ -160,13 +141,13 @@ def _better(first: EngineAnswer, second: EngineAnswer) -> EngineAnswer:
 
 
 class _Work:
-    """One problem, one method; the nominal curves are shared by all constants."""
+    """One problem, one request; the nominal curves are shared by all constants."""
 
-    def __init__(self, problem: Problem, method: str, cells: int | None) -> None:
-        self.problem, self.method, self.cells = problem, method, cells
+    def __init__(self, problem: Problem, asked: Request) -> None:
+        self.problem, self.method, self.cells = problem, asked.method, asked.cells
         self.flow = Flow(problem)
-        self.name = "kummer" if method == "auto" else method
-        self.segments = SEGMENTS if method in BY_CLEARANCE else SEGMENTS_BY_NAME
+        self.name = "kummer" if self.method == "auto" else self.method
+        self.segments = SEGMENTS if self.method in BY_CLEARANCE else SEGMENTS_BY_NAME
 
     @cached_property
     def curve(self) -> Curve:
