@@ -27,6 +27,7 @@ __all__ = ["EngineAnswer", "Verdict", "best_lower", "verify_safety"]
 _log = logging.getLogger(__name__)
 
 
+_TAKEN = ("margin", "time", "constraint", "tube", "reach", "constants", "deviation")  # of the best answer
 _LARGE = 60  # states beyond which no other engine is asked once one has proved SAFE
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -306,15 +307,9 @@ def _verdict(problem: Problem, answers: Mapping[str, EngineAnswer]) -> Verdict:
         status="SAFE" if safe else "UNSAFE" if unsafe else "UNKNOWN",
         log10_delta=level,
         log10_lower=lower,
-        margin=best.margin,
-        time=best.time,
-        constraint=best.constraint,
         reason=" ".join([_sentence(reason), *others]).strip(),
         method=best.method or name,
-        tube=best.tube,
-        reach=best.reach,
-        constants=best.constants,
-        deviation=best.deviation,
+        **{part: getattr(best, part) for part in _TAKEN},
         problem=problem,
         answers=MappingProxyType(dict(answers)),
     )

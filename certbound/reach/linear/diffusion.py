@@ -59,7 +59,7 @@ class Reference:
     value: Array
     gaussian: bool
     memory: dict[int, dict[bytes, Any]] = field(default_factory=dict)
-    events: dict[tuple[int, Share], ClockEvents] = field(default_factory=dict)
+    events: dict[tuple[int, Share], ClockEvents | WindowEvents] = field(default_factory=dict)
     levels: dict[tuple[int, int, Share], Array] = field(default_factory=dict)
 
 
@@ -121,20 +121,20 @@ class DiffusionRun(LinearRun):
 
     def events(self, cell: int, shared: Share) -> SplitEvents:
         """Scalar events of Z + M of one cell; half of the shared probability is granted to each."""
-        engine, reference = self.engine, self.held.reference
-        gaussian = None
+        reference, gaussian = self.held.reference, None
         share = shared.half() if reference.gaussian else shared
         if reference.gaussian:
             if (cell, share) not in reference.events:
-                windows = WindowEvents(reference.response, cell, engine.window, share.log)
-                found = ClockEvents(windows, reference.value[cell], reference.memory.setdefault(cell, {}))
-                reference.events[cell, share] = found
+                windows = WindowEvents(reference.response, cell, self.engine.window, share.log)
+                reference.events[cell, share] = self._events_of(windows, cell)
             gaussian = reference.events[cell, share]
-        excess = self.held.excess[cell]
-        return SplitEvents(
-            gaussian=gaussian,
-            martingales=Martingales(reference.response, cell, excess, share.log, self.frames[cell]),
-        )
+        martingales = Martingales(reference.response, cell, self.held.excess[cell], share.log, self.frames[cell])
+        return SplitEvents(gaussian=gaussian, martingales=martingales)
+
+    def _events_of(self, windows: WindowEvents, cell: int) -> ClockEvents | WindowEvents:
+        """The events of Z that follow from windows."""
+        reference = self.held.reference
+        return ClockEvents(windows, reference.value[cell], reference.memory.setdefault(cell, {}))
 
     def levels(self, nonlinear: Share) -> tuple[Array, list[Any]]:
         """Levels of |Z + M| along the inner rows that together cost exp(nonlinear.log), and the events.

@@ -92,17 +92,20 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
         "splits": exact(_edges(cells.boxes.lo, cells.boxes.hi)),
         "rooms": [None if not np.isfinite(room) else exact(float(room)) for room in rooms],
         "kummer": kummer,
-        "cells": [
-            {
-                "nominal": exact(curve.coefficients[cell]),
-                "eta": exact(eta[cell] if flow.continuous else eta[cell][: curve.pieces - 1]),
-                "radius": exact(radius[cell]),
-                "separations": _separations(problem, curve, norm, cell),
-            }
-            for cell in range(curve.cells)
-        ],
+        "cells": [_cell(problem, tube, eta, cell) for cell in range(curve.cells)],
     }
     return data, min(log10, 0.0), [] if given.certified else [STATED]
+
+
+def _cell(problem: Problem, tube: ReachTube, eta: Array, cell: int) -> dict[str, Any]:
+    """What is stated of one cell."""
+    curve = tube.curve
+    return {
+        "nominal": exact(curve.coefficients[cell]),
+        "eta": exact(eta[cell] if curve.continuous else eta[cell][: curve.pieces - 1]),
+        "radius": exact(tube.radius[cell]),
+        "separations": _separations(problem, curve, tube.norm, cell),
+    }
 
 
 def _rounded(given: Constants, slack: float) -> Constants:

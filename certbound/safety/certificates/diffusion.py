@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import CertificateError
-from certbound.gaussian.response import MartingaleEvent, Martingales, SplitEvents, WindowEvents, logsumexp
+from certbound.gaussian.response import MartingaleEvent, SplitEvents, WindowEvents, logsumexp
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
-from certbound.reach.linear import Accepted, DiffusionRun, Linearisation, Reference, Share, depends_on_state
+from certbound.reach.linear import Accepted, DiffusionRun, Reference, Share, depends_on_state
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificates.linear import (
     EFFORTS,
@@ -90,21 +90,8 @@ def diffusion_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
 class _StatedRun(DiffusionRun):
     """`DiffusionRun` with windows as the only events of Z."""
 
-    def __init__(self, engine: Linearisation) -> None:
-        super().__init__(engine)
-        self.windows: dict[tuple[int, int, Share], WindowEvents] = {}
-
-    def events(self, cell: int, shared: Share) -> SplitEvents:
-        """Scalar events of Z + M of one cell."""
-        reference, gaussian = self.held.reference, None
-        share = shared.half() if reference.gaussian else shared
-        if reference.gaussian:
-            key = cell, self.references.index(reference), share
-            if key not in self.windows:
-                self.windows[key] = WindowEvents(reference.response, cell, self.engine.window, share.log)
-            gaussian = self.windows[key]
-        martingales = Martingales(reference.response, cell, self.held.excess[cell], share.log, self.frames[cell])
-        return SplitEvents(gaussian=gaussian, martingales=martingales)
+    def _events_of(self, windows: WindowEvents, cell: int) -> WindowEvents:
+        return windows
 
     def stated(self, reference: Reference, nonlinear: Share, pad: float) -> Stated | None:
         """Sets H and boxes of the remainder that hold, with a margin, what follows from them; None: none was found."""

@@ -257,7 +257,7 @@ class _Work:
     def _refused(self, reach: ReachTube, erosion: Erosion, answer: EngineAnswer) -> EngineAnswer | None:
         """An answer where the reach tube ends early or leaves no room; None where it serves."""
         worst = erosion.tightest()
-        held = replace(answer, margin=worst.margin, time=worst.time, constraint=worst.label or None)
+        held = replace(answer, **worst.place)
         if reach.end < self.flow.horizon:
             return replace(
                 held, time=reach.end, reach=reach,
@@ -307,13 +307,11 @@ class _Work:
                 level = min(level, (closer if fit(closer) else tube).log10_delta)
             fits = level <= math.log10(target)
         worst = erosion.tightest(needed)
-        margin = max(worst.margin, 0.0) if fits else worst.margin
+        place = worst.place | {"margin": max(worst.margin, 0.0) if fits else worst.margin}
         return replace(
             answer,
+            **place,
             log10_delta=level,
-            margin=margin,
-            time=worst.time,
-            constraint=worst.label or None,
             reason=self._explained(erosion, needed, worst, level, fits),
             tube=tube,
             constants=constants,

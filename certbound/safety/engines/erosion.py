@@ -10,6 +10,7 @@ Source: Thm 1 and Prop 4 (paper); Thm K2 (theory) for what the rooms are used fo
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,12 @@ class Tightest:
     label: str
     time: float
     piece: int
+
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """As fields of an answer."""
+        return {"margin": self.margin, "time": self.time, "constraint": self.label or None}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -49,34 +49,30 @@ class Baseline:
     printed: bool = False
 
 
-_ONE, _ALL = "one time", "trajectory"
+_CT, _DT, _ONE, _ALL = "continuous", "discrete", "one time", "trajectory"
 _MOST_WINDOWS = 512
 _SLACK = 0.85  # the sharp tail gains at most that over the growth bound that the estimates use
 BASELINES: dict[str, Baseline] = {
-    "prop1": Baseline(time="continuous", kind="variance", level=_ONE, title="Prop 1 (paper)"),
-    "prop1_cosh": Baseline(time="continuous", kind="variance", level=_ONE, tail="cosh", title="Prop 1, n = 1"),
-    "prop1_sharp": Baseline(time="continuous", kind="variance", level=_ONE, tail="sharp", title="item 7.11"),
-    "prop2": Baseline(time="discrete", kind="variance", level=_ONE, title="Prop 2 (paper)"),
-    "prop2_sharp": Baseline(time="discrete", kind="variance", level=_ONE, tail="sharp", title="item 7.11"),
-    "prop3": Baseline(time="discrete", kind="variance", level=_ALL, title="Prop 3 (paper)"),
-    "prop3_sharp": Baseline(time="discrete", kind="variance", level=_ALL, tail="sharp", title="item 7.11"),
-    "thm2": Baseline(time="continuous", kind="scaled", level=_ALL, title="Thm 2 (paper)"),
-    "thm2_cosh": Baseline(time="continuous", kind="scaled", level=_ALL, tail="cosh", title="Thm 2, n = 1"),
-    "thm3": Baseline(time="continuous", kind="windows", level=_ALL, title="Thm 3 (paper)"),
-    "thm3_cosh": Baseline(time="continuous", kind="windows", level=_ALL, tail="cosh", title="Thm 3, n = 1"),
-    "thm3_sharp": Baseline(time="continuous", kind="windows", level=_ALL, tail="sharp", title="items 7.11, 7.15"),
-    "thm3_as_printed": Baseline(
-        time="continuous", kind="windows", level=_ALL, printed=True, title="Thm 3 with N = T/step (E6)"
-    ),
-    "thm4": Baseline(time="discrete", kind="scaled", level=_ALL, title="Thm 4 (paper), corrected (E1)"),
+    "prop1": Baseline(time=_CT, kind="variance", level=_ONE, title="Prop 1 (paper)"),
+    "prop1_cosh": Baseline(time=_CT, kind="variance", level=_ONE, tail="cosh", title="Prop 1, n = 1"),
+    "prop1_sharp": Baseline(time=_CT, kind="variance", level=_ONE, tail="sharp", title="item 7.11"),
+    "prop2": Baseline(time=_DT, kind="variance", level=_ONE, title="Prop 2 (paper)"),
+    "prop2_sharp": Baseline(time=_DT, kind="variance", level=_ONE, tail="sharp", title="item 7.11"),
+    "prop3": Baseline(time=_DT, kind="variance", level=_ALL, title="Prop 3 (paper)"),
+    "prop3_sharp": Baseline(time=_DT, kind="variance", level=_ALL, tail="sharp", title="item 7.11"),
+    "thm2": Baseline(time=_CT, kind="scaled", level=_ALL, title="Thm 2 (paper)"),
+    "thm2_cosh": Baseline(time=_CT, kind="scaled", level=_ALL, tail="cosh", title="Thm 2, n = 1"),
+    "thm3": Baseline(time=_CT, kind="windows", level=_ALL, title="Thm 3 (paper)"),
+    "thm3_cosh": Baseline(time=_CT, kind="windows", level=_ALL, tail="cosh", title="Thm 3, n = 1"),
+    "thm3_sharp": Baseline(time=_CT, kind="windows", level=_ALL, tail="sharp", title="items 7.11, 7.15"),
+    "thm3_as_printed": Baseline(time=_CT, kind="windows", level=_ALL, printed=True, title="Thm 3 with N = T/step (E6)"),
+    "thm4": Baseline(time=_DT, kind="scaled", level=_ALL, title="Thm 4 (paper), corrected (E1)"),
     "thm4_as_printed": Baseline(
-        time="discrete", kind="printed", level=_ALL, printed=True, title="Thm 4 without the factor 1/L (E1)"
+        time=_DT, kind="printed", level=_ALL, printed=True, title="Thm 4 without the factor 1/L (E1)"
     ),
-    "thm5": Baseline(time="discrete", kind="windows", level=_ALL, title="Thm 5 (paper)"),
-    "thm5_sharp": Baseline(time="discrete", kind="windows", level=_ALL, tail="sharp", title="items 7.11, 7.15"),
-    "thm5_as_printed": Baseline(
-        time="discrete", kind="windows", level=_ALL, printed=True, title="Thm 5 with N = T/step (E6)"
-    ),
+    "thm5": Baseline(time=_DT, kind="windows", level=_ALL, title="Thm 5 (paper)"),
+    "thm5_sharp": Baseline(time=_DT, kind="windows", level=_ALL, tail="sharp", title="items 7.11, 7.15"),
+    "thm5_as_printed": Baseline(time=_DT, kind="windows", level=_ALL, printed=True, title="Thm 5 with N = T/step (E6)"),
     "markov": Baseline(time="both", kind="variance", level=_ONE, tail="moment", title="Markov, E||S||^2 <= nu V"),
     "chebyshev": Baseline(time="both", kind="variance", level=_ONE, tail="moment", title="Chebyshev, nu = n"),
 }
