@@ -12,7 +12,7 @@ import numpy as np
 import certbound as cb
 from certbound.gaussian.response import level_scale
 from certbound.problem.problem import Problem
-from certbound.reach.linear import Linearisation, LinearRun, linear_answer
+from certbound.reach.linear import Linearisation, LinearRun, Share, linear_answer
 from certbound.reach.linear.fit import fitted
 from certbound.simulation.estimates.deviations import Measure, sup_deviation
 from experiments.harness import Arrays, Claims, main
@@ -41,12 +41,12 @@ def erosions(problem: Problem) -> tuple[list[str], np.ndarray]:
     """Labels and erosions of the requirements, for the share of delta whose erosions are least on the whole."""
     best: np.ndarray | None = None
     for share in SHARES:
-        log_nonlinear = float(np.log(problem.delta * share))
-        run = LinearRun(fitted(Linearisation.of(problem), float(np.log(FIT))))
-        bounds = run.include(run.levels(log_nonlinear)[0], 3)
+        nonlinear = Share.of(problem.delta * share)
+        run = LinearRun(fitted(Linearisation.of(problem), Share.of(FIT)))
+        bounds = run.include(run.levels(nonlinear)[0], 3)
         if bounds is None:
             continue
-        asked, events = run.requirements[0], run.events(0, log_nonlinear)
+        asked, events = run.requirements[0], run.events(0, nonlinear)
         support = run.supports[0]
         _, high, _ = support.remainder(bounds[0][0], bounds[1][0])
         taken = (support.y + high)[:, run.inner :]

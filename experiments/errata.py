@@ -9,7 +9,8 @@ import numpy as np
 
 import certbound as cb
 from certbound.problem.model import compile_numpy, jacobian
-from certbound.tubes.kummer import KummerProfile, Start
+from certbound.tubes.kummer import KummerProfile
+from certbound.tubes.question import Start
 from certbound.tubes.schedule import make_schedule
 from experiments.harness import Arrays, Claims, main
 from experiments.linear import SIGMA, limit, paths, tube

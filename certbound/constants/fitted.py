@@ -74,7 +74,7 @@ def noise_spread(constants: Constants) -> float:
     if constants.times is None:
         raise ValueError("`constants` must have time pieces, got constants that hold at all times.")
     spans = np.diff(np.asarray(constants.times, dtype=float))
-    rates = np.asarray(constants.rate if constants.gain is None else constants.gain, dtype=float)
+    rates = np.asarray(constants.slope, dtype=float)
     values = np.broadcast_to(rates, spans.shape)
     power = np.broadcast_to(constants.nu * np.asarray(constants.sigma, dtype=float) ** 2, spans.shape)
     level, largest = -np.inf, -np.inf  # logarithms: an expanding rate over a long tube overflows

@@ -50,18 +50,12 @@ def check_constants(problem: Problem, constants: Constants, name: str = "constan
 
 def implies(proved: Constants, claimed: Constants) -> bool:
     """Whether constants in one metric imply others at all times (False where that is not obvious)."""
-    same = np.array_equal(_metric(proved), _metric(claimed)) and proved.continuous == claimed.continuous
+    same = np.array_equal(proved.matrix, claimed.matrix) and proved.continuous == claimed.continuous
     if not same or (claimed.gaussian and not proved.gaussian) or claimed.noise_bound is not None:
         return False
-    value = proved.rate if proved.rate is not None else proved.gain
-    other = claimed.rate if claimed.rate is not None else claimed.gain
-    if np.max(np.asarray(value)) > np.min(np.asarray(other)):
+    if proved.worst_slope > np.min(np.asarray(claimed.slope)):
         return False
     sigma, stated = float(np.max(np.asarray(proved.sigma))), np.asarray(claimed.sigma)
     if claimed.isotropic:  # an equality
         return proved.isotropic and bool(np.all(stated == sigma))
     return bool(np.all(sigma <= stated)) and proved.nu <= claimed.nu
-
-
-def _metric(constants: Constants) -> np.ndarray:
-    return np.eye(constants.dimension) if constants.metric is None else np.asarray(constants.metric)

@@ -157,8 +157,8 @@ def improve(
     for members in _candidate_sets(model):
         for proposal in _tried(members, lambda s: rate_proposals(s, continuous=model.continuous)):
             found += _certified(model, proposal)
-    best = min(found, key=_value)
-    return best if _value(best) < _value(euclidean) - _GAIN * max(1e-3, abs(_value(euclidean))) else euclidean
+    best, plain = min(found, key=lambda constants: constants.worst_slope), euclidean.worst_slope
+    return best if best.worst_slope < plain - _GAIN * max(1e-3, abs(plain)) else euclidean
 
 
 def bound_metrics(
@@ -274,8 +274,7 @@ def erosion_ratio(constants: Constants, rooms: Rooms, horizon: float, delta: flo
 
     if constants.continuous:
         rooms = rooms.coarse(12)
-    metric = np.eye(constants.dimension) if constants.metric is None else constants.metric
-    room = (rooms.rooms / erosion_factors(metric, rooms.directions)[:, None]).min(axis=0)
+    room = (rooms.rooms / erosion_factors(constants.matrix, rooms.directions)[:, None]).min(axis=0)
     if constants.continuous:  # both ends of a piece count
         times = np.concatenate([[0.0], rooms.times[:-1], [horizon]])
         values = np.minimum(room, np.concatenate([room[:1], room[:-1]]))
@@ -341,11 +340,6 @@ def _certified(model: Model, proposal: Proposal) -> list[Constants]:
         return [certify(model, proposal.metric, status=proposal.status, tolerance=2e-3, budget=60_000)]
     except (EnclosureError, InfeasibleError):
         return []
-
-
-def _value(constants: Constants) -> float:
-    value = constants.rate if constants.gain is None else constants.gain
-    return float(np.max(np.asarray(value)))
 
 
 def _noise_matrices(model: Model) -> list[Array]:

@@ -10,6 +10,7 @@ F > 0 with diagonal multipliers (S-procedure). Source: Sec. 1 and 6 of docs/theo
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -95,11 +96,11 @@ def holds_gain(metric: ArrayLike, jacobians: JacobianSet | ArrayLike, gain: floa
 def _certify(metric: ArrayLike, jacobians: JacobianSet | ArrayLike, *, continuous: bool) -> float:
     """c, or L^2."""
     members = as_set(jacobians)
-    S, gram = _coordinates(metric)
+    frame = _coordinates(metric)
     n = members.dimension
-    if len(S) != n:
-        raise ValueError(f"`metric` must be {n} x {n}, got {len(S)} x {len(S)}.")
-    value = max(_member_value(metric, S, gram, part, continuous=continuous) for part in _members(members))
+    if len(frame.P) != n:
+        raise ValueError(f"`metric` must be {n} x {n}, got {len(frame.P)} x {len(frame.P)}.")
+    value = max(_member_value(frame, part, continuous=continuous) for part in _members(members))
     if not np.isfinite(value):
         raise EnclosureError("no finite contraction bound was proved; bound the domain, or give another metric.")
     return value
@@ -113,16 +114,24 @@ def _members(jacobians: JacobianSet) -> Iterator[JacobianSet]:
         yield jacobians.affine if isinstance(jacobians, IntervalMatrixSet) else jacobians
 
 
-def _member_value(metric: ArrayLike, S: Array, gram: Interval, member: JacobianSet, *, continuous: bool) -> float:
+class _Frame(NamedTuple):
+    """P, the coordinates S with S^T P S nearly I, and an enclosure of S^T P S, proved positive definite."""
+
+    P: Array
+    S: Array
+    gram: Interval
+
+
+def _member_value(frame: _Frame, member: JacobianSet, *, continuous: bool) -> float:
     by_vertices = member.vertex_count * member.dimension**3 <= VERTEX_WORK
     if by_vertices or not isinstance(member, (AffineSet, SectorSet)):
-        return _vertex_value(metric, S, gram, member, continuous=continuous)
+        return _vertex_value(frame, member, continuous=continuous)
     sector = member if isinstance(member, SectorSet) else member.sector()
-    return _sector_value(metric, S, gram, sector, continuous=continuous)
+    return _sector_value(frame, sector, continuous=continuous)
 
 
-def _coordinates(metric: ArrayLike) -> tuple[Array, Interval]:
-    """S with S^T P S nearly I, and an enclosure of S^T P S, proved positive definite."""
+def _coordinates(metric: ArrayLike) -> _Frame:
+    """The frame of a metric; it is proved on the way."""
     P = square_matrix("metric", metric)
     if not np.array_equal(P, P.T):
         raise ValueError("`metric` must be exactly symmetric; use (P + P.T) / 2.")
@@ -133,7 +142,7 @@ def _coordinates(metric: ArrayLike) -> tuple[Array, Interval]:
     gram = matmul(S.T, matmul(P, S))
     if not float(eigenvalue_lower(gram)) > 0:
         raise ValueError("`metric` must be positive definite; it is too close to singular for a proof.")
-    return S, gram
+    return _Frame(P, S, gram)
 
 
 def _vertices(member: JacobianSet, points: Array) -> Interval:
@@ -157,8 +166,8 @@ def _with_slack(member: AffineSet) -> Interval:
     return Interval(down(member.J0 - member.error), up(member.J0 + member.error))
 
 
-def _vertex_value(metric: ArrayLike, S: Array, gram: Interval, member: JacobianSet, *, continuous: bool) -> float:
-    P = np.asarray(metric, dtype=float)
+def _vertex_value(frame: _Frame, member: JacobianSet, *, continuous: bool) -> float:
+    P, S, gram = frame
     if isinstance(member, SectorSet):
         points = member.affine.corners()
     else:
@@ -177,10 +186,9 @@ def _vertex_value(metric: ArrayLike, S: Array, gram: Interval, member: JacobianS
     return float(up(worst / (low if worst >= 0 else high)))
 
 
-def _sector_value(metric: ArrayLike, S: Array, gram: Interval, sector: SectorSet, *, continuous: bool) -> float:
+def _sector_value(frame: _Frame, sector: SectorSet, *, continuous: bool) -> float:
     """Smallest value found for which F > 0 is proved; F in the coordinates of S, multipliers from a barrier."""
-    P = np.asarray(metric, dtype=float)
-    block = centred(sector)
+    P, block = frame.P, centred(sector)
     guess = center_multipliers(P, block, continuous=continuous)
     wide = varying(sector)
     # the barrier works at P / (2 ||P||) and with scaled columns: undo both
@@ -196,9 +204,10 @@ def _sector_value(metric: ArrayLike, S: Array, gram: Interval, sector: SectorSet
         A = A + matmul(
             Interval.point(sector.left[:, fixed]) * Interval.point(sector.box[0, fixed]), sector.right[fixed]
         )
-    F0 = _sector_matrix(P, S, A, B, C, radius, weights, continuous=continuous)
+    right = matmul(C, frame.S) * Interval.point(radius)[:, None]
+    F0 = _sector_matrix(frame, A, B, right, weights, continuous=continuous)
     size = abs(guess.value) + float(np.abs(F0.mid).max())
-    return _least_proved(F0, gram, guess.value, 1e-12 * size, factor=2.0 if continuous else 1.0)
+    return _least_proved(F0, frame.gram, guess.value, 1e-12 * size, factor=2.0 if continuous else 1.0)
 
 
 def _least_proved(F0: Interval, gram: Interval, guess: float, step: float, *, factor: float) -> float:
@@ -222,14 +231,14 @@ def _least_proved(F0: Interval, gram: Interval, guess: float, step: float, *, fa
 
 
 def _sector_matrix(
-    P: Array, S: Array, A: Interval, B: Array, C: Array, radius: Array, weights: Array, *, continuous: bool
+    frame: _Frame, A: Interval, B: Array, CS: Interval, weights: Array, *, continuous: bool
 ) -> Interval:
     """F at value 0, after the congruence diag(S, lambda^{-1/2}) (a floating-point scaling, applied exactly)."""
+    P, S, _ = frame
     n, k = len(P), len(weights)
     scale = 1 / np.sqrt(weights)
     AS = matmul(A, S)
     BS = Interval.point(B) * Interval.point(scale)
-    CS = matmul(C, S) * Interval.point(radius)[:, None]
     Lam = Interval.point(weights)
     first = matmul(CS.swapaxes(-1, -2), CS * Lam[:, None])
     corner = Lam * Interval.point(scale) * Interval.point(scale)

@@ -43,8 +43,7 @@ def refuse_contradiction(problem: Problem, constants: Constants) -> None:
         raise ValueError(f"`constants` must have dimension {system.dimension}, got {constants.dimension}.")
     if isinstance(system, DiscreteSystem) and constants.gaussian and not system.noise.gaussian:
         raise ValueError("`constants` assert Gaussian noise, and the problem's is not; leave `gaussian` out.")
-    n = system.dimension
-    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric)
+    metric = constants.matrix
     point = _start(problem)
     varies = isinstance(system, ContinuousSystem) and isinstance(system.diffusion, Tape)
     sigma = float(np.ravel(constants.sigma)[0]) if varies else float(np.min(constants.sigma))

@@ -69,7 +69,7 @@ def noisy_reach(verdict: Verdict) -> ReachTube | None:
     """The reach tube of a verdict with the stochastic deviation at the problem's delta, where there is one."""
     from certbound.reach.contraction import needed_radius
     from certbound.reach.sets import ReachTube
-    from certbound.tubes.kummer import Start
+    from certbound.tubes.question import Start
     from certbound.tubes.tube import Tube
 
     if verdict.reach is None or verdict.deviation is None:

@@ -18,7 +18,7 @@ from certbound.reach.contraction import (
 )
 from certbound.reach.nominal import Flow, initial_cells
 from certbound.reach.sets import ReachTube
-from certbound.tubes.kummer import Start
+from certbound.tubes.question import Start
 from certbound.tubes.tuning import tune_tube
 
 __all__ = ["bound_reach"]

@@ -17,7 +17,7 @@ from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
 
-__all__ = ["Answered", "Deviation", "EngineAnswer", "is_at_most", "is_more_than", "settled"]
+__all__ = ["AS_IT_IS", "Answered", "Deviation", "EngineAnswer", "Request", "is_at_most", "is_more_than", "settled"]
 
 Array = NDArray[np.float64]
 
@@ -121,6 +121,38 @@ class EngineAnswer:
     foresight: bool = False
     details: Any = None
     conclusive: bool = False
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Request:
+    """What an engine is asked besides the problem: made once, and each engine reads what it knows.
+
+    Parameters
+    ----------
+    method : str
+        "auto", or a tube method by name.
+    cells : int, optional
+        Parts along each side of the initial set.
+    constants : Constants, optional
+        Used instead of certified ones.
+    quick : bool
+        Another engine has proved SAFE or been conclusive: what is slow and then seldom decides may be left out.
+    thorough : bool
+        Without it an engine may spare itself: it is asked again where that matters.
+    before : Any
+        The ``details`` of its first answer, then.
+    """
+
+    method: str = "auto"
+    cells: int | None = None
+    constants: Constants | None = None
+    quick: bool = False
+    thorough: bool = True
+    before: Any = None
+
+
+AS_IT_IS = Request()
+"""Nothing but the problem."""
 
 
 class Answered(Protocol):

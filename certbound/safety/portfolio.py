@@ -28,10 +28,7 @@ class Engine:
     words : str
         What it does, for tables and messages.
     prove : callable
-        ``prove(problem, *, method, cells, constants, quick, thorough, before)`` to an `EngineAnswer`; an engine takes
-        the options that it knows. ``quick``: another one has proved SAFE or been conclusive, and what is slow may be
-        left out. Without ``thorough`` it may spare itself: it is asked again where that matters, with the ``details``
-        of its first answer as ``before``.
+        ``prove(problem, request)`` to an `EngineAnswer`; ``prove(problem)`` asks for nothing but the problem.
     write : callable, optional
         ``write(problem, answer, attempt)`` to a proof that the checker knows; None: no certificate states it.
     methods : bool

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from certbound.errors import CertificateError, EngineError, SolverError, contain
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
 from certbound.reach.sets import ReachTube
-from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, is_more_than, settled
+from certbound.safety.answers import Deviation, EngineAnswer, Request, is_at_most, is_more_than, settled
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.portfolio import ENGINES, engine_named
 
@@ -27,6 +27,7 @@ __all__ = ["EngineAnswer", "Verdict", "best_lower", "verify_safety"]
 _log = logging.getLogger(__name__)
 
 
+_TAKEN = ("margin", "time", "constraint", "tube", "reach", "constants", "deviation")  # of the best answer
 _LARGE = 60  # states beyond which no other engine is asked once one has proved SAFE
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -188,34 +189,33 @@ def verify_safety(
     >>> verify_safety(problem, method="constants").status
     'SAFE'
     """
-    names = _chosen(method)
-    _checked(problem, method, cells, constants)
+    names, inner = _chosen(method), "auto" if method in ENGINES else method
+    request = Request(method=inner, cells=cells, constants=constants, thorough=method != "auto")
+    _checked(problem, request)
     violation = _violation(problem)
     if violation is not None:
         return _unsafe(problem, violation)
     answers: dict[str, EngineAnswer] = {}
     for name in names:
-        inner = "auto" if method in ENGINES else method
         quick = any(_is_safe(answer, problem) or answer.conclusive for answer in answers.values())
         if quick and problem.system.dimension > _LARGE:
             continue
-        options = {"method": inner, "cells": cells, "constants": constants, "quick": quick}
-        answers[name] = _asked(name, problem, **options, thorough=method != "auto")
+        answers[name] = _asked(name, problem, replace(request, quick=quick))
     if method == "auto" and cells is None and not any(_is_safe(answer, problem) for answer in answers.values()):
         for name in (name for name, row in ENGINES.items() if row.again):
             first = answers[name]
             if first.applicable and not first.conclusive:
-                second = _asked(name, problem, before=first.details)
+                second = _asked(name, problem, Request(before=first.details))
                 if second.applicable:
                     answers[name] = min(first, second, key=lambda answer: answer.log10_delta)
     return _verdict(problem, answers)
 
 
-def _asked(name: str, problem: Problem, **options: Any) -> EngineAnswer:
+def _asked(name: str, problem: Problem, request: Request) -> EngineAnswer:
     """What an engine answers; where it fails, that it does not apply, and why."""
     try:
         with contained(name):
-            return ENGINES[name].prove(problem, **options)
+            return ENGINES[name].prove(problem, request)
     except EngineError as error:
         return EngineAnswer(applicable=False, reason=str(error), method=name)
 
@@ -230,8 +230,8 @@ def _violation(problem: Problem) -> Violation | None:
         return None
 
 
-def _checked(problem: Problem, method: str, cells: int | None, constants: Constants | None) -> None:
-    """Refuse what is wrong with the arguments before any engine runs: from then on whatever fails is an engine.
+def _checked(problem: Problem, request: Request) -> None:
+    """Refuse what is wrong with a request before any engine runs: from then on whatever fails is an engine.
 
     Raises
     ------
@@ -240,10 +240,11 @@ def _checked(problem: Problem, method: str, cells: int | None, constants: Consta
     """
     from certbound.tubes.paper import check_method
 
-    initial_cells(problem, cells)
+    initial_cells(problem, request.cells)
     _ = problem.closed_loop
     continuous, n = problem.system.time == "continuous", problem.system.dimension
-    check_method(method, continuous=continuous, dimension=n)
+    check_method(request.method, continuous=continuous, dimension=n)
+    constants = request.constants
     if constants is None:
         return
     if constants.continuous != continuous:
@@ -306,15 +307,9 @@ def _verdict(problem: Problem, answers: Mapping[str, EngineAnswer]) -> Verdict:
         status="SAFE" if safe else "UNSAFE" if unsafe else "UNKNOWN",
         log10_delta=level,
         log10_lower=lower,
-        margin=best.margin,
-        time=best.time,
-        constraint=best.constraint,
         reason=" ".join([_sentence(reason), *others]).strip(),
         method=best.method or name,
-        tube=best.tube,
-        reach=best.reach,
-        constants=best.constants,
-        deviation=best.deviation,
+        **{part: getattr(best, part) for part in _TAKEN},
         problem=problem,
         answers=MappingProxyType(dict(answers)),
     )

@@ -265,10 +265,8 @@ class Planner:
 
     def _clearance(self, constants: Constants, solution: Solution) -> Any:
         """Room of a plan in the metric, as a clearance profile; 'max' where it leaves none."""
-        n = self.plant.dimension
-        inverse = np.eye(n) if constants.metric is None else np.linalg.inv(np.asarray(constants.metric))
         times = self.grid.times()
-        unit = BallTube(radii=np.ones(self.grid.points), inverse=inverse)
+        unit = BallTube(radii=np.ones(self.grid.points), inverse=constants.inverse)
         factor = self.tightened(unit, solution.states)
         room = np.full(self.grid.points, np.inf)
         part = 0

@@ -214,15 +214,14 @@ def contraction_terminal(
     n, m = problem.system.dimension, len(problem.system.input_names)
     c = np.zeros(n) if center is None else np.asarray(center, dtype=float)
     u = np.zeros(m) if inputs is None else np.asarray(inputs, dtype=float)
-    slope = constants.rate if constants.continuous else constants.gain
-    worst = float(np.max(np.asarray(slope)))
+    worst = constants.worst_slope
     if worst >= (0 if constants.continuous else 1):
         raise ValueError(
             f"`terminal` from the contraction metric needs a {'negative rate' if constants.continuous else 'gain < 1'},"
             f" got {worst:.4g}; use terminal='riccati', or a feedback."
         )
     _check_equilibrium(problem, c, u)
-    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric)
+    metric = constants.matrix
     radius = _largest_level(metric, c, faces, erosion, time)
     weight = np.asarray(problem.cost[0]) if problem.cost is not None else np.zeros((n, n))
     root = np.linalg.inv(np.linalg.cholesky(metric))

@@ -20,7 +20,7 @@ from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Ellipsoid, GaussianStart
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
-from certbound.reach.linear import Events, Linearisation, LinearRun, Supports
+from certbound.reach.linear import Events, Linearisation, LinearRun, Share, Supports
 from certbound.reach.nominal import initial_cells
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm
@@ -147,14 +147,13 @@ def tighten(tube: Tightening, faces: Sequence[Face], states: Array, times: Array
 def linear_tube(problem: Problem, rows: int, delta: float, factors: dict[object, float]) -> LinearTube | None:
     """The linear response along the problem's plan for ``rows`` one-sided rows; None where it feeds itself."""
     run = LinearRun(Linearisation.of(problem))
-    log_nonlinear = float(np.log(delta * NONLINEAR_SHARE))
-    levels, events = run.levels(log_nonlinear)
+    levels, events = run.levels(Share.of(delta * NONLINEAR_SHARE))
     with np.errstate(all="ignore"):
         bounds = run.include(levels, 1)
     if bounds is None:
         return None
-    share = float(np.log(delta * (1 - NONLINEAR_SHARE) / max(rows, 1)))
-    return LinearTube(run=run, bounds=bounds, events=events[0], log_share=share, factors=factors)
+    share = Share.of(delta * (1 - NONLINEAR_SHARE) / max(rows, 1))
+    return LinearTube(run=run, bounds=bounds, events=events[0], log_share=share.log, factors=factors)
 
 
 def spread_tube(problem: Problem, plant: Plant, grid: Grid, states: Array, inputs: Array) -> ScaledTube:
@@ -207,8 +206,7 @@ def nominal_spread(
     problem: Problem, plant: Plant, grid: Grid, constants: Constants, states: Array, inputs: Array
 ) -> Array:
     """rho (points + 1,) with ||x_t - z_t||_P <= rho for every start and disturbance (Thm K5, in floating point)."""
-    norm = Norm(plant.dimension, constants.metric)
-    slope = float(np.max(np.asarray(constants.rate if constants.continuous else constants.gain)))
+    norm, slope = constants.norm, constants.worst_slope
     step = grid.step / grid.substeps
     start = np.atleast_2d(initial_center(problem.initial))
     found = [float(initial_cells(problem).radii(norm, Interval.point(start))[0])]
@@ -239,11 +237,9 @@ def _push(norm: Norm, box: Box | None, plant: Plant, point: Array) -> float:
 
 def ball_tube(tube: Tube, grid: Grid, spread: Array) -> BallTube:
     """A tube from constants as balls at the points, widened by the noise-free spread (points + 1,)."""
-    n = tube.constants.dimension
     times = np.minimum(grid.times(), tube.horizon)
     radius = np.asarray(tube.radius(np.round(times) if not grid.continuous else times))
     total = radius + spread
     if grid.continuous:  # a piece counts from end to end
         total = np.maximum(total, np.append(total[1:], total[-1]))
-    inverse = np.eye(n) if tube.constants.metric is None else np.linalg.inv(np.asarray(tube.constants.metric))
-    return BallTube(radii=total[1:], inverse=inverse)
+    return BallTube(radii=total[1:], inverse=tube.constants.inverse)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.display import Shown, plain, span_text
+from certbound.rigor.norms import Norm
 
 __all__ = ["Constants", "Proof", "check_delta"]
 
@@ -130,6 +132,39 @@ class Constants(Shown):
         return self.rate is not None
 
     @property
+    def slope(self) -> float | Array:
+        """The rate (CT) or the gain (DT)."""
+        value = self.gain if self.rate is None else self.rate
+        assert value is not None
+        return value
+
+    @property
+    def worst_slope(self) -> float:
+        """The largest of it."""
+        return float(np.max(np.asarray(self.slope)))
+
+    @property
+    def matrix(self) -> Array:
+        """P, the identity where none is stated."""
+        return np.eye(self.dimension) if self.metric is None else self.metric
+
+    @property
+    def inverse(self) -> Array:
+        """P^-1 in floating point: for proposals, not for proofs."""
+        return np.asarray(np.linalg.inv(self.matrix))
+
+    @cached_property
+    def norm(self) -> Norm:
+        """The norm of P, with a root that is proved once.
+
+        Raises
+        ------
+        SolverError
+            If P is too ill-conditioned for that.
+        """
+        return Norm(self.dimension, self.metric)
+
+    @property
     def nu(self) -> float:
         """Effective dimension as a float."""
         assert self.effective_dimension is not None
@@ -154,7 +189,7 @@ class Constants(Shown):
         """The constants in one line."""
         name, unit = ("rate", "1/s") if self.continuous else ("gain", "per step")
         origin = "certified" if self.certified else "stated"
-        value = span_text(self.rate if self.continuous else self.gain)
+        value = span_text(self.slope)
         states = "1 state" if self.dimension == 1 else f"{self.dimension} states"
         return f"{name} {value} {unit}, sigma {span_text(self.sigma)}, {states}, {origin}"
 
@@ -229,8 +264,7 @@ class Constants(Shown):
         """Certified minus sampled value of the rate or gain; None for stated constants."""
         if self.proof is None or not self.certified:
             return None
-        value = self.rate if self.rate is not None else self.gain
-        return float(np.max(np.asarray(value)) - self.proof.sampled)
+        return self.worst_slope - self.proof.sampled
 
 
 _PROVED = (

@@ -118,7 +118,7 @@ class Objective:
                 return np.sqrt(schedule.nodes[1][-1:]), np.ones(1)
             if self.clearance is None:
                 return root(schedule), np.ones(1)
-            cut = schedule.refined(self.clearance.ends(schedule))
+            cut = self.cut(schedule)
             side = "left" if schedule.continuous else "right"
             return root(cut)[1:], self.clearance.at(cut.times[1:], side=side)
 
@@ -129,7 +129,11 @@ class Objective:
         if self.clearance is None:
             return schedule, lambda grid: np.ones(len(grid.lengths))
         held = self.clearance
-        return schedule.refined(held.ends(schedule)), lambda grid: held.at(grid.times[:-1])
+        return self.cut(schedule), lambda grid: held.at(grid.times[:-1])
+
+    def cut(self, schedule: Schedule) -> Schedule:
+        """The schedule with a piece end wherever the clearance changes."""
+        return schedule if self.clearance is None else schedule.refined(self.clearance.ends(schedule))
 
     def weights(self, schedule: Schedule) -> Array:
         """Clearance at the nodes of a schedule: the smaller one where two pieces meet in CT."""

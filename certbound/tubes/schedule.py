@@ -116,17 +116,12 @@ class Schedule:
             return self
         merged = np.union1d(self.times, inside)
         piece = np.searchsorted(self.times, merged[:-1], side="right") - 1
-        return Schedule(
-            continuous=self.continuous, times=merged, slopes=self.slopes[piece], sigmas=self.sigmas[piece],
-            nu=self.nu, any_power=self.any_power, scale=self.scale,
-        )  # fmt: skip
+        return replace(self, times=merged, slopes=self.slopes[piece], sigmas=self.sigmas[piece])
 
     def until(self, last: int) -> Schedule:
         """The first ``last`` pieces, in the same unit."""
-        return Schedule(
-            continuous=self.continuous, times=self.times[: last + 1], slopes=self.slopes[:last], scale=self.unit,
-            sigmas=self.sigmas[:last], nu=self.nu, any_power=self.any_power,
-        )  # fmt: skip
+        times, slopes, sigmas = self.times[: last + 1], self.slopes[:last], self.sigmas[:last]
+        return replace(self, times=times, slopes=slopes, sigmas=sigmas, scale=self.unit)
 
     def idle_time(self, limit: float = 250.0) -> float:
         """Time after which the contraction adds up to e^-limit; 0 where the whole of it is weaker."""
@@ -227,8 +222,7 @@ def make_schedule(constants: Constants, horizon: float) -> Schedule:
         raise ValueError(f"`horizon` must be positive and finite, got {horizon}.")
     if not constants.continuous and horizon != int(horizon):
         raise ValueError(f"`horizon` must be a whole number of steps in discrete time, got {horizon}.")
-    slope = constants.rate if constants.rate is not None else constants.gain
-    slopes, sigmas = np.atleast_1d(np.asarray(slope, float)), np.atleast_1d(np.asarray(constants.sigma, float))
+    slopes, sigmas = (np.atleast_1d(np.asarray(part, float)) for part in (constants.slope, constants.sigma))
     if constants.times is None:
         times = np.array([0.0, horizon])
     else:

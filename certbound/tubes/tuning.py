@@ -15,21 +15,20 @@ from certbound.tubes.exact import AlmostSureProfile, bound_exact_exit, bound_wor
 from certbound.tubes.kummer import (
     KummerProfile,
     Search,
-    Start,
     check_power,
-    check_start,
     exit_level,
     mixture_level,
     mixture_tube,
     union_level,
     union_may_help,
 )
-from certbound.tubes.objective import Clearance, Objective, make_objective, read_clearance
+from certbound.tubes.objective import Objective
 from certbound.tubes.paper import BASELINES, baseline_tube
-from certbound.tubes.schedule import Schedule, make_schedule, spread
+from certbound.tubes.question import Question, Start
+from certbound.tubes.schedule import Schedule, spread
 from certbound.tubes.tube import Tube, log10_upper, supremum
 
-__all__ = ["METHODS", "applicable_methods", "bound_exit_probability", "tube_objective", "tune_tube"]
+__all__ = ["METHODS", "applicable_methods", "bound_exit_probability", "least_exit_level", "tube_objective", "tune_tube"]
 
 METHODS = ("auto", "kummer", "bessel", "mixture", "exact", "worst_case", *BASELINES)
 """Every name that ``method`` takes."""
@@ -41,7 +40,8 @@ _FAR = 2e-3
 """Standard deviation in units of the clearance below which the search works at a smaller scale."""
 
 _log = logging.getLogger(__name__)
-_QUICK = ("kummer", "bessel", "thm2", "thm2_cosh", "thm3_cosh", "thm3_sharp", "thm4", "prop3_sharp", "thm5_sharp")
+_FAMILY = ("kummer", "bessel")
+_QUICK = (*_FAMILY, "thm2", "thm2_cosh", "thm3_cosh", "thm3_sharp", "thm4", "prop3_sharp", "thm5_sharp")
 
 
 def tune_tube(
@@ -102,69 +102,70 @@ def tune_tube(
     delta = check_delta(delta)
     if method not in METHODS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
-    schedule = make_schedule(constants, horizon)
-    goal = make_objective(objective, schedule.horizon, continuous=schedule.continuous)
-    start = start or Start()
-    check_start(schedule, start, constants.dimension)
-    moving = start.offset > 0 or start.sigma > 0
-    if moving and method not in ("auto", "kummer", "bessel"):
+    question = Question.of(constants, horizon, objective=objective, start=start)
+    if question.moving and method not in ("auto", *_FAMILY):
         raise ValueError(f"`start` needs `method` 'auto', 'kummer' or 'bessel', got {method!r}.")
     if (epsilon is not None or step is not None) and method not in BASELINES:
         raise ValueError(f"`epsilon` and `step` belong to the paper's methods; `method` is {method!r}.")
+    if method == "auto":
+        tube = _best_tube(question, delta, thorough=thorough)
+    else:
+        tube = _tube_by(question, delta, method, epsilon=epsilon, step=step)
+    if tube is None:
+        raise InfeasibleError(f"no tube of `method` {method!r} was found; try 'kummer'.")
+    return _cut_by_bound(tube, question)
 
+
+def _best_tube(question: Question, delta: float, *, thorough: bool) -> Tube | None:
+    """The best of all that apply; one whose first look promises no gain is left out."""
     best: Tube | None = None
     value = math.inf
-    for name in applicable_methods(constants) if method == "auto" else (method,):
-        tube: Tube | None
-        if name in SLOW:
-            tube = _slow_tube(constants, schedule, delta, goal, name, seed=None)
-        elif name in ("kummer", "bessel"):
-            bessel = name == "bessel"
-            tube = _family_tube(constants, schedule, delta, goal, start, bessel=bessel, unless=value)
-        elif moving:
+    for name in applicable_methods(question.constants):
+        if question.moving and name not in _FAMILY:
             continue
-        else:
-            tube = baseline_tube(
-                constants,
-                name,
-                horizon=schedule.horizon,
-                delta=delta,
-                objective=goal,
-                epsilon=epsilon,
-                step=step,
-                unless=value,
-            )
+        tube = _tube_by(question, delta, name, unless=value)
         if tube is None:
             continue
-        other = tube_objective(tube, goal) if method == "auto" else value
+        other = tube_objective(tube, question.goal)
         if best is None or other < value:
             best, value = tube, other
-    if best is None:
-        raise InfeasibleError(f"no tube of `method` {method!r} was found; try 'kummer'.")
-    if method == "auto" and thorough and not moving and value > 0:
-        best = _thorough_tube(constants, schedule, delta, goal, best)
-    return _cut_by_bound(best, schedule, start)
+    if best is not None and thorough and not question.moving and value > 0:
+        return _thorough_tube(question, delta, best)
+    return best
 
 
-def _cut_by_bound(tube: Tube, schedule: Schedule, start: Start) -> Tube:
+def _tube_by(
+    question: Question, delta: float, method: str, *, epsilon: float | None = None, step: float | None = None,
+    unless: float = math.inf,
+) -> Tube | None:
+    """The tube of one method; None when a first look exceeds ``unless``."""
+    if method in SLOW:
+        return _slow_tube(question, delta, method, seed=None)
+    if method in _FAMILY:
+        return _family_tube(question, delta, bessel=method == "bessel", unless=unless)
+    return baseline_tube(question, delta, method, epsilon=epsilon, step=step, unless=unless)
+
+
+def _cut_by_bound(tube: Tube, question: Question) -> Tube:
     """The pointwise minimum with the almost-sure bound, where the noise has one."""
-    bound = tube.constants.noise_bound
-    if bound is None or start.sigma > 0 or tube.level != "trajectory":
+    bound, schedule = tube.constants.noise_bound, question.schedule
+    if bound is None or question.start.sigma > 0 or tube.level != "trajectory":
         return tube
     pieces = len(schedule.lengths)
     bounds = spread(np.atleast_1d(np.asarray(bound, dtype=float))[:pieces], pieces)
-    return replace(tube, bounded=AlmostSureProfile(schedule=schedule, bounds=bounds, start=start.offset))
+    return replace(tube, bounded=AlmostSureProfile(schedule=schedule, bounds=bounds, start=question.start.offset))
 
 
-def _thorough_tube(constants: Constants, schedule: Schedule, delta: float, goal: Objective, best: Tube) -> Tube:
+def _thorough_tube(question: Question, delta: float, best: Tube) -> Tube:
     """The best of ``best`` and the slow methods that apply; one that fails is left out."""
+    constants, goal = question.constants, question.goal
     value, seed, decided = tube_objective(best, goal), best, False
     names = ["exact"] * constants.isotropic + ["worst_case"] * constants.continuous + ["mixture"]
     for name in names:
         if decided and name == "mixture":
             continue  # a first-passage law is the limit of every mixture
         try:
-            tube = _slow_tube(constants, schedule, delta, goal, name, seed=seed)
+            tube = _slow_tube(question, delta, name, seed=seed)
         except (InfeasibleError, SolverError) as error:
             _log.debug("%s is left out: %s", name, error)
             continue
@@ -174,28 +175,21 @@ def _thorough_tube(constants: Constants, schedule: Schedule, delta: float, goal:
     return best
 
 
-def _slow_tube(
-    constants: Constants, schedule: Schedule, delta: float, goal: Objective, method: str, *, seed: Tube | None
-) -> Tube:
+def _slow_tube(question: Question, delta: float, method: str, *, seed: Tube | None) -> Tube:
     """A tube of a slow method; ``seed`` is a valid tube to start from."""
-    if np.max(schedule.sigmas) == 0:
+    if question.silent:
         raise InfeasibleError(f"`method` {method!r} needs noise, sigma is 0; use 'kummer' (the radius is 0).")
-    if seed is None:
-        seed = _family_tube(constants, schedule, delta, goal, Start(), bessel=False)
+    seed = seed or _family_tube(question, delta, bessel=False)
     assert seed is not None
     if method == "mixture":
-        return mixture_tube(constants, schedule, delta, goal, seed=seed, objective=goal.given)
-    return first_passage_tube(
-        constants, horizon=schedule.horizon, delta=delta, worst=method == "worst_case", objective=goal.given,
-        above=seed.maximum,
-    )  # fmt: skip
+        return mixture_tube(question, delta, seed=seed)
+    return first_passage_tube(question, delta, worst=method == "worst_case", above=seed.maximum)
 
 
 def applicable_methods(constants: Constants) -> list[str]:
     """Names that ``auto`` compares for these constants: certified, trajectory level, hypotheses fulfilled."""
     time = "continuous" if constants.continuous else "discrete"
-    slope = constants.rate if constants.rate is not None else constants.gain
-    contracting = bool(np.all(np.asarray(slope) < (0 if constants.continuous else 1)))
+    contracting = constants.worst_slope < (0 if constants.continuous else 1)
     names = []
     for name in _QUICK:
         row = BASELINES.get(name)
@@ -233,31 +227,17 @@ def tube_objective(tube: Tube, goal: Objective) -> float:
     return scale
 
 
-def _family_tube(
-    constants: Constants,
-    schedule: Schedule,
-    delta: float,
-    goal: Objective,
-    start: Start,
-    *,
-    bessel: bool,
-    unless: float = math.inf,
-) -> Tube | None:
+def _family_tube(question: Question, delta: float, *, bessel: bool, unless: float = math.inf) -> Tube | None:
     """Thm K1, or its Bessel form, with the best parameters found; None when a first look exceeds ``unless``."""
-    if bessel and not schedule.any_power:
-        # isotropic proxy: nu = n always holds
-        schedule = replace_nu(schedule, float(constants.dimension))
+    goal, start = question.goal, question.start
+    schedule = question.with_any_power().schedule if bessel else question.schedule
     unit = schedule.unit
     idle = schedule.idle_time() if goal.kind == "final" else 0.0
     if idle > 0:
         schedule = schedule.idled(idle)
-    cut = schedule if goal.clearance is None else schedule.refined(goal.clearance.ends(schedule))
-    search = Search(
-        schedule=cut.graded(6 if goal.kind != "mean" else 16), kind=goal.kind, weights=np.ones(1),
-        log_delta=math.log(delta), bessel=bessel, start=start,
-    )  # fmt: skip
-    search = replace(search, weights=goal.weights(search.schedule))
-    if np.max(schedule.sigmas) == 0:
+    graded = goal.cut(schedule).graded(6 if goal.kind != "mean" else 16)
+    search = Search.of(question, graded, bessel=bessel, log_delta=math.log(delta))
+    if question.silent:
         a, v0 = (1.0 if bessel else 0.0), 1.0
     else:
         if unless < math.inf and search.worse_than(1.3 * unless):
@@ -266,16 +246,7 @@ def _family_tube(
     check_power(schedule, a, bessel=bessel)
     profile = KummerProfile(schedule=schedule, a=a, v0=v0, delta=delta, bessel=bessel, start=start)
     parameters = {"a": a, "v0": v0 * unit**2, **({"idle": idle} if idle > 0 else {})}
-    return Tube(
-        method="bessel" if bessel else "kummer", parameters=parameters, level="trajectory",
-        certified=True, delta=delta, horizon=schedule.horizon, constants=constants, objective=goal.given,
-        profile=profile,
-    )  # fmt: skip
-
-
-def replace_nu(schedule: Schedule, nu: float) -> Schedule:
-    """The same data with another effective dimension, for which every Kummer parameter is valid."""
-    return replace(schedule, nu=nu, any_power=True)
+    return question.tube("bessel" if bessel else "kummer", delta, parameters, profile)
 
 
 def bound_exit_probability(
@@ -315,46 +286,43 @@ def bound_exit_probability(
     >>> bound_exit_probability(constants, horizon=5.0, clearance=1.34) < -3
     True
     """
-    schedule = make_schedule(constants, horizon)
-    held = read_clearance(clearance, schedule.horizon, continuous=schedule.continuous)
-    start = start or Start()
-    check_start(schedule, start, constants.dimension)
-    if np.max(schedule.sigmas) == 0 and start == Start():
+    return least_exit_level(Question.of(constants, horizon, clearance=clearance, start=start), thorough=thorough)
+
+
+def least_exit_level(question: Question, *, thorough: bool = False) -> float:
+    """:func:`bound_exit_probability` for the clearance of a question."""
+    if question.silent and not question.moving:
         return -1e12
-    cut = schedule.refined(held.ends(schedule))
-    best = 0.0
-    forms: list[tuple[Schedule, bool]] = [(cut, False)]
-    scaled = cut if cut.any_power else replace_nu(cut, float(constants.dimension))
+    held, start, cut = question.clearance, question.start, question.cut
+    scaled = replace(question, schedule=cut).with_any_power().schedule
+    a, v0 = _parameters(question, cut)
+    best, pair = exit_level(cut, held, a=a, v0=v0, start=start), (a, v0, False)
     if np.max(cut.rates) >= 0:
-        forms.append((scaled, True))
-    for data, bessel in forms:
-        graded = data.graded(4)
-        search = Search(
-            schedule=graded, kind="probability", weights=Objective(None, "scale", held).weights(graded), bessel=bessel,
-            start=start,
-        )  # fmt: skip
-        # far out the parameters hardly change, but the sums grow: they are sought nearer
-        farthest = float(np.max(np.sqrt(graded.nodes[1]) * (schedule.unit / search.weights)))
-        if 0 < farthest < _FAR:
-            search = replace(search, weights=search.weights * (farthest / _FAR))
-        a, v0 = search.solve()
-        best = min(best, exit_level(data, held, a=a, v0=v0, bessel=bessel, start=start))
-        if not bessel:
-            pair = (a, v0, False)
-    if start == Start() and not scaled.continuous and union_may_help(scaled, held, best):
+        a, v0 = _parameters(question, scaled, bessel=True)
+        best = min(best, exit_level(scaled, held, a=a, v0=v0, bessel=True, start=start))
+    if not question.moving and not scaled.continuous and union_may_help(scaled, held, best):
         best = min(best, union_level(scaled, held))
-    if thorough and start == Start():
-        best = min(best, _thorough_level(constants, cut, held, pair, best))
+    if thorough and not question.moving:
+        best = min(best, _thorough_level(question, cut, pair, best))
     return max(best, -1e12)
 
 
-def _thorough_level(
-    constants: Constants, schedule: Schedule, held: Clearance, pair: tuple[float, float, bool], best: float
-) -> float:
+def _parameters(question: Question, schedule: Schedule, *, bessel: bool = False) -> tuple[float, float]:
+    """(a, v_0) of about the least probability."""
+    graded = schedule.graded(4)
+    search = Search.of(question, graded, bessel=bessel)
+    # far out the parameters hardly change, but the sums grow: they are sought nearer
+    farthest = float(np.max(np.sqrt(graded.nodes[1]) * (schedule.unit / search.weights)))
+    if 0 < farthest < _FAR:
+        search = replace(search, weights=search.weights * (farthest / _FAR))
+    return search.solve()
+
+
+def _thorough_level(question: Question, cut: Schedule, pair: tuple[float, float, bool], best: float) -> float:
     """log10 of the probability by the slow methods that apply."""
-    levels = [0.0]
+    constants, held, levels = question.constants, question.clearance, [0.0]
     try:
-        levels.append(mixture_level(schedule, held, best=[pair]))
+        levels.append(mixture_level(cut, held, best=[pair]))
     except SolverError as error:
         _log.debug("mixture is left out: %s", error)
     laws = [bound_exact_exit] * constants.isotropic + [bound_worst_exit] * constants.continuous
@@ -362,7 +330,7 @@ def _thorough_level(
         for law in laws:
             target = min(0.5, 10.0 ** min(best, *levels))
             try:
-                value = law(constants, horizon=schedule.horizon, radius=float(held.values[0]), target=target)
+                value = law(constants, horizon=question.horizon, radius=float(held.values[0]), target=target)
             except InfeasibleError as error:
                 _log.debug("%s is left out: %s", law.__name__, error)
                 continue

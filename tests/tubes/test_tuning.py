@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from certbound.tubes.constants import Constants
-from certbound.tubes.kummer.profile import Start, kummer_tube
+from certbound.tubes.kummer.profile import kummer_tube
 from certbound.tubes.kummer.search import Search
 from certbound.tubes.objective import make_objective
+from certbound.tubes.question import Start
 from certbound.tubes.tuning import METHODS, applicable_methods, bound_exit_probability, tube_objective, tune_tube
 
 OU = Constants(rate=-0.5, sigma=0.1**0.5, dimension=1)

@@ -110,8 +110,41 @@ class RowMoments:
         self.s1_two = (apply(m.v[2], self.s_alpha) + 2 * apply(m.v[1], s_kappa)) * UP
         s2 = (apply(m.a, s1) + s1_one) * UP
         s3 = (apply(m.a, s2) + apply(size_k, s1) + apply(m.a, s1_one) + self.s1_two) * UP
-        # errors of the floats: sums of products of at most three matrices
-        n, total = len(w), float(size_w.max(axis=0).sum())
+        self._set_loose(size_w, size_k, noise)
+        v, v_next = r.covariance[0, first:-1], r.covariance[0, first + 1 :]
+        self.v = v, v_next
+        push = a_end @ v_next
+        v_rate = push + np.swapaxes(push, 1, 2) + gram
+        c0, c1 = apply(v_next, self.w), apply(v_next, self.alpha_end) + apply(gram, self.w)
+        c2 = -apply(a_end, c1) + apply(v_rate, self.alpha_end) + apply(v_next, self.kappa)
+        grow = m.grow
+        self.columns = (
+            self._column(0, c0, c1, h * h / 2 * apply(grow, s2)), self._column(1, c1, c2, h * h / 2 * apply(grow, s3)),
+            self._column(2, c2, np.zeros_like(c2), h * apply(grow, s3)),
+        )
+        self.rows = (
+            self._row(0, self.w, self.alpha, h * h / 2 * _left(self.s_alpha2, grow)),
+            self._row(1, self.alpha, self.alpha2, h * h / 2 * _left(s_alpha3, grow)),
+            self._row(2, self.alpha2, np.zeros_like(self.alpha2), h * _left(s_alpha3, grow)),
+        )
+        self.at_middle = (
+            self._row(0, self.w, self.alpha, h * h / 2 * _left(self.s_alpha2, grow), 0.0),
+            self._row(1, self.alpha, self.alpha2, h * h / 2 * _left(s_alpha3, grow), 0.0),
+            self._column(0, c0, c1, h * h / 2 * apply(grow, s2), 0.0),
+        )
+        b0, b1 = apply(v, self.w), apply(v, self.alpha) + apply(gram, self.w)
+        # inside a part: c_0 and c_1 themselves, alpha and alpha_2 themselves
+        self.inner_columns = (
+            self._between(b0, c0, h * h / 8 * apply(m.v[2], size_w), self.loose_columns[0]),
+            self._between(b1, c1, h * h / 8 * self.s1_two, self.loose_columns[1]),
+        )
+        self.inner_rows = self._inner_rows(alpha2_end, s_kappa, size_k)
+        self._own(gram, (b0, c0), (b1, c1), alpha2_end, (s1, s1_one))
+
+    def _set_loose(self, size_w: Array, size_k: Array, noise: Array) -> None:
+        """Errors of the floats: sums of products of at most three matrices."""
+        m, n = self.m, size_w.shape[-1]
+        total = float(size_w.max(axis=0).sum())
         norm_a = float(m.a.sum(axis=2).max())
         norm_v, norm_g = m.v[0].sum(axis=2).max(axis=1), float(noise.sum(axis=2).max())
         norm_k = float(size_k.sum(axis=2).max())
@@ -124,53 +157,30 @@ class RowMoments:
             8 * (norm_a * loose_c + loose_a * (norm_v * norm_a + norm_g) * total)
             + (loose_v + 1e-13 * norm_v) * total * norm_k,
         )
-        v, v_next = r.covariance[0, first:-1], r.covariance[0, first + 1 :]
-        self.v = v, v_next
-        push = a_end @ v_next
-        v_rate = push + np.swapaxes(push, 1, 2) + gram
-        c0, c1 = apply(v_next, self.w), apply(v_next, self.alpha_end) + apply(gram, self.w)
-        c2 = -apply(a_end, c1) + apply(v_rate, self.alpha_end) + apply(v_next, self.kappa)
-        half = h / 2
-        grow = m.grow
 
-        def column(k: int, middle: Array, swing: Array, rest: Array, share: float = 1.0) -> Vectors:
-            """On the whole part, or, with ``share`` = 0, at its middle."""
-            radius = share * half * np.abs(swing) + (rest if share else rest / 4)
-            loose = self.loose_columns[k][:, None] + h * self.loose_columns[min(k + 1, 2)][:, None]
-            return Vectors(middle - half * swing, radius * UP + loose)
+    def _column(self, k: int, middle: Array, swing: Array, rest: Array, share: float = 1.0) -> Vectors:
+        """On the whole part, or, with ``share`` = 0, at its middle."""
+        half = self.h / 2
+        radius = share * half * np.abs(swing) + (rest if share else rest / 4)
+        loose = self.loose_columns[k][:, None] + self.h * self.loose_columns[min(k + 1, 2)][:, None]
+        return Vectors(middle - half * swing, radius * UP + loose)
 
-        self.columns = (
-            column(0, c0, c1, h * h / 2 * apply(grow, s2)), column(1, c1, c2, h * h / 2 * apply(grow, s3)),
-            column(2, c2, np.zeros_like(c2), h * apply(grow, s3)),
-        )
+    def _row(self, k: int, middle: Array, swing: Array, rest: Array, share: float = 1.0) -> Vectors:
+        """The same for rows, which are given at the other end."""
+        half = self.h / 2
+        radius = share * half * np.abs(swing) + (rest if share else rest / 4)
+        radius = radius * UP + self.loose_rows[k] + self.h * self.loose_rows[min(k + 1, 2)]
+        return Vectors(middle + half * swing, radius)
 
-        def row(k: int, middle: Array, swing: Array, rest: Array, share: float = 1.0) -> Vectors:
-            radius = share * half * np.abs(swing) + (rest if share else rest / 4)
-            return Vectors(middle + half * swing, radius * UP + self.loose_rows[k] + h * self.loose_rows[min(k + 1, 2)])
-
-        self.rows = (
-            row(0, self.w, self.alpha, h * h / 2 * _left(self.s_alpha2, grow)),
-            row(1, self.alpha, self.alpha2, h * h / 2 * _left(s_alpha3, grow)),
-            row(2, self.alpha2, np.zeros_like(self.alpha2), h * _left(s_alpha3, grow)),
-        )
-        self.at_middle = (
-            row(0, self.w, self.alpha, h * h / 2 * _left(self.s_alpha2, grow), 0.0),
-            row(1, self.alpha, self.alpha2, h * h / 2 * _left(s_alpha3, grow), 0.0),
-            column(0, c0, c1, h * h / 2 * apply(grow, s2), 0.0),
-        )
-        # inside a part: c_0 and c_1 themselves, alpha and alpha_2 themselves
-        b0, b1 = apply(v, self.w), apply(v, self.alpha) + apply(gram, self.w)
-        self.inner_columns = (
-            self._between(b0, c0, h * h / 8 * apply(m.v[2], size_w), self.loose_columns[0]),
-            self._between(b1, c1, h * h / 8 * self.s1_two, self.loose_columns[1]),
-        )
-        self.inner_rows = (
+    def _inner_rows(self, alpha2_end: Array, s_kappa: Array, size_k: Array) -> tuple[Vectors, Vectors, Vectors]:
+        """w, alpha and alpha_2 inside a part."""
+        half = self.h / 2
+        turned = np.abs(alpha2_end - self.alpha2) / 2 + self.h * self.h * _left(s_kappa, size_k)
+        return (
             Vectors(self.w, np.zeros_like(self.w)),
             Vectors(self.alpha + half * self.kappa, half * np.abs(self.kappa) + self.loose_rows[1]),
-            Vectors((self.alpha2 + alpha2_end) / 2,
-                 (np.abs(alpha2_end - self.alpha2) / 2 + h * h * _left(s_kappa, size_k)) * UP + self.loose_rows[2]),
+            Vectors((self.alpha2 + alpha2_end) / 2, turned * UP + self.loose_rows[2]),
         )
-        self._own(gram, (b0, c0), (b1, c1), alpha2_end, (s1, s1_one))
 
     @staticmethod
     def _between(left: Array, right: Array, bend: Array, loose: Array) -> Vectors:

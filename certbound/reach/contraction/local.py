@@ -28,7 +28,7 @@ from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
-from certbound.tubes.kummer import Start
+from certbound.tubes.question import Start
 from certbound.tubes.tube import Tube, supremum
 from certbound.tubes.tuning import tune_tube
 
@@ -258,8 +258,7 @@ def random_start(problem: Problem, constants: Constants) -> Start:
     if not isinstance(problem.initial, GaussianStart) or not np.any(problem.initial.covariance):
         return Start()
     covariance = np.asarray(problem.initial.covariance, dtype=float)
-    n = len(covariance)
-    metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric, dtype=float)
+    metric = constants.matrix
     root = np.linalg.cholesky(metric)
     square = float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1])
     inner = Interval.point(metric) @ Interval.point(covariance) @ Interval.point(metric)

@@ -88,10 +88,9 @@ def contraction_tube(
     parts = initial_cells(flow.problem, cells)
     if curve is None:
         curve = nominal_curve(flow, parts.centres)
-    norm = Norm(flow.dimension, constants.metric)
+    norm = constants.norm
     eta = bound_forcing(flow, curve, norm) if forcing is None else forcing
-    slope = constants.rate if constants.rate is not None else constants.gain
-    slopes = values_on_pieces(slope, constants.times, curve)
+    slopes = values_on_pieces(constants.slope, constants.times, curve)
     rho = parts.radii(norm, curve.initial())
     radius, _ = integrate_radius(curve, jump_sizes(curve, norm), rho, slopes, eta)
     proved = first_infinite(radius)

@@ -8,6 +8,7 @@ from certbound.reach.linear.diffusion import Accepted, DiffusionRun, Reference, 
 from certbound.reach.linear.inclusion import Supports
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import Events, LinearRun, correlated
+from certbound.reach.linear.shares import Share
 
 __all__ = [
     "Accepted",
@@ -23,5 +24,6 @@ __all__ = [
     "LinearRun",
     "Reference",
     "refusal",
+    "Share",
     "Supports",
 ]

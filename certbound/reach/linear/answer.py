@@ -12,12 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.gaussian.response import level_along, level_scale, logsumexp
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
+from certbound.reach.linear import shares
 from certbound.reach.linear.deviation_tube import DeviationTube
 from certbound.reach.linear.diffusion import DiffusionRun, depends_on_state
 from certbound.reach.linear.fit import fitted
 from certbound.reach.linear.inclusion import Supports
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import LinearRun, Outcome
+from certbound.reach.linear.shares import Share
 from certbound.reach.nominal import Curve
 from certbound.reach.sets import ReachTube, Requirement
 from certbound.rigor.intervals import Interval
@@ -26,15 +28,10 @@ __all__ = ["LinearAnswer", "linear_answer", "linear_reach", "refusal"]
 
 Array = NDArray[np.float64]
 
-_SHARES = ((0.1, 1), (0.3, 2), (0.8, 3))
-_LINEAR_SHARES = ((0.02, 1), (0.2, 1))  # where only windows ask for it
-_FITTED = 0.3  # share of delta whose deviations the slopes are fitted over
-_GUESSED = ((0.1, 1), (0.1, 3), (0.3, 3), (0.6, 3), (0.85, 3))
 _REFINEMENTS = 3
 _FEW = 20  # states up to which each has an event of its own in the deviation tube
 _MANY = 20  # nonlinear coordinates beyond which a probability below the target is not refined
 _NOTHING = -0.1  # log of a probability that says nothing
-_LIKELIER = np.log([0.01, 0.05, 0.2])  # delta_N where nothing was proved near the target
 _PARTS = (2, 4, 8)  # cells along each side, tried one after the other
 _NEAR = 3.5  # log of how many times the target one cell may prove for more cells to be tried
 _MOST_PIECES = 4000  # pieces of time times cells
@@ -62,7 +59,7 @@ class LinearAnswer:
     def exact(self) -> bool:
         """Whether the model is linear and its noise Gaussian: only the union over constraints and times is lost."""
         system = self.run.engine.system
-        return not len(self.run.engine.model.active) and (
+        return not self.run.curved and (
             isinstance(system, ContinuousSystem) or bool(system.noise.gaussian)
         )
 
@@ -123,16 +120,15 @@ class LinearAnswer:
             If the remainder feeds itself, or was bounded at the whole of delta or more only.
         """
         run, outcome, bounds = self.run, self.shown, self.shown.bounds
-        left = run.engine.problem.delta - np.exp(outcome.log_nonlinear) * (1 + 1e-12)
+        left = run.engine.problem.delta - np.exp(outcome.nonlinear.log) * (1 + 1e-12)
         if bounds is None or left <= 0:
             raise ArithmeticError(self.reason)
         engine = run.engine
         count = engine.pieces if engine.continuous else engine.pieces + 1
         rows = np.broadcast_to(np.asarray(direction, dtype=float), (count, engine.n))
-        log_nonlinear = outcome.log_nonlinear
-        share = float(np.log(0.49 * left))
+        share = Share.of(0.49 * left).log
         silent, result = _silent(run), np.zeros(count)
-        _, events = run.levels(log_nonlinear)
+        _, events = run.levels(outcome.nonlinear)
         for cell in range(len(engine.centres)):
             event = events[cell].along(rows)
             level = level_along(event, share) if event.profile.max() > 0 else np.zeros(count)
@@ -178,30 +174,29 @@ def linear_answer(
     before : LinearAnswer, optional
         What was found for the same problem without ``thorough`` and ``cells``; it is not looked for again.
     """
-    target = float(np.log(problem.delta))
-    first = target + float(np.log(_SHARES[0][0]))
+    target = Share.of(problem.delta)
     run = _run(problem, cells=1 if cells is None else cells) if before is None else before.run
-    best, effort = _best(run, target) if before is None else (before.outcome, _SHARES[-1][1])
+    best, effort = _best(run, target) if before is None else (before.outcome, shares.HOPED[-1][1])
     closes = best.bounds is not None
-    near = best.log_probability < target + _NEAR and len(run.engine.model.active) and not isinstance(run, DiffusionRun)
-    if thorough and cells is None and best.log_probability > target and (near or not closes):
+    near = best.log_probability < target.log + _NEAR and run.curved and not isinstance(run, DiffusionRun)
+    if thorough and cells is None and best.log_probability > target.log and (near or not closes):
         for finer in _splits(problem, run):
-            if _promising(finer, target) if closes else finer.probability(first, _SHARES[0][1]).bounds is not None:
+            if _promising(finer, target) if closes else _tried(finer, target, shares.HOPED[0]).bounds is not None:
                 other = _best(finer, target)
                 if not closes or other[0].log_probability < best.log_probability:
                     run, (best, effort) = finer, other
                 break
-    if thorough and best.log_probability > _NOTHING and len(run.engine.model.active):
-        for log_nonlinear in _LIKELIER[target < _LIKELIER]:
-            best = _least(best, run.probability(float(log_nonlinear), 2))
+    if thorough and best.log_probability > _NOTHING and run.curved:
+        for likelier in (share for share in map(Share.of, shares.LIKELIER) if target.log < share.log):
+            best = _least(best, run.probability(likelier, 2))
             if best.bounds is not None:
                 break
     shown = best
-    above = best.log_probability - best.log_nonlinear
-    if best.log_probability <= target and above > -3.0 and (above < 2.0 or len(run.engine.model.active)):
+    above = best.log_probability - best.nonlinear.log
+    if best.log_probability <= target.log and above > -3.0 and (above < 2.0 or run.curved):
         coupled = max((len(group[0]) for group in run.engine.model.blocks), default=1) > 1
         for _ in range(0 if coupled or len(run.engine.model.active) > _MANY else _REFINEMENTS):
-            outcome = run.probability(2 * best.log_nonlinear, effort)
+            outcome = run.probability(Share(2 * best.nonlinear.log), effort)
             if outcome.log_probability >= best.log_probability:
                 break
             best = outcome
@@ -210,47 +205,49 @@ def linear_answer(
 
 def _run(problem: Problem, *, cells: int | None, noise: bool = True) -> LinearRun:
     """The engine for the problem's noise."""
-    engine = fitted(Linearisation.of(problem, cells=cells, noise=noise), float(np.log(problem.delta * _FITTED)))
+    engine = fitted(Linearisation.of(problem, cells=cells, noise=noise), Share.of(problem.delta * shares.FITTED))
     return DiffusionRun(engine) if noise and depends_on_state(problem) else LinearRun(engine)
 
 
-def _best(run: LinearRun, target: float) -> tuple[Outcome, int]:
+def _best(run: LinearRun, target: Share) -> tuple[Outcome, int]:
     """The least probability over a few shares of the target for delta_N, and the last effort.
 
     Where a guess of the remainder tells which of them has a chance, only those are proved, and the last one if none.
     """
-    guessed = bool(len(run.engine.model.active)) and not isinstance(run, DiffusionRun)
-    shares = _SHARES if len(run.engine.model.active) else _LINEAR_SHARES
+    guessed = run.curved and not isinstance(run, DiffusionRun)
+    parts = shares.GUESSED if guessed else shares.HOPED if run.curved else shares.HOPED_LINEAR
     best: Outcome | None = None
-    for share, effort in _hopes(run, target) if guessed else shares:
-        found = run.probability(target + float(np.log(share)), effort)
+    for hope in _hopes(run, target) if guessed else parts:
+        found = _tried(run, target, hope)
         best = found if best is None else _least(best, found)
-        if best.log_probability <= target or not (len(run.engine.model.active) or run.engine.continuous):
-            return best, effort
-    share, effort = _GUESSED[-1] if guessed else shares[-1]
-    if best is None:
-        best = run.probability(target + float(np.log(share)), effort)
-    return best, effort
+        if best.log_probability <= target.log or not (run.curved or run.engine.continuous):
+            return best, hope[1]
+    return best or _tried(run, target, parts[-1]), parts[-1][1]
 
 
-def _hopes(run: LinearRun, target: float) -> Iterator[tuple[float, int]]:
+def _tried(run: LinearRun, target: Share, hope: tuple[float, int]) -> Outcome:
+    """What a part of the target proves, with its effort."""
+    return run.probability(target.part(hope[0]), hope[1])
+
+
+def _hopes(run: LinearRun, target: Share) -> Iterator[tuple[float, int]]:
     """The shares of the target with which a guess of the remainder says that it is within reach.
 
     Of all of them the last one has the least levels, and so the least remainder. Where the first has no chance, it is
     looked at next: if the noise takes more than the target with it as well, the others need no look.
     """
-    for index, (share, effort) in enumerate(_GUESSED):
-        if run.promise(target + float(np.log(share)), effort, limit=target) <= target:
+    for index, (share, effort) in enumerate(shares.GUESSED):
+        if run.promise(target.part(share), effort, limit=target.log) <= target.log:
             yield share, effort
         elif index == 0 and not _within_reach(run, target):
             return
 
 
-def _within_reach(run: LinearRun, target: float) -> bool:
+def _within_reach(run: LinearRun, target: Share) -> bool:
     """Whether the noise alone, next to the least remainder that is tried, may cost no more than the target."""
-    share, effort = _GUESSED[-1]
-    limit = target + float(np.log1p(share))
-    return run.promise(target + float(np.log(share)), effort, limit=limit) <= limit
+    share, effort = shares.GUESSED[-1]
+    limit = target.log + float(np.log1p(share))
+    return run.promise(target.part(share), effort, limit=limit) <= limit
 
 
 def _splits(problem: Problem, run: LinearRun) -> Iterator[LinearRun]:
@@ -262,7 +259,7 @@ def _splits(problem: Problem, run: LinearRun) -> Iterator[LinearRun]:
         yield _run(problem, cells=parts)
 
 
-def _promising(run: LinearRun, target: float) -> bool:
+def _promising(run: LinearRun, target: Share) -> bool:
     """Whether a guess of the remainder says that the target is within reach."""
     return _within_reach(run, target) and any(True for _ in _hopes(run, target))
 
@@ -280,7 +277,7 @@ def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = No
         If the remainder feeds itself before the horizon ends.
     """
     run = _run(problem, cells=cells, noise=noise)
-    outcome = run.probability(float(np.log(problem.delta / 2)), 2 if noise else 1)
+    outcome = run.probability(Share.of(problem.delta / 2), 2 if noise else 1)
     if outcome.bounds is None:
         raise ArithmeticError(LinearAnswer(run=run, outcome=outcome, shown=outcome).reason)
     if noise:
@@ -308,16 +305,16 @@ def _levels_of_coordinates(run: LinearRun, outcome: Outcome) -> tuple[list[Array
     n, cells = engine.n, len(engine.centres)
     count = engine.pieces if engine.continuous else engine.pieces + 1
     active = [int(state) for state in engine.model.active]
-    log_nonlinear = outcome.log_nonlinear if active else float(np.log(engine.problem.delta / 10))
-    levels, events = run.levels(log_nonlinear)
-    left = engine.problem.delta - np.exp(log_nonlinear)
+    nonlinear = outcome.nonlinear if active else Share.of(engine.problem.delta / 10)
+    levels, events = run.levels(nonlinear)
+    left = engine.problem.delta - np.exp(nonlinear.log)
     again = n <= _FEW and left >= 0.5 * engine.problem.delta  # room for events of the active states alone
     rest = [i for i in range(n) if again or i not in active]
     budget = 0.99 * left if again else 0.5 * engine.problem.delta
-    share = float(np.log(budget / (2 * max(len(rest), 1))))
+    share = Share.of(budget / (2 * max(len(rest), 1))).log
     result, worst = [], -np.inf
     for cell in range(cells):
-        values, logs = np.zeros((count, n)), [log_nonlinear]
+        values, logs = np.zeros((count, n)), [nonlinear.log]
         for i in range(n):
             event = events[cell].along(np.broadcast_to(np.eye(n)[i], (count, n)))
             own = np.full(count, np.inf)
@@ -342,7 +339,7 @@ def _levels_of_coordinates(run: LinearRun, outcome: Outcome) -> tuple[list[Array
 def _silent(run: LinearRun) -> tuple[Array, Array] | None:
     """Bounds of the remainder of the associated trajectory from a fixed start without disturbance: next to nothing."""
     engine = run.engine
-    alone = not engine.radii.any() and not engine.d_radius.any() and len(engine.model.active)
+    alone = not engine.radii.any() and not engine.d_radius.any() and run.curved
     return run.include(np.zeros(run.rows.shape[:3]), 1) if alone else None
 
 

@@ -32,6 +32,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import LinearRun, Outcome
+from certbound.reach.linear.shares import Share
 from certbound.reach.sets import Requirement
 from certbound.rigor.intervals import Interval
 
@@ -43,7 +44,6 @@ _ROUNDS = 12
 _SETTLE = 6
 _GROWTH = 0.03
 _ENOUGH = 0.5  # levels of M below this share of those of Z: all noise in M cannot be better
-_HALF = float(np.log(0.5)) * (1 + 1e-15)
 
 
 def depends_on_state(problem: Problem) -> bool:
@@ -59,8 +59,8 @@ class Reference:
     value: Array
     gaussian: bool
     memory: dict[int, dict[bytes, Any]] = field(default_factory=dict)
-    events: dict[tuple[int, float], ClockEvents] = field(default_factory=dict)
-    levels: dict[tuple[int, int, float], Array] = field(default_factory=dict)
+    events: dict[tuple[int, Share], ClockEvents | WindowEvents] = field(default_factory=dict)
+    levels: dict[tuple[int, int, Share], Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -93,8 +93,8 @@ class DiffusionRun(LinearRun):
             Reference(response=still, value=silent, gaussian=bool(engine.start_covariance.any())),
         ]
         self.frames = [Windowed(engine.response, cell) for cell in range(cells)]
-        self.outcomes: dict[float, Outcome] = {}
-        self.accepted: dict[float, Accepted] = {}
+        self.outcomes: dict[Share, Outcome] = {}
+        self.accepted: dict[Share, Accepted] = {}
         self.held = Accepted(reference=self.references[0], excess=[])
 
     # ---- the noise over a tube ---------------------------------------------------------------------------
@@ -119,85 +119,83 @@ class DiffusionRun(LinearRun):
         shape = (engine.pieces, *self.tape.shape)
         return [value[k * engine.pieces : (k + 1) * engine.pieces].reshape(*shape) for k in range(len(self.supports))]
 
-    def events(self, cell: int, shared_log: float) -> SplitEvents:
+    def events(self, cell: int, shared: Share) -> SplitEvents:
         """Scalar events of Z + M of one cell; half of the shared probability is granted to each."""
-        engine, reference = self.engine, self.held.reference
-        gaussian = None
-        share = shared_log
+        reference, gaussian = self.held.reference, None
+        share = shared.half() if reference.gaussian else shared
         if reference.gaussian:
-            share = shared_log + _HALF
             if (cell, share) not in reference.events:
-                windows = WindowEvents(reference.response, cell, engine.window, share)
-                found = ClockEvents(windows, reference.value[cell], reference.memory.setdefault(cell, {}))
-                reference.events[cell, share] = found
+                windows = WindowEvents(reference.response, cell, self.engine.window, share.log)
+                reference.events[cell, share] = self._events_of(windows, cell)
             gaussian = reference.events[cell, share]
-        excess = self.held.excess[cell]
-        return SplitEvents(
-            gaussian=gaussian,
-            martingales=Martingales(reference.response, cell, excess, share, self.frames[cell]),
-        )
+        martingales = Martingales(reference.response, cell, self.held.excess[cell], share.log, self.frames[cell])
+        return SplitEvents(gaussian=gaussian, martingales=martingales)
 
-    def levels(self, log_nonlinear: float) -> tuple[Array, list[Any]]:
-        """Levels of |Z + M| along the inner rows that together cost exp(log_nonlinear), and the events.
+    def _events_of(self, windows: WindowEvents, cell: int) -> ClockEvents | WindowEvents:
+        """The events of Z that follow from windows."""
+        reference = self.held.reference
+        return ClockEvents(windows, reference.value[cell], reference.memory.setdefault(cell, {}))
 
-        A tenth of it goes to the coordinates that all rows share; the rest is divided between the rows, and in equal
-        parts between Z and M.
+    def levels(self, nonlinear: Share) -> tuple[Array, list[Any]]:
+        """Levels of |Z + M| along the inner rows that together cost exp(nonlinear.log), and the events.
+
+        What `Share.common` leaves is divided between the rows, and in equal parts between Z and M.
         """
-        self.held = self.accepted.get(log_nonlinear, self.held)
+        self.held = self.accepted.get(nonlinear, self.held)
         cells, pieces, count = self.rows.shape[:3]
         result = np.zeros((cells, pieces, count))
-        share = log_nonlinear + float(np.log(0.9 / (4 * max(count, 1))))
-        events = [self.events(cell, log_nonlinear + float(np.log(0.1))) for cell in range(cells)]
+        share = nonlinear.side(count, terms=2)
+        events = [self.events(cell, nonlinear.common()) for cell in range(cells)]
         for cell, d in np.ndindex(cells, count):
-            level = events[cell].martingales.along(self.rows[cell, :, d]).level(share)
+            level = events[cell].martingales.along(self.rows[cell, :, d]).level(share.log)
             result[cell, :, d] = level * (1 + 1e-12) + self._gaussian_level(events[cell], cell, d, share)
         return result, list(events)
 
-    def _gaussian_level(self, events: SplitEvents, cell: int, d: int, share: float) -> Array:
-        """Levels of w . Z along an inner row that cost exp(share)."""
+    def _gaussian_level(self, events: SplitEvents, cell: int, d: int, share: Share) -> Array:
+        """Levels of w . Z along an inner row that cost a share."""
         found, key = self.held.reference.levels, (cell, d, share)
         if key not in found:
             event = None if events.gaussian is None else events.gaussian.along(self.rows[cell, :, d])
             found[key] = np.zeros(self.rows.shape[1])
             if event is not None and event.profile.max() > 0:
-                found[key] = level_along(event, share)
+                found[key] = level_along(event, share.log)
         return found[key]
 
     def tightest(self, outcome: Outcome) -> tuple[Requirement | None, int, float]:
         """See `LinearRun.tightest`."""
-        self.held = self.accepted.get(outcome.log_nonlinear, self.held)
+        self.held = self.accepted.get(outcome.nonlinear, self.held)
         return super().tightest(outcome)
 
     # ---- the fixed point ---------------------------------------------------------------------------------
 
-    def probability(self, log_nonlinear: float, effort: int = 2) -> Outcome:
-        """Thm K7' with delta_N = exp(log_nonlinear), by the better of both references."""
-        if log_nonlinear in self.outcomes:
-            return self.outcomes[log_nonlinear]
-        best = Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None)
+    def probability(self, nonlinear: Share, effort: int = 2) -> Outcome:
+        """Thm K7' with delta_N = exp(nonlinear.log), by the better of both references."""
+        if nonlinear in self.outcomes:
+            return self.outcomes[nonlinear]
+        best = Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=None)
         for reference in self.references:
-            found = self._close(reference, log_nonlinear, effort)
+            found = self._close(reference, nonlinear, effort)
             if found is None:
                 continue
             accepted, bounds, share = found
-            _, events = self.levels(log_nonlinear)
-            outcomes = [self._cell(k, bounds, events[k], log_nonlinear) for k in range(len(self.supports))]
+            _, events = self.levels(nonlinear)
+            outcomes = [self._cell(k, bounds, events[k], nonlinear) for k in range(len(self.supports))]
             worst = max(outcomes, key=lambda outcome: outcome.log_probability)
             if best.bounds is None or worst.log_probability < best.log_probability:
                 best, kept = worst, accepted
             if share < _ENOUGH:
                 break
         if best.bounds is not None:
-            self.accepted[log_nonlinear] = self.held = kept
-        self.outcomes[log_nonlinear] = best
+            self.accepted[nonlinear] = self.held = kept
+        self.outcomes[nonlinear] = best
         return best
 
-    def promise(self, log_nonlinear: float, effort: int, limit: float = 0.0) -> float:
+    def promise(self, nonlinear: Share, effort: int, limit: float = 0.0) -> float:
         """What `probability` finds, in logarithms: nothing can be guessed before a tube has closed."""
-        return self.probability(log_nonlinear, effort).log_probability
+        return self.probability(nonlinear, effort).log_probability
 
     def _close(
-        self, reference: Reference, log_nonlinear: float, effort: int
+        self, reference: Reference, nonlinear: Share, effort: int
     ) -> tuple[Accepted, tuple[Array, Array], float] | None:
         """Bounds of g - ghat and of the remainder over a tube that contains what follows from them.
 
@@ -215,7 +213,7 @@ class DiffusionRun(LinearRun):
                 if excess is None:
                     return None
                 self.held = Accepted(reference=reference, excess=excess)
-                levels, events = self.levels(log_nonlinear)
+                levels, events = self.levels(nonlinear)
                 levels = levels * (1 + 1e-12) + 1e-280  # the state then stays strictly inside
                 reached = self.deviations(levels, *bounds) if np.isfinite(levels).all() else None
                 if reached is None:

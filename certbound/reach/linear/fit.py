@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import LinearRun
+from certbound.reach.linear.shares import Share
 from certbound.reach.remainder import fitted_slopes
 
 __all__ = ["fitted"]
@@ -25,8 +26,8 @@ _EARLY = 5
 _STEEPEST = 2.0  # ||Jhat|| h, at most so many times that of the Jacobian, or 1/2
 
 
-def fitted(engine: Linearisation, log_nonlinear: float) -> Linearisation:
-    """``engine`` with slopes fitted over the deviations that a probability of exp(log_nonlinear) leaves out.
+def fitted(engine: Linearisation, nonlinear: Share) -> Linearisation:
+    """``engine`` with slopes fitted over the deviations that a probability of ``nonlinear`` leaves out.
 
     The fit is repeated where the remainder of the first one was large.
     """
@@ -34,7 +35,7 @@ def fitted(engine: Linearisation, log_nonlinear: float) -> Linearisation:
         return engine
     run = LinearRun(engine, asked=False)
     for _ in range(2):
-        tube = _tube(run, log_nonlinear)
+        tube = _tube(run, nonlinear)
         if tube is None:
             break
         low, high, grown = tube
@@ -51,13 +52,13 @@ def fitted(engine: Linearisation, log_nonlinear: float) -> Linearisation:
     return engine
 
 
-def _tube(run: LinearRun, log_nonlinear: float) -> tuple[Array, Array, float] | None:
+def _tube(run: LinearRun, nonlinear: Share) -> tuple[Array, Array, float] | None:
     """Rough bounds of the deviation along the inner rows (B N, D), and the remainder's share of them.
 
     None where the deviation without any remainder is beyond all use already.
     """
     engine = run.engine
-    levels = _levels(run, log_nonlinear)
+    levels = _levels(run, nonlinear)
     shape = (len(engine.centres), engine.pieces, engine.n)
     low, high = np.zeros(shape), np.zeros(shape)
     base = run.deviations(levels, low, high)
@@ -83,7 +84,7 @@ def _tube(run: LinearRun, log_nonlinear: float) -> tuple[Array, Array, float] | 
     return *tube, grown
 
 
-def _levels(run: LinearRun, log_nonlinear: float) -> Array:
+def _levels(run: LinearRun, nonlinear: Share) -> Array:
     """Levels of |Z| along the inner rows from their standard deviations alone."""
     v = run.engine.response.covariance
     variance = [np.einsum("bkdi,bkij,bkdj->bkd", run.rows, ends, run.rows) for ends in (v[:, :-1], v[:, 1:])]
@@ -91,7 +92,7 @@ def _levels(run: LinearRun, log_nonlinear: float) -> Array:
     early = max(1, deviation.shape[1] // _EARLY)
     if run.engine.continuous:
         deviation[:, :early] = np.maximum(deviation[:, :early], deviation[:, early - 1 : early])
-    return np.asarray(np.sqrt(2 * (np.log(4.0 * max(run.rows.shape[2], 1)) - log_nonlinear)) * deviation)
+    return np.asarray(np.sqrt(2 * (np.log(4.0 * max(run.rows.shape[2], 1)) - nonlinear.log)) * deviation)
 
 
 def _at_nodes(engine: Linearisation, found: Array) -> Array:

@@ -32,6 +32,7 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear.inclusion import Supports
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.rows import inner_rows
+from certbound.reach.linear.shares import Share
 from certbound.reach.remainder import sampled_range
 from certbound.reach.sets import Requirement, requirements
 
@@ -61,8 +62,8 @@ class Outcome:
     ----------
     log_probability : float
         Natural logarithm of a bound on P(unsafe); 0 when nothing was proved.
-    log_nonlinear : float
-        Logarithm of delta_N.
+    nonlinear : Share
+        delta_N.
     bounds : (ndarray, ndarray), shape (B, N, n), or None
         The proved enclosure of the remainder beta, None when it fed itself.
     cell : int
@@ -72,7 +73,7 @@ class Outcome:
     """
 
     log_probability: float
-    log_nonlinear: float
+    nonlinear: Share
     bounds: tuple[Array, Array] | None
     cell: int = 0
     logs: tuple[float, ...] = ()
@@ -107,9 +108,14 @@ class LinearRun:
         self.inner = self.rows.shape[2]
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
-        self.kept: dict[float, tuple[Array, list[Events]]] = {}
-        self.spent: dict[float, tuple[Array, Array] | None] = {}
+        self.kept: dict[Share, tuple[Array, list[Events]]] = {}
+        self.spent: dict[Share, tuple[Array, Array] | None] = {}
         self.failed_at = 0
+
+    @property
+    def curved(self) -> bool:
+        """Whether the model leaves a remainder at all."""
+        return bool(len(self.engine.model.active))
 
     def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
         """Bounds of s = y + Z + R along the inner rows over all pieces: (B N, D)."""
@@ -252,63 +258,63 @@ class LinearRun:
 
     # ---- probabilities -----------------------------------------------------------------------------------
 
-    def events(self, cell: int, shared_log: float) -> Events:
-        """Scalar events of one cell; ``shared_log`` is the log probability that they may share."""
+    def events(self, cell: int, shared: Share) -> Events:
+        """Scalar events of one cell; ``shared`` is what they may cost in common."""
         engine = self.engine
         if isinstance(engine.system, ContinuousSystem):
-            windows = WindowEvents(engine.response, cell, engine.window, shared_log)
+            windows = WindowEvents(engine.response, cell, engine.window, shared.log)
             diffusion = engine.diffusion if engine.diffusion.ndim == 2 else engine.diffusion[cell]
             return ClockEvents(windows, diffusion, self.memory.setdefault(cell, {}))
         if cell not in self.steps:
             self.steps[cell] = StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
         return self.steps[cell]
 
-    def levels(self, log_nonlinear: float) -> tuple[Array, list[Events]]:
-        """Levels of |Z| along the inner rows costing exp(log_nonlinear) together (B, N, D); no events without noise."""
-        if log_nonlinear in self.kept:
-            return self.kept[log_nonlinear]
+    def levels(self, nonlinear: Share) -> tuple[Array, list[Events]]:
+        """Levels of |Z| along the inner rows costing exp(nonlinear.log) together (B, N, D); no events without noise."""
+        if nonlinear in self.kept:
+            return self.kept[nonlinear]
         cells, pieces, count = self.rows.shape[:3]
         result = np.zeros((cells, pieces, count))
         if not self.engine.noise:
             return result, []
-        share = log_nonlinear + np.log(0.9 / (2 * max(count, 1)))
+        share = nonlinear.side(count).log
         found = []
         for cell in range(cells):
-            events = self.events(cell, self._shared(log_nonlinear))
+            events = self.events(cell, nonlinear.common(count))
             found.append(events)
             for d in range(count):
                 event = events.along(self.rows[cell, :, d])
                 if event.profile.max() > 0:
                     result[cell, :, d] = level_along(event, share)
-        self.kept[log_nonlinear] = result, found
+        self.kept[nonlinear] = result, found
         return result, found
 
-    def hopeless(self, log_nonlinear: float) -> bool:
+    def hopeless(self, nonlinear: Share) -> bool:
         """Whether the remainder feeds itself at levels that are too small already (``failed_at`` names a piece).
 
         Z leaves a level of q standard deviations with probability 2 Q(q) at one time alone, so that all levels that
-        cost exp(log_nonlinear) are larger; in continuous time they are dear, and not asked for where this is enough.
+        cost exp(nonlinear.log) are larger; in continuous time they are dear, and not asked for where this is enough.
         """
-        if not (self.engine.continuous and self.engine.noise and len(self.engine.model.active)):
+        if not (self.engine.continuous and self.engine.noise and self.curved):
             return False
-        return self._at_least(log_nonlinear) is None
+        return self._at_least(nonlinear) is None
 
-    def _at_least(self, log_nonlinear: float) -> tuple[Array, Array] | None:
+    def _at_least(self, nonlinear: Share) -> tuple[Array, Array] | None:
         """A guess of the remainder at those levels: less than what any proof finds; None where it feeds itself."""
-        if log_nonlinear not in self.spent:
-            q = quantile(log_nonlinear - float(np.log(2.0)))
+        if nonlinear not in self.spent:
+            q = quantile(nonlinear.log - float(np.log(2.0)))
             v = self.engine.response.covariance[:, 1:]
             variance = np.einsum("bkdi,bkij,bkdj->bkd", self.rows, v, self.rows)
             levels = 0.99 * q * np.sqrt(np.maximum(variance, 0.0))
             nothing = np.zeros((len(levels), self.engine.pieces, self.engine.n))
-            self.spent[log_nonlinear] = self.guess(levels, (nothing, nothing), (nothing, nothing), 0.0)
-        return self.spent[log_nonlinear]
+            self.spent[nonlinear] = self.guess(levels, (nothing, nothing), (nothing, nothing), 0.0)
+        return self.spent[nonlinear]
 
-    def _one_time(self, log_nonlinear: float) -> float:
+    def _one_time(self, nonlinear: Share) -> float:
         """Logarithm of what leaving costs at least, by the guess: the noise beyond the room of one row at one time."""
-        if not (self.engine.continuous and self.engine.noise and len(self.engine.model.active)):
+        if not (self.engine.continuous and self.engine.noise and self.curved):
             return -np.inf
-        guess, worst = self._at_least(log_nonlinear), -np.inf
+        guess, worst = self._at_least(nonlinear), -np.inf
         for cell, asked in enumerate(self.requirements if guess is not None else ()):
             assert guess is not None
             rooms, v = self.rooms(cell, guess), self.engine.response.covariance[cell, 1:]
@@ -319,40 +325,40 @@ class LinearRun:
                 worst = max(worst, float(log_tail_below(np.clip(np.min(sizes), -1e3, 1e100))))
         return worst
 
-    def promise(self, log_nonlinear: float, effort: int, limit: float = 0.0) -> float:
+    def promise(self, nonlinear: Share, effort: int, limit: float = 0.0) -> float:
         """What `probability` is likely to find, in logarithms: from a guess of the remainder that is not proved.
 
         A value beyond ``limit`` says no more than that: the cells that come after such a one are left out.
         """
         shape = (len(self.engine.centres), self.engine.pieces, self.engine.n)
-        if self.hopeless(log_nonlinear):
+        if self.hopeless(nonlinear):
             return 0.0
-        least = self._one_time(log_nonlinear)
+        least = self._one_time(nonlinear)
         if least > limit:
             return least
-        levels, events = self.levels(log_nonlinear)
+        levels, events = self.levels(nonlinear)
         nothing = np.zeros(shape), np.zeros(shape)
         guess = self.guess(levels, nothing, nothing, _MARGIN * _PADS[effort])
         if guess is None:
             return 0.0
         worst = -np.inf
         for cell in range(len(self.supports)):
-            worst = max(worst, self._cell(cell, guess, events[cell], log_nonlinear).log_probability)
+            worst = max(worst, self._cell(cell, guess, events[cell], nonlinear).log_probability)
             if worst > limit:
                 break
         return worst
 
-    def probability(self, log_nonlinear: float, effort: int = 2) -> Outcome:
-        """Thm K7' with delta_N = exp(log_nonlinear): the outcome of the worst cell."""
-        if self.hopeless(log_nonlinear):
-            return Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None)
-        levels, events = self.levels(log_nonlinear)
+    def probability(self, nonlinear: Share, effort: int = 2) -> Outcome:
+        """Thm K7' with delta_N = exp(nonlinear.log): the outcome of the worst cell."""
+        if self.hopeless(nonlinear):
+            return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=None)
+        levels, events = self.levels(nonlinear)
         bounds = self.include(levels, effort)
         if bounds is None:
-            return Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=None)
+            return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=None)
         if not events:  # the noise-free reachable set alone
-            return Outcome(log_probability=0.0, log_nonlinear=log_nonlinear, bounds=bounds)
-        outcomes = [self._cell(cell, bounds, events[cell], log_nonlinear) for cell in range(len(self.supports))]
+            return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=bounds)
+        outcomes = [self._cell(cell, bounds, events[cell], nonlinear) for cell in range(len(self.supports))]
         return max(outcomes, key=lambda outcome: outcome.log_probability)
 
     def rooms(self, cell: int, bounds: tuple[Array, Array]) -> Array:
@@ -365,9 +371,9 @@ class LinearRun:
             left = room - used - 4e-16 * (np.abs(room) + np.abs(used))
         return np.asarray(np.where(np.isinf(room), np.inf, left))
 
-    def _cell(self, cell: int, bounds: tuple[Array, Array], events: Events, log_nonlinear: float) -> Outcome:
+    def _cell(self, cell: int, bounds: tuple[Array, Array], events: Events, nonlinear: Share) -> Outcome:
         rooms = self.rooms(cell, bounds)
-        shared = log_nonlinear if len(self.engine.model.active) else events.shared_log
+        shared = nonlinear.log if self.curved else events.shared_log
         asked = self.requirements[cell]
         along = [events.along(r.rows) for r in asked]
         logs = [event.log_exceedance(rooms[:, i]) for i, event in enumerate(along)]
@@ -375,7 +381,7 @@ class LinearRun:
             logs = [self._entered(cell, r, log, bounds) for r, log in zip(asked, logs, strict=True)]
         total = logsumexp(np.array([shared, *logs]))
         steady = [event for event in along if isinstance(event, SteadyEvent)]
-        if asked and not len(self.engine.model.active) and len(steady) == len(along):
+        if asked and not self.curved and len(steady) == len(along):
             total = min(total, logsumexp(np.array([e.log_unshared(rooms[:, i]) for i, e in enumerate(steady)])))
         if total > _LIKELY and isinstance(events, StepEvents) and events.gaussian:
             total = min(total, correlated(events, asked, rooms, shared, logs))
@@ -383,13 +389,13 @@ class LinearRun:
             joined = log_any_exceedance(events, [r.rows for r in asked], list(rooms.T))
             total = min(total, logsumexp(np.array([shared, joined])))
         return Outcome(
-            log_probability=min(total, 0.0), log_nonlinear=log_nonlinear, bounds=bounds, cell=cell, logs=tuple(logs),
+            log_probability=min(total, 0.0), nonlinear=nonlinear, bounds=bounds, cell=cell, logs=tuple(logs),
         )
 
     def _entered(self, cell: int, asked: Requirement, log: float, bounds: tuple[Array, Array]) -> float:
         """What a requirement costs, or the time spent in its obstacle, if that is less and the cost is too much."""
         engine, constraints = self.engine, self.engine.problem.constraints
-        if log <= float(np.log(engine.problem.delta)) or not 0 <= asked.constraint < len(constraints):
+        if log <= Share.of(engine.problem.delta).log or not 0 <= asked.constraint < len(constraints):
             return log
         support = self.supports[cell]
         remainder = support.remainder(bounds[0][cell], bounds[1][cell])[2]
@@ -405,9 +411,9 @@ class LinearRun:
         if not asked:
             return None, 0, np.inf
         rooms = self.rooms(outcome.cell, outcome.bounds)
-        kept = self.kept.get(outcome.log_nonlinear, (None, []))[1]
-        events = kept[outcome.cell] if kept else self.events(outcome.cell, self._shared(outcome.log_nonlinear))
-        target = float(np.log(self.engine.problem.delta / len(asked)))
+        kept = self.kept.get(outcome.nonlinear, (None, []))[1]
+        events = kept[outcome.cell] if kept else self.events(outcome.cell, outcome.nonlinear.common(self.inner))
+        target = Share.of(self.engine.problem.delta / len(asked)).log
         left = np.empty_like(rooms)
         for index, requirement in enumerate(asked):
             event = events.along(requirement.rows)
@@ -416,10 +422,6 @@ class LinearRun:
             left[:, index] = np.where(asking, rooms[:, index] - np.where(asking, level, 0.0), rooms[:, index])
         piece, tightest = divmod(int(np.argmin(left)), len(asked))
         return asked[tightest], piece, float(left[piece, tightest])
-
-    def _shared(self, log_nonlinear: float) -> float:
-        """The log probability that all events share: a tenth of exp(log_nonlinear) if levels take the rest."""
-        return log_nonlinear + float(np.log(0.1 if self.rows.shape[2] else 1.0))
 
 
 def correlated(events: StepEvents, asked: list[Requirement], rooms: Array, shared: float, logs: list[float]) -> float:

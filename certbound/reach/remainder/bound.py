@@ -13,7 +13,7 @@ Symbols: H second derivatives of f, J first ones; Thm K7 and "Bounding beta" of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from certbound.problem.model import adds_plainly, selected
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.expansion import Expansion, Parts
 from certbound.reach.remainder.frame import Frame
-from certbound.reach.remainder.polytope import cull, grid, halve
+from certbound.reach.remainder.polytope import Boxes, Polytope, grid
 from certbound.rigor.intervals import Interval
 
 __all__ = ["Remainder"]
@@ -36,6 +36,25 @@ _GRID = {1: 16, 2: 6, 3: 4}
 _MOST = 300  # boxes per piece that one round may cut
 _STALLED = 0.995  # cutting a box must make it exceed less
 _EFFORT = ((0, np.inf), (8, 0.5), (12, 0.2), (20, 0.08))  # rounds of bisection, tolerated excess over the range
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """Over what a bound is asked for, in how many rounds and how closely, what is hoped for, and on which pieces."""
+
+    inner: Target
+    polytope: Polytope
+    rounds: int
+    tolerance: float
+    target: Target | None
+    only: Indices | None
+
+    def excess(self, lo: Array, hi: Array, inner_lo: Array, inner_hi: Array, items: Indices) -> Array:
+        """By how much bounds over boxes exceed what is hoped for, or their own range: in its units, (Q, n)."""
+        low, high = (inner_lo, inner_hi) if self.target is None else self.target
+        found = np.maximum(hi - high[items], low[items] - lo) / np.maximum(high - low, 1e-300)[items]
+        found = found - self.tolerance if self.target is None else found
+        return np.where(np.isfinite(found) | (found < 0), found, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,19 +87,19 @@ class Remainder(Derivatives):
         lower, upper : ndarray, shape (M, n)
             Infinite where the dynamics is not defined on the whole polytope.
         """
-        m, count = len(frame), len(self.active)
+        count = len(self.active)
         expansion = self._expansion(frame)
         extra = self._disturbance(frame, low[:, :count], high[:, :count]) if self.gain is not None else None
         if target is not None and extra is not None:
             target = target[0] - extra.lo, target[1] - extra.hi
+        inner = low[:, :count], high[:, :count]
+        asked = _Asked(inner, Polytope(low[:, count:], high[:, count:], rows), *_EFFORT[effort], target, only)
         if len(self.blocks) == 1:
-            lower, upper = self._group(expansion, self.blocks[0], low, high, rows, effort, target, only)
+            lower, upper = self._group(expansion, self.blocks[0], asked)
         else:
-            origin = np.zeros((m, count))
-            base = Interval(*expansion.plain_range(expansion.boxes(np.arange(m), origin, origin), origin))
-            total = base
+            total = base = self._at_nominal(frame)
             for group in self.blocks:
-                total = total + (Interval(*self._group(expansion, group, low, high, rows, effort, None, only)) - base)
+                total = total + (Interval(*self._group(expansion, group, replace(asked, target=None))) - base)
             lower, upper = total.lo, total.hi
         if extra is not None:
             total = Interval(lower, upper) + extra
@@ -89,10 +108,14 @@ class Remainder(Derivatives):
 
     def defect(self, frame: Frame) -> Array:
         """What no cutting of boxes takes off a bound of beta, on either side: its motion over the piece, (M, n)."""
-        origin = np.zeros((len(frame), len(self.active)))
-        expansion = self._expansion(frame)
-        lower, upper = expansion.plain_range(expansion.boxes(np.arange(len(frame)), origin, origin), origin)
-        return np.nan_to_num((upper - lower) / 2, nan=0.0, posinf=0.0)
+        base = self._at_nominal(frame)
+        return np.nan_to_num((base.hi - base.lo) / 2, nan=0.0, posinf=0.0)
+
+    def _at_nominal(self, frame: Frame) -> Interval:
+        """beta without any deviation, (M, n)."""
+        origin, expansion = np.zeros((len(frame), len(self.active))), self._expansion(frame)
+        boxes = Boxes(np.arange(len(frame)), origin, origin)
+        return Interval(*expansion.plain_range(expansion.parts(boxes), boxes))
 
     def _expansion(self, frame: Frame) -> Expansion:
         """The expansions over ``frame``; those of the last frame are kept."""
@@ -119,53 +142,33 @@ class Remainder(Derivatives):
         reach = Interval(frame.disturbance_low, frame.disturbance_high) - frame.disturbance_middle
         return ((gain - frame.input_gain) * reach[None, None, :]).sum(axis=-1)
 
-    def _group(
-        self, expansion: Expansion, group: list[list[int]], low: Array, high: Array, rows: Array, effort: int,
-        target: Target | None, only: Indices | None,
-    ) -> tuple[Array, Array]:
+    def _group(self, expansion: Expansion, group: list[list[int]], asked: _Asked) -> tuple[Array, Array]:
         """Bounds over the boxes of one group of blocks, displaced together."""
-        m, count, n = len(low), len(self.active), expansion.frame.spread.shape[1]
+        m, n = expansion.frame.spread.shape
         size, alone = len(group[0]), len(group) == 1
-        divisions = _GRID.get(size, 2 if size <= 8 else 1)
-        each = divisions**size
-        items = np.repeat(np.arange(m), each)
-        centre, radius = np.zeros((m, each, count)), np.zeros((m, each, count))
-        for block in group:
-            centre[..., block], radius[..., block] = grid(low[:, :count], high[:, :count], block, divisions)
-        centre, radius = centre.reshape(-1, count), radius.reshape(-1, count)
-        if only is not None:
-            chosen = np.isin(items, only)
-            items, centre, radius = items[chosen], centre[chosen], radius[chosen]
+        boxes = self._first_boxes(group, asked)
         lower, upper = np.full((m, n), np.inf), np.full((m, n), -np.inf)
         inner_lo, inner_hi = lower.copy(), upper.copy()
-        rounds, tolerance = _EFFORT[effort]
-        bound = (low[:, count:], high[:, count:], rows)
-        curbed = alone and rows.shape[1] > 0
-        before = np.full(len(items), np.inf)  # by how much the box that a box was cut from exceeded
-        for step in range(rounds + 1):
-            inside = np.ones(len(items), dtype=bool)
+        curbed = alone and asked.polytope.rows.shape[1] > 0
+        before = np.full(len(boxes), np.inf)  # by how much the box that a box was cut from exceeded
+        for step in range(asked.rounds + 1):
+            inside = np.ones(len(boxes), dtype=bool)
             if curbed:
-                keep, inside = cull(items, centre, radius, *bound)
-                items, centre, radius, inside = items[keep], centre[keep], radius[keep], inside[keep]
-                before = before[keep]
-            if not len(items):
+                keep, inside = asked.polytope.cull(boxes)
+                boxes, inside, before = boxes[keep], inside[keep], before[keep]
+            if not len(boxes):
                 break
-            parts = expansion.boxes(items, centre, radius)
+            items, parts = boxes.items, expansion.parts(boxes)
             if curbed:
-                lo, hi = expansion.polytope_range(items, parts, centre, radius, *bound)
+                lo, hi = expansion.polytope_range(parts, boxes, asked.polytope)
             else:
-                lo, hi = expansion.plain_range(parts, radius)
+                lo, hi = expansion.plain_range(parts, boxes)
             np.fmax.at(inner_hi, items[inside], parts.middle[inside])
             np.fmin.at(inner_lo, items[inside], parts.middle[inside])
-            if step == rounds or not alone or size > 6:
+            if step == asked.rounds or not alone or size > 6:
                 excess = np.full((len(items), n), -np.inf)
-            elif target is None:
-                span = np.maximum(inner_hi - inner_lo, 1e-300)[items]
-                excess = np.maximum(hi - inner_hi[items], inner_lo[items] - lo) / span - tolerance
             else:
-                span = np.maximum(target[1] - target[0], 1e-300)[items]
-                excess = np.maximum(hi - target[1][items], target[0][items] - lo) / span
-            excess = np.where(np.isfinite(excess) | (excess < 0), excess, np.inf)
+                excess = asked.excess(lo, hi, inner_lo, inner_hi, items)
             largest = excess.max(axis=1)
             worst = (largest > 0) & ((largest < _STALLED * before) | np.isinf(before))
             if worst.sum() > _MOST * m:
@@ -175,12 +178,22 @@ class Remainder(Derivatives):
             np.maximum.at(upper, items[done], hi[done])
             if not worst.any():
                 break
-            along = _costliest(expansion, parts, radius, excess)[worst]
-            items, centre, radius = halve(items[worst], centre[worst], radius[worst], along)
+            boxes = boxes[worst].halved(_costliest(expansion, parts, boxes.radius, excess)[worst])
             before = np.tile(largest[worst], 2)
         # a polytope without any box left is empty: nothing can leave it, and 0 stands for the empty set
         empty = lower > upper
         return np.where(empty, 0.0, lower), np.where(empty, 0.0, upper)
+
+    def _first_boxes(self, group: list[list[int]], asked: _Asked) -> Boxes:
+        """A grid over the blocks of a group on every piece that is asked for."""
+        (m, count), size = asked.inner[0].shape, len(group[0])
+        divisions = _GRID.get(size, 2 if size <= 8 else 1)
+        items = np.repeat(np.arange(m), divisions**size)
+        centre, radius = (np.zeros((m, divisions**size, count)) for _ in range(2))
+        for block in group:
+            centre[..., block], radius[..., block] = grid(*asked.inner, block, divisions)
+        boxes = Boxes(items, centre.reshape(-1, count), radius.reshape(-1, count))
+        return boxes if asked.only is None else boxes[np.isin(items, asked.only)]
 
 
 def _costliest(expansion: Expansion, parts: Parts, radius: Array, excess: Array) -> Indices:

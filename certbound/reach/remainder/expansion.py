@@ -20,7 +20,7 @@ from certbound.constants.enclosures import enclose
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.frame import Frame
 from certbound.reach.remainder.nominal_defect import Still
-from certbound.reach.remainder.polytope import linear_range
+from certbound.reach.remainder.polytope import Boxes, Polytope, linear_range
 from certbound.rigor.intervals import Interval
 
 __all__ = ["Expansion", "Parts"]
@@ -51,6 +51,18 @@ class Parts:
     middle: Array
     spend: Array
     bad: Mask
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Enclosed:
+    """Boxes, the reach of all states, the model at their centres (``slots``) and over the whole, its derivatives."""
+
+    boxes: Boxes
+    reach: Array
+    slots: list[Interval]
+    wide: list[Interval]
+    first: Interval | None
+    second: Interval | None
 
 
 class Expansion:
@@ -84,27 +96,51 @@ class Expansion:
             self.second.append((column, entry, b, number.get((i, b), -1) if model.folded(entry, state) else -1))
         self.still = Still(model, frame) if frame.half else None
 
-    def boxes(self, items: Indices, centre: Array, radius: Array) -> Parts:
-        """The expansions on boxes centre + [-radius, radius] (Q, active) of the pieces ``items``.
-
-        To first order, with the Jacobian over the whole box, where it may jump (abs, min, max).
-        """
-        parts = self._expanded(items, centre, radius, order=2)
+    def parts(self, boxes: Boxes) -> Parts:
+        """The expansions on boxes; to first order, with the Jacobian over the whole box, where it may jump."""
+        parts = self._expanded(boxes, order=2)
         if not self.model.kinked or not parts.bad.any():
             return parts
         kinks = np.flatnonzero(parts.bad)
-        other = self._expanded(items[kinks], centre[kinks], radius[kinks], order=1)
+        other = self._expanded(boxes[kinks], order=1)
         merged = {name: getattr(parts, name).copy() for name in Parts.__dataclass_fields__}
         for name, array in merged.items():
             array[kinks] = getattr(other, name)
         return Parts(**merged)
 
-    def _expanded(self, items: Indices, centre: Array, radius: Array, *, order: int) -> Parts:
-        f, model = self.frame, self.model
-        count, n, entries = len(items), f.spread.shape[1], len(self.entries)
+    def _expanded(self, boxes: Boxes, *, order: int) -> Parts:
+        held, value, bad = self._enclosed(boxes, order)
+        with np.errstate(invalid="ignore", over="ignore"):
+            lower, upper, middle = self._values(boxes, value, *self._base(boxes.items, order))
+            gradient, blur = self._gradients(boxes.items, held.first)
+            spend = np.zeros((*lower.shape, len(self.active)))
+            if order == 2:
+                plus, minus, spend = self._curvature(held)
+                if self.frame.half:
+                    motion, shaken = self._second_motion(held)
+                    plus, minus, blur = plus + motion, minus + motion, blur + shaken
+                upper, lower = upper + (plus * _WIDE + _LEAST), lower - (minus * _WIDE + _LEAST)
+                upper, lower = upper + 8 * _UNIT * np.abs(upper), lower - 8 * _UNIT * np.abs(lower)
+                if self.frame.half and self.model.timed:
+                    timed, motion = self.model.timed, self._explicit_time(held)
+                    up, down = upper[:, timed], lower[:, timed]
+                    upper[:, timed] = (up + motion) + 4 * _UNIT * (np.abs(up) + motion)
+                    lower[:, timed] = (down - motion) - 4 * _UNIT * (np.abs(down) + motion)
+            elif self.frame.half:
+                motion, shaken = self._first_motion(held)
+                upper = upper + (motion + 8 * _UNIT * (np.abs(upper) + motion))
+                lower = lower - (motion + 8 * _UNIT * (np.abs(lower) + motion))
+                blur = blur + shaken
+        return Parts(lower=lower, upper=upper, gradient=gradient, blur=blur * _WIDE + _LEAST, middle=middle,
+                     spend=spend, bad=bad)
+
+    def _enclosed(self, boxes: Boxes, order: int) -> tuple[_Enclosed, Interval, Mask]:
+        """What is known over boxes, f at their centres, and where something is not defined."""
+        f, model, items = self.frame, self.model, boxes.items
+        count, n, entries = len(boxes), f.spread.shape[1], len(self.entries)
         shift, reach = np.zeros((count, n)), f.spread[items]
-        shift[:, self.active] = centre
-        reach[:, self.active] += radius
+        shift[:, self.active] = boxes.centre
+        reach[:, self.active] += boxes.radius
         reach = reach * (1 + 1e-14)
         thin = f.middle[items] + shift
         slots = model.slots(f.middle_time[items], thin, f.inputs[items], f.disturbance_middle)
@@ -122,46 +158,26 @@ class Expansion:
             columns = len(model.second.outputs)
             second = enclose(model.second, wide, undefined="infinite").broadcast_to((count, columns))
             bad = bad | _infinite(second)
-        with np.errstate(invalid="ignore", over="ignore"):
-            base, rest = self._base(items, order)
-            lower, upper, middle = self._values(items, centre, value, base, rest)
-            gradient, blur = self._gradients(items, first)
-            spend = np.zeros((count, n, len(self.active)))
-            if order == 1:
-                self._first_order(items, centre, radius, wide, first, lower, upper, blur)
-            else:
-                self._second_order(items, centre, radius, reach, first, second, lower, upper, blur, spend)
-                if f.half and model.timed:
-                    self._explicit_time(items, slots, wide, lower, upper)
-        return Parts(lower=lower, upper=upper, gradient=gradient, blur=blur * _WIDE + _LEAST, middle=middle,
-                     spend=spend, bad=bad)
+        return _Enclosed(boxes=boxes, reach=reach, slots=slots, wide=wide, first=first, second=second), value, bad
 
-    def _first_order(
-        self, items: Indices, centre: Array, radius: Array, wide: list[Interval], first: Interval | None,
-        lower: Array, upper: Array, blur: Array,
-    ) -> None:
-        """Add the motion over the piece, by the rate of beta over the whole box and piece."""
-        f, model, half = self.frame, self.model, self.frame.half
-        if not half:
-            return
+    def _first_motion(self, held: _Enclosed) -> tuple[Array, Array]:
+        """The motion over the piece, by the rate of beta over the whole box and piece: of beta, of its slopes."""
+        f, model, half, items = self.frame, self.model, self.frame.half, held.boxes.items
         velocity, drift = f.velocity[items], self.drift[items]
         rate = _product(model.constant_slope, velocity) - f.acceleration[items]
-        box = (Interval(-radius, radius) + centre)[:, self.columns] * drift
+        box = (Interval(-held.boxes.radius, held.boxes.radius) + held.boxes.centre)[:, self.columns] * drift
         rates = [rate[:, i] for i in range(rate.shape[1])]
         for p, i in enumerate(self.gather.argmax(axis=1)):
             rates[i] = rates[i] - box[:, p]
         for entry, (i, a) in enumerate(self.entries):
-            assert first is not None
-            rates[i] = rates[i] + first[:, entry] * velocity[:, self.active[a]]
+            assert held.first is not None
+            rates[i] = rates[i] + held.first[:, entry] * velocity[:, self.active[a]]
         if model.timed:
-            once = enclose(model.time, wide, undefined="infinite").broadcast_to((len(items), len(model.timed)))
+            once = enclose(model.time, held.wide, undefined="infinite").broadcast_to((len(items), len(model.timed)))
             for column, i in enumerate(model.timed):
                 rates[i] = rates[i] + once[:, column]
-        for i, rate in enumerate(rates):
-            motion = half * rate.mag * _WIDE + _LEAST
-            lower[:, i] -= motion + 8 * _UNIT * (np.abs(lower[:, i]) + motion)
-            upper[:, i] += motion + 8 * _UNIT * (np.abs(upper[:, i]) + motion)
-        blur += half * np.abs(drift[:, self.chosen])
+        motion = np.stack([half * rate.mag * _WIDE + _LEAST for rate in rates], axis=1)
+        return motion, half * np.abs(drift[:, self.chosen])
 
     def _base(self, items: Indices, order: int) -> tuple[Interval, Interval | None]:
         """What beta is counted from at the middle of a piece, and beta itself there over the piece."""
@@ -170,9 +186,10 @@ class Expansion:
         return self.still.value[items], self.still.defect[items]
 
     def _values(
-        self, items: Indices, centre: Array, value: Interval, base: Interval, rest: Interval | None
+        self, boxes: Boxes, value: Interval, base: Interval, rest: Interval | None
     ) -> tuple[Array, Array, Array]:
         """beta(t_m, c) = f - base - J_m c, and the ``rest`` that it has at s = 0: bounds and floats."""
+        items, centre = boxes.items, boxes.centre
         product = self.slope[items] * centre[:, self.columns]
         moved, size = product @ self.gather, np.abs(product) @ self.gather
         blur = (self.slope_rad[items] * np.abs(centre[:, self.columns])) @ self.gather
@@ -194,82 +211,74 @@ class Expansion:
         blur = (first.hi - first.lo) / 2 + self.slope_rad[items][:, self.chosen]
         return gradient, blur + 8 * _UNIT * (first.mag + np.abs(slope))
 
-    def _second_order(
-        self, items: Indices, centre: Array, radius: Array, reach: Array, first: Interval | None,
-        second: Interval | None, lower: Array, upper: Array, blur: Array, spend: Array,
-    ) -> None:
-        """Add d H d / 2 and the motion over the piece to the bounds and radii; fill in ``spend``."""
-        f, half = self.frame, self.frame.half
-        n, count = reach.shape[1], len(items)
-        plus, minus = np.zeros((count, n)), np.zeros((count, n))
-        if half:
-            speed = f.velocity[items]
-            velocity, shake = speed.mid, speed.rad
-            pace = np.abs(velocity) + shake
-            turn, blurred, swell = (np.zeros(blur.shape) for _ in range(3))  # dJ/dt: floats, radii; |J - J(c)|
-            bend = np.zeros((count, n))
-            assert self.still is not None
-            beside = self.still.second[items]
+    def _curvature(self, held: _Enclosed) -> tuple[Array, Array, Array]:
+        """d H d / 2 upward and downward (Q, n), and what it costs in each coordinate (Q, n, active)."""
+        radius = held.boxes.radius
+        plus, minus = np.zeros(held.reach.shape), np.zeros(held.reach.shape)
+        spend = np.zeros((*held.reach.shape, len(self.active)))
         for column, entry, b, other in self.second:
-            assert second is not None
-            lo, hi = second.lo[:, column], second.hi[:, column]
+            if b < 0:
+                continue
+            assert held.second is not None
+            lo, hi = held.second.lo[:, column], held.second.hi[:, column]
             size = np.maximum(-lo, hi)
             i, a = self.entries[entry]
-            if b >= 0:
-                square = radius[:, a] * radius[:, b]
-                if a == b:
-                    plus[:, i] += np.maximum(hi, 0.0) * square / 2
-                    minus[:, i] += np.maximum(-lo, 0.0) * square / 2
-                else:
-                    cost = size * square * (1.0 if other >= 0 else 0.5)
-                    plus[:, i] += cost
-                    minus[:, i] += cost
-                    spend[:, i, b] += size * square / 2
-                spend[:, i, a] += size * square / 2
-            if not half:
-                continue
-            centre_h, radius_h = (lo + hi) / 2, (hi - lo) / 2 + 4 * _UNIT * size
+            square = radius[:, a] * radius[:, b]
+            if a == b:
+                plus[:, i] += np.maximum(hi, 0.0) * square / 2
+                minus[:, i] += np.maximum(-lo, 0.0) * square / 2
+            else:
+                cost = size * square * (1.0 if other >= 0 else 0.5)
+                plus[:, i] += cost
+                minus[:, i] += cost
+                spend[:, i, b] += size * square / 2
+            spend[:, i, a] += size * square / 2
+        return plus, minus, spend
+
+    def _second_motion(self, held: _Enclosed) -> tuple[Array, Array]:
+        """The motion over the piece but for explicit time: of beta (Q, n), and of its slopes (Q, E)."""
+        f, half, items = self.frame, self.frame.half, held.boxes.items
+        velocity, shake = f.velocity[items].mid, f.velocity[items].rad
+        pace = np.abs(velocity) + shake
+        # dJ/dt: floats, radii; |J - J(c)|
+        turn, blurred, swell = (np.zeros((len(items), len(self.entries))) for _ in range(3))
+        bend = np.zeros(held.reach.shape)
+        assert self.still is not None
+        beside = self.still.second[items]
+        for column, entry, b, other in self.second:
+            assert held.second is not None
+            lo, hi = held.second.lo[:, column], held.second.hi[:, column]
+            size = np.maximum(-lo, hi)
+            i, a = self.entries[entry]
+            centre, radius = (lo + hi) / 2, (hi - lo) / 2 + 4 * _UNIT * size
             change = np.maximum(hi - beside.lo[:, column], beside.hi[:, column] - lo)
             change = change + 4 * _UNIT * (size + np.maximum(-beside.lo[:, column], beside.hi[:, column]))
-            pairs = [(entry, b)] if other < 0 else [(entry, b), (other, a)]
-            for target, along in pairs:
+            for target, along in [(entry, b)] if other < 0 else [(entry, b), (other, a)]:
                 if along < 0:
-                    turn[:, target] += centre_h
-                    blurred[:, target] += radius_h
+                    turn[:, target] += centre
+                    blurred[:, target] += radius
                     swell[:, target] += half * size
                     bend[:, i] += 2 * change * pace[:, self.active[a]]
                     continue
                 state = self.active[along]
-                turn[:, target] += centre_h * velocity[:, state]
-                blurred[:, target] += radius_h * pace[:, state] + size * (shake[:, state] + 16 * (
+                turn[:, target] += centre * velocity[:, state]
+                blurred[:, target] += radius * pace[:, state] + size * (shake[:, state] + 16 * (
                     len(self.active) + 4) * _UNIT * pace[:, state])
-                swell[:, target] += size * reach[:, state]
+                swell[:, target] += size * held.reach[:, state]
                 bend[:, i] += change * pace[:, self.active[self.of_state[target]]] * pace[:, state]
-        if half:
-            drift = self.drift[items]
-            if self.entries:
-                own = drift[:, self.chosen]
-                blur += half * (np.abs(turn - own) + blurred + 8 * _UNIT * (np.abs(turn) + np.abs(own)))
-            motion = self._motion(items, centre, drift, first, swell, bend)
-            plus += motion
-            minus += motion
-        upper += plus * _WIDE + _LEAST
-        lower -= minus * _WIDE + _LEAST
-        slack = 8 * _UNIT
-        upper += slack * np.abs(upper)
-        lower -= slack * np.abs(lower)
+        own = self.drift[items][:, self.chosen]
+        shaken = half * (np.abs(turn - own) + blurred + 8 * _UNIT * (np.abs(turn) + np.abs(own)))
+        return self._motion(held, swell, bend), shaken
 
-    def _motion(
-        self, items: Indices, centre: Array, drift: Array, first: Interval | None, swell: Array, bend: Array
-    ) -> Array:
+    def _motion(self, held: _Enclosed, swell: Array, bend: Array) -> Array:
         """half |d gamma/dt at (t_m, c)| + half^2/2 |d^2 gamma/dt^2 at c|, without explicit time: (Q, n).
 
         gamma is beta less what it is at s = 0.
         """
-        f, half, still = self.frame, self.frame.half, self.still
+        f, half, still, items, first = self.frame, self.frame.half, self.still, held.boxes.items, held.first
         assert still is not None
         rate = still.rate[items]
-        turned = drift * centre[:, self.columns]
+        turned = self.drift[items] * held.boxes.centre[:, self.columns]
         value, error = -rate.mid - turned @ self.gather, rate.rad
         size = np.abs(rate.mid) + np.abs(turned) @ self.gather
         curve = still.curve[items] + bend
@@ -288,43 +297,36 @@ class Expansion:
                 curve[:, i] += (change[:, entry] + swell[:, entry]) * acceleration[:, j]
         return half * (np.abs(value) + error + self.relative * size) + half * half / 2 * curve
 
-    def _explicit_time(
-        self, items: Indices, slots: list[Interval], wide: list[Interval], lower: Array, upper: Array
-    ) -> None:
-        """Add the derivatives by explicit time, less what they are at s = 0."""
-        model, half, still = self.model, self.frame.half, self.still
+    def _explicit_time(self, held: _Enclosed) -> Array:
+        """What the derivatives by explicit time add to the motion, less what they are at s = 0: (Q, timed)."""
+        model, half, still, items = self.model, self.frame.half, self.still, held.boxes.items
         assert still is not None
         shape = (len(items), len(model.timed))
-        once = enclose(model.time, slots, undefined="infinite").broadcast_to(shape) - still.once[items]
-        twice = enclose(model.time2, wide, undefined="infinite").reshape(shape) - still.twice[items]
-        for column, i in enumerate(model.timed):
-            motion = (half * once.mag[:, column] + half * half / 2 * twice.mag[:, column]) * _WIDE
-            upper[:, i] = (upper[:, i] + motion) + 4 * _UNIT * (np.abs(upper[:, i]) + motion)
-            lower[:, i] = (lower[:, i] - motion) - 4 * _UNIT * (np.abs(lower[:, i]) + motion)
+        once = enclose(model.time, held.slots, undefined="infinite").broadcast_to(shape) - still.once[items]
+        twice = enclose(model.time2, held.wide, undefined="infinite").reshape(shape) - still.twice[items]
+        return (half * once.mag + half * half / 2 * twice.mag) * _WIDE
 
-    def plain_range(self, parts: Parts, radius: Array) -> tuple[Array, Array]:
+    def plain_range(self, parts: Parts, boxes: Boxes) -> tuple[Array, Array]:
         """Bounds of beta over whole boxes: (Q, n); infinite where beta is not defined."""
         n = parts.lower.shape[1]
-        linear = np.zeros((len(radius), n))
+        linear = np.zeros((len(boxes), n))
         for entry, (i, a) in enumerate(self.entries):
-            linear[:, i] += (np.abs(parts.gradient[:, entry]) + parts.blur[:, entry]) * radius[:, a]
+            linear[:, i] += (np.abs(parts.gradient[:, entry]) + parts.blur[:, entry]) * boxes.radius[:, a]
         return _closed(parts, linear, linear)
 
-    def polytope_range(
-        self, items: Indices, parts: Parts, centre: Array, radius: Array, low: Array, high: Array, rows: Array
-    ) -> tuple[Array, Array]:
-        """Bounds of beta over the parts of boxes in {low <= rows . s <= high}, given per piece: (Q, n)."""
-        n = parts.lower.shape[1]
+    def polytope_range(self, parts: Parts, boxes: Boxes, polytope: Polytope) -> tuple[Array, Array]:
+        """Bounds of beta over the parts of boxes in the polytopes of their pieces: (Q, n)."""
+        items, centre, radius, n = boxes.items, boxes.centre, boxes.radius, parts.lower.shape[1]
         matrix = np.zeros((len(items), n, len(self.active)))
         matrix[:, self.of_output, self.of_state] = np.where(parts.bad[:, None], 0.0, parts.gradient)
         blur = np.zeros((len(items), n))
         for entry, (i, a) in enumerate(self.entries):
             blur[:, i] += parts.blur[:, entry] * radius[:, a]
-        own = rows[items]
+        own, low, high = polytope.rows[items], polytope.low[items], polytope.high[items]
         value = np.einsum("qda,qa->qd", own, centre)
         slack = 1e-13 * np.einsum("qda,qa->qd", np.abs(own), np.abs(centre))
-        above = high[items] - value + slack + 1e-15 * np.abs(high[items])
-        below = value - low[items] + slack + 1e-15 * np.abs(low[items])
+        above = high - value + slack + 1e-15 * np.abs(high)
+        below = value - low + slack + 1e-15 * np.abs(low)
         normals, room = np.concatenate([own, -own], axis=1), np.concatenate([above, below], axis=1)
         up, down = (linear_range(sign * matrix, radius, normals, room) for sign in (1.0, -1.0))
         return _closed(parts, down + blur, up + blur)

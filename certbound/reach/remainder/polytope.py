@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["cull", "grid", "halve", "linear_range"]
+__all__ = ["Boxes", "Polytope", "grid", "linear_range"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -15,6 +16,50 @@ Mask = NDArray[np.bool_]
 
 _WIDE = 1 + 1e-11
 _LEAST = 1e-290
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """Boxes centre + [-radius, radius], shape (Q, active) each, of the pieces ``items`` (Q,)."""
+
+    items: Indices
+    centre: Array
+    radius: Array
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __getitem__(self, chosen: Indices | Mask) -> Boxes:
+        return Boxes(self.items[chosen], self.centre[chosen], self.radius[chosen])
+
+    def halved(self, along: Indices) -> Boxes:
+        """Every box cut in two along its coordinate ``along``."""
+        number = np.arange(len(self))
+        half, old = self.radius[number, along] / 2, self.centre[number, along]
+        small = self.radius.copy()
+        small[number, along] = half * (1 + 1e-15) + 4e-16 * (np.abs(old) + half)
+        left, right = self.centre.copy(), self.centre.copy()
+        left[number, along], right[number, along] = old - half, old + half
+        return Boxes(np.tile(self.items, 2), np.concatenate([left, right]), np.concatenate([small, small]))
+
+
+@dataclass(frozen=True, eq=False)
+class Polytope:
+    """{low <= rows . s <= high} on every piece: ``low`` and ``high`` (M, D), ``rows`` (M, D, active)."""
+
+    low: Array
+    high: Array
+    rows: Array
+
+    def cull(self, boxes: Boxes) -> tuple[Mask, Mask]:
+        """Which boxes may meet the polytope of their piece, and which centres lie in it."""
+        own = self.rows[boxes.items]
+        value = np.einsum("qda,qa->qd", own, boxes.centre)
+        reach = np.einsum("qda,qa->qd", np.abs(own), boxes.radius)
+        slack = 1e-13 * (np.einsum("qda,qa->qd", np.abs(own), np.abs(boxes.centre)) + reach)
+        lo, hi = self.low[boxes.items], self.high[boxes.items]
+        keep = ((value - reach - slack <= hi) & (value + reach + slack >= lo)).all(axis=1)
+        return keep, ((value <= hi) & (value >= lo)).all(axis=1)
 
 
 def linear_range(matrix: Array, radius: Array, normals: Array, room: Array) -> Array:
@@ -57,17 +102,6 @@ def linear_range(matrix: Array, radius: Array, normals: Array, room: Array) -> A
     return np.asarray(result)
 
 
-def cull(items: Indices, centre: Array, radius: Array, low: Array, high: Array, rows: Array) -> tuple[Mask, Mask]:
-    """Which boxes may meet the polytope low <= rows . c <= high, and which centres lie in it."""
-    own = rows[items]
-    value = np.einsum("qda,qa->qd", own, centre)
-    reach = np.einsum("qda,qa->qd", np.abs(own), radius)
-    slack = 1e-13 * (np.einsum("qda,qa->qd", np.abs(own), np.abs(centre)) + reach)
-    lo, hi = low[items], high[items]
-    keep = ((value - reach - slack <= hi) & (value + reach + slack >= lo)).all(axis=1)
-    return keep, ((value <= hi) & (value >= lo)).all(axis=1)
-
-
 def grid(low: Array, high: Array, block: list[int], divisions: int) -> tuple[Array, Array]:
     """Boxes that cover [low, high] in the coordinates of ``block``: centres and radii (M, K, len(block))."""
     unit = (np.array(list(itertools.product(range(divisions), repeat=len(block)))) + 0.5) / divisions
@@ -75,14 +109,3 @@ def grid(low: Array, high: Array, block: list[int], divisions: int) -> tuple[Arr
     centre = low[:, None, block] + width[:, None] * unit[None]
     radius = (width / (2 * divisions))[:, None] * (1 + 1e-13) + 4e-16 * (np.abs(centre) + np.abs(low)[:, None, block])
     return centre, radius
-
-
-def halve(items: Indices, centre: Array, radius: Array, along: Indices) -> tuple[Indices, Array, Array]:
-    """Cut every box in two along its coordinate ``along``."""
-    number = np.arange(len(items))
-    half, old = radius[number, along] / 2, centre[number, along]
-    small = radius.copy()
-    small[number, along] = half * (1 + 1e-15) + 4e-16 * (np.abs(old) + half)
-    left, right = centre.copy(), centre.copy()
-    left[number, along], right[number, along] = old - half, old + half
-    return np.concatenate([items, items]), np.concatenate([left, right]), np.concatenate([small, small])

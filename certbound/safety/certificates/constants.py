@@ -6,8 +6,8 @@ stated probability is Thm K2's for exactly these numbers.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,9 +24,8 @@ from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificates.parts import Proof, exact, needs_direction
 from certbound.safety.engines import Erosion, erode, joined
 from certbound.tubes.constants import Constants
-from certbound.tubes.kummer import Search, Start, exit_level
-from certbound.tubes.objective import Clearance, Objective, read_clearance
-from certbound.tubes.schedule import Schedule, make_schedule
+from certbound.tubes.kummer import Search, exit_level, moderate_parameters
+from certbound.tubes.question import Question, Start
 
 __all__ = ["STATED", "constants_proof"]
 
@@ -64,10 +63,10 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
     if reach is None:
         raise CertificateError("there is no reach tube.")
     curve = reach.curve
-    norm = Norm(flow.dimension, constants.metric)
+    norm = constants.norm
     cells = initial_cells(problem, _cells_along(curve))
     eta = bound_forcing(flow, curve, norm) * (1 + _ROOM[effort]) + _smallest(curve, norm, answer) * slack
-    slope = float(np.max(np.asarray(constants.rate if constants.rate is not None else constants.gain, dtype=float)))
+    slope = constants.worst_slope
     rho = cells.radii(norm, curve.initial())
     slopes = np.full(curve.pieces, slope)
     radius, _ = integrate_radius(curve, jump_sizes(curve, norm), rho, slopes, eta)
@@ -93,17 +92,20 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
         "splits": exact(_edges(cells.boxes.lo, cells.boxes.hi)),
         "rooms": [None if not np.isfinite(room) else exact(float(room)) for room in rooms],
         "kummer": kummer,
-        "cells": [
-            {
-                "nominal": exact(curve.coefficients[cell]),
-                "eta": exact(eta[cell] if flow.continuous else eta[cell][: curve.pieces - 1]),
-                "radius": exact(radius[cell]),
-                "separations": _separations(problem, curve, norm, cell),
-            }
-            for cell in range(curve.cells)
-        ],
+        "cells": [_cell(problem, tube, eta, cell) for cell in range(curve.cells)],
     }
     return data, min(log10, 0.0), [] if given.certified else [STATED]
+
+
+def _cell(problem: Problem, tube: ReachTube, eta: Array, cell: int) -> dict[str, Any]:
+    """What is stated of one cell."""
+    curve = tube.curve
+    return {
+        "nominal": exact(curve.coefficients[cell]),
+        "eta": exact(eta[cell] if curve.continuous else eta[cell][: curve.pieces - 1]),
+        "radius": exact(tube.radius[cell]),
+        "separations": _separations(problem, curve, tube.norm, cell),
+    }
 
 
 def _rounded(given: Constants, slack: float) -> Constants:
@@ -148,10 +150,7 @@ def _edges(low: Array, high: Array) -> list[list[float]]:
 
 
 def _with_rooms(erosion: Erosion, rooms: Array) -> Erosion:
-    return Erosion(
-        labels=("all",), continuous=erosion.continuous, starts=erosion.starts, ends=erosion.ends, radius=rooms[None],
-        factor=np.ones((1, len(rooms))),
-    )  # fmt: skip
+    return replace(erosion, labels=("all",), radius=rooms[None], factor=np.ones((1, len(rooms))))
 
 
 def _search(constants: Constants, erosion: Erosion, horizon: float, start: Start) -> tuple[float, dict[str, Any]]:
@@ -159,14 +158,13 @@ def _search(constants: Constants, erosion: Erosion, horizon: float, start: Start
     profile = joined(erosion.profile(random_start=start != Start()), 1e-9)
     if not np.any(np.isfinite(profile[1])):
         return -1e12, {"form": "kummer", "a": exact(1.0), "v0": exact(1.0)}
-    schedule = make_schedule(constants, horizon)
-    held = read_clearance(profile, horizon, continuous=schedule.continuous)
-    cut = schedule.refined(held.ends(schedule))
+    question = Question.of(constants, horizon, clearance=profile, start=start)
+    cut = question.cut
     best, chosen = 0.0, None
-    for bessel, a, v0 in _candidates(cut, held, start):
-        level = exit_level(cut, held, a=a, v0=v0, bessel=bessel, start=start)
+    for bessel, a, v0 in _candidates(question):
+        level = exit_level(cut, question.clearance, a=a, v0=v0, bessel=bessel, start=start)
         if level < best:
-            best, chosen = level, (bessel, a, v0 * schedule.unit**2)
+            best, chosen = level, (bessel, a, v0 * cut.unit**2)
     if chosen is None:
         raise CertificateError("Thm K2 bounds nothing for the rounded constants.")
     bessel, a, v0 = chosen
@@ -174,18 +172,13 @@ def _search(constants: Constants, erosion: Erosion, horizon: float, start: Start
     return best, {"form": "bessel" if bessel else "kummer", "a": exact(float(a)), "v0": exact(float(v0))}
 
 
-def _candidates(cut: Schedule, held: Clearance, start: Start) -> Iterator[tuple[bool, float, float]]:
+def _candidates(question: Question) -> Iterator[tuple[bool, float, float]]:
     """Parameters to try: what a search finds, and a coarse grid in case it loses its way."""
+    cut = question.cut
     graded = cut.graded(6)
-    weights = Objective(None, "scale", held).weights(graded)
     for bessel in (False, True) if np.max(cut.rates) >= 0 and cut.any_power else (False,):
-        a, v0 = Search(schedule=graded, kind="probability", weights=weights, bessel=bessel, start=start).solve()
-        yield bessel, a, v0
-    limit = math.inf if cut.any_power else cut.nu / 2 * (1 - 1e-9)
-    scale = float(np.max(np.where(np.isfinite(cut.nodes[1]), cut.nodes[1], 0.0))) or 1.0
-    for power in sorted({min(power, limit) for power in (0.4, 5.0, 50.0)}):
-        for ratio in 10.0 ** np.arange(-3.0, 3.1, 0.5):
-            yield False, power, float(ratio * scale)
+        yield (bessel, *Search.of(question, graded, bessel=bessel).solve())
+    yield from ((False, a, v0) for a, v0 in moderate_parameters(cut))
 
 
 def _separations(problem: Problem, curve: Curve, norm: Norm, cell: int) -> list[Any]:

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import CertificateError
-from certbound.gaussian.response import MartingaleEvent, Martingales, SplitEvents, WindowEvents, logsumexp
+from certbound.gaussian.response import MartingaleEvent, SplitEvents, WindowEvents, logsumexp
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
-from certbound.reach.linear import Accepted, DiffusionRun, Linearisation, Reference, depends_on_state
+from certbound.reach.linear import Accepted, DiffusionRun, Reference, Share, depends_on_state
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificates.linear import (
     EFFORTS,
@@ -38,7 +38,6 @@ Array = NDArray[np.float64]
 _ROUNDS = 10
 _WIDER = 0.03  # H beyond what it must hold, the first time
 _INSIDE = 0.005  # what must be left of that in the end
-_HALF = math.log(0.5) * (1 + 1e-15)
 _LARGER = 1 + 1e-6  # the checker's own kappas differ by rounding
 _MOVED = 1.005  # its directions differ within a window
 _LOG10 = math.log(10.0)
@@ -68,8 +67,8 @@ def diffusion_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
     effort = min(attempt, EFFORTS - 1)
     found = answer.details
     engine = engine_of(answer)
-    target = math.log(problem.delta)
-    shares = list(dict.fromkeys([found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]))
+    target = Share.of(problem.delta)
+    shares = list(dict.fromkeys([found.outcome.nonlinear, found.shown.nonlinear, target.stated()]))
     best: tuple[_StatedRun, Stated] | None = None
     for grid in grids(engine, effort):
         run = _StatedRun(grid)
@@ -78,7 +77,7 @@ def diffusion_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
                 stated = next((s for pad in PADS[effort] if (s := run.stated(reference, share, pad)) is not None), None)
                 if stated is not None and (best is None or stated.log_probability < best[1].log_probability):
                     best = run, stated
-            if best is not None and best[1].log_probability <= target:
+            if best is not None and best[1].log_probability <= target.log:
                 break
         if best is not None:
             break
@@ -91,30 +90,17 @@ def diffusion_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
 class _StatedRun(DiffusionRun):
     """`DiffusionRun` with windows as the only events of Z."""
 
-    def __init__(self, engine: Linearisation) -> None:
-        super().__init__(engine)
-        self.windows: dict[tuple[int, int, float], WindowEvents] = {}
+    def _events_of(self, windows: WindowEvents, cell: int) -> WindowEvents:
+        return windows
 
-    def events(self, cell: int, shared_log: float) -> SplitEvents:
-        """Scalar events of Z + M of one cell."""
-        reference, share, gaussian = self.held.reference, shared_log, None
-        if reference.gaussian:
-            share = shared_log + _HALF
-            key = cell, self.references.index(reference), share
-            if key not in self.windows:
-                self.windows[key] = WindowEvents(reference.response, cell, self.engine.window, share)
-            gaussian = self.windows[key]
-        martingales = Martingales(reference.response, cell, self.held.excess[cell], share, self.frames[cell])
-        return SplitEvents(gaussian=gaussian, martingales=martingales)
-
-    def stated(self, reference: Reference, log_nonlinear: float, pad: float) -> Stated | None:
+    def stated(self, reference: Reference, nonlinear: Share, pad: float) -> Stated | None:
         """Sets H and boxes of the remainder that hold, with a margin, what follows from them; None: none was found."""
-        found = self._close(reference, log_nonlinear, 2)
+        found = self._close(reference, nonlinear, 2)
         if found is None:
             return None
         self.held = found[0]
         count = len(self.engine.model.active)
-        levels, _ = self.levels(log_nonlinear)
+        levels, _ = self.levels(nonlinear)
         reached = self.deviations(levels * _MOVED, *found[1])
         if reached is None:
             return None
@@ -124,7 +110,7 @@ class _StatedRun(DiffusionRun):
             if excess is None:
                 return None
             self.held = Accepted(reference=reference, excess=excess)
-            levels, events = self.levels(log_nonlinear)
+            levels, events = self.levels(nonlinear)
             levels = levels * _MOVED + 1e-280
             bounds = self.include(levels, 2) if np.isfinite(levels).all() else None
             boxes = None if bounds is None else widened(self, levels, bounds, pad)
@@ -133,18 +119,18 @@ class _StatedRun(DiffusionRun):
                 return None
             needed = _wider(reached[0][:, :count], reached[1][:, :count], _INSIDE)
             if np.all((needed[0] >= low) & (needed[1] <= high)):
-                return self._stated(levels, boxes, events, log_nonlinear, (low, high))
+                return self._stated(levels, boxes, events, nonlinear, (low, high))
             wider = _wider(reached[0][:, :count], reached[1][:, :count], _WIDER)
             low, high = np.minimum(low, wider[0]), np.maximum(high, wider[1])
         return None
 
     def _stated(
-        self, levels: Array, bounds: tuple[Array, Array], events: list[SplitEvents], log_nonlinear: float,
+        self, levels: Array, bounds: tuple[Array, Array], events: list[SplitEvents], nonlinear: Share,
         held: tuple[Array, Array],
     ) -> Stated:
-        """The proof's numbers and what they prove: the levels cost exp(log_nonlinear) at most."""
+        """The proof's numbers and what they prove: the levels cost exp(nonlinear.log) at most."""
         cells, pieces, count = self.rows.shape[:3]
-        share = log_nonlinear + math.log(0.9 / (4 * max(count, 1)))
+        share = nonlinear.side(count, terms=2)
         gaussian = np.zeros((cells, pieces, count))
         stopped, worst = [], -np.inf
         for cell, own in enumerate(events):
@@ -158,7 +144,7 @@ class _StatedRun(DiffusionRun):
                 log, part = event.split(rooms[:, i])
                 asked.append(log)
                 granted.append(_factors(event.martingale, part))
-            worst = max(worst, logsumexp(np.array([log_nonlinear, *asked])))
+            worst = max(worst, logsumexp(np.array([nonlinear.log, *asked])))
             part_low, part_high = (x[cell * pieces : (cell + 1) * pieces] for x in held)
             random = isinstance(self.engine.problem.initial, GaussianStart)
             silent = self.held.reference is self.references[1] and not random
@@ -168,7 +154,7 @@ class _StatedRun(DiffusionRun):
                 else exact(self.held.reference.value[cell]),
                 "low": exact(part_low), "high": exact(part_high),
                 "coordinates": exact(float(own.martingales.factor * _LARGER)),
-                "rows": exact([_factors(event, share) for event in rows]),
+                "rows": exact([_factors(event, share.log) for event in rows]),
                 "rooms": None if silent else exact(granted),
             })  # fmt: skip
         zeros = np.zeros((1, self.engine.n))

@@ -23,7 +23,7 @@ from certbound.problem.model import Tape, compile_numpy, jacobian, varying_outpu
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Ellipsoid, Inside, Region
 from certbound.problem.systems import ContinuousSystem
-from certbound.reach.linear import Linearisation, LinearRun, correlated
+from certbound.reach.linear import Linearisation, LinearRun, Share, correlated
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificates.parts import Proof, exact, needs_direction
 
@@ -55,10 +55,10 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     effort = min(attempt, EFFORTS - 1)
     found = answer.details
     engine = engine_of(answer)
-    target = math.log(problem.delta)
-    tried = [found.outcome.log_nonlinear, found.shown.log_nonlinear, target + math.log(0.3)]
+    target = Share.of(problem.delta)
+    tried = [found.outcome.nonlinear, found.shown.nonlinear, target.stated()]
     if not len(engine.model.active):  # only windows ask for a share
-        tried.insert(0, found.outcome.log_probability + math.log(0.02))
+        tried.insert(0, Share(found.outcome.log_probability).stated(linear=True))
     best: tuple[LinearRun, Stated] | None = None
     for grid in grids(engine, effort):
         run = found.run if grid is engine else LinearRun(grid)
@@ -134,10 +134,10 @@ class Stated:
     stopped: list[dict[str, Any]] | None = None
 
 
-def _events(run: LinearRun, cell: int, shared: float) -> Events:
+def _events(run: LinearRun, cell: int, shared: Share) -> Events:
     engine = run.engine
     if isinstance(engine.system, ContinuousSystem):
-        return WindowEvents(engine.response, cell, engine.window, shared)
+        return WindowEvents(engine.response, cell, engine.window, shared.log)
     return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
 
 
@@ -151,7 +151,7 @@ class _Levels:
     found: tuple[Array, Array]
 
 
-def _search(run: LinearRun, shares: list[float], pads: Sequence[float], target: float) -> Stated | None:
+def _search(run: LinearRun, shares: list[Share], pads: Sequence[float], target: Share) -> Stated | None:
     """The first share's proof that reaches the target, or the best one found, with the widest boxes that close.
 
     Wide boxes are quick to check.
@@ -168,19 +168,19 @@ def _search(run: LinearRun, shares: list[float], pads: Sequence[float], target: 
         stated = _stated(run, given, bounds)
         if best is None or stated.log_probability < best.log_probability:
             best = stated
-        if best.log_probability <= target:
+        if best.log_probability <= target.log:
             break
     return best
 
 
-def _levels(run: LinearRun, log_nonlinear: float) -> _Levels | None:
-    """Levels that cost exp(log_nonlinear); None where the remainder feeds itself."""
+def _levels(run: LinearRun, nonlinear: Share) -> _Levels | None:
+    """Levels that cost a share; None where the remainder feeds itself."""
     cells, pieces, count = run.rows.shape[:3]
     levels = np.zeros((cells, pieces, count))
-    share = log_nonlinear + math.log(0.9 / (2 * max(count, 1)))
+    share = nonlinear.side(count).log
     events, spent = [], []
     for cell in range(cells):
-        own = _events(run, cell, log_nonlinear + (math.log(0.1) if count else 0.0))
+        own = _events(run, cell, nonlinear.common(count))
         logs = [own.shared_log]
         for d in range(count):
             event = own.along(run.rows[cell, :, d])

@@ -32,7 +32,7 @@ from certbound.problem.sets import Ball, Box, GaussianStart, HalfSpace, Polytope
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.nominal import initial_cells
 from certbound.rigor.intervals import Interval
-from certbound.safety.answers import EngineAnswer
+from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
 
 __all__ = ["Barrier", "barrier_engine"]
@@ -83,13 +83,12 @@ class Barrier:
         return value + 4e-16 * abs(value)
 
 
-def barrier_engine(problem: Problem, *, quick: bool = False, **_: Any) -> EngineAnswer:
-    """The smallest probability that an exponential polynomial barrier proves (options of other engines are ignored).
+def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+    """The smallest probability that an exponential polynomial barrier proves, if no other engine has proved enough.
 
     It covers the disturbances that do not see coming noise.
-    ``quick`` leaves the search out: another engine has proved enough.
     """
-    refused = "another engine is enough." if quick else _refusal(problem)
+    refused = "another engine is enough." if asked.quick else _refusal(problem)
     if refused is not None:
         return EngineAnswer(applicable=False, reason=refused, method="barrier")
     assert isinstance(problem.system, ContinuousSystem)

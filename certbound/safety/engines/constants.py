@@ -19,7 +19,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +40,7 @@ from certbound.reach.contraction import (
 )
 from certbound.reach.nominal import Curve, Flow, initial_cells, nominal_curve
 from certbound.reach.sets import ReachTube
-from certbound.rigor.norms import Norm
-from certbound.safety.answers import Deviation, EngineAnswer
+from certbound.safety.answers import AS_IT_IS, Deviation, EngineAnswer, Request
 from certbound.safety.engines.erosion import Erosion, Tightest, erode
 from certbound.safety.engines.rooms import (
     BELOW,
@@ -53,7 +51,7 @@ from certbound.safety.engines.rooms import (
     smallest_level,
 )
 from certbound.tubes.constants import Constants
-from certbound.tubes.kummer import Start
+from certbound.tubes.question import Start
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
@@ -76,30 +74,11 @@ QUICK_BUDGET = 250
 """Boxes spent on global constants when another engine has proved SAFE already."""
 
 
-def constants_engine(
-    problem: Problem,
-    *,
-    method: str = "auto",
-    cells: int | None = None,
-    constants: Constants | None = None,
-    quick: bool = False,
-    **_: Any,
-) -> EngineAnswer:
+def constants_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     """The best answer from constants: global ones, or local ones along the reach tube where none are global.
 
-    It covers the disturbances that do not see coming noise. Options of other engines are ignored.
-
-    Parameters
-    ----------
-    problem : Problem
-    method : str
-        "auto" (Thm K2), or a tube method by name.
-    cells : int, optional
-        Parts along each side of the initial set.
-    constants : Constants, optional
-        Stated constants, used instead of certified ones.
-    quick : bool
-        Leave out what is slow and then seldom decides: proposed metrics and local constants.
+    It covers the disturbances that do not see coming noise. Where it is asked to be quick, proposed metrics and local
+    constants are left out.
 
     Raises
     ------
@@ -110,10 +89,11 @@ def constants_engine(
     EngineError
         If the nominal is lost before the horizon.
     """
+    method, constants, quick = asked.method, asked.constants, asked.quick
     if constants is not None:
         refuse_contradiction(problem, constants)
         constants = proved_or_stated(problem, constants)
-    work = _Work(problem, method, cells)
+    work = _Work(problem, asked)
     by_clearance, target = method in BY_CLEARANCE, math.log10(problem.delta)
     best: EngineAnswer | None = None
     reason = ""
@@ -161,13 +141,13 @@ def _better(first: EngineAnswer, second: EngineAnswer) -> EngineAnswer:
 
 
 class _Work:
-    """One problem, one method; the nominal curves are shared by all constants."""
+    """One problem, one request; the nominal curves are shared by all constants."""
 
-    def __init__(self, problem: Problem, method: str, cells: int | None) -> None:
-        self.problem, self.method, self.cells = problem, method, cells
+    def __init__(self, problem: Problem, asked: Request) -> None:
+        self.problem, self.method, self.cells = problem, asked.method, asked.cells
         self.flow = Flow(problem)
-        self.name = "kummer" if method == "auto" else method
-        self.segments = SEGMENTS if method in BY_CLEARANCE else SEGMENTS_BY_NAME
+        self.name = "kummer" if self.method == "auto" else self.method
+        self.segments = SEGMENTS if self.method in BY_CLEARANCE else SEGMENTS_BY_NAME
 
     @cached_property
     def curve(self) -> Curve:
@@ -277,7 +257,7 @@ class _Work:
     def _refused(self, reach: ReachTube, erosion: Erosion, answer: EngineAnswer) -> EngineAnswer | None:
         """An answer where the reach tube ends early or leaves no room; None where it serves."""
         worst = erosion.tightest()
-        held = replace(answer, margin=worst.margin, time=worst.time, constraint=worst.label or None)
+        held = replace(answer, **worst.place)
         if reach.end < self.flow.horizon:
             return replace(
                 held, time=reach.end, reach=reach,
@@ -327,17 +307,15 @@ class _Work:
                 level = min(level, (closer if fit(closer) else tube).log10_delta)
             fits = level <= math.log10(target)
         worst = erosion.tightest(needed)
-        margin = max(worst.margin, 0.0) if fits else worst.margin
+        place = worst.place | {"margin": max(worst.margin, 0.0) if fits else worst.margin}
         return replace(
             answer,
+            **place,
             log10_delta=level,
-            margin=margin,
-            time=worst.time,
-            constraint=worst.label or None,
             reason=self._explained(erosion, needed, worst, level, fits),
             tube=tube,
             constants=constants,
-            deviation=Deviation.of_ball(*deviation_pieces(curve, needed), Norm(self.flow.dimension, constants.metric)),
+            deviation=Deviation.of_ball(*deviation_pieces(curve, needed), constants.norm),
             certified=tube.certified and tube.level == "trajectory",
             method=self.name,
         )

@@ -9,7 +9,8 @@ Source: Thm 1 and Prop 4 (paper); Thm K2 (theory) for what the rooms are used fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,12 @@ class Tightest:
     label: str
     time: float
     piece: int
+
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """As fields of an answer."""
+        return {"margin": self.margin, "time": self.time, "constraint": self.label or None}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,25 +74,13 @@ class Erosion:
     def only(self, constraint: int) -> Erosion:
         """The same for one constraint."""
         chosen = slice(constraint, constraint + 1)
-        return Erosion(
-            labels=self.labels[chosen],
-            continuous=self.continuous,
-            starts=self.starts,
-            ends=self.ends,
-            radius=self.radius[chosen],
-            factor=self.factor[chosen],
+        return replace(
+            self, labels=self.labels[chosen], radius=self.radius[chosen], factor=self.factor[chosen]
         )
 
     def capped(self, limit: Array) -> Erosion:
         """Rooms cut to ``limit``, shape (K,): what local constants allow."""
-        return Erosion(
-            labels=self.labels,
-            continuous=self.continuous,
-            starts=self.starts,
-            ends=self.ends,
-            radius=np.minimum(self.radius, limit),
-            factor=self.factor,
-        )
+        return replace(self, radius=np.minimum(self.radius, limit))
 
     def profile(self, *, random_start: bool = False) -> tuple[Array, Array]:
         """Clearance as (times, values), values[k] on [times[k], times[k + 1]), for ``bound_exit_probability``.

@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from certbound.problem.problem import Problem
 from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state, linear_answer
 from certbound.reach.remainder import hidden_jump
-from certbound.safety.answers import Deviation, EngineAnswer
+from certbound.safety.answers import AS_IT_IS, Deviation, EngineAnswer, Request
 
 __all__ = ["linear_engine"]
 
 
-def linear_engine(
-    problem: Problem, *, cells: int | None = None, thorough: bool = True, before: LinearAnswer | None = None, **_: Any
-) -> EngineAnswer:
-    """Smallest probability that Thm K7' proves for the problem (options of other engines are ignored).
+def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+    """Smallest probability that Thm K7' proves for the problem, with one cell unless ``asked`` for more.
 
     With additive noise it covers every disturbance, even one that sees coming noise; with noise that depends on the
     state, those that do not.
-
-    Without ``thorough`` the initial set is one cell unless ``cells`` says otherwise; what was found in that way can be
-    given as ``before``.
     """
     hidden = hidden_jump(problem)
     if hidden is not None:
         return EngineAnswer(applicable=False, reason=hidden, method="linear")
-    answer = linear_answer(problem, cells=cells, thorough=thorough, before=before)
+    answer = linear_answer(problem, cells=asked.cells, thorough=asked.thorough, before=asked.before)
     tube = answer.tube
     return EngineAnswer(
         log10_delta=answer.log10_delta,

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from certbound.reach.nominal import Curve
 from certbound.rigor.balls import precision, upper
 from certbound.tubes.constants import Constants
-from certbound.tubes.kummer import Start, exit_level
-from certbound.tubes.objective import read_clearance
-from certbound.tubes.schedule import make_schedule
+from certbound.tubes.kummer import exit_level, moderate_parameters
+from certbound.tubes.question import Question, Start
 from certbound.tubes.tube import Tube
-from certbound.tubes.tuning import bound_exit_probability
+from certbound.tubes.tuning import least_exit_level
 
 __all__ = [
     "BELOW",
@@ -39,7 +38,6 @@ SMALLEST_LOG10 = -290.0
 BISECTIONS = 9
 BELOW = 1e-9
 """A tube that fits at a little less than the target leaves no doubt about the last digit of a logarithm."""
-POWERS = (0.4, 5.0, 50.0)
 
 
 def room_level(constants: Constants, *, horizon: float, profile: Profile, start: Start, fits: bool = False) -> float:
@@ -52,17 +50,13 @@ def room_level(constants: Constants, *, horizon: float, profile: Profile, start:
         return 0.0
     if not np.any(np.isfinite(profile[1])):
         return -1e12  # nothing is asked
-    level = bound_exit_probability(constants, horizon=horizon, clearance=profile, start=start)
+    question = Question.of(constants, horizon, clearance=profile, start=start)
+    level = least_exit_level(question)
     if level < 0.0 or not fits:
         return level
-    held = read_clearance(profile, horizon, continuous=constants.continuous)
-    schedule = make_schedule(constants, horizon)
-    cut = schedule.refined(held.ends(schedule))
-    limit = math.inf if schedule.any_power else schedule.nu / 2 * (1 - 1e-9)
-    scale = float(np.max(np.where(np.isfinite(cut.nodes[1]), cut.nodes[1], 0.0))) or 1.0
-    for a in sorted({min(power, limit) for power in POWERS}):
-        for ratio in 10.0 ** np.arange(-3.0, 3.1, 0.5):
-            level = min(level, exit_level(cut, held, a=a, v0=float(ratio * scale), start=start))
+    cut = question.cut
+    for a, v0 in moderate_parameters(cut):
+        level = min(level, exit_level(cut, question.clearance, a=a, v0=v0, start=start))
     return max(level, -1e12)
 
 

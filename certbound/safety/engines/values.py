@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from certbound.display import rounded
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Region
 from certbound.problem.systems import DiscreteSystem
-from certbound.safety.answers import EngineAnswer
+from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.values.continuous import ExitBounds, bound_exits
 from certbound.values.discrete import FailureBounds, bound_failure
 
@@ -23,35 +22,30 @@ _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 
 def values_engine(
     problem: Problem,
+    asked: Request = AS_IT_IS,
     *,
     target: Region | None = None,
-    quick: bool = False,
-    thorough: bool = True,
     ratio: float = 1.05,
     seconds: float = _SECONDS,
-    **_: Any,
 ) -> EngineAnswer:
-    """Certified bounds of the probability of failing, on finer and finer grids (options of other engines are ignored).
+    """Certified bounds of the probability of failing, on finer and finer grids; nothing where another has answered.
 
     Proves: log10_lower <= log10 of the largest probability of failing over starts and disturbances <= log10_delta.
 
     Parameters
     ----------
     problem : Problem
+    asked : Request
     target : Region, optional
         Set that ends the danger; never to enter it counts as failing.
-    quick : bool
-        Another engine has answered: nothing is done.
-    thorough : bool
-        Without it the grids stop being refined after a quarter of the time.
     ratio : float
         Refine until the upper bound is at most that many times the lower one.
     seconds : float
-        About what may be spent.
+        About what may be spent; a quarter of it unless ``asked`` is thorough.
     """
-    if quick:
+    if asked.quick:
         return EngineAnswer(applicable=False, method="values", reason="left out, since another engine has answered.")
-    limit = seconds if thorough else seconds / 4
+    limit = seconds if asked.thorough else seconds / 4
     try:
         if not isinstance(problem.system, DiscreteSystem):
             return _continuous(problem, target=target, seconds=limit)

@@ -199,8 +199,7 @@ class SafetyFilter:
 
     def _size(self, tube: Tube) -> float:
         """Sum of the logarithms of what a tube takes from the faces at most."""
-        metric, last = tube.constants.metric, float(tube.radius(tube.horizon))
-        inverse = np.eye(self.planner.plant.dimension) if metric is None else np.linalg.inv(np.asarray(metric))
+        last, inverse = float(tube.radius(tube.horizon)), tube.constants.inverse
         found = []
         for face in self.planner.faces:
             if isinstance(face, Round):

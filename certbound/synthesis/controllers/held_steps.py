@@ -107,7 +107,7 @@ class HeldSteps:
     _pieces: int = field(init=False, default=1)
 
     def __post_init__(self) -> None:
-        self._norm = Norm(self.problem.system.dimension, self.tube.constants.metric)
+        self._norm = self.tube.constants.norm
 
     @property
     def continuous(self) -> bool:

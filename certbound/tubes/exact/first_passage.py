@@ -26,6 +26,7 @@ from certbound.tubes.ballpath import integral
 from certbound.tubes.constants import Constants
 from certbound.tubes.exact.recursion import Recursion
 from certbound.tubes.exact.supersolution import Supersolution
+from certbound.tubes.question import Question
 from certbound.tubes.schedule import Schedule, make_schedule
 from certbound.tubes.tube import Tube
 
@@ -214,17 +215,15 @@ def _check_continuous(constants: Constants) -> None:
         raise ValueError("`method` 'worst_case' is for continuous time; use 'mixture' or 'kummer'.")
 
 
-def first_passage_tube(
-    constants: Constants, *, horizon: float, delta: float, worst: bool, objective: Any = "max", above: float
-) -> Tube:
+def first_passage_tube(question: Question, delta: float, *, worst: bool, above: float) -> Tube:
     """The tube of least constant radius: P(||S_t|| <= R for all t <= T) >= 1 - delta.
 
     Parameters
     ----------
-    constants : Constants
+    question : Question
         ``isotropic=True`` for the exact law (``worst=False``); continuous time for the worst case.
-    horizon, delta : float
-        T and the level.
+    delta : float
+        The level.
     worst : bool
         Which law.
     above : float
@@ -239,8 +238,8 @@ def first_passage_tube(
 
     Source: item 7.9 of docs/theory.md.
     """
+    constants, schedule = question.constants, question.schedule
     (_check_continuous if worst else _check_isotropic)(constants)
-    schedule = make_schedule(constants, horizon)
     chained = not schedule.continuous and chain_of(constants, schedule, above) is not None
 
     def bound(radius: float, coarseness: float = 0.0) -> float:
@@ -253,11 +252,10 @@ def first_passage_tube(
         return problem.estimate() if coarseness else problem.bound()
 
     radius, value = _least_radius(bound, above, delta, coarseness=0.0 if chained else 4.0)
-    return Tube(
-        method="worst_case" if worst else "exact", parameters={"radius": radius, "probability": value},
-        level="trajectory", certified=True, delta=delta, horizon=schedule.horizon, constants=constants,
-        objective=objective, profile=ConstantProfile(value=radius, horizon=schedule.horizon),
-    )  # fmt: skip
+    profile = ConstantProfile(value=radius, horizon=schedule.horizon)
+    return question.tube(
+        "worst_case" if worst else "exact", delta, {"radius": radius, "probability": value}, profile
+    )
 
 
 def _least_radius(bound: Callable[..., float], above: float, delta: float, *, coarseness: float) -> tuple[float, float]:

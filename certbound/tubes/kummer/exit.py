@@ -12,10 +12,11 @@ from flint import arb
 from certbound.rigor.balls import excess_floor, excess_tangent, lower, precision, upper
 from certbound.tubes.ballpath import ball_path
 from certbound.tubes.excess import log_excess_one, log_phi_one
-from certbound.tubes.kummer.profile import Start, initial_ball, phi_ball
+from certbound.tubes.kummer.profile import initial_ball, phi_ball
 from certbound.tubes.kummer.search import log_gain
 from certbound.tubes.line_search import golden
 from certbound.tubes.objective import Clearance
+from certbound.tubes.question import Start
 from certbound.tubes.schedule import Schedule
 
 __all__ = ["Tangents", "exit_level", "union_level", "union_may_help"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from flint import arb
@@ -12,9 +11,9 @@ from numpy.typing import NDArray
 
 from certbound.errors import InfeasibleError
 from certbound.rigor.balls import precision, upper
-from certbound.tubes.constants import Constants
 from certbound.tubes.kummer.mixture import Component, MixtureProfile, MixtureProgram
-from certbound.tubes.objective import Clearance, Objective
+from certbound.tubes.objective import Clearance
+from certbound.tubes.question import Question
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.tube import Tube
 
@@ -26,12 +25,11 @@ Pair = tuple[float, float, bool]
 _ALL_STEPS = 400
 
 
-def _cut(schedule: Schedule, clearance: Clearance | None) -> Schedule:
+def _rows(cut: Schedule) -> Schedule:
     """One piece per row of the program: every step in DT (up to 400), graded intervals in CT."""
-    data = schedule if clearance is None else schedule.refined(clearance.ends(schedule))
-    if not schedule.continuous and schedule.horizon <= _ALL_STEPS:
-        return data.refined(np.arange(1.0, schedule.horizon))
-    return data.graded(256)
+    if not cut.continuous and cut.horizon <= _ALL_STEPS:
+        return cut.refined(np.arange(1.0, cut.horizon))
+    return cut.graded(256)
 
 
 def _radii(data: Schedule, clearance: Clearance) -> Array:
@@ -59,9 +57,7 @@ def _dictionary(data: Schedule, best: list[Pair]) -> tuple[list[Pair], NDArray[n
     return [*best, *pairs], ends
 
 
-def mixture_tube(
-    constants: Constants, schedule: Schedule, delta: float, goal: Objective, *, seed: Tube, objective: Any
-) -> Tube:
+def mixture_tube(question: Question, delta: float, *, seed: Tube) -> Tube:
     """The tube of Thm K3 whose shape is the objective's clearance (the seed's radii for ``final`` and ``mean``).
 
     Raises
@@ -69,7 +65,8 @@ def mixture_tube(
     InfeasibleError
         If no mixture of the asked level was found.
     """
-    data = _cut(schedule, goal.clearance)
+    goal = question.goal
+    data = _rows(question.cut)
     if goal.kind != "scale":
         shape = np.asarray(seed.radius(data.times[1:]), dtype=float)
         first = 1.0
@@ -92,10 +89,7 @@ def mixture_tube(
             for c in shares
         ],
     }
-    return Tube(
-        method="mixture", parameters=parameters, level="trajectory", certified=True, delta=delta,
-        horizon=schedule.horizon, constants=constants, objective=objective, profile=profile,
-    )  # fmt: skip
+    return question.tube("mixture", delta, parameters, profile)
 
 
 def _seed_pairs(seed: Tube, data: Schedule) -> list[Pair]:
@@ -134,7 +128,7 @@ def mixture_level(schedule: Schedule, clearance: Clearance, *, best: list[Pair])
 
     The least certified gain over the rows divides the certified sum of the weights.
     """
-    data = _cut(schedule, clearance)
+    data = _rows(schedule.refined(clearance.ends(schedule)))
     radii = _radii(data, clearance)
     pairs, ends = _dictionary(data, best)
     program = MixtureProgram(schedule=data, clearance=radii, ends=ends)

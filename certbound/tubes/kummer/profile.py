@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -28,28 +28,16 @@ from certbound.rigor.balls import bessel_excess, excess_floor, kummer_excess, lo
 from certbound.tubes.ballpath import BallPath, ball_path
 from certbound.tubes.constants import Constants, check_delta
 from certbound.tubes.excess import log_excess_one, log_phi, log_phi_one, solve_excess, solve_excess_one
-from certbound.tubes.schedule import Schedule, make_schedule
+from certbound.tubes.piecewise import PiecewiseProfile
+from certbound.tubes.question import Question, Start
+from certbound.tubes.schedule import Schedule
 from certbound.tubes.tube import Tube
 
-__all__ = ["KummerProfile", "Start", "kummer_tube", "log_initial", "log_target"]
+__all__ = ["KummerProfile", "kummer_tube", "log_initial", "log_target"]
 
 Array = NDArray[np.float64]
 
 _LARGEST_EXPONENT = 1e8
-
-
-@dataclass(frozen=True, kw_only=True)
-class Start:
-    """Deviation at time 0: ||S_0|| <= offset, plus an isotropic sub-Gaussian part of proxy std sigma (item 7.4)."""
-
-    offset: float = 0.0
-    sigma: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("offset", "sigma"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"`start` {name} must be finite and not negative, got {value}.")
 
 
 def log_initial(schedule: Schedule, a: float, v0: float, info: float, start: Start, bessel: bool) -> float:
@@ -78,23 +66,14 @@ def log_target(a: Any, info: Any, log_x: Any, log_delta: float) -> Any:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class KummerProfile:
+class KummerProfile(PiecewiseProfile):
     """Radius of Thm K1 for given a and v_0 (``v0`` in units of ``schedule.unit``^2)."""
 
-    schedule: Schedule
     a: float
     v0: float
     delta: float
     bessel: bool = False
-    start: Start = Start()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
-    @property
-    def times(self) -> Array:
-        """Piece ends of the schedule."""
-        return self.schedule.times
+    start: Start = field(default_factory=Start)
 
     def to_dict(self) -> dict[str, Any]:
         """Parameters as plain data; ``v0`` is in units of ``unit``^2."""
@@ -267,19 +246,15 @@ def kummer_tube(
     True
     """
     delta = check_delta(delta)
-    schedule = make_schedule(constants, horizon)
-    start = start or Start()
+    question = Question.of(constants, horizon, clearance=math.inf, start=start)  # no radius is asked for
+    schedule = question.schedule
     check_power(schedule, a, bessel=bessel)
-    check_start(schedule, start, constants.dimension)
     if not (math.isfinite(v0) and v0 > 0):
         raise ValueError(f"`v0` must be positive and finite, got {v0}.")
     profile = KummerProfile(
-        schedule=schedule, a=float(a), v0=v0 / schedule.unit**2, delta=delta, bessel=bessel, start=start
+        schedule=schedule, a=float(a), v0=v0 / schedule.unit**2, delta=delta, bessel=bessel, start=question.start
     )
-    return Tube(
-        method="bessel" if bessel else "kummer", parameters={"a": float(a), "v0": float(v0)}, level="trajectory",
-        certified=True, delta=delta, horizon=float(horizon), constants=constants, objective=None, profile=profile,
-    )  # fmt: skip
+    return question.tube("bessel" if bessel else "kummer", delta, {"a": float(a), "v0": float(v0)}, profile)
 
 
 def check_power(schedule: Schedule, a: float, *, bessel: bool) -> None:
@@ -291,13 +266,4 @@ def check_power(schedule: Schedule, a: float, *, bessel: bool) -> None:
         raise ValueError(
             f"`a` must be below nu/2 = {schedule.nu / 2:g} for sub-Gaussian noise with nu < n in discrete time, "
             f"got {got}; state `gaussian=True` if the noise is Gaussian, or `effective_dimension=None`."
-        )
-
-
-def check_start(schedule: Schedule, start: Start, dimension: int) -> None:
-    """Refuse a random start that the effective dimension does not cover."""
-    if start.sigma > 0 and schedule.nu < dimension:
-        raise ValueError(
-            f"a random `start` is isotropic and needs nu = n = {dimension}, got nu = {schedule.nu:g}; "
-            "drop `effective_dimension`."
         )

@@ -7,7 +7,7 @@ infinite one is an edge of the box. A coarse grid gives the start, the simplex m
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -15,16 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.tubes.excess import log_excess_value, log_excess_values, log_phi, log_phi_one, solve_excess
-from certbound.tubes.kummer.profile import Start, log_initial, log_target
+from certbound.tubes.kummer.profile import log_initial, log_target
+from certbound.tubes.question import Question, Start
 from certbound.tubes.schedule import Schedule
 
-__all__ = ["Search", "log_gain", "simplex"]
+__all__ = ["Search", "log_gain", "moderate_parameters", "simplex"]
 
 Array = NDArray[np.float64]
 Point = tuple[float, ...]
 
 _POWERS = np.array([0.1, 1.5, 20.0])
 _SPREADS = np.log(10.0) * np.array([-2.0, -0.9, -0.2, 0.6])
+_MODERATE = (0.4, 5.0, 50.0)
 _SPAN = 2.0  # of the first unknown
 _LARGEST = 1e4  # power a
 _FEW = 16
@@ -58,6 +60,16 @@ class Search:
     log_delta: float = 0.0
     bessel: bool = False
     start: Start = field(default_factory=Start)
+
+    @classmethod
+    def of(
+        cls, question: Question, schedule: Schedule, *, bessel: bool = False, log_delta: float | None = None
+    ) -> Search:
+        """The search on a graded schedule of the question's data; for the least probability without ``log_delta``."""
+        return cls(
+            schedule=schedule, kind="probability" if log_delta is None else question.goal.kind, bessel=bessel,
+            weights=question.goal.weights(schedule), log_delta=log_delta or 0.0, start=question.start,
+        )  # fmt: skip
 
     @cached_property
     def reference(self) -> float:
@@ -307,6 +319,16 @@ class Search:
         size = roots[-1] if self.kind == "final" else np.max(roots)
         tail = max(1e-3, -self.log_delta)
         return float(size * math.sqrt(2 * self.half + 2 * math.sqrt(2 * self.half * tail) + 2 * tail))
+
+
+def moderate_parameters(schedule: Schedule) -> Iterator[tuple[float, float]]:
+    """A coarse grid of (a, v_0), for when a search has lost its way."""
+    limit = math.inf if schedule.any_power else schedule.nu / 2 * (1 - 1e-9)
+    variance = schedule.nodes[1]
+    scale = float(np.max(np.where(np.isfinite(variance), variance, 0.0))) or 1.0
+    for a in sorted({min(power, limit) for power in _MODERATE}):
+        for ratio in 10.0 ** np.arange(-3.0, 3.1, 0.5):
+            yield a, float(ratio * scale)
 
 
 def log_gain(a: float, half: float, info: float, z: float, bessel: bool) -> float:

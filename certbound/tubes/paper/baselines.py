@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.tubes.constants import Constants, check_delta
-from certbound.tubes.objective import Objective
 from certbound.tubes.paper.radii import RootProfile, Tail, best_epsilon, best_growth, growth, sharp_tail
 from certbound.tubes.paper.windows import WindowProfile, event_count, window_scale
-from certbound.tubes.schedule import Schedule, integral, make_schedule
+from certbound.tubes.question import Question
+from certbound.tubes.schedule import Schedule, integral
 from certbound.tubes.tube import Profile, Tube
 
 __all__ = ["BASELINES", "Baseline", "baseline_tube", "check_method"]
@@ -50,34 +49,30 @@ class Baseline:
     printed: bool = False
 
 
-_ONE, _ALL = "one time", "trajectory"
+_CT, _DT, _ONE, _ALL = "continuous", "discrete", "one time", "trajectory"
 _MOST_WINDOWS = 512
 _SLACK = 0.85  # the sharp tail gains at most that over the growth bound that the estimates use
 BASELINES: dict[str, Baseline] = {
-    "prop1": Baseline(time="continuous", kind="variance", level=_ONE, title="Prop 1 (paper)"),
-    "prop1_cosh": Baseline(time="continuous", kind="variance", level=_ONE, tail="cosh", title="Prop 1, n = 1"),
-    "prop1_sharp": Baseline(time="continuous", kind="variance", level=_ONE, tail="sharp", title="item 7.11"),
-    "prop2": Baseline(time="discrete", kind="variance", level=_ONE, title="Prop 2 (paper)"),
-    "prop2_sharp": Baseline(time="discrete", kind="variance", level=_ONE, tail="sharp", title="item 7.11"),
-    "prop3": Baseline(time="discrete", kind="variance", level=_ALL, title="Prop 3 (paper)"),
-    "prop3_sharp": Baseline(time="discrete", kind="variance", level=_ALL, tail="sharp", title="item 7.11"),
-    "thm2": Baseline(time="continuous", kind="scaled", level=_ALL, title="Thm 2 (paper)"),
-    "thm2_cosh": Baseline(time="continuous", kind="scaled", level=_ALL, tail="cosh", title="Thm 2, n = 1"),
-    "thm3": Baseline(time="continuous", kind="windows", level=_ALL, title="Thm 3 (paper)"),
-    "thm3_cosh": Baseline(time="continuous", kind="windows", level=_ALL, tail="cosh", title="Thm 3, n = 1"),
-    "thm3_sharp": Baseline(time="continuous", kind="windows", level=_ALL, tail="sharp", title="items 7.11, 7.15"),
-    "thm3_as_printed": Baseline(
-        time="continuous", kind="windows", level=_ALL, printed=True, title="Thm 3 with N = T/step (E6)"
-    ),
-    "thm4": Baseline(time="discrete", kind="scaled", level=_ALL, title="Thm 4 (paper), corrected (E1)"),
+    "prop1": Baseline(time=_CT, kind="variance", level=_ONE, title="Prop 1 (paper)"),
+    "prop1_cosh": Baseline(time=_CT, kind="variance", level=_ONE, tail="cosh", title="Prop 1, n = 1"),
+    "prop1_sharp": Baseline(time=_CT, kind="variance", level=_ONE, tail="sharp", title="item 7.11"),
+    "prop2": Baseline(time=_DT, kind="variance", level=_ONE, title="Prop 2 (paper)"),
+    "prop2_sharp": Baseline(time=_DT, kind="variance", level=_ONE, tail="sharp", title="item 7.11"),
+    "prop3": Baseline(time=_DT, kind="variance", level=_ALL, title="Prop 3 (paper)"),
+    "prop3_sharp": Baseline(time=_DT, kind="variance", level=_ALL, tail="sharp", title="item 7.11"),
+    "thm2": Baseline(time=_CT, kind="scaled", level=_ALL, title="Thm 2 (paper)"),
+    "thm2_cosh": Baseline(time=_CT, kind="scaled", level=_ALL, tail="cosh", title="Thm 2, n = 1"),
+    "thm3": Baseline(time=_CT, kind="windows", level=_ALL, title="Thm 3 (paper)"),
+    "thm3_cosh": Baseline(time=_CT, kind="windows", level=_ALL, tail="cosh", title="Thm 3, n = 1"),
+    "thm3_sharp": Baseline(time=_CT, kind="windows", level=_ALL, tail="sharp", title="items 7.11, 7.15"),
+    "thm3_as_printed": Baseline(time=_CT, kind="windows", level=_ALL, printed=True, title="Thm 3 with N = T/step (E6)"),
+    "thm4": Baseline(time=_DT, kind="scaled", level=_ALL, title="Thm 4 (paper), corrected (E1)"),
     "thm4_as_printed": Baseline(
-        time="discrete", kind="printed", level=_ALL, printed=True, title="Thm 4 without the factor 1/L (E1)"
+        time=_DT, kind="printed", level=_ALL, printed=True, title="Thm 4 without the factor 1/L (E1)"
     ),
-    "thm5": Baseline(time="discrete", kind="windows", level=_ALL, title="Thm 5 (paper)"),
-    "thm5_sharp": Baseline(time="discrete", kind="windows", level=_ALL, tail="sharp", title="items 7.11, 7.15"),
-    "thm5_as_printed": Baseline(
-        time="discrete", kind="windows", level=_ALL, printed=True, title="Thm 5 with N = T/step (E6)"
-    ),
+    "thm5": Baseline(time=_DT, kind="windows", level=_ALL, title="Thm 5 (paper)"),
+    "thm5_sharp": Baseline(time=_DT, kind="windows", level=_ALL, tail="sharp", title="items 7.11, 7.15"),
+    "thm5_as_printed": Baseline(time=_DT, kind="windows", level=_ALL, printed=True, title="Thm 5 with N = T/step (E6)"),
     "markov": Baseline(time="both", kind="variance", level=_ONE, tail="moment", title="Markov, E||S||^2 <= nu V"),
     "chebyshev": Baseline(time="both", kind="variance", level=_ONE, tail="moment", title="Chebyshev, nu = n"),
 }
@@ -85,12 +80,10 @@ BASELINES: dict[str, Baseline] = {
 
 
 def baseline_tube(
-    constants: Constants,
+    question: Question,
+    delta: float,
     method: str,
     *,
-    horizon: float,
-    delta: float,
-    objective: Objective,
     epsilon: float | None = None,
     step: float | None = None,
     unless: float = math.inf,
@@ -99,14 +92,12 @@ def baseline_tube(
 
     Parameters
     ----------
-    constants : Constants
-        Rate or gain, sigma, dimension.
+    question : Question
+        Its goal is what ``step`` minimises (``epsilon`` has one best value for all of them).
+    delta : float
+        As in :func:`certbound.tune_tube`.
     method : str
         A key of :data:`BASELINES`.
-    horizon, delta : float
-        As in :func:`certbound.tune_tube`.
-    objective : Objective
-        What ``step`` minimises (``epsilon`` has one best value for all of them).
     epsilon : float, optional
         In (0, 1).
     step : float, optional
@@ -123,21 +114,17 @@ def baseline_tube(
     Source: Props 1-3, Thms 2-5 (paper), with E1-E6 and items 7.11, 7.15 of docs/theory.md.
     """
     row = BASELINES[method]
-    delta, schedule = check_delta(delta), make_schedule(constants, horizon)
-    _check_hypotheses(constants, method, row, schedule)
+    _check_hypotheses(question, method, row)
     if epsilon is not None and not 0 < epsilon < 1:
         raise ValueError(f"`epsilon` must lie in (0, 1), got {epsilon}.")
     if step is not None:
-        step = _checked_step(step, schedule)
-    builder = _Builder(constants, method, row, schedule, delta, objective, epsilon)
+        step = _checked_step(step, question.schedule)
+    builder = _Builder(question, delta, method, epsilon)
     if unless < math.inf and builder.estimate(step) > unless / _SLACK:
         return None
     profile, parameters = builder.windows(step) if row.kind == "windows" else builder.roots()
     certified = row.level == _ALL and not row.printed
-    return Tube(
-        method=method, parameters=parameters, level=row.level, certified=certified, delta=delta,
-        horizon=float(horizon), constants=constants, objective=objective.given, profile=profile,
-    )  # fmt: skip
+    return question.tube(method, delta, parameters, profile, level=row.level, certified=certified)
 
 
 def check_method(method: str, *, continuous: bool, dimension: int) -> None:
@@ -160,7 +147,8 @@ def check_method(method: str, *, continuous: bool, dimension: int) -> None:
         raise ValueError(f"`method` {method!r} needs dimension 1, got {dimension}; drop '_cosh'.")
 
 
-def _check_hypotheses(constants: Constants, method: str, row: Baseline, schedule: Schedule) -> None:
+def _check_hypotheses(question: Question, method: str, row: Baseline) -> None:
+    constants, schedule = question.constants, question.schedule
     check_method(method, continuous=constants.continuous, dimension=constants.dimension)
     worst = float(np.max(schedule.slopes))
     if row.kind == "windows" and row.tail != "sharp":
@@ -183,17 +171,22 @@ def _checked_step(step: float, schedule: Schedule) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Builder:
-    constants: Constants
-    method: str
-    row: Baseline
-    schedule: Schedule
+    question: Question
     delta: float
-    objective: Objective
+    method: str
     epsilon: float | None
+
+    @property
+    def row(self) -> Baseline:
+        return BASELINES[self.method]
+
+    @property
+    def schedule(self) -> Schedule:
+        return self.question.schedule
 
     def tail(self, count: float) -> Tail:
         """B for a number of events, with the best free parameter."""
-        row, n, nu = self.row, self.constants.dimension, self.constants.nu
+        row, n, nu = self.row, self.question.constants.dimension, self.question.constants.nu
         if row.tail == "sharp":
             return sharp_tail(delta=self.delta, dimension=nu if self.schedule.any_power else n, count=count)
         if row.tail == "moment":
@@ -207,7 +200,7 @@ class _Builder:
 
     def size(self, count: float) -> float:
         """B in floating point (the growth bound stands for the sharp one)."""
-        n, level = self.constants.dimension, math.log(count) - math.log(self.delta)
+        n, level = self.question.constants.dimension, math.log(count) - math.log(self.delta)
         if self.row.tail == "cosh":
             return 2 * math.log(2) + 2 * level
         return best_growth(n, level) if self.epsilon is None else growth(self.epsilon, n, level)
@@ -218,7 +211,7 @@ class _Builder:
         if row.kind == "windows":
             scale = self._closed_scale() if self._plain else self._sum_scale
             return scale(step) if step is not None else rough_scale(data, scale, self._most)
-        roots, weights = self.objective.roots(data, scaled=row.kind == "scaled")
+        roots, weights = self.question.goal.roots(data, scaled=row.kind == "scaled")
         count = data.horizon if self.method.startswith("prop3") else 1.0
         with np.errstate(over="ignore", invalid="ignore"):
             scale_value = float(np.max(roots / weights)) * math.sqrt(self.size(count)) * data.unit
@@ -264,7 +257,7 @@ class _Builder:
     def _closed_scale(self) -> Callable[[float], float]:
         """Objective of Thms 3 and 5 for constant data, as a function of the step."""
         data = self.schedule
-        roots, weights = self.objective.roots(data)
+        roots, weights = self.question.goal.roots(data)
         rate, noise = data.rates[0], data.noise[0]
         shrink = 1.0 if data.continuous else math.exp(2 * rate)
 
@@ -277,9 +270,9 @@ class _Builder:
 
     def _sum_scale(self, step: float) -> float:
         """Objective of the window sums, as a function of the step."""
-        data, weights = self.objective.pieces(self.schedule)
+        data, weights = self.question.goal.pieces(self.schedule)
         with np.errstate(over="ignore", invalid="ignore"):
-            scale = window_scale(data, step, weights, final=self.objective.kind == "final")
+            scale = window_scale(data, step, weights, final=self.question.goal.kind == "final")
             scale *= math.sqrt(self.size(self._events(step)))
         return scale if scale == scale else math.inf
 

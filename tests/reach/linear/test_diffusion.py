@@ -13,6 +13,7 @@ from certbound.reach.linear.answer import linear_answer, linear_reach
 from certbound.reach.linear.diffusion import DiffusionRun
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import LinearRun
+from certbound.reach.linear.shares import Share
 
 Array = NDArray[np.float64]
 
@@ -55,12 +56,12 @@ def free(bound: float) -> cb.Problem:
     return cb.Problem(system, initial=[0.0], safe=safe, horizon=1.0, delta=1e-2)
 
 
-def level(problem: cb.Problem, log_nonlinear: float) -> float:
+def level(problem: cb.Problem, nonlinear: Share) -> float:
     """log10 of the bound for one delta_N, by the engine that fits the noise."""
     engine = Linearisation.of(problem)
     additive = isinstance(problem.system.diffusion, np.ndarray)  # type: ignore[union-attr]
     run = LinearRun(engine) if additive else DiffusionRun(engine)
-    return run.probability(log_nonlinear).log_probability / float(np.log(10.0))
+    return run.probability(nonlinear).log_probability / float(np.log(10.0))
 
 
 @pytest.mark.parametrize(("build", "steps"), [(growing, 200), (oscillator, 300), (pendulum, 1500)])
@@ -68,7 +69,7 @@ def level(problem: cb.Problem, log_nonlinear: float) -> float:
 def test_simulation_does_not_contradict_the_bound(build: Callable[[], cb.Problem], steps: int, paths: int) -> None:
     problem = build()
     found = cb.simulate_exits(problem, paths=paths, rng=np.random.default_rng(1), steps=steps)
-    bound = 10 ** level(problem, float(np.log(problem.delta / 10)))
+    bound = 10 ** level(problem, Share.of(problem.delta / 10))
     assert found.exits > 0  # the simulation can tell
     assert found.lower <= bound < 0.3
 
@@ -77,16 +78,16 @@ def test_noise_frozen_on_the_nominal_would_be_unsound_and_is_not_what_is_proved(
     problem = free(0.4)
     frozen = problem.replace(system=cb.ContinuousSystem(lambda t, x: [0 * x[0]], states=1, diffusion=[[0.1]]))
     found = cb.simulate_exits(problem, paths=100_000, rng=np.random.default_rng(2), steps=200)
-    assert 10 ** level(frozen, np.log(1e-3)) < found.lower  # the formula without M
-    assert found.lower <= 10 ** level(problem, np.log(1e-3)) < 0.3
+    assert 10 ** level(frozen, Share.of(1e-3)) < found.lower  # the formula without M
+    assert found.lower <= 10 ** level(problem, Share.of(1e-3)) < 0.3
 
 
 def test_the_bound_tends_to_that_of_additive_noise() -> None:
     changes = {"safe": [cb.Inside(cb.Box([-0.4], [0.9]))], "delta": 1e-9}
     additive = growing(0.0, **changes)
     assert isinstance(additive.system.diffusion, np.ndarray)  # type: ignore[union-attr]
-    limit = level(additive, -45.0)
-    levels = [level(growing(gain, **changes), -45.0) for gain in (1e-1, 1e-2, 1e-4)]
+    limit = level(additive, Share(-45.0))
+    levels = [level(growing(gain, **changes), Share(-45.0)) for gain in (1e-1, 1e-2, 1e-4)]
     assert limit <= levels[2] < levels[1] < levels[0]
     assert levels[2] == pytest.approx(limit, abs=0.02)
 
@@ -96,8 +97,8 @@ def test_all_noise_goes_into_the_martingale_where_it_varies_most() -> None:
     safe = [cb.Inside(cb.HalfSpace([1.0], 2.0))]
     problem = cb.Problem(system, initial=[1.0], safe=safe, horizon=2.0, delta=5e-2)
     run = DiffusionRun(Linearisation.of(problem))
-    outcome = run.probability(-4.0)
-    assert run.accepted[-4.0].reference is run.references[1]
+    outcome = run.probability(Share(-4.0))
+    assert run.accepted[Share(-4.0)].reference is run.references[1]
     assert outcome.log_probability < np.log(0.1)
 
 
@@ -117,9 +118,9 @@ def test_the_deviation_tube_holds_simulated_deviations() -> None:
 
 def test_the_tube_that_bounds_the_noise_contains_what_follows_from_it() -> None:
     run = DiffusionRun(Linearisation.of(oscillator()))
-    outcome = run.probability(float(np.log(1e-3)))
+    outcome = run.probability(Share.of(1e-3))
     assert outcome.bounds is not None
-    levels, _ = run.levels(float(np.log(1e-3)))
+    levels, _ = run.levels(Share.of(1e-3))
     low, high = run.deviations(levels, *outcome.bounds)  # type: ignore[misc]
     active = len(run.engine.model.active)
     again = run.excess(run.held.reference, low[:, :active], high[:, :active])
@@ -160,4 +161,4 @@ def test_a_diffusion_of_time_alone_is_bounded_as_well() -> None:
     system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=lambda t, x: [[0.1 + 0.05 * np.sin(t)]])
     problem = growing().replace(system=system)
     found = cb.simulate_exits(problem, paths=100_000, rng=np.random.default_rng(4), steps=200)
-    assert found.lower <= 10 ** level(problem, np.log(1e-3)) < 0.1
+    assert found.lower <= 10 ** level(problem, Share.of(1e-3)) < 0.1

@@ -10,8 +10,9 @@ from certbound.reach.linear.answer import linear_answer
 from certbound.reach.linear.fit import fitted
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import LinearRun
+from certbound.reach.linear.shares import Share
 
-LOG = float(np.log(1e-3))
+LIKELY = Share.of(1e-3)
 
 
 def cubic(width: float = 0.6, sigma: float = 0.05) -> cb.Problem:
@@ -23,14 +24,14 @@ def cubic(width: float = 0.6, sigma: float = 0.05) -> cb.Problem:
 
 def test_the_fit_halves_the_remainder_and_keeps_constant_entries() -> None:
     plain = Linearisation(cubic(), pieces=50)
-    engine = fitted(plain, LOG)
+    engine = fitted(plain, LIKELY)
     assert engine.correction is not None
     assert np.all(engine.correction[..., 1, 0] < 0)  # the cubic spring is stiffer away from 0
     assert not np.any(engine.correction[..., [0, 0, 1], [0, 1, 1]])
     widths = []
     for own in (plain, engine):
         run = LinearRun(own)
-        bounds = run.include(run.levels(LOG)[0], 2)
+        bounds = run.include(run.levels(LIKELY)[0], 2)
         assert bounds is not None
         widths.append(float(np.max(bounds[1] - bounds[0])))
     assert widths[1] < 0.5 * widths[0]
@@ -39,17 +40,17 @@ def test_the_fit_halves_the_remainder_and_keeps_constant_entries() -> None:
 def test_discrete_time_is_fitted_too() -> None:
     system = cb.DiscreteSystem(lambda x: [x[0] - 0.3 * np.tanh(2 * x[0])], states=1, noise=cb.Gaussian(std=0.05))
     problem = cb.Problem(system, initial=cb.Box([-1.0], [1.0]), safe=[], horizon=6, delta=1e-2)
-    engine = fitted(Linearisation(problem), float(np.log(1e-2)))
+    engine = fitted(Linearisation(problem), Share.of(1e-2))
     assert np.all(engine.slopes[0][0, :3] > engine.tangents[0][0, :3] + 0.05)
 
 
 def test_a_linear_model_is_left_alone() -> None:
     engine = Linearisation(cb.load("ou"), pieces=10)
-    assert fitted(engine, LOG) is engine
+    assert fitted(engine, LIKELY) is engine
 
 
 def test_another_grid_keeps_the_fit() -> None:
-    engine = fitted(Linearisation(cubic(), pieces=60), LOG)
+    engine = fitted(Linearisation(cubic(), pieces=60), LIKELY)
     coarse = engine.on_grid(20)
     assert coarse.pieces == 20
     assert coarse.correction is not None
@@ -62,7 +63,7 @@ def test_a_fit_that_would_be_too_steep_is_not_used() -> None:
     system = cb.ContinuousSystem(lambda x: -x - 50 * x**3, states=1, diffusion=[[0.05]])
     problem = cb.Problem(system, initial=cb.Box([-4.0], [4.0]), safe=[], horizon=2.0, delta=1e-3)
     engine = Linearisation(problem, pieces=50)
-    assert fitted(engine, LOG) is engine
+    assert fitted(engine, LIKELY) is engine
 
 
 @pytest.mark.parametrize(("horizon", "sigma"), [

@@ -14,6 +14,7 @@ from certbound.errors import EngineError
 from certbound.reach.linear.answer import linear_answer, linear_reach
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import LinearRun
+from certbound.reach.linear.shares import Share
 from certbound.simulation.estimates.deviations import Measure, sup_deviation
 
 Array = NDArray[np.float64]
@@ -101,7 +102,7 @@ def test_the_remainder_bound_contains_the_remainder_at_random_points() -> None:
     problem = cb.load("unicycle")
     run = LinearRun(Linearisation(problem, pieces=40))
     engine = run.engine
-    levels, _ = run.levels(np.log(1e-3))
+    levels, _ = run.levels(Share.of(1e-3))
     shape = (1, engine.pieces, engine.n)
     low, high = run.deviations(levels, np.zeros(shape), np.zeros(shape))  # type: ignore[misc]
     extra = run.extra.reshape(engine.pieces, *run.extra.shape[2:])
@@ -204,7 +205,7 @@ def test_a_direction_alone_needs_a_proof() -> None:
 @pytest.mark.parametrize("effort", [0, 1, 2])
 def test_bounds_of_the_remainder_prove_themselves(effort: int) -> None:
     run = LinearRun(Linearisation.of(cb.load("unicycle").replace(horizon=1.0)), asked=False)
-    levels, _ = run.levels(float(np.log(1e-4)))
+    levels, _ = run.levels(Share.of(1e-4))
     bounds = run.include(levels, effort)
     assert bounds is not None
     implied = run.deviations(levels, *bounds)
@@ -221,7 +222,7 @@ def test_bounds_of_the_remainder_prove_themselves(effort: int) -> None:
 
 def test_a_piece_that_needs_more_is_tried_again_alone() -> None:
     run = LinearRun(Linearisation.of(cb.load("unicycle").replace(horizon=1.0)), asked=False)
-    levels, _ = run.levels(float(np.log(1e-4)))
+    levels, _ = run.levels(Share.of(1e-4))
     bounds = run.include(levels, 1)
     assert bounds is not None
     implied = run.deviations(levels, *bounds)
@@ -273,8 +274,8 @@ def test_no_room_and_no_level_together_are_no_number(monkeypatch: pytest.MonkeyP
 def test_a_target_out_of_reach_is_told_by_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
     looks = []
 
-    def promise(run: LinearRun, log_nonlinear: float, effort: int, limit: float = 0.0) -> float:
-        looks.append((log_nonlinear, effort))
+    def promise(run: LinearRun, nonlinear: Share, effort: int, limit: float = 0.0) -> float:
+        looks.append((nonlinear.log, effort))
         return limit + 1.0
 
     monkeypatch.setattr(LinearRun, "promise", promise)
@@ -290,6 +291,6 @@ def test_leaving_costs_no_less_than_the_noise_at_one_time() -> None:
         box = cb.Box([-half, -2.0], [half, 2.0])
         problem = oscillator(initial=cb.Box([0.3, -0.1], [0.4, 0.1]), safe=[cb.Inside(box)], delta=1e-3)
         run = linear_answer(problem, thorough=False).run
-        least = run._one_time(np.log(1e-4))
-        assert -np.inf < least <= run.promise(np.log(1e-4), 3)
-        assert run.promise(np.log(1e-4), 3, limit=least - 1.0) == least
+        least = run._one_time(Share.of(1e-4))
+        assert -np.inf < least <= run.promise(Share.of(1e-4), 3)
+        assert run.promise(Share.of(1e-4), 3, limit=least - 1.0) == least

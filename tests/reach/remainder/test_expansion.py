@@ -12,9 +12,10 @@ from certbound.problem.model.analysis import adds_plainly
 from certbound.reach.linear.fit import fitted
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import LinearRun
+from certbound.reach.linear.shares import Share
 from certbound.reach.remainder.bound import Remainder
 from certbound.reach.remainder.expansion import Expansion
-from certbound.reach.remainder.polytope import linear_range
+from certbound.reach.remainder.polytope import Boxes, Polytope, linear_range
 from certbound.reach.remainder.samples import sampled_range
 
 Array = NDArray[np.float64]
@@ -86,7 +87,7 @@ def remainder(engine: Linearisation, k: int, theta: Array, s: Array) -> Array:
 def test_boxes_and_their_parts_in_a_polytope_contain_the_remainder(problem: cb.Problem, fit: bool) -> None:
     engine = Linearisation(problem, pieces=12) if problem.system.time == "continuous" else Linearisation(problem)
     if fit:
-        engine = fitted(engine, float(np.log(1e-3)))
+        engine = fitted(engine, Share.of(1e-3))
         assert engine.correction is not None
     active, rng = engine.model.active, np.random.default_rng(5)
     count, boxes = len(active), 400
@@ -96,9 +97,10 @@ def test_boxes_and_their_parts_in_a_polytope_contain_the_remainder(problem: cb.P
     rows = rng.normal(size=(engine.pieces, 2, count))
     low, high = -rng.uniform(0.1, 0.5, (engine.pieces, 2)), rng.uniform(0.1, 0.5, (engine.pieces, 2))
     expansion = Expansion(engine.model, engine.frame)
-    parts = expansion.boxes(items, centre, radius)
-    whole = expansion.plain_range(parts, radius)
-    curbed = expansion.polytope_range(items, parts, centre, radius, low, high, rows)
+    some = Boxes(items, centre, radius)
+    parts = expansion.parts(some)
+    whole = expansion.plain_range(parts, some)
+    curbed = expansion.polytope_range(parts, some, Polytope(low, high, rows))
     assert not parts.bad.any()
     assert np.all(curbed[0] >= whole[0] - 1e-9)
     assert np.all(curbed[1] <= whole[1] + 1e-9)
@@ -143,13 +145,13 @@ def test_a_bound_asked_for_is_proved_with_less_work_than_a_tight_one(monkeypatch
     engine = Linearisation(cb.load("unicycle"), pieces=10)
     low, high = -0.2 * np.ones((10, 3)), 0.2 * np.ones((10, 3))
     rows, seen = np.zeros((10, 0, 3)), [0]
-    original = Expansion.boxes
+    original = Expansion.parts
 
-    def counted(self: Expansion, items: Array, centre: Array, radius: Array) -> object:
-        seen[0] += len(items)
-        return original(self, items, centre, radius)  # type: ignore[arg-type]
+    def counted(self: Expansion, boxes: Boxes) -> object:
+        seen[0] += len(boxes)
+        return original(self, boxes)
 
-    monkeypatch.setattr(Expansion, "boxes", counted)
+    monkeypatch.setattr(Expansion, "parts", counted)
     tight = engine.model.bound(engine.frame, low, high, rows, 3)
     work, seen[0] = seen[0], 0
     width = tight[1] - tight[0]
@@ -210,12 +212,12 @@ def test_boxes_are_not_cut_where_cutting_does_not_help(monkeypatch: pytest.Monke
     problem = cb.load("pendulum").replace(horizon=1.0)
     engine = Linearisation.of(problem)
     run = LinearRun(engine)
-    original, seen = Expansion.boxes, [0]
+    original, seen = Expansion.parts, [0]
 
-    def counted(self: Expansion, items: Array, centre: Array, radius: Array) -> object:
-        seen[0] += len(items)
-        return original(self, items, centre, radius)  # type: ignore[arg-type]
+    def counted(self: Expansion, boxes: Boxes) -> object:
+        seen[0] += len(boxes)
+        return original(self, boxes)
 
-    monkeypatch.setattr(Expansion, "boxes", counted)
-    assert run.include(run.levels(float(np.log(1e-4)))[0], 3) is not None
+    monkeypatch.setattr(Expansion, "parts", counted)
+    assert run.include(run.levels(Share.of(1e-4))[0], 3) is not None
     assert seen[0] < 100 * engine.pieces

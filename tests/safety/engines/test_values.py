@@ -10,6 +10,7 @@ import pytest
 import certbound as cb
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
+from certbound.safety.answers import Request
 from certbound.safety.engines.values import log10_outward, values_engine
 from certbound.safety.verification import verify_safety
 
@@ -46,7 +47,7 @@ def test_auto_takes_the_engine_where_the_others_prove_too_little() -> None:
 
 
 def test_it_is_left_out_when_another_engine_has_answered() -> None:
-    assert not values_engine(logistic(), quick=True).applicable
+    assert not values_engine(logistic(), Request(quick=True)).applicable
 
 
 @pytest.mark.parametrize(

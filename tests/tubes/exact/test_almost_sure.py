@@ -7,7 +7,7 @@ import pytest
 
 from certbound.tubes.constants import Constants
 from certbound.tubes.exact.almost_sure import AlmostSureProfile
-from certbound.tubes.kummer.profile import Start
+from certbound.tubes.question import Start
 from certbound.tubes.schedule import make_schedule
 from certbound.tubes.tuning import tune_tube
 

@@ -14,9 +14,10 @@ from scipy.special import gamma, hyp1f1, iv
 from certbound.rigor.balls import excess_floor, precision
 from certbound.tubes.constants import Constants
 from certbound.tubes.kummer.exit import Tangents, exit_level, union_level, union_may_help
-from certbound.tubes.kummer.profile import Start, kummer_tube, log_initial
+from certbound.tubes.kummer.profile import kummer_tube, log_initial
 from certbound.tubes.kummer.search import log_gain
 from certbound.tubes.objective import read_clearance
+from certbound.tubes.question import Start
 from certbound.tubes.schedule import make_schedule
 from certbound.tubes.tuning import bound_exit_probability, tune_tube
 from tests.tubes.yardstick import estimate_exit_probability

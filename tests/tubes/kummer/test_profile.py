@@ -12,7 +12,8 @@ from scipy.special import hyp1f1, iv
 
 from certbound.rigor.balls import kummer_excess, precision
 from certbound.tubes.constants import Constants
-from certbound.tubes.kummer.profile import Start, kummer_tube
+from certbound.tubes.kummer.profile import kummer_tube
+from certbound.tubes.question import Start
 
 OU = Constants(rate=-0.5, sigma=0.1**0.5, dimension=1)
 
