@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from flint import arb, arb_mat
 
-from certbound.checker.balls import column, identity, magnitude, row_sums
+from certbound.checker.balls import column, diagonal, identity, magnitude, row_sums
 from certbound.checker.report import Budget, Unproved
 
 __all__ = [
@@ -79,8 +79,22 @@ def _series(
     raise Unproved("the pieces are too long for the slope: its norm times a piece's length is beyond all use")
 
 
-def continuous_piece(slope: arb_mat, drift: arb_mat, length: arb, noise: arb_mat) -> Piece:
-    """The data of one piece in continuous time; ``noise`` is g g^T."""
+def continuous_piece(
+    slope: arb_mat, drift: arb_mat, length: arb, noise: arb_mat, units: Sequence[arb] = ()
+) -> Piece:
+    """The data of one piece in continuous time; ``noise`` is g g^T, and the series run in ``units`` of the states."""
+    n = slope.nrows()
+    unit = diagonal(units or [arb(1)] * n)
+    back = diagonal([1 / value for value in units] or [arb(1)] * n)
+    own = _piece(back * slope * unit, back * drift * unit, length, back * noise * back)
+    return Piece(
+        length=length, transition=unit * own.transition * back, gathered=unit * own.gathered * back,
+        noise=unit * own.noise * unit, deviation=magnitude(unit * own.deviation * back),
+        second=magnitude(unit * own.second * back), slope=slope, size=magnitude(slope), drift=magnitude(drift),
+    )  # fmt: skip
+
+
+def _piece(slope: arb_mat, drift: arb_mat, length: arb, noise: arb_mat) -> Piece:
     n = slope.nrows()
     a, k, one = slope * length, drift * (length * length), identity(n)
     size = magnitude(slope)
