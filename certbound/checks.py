@@ -86,11 +86,12 @@ def matrix(name: str, value: Any, rows: int | None = None, columns: int | None =
 
 
 def symmetric(name: str, value: Any, size: int | None = None) -> Array:
-    """A symmetric matrix (asymmetry of rounding size is averaged away)."""
+    """A symmetric matrix; what rounding makes of one is averaged away, in units in which its diagonal is 1."""
     array = matrix(name, value, size, size)
     if array.shape[0] != array.shape[1]:
         raise ValueError(f"`{name}` must be square, got shape {array.shape}.")
-    if not np.allclose(array, array.T, rtol=1e-12, atol=1e-14 * float(np.max(np.abs(array)))):
+    scale = np.sqrt(np.abs(np.diag(array)))
+    if np.any(np.abs(array - array.T) > _SLACK * (np.outer(scale, scale) + np.abs(array))):
         raise ValueError(f"`{name}` must be symmetric; use (M + M.T) / 2.")
     return frozen((array + array.T) / 2)
 

@@ -246,7 +246,8 @@ class Problem(Shown):
             if len(rows) < self.horizon:
                 raise ValueError(f"`plan` must have {self.horizon} rows, one a step, got {len(rows)}.")
             rows = rows[: self.horizon]
-        slack = 1e-9 * (1.0 + np.abs(rows))
+        width = box.high - box.low
+        slack = 1e-9 * (np.abs(rows) + np.where(np.isfinite(width), width, 0.0))
         outside = (rows < box.low - slack) | (rows > box.high + slack)
         if np.any(outside):
             row, column = (int(k) for k in np.argwhere(outside)[0])

@@ -28,22 +28,26 @@ CORNERS = 10
 def ball_root(matrix: Array) -> Array:
     """A float matrix T with P^-1 <= T T^T, close to equality: {||y||_P <= 1} lies in T times the unit ball.
 
-    Proved through T^T P T >= I, whose congruence with T^-1 is P >= (T T^T)^-1.
+    Proved through T^T P T >= I, whose congruence with T^-1 is P >= (T T^T)^-1, after powers of two (which are exact)
+    have brought the diagonal of P near 1: states in small units must not hide behind those in large ones.
 
     Raises
     ------
     SolverError
         If ``matrix`` is too ill-conditioned for double precision.
     """
-    matrix = np.asarray(matrix, dtype=float)
+    given = np.asarray(matrix, dtype=float)
+    units = np.exp2(-np.round(0.5 * np.log2(np.maximum(np.diag(given), 1e-300))))
+    matrix = units[:, None] * given * units
     values, vectors = np.linalg.eigh(matrix)
-    if values[0] > 0:
+    if values[0] > 0 and np.array_equal(matrix / units[:, None] / units, given):
         guess = vectors / np.sqrt(values)
         for slack in 10.0 ** np.arange(-14, -1):
             root: Array = guess * (1 + slack)
             point = Interval.point(root)
-            if float(eigenvalue_lower(point.T @ Interval.point(matrix) @ point)) >= 1.0:
-                return root
+            proved = float(eigenvalue_lower(point.T @ Interval.point(matrix) @ point)) >= 1.0
+            if proved and np.array_equal(units[:, None] * root / units[:, None], root):
+                return np.asarray(units[:, None] * root)
     raise SolverError("`metric` could not be inverted with a proof; its condition number is too large.")
 
 

@@ -311,12 +311,12 @@ def _(data: Data) -> None:
     _claim(data, -23.0)
 
 
-@forges("the series of a piece converge", "flow", "linear/response.py", "continuous_piece", "too long for the slope")
+@forges("the series of a piece converge", "flow", "linear/response.py", "_piece", "too long for the slope")
 def _(data: Data) -> None:
     _scale(_cell(data)["slopes"][3], 0, 1.0, 1e4)
 
 
-@forges("y starts anywhere in its cell", "straight", "linear/response.py", "supports", BEYOND)
+@forges("y starts anywhere in its cell", "straight", "linear/response.py", "_carried", BEYOND)
 def _(data: Data) -> None:
     _from(data, [0.1], [0.95])
 

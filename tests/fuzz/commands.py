@@ -345,7 +345,11 @@ class Run:
         """A finding where hits out of paths refute ``level``, on every finer grid as well."""
         said = []
         for factor in (1, *FINER) if self.draft.continuous else (1,):
-            hits, paths = count(oracle.STEPS * factor)
+            try:
+                hits, paths = count(oracle.STEPS * factor)
+            except Exception as error:  # noqa: BLE001  (what was answered cannot be used: a finding too)
+                self.report(command, "error", signature_of(error), str(error))
+                return
             lower = oracle.lower_limit(hits, paths)
             said.append(f"{hits} of {paths} in {oracle.STEPS * factor} steps")
             if lower <= level:

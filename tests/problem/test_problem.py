@@ -244,6 +244,42 @@ def test_a_start_that_touches_or_comes_before_a_window_is_accepted(start, constr
     assert problem(initial=start, safe=[constraint]).horizon == 5
 
 
+EDGES = [
+    ([0.1, 0.1], [0.1001, 0.1], Inside(Polytope([[0.7, -0.1], [1.0, 0.0]], [0.7 * 0.1 - 0.1 * 0.1, 9.0]))),
+    ([0.3, 0.4], [0.3, 0.4001], Inside(Ball([0, 0], 0.5))),
+    ([0.3, 0.4], [0.3, 0.3999], Outside(Ball([0.3, 0], 0.4))),
+    (Ball([0.3, 0.1], 0.3), Ball([0.3001, 0.1], 0.3), Inside(HalfSpace([1.0, 0.0], 0.6))),
+]
+
+
+@pytest.mark.parametrize(("start", "beyond", "wall"), EDGES)
+@pytest.mark.parametrize("unit", [1e-9, 0.3, 1e8])
+def test_units_decide_nothing_for_a_start_on_an_edge(start, beyond, wall, unit):
+    constraint = type(wall)(_in_units(wall.region, unit))
+    assert problem(initial=_in_units(start, unit), safe=[constraint]).safe
+    with pytest.raises(ValueError, match="`initial` must satisfy"):
+        problem(initial=_in_units(beyond, unit), safe=[constraint])
+
+
+def _in_units(region, unit):
+    """A set of states as it reads in other units of length."""
+    if isinstance(region, Ball):
+        return Ball(unit * region.center, unit * region.radius)
+    if isinstance(region, HalfSpace):
+        return HalfSpace(region.normal, unit * region.bound)
+    return Polytope(region.A, unit * region.b) if isinstance(region, Polytope) else unit * np.array(region)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_a_plan_outside_its_bounds_is_refused_in_all_units(unit):
+    system = ContinuousSystem(lambda x, u: u - x, states=1, inputs=Box([-unit], [unit]), diffusion=[[0.1 * unit]])
+    wall = Inside(Box([-9 * unit], [9 * unit]))
+    with pytest.raises(ValueError, match="`plan` must stay in the input bounds"):
+        Problem(system, initial=[0.0], safe=[wall], horizon=1, plan=[[unit], [1.5 * unit]])
+    rounded = Problem(system, initial=[0.0], safe=[wall], horizon=1, plan=[[unit], [(1 + 1e-12) * unit]])
+    assert rounded.plan.max() == unit
+
+
 def test_a_start_outside_the_domain_is_refused():
     with pytest.raises(ValueError, match="violates 'the model's domain'"):
         problem(safe=[], initial=[9, 9], domain=Box([-5, -5], [5, 5]))

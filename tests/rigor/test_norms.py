@@ -27,6 +27,12 @@ def test_the_ball_lies_in_the_image_of_the_root_and_fills_it(n):
     assert np.linalg.norm(above - exact) < 1e-6 * np.linalg.norm(exact)
 
 
+def test_the_root_of_a_metric_in_mixed_units_is_that_of_its_own_units():
+    matrix, units = metric(np.random.default_rng(0), 3, spread=0.5), np.exp2([60.0, 0.0, -40.0])
+    scaled = units[:, None] * ball_root(units[:, None] * matrix * units)
+    np.testing.assert_allclose(scaled @ scaled.T, ball_root(matrix) @ ball_root(matrix).T, rtol=1e-9)
+
+
 def test_a_metric_that_double_precision_cannot_invert_is_refused():
     with pytest.raises(SolverError, match="condition number"):
         ball_root(np.array([[1.0, 1.0], [1.0, 1.0 + 1e-15]]))

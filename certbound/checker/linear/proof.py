@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import pairwise
 
 from flint import arb, arb_mat, ctx
 
-from certbound.checker.balls import column, identity, row_sums, upper
+from certbound.checker.balls import balance, column, diagonal, identity, magnitude, row_sums, upper
 from certbound.checker.linear.diffusion import Along, Asked, StateNoise, Stopped
 from certbound.checker.linear.events import Windows, chain, sub_gaussian
 from certbound.checker.linear.families import Family, leaving
@@ -176,7 +177,9 @@ class _Cell:
     def probability(self, outputs: Sequence[OutputRemainder]) -> arb:
         """Upper bound of the probability that this cell's paths break a constraint."""
         self.pieces = self._pieces()
-        growth = sum(max(0.0, float(row_sums(p.transition).log() / arb.const_log2())) for p in self.pieces)
+        unit, back = diagonal(self.natural), diagonal([1 / value for value in self.natural])
+        grown = [row_sums(back * piece.transition * unit) for piece in self.pieces]
+        growth = sum(max(0.0, float(factor.log() / arb.const_log2())) for factor in grown)
         if growth <= 20:
             return self._probability(outputs)
         if not growth < math.inf:
@@ -215,17 +218,24 @@ class _Cell:
             asked.append(Asked(rows=demand.rows, levels=rooms[number_], factors=factors))
         return found.paid, found.along(asked)
 
+    @cached_property
+    def natural(self) -> list[arb]:
+        """Units of the states in which the slopes' rows and columns are about equal."""
+        largest = identity(self.model.dimension) * 0
+        for slopes in self.slopes:
+            largest = largest + magnitude(self.shared.full(slopes))
+        return balance(largest)
+
     def _pieces(self) -> list[Piece]:
         shared, state = self.shared, self.state
         fixed = identity(self.model.dimension) * 0 if state is not None else self.model.noise.covariance()
         self.budget.hold(self.shared.count * self.model.dimension**2 * (8 if self.model.continuous else 4))
         result = []
-        for k, (slopes, drifts) in enumerate(zip(self.slopes, self.drifts)):
+        for k, (slope, drifts) in enumerate(zip(map(shared.full, self.slopes), self.drifts)):
             self.budget.check()
             noise = fixed if state is None else state.noise(k)
-            slope = shared.full(slopes)
             if self.model.continuous:
-                result.append(continuous_piece(slope, shared.drift(drifts), shared.length, noise))
+                result.append(continuous_piece(slope, shared.drift(drifts), shared.length, noise, self.natural))
             else:
                 result.append(discrete_piece(slope, noise))
         return result

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from flint import arb, arb_mat
 
-from certbound.checker.balls import column, identity, magnitude, row_sums
+from certbound.checker.balls import column, diagonal, identity, magnitude, row_sums
 from certbound.checker.report import Budget, Unproved
 
 __all__ = [
@@ -26,8 +26,8 @@ __all__ = [
 
 _TERMS = 60
 _SMALL = arb(2) ** -100
-_BLOCK = 3e6
-"""Products of numbers between two looks at the clock."""
+_ROWS, _BLOCK = 512, 3e6
+"""Rows that are carried back together, and products of numbers between two looks at the clock."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,8 +79,22 @@ def _series(
     raise Unproved("the pieces are too long for the slope: its norm times a piece's length is beyond all use")
 
 
-def continuous_piece(slope: arb_mat, drift: arb_mat, length: arb, noise: arb_mat) -> Piece:
-    """The data of one piece in continuous time; ``noise`` is g g^T."""
+def continuous_piece(
+    slope: arb_mat, drift: arb_mat, length: arb, noise: arb_mat, units: Sequence[arb] = ()
+) -> Piece:
+    """The data of one piece in continuous time; ``noise`` is g g^T, and the series run in ``units`` of the states."""
+    n = slope.nrows()
+    unit = diagonal(units or [arb(1)] * n)
+    back = diagonal([1 / value for value in units] or [arb(1)] * n)
+    own = _piece(back * slope * unit, back * drift * unit, length, back * noise * back)
+    return Piece(
+        length=length, transition=unit * own.transition * back, gathered=unit * own.gathered * back,
+        noise=unit * own.noise * unit, deviation=magnitude(unit * own.deviation * back),
+        second=magnitude(unit * own.second * back), slope=slope, size=magnitude(slope), drift=magnitude(drift),
+    )  # fmt: skip
+
+
+def _piece(slope: arb_mat, drift: arb_mat, length: arb, noise: arb_mat) -> Piece:
     n = slope.nrows()
     a, k, one = slope * length, drift * (length * length), identity(n)
     size = magnitude(slope)
@@ -161,64 +175,60 @@ def supports(
     """
     n = transitions[0].nrows()
     budget.hold(3 * (n + 1) * sum(map(len, rows)))
-    flat: list[arb] = []
-    nodes: list[int] = []
-    centre: list[arb] = []
-    radius: list[arb] = []
-    reach: list[arb] = []
-
-    def take(node: int) -> None:
-        for row in rows[node]:
-            flat.extend(row)
-            nodes.append(node)
-            for values in (centre, radius, reach):
-                values.append(arb(0))
-
-    for j in range(len(transitions) - 1, -1, -1):
-        budget.check()
-        take(j + 1)
-        count = len(nodes)
-        if not count:
-            continue
-        load = loads[j]
-        middle = _products(flat, load.centre, budget)
-        boxes = [value for pair in zip(load.radius, load.box) for value in pair]
-        spread = _products([x.abs_upper() for x in flat], arb_mat(n, 2, boxes), budget)
-        for i in range(count):
-            centre[i] += middle[i]
-            radius[i] += spread[2 * i]
-            reach[i] += spread[2 * i + 1]
-        if load.generators is not None:
-            columns = load.generators.ncols()
-            shares = _products(flat, load.generators, budget)
-            for i in range(count):
-                reach[i] += sum((x.abs_upper() for x in shares[i * columns : (i + 1) * columns]), arb(0))
-        flat = _products(flat, transitions[j], budget)
-    take(0)
-    count = len(nodes)
-    if count:
-        spread = _products([x.abs_upper() for x in flat], arb_mat(n, 1, list(start)), budget)
-        reach = [a + b for a, b in zip(reach, spread)]
+    columns = [
+        (load.centre, arb_mat(n, 2, [x for pair in zip(load.radius, load.box) for x in pair]), load.generators)
+        for load in loads
+    ]
     low: list[list[arb]] = [[] for _ in rows]
     high: list[list[arb]] = [[] for _ in rows]
     size: list[list[arb]] = [[] for _ in rows]
-    for i, node in enumerate(nodes):
-        low[node].append((centre[i] - radius[i]).lower())
-        high[node].append((centre[i] + radius[i]).upper())
-        size[node].append(reach[i].upper())
+    pairs = [(node, row) for node, own in enumerate(rows) for row in own]
+    most = max(1, min(_ROWS, int(_BLOCK / (n * n))))
+    for first in range(0, len(pairs), most):
+        part = pairs[first : first + most]
+        centre, spread = _carried(part, transitions, columns, start, budget)
+        for i, (node, _) in enumerate(part):
+            low[node].append((centre[i, 0] - spread[i, 0]).lower())
+            high[node].append((centre[i, 0] + spread[i, 0]).upper())
+            size[node].append(spread[i, 1].upper())
     return Supports(low=low, high=high, reach=size)
 
 
-def _products(flat: list[arb], matrix: arb_mat, budget: Budget) -> list[arb]:
-    """Rows, one after another, times a matrix, block by block."""
-    n, columns = matrix.nrows(), matrix.ncols()
-    block = n * max(1, int(_BLOCK / (n * columns)))
-    result: list[arb] = []
-    for start in range(0, len(flat), block):
+def _carried(
+    pairs: Sequence[tuple[int, Sequence[arb]]], transitions: Sequence[arb_mat],
+    columns: Sequence[tuple[arb_mat, arb_mat, arb_mat | None]], start: Sequence[arb], budget: Budget,
+) -> tuple[arb_mat, arb_mat]:
+    """Pairs (node, row), nodes in order: sums of row . centre, and of |row| . radius and what reaches y, in two columns.
+
+    The last nodes' rows start; those of earlier nodes join them on the way back.
+    """
+    n, left = transitions[0].nrows(), len(pairs)
+    rows, centre, spread = arb_mat(0, n), arb_mat(0, 1), arb_mat(0, 2)
+    for node in range(pairs[-1][0], -1, -1):
         budget.check()
-        part = flat[start : start + block]
-        result += (arb_mat(len(part) // n, n, part) * matrix).entries()
-    return result
+        own = left
+        while left and pairs[left - 1][0] == node:
+            left -= 1
+        if left < own:  # in front, so that the order of the pairs stays
+            flat = [x for _, row in pairs[left:own] for x in row]
+            rows = arb_mat(len(pairs) - left, n, flat + rows.entries())
+            centre = arb_mat(len(pairs) - left, 1, [arb(0)] * (own - left) + centre.entries())
+            spread = arb_mat(len(pairs) - left, 2, [arb(0)] * (2 * (own - left)) + spread.entries())
+        if node == 0:
+            break
+        middle, boxes, generators = columns[node - 1]
+        centre, spread = centre + rows * middle, spread + _sizes(rows) * boxes
+        if generators is not None:
+            spread = spread + _sizes(rows * generators) * arb_mat(
+                generators.ncols(), 2, [arb(0), arb(1)] * generators.ncols()
+            )
+        rows = rows * transitions[node - 1]
+    return centre, spread + _sizes(rows) * arb_mat(n, 2, [x for value in start for x in (arb(0), value)])
+
+
+def _sizes(matrix: arb_mat) -> arb_mat:
+    """Upper bounds of the entries' sizes."""
+    return arb_mat(matrix.nrows(), matrix.ncols(), [x.abs_upper() for x in matrix.entries()])
 
 
 def over_piece(

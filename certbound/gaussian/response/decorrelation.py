@@ -160,12 +160,13 @@ def _derivatives(
 
 
 def _product(middle: Array, radius: Array, other: Array, width: Array) -> Interval:
-    """Row times column, both within a radius of their middles."""
+    """Row times column, both within a radius of their middles; the whole line where floats overflowed."""
     size = np.abs(other)
     centre = np.einsum("ai,ai->a", middle, other)
     spread = np.einsum("ai,ai->a", np.abs(middle) + radius, width) + np.einsum("ai,ai->a", radius, size)
     spread = spread * UP + 1e-14 * np.einsum("ai,ai->a", np.abs(middle), size)
-    return Interval(centre - spread, centre + spread)
+    known = np.isfinite(centre - spread) & np.isfinite(centre + spread)
+    return Interval(np.where(known, centre - spread, -np.inf), np.where(known, centre + spread, np.inf))
 
 
 def _second(d: dict[str, Interval], usable: Flags, own: Interval, twice: str, once: str) -> Interval:

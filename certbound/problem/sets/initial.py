@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
+from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid
 
 __all__ = ["check_start"]
 
 Array = NDArray[np.float64]
+_ROUNDING, _SLACK = 1e-12, 1e-9
+"""Shares of a state's size by which the start's centre, and its farthest part, may miss a constraint."""
 
 
 def check_start(initial: Box | Ball | Ellipsoid | GaussianStart, constraints: Sequence[Inside]) -> None:
@@ -43,52 +46,60 @@ def _center(initial: Box | Ball | Ellipsoid | GaussianStart) -> Array:
 
 
 def _fault(initial: Any, center: Array, constraint: Inside) -> str:
-    text = "(" + ", ".join(f"{value:g}" for value in center) + ")"
-    if not np.any(constraint.satisfied(center)) and not _on_boundary(center, constraint):
+    size = _size(initial, constraint.region)
+    if _misses(center, constraint, size):
+        text = "(" + ", ".join(f"{value:g}" for value in center) + ")"
         return f"the mean {text}" if isinstance(initial, GaussianStart) else f"its centre {text}"
     if isinstance(initial, GaussianStart):
         return ""
     sticks_out = _leaves if not isinstance(constraint, Outside) else _touches
-    return "a part of it" if sticks_out(initial, center, constraint.region) else ""
+    return "a part of it" if sticks_out(initial, center, constraint.region, _SLACK * size) else ""
 
 
-def _on_boundary(point: Array, constraint: Inside) -> bool:
-    """True for a start on the edge of an obstacle's closed set, which rounding must not decide."""
-    moved = point + 1e-12 * (1.0 + np.abs(point)) * np.array([[1.0], [-1.0]])
-    return isinstance(constraint, Outside) and bool(np.any(constraint.satisfied(moved)))
+def _size(initial: Any, region: Any) -> Array:
+    """How large each state is in the start and in the set's centre, shape (n,): what rounding is measured by."""
+    eye = np.eye(initial.dimension)
+    ends = [initial.mean] if isinstance(initial, GaussianStart) else [initial.support(eye), initial.support(-eye)]
+    size: Array = np.max(np.abs(ends), axis=0)
+    size[slice(None) if region.coordinates is None else list(region.coordinates)] += np.abs(region.center_at())
+    return size
 
 
-def _slack(value: Any) -> Any:
-    return 1e-9 * (1.0 + np.abs(value))
+def _misses(center: Array, constraint: Inside, size: Array) -> bool:
+    """Whether a point violates the constraint by more than rounding, which must decide nothing on an edge."""
+    if np.any(constraint.satisfied(center)):
+        return False
+    with np.errstate(divide="ignore", invalid="ignore"):  # nothing is left of a face along states that are 0
+        return bool(clearance(constraint, center, np.diag(size**2)) < -_ROUNDING)
 
 
-def _leaves(initial: Any, center: Array, region: Any) -> bool:
+def _leaves(initial: Any, center: Array, region: Any, slack: Array) -> bool:
     """Whether the start surely has a point outside the region."""
     if isinstance(region, (Ball, Ellipsoid)):
         if not isinstance(region, Ball):
             return False
-        return bool(_farthest(initial, region) > region.radius + _slack(region.radius))
+        return bool(_farthest(initial, region) > region.radius + np.max(region.local(slack)))
     normals, bounds = region.halfspaces()
     if not len(bounds):
         return False
     full = np.zeros((len(bounds), len(center)))
     full[:, range(len(center)) if region.coordinates is None else list(region.coordinates)] = normals
     reach = initial.support(full) - normals @ region.center_at()
-    return bool(np.any(reach > bounds + _slack(bounds)))
+    return bool(np.any(reach > bounds + np.abs(full) @ slack))
 
 
-def _touches(initial: Any, center: Array, region: Any) -> bool:
+def _touches(initial: Any, center: Array, region: Any, slack: Array) -> bool:
     """Whether the start surely has a point inside the region."""
     if isinstance(region, Ball):
-        return bool(_nearest(initial, region) < region.radius - _slack(region.radius))
+        return bool(_nearest(initial, region) < region.radius - np.max(region.local(slack)))
     normals, bounds = region.halfspaces() if not isinstance(region, Ellipsoid) else (np.empty(0), np.empty(0))
     if len(bounds) == 1 and region.coordinates is None:
-        return bool(-initial.support(-normals)[0] < bounds[0] - _slack(bounds[0]))
+        return bool(-initial.support(-normals)[0] < bounds[0] - np.abs(normals[0]) @ slack)
     if isinstance(region, Box) and isinstance(initial, Box):
         offset = region.center_at()
         low, high = region.low + offset, region.high + offset
-        below = region.local(initial.low) < high - _slack(0.0)
-        above = region.local(initial.high) > low + _slack(0.0)
+        below = region.local(initial.low) < high - region.local(slack)
+        above = region.local(initial.high) > low + region.local(slack)
         return bool(np.all(below & above))
     return False
 

@@ -274,14 +274,23 @@ def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = No
     Raises
     ------
     ArithmeticError
-        If the remainder feeds itself before the horizon ends.
+        If the remainder feeds itself before the horizon ends, or no bound of the noise along some state was found.
     """
     run = _run(problem, cells=cells, noise=noise)
     outcome = run.probability(Share.of(problem.delta / 2), 2 if noise else 1)
     if outcome.bounds is None:
         raise ArithmeticError(LinearAnswer(run=run, outcome=outcome, shown=outcome).reason)
     if noise:
-        reach = LinearAnswer(run=run, outcome=outcome, shown=outcome).reach
+        answer = LinearAnswer(run=run, outcome=outcome, shown=outcome)
+        tube = answer.tube
+        assert tube is not None
+        for name, half in zip(problem.system.states, tube.half_widths.T, strict=True):
+            if not np.all(np.isfinite(half)):
+                raise ArithmeticError(
+                    f"no bound of the deviation of {name} was found at delta = {problem.delta:.3g}; "
+                    "shorten the horizon, or use method='contraction'."
+                )
+        reach = answer.reach
         assert reach is not None
         return reach
     return _reach_tube(run, outcome.bounds, -np.inf, None)

@@ -26,7 +26,10 @@ __all__ = ["WINDOW", "WINDOW_TURN", "Linearisation"]
 Array = NDArray[np.float64]
 
 _FEWEST_PIECES, _MOST_PIECES = 50, 2000
-_STEP = 0.1  # ||J|| h of a piece
+_STEP = 0.1
+"""||J|| h of a piece, in units of the states that balance J: how far a row turns."""
+_SERIES = 2.0
+"""||J|| h of a piece in the states' own units: how many terms the series of its transition matrix need."""
 _ROUND = 1 + 1e-13
 _LARGE = 40  # states
 WINDOW = 0.05
@@ -87,14 +90,16 @@ class Linearisation:
 
     @classmethod
     def of(cls, problem: Problem, *, cells: int | None = None, noise: bool = True) -> Linearisation:
-        """The linearisation on a grid that resolves the nominal Jacobians: ||J|| h at most 0.1."""
+        """The linearisation on a grid that resolves the nominal Jacobians: see ``_STEP`` and ``_SERIES``."""
         if problem.system.time == "discrete":
             return cls(problem, cells=cells, noise=noise)
         trial = cls(problem, noise=noise)
         while trial.lost and 4 * trial.pieces <= _MOST_PIECES:  # a coarse grid loses a stiff system's nominal at once
             trial = cls(problem, pieces=4 * trial.pieces, noise=noise)
-        size = float(np.linalg.norm(np.nan_to_num(trial.slopes[0]), axis=(-2, -1)).max())
-        pieces = int(np.clip(np.ceil(problem.horizon * size / _STEP), _FEWEST_PIECES, _MOST_PIECES))
+        slopes = np.nan_to_num(trial.slopes[0])
+        sizes = [float(np.linalg.norm(found, axis=(-2, -1)).max()) for found in (balanced(slopes), slopes)]
+        least = problem.horizon * max(sizes[0] / _STEP, sizes[1] / _SERIES)
+        pieces = int(np.clip(np.ceil(least), _FEWEST_PIECES, _MOST_PIECES))
         alike = (cells is None or cells == 1) and trial._pieces(pieces) == trial.pieces
         return trial if alike else cls(problem, cells=cells, pieces=pieces, noise=noise)
 
@@ -382,6 +387,15 @@ class Linearisation:
             return None
         found = {i for i, _ in self.model.entries} | set(np.flatnonzero((self.slopes[2] != 0).any(axis=(0, 1, 3))))
         return np.array(sorted(found), dtype=np.int64)
+
+
+def balanced(slopes: Array) -> Array:
+    """Slopes (..., n, n) in units of the states, powers of two, in which their rows and columns are about equal."""
+    from scipy.linalg import matrix_balance
+
+    largest = np.abs(slopes).reshape(-1, *slopes.shape[-2:]).max(axis=0)
+    units = matrix_balance(largest, permute=False, separate=True)[1][0]
+    return np.asarray(slopes / units[:, None] * units)
 
 
 def _square(a: Array) -> Array:

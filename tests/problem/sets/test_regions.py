@@ -1,5 +1,7 @@
 """Sets know their points, supports and faces, in some coordinates or all, also when they move."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -180,3 +182,11 @@ def test_round_sets_have_no_faces(region):
 def test_arrays_are_read_only():
     with pytest.raises(ValueError, match="read-only"):
         Box([0], [1]).low[0] = 5
+
+
+def test_a_shape_is_symmetric_in_the_units_of_its_small_entries():
+    large = np.diag([1e16, 2.0, 3.0])
+    for asymmetry, refused in [(1e-13, False), (1e-2, True)]:
+        shape = large + asymmetry * np.eye(3)[:, [0, 2, 1]] * [[0], [1], [0]]
+        with pytest.raises(ValueError, match="must be symmetric") if refused else nullcontext():
+            assert Ellipsoid([0, 0, 0], shape).shape[1, 2] == asymmetry / 2

@@ -74,3 +74,13 @@ def test_the_unicycle_is_safe_at_ten_times_its_noise(horizon: float, sigma: floa
     answer = linear_answer(problem)
     assert len(answer.run.engine.centres) == 1
     assert answer.log10_delta <= -3
+
+
+def test_units_of_single_states_cost_few_pieces_of_time() -> None:
+    """||J|| is 1000 in these units, and 1.4 in the states' own."""
+    slope = np.array([[0.0, 1000.0], [-0.001, -0.1]])
+    system = cb.linear_system(slope, diffusion=np.diag([0.1, 1e-4]))
+    start, safe = cb.Box([0, 0], [0, 0]), [cb.Inside(cb.Box([-3, -3], [3, 3]))]
+    problem = cb.Problem(system, initial=start, safe=safe, horizon=1.0)
+    assert Linearisation.of(problem).pieces == 501
+    assert Linearisation.of(problem.replace(horizon=0.01)).pieces == 50
