@@ -62,7 +62,7 @@ synthesis.controllers
 plotting
 html_report
 cli.describe cli.messages cli.output
-cli.options
+cli.options cli.pictures
 cli.clock
 cli.commands
 cli
