@@ -57,6 +57,9 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.synthesis.plans import synthesize_plan as synthesize_plan
     from certbound.synthesis.terminal import TerminalSet as TerminalSet
     from certbound.tubes.constants import Constants as Constants
+    from certbound.tubes.paper import AffineMartingale as AffineMartingale
+    from certbound.tubes.paper import estimate_affine_excess as estimate_affine_excess
+    from certbound.tubes.paper import log_energy as log_energy
     from certbound.tubes.tube import Tube as Tube
     from certbound.tubes.tuning import bound_exit_probability as bound_exit_probability
     from certbound.tubes.tuning import tune_tube as tune_tube
@@ -91,6 +94,9 @@ _HOME = {
     "Tube": "tubes.tube",
     "tune_tube": "tubes.tuning",
     "bound_exit_probability": "tubes.tuning",
+    "AffineMartingale": "tubes.paper",
+    "estimate_affine_excess": "tubes.paper",
+    "log_energy": "tubes.paper",
     "simulate_exits": "simulation.estimates",
     "sample_paths": "simulation.estimates",
     "bound_constants": "constants.bounds",
