@@ -113,6 +113,7 @@ MANY_DOORS = {
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (7, "to and from each library"),
     "safety.engines": (9, "three engines, and the rooms that their certificates restate"),
+    "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),
     "reach.sets": (7, "tubes, requirements, and directions for the certificate"),
 }
 """Sub-rooms with more than ``MOST_DOORS`` names in their ``__init__``: how many at most, and why."""

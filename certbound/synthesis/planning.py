@@ -45,7 +45,7 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
-__all__ = ["Path", "Planner", "Tightened"]
+__all__ = ["Path", "Planner", "Tightened", "check_tube"]
 
 Array = NDArray[np.float64]
 
@@ -55,6 +55,14 @@ ROUNDING = 1e-7
 SUBSTEPS = 2
 FITTED = ("kummer", "bessel")
 """Tubes that are fitted to the room of the plan."""
+
+
+def check_tube(problem: Problem, tube: Tube) -> None:
+    """Refuse a tube that ends before the problem, and what is no tube."""
+    if not isinstance(tube, Tube):
+        raise TypeError(f"`tube` must be a cb.Tube, got {tube!r}; the name of one goes under `method`.")
+    if tube.horizon < problem.horizon:
+        raise ValueError(f"`tube` must cover the horizon {problem.horizon:g}, got one up to {tube.horizon:g}.")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -244,7 +252,7 @@ class Planner:
         if involved and not box.bounded:
             raise ValueError(
                 "`inputs` must be bounded: the Jacobian depends on them, so that no constants hold for all inputs; "
-                "give cb.Box(low, high), or tube='linear'."
+                "give cb.Box(low, high), or method='linear'."
             )
         if n == 1 or metric is not None:
             return bound_constants(nominal, metric="euclidean" if metric is None else metric)

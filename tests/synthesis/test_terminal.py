@@ -72,7 +72,7 @@ def test_on_the_riccati_set_states_and_inputs_keep_their_bounds() -> None:
 
 def test_a_plan_ends_in_its_terminal_set() -> None:
     target = cb.Box([0.1, -0.1], [0.2, 0.1])
-    found = cb.synthesize_plan(cart(), tube="linear", terminal=target)
+    found = cb.synthesize_plan(cart(), method="linear", terminal=target)
     assert found.status == "SAFE"
     assert np.all(found.states[-1] >= target.low - 1e-6)
     assert np.all(found.states[-1] <= target.high + 1e-6)
@@ -82,7 +82,7 @@ def test_a_plan_ends_in_its_terminal_set() -> None:
     "terminal", ["riccati", TerminalSet(region=cb.Ball([0.3, 0], 0.05)), cb.Box([0.5, 0], [0.5, 0])]
 )
 def test_every_kind_of_terminal_set_is_met(terminal: object) -> None:
-    found = cb.synthesize_plan(cart(), tube="linear", terminal=terminal)  # type: ignore[arg-type]
+    found = cb.synthesize_plan(cart(), method="linear", terminal=terminal)  # type: ignore[arg-type]
     assert found.feasible
     if isinstance(terminal, cb.Box):
         np.testing.assert_allclose(found.states[-1], [0.5, 0], atol=1e-5)

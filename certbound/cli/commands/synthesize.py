@@ -41,8 +41,8 @@ RUNS = (
     "runs", "violations", "lower", "upper", "max_input", "mean_final_cost", "mean_cost", "by_constraint", "seconds",
 )  # fmt: skip
 
-TubeOption = Annotated[
-    str, typer.Option("--tube", metavar="METHOD", help="auto, linear, or a tube method such as kummer, thm5, markov.")
+MethodOption = Annotated[
+    str, typer.Option("--method", "--tube", metavar="M", help="auto, linear, or a tube's (kummer, thm5, markov).")
 ]
 EpsilonOption = Annotated[float | None, option("--epsilon", "E", "The paper's epsilon.", number)]
 TerminalOption = Annotated[str | None, option("--terminal", "KIND", "Terminal set: contraction or riccati.")]
@@ -58,7 +58,7 @@ def synthesize(
     pairs: SetOption = None,
     delta: DeltaOption = None,
     horizon: HorizonOption = None,
-    tube: TubeOption = "auto",
+    method: MethodOption = "auto",
     epsilon: EpsilonOption = None,
     terminal: TerminalOption = None,
     feedback: FeedbackOption = None,
@@ -84,7 +84,7 @@ def synthesize(
 
     with spinner("planning") as tell:
         result = synthesize_plan(
-            subject, tube=tube, epsilon=epsilon, terminal=terminal, feedback=gain, steps=steps,
+            subject, method=method, epsilon=epsilon, terminal=terminal, feedback=gain, steps=steps,
             find_delta=smallest_delta, progress=tell,
         )  # fmt: skip
         runs = None

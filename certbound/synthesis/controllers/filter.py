@@ -37,7 +37,7 @@ from certbound.problem.sets import GaussianStart
 from certbound.safety.verification import Verdict, verify_safety
 from certbound.synthesis.controllers.held_steps import SPARE, HeldSteps, Link, ProvedStep
 from certbound.synthesis.faces import Face, Round
-from certbound.synthesis.planning import Planner
+from certbound.synthesis.planning import Planner, check_tube
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 
@@ -96,8 +96,10 @@ class SafetyFilter:
     ----------
     problem : Problem
         With inputs, without a disturbance; its delta and horizon are those of the guarantee.
-    tube : str or Tube
-        A tube method, or a tube for the problem's delta (or less) and horizon (or more), of its own constants.
+    method : str
+        Of the tube, as in `certbound.tune_tube`.
+    tube : Tube, optional
+        One for the problem's delta (or less) and horizon (or more), of its own constants, in place of a method.
     constants : Constants, optional
         Stated, or certified for this problem; certified ones for all inputs in one common metric when omitted.
     decay : float
@@ -136,7 +138,8 @@ class SafetyFilter:
         self,
         problem: Problem,
         *,
-        tube: str | Tube = "auto",
+        method: str = "auto",
+        tube: Tube | None = None,
         constants: Constants | None = None,
         decay: float = 0.5,
         steady: bool = False,
@@ -152,11 +155,11 @@ class SafetyFilter:
         self.planner = Planner(problem, steps=steps)
         guess = self.planner.guess()
         whole = problem.replace(plan=None)
-        if isinstance(tube, Tube):
+        if tube is not None:
             _check_tube(tube, whole)
         elif constants is not None:
             check_constants(whole, constants)
-        self.tube = tube if isinstance(tube, Tube) else self._tube(tube, constants)
+        self.tube = self._tube(method, constants) if tube is None else tube
         self._radii = self._floating_radii(steady)
         self._grid = replace(self.planner.grid, substeps=self._substeps(guess[0]))
         self._rooms, self._step = self._compiled()
@@ -421,10 +424,9 @@ class _Program:
 
 def _check_tube(tube: Tube, problem: Problem) -> None:
     """Refuse a tube that promises less than the problem asks, or is made from constants of another problem."""
+    check_tube(problem, tube)
     if tube.delta > problem.delta:
         raise ValueError(f"`tube` must have delta {problem.delta:g} or less, got {tube.delta:g}; tune it for that.")
-    if tube.horizon < problem.horizon:
-        raise ValueError(f"`tube` must cover the horizon {problem.horizon:g}, got one up to {tube.horizon:g}.")
     check_constants(problem, tube.constants, "tube")
 
 
