@@ -17,7 +17,7 @@ PACKAGE = ROOT / "certbound"
 
 # What a line names may import the lines above it: rooms, sub-rooms, and single modules that stand between these.
 ORDER = """
-errors _version
+errors lazy _version
 checks
 display
 rigor
@@ -178,8 +178,8 @@ def imports_of(path: Path, module: str) -> list[Import]:
         elif isinstance(node, ast.Constant) and re.fullmatch(r"certbound(\.\w+)+", str(node.value)):
             found.append(Import(node.lineno, str(node.value), ""))
         elif isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "_HOME":
-            homes = ast.literal_eval(node.value)
-            found += [Import(node.lineno, f"{package}.{home}", name) for name, home in homes.items()]
+            for home, names in ast.literal_eval(node.value).items():
+                found += [Import(node.lineno, f"{package}.{home}", name) for name in names.split()]
     return found
 
 

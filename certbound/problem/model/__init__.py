@@ -5,8 +5,9 @@ Each name is loaded when it is first used, so that the checker reads a tape with
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from certbound.lazy import load_name
 
 if TYPE_CHECKING:
     from certbound.problem.model.analysis import (
@@ -25,24 +26,12 @@ if TYPE_CHECKING:
     from certbound.problem.model.tracing import trace
 
 _HOME = {
-    "adds_plainly": "analysis",
-    "BINARY": "tape",
-    "compile_numpy": "evaluation",
-    "compile_scalar": "evaluation",
-    "deciding": "analysis",
-    "Graph": "graph",
-    "is_zero": "analysis",
-    "jacobian": "derivative",
-    "JUMPS": "tape",
-    "Node": "tape",
-    "NUMPY": "evaluation",
-    "selected": "analysis",
-    "sources": "analysis",
-    "substitute": "graph",
-    "Tape": "tape",
-    "trace": "tracing",
-    "varying_outputs": "analysis",
-    "watched": "analysis",
+    "analysis": "adds_plainly deciding is_zero selected sources varying_outputs watched",
+    "derivative": "jacobian",
+    "evaluation": "compile_numpy compile_scalar NUMPY",
+    "graph": "Graph substitute",
+    "tape": "BINARY JUMPS Node Tape",
+    "tracing": "trace",
 }
 
 __all__ = [
@@ -68,11 +57,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return load_name(__name__, _HOME, name)
 
 
 def __dir__() -> list[str]:

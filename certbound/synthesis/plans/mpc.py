@@ -116,7 +116,7 @@ def synthesize_plan(
         parameters={name: value for name, value in (("epsilon", epsilon), ("step", step)) if value is not None},
         constants=constants, find_delta=find_delta, tell=progress or (lambda text: _LOG.info("%s", text)),
     )  # fmt: skip
-    for name, given in (("tube", tube and tube.constants), ("constants", constants)):
+    for name, given in (("tube", tube.constants if tube is not None else None), ("constants", constants)):
         if given is not None:
             check_constants(work.planner.nominal, given, name)
     work.tell("looking for the plan with the most room")
