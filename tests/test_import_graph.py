@@ -33,7 +33,7 @@ gaussian.response
 gaussian
 tubes.constants tubes.line_search
 tubes.tube tubes.schedule tubes.excess
-tubes.ballpath tubes.objective
+tubes.ballpath tubes.objective tubes.piecewise
 tubes.paper tubes.kummer
 tubes.exact
 tubes

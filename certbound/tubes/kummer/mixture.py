@@ -25,6 +25,7 @@ from certbound.tubes.ballpath import BallPath, ball_path
 from certbound.tubes.excess import log_excess, log_phi
 from certbound.tubes.kummer.profile import excess_function, phi_ball
 from certbound.tubes.kummer.search import simplex
+from certbound.tubes.piecewise import PiecewiseProfile
 from certbound.tubes.schedule import Schedule
 
 __all__ = ["Component", "MixtureProfile", "MixtureProgram"]
@@ -203,25 +204,16 @@ class _Held:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MixtureProfile:
+class MixtureProfile(PiecewiseProfile):
     """Radius r_t with sum_i w_i g^i_t(r_t) = 1; sum_i w_i X_i <= delta is checked by :meth:`level`.
 
     ``weight`` of a component is w_i X_i, its share of the probability; ``aims`` (K,) are the radii per piece, in
     units, that the program was solved for.
     """
 
-    schedule: Schedule
     components: tuple[Component, ...]
     aims: Array
     splits: ClassVar[int] = 2  # a stretch is costly, and the pieces are short
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
-    @property
-    def times(self) -> Array:
-        """Piece ends of the schedule, which contain the end times."""
-        return self.schedule.times
 
     def to_dict(self) -> dict[str, Any]:
         """Parameters as plain data."""

@@ -28,6 +28,7 @@ from certbound.rigor.balls import bessel_excess, excess_floor, kummer_excess, lo
 from certbound.tubes.ballpath import BallPath, ball_path
 from certbound.tubes.constants import Constants, check_delta
 from certbound.tubes.excess import log_excess_one, log_phi, log_phi_one, solve_excess, solve_excess_one
+from certbound.tubes.piecewise import PiecewiseProfile
 from certbound.tubes.schedule import Schedule, make_schedule
 from certbound.tubes.tube import Tube
 
@@ -78,23 +79,14 @@ def log_target(a: Any, info: Any, log_x: Any, log_delta: float) -> Any:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class KummerProfile:
+class KummerProfile(PiecewiseProfile):
     """Radius of Thm K1 for given a and v_0 (``v0`` in units of ``schedule.unit``^2)."""
 
-    schedule: Schedule
     a: float
     v0: float
     delta: float
     bessel: bool = False
     start: Start = Start()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
-    @property
-    def times(self) -> Array:
-        """Piece ends of the schedule."""
-        return self.schedule.times
 
     def to_dict(self) -> dict[str, Any]:
         """Parameters as plain data; ``v0`` is in units of ``unit``^2."""

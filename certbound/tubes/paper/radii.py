@@ -23,12 +23,11 @@ import numpy as np
 from flint import arb
 from numpy.typing import NDArray
 
-from certbound.rigor.balls import bessel_excess, precision, solve_upward, upper
+from certbound.rigor.balls import bessel_excess, precision, solve_upward
 from certbound.tubes.ballpath import BallPath, ball_path, integral
 from certbound.tubes.excess import log_phi_one, solve_excess_one
 from certbound.tubes.line_search import golden
-from certbound.tubes.schedule import Schedule
-from certbound.tubes.tube import monotone
+from certbound.tubes.piecewise import MonotoneProfile
 
 __all__ = ["RootProfile", "Tail", "best_epsilon", "best_growth", "growth", "growth_ball", "sharp_tail"]
 
@@ -131,7 +130,7 @@ def sharp_tail(*, delta: float, dimension: float, count: float = 1.0) -> Tail:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RootProfile:
+class RootProfile(MonotoneProfile):
     """sqrt(B) times the roots named by ``kind``.
 
     Parameters
@@ -148,39 +147,14 @@ class RootProfile:
         N = ceil(T/step) of ``"windows"``; the length is at least T/N whatever the rounding of ``step``.
     """
 
-    schedule: Schedule
     tail: Tail
     kind: str
     step: float = 0.0
     count: int = 1
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
-    @property
-    def times(self) -> Array:
-        """Piece ends of the schedule."""
-        return self.schedule.times
-
     def to_dict(self) -> dict[str, Any]:
         """Parameters as plain data."""
         return {"kind": self.kind, "step": self.step, "unit": self.schedule.unit, "tail": vars(self.tail)}
-
-    def radius(self, t: Array) -> Array:
-        """Radius, rounded up."""
-        flat = np.ravel(t)
-        pieces = self.schedule.locate(flat)
-        with precision():
-            values = [upper(self._point(int(k), x)) for k, x in zip(pieces, flat.tolist())]
-        return np.array(values).reshape(np.shape(t))
-
-    def stretch(self, piece: int, start: float, end: float) -> tuple[float, float]:
-        """V_t and C_t are monotone on a piece."""
-        return monotone(lambda t: self._point(piece, t), start, end)
-
-    def rough(self, piece: int, start: float, end: float) -> float:
-        """The bound itself: it is quick."""
-        return self.stretch(piece, start, end)[0]
 
     @cached_property
     def _path(self) -> BallPath:
@@ -211,7 +185,8 @@ class RootProfile:
             inside = noise * integral(-2 * rate, arb(self.step) - 1)
             return inside * (2 * rate).exp()
 
-    def _point(self, piece: int, t: float) -> arb:
+    def point(self, piece: int, t: float) -> arb:
+        """The radius: V_t and C_t are monotone on a piece."""
         square = self._path.at(piece, t)[0]
         root = arb.max(square, arb(0)).sqrt()
         if self.kind == "windows":

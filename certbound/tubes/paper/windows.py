@@ -21,12 +21,12 @@ import numpy as np
 from flint import arb
 from numpy.typing import NDArray
 
-from certbound.rigor.balls import precision, upper
+from certbound.rigor.balls import precision
 from certbound.tubes.ballpath import BallPath, ball_path, integral
 from certbound.tubes.paper.radii import Tail
+from certbound.tubes.piecewise import MonotoneProfile
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.schedule import integral as integral_float
-from certbound.tubes.tube import monotone
 
 __all__ = ["WindowProfile", "event_count", "window_scale"]
 
@@ -59,7 +59,7 @@ class _Piece:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WindowProfile:
+class WindowProfile(MonotoneProfile):
     """Radius of the module's formula.
 
     Parameters
@@ -72,48 +72,27 @@ class WindowProfile:
         Window length.
     """
 
-    schedule: Schedule
     tail: Tail
     step: float
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     @cached_property
     def grid(self) -> Schedule:
         """Data cut at the window starts as well."""
         return self.schedule.refined(_starts(self.schedule.horizon, self.step))
 
-    @property
-    def times(self) -> Array:
-        """Piece ends, window starts included."""
-        return self.grid.times
-
     def to_dict(self) -> dict[str, Any]:
         """Parameters as plain data."""
         return {"kind": "windows", "step": self.step, "unit": self.schedule.unit, "tail": vars(self.tail)}
 
-    def radius(self, t: Array) -> Array:
-        """Radius, rounded up."""
-        flat = np.ravel(t)
-        pieces = self.grid.locate(flat)
-        with precision():
-            values = [upper(self._point(int(k), x)) for k, x in zip(pieces, flat.tolist())]
-        return np.array(values).reshape(np.shape(t))
-
     def stretch(self, piece: int, start: float, end: float) -> tuple[float, float]:
         """C_t is monotone on a piece; in DT the ends of windows count apart."""
+        stretch = super().stretch
         if self.schedule.continuous or start == end:
-            return monotone(lambda t: self._point(piece, t), start, end)
+            return stretch(piece, start, end)
         first, last = min(start + 1, end), max(end - 1, start)
-        bounds = [monotone(lambda t: self._point(piece, t), s, e) for s, e in ((start, start), (end, end))]
-        if first <= last:
-            bounds.append(monotone(lambda t: self._point(piece, t), first, last))
+        spans = [(start, start), (end, end), *([(first, last)] if first <= last else [])]
+        bounds = [stretch(piece, *span) for span in spans]
         return max(b for b, _ in bounds), max(v for _, v in bounds)
-
-    def rough(self, piece: int, start: float, end: float) -> float:
-        """The bound itself: it is quick."""
-        return self.stretch(piece, start, end)[0]
 
     @cached_property
     def _path(self) -> BallPath:
@@ -145,7 +124,8 @@ class WindowProfile:
                     result.append(_Piece(growth=g, whole=whole, begin=begin, end=end))
         return result
 
-    def _point(self, piece: int, t: float) -> arb:
+    def point(self, piece: int, t: float) -> arb:
+        """The radius at a time of a piece."""
         data, held = self.grid, self._pieces[piece]
         if held.begin is not None and t == data.times[piece]:
             return held.begin
