@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from certbound.problem.sets import Outside
 from certbound.simulation.tape_text import Parameters, linear_form
 
-__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "window_test"]
+__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "tables_of", "window_test"]
 
 Array = NDArray[np.float64]
 
@@ -133,6 +133,15 @@ def barriers_of(problem: Any, times: Array) -> list[Barrier]:
         fields |= {"first": min(first, last), "last": min(end, last), "always": first == 0 and end >= last}
         barriers.append(Barrier(**fields))
     return barriers
+
+
+def tables_of(barriers: Sequence[Barrier]) -> dict[str, Any]:
+    """What the kernels read of barriers: ``moving`` offsets (a row a step), and ``windows`` (first and last step)."""
+    moving = [barrier.offset for barrier in barriers if barrier.moving]
+    return {
+        "moving": np.hstack(moving) if moving else np.zeros((0, 0)),
+        "windows": np.array([[b.first, b.last] for b in barriers], dtype=np.int64).reshape(-1, 2),
+    }
 
 
 _ROUND = ("ball", "ellipsoid")
