@@ -58,7 +58,7 @@ class Setting:
         return self.fixed is not None and not self.model.own_disturbance and self.steps <= _LONGEST_NOMINAL
 
     def nominal(self) -> Array:
-        """The noise-free path of the discretised model that all paths share, shape (steps + 1, n); else an empty table."""
+        """The noise-free path of the discretised model, shape (steps + 1, n), where all paths share it; else empty."""
         if self.fixed is None or not self.shared_nominal:
             return np.zeros((0, 0))
         model = self.model
