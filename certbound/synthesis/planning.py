@@ -26,9 +26,9 @@ from certbound.problem.model import jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart, Region
 from certbound.synthesis.costs import Cost, cost_of
-from certbound.synthesis.faces import Face, faces_of
+from certbound.synthesis.faces import Face, faces_of, with_parts
 from certbound.synthesis.feedback import close_loop, constrain_inputs, depends_on, resolve_feedback
-from certbound.synthesis.plant import Grid, Plant
+from certbound.synthesis.plant import Grid, Plant, middle_of
 from certbound.synthesis.terminal import TerminalSet, check_terminal, contraction_terminal, riccati_terminal
 from certbound.synthesis.tightening import (
     BallTube,
@@ -279,12 +279,10 @@ class Planner:
         unit = BallTube(radii=np.ones(self.grid.points), inverse=inverse)
         factor = self.tightened(unit, solution.states)
         room = np.full(self.grid.points, np.inf)
-        part = 0
-        for face in self.faces:
-            own = factor.erosion[:, part : part + face.parts].max(axis=1)
+        for face, parts in with_parts(self.faces):
+            own = factor.erosion[:, parts].max(axis=1)
             value = face.room(solution.states[1:], times[1:]) / np.maximum(own, 1e-300)
             room = np.minimum(room, np.where(face.asked(times[1:]), value, np.inf))
-            part += face.parts
         spread = nominal_spread(self.problem, self.plant, self.grid, constants, solution.states, solution.inputs)
         room = room - spread[1:]
         if not np.any(np.isfinite(room)):
@@ -364,8 +362,7 @@ def _grid(problem: Problem, steps: int | None) -> Grid:
 
 
 def _plant(problem: Problem, dynamics: Any, feedback: Array | None) -> Plant:
-    system, box = problem.system, problem.system.disturbance
-    middle = np.zeros(0) if box is None else np.asarray((box.low + box.high) / 2)
+    system, middle = problem.system, middle_of(problem.system.disturbance)
     assert system.inputs is not None
     low, high = np.asarray(system.inputs.low), np.asarray(system.inputs.high)
     if feedback is None:

@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Ellipsoid, Region
-from certbound.synthesis.faces import Face, Facets, Round
+from certbound.synthesis.faces import Face, Facets, Round, with_parts
+from certbound.synthesis.plant import middle_of
 from certbound.tubes.constants import Constants
 
 __all__ = ["TerminalSet", "check_terminal", "contraction_terminal", "linearise", "riccati", "riccati_terminal"]
@@ -105,10 +106,8 @@ def check_terminal(terminal: TerminalSet, faces: Sequence[Face], erosion: Array,
     ValueError
         Naming the constraint and by how much it is missed.
     """
-    part = 0
-    for face in faces:
-        own = erosion[part : part + face.parts]
-        part += face.parts
+    for face, parts in with_parts(faces):
+        own = erosion[parts]
         if not face.asked(np.array([time]))[0]:
             continue
         room = _room_of_region(terminal.region, face, own, time)
@@ -152,10 +151,9 @@ def linearise(problem: Problem, state: ArrayLike, inputs: ArrayLike, time: float
     """D_x f and D_u f at a point, with the disturbance in its middle: shapes (n, n), (n, m)."""
     system = problem.system
     n, m = system.dimension, len(system.input_names)
-    box = system.disturbance
-    middle = np.zeros(0) if box is None else np.asarray((box.low + box.high) / 2)
     slopes = compile_numpy(jacobian(system.dynamics, range(1, 1 + n + m)))
-    value = slopes(time, *np.asarray(state, dtype=float), *np.asarray(inputs, dtype=float), *middle)
+    point = [*np.asarray(state, dtype=float), *np.asarray(inputs, dtype=float), *middle_of(system.disturbance)]
+    value = slopes(time, *point)
     return np.asarray(value[:, :n]), np.asarray(value[:, n:])
 
 
@@ -211,9 +209,7 @@ def contraction_terminal(
     ValueError
         If the constants do not contract, the centre is no equilibrium, or it lies outside the tightened constraints.
     """
-    n, m = problem.system.dimension, len(problem.system.input_names)
-    c = np.zeros(n) if center is None else np.asarray(center, dtype=float)
-    u = np.zeros(m) if inputs is None else np.asarray(inputs, dtype=float)
+    n = problem.system.dimension
     slope = constants.rate if constants.continuous else constants.gain
     worst = float(np.max(np.asarray(slope)))
     if worst >= (0 if constants.continuous else 1):
@@ -221,7 +217,7 @@ def contraction_terminal(
             f"`terminal` from the contraction metric needs a {'negative rate' if constants.continuous else 'gain < 1'},"
             f" got {worst:.4g}; use terminal='riccati', or a feedback."
         )
-    _check_equilibrium(problem, c, u)
+    c, _ = _equilibrium(problem, center, inputs)
     metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric)
     radius = _largest_level(metric, c, faces, erosion, time)
     weight = np.asarray(problem.cost[0]) if problem.cost is not None else np.zeros((n, n))
@@ -243,10 +239,7 @@ def riccati_terminal(
     ValueError
         As ``contraction_terminal``, or if the linearisation cannot be stabilised.
     """
-    n, m = problem.system.dimension, len(problem.system.input_names)
-    c = np.zeros(n) if center is None else np.asarray(center, dtype=float)
-    u = np.zeros(m) if inputs is None else np.asarray(inputs, dtype=float)
-    _check_equilibrium(problem, c, u)
+    c, u = _equilibrium(problem, center, inputs)
     value, gain, _ = riccati(problem, c, u)
     radius = _largest_level(value, c, faces, erosion, time)
     box = problem.system.inputs
@@ -260,25 +253,27 @@ def riccati_terminal(
     return TerminalSet(region=Ellipsoid(c, np.linalg.inv(value) * radius**2), cost=value, center=c)
 
 
-def _check_equilibrium(problem: Problem, center: Array, inputs: Array) -> None:
-    box = problem.system.disturbance
-    middle = np.zeros(0) if box is None else np.asarray((box.low + box.high) / 2)
-    value = compile_numpy(problem.system.dynamics)(0.0, *center, *inputs, *middle)
-    moved = value if problem.system.time == "continuous" else value - center
-    if np.max(np.abs(moved)) > 1e-6 * (1 + np.max(np.abs(center))):
+def _equilibrium(problem: Problem, center: ArrayLike | None, inputs: ArrayLike | None) -> tuple[Array, Array]:
+    """State and inputs, zero where omitted, at which the system is found to stand still."""
+    system = problem.system
+    c = np.zeros(system.dimension) if center is None else np.asarray(center, dtype=float)
+    u = np.zeros(len(system.input_names)) if inputs is None else np.asarray(inputs, dtype=float)
+    value = compile_numpy(system.dynamics)(0.0, *c, *u, *middle_of(system.disturbance))
+    moved = float(np.max(np.abs(value if system.time == "continuous" else value - c)))
+    if moved > 1e-6 * (1 + np.max(np.abs(c))):
         raise ValueError(
-            f"`terminal` needs an equilibrium, but at {center.tolist()} with inputs {inputs.tolist()} the state moves "
-            f"by {np.max(np.abs(moved)):.3g}; give a set instead."
+            f"`terminal` needs an equilibrium, but at {c.tolist()} with inputs {u.tolist()} the state moves "
+            f"by {moved:.3g}; give a set instead."
         )
+    return c, u
 
 
 def _largest_level(metric: Array, center: Array, faces: Sequence[Face], erosion: Array, time: float) -> float:
     """Largest r with {||z - c||_P <= r} inside the tightened constraints."""
     inverse = np.linalg.inv(metric)
-    best, part = np.inf, 0
-    for face in faces:
-        own = erosion[part : part + face.parts]
-        part += face.parts
+    best = np.inf
+    for face, parts in with_parts(faces):
+        own = erosion[parts]
         if not face.asked(np.array([time]))[0]:
             continue
         rows = face.rows(center[None], np.array([time]))[0]
