@@ -97,7 +97,7 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
-    "gaussian.scalar": (27, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
+    "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (18, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),
     "reach.linear": (14, "certificates state the records of the search: its linearisation, rows, levels, references"),

@@ -275,7 +275,7 @@ def test_a_tube_that_promises_more_than_the_problem_asks_serves() -> None:
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: tube_of(integrator(), delta=0.2), "`tube` must have delta 0.001 or less, got 0.2"),
+        (lambda: tube_of(integrator(), delta=0.2), "`tube` must have delta <= 0.001, got 0.2"),
         (lambda: tube_of(integrator(), horizon=5), "`tube` must cover the horizon 30, got one up to 5"),
         (lambda: tube_of(noisy(0.0005)), "`tube` must hold for this problem on its whole domain, got gain 1"),
         (
