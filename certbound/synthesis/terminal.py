@@ -147,20 +147,18 @@ def _middle(region: Region, dimension: int) -> Array:
     return full
 
 
-def linearise(problem: Problem, state: ArrayLike, inputs: ArrayLike, time: float = 0.0) -> tuple[Array, Array]:
+def linearise(problem: Problem, state: ArrayLike, inputs: ArrayLike) -> tuple[Array, Array]:
     """D_x f and D_u f at a point, with the disturbance in its middle: shapes (n, n), (n, m)."""
     system = problem.system
     n, m = system.dimension, len(system.input_names)
     slopes = compile_numpy(jacobian(system.dynamics, range(1, 1 + n + m)))
     point = [*np.asarray(state, dtype=float), *np.asarray(inputs, dtype=float), *middle_of(system.disturbance)]
-    value = slopes(time, *point)
+    value = slopes(0.0, *point)
     return np.asarray(value[:, :n]), np.asarray(value[:, n:])
 
 
-def riccati(
-    problem: Problem, state: ArrayLike | None = None, inputs: ArrayLike | None = None
-) -> tuple[Array, Array, Array]:
-    """S, K and the closed loop's matrix of the linear-quadratic regulator at a point (python-control).
+def riccati(problem: Problem, state: ArrayLike | None = None) -> tuple[Array, Array, Array]:
+    """S, K and the closed loop's matrix of the linear-quadratic regulator at a state without inputs (python-control).
 
     Without a cost of the problem, Q = I and R = I.
 
@@ -176,7 +174,7 @@ def riccati(
     """
     control = importlib.import_module("control")
     n, m = problem.system.dimension, len(problem.system.input_names)
-    a, b = linearise(problem, np.zeros(n) if state is None else state, np.zeros(m) if inputs is None else inputs)
+    a, b = linearise(problem, np.zeros(n) if state is None else state, np.zeros(m))
     weight, effort = problem.cost if problem.cost is not None else (np.eye(n), np.eye(m))
     solve = control.lqr if problem.system.time == "continuous" else control.dlqr
     try:
@@ -189,9 +187,8 @@ def riccati(
 
 
 def contraction_terminal(
-    problem: Problem, constants: Constants, faces: Sequence[Face], erosion: Array, time: float,
-    *, center: ArrayLike | None = None, inputs: ArrayLike | None = None,
-) -> TerminalSet:  # fmt: skip
+    problem: Problem, constants: Constants, faces: Sequence[Face], erosion: Array, time: float
+) -> TerminalSet:
     """The largest ball of the contraction metric that fits into the tightened constraints, with its cost.
 
     Parameters
@@ -201,13 +198,11 @@ def contraction_terminal(
         With a gain below 1 (rate below 0).
     faces, erosion, time
         The tightened constraints at the last time.
-    center, inputs : array_like, optional
-        An equilibrium; the origin with zero inputs when omitted.
 
     Raises
     ------
     ValueError
-        If the constants do not contract, the centre is no equilibrium, or it lies outside the tightened constraints.
+        If the constants do not contract, or the origin is no equilibrium or lies outside the tightened constraints.
     """
     n = problem.system.dimension
     slope = constants.rate if constants.continuous else constants.gain
@@ -217,7 +212,7 @@ def contraction_terminal(
             f"`terminal` from the contraction metric needs a {'negative rate' if constants.continuous else 'gain < 1'},"
             f" got {worst:.4g}; use terminal='riccati', or a feedback."
         )
-    c, _ = _equilibrium(problem, center, inputs)
+    c = _equilibrium(problem)
     metric = np.eye(n) if constants.metric is None else np.asarray(constants.metric)
     radius = _largest_level(metric, c, faces, erosion, time)
     weight = np.asarray(problem.cost[0]) if problem.cost is not None else np.zeros((n, n))
@@ -228,10 +223,7 @@ def contraction_terminal(
     return TerminalSet(region=region, cost=share * metric, center=c)
 
 
-def riccati_terminal(
-    problem: Problem, faces: Sequence[Face], erosion: Array, time: float,
-    *, center: ArrayLike | None = None, inputs: ArrayLike | None = None,
-) -> TerminalSet:  # fmt: skip
+def riccati_terminal(problem: Problem, faces: Sequence[Face], erosion: Array, time: float) -> TerminalSet:
     """A level set of the Riccati cost on which the tightened constraints and the regulator's inputs are kept.
 
     Raises
@@ -239,33 +231,32 @@ def riccati_terminal(
     ValueError
         As ``contraction_terminal``, or if the linearisation cannot be stabilised.
     """
-    c, u = _equilibrium(problem, center, inputs)
-    value, gain, _ = riccati(problem, c, u)
+    c = _equilibrium(problem)
+    value, gain, _ = riccati(problem, c)
     radius = _largest_level(value, c, faces, erosion, time)
     box = problem.system.inputs
     assert box is not None
     reach = np.sqrt(np.einsum("ij,jk,ik->i", gain, np.linalg.inv(value), gain))
     with np.errstate(divide="ignore"):
-        room = np.minimum(box.high - u, u - box.low) / reach
+        room = np.minimum(box.high, -box.low) / reach
     radius = min(radius, float(np.min(room)))
     if radius <= 0:
         raise ValueError("`terminal` needs an equilibrium whose inputs lie inside their bounds.")
     return TerminalSet(region=Ellipsoid(c, np.linalg.inv(value) * radius**2), cost=value, center=c)
 
 
-def _equilibrium(problem: Problem, center: ArrayLike | None, inputs: ArrayLike | None) -> tuple[Array, Array]:
-    """State and inputs, zero where omitted, at which the system is found to stand still."""
+def _equilibrium(problem: Problem) -> Array:
+    """The origin, at which the system is found to stand still without inputs."""
     system = problem.system
-    c = np.zeros(system.dimension) if center is None else np.asarray(center, dtype=float)
-    u = np.zeros(len(system.input_names)) if inputs is None else np.asarray(inputs, dtype=float)
-    value = compile_numpy(system.dynamics)(0.0, *c, *u, *middle_of(system.disturbance))
-    moved = float(np.max(np.abs(value if system.time == "continuous" else value - c)))
-    if moved > 1e-6 * (1 + np.max(np.abs(c))):
+    c = np.zeros(system.dimension)
+    idle = np.zeros(len(system.input_names))
+    moved = float(np.max(np.abs(compile_numpy(system.dynamics)(0.0, *c, *idle, *middle_of(system.disturbance)))))
+    if moved > 1e-6:
         raise ValueError(
-            f"`terminal` needs an equilibrium, but at {c.tolist()} with inputs {u.tolist()} the state moves "
-            f"by {moved:.3g}; give a set instead."
+            f"`terminal` needs an equilibrium, but at the origin without inputs the state moves by {moved:.3g}; give a "
+            "set instead."
         )
-    return c, u
+    return c
 
 
 def _largest_level(metric: Array, center: Array, faces: Sequence[Face], erosion: Array, time: float) -> float:

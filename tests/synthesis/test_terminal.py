@@ -18,9 +18,9 @@ from certbound.synthesis.terminal import (
 from tests.synthesis.conftest import A, B, cart
 
 
-def stable() -> cb.Problem:
-    slope = [[0.8, 0.2], [0.0, 0.7]]
-    system = cb.linear_system(slope, [[0], [1]], inputs=cb.Box([-1], [1]), noise=cb.Gaussian(std=0.01))
+def stable(pushed: float = 0.0) -> cb.Problem:
+    slope, b = [[0.8, 0.2], [0.0, 0.7]], [0.0, pushed]
+    system = cb.linear_system(slope, [[0], [1]], b, inputs=cb.Box([-1], [1]), noise=cb.Gaussian(std=0.01))
     safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
     return cb.Problem(system, initial=[0, 0], safe=safe, horizon=10, cost=([1, 2], [1]))
 
@@ -107,6 +107,6 @@ def test_a_contraction_set_needs_contraction_and_an_equilibrium_inside() -> None
         contraction_terminal(problem, constants, faces, np.full(4, 0.1), 10.0)
     constants = cb.Constants(gain=0.9, sigma=0.1, dimension=2)
     with pytest.raises(ValueError, match="needs an equilibrium"):
-        contraction_terminal(problem, constants, faces, np.full(4, 0.1), 10.0, center=[0.5, 0.5])
+        contraction_terminal(stable(pushed=0.1), constants, faces, np.full(4, 0.1), 10.0)
     with pytest.raises(ValueError, match="must have its centre inside"):
         contraction_terminal(problem, constants, faces, np.full(4, 1.1), 10.0)

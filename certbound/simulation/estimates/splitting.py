@@ -28,7 +28,6 @@ from certbound.simulation.gap_tests import Barrier, barriers_of, tables_of
 from certbound.simulation.kernel_source import (
     SIGNATURE,
     close_noise,
-    indent,
     load_lines,
     module_head,
     nominal_lines,
@@ -36,7 +35,7 @@ from certbound.simulation.kernel_source import (
     step_lines,
 )
 from certbound.simulation.stepping import Scenario, StepModel
-from certbound.simulation.tape_text import Parameters
+from certbound.simulation.tape_text import Parameters, indent
 
 __all__ = ["RareExits", "simulate_rare_exits"]
 
