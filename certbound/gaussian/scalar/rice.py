@@ -152,8 +152,8 @@ def _vanishing(low: Array, v_hi: Array, deviation: Array, fall: Array) -> Array:
     """
     least = np.where(v_hi > 0, low / up(np.sqrt(v_hi)), np.inf) * (1 - 4 * EPS)
     one, two = np.maximum(least, 1.0), np.maximum(least, np.sqrt(2.0))
-    once = np.log(one) - 0.5 * one * one - LOG_ROOT_2PI
-    twice = 2 * np.log(two) - 0.5 * two * two - LOG_ROOT_2PI
-    value = np.logaddexp(np.log(deviation) + twice, np.log(0.4 * deviation + fall) + once) - np.log(low)
+    linear = np.log(one) - 0.5 * one * one - LOG_ROOT_2PI
+    square = 2 * np.log(two) - 0.5 * two * two - LOG_ROOT_2PI
+    value = np.logaddexp(np.log(deviation) + square, np.log(0.4 * deviation + fall) + linear) - np.log(low)
     value = value + 64 * EPS * (1 + two * two)
     return np.where((low > 0) & ~np.isnan(value), value, np.where((v_hi > 0) | (low < 0), np.inf, -np.inf))

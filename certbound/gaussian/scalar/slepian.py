@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.gaussian.scalar.normal import EPS, lift, log_tail
+from certbound.checks import frozen
+from certbound.gaussian.scalar.normal import EPS
 from certbound.gaussian.scalar.ornstein_uhlenbeck import log_polygon_crossing
 from certbound.gaussian.scalar.pairs import total
 from certbound.rigor.rounding import quiet
@@ -98,13 +99,7 @@ def node_clock(durations: ArrayLike, near: ArrayLike, needs: ArrayLike, *, limit
         ahead = float(np.max(clock[block : j + 1] + asked)) - clock[j]
         increments[j] = max(increments[j], ahead + 8 * EPS * (1 + abs(clock[j])))
         clock[j + 1] = clock[j] + increments[j]
-    return Clock(increments=_frozen(increments), starts=np.asarray(starts, dtype=np.intp))
-
-
-def _frozen(array: Array) -> Array:
-    array = np.array(array, dtype=np.float64)
-    array.setflags(write=False)
-    return array
+    return Clock(increments=frozen(increments), starts=np.asarray(starts, dtype=np.intp))
 
 
 NO_CUTS: Index = np.zeros(1, dtype=np.intp)
@@ -197,12 +192,10 @@ def _cut(clock: Array, span: float, forced: Index) -> Index:
 
 
 @quiet
-def clock_crossing(
-    clock: Clock, levels: ArrayLike, *, continuous: ArrayLike = True, weight: float = _WEIGHT
-) -> float:
+def clock_crossing(clock: Clock, levels: ArrayLike) -> float:
     """Upper bound of log10 P(exists t: xi_t > z_t) for a process compared with an OU process by its `Clock`.
 
-    Proves: with A_k the exceedance in block k and x continuous at the block's start, P <= P(A_0) + sum_k
+    Proves: with A_k the exceedance in block k and x continuous from block to block, P <= P(A_0) + sum_k
     [P(A_k) - P(A_k, x > q at the end of block k - 1)], and P(A_k) by Slepian and the window sums of
     `log_polygon_crossing`; a boundary linear in the clock and >= 0 is concave in Brownian coordinates,
     hence above its chords.
@@ -214,11 +207,6 @@ def clock_crossing(
     levels : array_like, shape (K,) or (K, 2)
         Lower bounds of z_t/s_t on each piece: one number, or its two ends when z_t/s_t is at least the
         linear interpolation (in t) between them. +inf allowed.
-    continuous : array_like of bool
-        Per block start after the first (or one for all): xi is the same process across it. Where False,
-        nothing is subtracted.
-    weight : float
-        Clock of a window times the square of the least level.
 
     Returns
     -------
@@ -248,16 +236,13 @@ def clock_crossing(
     if least == np.inf:
         return -np.inf
     q = np.minimum(q, 3 * least + 40)
-    span = max(weight / max(least, 0.5) ** 2, float(np.sum(d)) / _MOST_WINDOWS)
-    linked = np.broadcast_to(np.asarray(continuous, dtype=bool), (len(clock.starts) - 1,))
+    span = max(_WEIGHT / max(least, 0.5) ** 2, float(np.sum(d)) / _MOST_WINDOWS)
     parts = np.maximum(np.ceil(3 * d / span), 1).astype(np.intp)
     nodes, left, right = _subdivide(d, q, parts)
     forced = (np.cumsum(parts) - parts)[clock.starts]
     lines = group_windows(nodes, left, right, span, forced)
     fresh = np.isin(lines.first, forced)
     logs = log_polygon_crossing(lines.spans, lines.starts, lines.stops, fresh=fresh)
-    restart = np.searchsorted(lines.first, forced[1:][~linked])
-    logs[1 + restart] = lift(np.logaddexp(logs[1 + restart], log_tail(lines.starts[restart])), 8)
     return float(total(logs))
 
 
