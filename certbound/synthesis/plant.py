@@ -81,12 +81,12 @@ class Plant:
 
         return np.array(_piece(f, grid, time_, state))
 
-    def rollout(self, grid: Grid, start: Array, inputs: Array, time_: float = 0.0) -> Array:
+    def rollout(self, grid: Grid, start: Array, inputs: Array) -> Array:
         """Noise-free states at all points, shape (points + 1, n)."""
         states = [np.asarray(start, dtype=float)]
         with np.errstate(all="ignore"):
             for k in range(len(inputs)):
-                states += list(self.step(grid, time_ + k * grid.step, states[-1], inputs[k]))
+                states += list(self.step(grid, k * grid.step, states[-1], inputs[k]))
         return np.array(states)
 
     def symbolic_step(self, ca: Any, grid: Grid, time_: Any, state: Any, inputs: Any) -> list[Any]:

@@ -25,7 +25,6 @@ def crossing_rate(
     velocity_variance: Bounds,
     *,
     start_variance: Bounds | None = None,
-    residual_variance: ArrayLike | None = None,
 ) -> Any:
     """Upper bound of log10 P(exists t: xi_t > z_t) for a process xi with continuous derivative eta.
 
@@ -47,8 +46,6 @@ def crossing_rate(
         Enclosures of s^2, c and Var eta over each piece.
     start_variance : Bounds, optional
         Enclosure of s^2 at the start; that of the first piece when omitted.
-    residual_variance : array_like, optional
-        Upper bounds of v^2, where they are known better than by the formula.
 
     Returns
     -------
@@ -88,8 +85,6 @@ def crossing_rate(
     nearest = np.where((c_lo <= 0) & (c_hi >= 0), 0.0, np.minimum(np.abs(c_lo), np.abs(c_hi)))
     rest = np.maximum(up(e_hi - nearest * nearest / v_hi * (1 - 4 * EPS)), 0.0)
     rest = np.where(v_hi > 0, rest, e_hi)
-    if residual_variance is not None:
-        rest = np.minimum(rest, np.asarray(residual_variance, dtype=np.float64))
     log_density = _largest_density(low, high, v_lo, v_hi)
     near = log_density + _log_positive_part(mean, up(np.sqrt(rest)))
     far = _vanishing(low, v_hi, up(np.sqrt(e_hi)), fall)
