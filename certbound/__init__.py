@@ -5,12 +5,12 @@ Every name below is loaded when it is first used, so that reading a certificate 
 
 from __future__ import annotations
 
-import importlib
 import logging
 from typing import TYPE_CHECKING, Any
 
 from certbound._version import __version__
 from certbound.display import connect
+from certbound.lazy import load_name, names_in
 
 if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the table below
     from certbound.constants.bounds import bound_constants as bound_constants
@@ -57,6 +57,9 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.synthesis.plans import synthesize_plan as synthesize_plan
     from certbound.synthesis.terminal import TerminalSet as TerminalSet
     from certbound.tubes.constants import Constants as Constants
+    from certbound.tubes.paper import AffineMartingale as AffineMartingale
+    from certbound.tubes.paper import estimate_affine_excess as estimate_affine_excess
+    from certbound.tubes.paper import log_energy as log_energy
     from certbound.tubes.tube import Tube as Tube
     from certbound.tubes.tuning import bound_exit_probability as bound_exit_probability
     from certbound.tubes.tuning import tune_tube as tune_tube
@@ -64,56 +67,30 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 _HOME = {
-    "ContinuousSystem": "problem.systems",
-    "DiscreteSystem": "problem.systems",
-    "linear_system": "problem.systems",
-    "from_control": "problem.systems",
-    "Gaussian": "problem.noise",
-    "Uniform": "problem.noise",
-    "Rademacher": "problem.noise",
-    "Bounded": "problem.noise",
-    "SubGaussian": "problem.noise",
-    "Box": "problem.sets",
-    "Ball": "problem.sets",
-    "Ellipsoid": "problem.sets",
-    "HalfSpace": "problem.sets",
-    "Polytope": "problem.sets",
-    "GaussianStart": "problem.sets",
-    "Inside": "problem.sets",
-    "Outside": "problem.sets",
-    "Problem": "problem.problem",
-    "load": "problem.files",
-    "save": "problem.files",
-    "export_casadi": "problem.export",
-    "export_control": "problem.export",
-    "load_result": "display",
-    "Constants": "tubes.constants",
-    "Tube": "tubes.tube",
-    "tune_tube": "tubes.tuning",
-    "bound_exit_probability": "tubes.tuning",
-    "simulate_exits": "simulation.estimates",
-    "sample_paths": "simulation.estimates",
-    "bound_constants": "constants.bounds",
-    "bound_metrics": "constants.metrics",
-    "bound_reach": "reach",
-    "ReachTube": "reach.sets",
-    "verify_safety": "safety.verification",
-    "Verdict": "safety.verification",
-    "synthesize_plan": "synthesis.plans",
-    "simulate_closed_loop": "synthesis.controllers",
-    "PredictiveController": "synthesis.controllers",
-    "ConvexPlanner": "synthesis.controllers",
-    "SafetyFilter": "synthesis.controllers",
-    "TerminalSet": "synthesis.terminal",
-    "CertboundError": "errors",
-    "CertificateError": "errors",
-    "EnclosureError": "errors",
-    "EngineError": "errors",
-    "InfeasibleError": "errors",
-    "SolverError": "errors",
+    "problem.systems": "ContinuousSystem DiscreteSystem linear_system from_control",
+    "problem.noise": "Gaussian Uniform Rademacher Bounded SubGaussian",
+    "problem.sets": "Box Ball Ellipsoid HalfSpace Polytope GaussianStart Inside Outside",
+    "problem.problem": "Problem",
+    "problem.files": "load save",
+    "problem.export": "export_casadi export_control",
+    "display": "load_result",
+    "tubes.constants": "Constants",
+    "tubes.tube": "Tube",
+    "tubes.tuning": "tune_tube bound_exit_probability",
+    "tubes.paper": "AffineMartingale estimate_affine_excess log_energy",
+    "simulation.estimates": "simulate_exits sample_paths",
+    "constants.bounds": "bound_constants",
+    "constants.metrics": "bound_metrics",
+    "reach": "bound_reach",
+    "reach.sets": "ReachTube",
+    "safety.verification": "verify_safety Verdict",
+    "synthesis.plans": "synthesize_plan",
+    "synthesis.controllers": "simulate_closed_loop PredictiveController ConvexPlanner SafetyFilter",
+    "synthesis.terminal": "TerminalSet",
+    "errors": "CertboundError CertificateError EnclosureError EngineError InfeasibleError SolverError",
 }
 
-__all__ = ["__version__", *_HOME]
+__all__ = ["__version__", *names_in(_HOME)]
 
 
 def _draw(result: Any, axes: Any) -> None:
@@ -138,11 +115,7 @@ connect(draw=_draw, content=_content, constants=_constants)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return load_name(__name__, _HOME, name)
 
 
 def __dir__() -> list[str]:

@@ -121,7 +121,7 @@ def ours(chain: cb.Problem, noise: np.ndarray) -> dict[str, Claims]:
     """The three ways of this package."""
     rows = {}
     for name, feedback in (("certbound, plan", None), ("certbound, plan and Riccati feedback", "riccati")):
-        plan = cb.synthesize_plan(chain, tube="linear", feedback=feedback)
+        plan = cb.synthesize_plan(chain, method="linear", feedback=feedback)
         if feedback is None:
             states, inputs = blind(chain, plan.plan, noise), plan.plan
             first = plan

@@ -20,11 +20,11 @@ from certbound.synthesis.planning import Planner
 from experiments.harness import Arrays, Claims, main
 
 SIGMA = 0.43
-PAPER: dict[str, Any] = {"tube": "thm5", "epsilon": 15 / 16, "step": 1}
+PAPER: dict[str, Any] = {"method": "thm5", "epsilon": 15 / 16, "step": 1}
 TUBES: dict[str, dict[str, Any]] = {
     "Thm 5 (eps = 15/16)": PAPER,
-    "K1, one common metric": {"tube": "kummer"},
-    "K7', linear response": {"tube": "linear"},
+    "K1, one common metric": {"method": "kummer"},
+    "K7', linear response": {"method": "linear"},
 }
 
 
@@ -106,7 +106,7 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
     for name in list(TUBES)[1:]:
         tell(f"{name}: over Thm 5's level", levels[name, 2e-3] / base)
     for delta in (0.03, 0.05):
-        found = planned({"tube": "markov"}, delta=delta)
+        found = planned({"method": "markov"}, delta=delta)
         tell(f"Markov, delta = {delta:g}", f"feasible {found.feasible}, status {found.status}")
         if found.infeasibility is not None:
             tell("Markov: proved, and at most this much of the tube fits",

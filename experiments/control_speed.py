@@ -72,7 +72,7 @@ def convex(masses: int) -> Claims:
 
 def runs() -> Claims:
     """3000 noisy runs of 50 steps with the plan: once with compilation, once without."""
-    plan = cb.synthesize_plan(cb.load("chain"), tube="linear")
+    plan = cb.synthesize_plan(cb.load("chain"), method="linear")
     return {
         name: timed(lambda: cb.simulate_closed_loop(plan, runs=3000, rng=0))[1] for name in ("first", "again")
     }  # fmt: skip

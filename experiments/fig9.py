@@ -25,7 +25,7 @@ EPSILON = 15 / 16
 def compute(full: bool) -> tuple[Arrays, Claims]:
     """The plan of the predictive control, its paths, both tubes around it, and which methods leave a plan at all."""
     chain = cb.load("chain")
-    planned = cb.synthesize_plan(chain, tube="thm5", epsilon=EPSILON, step=1)
+    planned = cb.synthesize_plan(chain, method="thm5", epsilon=EPSILON, step=1)
     problem = planned.problem
     verdict = cb.verify_safety(problem)
     count = 3000 if full else 600
@@ -71,7 +71,7 @@ def _bound(verdict, direction: np.ndarray) -> np.ndarray:  # type: ignore[no-unt
 
 def markov_fits(delta: float) -> bool:
     """Whether the predictive control finds a plan inside the set that the Markov tube leaves."""
-    return cb.synthesize_plan(cb.load("chain").replace(delta=delta), tube="markov").scale >= 1
+    return cb.synthesize_plan(cb.load("chain").replace(delta=delta), method="markov").scale >= 1
 
 
 def feasibility() -> Claims:

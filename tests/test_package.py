@@ -39,7 +39,7 @@ def test_editors_and_mypy_read_the_names_that_are_loaded() -> None:
         for node in tree.body
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id == "_HOME"
     )
-    assert read == {name: f"certbound.{home}.{name}" for name, home in table.items()}
+    assert read == {name: f"certbound.{home}.{name}" for home, names in table.items() for name in names.split()}
 
 
 @pytest.mark.slow

@@ -45,8 +45,9 @@ def _global_options(
         raise typer.Exit(BAD_INPUT)
 
 
-for _command in (verify, derive, tune, synthesize, simulate, check, problems, new, doctor):
-    _command.register(app)
+for _module in (verify, derive, tune, synthesize, simulate, check, problems, new, doctor):
+    _name = _module.__name__.rpartition(".")[2]
+    app.command(_name, epilog=_module.EXAMPLES)(getattr(_module, _name))
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from certbound.cli.messages import InputError
+from certbound.cli.options import number, option
 
 __all__ = ["Clock", "OutOfTime", "TimeLimitOption", "positive"]
 
@@ -29,8 +30,6 @@ def positive(text: str) -> float:
     >>> positive("2.5")
     2.5
     """
-    from certbound.cli.options import number
-
     value = number(text)
     if value <= 0:
         raise typer.BadParameter(f"must be positive, got `{text}`")
@@ -38,14 +37,7 @@ def positive(text: str) -> float:
 
 
 TimeLimitOption = Annotated[
-    float | None,
-    typer.Option(
-        "--time-limit",
-        parser=positive,
-        metavar="SECONDS",
-        help="Stop searching then, and give the best answer so far.",
-        show_default=False,
-    ),
+    float | None, option("--time-limit", "SECONDS", "Stop searching then, and give the best answer so far.", positive)
 ]
 
 

@@ -6,28 +6,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from certbound.display import log10_text
-
 if TYPE_CHECKING:
     from certbound.safety.verification import Verdict
     from certbound.tubes.constants import Constants
     from certbound.tubes.tube import Tube
 
-__all__ = ["describe_constants", "describe_deviation", "describe_parameters", "log10_text"]
+__all__ = ["attributes", "describe_constants", "describe_deviation", "describe_parameters"]
+
+
+def attributes(found: Any, *names: str) -> dict[str, Any]:
+    """Some attributes of a result, by name."""
+    return {name: getattr(found, name) for name in names}
 
 
 def describe_constants(constants: Constants) -> dict[str, Any]:
     """``rate`` or ``gain``, ``sigma``, ``effective_dimension``, ``metric``, and what they rest on."""
     name = "rate" if constants.continuous else "gain"
     return {
-        name: getattr(constants, name),
-        "sigma": constants.sigma,
+        **attributes(constants, name, "sigma"),
         "effective_dimension": constants.nu,
-        "metric": constants.metric,
-        "isotropic": constants.isotropic,
-        "times": constants.times,
-        "certified": constants.certified,
-        "gap": constants.gap,
+        **attributes(constants, "metric", "isotropic", "times", "certified", "gap"),
         "domain": None if constants.proof is None else constants.proof.domain,
     }
 
@@ -43,7 +41,4 @@ def describe_deviation(verdict: Verdict) -> dict[str, Any] | None:
     Piece k is [times[k], times[k+1]] with both ends; in discrete time it covers the steps k and k + 1. None
     where no tube could be certified.
     """
-    deviation = verdict.deviation
-    if deviation is None:
-        return None
-    return {"times": deviation.times, "radius": deviation.radius, "extent": deviation.extent}
+    return None if verdict.deviation is None else attributes(verdict.deviation, "times", "radius", "extent")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,18 +14,25 @@ import typer
 from certbound.cli.messages import InputError, split_cure
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from certbound.problem.problem import Problem
 
 __all__ = [
+    "DeltaOption",
+    "HorizonOption",
     "JsonOption",
+    "PlotOption",
     "ProblemArgument",
+    "SeedOption",
     "SetOption",
-    "check_picture",
     "check_writable",
     "examples",
+    "generator",
     "integer",
     "load_problem",
     "number",
+    "option",
     "settings_of",
 ]
 
@@ -62,6 +69,11 @@ def complete_problem(incomplete: str) -> list[str]:
     return sorted(name for name in MODELS if name.startswith(incomplete))
 
 
+def option(flag: str, metavar: str, text: str, parser: Callable[[str], Any] | None = None) -> Any:
+    """An option that takes a value and may be left out."""
+    return typer.Option(flag, metavar=metavar, help=text, parser=parser, show_default=False)
+
+
 ProblemArgument = Annotated[
     str,
     typer.Argument(
@@ -72,23 +84,13 @@ ProblemArgument = Annotated[
     ),
 ]
 SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Change a parameter of the problem; repeat for more.",
-        show_default=False,
-    ),
+    list[str] | None, option("--set", "KEY=VALUE", "Change a parameter of the problem; repeat for more.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
-HorizonOption = Annotated[
-    float | None,
-    typer.Option("--horizon", parser=number, metavar="T", help="Seconds, or steps.", show_default=False),
-]
-DeltaOption = Annotated[
-    float | None,
-    typer.Option("--delta", parser=number, metavar="D", help="Allowed exit probability.", show_default=False),
-]
+HorizonOption = Annotated[float | None, option("--horizon", "T", "Seconds, or steps.", number)]
+DeltaOption = Annotated[float | None, option("--delta", "D", "Allowed exit probability.", number)]
+SeedOption = Annotated[int | None, option("--seed", "S", "The same seed gives the same runs.", integer)]
+PlotOption = Annotated[Path | None, option("--plot", "FILE", "Draw tubes, sets and sample paths.")]
 
 
 def settings_of(pairs: Sequence[str] | None) -> dict[str, float]:
@@ -111,6 +113,15 @@ def settings_of(pairs: Sequence[str] | None) -> dict[str, float]:
         except typer.BadParameter as error:
             raise InputError(f"the value of `--set {key}` {error}", f"write for example --set {key}=0.02") from None
     return found
+
+
+def generator(seed: int | None) -> np.random.Generator:
+    """Random numbers from ``--seed``, or from the system."""
+    if seed is not None and seed < 0:
+        raise InputError(f"`--seed` must not be negative, got {seed}", "give a whole number such as 1")
+    import numpy as np
+
+    return np.random.default_rng(seed)
 
 
 def load_problem(
@@ -166,19 +177,6 @@ def check_writable(*paths: Path | None) -> None:
             raise InputError(f"the directory `{path.parent}` does not exist", f"run mkdir -p {path.parent}")
         if not os.access(path if path.exists() else path.parent, os.W_OK):
             raise InputError(f"`{path}` cannot be written", "choose another place, or change the permissions")
-
-
-def check_picture(path: Path | None) -> None:
-    """Refuse, before any work, to draw in a format that matplotlib does not write."""
-    if path is None or not path.suffix:
-        return
-    from matplotlib.backend_bases import FigureCanvasBase
-
-    known = FigureCanvasBase.get_supported_filetypes()
-    if path.suffix[1:].lower() not in known:
-        raise InputError(
-            f"`{path.name}` ends in {path.suffix}, which is no format of pictures", "end it in .png or .pdf"
-        )
 
 
 def examples(*lines: str) -> str:

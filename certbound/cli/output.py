@@ -8,7 +8,7 @@ import logging
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,18 @@ from certbound.display import plain
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["SETTINGS", "Settings", "console", "logging_to_stderr", "plain", "print_json", "spinner", "write_file"]
+__all__ = [
+    "SETTINGS",
+    "Settings",
+    "animated",
+    "console",
+    "logging_to_stderr",
+    "plain",
+    "print_json",
+    "print_status",
+    "spinner",
+    "write_file",
+]
 
 
 class Settings:
@@ -45,19 +56,33 @@ def print_json(value: Mapping[str, Any]) -> None:
     sys.stdout.flush()
 
 
+def print_status(screen: Console, status: str) -> None:
+    """The word of a verdict in its colour, without the end of the line."""
+    color = {"SAFE": "green", "UNKNOWN": "yellow"}.get(status, "red")
+    screen.print(f"[bold {color}]{status}[/]  ", end="")
+
+
+def animated() -> bool:
+    """Whether somebody watches standard error, who did not ask for less or for more."""
+    return not SETTINGS.quiet and not SETTINGS.verbose and sys.stderr.isatty()
+
+
 @contextlib.contextmanager
-def spinner(text: str) -> Iterator[None]:
-    """A spinner with the elapsed time on standard error while the work runs, on a terminal only."""
-    if SETTINGS.quiet or SETTINGS.verbose or not sys.stderr.isatty():
-        yield
+def spinner(text: str) -> Iterator[Callable[[str], None]]:
+    """A spinner with the elapsed time on standard error while the work runs, on a terminal only.
+
+    What the block is given changes the text.
+    """
+    if not animated():
+        yield lambda text: None
         return
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        progress.add_task(text, total=None)
-        yield
+        task = progress.add_task(text, total=None)
+        yield lambda text: progress.update(task, description=text)
 
 
 @contextlib.contextmanager

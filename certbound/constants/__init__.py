@@ -13,39 +13,25 @@ What a user may want of it, each name loaded when it is first used:
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
+from certbound.lazy import load_name, names_in
+
 _HOME = {
-    "bound_constants": "bounds",
-    "bound_metrics": "metrics",
-    "propose_metrics": "metrics",
-    "split_delta": "metrics",
-    "constants_along": "bounds",
-    "fitted_constants_along": "fitted",
-    "matrix_measure": "jacobians",
-    "induced_norm": "jacobians",
-    "diagonal_weights": "jacobians",
-    "jacobian_set": "jacobians",
-    "AffineSet": "jacobians",
-    "SectorSet": "jacobians",
-    "VertexPolytope": "jacobians",
-    "IntervalMatrixSet": "jacobians",
-    "UnionSet": "jacobians",
-    "certify_rate": "recheck",
-    "certify_gain": "recheck",
-    "design_feedback": "programs",
+    "bounds": "bound_constants constants_along",
+    "metrics": "bound_metrics propose_metrics split_delta",
+    "fitted": "fitted_constants_along",
+    "jacobians": "matrix_measure induced_norm diagonal_weights jacobian_set "
+    "AffineSet SectorSet VertexPolytope IntervalMatrixSet UnionSet",
+    "recheck": "certify_rate certify_gain",
+    "programs": "design_feedback",
 }
 
-__all__ = [*_HOME]
+__all__ = names_in(_HOME)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return load_name(__name__, _HOME, name)
 
 
 def __dir__() -> list[str]:

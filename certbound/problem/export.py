@@ -14,7 +14,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Ellipsoid, Inside, Outside
 from certbound.problem.systems import System
 
-__all__ = ["CasadiProblem", "export_casadi", "export_control"]
+__all__ = ["CasadiProblem", "export_casadi", "export_control", "runge_kutta"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,7 +72,7 @@ def export_casadi(problem: Problem) -> CasadiProblem:
     u, d = ca.SX.sym("u", len(system.input_names)), ca.SX.sym("d", len(system.disturbance_names))
     value = to_casadi(system.dynamics, [part for part in (t, x, u, d) if part.numel()])
     dynamics = ca.Function("dynamics", [t, x, u, d], [value], ["t", "x", "u", "d"], ["f"])
-    following = value if system.time == "discrete" else _runge_kutta(dynamics, t, x, u, d, h)
+    following = value if system.time == "discrete" else runge_kutta(lambda s, y: dynamics(s, y, u, d), t, x, h)
     step = ca.Function("step", [t, x, u, d, h], [following], ["t", "x", "u", "d", "h"], ["next"])
     rows, labels = _constraint_rows(ca, problem, t, x)
     constraints = ca.Function("constraints", [t, x], [rows], ["t", "x"], ["g"])
@@ -84,11 +84,12 @@ def export_casadi(problem: Problem) -> CasadiProblem:
     return CasadiProblem(dynamics=dynamics, step=step, constraints=constraints, labels=labels, cost=cost)
 
 
-def _runge_kutta(f: Any, t: Any, x: Any, u: Any, d: Any, h: Any) -> Any:
-    first = f(t, x, u, d)
-    second = f(t + h / 2, x + h / 2 * first, u, d)
-    third = f(t + h / 2, x + h / 2 * second, u, d)
-    fourth = f(t + h, x + h * third, u, d)
+def runge_kutta(f: Callable[[Any, Any], Any], t: Any, x: Any, h: Any) -> Any:
+    """One step of length h of the classical method for x' = f(t, x), of numbers or CasADi's expressions."""
+    first = f(t, x)
+    second = f(t + h / 2, x + h / 2 * first)
+    third = f(t + h / 2, x + h / 2 * second)
+    fourth = f(t + h, x + h * third)
     return x + h / 6 * (first + 2 * second + 2 * third + fourth)
 
 

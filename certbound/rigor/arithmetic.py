@@ -171,10 +171,6 @@ class Interval:
         result: NDArray[np.bool_] = np.asarray((self.lo <= lo) & (hi <= self.hi))
         return result
 
-    def subset(self, other: IntervalLike) -> NDArray[np.bool_]:
-        """Elementwise: does ``other`` contain this interval?"""
-        return _as_interval(other).contains(self)
-
     def hull(self, other: IntervalLike) -> Interval:
         """Smallest intervals that contain both."""
         other = _as_interval(other)

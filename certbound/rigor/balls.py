@@ -1,8 +1,8 @@
 """Special functions in ball arithmetic: every result is a rigorous enclosure (python-flint, log domain).
 
 Symbols: F_a(z) = 1F1(a; b; z), excess E_a(z) = (F_a(z) - 1)/a with the limit sum_k z^k/(k (b)_k) at a = 0
-(item 7.13 of docs/theory.md), 0F1(; b; x), and the normal tail Q(x) = P(N(0, 1) > x). All the Taylor coefficients
-of E_a and 0F1 are positive for a >= 0, b > 0.
+(item 7.13 of docs/theory.md), and 0F1(; b; x). All the Taylor coefficients of E_a and 0F1 are positive for a >= 0,
+b > 0.
 """
 
 from __future__ import annotations
@@ -20,11 +20,6 @@ __all__ = [
     "excess_floor",
     "excess_tangent",
     "kummer_excess",
-    "log_bessel0f1",
-    "log_expm1",
-    "log_kummer",
-    "log_q_bounds",
-    "log_q_upper",
     "lower",
     "precision",
     "solve_upward",
@@ -205,48 +200,6 @@ def _peak(a: float, b: float, x: float, *, bessel: bool) -> float:
     return half + math.sqrt(max(half * half + a * x - b, 0.0))
 
 
-def log_expm1(x: arb) -> arb:
-    """Ball of log(exp(x) - 1), x > 0."""
-    return x + (-(-x).expm1()).log()
-
-
-def log_kummer(a: float, b: float, z: float) -> tuple[float, float]:
-    """Rigorous bounds (lo, hi) of log 1F1(a; b; z), a >= 0, b > 0, z >= 0.
-
-    Examples
-    --------
-    >>> lo, hi = log_kummer(0.5, 0.5, 3.0)
-    >>> lo <= 3.0 <= hi and hi - lo < 1e-14
-    True
-    """
-    _check(a=a, b=b, z=z)
-    with precision():
-        value = (arb(a) * kummer_excess(arb(a), arb(b), arb(z))).log1p()
-        return lower(value), upper(value)
-
-
-def log_bessel0f1(b: float, z: float) -> tuple[float, float]:
-    """Rigorous bounds (lo, hi) of log 0F1(; b; z), b > 0, z >= 0.
-
-    Examples
-    --------
-    >>> lo, hi = log_bessel0f1(0.5, 1.0)  # cosh(2 sqrt z)
-    >>> lo <= math.log(math.cosh(2.0)) + 1e-15 and hi - lo < 1e-14
-    True
-    """
-    _check(b=b, z=z)
-    with precision():
-        value = bessel_excess(arb(b), arb(z)).log1p()
-        return lower(value), upper(value)
-
-
-def _check(**values: float) -> None:
-    for name, value in values.items():
-        if not (math.isfinite(value) and value >= 0 and (name != "b" or value > 0)):
-            rule = "be positive and finite" if name == "b" else "be finite and not negative"
-            raise ValueError(f"`{name}` must {rule}, got {value}.")
-
-
 def solve_upward(function: Callable[[arb], arb], target: arb, guess: float) -> float:
     """Float z with function(z) >= target proved, close above ``guess``; inf when none is found.
 
@@ -262,35 +215,3 @@ def solve_upward(function: Callable[[arb], arb], target: arb, guess: float) -> f
         z = max(z * (1 + step), math.nextafter(z, math.inf))
         step *= 8
     return math.inf
-
-
-def log_q_bounds(x: float) -> tuple[float, float]:
-    """Rigorous bounds (lo, hi) of log Q(x), Q the upper tail of the standard normal law.
-
-    Examples
-    --------
-    >>> lo, hi = log_q_bounds(0.0)
-    >>> lo <= math.log(0.5) <= hi
-    True
-    """
-    if math.isnan(x):
-        raise ValueError("`x` must not be nan.")
-    if math.isinf(x):
-        return (-math.inf, -math.inf) if x > 0 else (0.0, 0.0)
-    with precision():
-        value = ((arb(x) / arb(2).sqrt()).erfc() / 2).log()
-        if not value.is_finite():  # Mills: x phi/(1 + x^2) < Q < phi/x
-            density = -(arb(x) ** 2) / 2 - (2 * arb.pi()).log() / 2
-            return lower(density + (arb(x) / (1 + arb(x) ** 2)).log()), upper(density - arb(x).log())
-        return lower(value), upper(value)
-
-
-def log_q_upper(x: float) -> float:
-    """Upper bound of log Q(x).
-
-    Examples
-    --------
-    >>> abs(log_q_upper(1.959963984540054) - math.log(0.025)) < 1e-12
-    True
-    """
-    return log_q_bounds(x)[1]

@@ -1,6 +1,6 @@
-"""Rigorous bounds of eigenvalues and norms over batches of interval matrices, and the matrix exponential.
+"""Rigorous bounds of eigenvalues over batches of interval matrices.
 
-The floating-point eigenvectors V (or singular vectors U, V) only choose coordinates: the matrix is enclosed
+The floating-point eigenvectors V only choose coordinates: the matrix is enclosed
 in them rigorously, T = V^T A V, and the bound is read off T with the defect of orthogonality, |V^T V - I| <=
 g, accounted for. There the largest eigenvalue of T is bounded by Collatz and Wielandt's quotient, which holds
 for every positive vector w: lambda_max(T) <= max_i (N w)_i / w_i with N_ii = sup T_ii and N_ij = sup |T_ij|.
@@ -9,28 +9,21 @@ The bounds are exact up to rounding for point matrices and to first order in the
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from certbound.rigor.arithmetic import Interval, IntervalLike, matmul
 from certbound.rigor.rounding import STEP, TINY, lower, product_error, quiet, upper
 
-__all__ = [
-    "eigenvalue_lower", "eigenvalue_upper", "is_positive_definite", "matrix_exponential", "norm_upper",
-    "perron_upper",
-]  # fmt: skip
+__all__ = ["eigenvalue_lower", "eigenvalue_upper", "is_positive_definite", "perron_upper"]
 
 Array = NDArray[np.float64]
-DEGREE = 14  # of the Taylor polynomial
 
 
-def _matrices(name: str, matrix: IntervalLike, *, square: bool) -> Interval:
+def _matrices(name: str, matrix: IntervalLike) -> Interval:
     x = matrix if isinstance(matrix, Interval) else Interval.point(matrix)
-    if x.ndim < 2 or (square and x.shape[-1] != x.shape[-2]):
-        kind = "square matrices" if square else "matrices"
-        raise ValueError(f"`{name}` must be a batch of {kind}, got shape {x.shape}.")
+    if x.ndim < 2 or x.shape[-1] != x.shape[-2]:
+        raise ValueError(f"`{name}` must be a batch of square matrices, got shape {x.shape}.")
     return x
 
 
@@ -60,7 +53,7 @@ def eigenvalue_upper(A: IntervalLike) -> Array:
     >>> bool(0 <= eigenvalue_upper(np.array([[2.0, 1.0], [1.0, 2.0]])) - 3.0 < 1e-14)
     True
     """
-    x = _matrices("A", A, square=True)
+    x = _matrices("A", A)
     n = x.shape[-1]
     if n == 1:
         return np.array(x.hi[..., 0, 0])
@@ -81,7 +74,7 @@ def eigenvalue_upper(A: IntervalLike) -> Array:
 
 def eigenvalue_lower(A: IntervalLike) -> Array:
     """Lower bounds of the smallest eigenvalue; see `eigenvalue_upper`."""
-    return -eigenvalue_upper(-_matrices("A", A, square=True))
+    return -eigenvalue_upper(-_matrices("A", A))
 
 
 @quiet
@@ -104,7 +97,7 @@ def is_positive_definite(A: IntervalLike) -> NDArray[np.bool_]:
     ValueError
         If the matrices are not square, or an array is not symmetric.
     """
-    x = _matrices("A", A, square=True)
+    x = _matrices("A", A)
     diagonal = np.diagonal(x.lo, axis1=-2, axis2=-1)
     possible = np.all((diagonal > 0) & (diagonal < np.inf), axis=-1)
     safe = np.where(possible[..., None], diagonal, 1.0)
@@ -112,39 +105,6 @@ def is_positive_definite(A: IntervalLike) -> NDArray[np.bool_]:
     shift = np.clip(exponent[..., :, None] + exponent[..., None, :], -900, 900)
     scaled = Interval._raw(lower(np.ldexp(x.lo, shift), tiny=TINY), upper(np.ldexp(x.hi, shift), tiny=TINY))
     return np.asarray(possible & (eigenvalue_lower(scaled) > 0))
-
-
-@quiet
-def norm_upper(A: IntervalLike) -> Array:
-    """Upper bounds of the spectral norm of interval matrices.
-
-    Proves: ||M||_2 <= result for every M in A.
-
-    Parameters
-    ----------
-    A : Interval or ndarray, shape (..., p, q)
-
-    Returns
-    -------
-    ndarray, shape (...)
-        +inf where an entry is unbounded.
-
-    Examples
-    --------
-    >>> bool(0 <= norm_upper(np.array([[3.0, 0.0], [4.0, 0.0]])) - 5.0 < 1e-13)
-    True
-    """
-    x = _matrices("A", A, square=False)
-    s, finite = _finite_part(x)
-    if 1 in s.shape[-2:]:
-        total = s.mag
-        return np.where(finite, _up_sqrt(_sum_up(upper(total * total, tiny=TINY), axis=(-1, -2))), np.inf)
-    u, _, vt = np.linalg.svd(s.mid, full_matrices=True)
-    t = matmul(matmul(u.swapaxes(-1, -2), s), vt.swapaxes(-1, -2))
-    top = _nonnegative_norm(t.mag)
-    shrink = lower(lower(1.0 - _defect(u)) * lower(1.0 - _defect(vt.swapaxes(-1, -2))))
-    bound = upper(top / lower(np.sqrt(np.maximum(shrink, 0.0))), tiny=TINY)
-    return np.where(finite & (shrink > 0.25), bound, np.inf)
 
 
 def _finite_part(x: Interval) -> tuple[Interval, NDArray[np.bool_]]:
@@ -167,10 +127,6 @@ def _largest_of_two(a: Array, d: Array, b: Array) -> Array:
     excess = np.where(b == 0, 0.0, np.minimum(excess, b))
     total = np.where(excess == 0, largest, upper(largest + excess))
     return np.where(np.isfinite(largest) & np.isfinite(b), total, np.inf)
-
-
-def _up_sqrt(x: Array) -> Array:
-    return upper(np.sqrt(x))
 
 
 def _sum_up(x: Array, axis: int | tuple[int, ...]) -> Array:
@@ -234,68 +190,3 @@ def perron_upper(n: Array) -> Array:
         bound = np.array(bound)
         bound[loose] = np.minimum(bound[loose], better)
     return bound
-
-
-def _nonnegative_norm(n: Array) -> Array:
-    """Upper bounds of the spectral norm of nonnegative matrices: ||N||^2 = lambda_max(N^T N)."""
-    gram = matmul(n.swapaxes(-1, -2), n).hi
-    return _up_sqrt(np.maximum(perron_upper(np.maximum(gram, gram.swapaxes(-1, -2))), 0.0))
-
-
-@quiet
-def matrix_exponential(A: IntervalLike, h: ArrayLike | Interval = 1.0) -> Interval:
-    """Enclosures of exp(A h).
-
-    Proves: exp(M s) lies in the result for every M in A and s in h. X = A h is halved until its norm is at
-    most 1/2, the Taylor polynomial of degree 14 is evaluated by Horner's rule, the remainder is bounded entry
-    by entry by x^15/15! / (1 - x/16) with x = ||X||_inf, and the result is squared back.
-
-    Parameters
-    ----------
-    A : Interval or ndarray, shape (..., n, n)
-        Generator; 1/s when h is in seconds.
-    h : float, ndarray or Interval, shape broadcastable to (...)
-        Time.
-
-    Returns
-    -------
-    Interval, shape (..., n, n)
-
-    Raises
-    ------
-    ValueError
-        If the matrices are not square, or a norm exceeds 1000 (the exponential would overflow).
-
-    Examples
-    --------
-    >>> rotation = matrix_exponential(np.array([[0.0, 1.0], [-1.0, 0.0]]), np.pi / 2)
-    >>> bool(rotation.width.max() < 1e-13 and rotation.contains(np.array([[0.0, 1.0], [-1.0, 0.0]])).all())
-    True
-    """
-    generator = _matrices("A", A, square=True)
-    time = h if isinstance(h, Interval) else Interval.point(h)
-    x = generator * Interval._raw(np.asarray(time.lo)[..., None, None], np.asarray(time.hi)[..., None, None])
-    n = x.shape[-1]
-    size = float(np.max(_sum_up(x.mag, axis=-1), initial=0.0))
-    if not size <= 1000.0:
-        raise ValueError(f"`A` times `h` must have norm at most 1000, got {size:.3g}; take smaller steps.")
-    halvings = max(0, math.ceil(math.log2(size)) + 1) if size > 0 else 0
-    scale = 0.5**halvings
-    small = Interval._raw(x.lo * scale, x.hi * scale) if halvings else x
-    if halvings:  # exact but for subnormal numbers
-        small = Interval._raw(lower(small.lo, tiny=TINY), upper(small.hi, tiny=TINY))
-    degree = DEGREE
-    identity = np.eye(n)
-    result = Interval.point(np.broadcast_to(identity, x.shape))
-    for k in range(degree, 0, -1):
-        result = matmul(small, result) / float(k) + identity
-    norm = np.max(_sum_up(small.mag, axis=-1), axis=-1)
-    power = norm
-    for _ in range(degree):
-        power = upper(power * norm, tiny=TINY)
-    remainder = upper(power / math.factorial(degree + 1) * (1 + 1e-9) / (1 - 0.5 / (degree + 1)), tiny=TINY)
-    rest = np.broadcast_to(remainder[..., None, None], x.shape)
-    result = result + Interval._raw(-rest, rest)
-    for _ in range(halvings):
-        result = matmul(result, result)
-    return result

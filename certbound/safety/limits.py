@@ -23,7 +23,7 @@ from certbound.problem.systems import ContinuousSystem, System
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import Verdict, verify_safety
 
-__all__ = ["Limits", "find_limits", "find_smallest", "smaller_verdicts"]
+__all__ = ["Limits", "find_limits", "smaller_verdicts"]
 
 _HALVINGS = 5
 _WIDENINGS = 4
@@ -137,33 +137,6 @@ def smaller_verdicts(verdict: Verdict, *, method: str = "auto", cells: int | Non
             level, step = found.log10_delta, 2 * step
         else:
             step = min(step / 3, max(0.99 * (level - found.log10_delta), step / 10))
-
-
-def find_smallest(verdict: Verdict, *, method: str = "auto", cells: int | None = None) -> Verdict:
-    """The verdict with the smallest probability that can be proved, within some 2 % of its exponent.
-
-    Parameters
-    ----------
-    verdict : Verdict
-        SAFE.
-    method : str
-        As for `verify_safety`.
-    cells : int, optional
-        Parts along each side of the initial set.
-
-    Raises
-    ------
-    ValueError
-        If the verdict is not SAFE or knows no problem.
-
-    Examples
-    --------
-    >>> import certbound as cb
-    >>> verdict = cb.verify_safety(cb.load("ou"), method="constants")
-    >>> find_smallest(verdict, method="constants").log10_delta <= verdict.log10_delta
-    True
-    """
-    return [verdict, *smaller_verdicts(verdict, method=method, cells=cells)][-1]
 
 
 def _horizon(problem: Problem, safe: Callable[[Callable[[], Problem]], bool]) -> float | None:

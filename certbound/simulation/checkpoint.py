@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.simulation.blocks import Tally, Work
+from certbound.simulation.blocks import Tally, Work, entropy_of
 from certbound.simulation.compiled import write_atomically
 
-__all__ = ["Checkpoint", "stored_entropy"]
+__all__ = ["Checkpoint", "seed_of"]
 
 _VERSION = 1
 
@@ -134,6 +134,8 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
     return stored
 
 
-def stored_entropy(path: str | Path) -> int | None:
-    """The seed that a checkpoint was made with, None where there is no file."""
-    return int(str(_read(Path(path))["seed"])) if Path(path).exists() else None
+def seed_of(rng: np.random.Generator | int | None, path: str | Path | None) -> int:
+    """The seed of a run: that of an existing checkpoint where ``rng`` is omitted."""
+    if rng is None and path is not None and Path(path).exists():
+        return int(str(_read(Path(path))["seed"]))
+    return entropy_of(rng)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -25,8 +24,6 @@ from certbound.simulation.blocks import Tally, Work, run_blocks
 from certbound.simulation.checkpoint import Checkpoint
 
 __all__ = ["Outcome", "Progress", "connect", "run_work"]
-
-logger = logging.getLogger(__name__)
 
 _STEPS_PER_CHUNK = 4e7  # about a quarter of a second
 _FEWEST_CHUNKS = 64

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.sets import Outside
-from certbound.simulation.tape_text import Parameters, linear_form
+from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 
-__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "window_test"]
+__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "tables_of", "window_test"]
 
 Array = NDArray[np.float64]
 
@@ -135,6 +135,15 @@ def barriers_of(problem: Any, times: Array) -> list[Barrier]:
     return barriers
 
 
+def tables_of(barriers: Sequence[Barrier]) -> dict[str, Any]:
+    """What the kernels read of barriers: ``moving`` offsets (a row a step), and ``windows`` (first and last step)."""
+    moving = [barrier.offset for barrier in barriers if barrier.moving]
+    return {
+        "moving": np.hstack(moving) if moving else np.zeros((0, 0)),
+        "windows": np.array([[b.first, b.last] for b in barriers], dtype=np.int64).reshape(-1, 2),
+    }
+
+
 _ROUND = ("ball", "ellipsoid")
 
 
@@ -182,10 +191,6 @@ def _starts(number: int, barrier: Barrier) -> str:
     return "" if barrier.always else f"windows[{number}, 0] == 0"
 
 
-def _names(letter: str, count: int) -> list[str]:
-    return [f"{letter}_{i}" for i in range(count)]
-
-
 def _touch(exponent: str, number: int) -> list[str]:
     """Leave with probability exp(-e), which is below 1/(1 + e + e^2/2): that saves most exponentials."""
     return [
@@ -196,21 +201,17 @@ def _touch(exponent: str, number: int) -> list[str]:
     ]
 
 
-def _indent(lines: Sequence[str], levels: int = 1) -> list[str]:
-    return ["    " * levels + line for line in lines]
-
-
 def _faces(
     number: int, barrier: Barrier, bridge: Bridge | None, p: Parameters, column: int
 ) -> tuple[list[str], list[str], list[str]]:
     rows, dimension = barrier.matrix.shape
-    old, new = _names(f"g_{number}", rows), _names(f"n_{number}", rows)
+    old, new = vector(f"g_{number}", rows), vector(f"n_{number}", rows)
 
     def gaps(targets: list[str], state: str, step: str) -> list[str]:
         lines = []
         for f, target in enumerate(targets):
             bound = f"moving[{step}, {column + f}]" if barrier.moving else p.add(float(barrier.offset[f]))
-            value = linear_form(barrier.matrix[f].tolist(), _names(state, dimension), p)
+            value = linear_form(barrier.matrix[f].tolist(), vector(state, dimension), p)
             lines.append(f"{target} = " + (f"{bound} - ({value})" if barrier.stay else f"{value} - {bound}"))
         return lines
 
@@ -241,7 +242,7 @@ def _bridge_stay(
         if not p.is_zero(spread):
             near = f"0.0 <= {g} and {g} * {n} < {0.5 * EXPONENT} * ({spread})"
             lines += [if_all(near, "left < 0", *active)]
-            lines += _indent(_touch(f"2.0 * {g} * {n} / ({spread})", number))
+            lines += indent(_touch(f"2.0 * {g} * {n} / ({spread})", number))
     return lines
 
 
@@ -257,9 +258,9 @@ def _bridge_avoid(
         lines += [f"if {g} > 0.0 and {n} > 0.0:", f"    worst = max(worst, 2.0 * {g} * {n} / ({spread}))"]
         lines += [f"elif {g} > 0.0:", f"    enter = max(enter, {g} / ({g} - {n}))"]
         lines += [f"elif {n} > 0.0:", f"    leave = min(leave, {g} / ({g} - {n}))"]
-    lines += ["if worst >= 0.0:", *_indent(_touch("worst", number))]
+    lines += ["if worst >= 0.0:", *indent(_touch("worst", number))]
     lines += ["elif enter < leave:", f"    left = {number}"]
-    return [if_all(near, "left < 0", *active), *_indent(lines)]
+    return [if_all(near, "left < 0", *active), *indent(lines)]
 
 
 def _round(
@@ -268,13 +269,13 @@ def _round(
     rows, dimension = barrier.matrix.shape
     old, new = f"q_{number}", f"r_{number}"
     radius = p.add(barrier.radius)
-    legs = _names(f"e_{number}", rows)
+    legs = vector(f"e_{number}", rows)
 
     def distance(target: str, state: str, step: str) -> list[str]:
         lines = []
         for i, leg in enumerate(legs):
             center = f"moving[{step}, {column + i}]" if barrier.moving else p.add(float(barrier.offset[i]))
-            value = linear_form(barrier.matrix[i].tolist(), _names(state, dimension), p)
+            value = linear_form(barrier.matrix[i].tolist(), vector(state, dimension), p)
             lines += [f"{leg} = {value} - {center}"]
         return [*lines, f"{target} = {' + '.join(f'{leg} * {leg}' for leg in legs)}"]
 
@@ -291,12 +292,12 @@ def _round(
     lines = [f"before, after = {gap.format(old)}, {gap.format(new)}"]
     weights = [linear_form(column_.tolist(), legs, p) for column_ in barrier.matrix.T]
     lines += [f"w_{i} = {weight}" for i, weight in enumerate(weights)]
-    spread = bridge.moving_variance(_names("w", dimension), p)
+    spread = bridge.moving_variance(vector("w", dimension), p)
     lines += [f"spread = ({spread}) / {new} if {new} > 0.0 else 0.0"]
     lines += [f"if before >= 0.0 and before * after < {0.5 * EXPONENT} * spread:"]
-    lines += _indent(_touch("2.0 * before * after / spread", number))
+    lines += indent(_touch("2.0 * before * after / spread", number))
     test = if_all(near, *window_test(number, barrier, "k"), word="elif")
-    return start, [*step, test, *_indent(lines)], end
+    return start, [*step, test, *indent(lines)], end
 
 
 def _near(barrier: Barrier, bridge: Bridge, old: str, new: str, p: Parameters) -> str:

@@ -18,20 +18,18 @@ from numpy.typing import NDArray
 from certbound.problem.model import Tape
 from certbound.simulation.gap_tests import Bridge
 from certbound.simulation.stepping import StepModel
-from certbound.simulation.tape_text import Parameters, function_source, linear_form
+from certbound.simulation.tape_text import Parameters, function_source, indent, linear_form, vector
 from certbound.simulation.tasks import LOWEST, Task, task_source
 
 __all__ = [
     "SIGNATURE",
     "close_noise",
-    "indent",
     "kernel_source",
     "load_lines",
     "module_head",
     "nominal_lines",
     "open_noise",
     "step_lines",
-    "vector",
 ]
 
 Array = NDArray[np.float64]
@@ -149,16 +147,6 @@ def nominal_lines(model: StepModel, p: Parameters) -> list[str]:
     """Lines that advance the noise-free path from a_i to b_i."""
     call = f"{_targets(vector('h', model.dimension))} = drift(p, {', '.join(_arguments(model, 'a'))})"
     return [call, *[f"b_{i} = {value}" for i, value in enumerate(_moved(model, "a", "h", p))]]
-
-
-def vector(letter: str, count: int) -> list[str]:
-    """Names letter_0, letter_1, ..."""
-    return [f"{letter}_{i}" for i in range(count)]
-
-
-def indent(lines: Sequence[str], levels: int = 1) -> list[str]:
-    """Lines moved to the right."""
-    return ["    " * levels + line for line in lines]
 
 
 def _arguments(model: StepModel, state: str) -> list[str]:

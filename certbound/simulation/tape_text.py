@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from certbound.problem.model import OPERATIONS, Node, Tape, needed
 
-__all__ = ["Parameters", "function_source", "linear_form", "live_nodes"]
+__all__ = ["Parameters", "function_source", "indent", "linear_form", "live_nodes", "vector"]
 
 @dataclass(eq=False, slots=True)
 class Parameters:
@@ -33,6 +33,16 @@ class Parameters:
     def is_zero(self, expression: str) -> bool:
         """Whether an expression is known to be 0."""
         return self.value_of(expression) == 0.0
+
+
+def vector(letter: str, count: int) -> list[str]:
+    """Names letter_0, letter_1, ..."""
+    return [f"{letter}_{i}" for i in range(count)]
+
+
+def indent(lines: Sequence[str]) -> list[str]:
+    """Lines moved to the right."""
+    return ["    " + line for line in lines]
 
 
 def live_nodes(tape: Tape) -> list[int]:

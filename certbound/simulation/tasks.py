@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, barrier_source
-from certbound.simulation.tape_text import Parameters, linear_form
+from certbound.simulation.tape_text import Parameters, indent, linear_form
 
 __all__ = ["LOWEST", "Lines", "Task", "task_source"]
 
@@ -137,7 +137,7 @@ def _deviation(task: Task, dimension: int, bridge: Bridge | None, p: Parameters)
         begin += ["at = 0"]
         within += ["at += 1", *[f"track_{j}[at] = new_{j}" for j in range(count)]]
         due = "at == STRETCH or (mark < marks.shape[0] and marks[mark] == k + 1)" if task.marked else "at == STRETCH"
-        within += [f"if {due}:", *_indent(asked)]
+        within += [f"if {due}:", *indent(asked)]
         finish += asked
     begin = ["mark = 0", *begin] if task.marked else begin
     within += ["if mark < marks.shape[0] and marks[mark] == k + 1:"] if task.marked else []
@@ -172,7 +172,7 @@ def _norm_supremum(task: Task, norm: Array, n: int, bridge: Bridge | None, p: Pa
     if bridge.spread is not None:
         band = _band(norm @ bridge.spread, task)
         near += [f"limit_0 = max(top_0 - {p.add(band)}, 0.0) ** 2"]
-    return [*lines, "if new_0 > limit_0 or old_0 > limit_0:", *_indent(near)]
+    return [*lines, "if new_0 > limit_0 or old_0 > limit_0:", *indent(near)]
 
 
 def _scalar_suprema(task: Task, rows: Array, n: int, bridge: Bridge | None, p: Parameters) -> list[str]:
@@ -190,17 +190,13 @@ def _scalar_suprema(task: Task, rows: Array, n: int, bridge: Bridge | None, p: P
         half = f"{0.5 * EXPONENT} * spread"
         top = _bridge_top(str(j), f"old_{j}", f"new_{j}", "spread", p, tested=True)
         near = [f"top_{j} = max(top_{j}, new_{j})", *top]
-        lines += [f"if (top_{j} - old_{j}) * (top_{j} - new_{j}) < {half}:", *_indent(near)]
+        lines += [f"if (top_{j} - old_{j}) * (top_{j} - new_{j}) < {half}:", *indent(near)]
     return lines
 
 
 def _late(task: Task, bridge: Bridge) -> bool:
     """Whether the bridges of scalar values are alike, and are looked at when a stretch of steps is over."""
     return bridge.spread is not None and task.smallest_scale <= 0.0
-
-
-def _indent(lines: Sequence[str]) -> list[str]:
-    return [f"    {line}" for line in lines]
 
 
 def _bridge_top(j: str, before: str, after: str, spread: str, p: Parameters, tested: bool = False) -> list[str]:
@@ -222,7 +218,7 @@ def _bridge_top(j: str, before: str, after: str, spread: str, p: Parameters, tes
     ]
     if tested:
         return [f"exponent = {exponent}", *draw]
-    return [f"exponent = {exponent}", f"if exponent < {EXPONENT}:", *_indent(draw)]
+    return [f"exponent = {exponent}", f"if exponent < {EXPONENT}:", *indent(draw)]
 
 
 def _band(spread: Array, task: Task) -> float:

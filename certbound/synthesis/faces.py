@@ -14,6 +14,7 @@ Everything is in floating point: a verdict proves the result again. Source: Thm 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +26,7 @@ from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
 
-__all__ = ["Face", "Facets", "Plane", "Round", "faces_of"]
+__all__ = ["Face", "Facets", "Plane", "Round", "faces_of", "with_parts"]
 
 Array = NDArray[np.float64]
 
@@ -216,6 +217,14 @@ def faces_of(problem: Problem) -> tuple[Face, ...]:
     for index, constraint in enumerate(problem.constraints):
         found += _faces(constraint, index, problem.system.dimension)
     return tuple(found)
+
+
+def with_parts(faces: Iterable[Face]) -> Iterator[tuple[Face, slice]]:
+    """Every face, and its place among the parts of all."""
+    first = 0
+    for face in faces:
+        yield face, slice(first, first + face.parts)
+        first += face.parts
 
 
 def _faces(constraint: Inside, index: int, dimension: int) -> list[Face]:

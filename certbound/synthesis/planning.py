@@ -26,9 +26,9 @@ from certbound.problem.model import jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart, Region
 from certbound.synthesis.costs import Cost, cost_of
-from certbound.synthesis.faces import Face, faces_of
+from certbound.synthesis.faces import Face, faces_of, with_parts
 from certbound.synthesis.feedback import close_loop, constrain_inputs, depends_on, resolve_feedback
-from certbound.synthesis.plant import Grid, Plant
+from certbound.synthesis.plant import Grid, Plant, middle_of
 from certbound.synthesis.terminal import TerminalSet, check_terminal, contraction_terminal, riccati_terminal
 from certbound.synthesis.tightening import (
     BallTube,
@@ -45,7 +45,7 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
-__all__ = ["Path", "Planner", "Tightened"]
+__all__ = ["Path", "Planner", "Tightened", "check_tube"]
 
 Array = NDArray[np.float64]
 
@@ -55,6 +55,14 @@ ROUNDING = 1e-7
 SUBSTEPS = 2
 FITTED = ("kummer", "bessel")
 """Tubes that are fitted to the room of the plan."""
+
+
+def check_tube(problem: Problem, tube: Tube) -> None:
+    """Refuse a tube that ends before the problem, and what is no tube."""
+    if not isinstance(tube, Tube):
+        raise TypeError(f"`tube` must be a cb.Tube, got {tube!r}; the name of one goes under `method`.")
+    if tube.horizon < problem.horizon:
+        raise ValueError(f"`tube` must cover the horizon {problem.horizon:g}, got one up to {tube.horizon:g}.")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -244,7 +252,7 @@ class Planner:
         if involved and not box.bounded:
             raise ValueError(
                 "`inputs` must be bounded: the Jacobian depends on them, so that no constants hold for all inputs; "
-                "give cb.Box(low, high), or tube='linear'."
+                "give cb.Box(low, high), or method='linear'."
             )
         if n == 1 or metric is not None:
             return bound_constants(nominal, metric="euclidean" if metric is None else metric)
@@ -269,12 +277,10 @@ class Planner:
         unit = BallTube(radii=np.ones(self.grid.points), inverse=constants.inverse)
         factor = self.tightened(unit, solution.states)
         room = np.full(self.grid.points, np.inf)
-        part = 0
-        for face in self.faces:
-            own = factor.erosion[:, part : part + face.parts].max(axis=1)
+        for face, parts in with_parts(self.faces):
+            own = factor.erosion[:, parts].max(axis=1)
             value = face.room(solution.states[1:], times[1:]) / np.maximum(own, 1e-300)
             room = np.minimum(room, np.where(face.asked(times[1:]), value, np.inf))
-            part += face.parts
         spread = nominal_spread(self.problem, self.plant, self.grid, constants, solution.states, solution.inputs)
         room = room - spread[1:]
         if not np.any(np.isfinite(room)):
@@ -354,8 +360,7 @@ def _grid(problem: Problem, steps: int | None) -> Grid:
 
 
 def _plant(problem: Problem, dynamics: Any, feedback: Array | None) -> Plant:
-    system, box = problem.system, problem.system.disturbance
-    middle = np.zeros(0) if box is None else np.asarray((box.low + box.high) / 2)
+    system, middle = problem.system, middle_of(problem.system.disturbance)
     assert system.inputs is not None
     low, high = np.asarray(system.inputs.low), np.asarray(system.inputs.high)
     if feedback is None:

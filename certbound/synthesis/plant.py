@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.adapters import to_casadi
+from certbound.problem.export import runge_kutta
 from certbound.problem.model import Tape, compile_numpy
+from certbound.problem.sets import Box
 
-__all__ = ["Grid", "Plant"]
+__all__ = ["Grid", "Plant", "middle_of"]
 
 Array = NDArray[np.float64]
 
@@ -77,26 +79,14 @@ class Plant:
         def f(t: float, x: Array) -> Array:
             return self.evaluate(t, *np.moveaxis(x, -1, 0), *inputs, *self.disturbance)
 
-        if not grid.continuous:
-            return np.asarray(f(time_, state))[None]
-        h = grid.step / grid.substeps
-        found = []
-        for i in range(grid.substeps):
-            t = time_ + i * h
-            k1 = f(t, state)
-            k2 = f(t + h / 2, state + h / 2 * k1)
-            k3 = f(t + h / 2, state + h / 2 * k2)
-            k4 = f(t + h, state + h * k3)
-            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            found.append(state)
-        return np.array(found)
+        return np.array(_piece(f, grid, time_, state))
 
-    def rollout(self, grid: Grid, start: Array, inputs: Array, time_: float = 0.0) -> Array:
+    def rollout(self, grid: Grid, start: Array, inputs: Array) -> Array:
         """Noise-free states at all points, shape (points + 1, n)."""
         states = [np.asarray(start, dtype=float)]
         with np.errstate(all="ignore"):
             for k in range(len(inputs)):
-                states += list(self.step(grid, time_ + k * grid.step, states[-1], inputs[k]))
+                states += list(self.step(grid, k * grid.step, states[-1], inputs[k]))
         return np.array(states)
 
     def symbolic_step(self, ca: Any, grid: Grid, time_: Any, state: Any, inputs: Any) -> list[Any]:
@@ -106,16 +96,21 @@ class Plant:
         def f(t: Any, x: Any) -> Any:
             return to_casadi(self.dynamics, [ca.SX(t), x, inputs, *disturbance])
 
-        if not grid.continuous:
-            return [f(time_, state)]
-        h = grid.step / grid.substeps
-        found = []
-        for i in range(grid.substeps):
-            t = time_ + i * h
-            k1 = f(t, state)
-            k2 = f(t + h / 2, state + h / 2 * k1)
-            k3 = f(t + h / 2, state + h / 2 * k2)
-            k4 = f(t + h, state + h * k3)
-            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            found.append(state)
-        return found
+        return _piece(f, grid, time_, state)
+
+
+def _piece(f: Callable[[Any, Any], Any], grid: Grid, time_: Any, state: Any) -> list[Any]:
+    """States at the points of one piece, for numbers and for CasADi's expressions."""
+    if not grid.continuous:
+        return [f(time_, state)]
+    h = grid.step / grid.substeps
+    found = []
+    for i in range(grid.substeps):
+        state = runge_kutta(f, time_ + i * h, state, h)
+        found.append(state)
+    return found
+
+
+def middle_of(disturbance: Box | None) -> Array:
+    """The middle of a disturbance's box, shape (q,)."""
+    return np.zeros(0) if disturbance is None else np.asarray((disturbance.low + disturbance.high) / 2)

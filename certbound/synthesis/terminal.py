@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Ellipsoid, Region
-from certbound.synthesis.faces import Face, Facets, Round
+from certbound.synthesis.faces import Face, Facets, Round, with_parts
+from certbound.synthesis.plant import middle_of
 from certbound.tubes.constants import Constants
 
 __all__ = ["TerminalSet", "check_terminal", "contraction_terminal", "linearise", "riccati", "riccati_terminal"]
@@ -105,10 +106,8 @@ def check_terminal(terminal: TerminalSet, faces: Sequence[Face], erosion: Array,
     ValueError
         Naming the constraint and by how much it is missed.
     """
-    part = 0
-    for face in faces:
-        own = erosion[part : part + face.parts]
-        part += face.parts
+    for face, parts in with_parts(faces):
+        own = erosion[parts]
         if not face.asked(np.array([time]))[0]:
             continue
         room = _room_of_region(terminal.region, face, own, time)
@@ -148,21 +147,18 @@ def _middle(region: Region, dimension: int) -> Array:
     return full
 
 
-def linearise(problem: Problem, state: ArrayLike, inputs: ArrayLike, time: float = 0.0) -> tuple[Array, Array]:
+def linearise(problem: Problem, state: ArrayLike, inputs: ArrayLike) -> tuple[Array, Array]:
     """D_x f and D_u f at a point, with the disturbance in its middle: shapes (n, n), (n, m)."""
     system = problem.system
     n, m = system.dimension, len(system.input_names)
-    box = system.disturbance
-    middle = np.zeros(0) if box is None else np.asarray((box.low + box.high) / 2)
     slopes = compile_numpy(jacobian(system.dynamics, range(1, 1 + n + m)))
-    value = slopes(time, *np.asarray(state, dtype=float), *np.asarray(inputs, dtype=float), *middle)
+    point = [*np.asarray(state, dtype=float), *np.asarray(inputs, dtype=float), *middle_of(system.disturbance)]
+    value = slopes(0.0, *point)
     return np.asarray(value[:, :n]), np.asarray(value[:, n:])
 
 
-def riccati(
-    problem: Problem, state: ArrayLike | None = None, inputs: ArrayLike | None = None
-) -> tuple[Array, Array, Array]:
-    """S, K and the closed loop's matrix of the linear-quadratic regulator at a point (python-control).
+def riccati(problem: Problem, state: ArrayLike | None = None) -> tuple[Array, Array, Array]:
+    """S, K and the closed loop's matrix of the linear-quadratic regulator at a state without inputs (python-control).
 
     Without a cost of the problem, Q = I and R = I.
 
@@ -178,7 +174,7 @@ def riccati(
     """
     control = importlib.import_module("control")
     n, m = problem.system.dimension, len(problem.system.input_names)
-    a, b = linearise(problem, np.zeros(n) if state is None else state, np.zeros(m) if inputs is None else inputs)
+    a, b = linearise(problem, np.zeros(n) if state is None else state, np.zeros(m))
     weight, effort = problem.cost if problem.cost is not None else (np.eye(n), np.eye(m))
     solve = control.lqr if problem.system.time == "continuous" else control.dlqr
     try:
@@ -191,9 +187,8 @@ def riccati(
 
 
 def contraction_terminal(
-    problem: Problem, constants: Constants, faces: Sequence[Face], erosion: Array, time: float,
-    *, center: ArrayLike | None = None, inputs: ArrayLike | None = None,
-) -> TerminalSet:  # fmt: skip
+    problem: Problem, constants: Constants, faces: Sequence[Face], erosion: Array, time: float
+) -> TerminalSet:
     """The largest ball of the contraction metric that fits into the tightened constraints, with its cost.
 
     Parameters
@@ -203,24 +198,20 @@ def contraction_terminal(
         With a gain below 1 (rate below 0).
     faces, erosion, time
         The tightened constraints at the last time.
-    center, inputs : array_like, optional
-        An equilibrium; the origin with zero inputs when omitted.
 
     Raises
     ------
     ValueError
-        If the constants do not contract, the centre is no equilibrium, or it lies outside the tightened constraints.
+        If the constants do not contract, or the origin is no equilibrium or lies outside the tightened constraints.
     """
-    n, m = problem.system.dimension, len(problem.system.input_names)
-    c = np.zeros(n) if center is None else np.asarray(center, dtype=float)
-    u = np.zeros(m) if inputs is None else np.asarray(inputs, dtype=float)
+    n = problem.system.dimension
     worst = constants.worst_slope
     if worst >= (0 if constants.continuous else 1):
         raise ValueError(
             f"`terminal` from the contraction metric needs a {'negative rate' if constants.continuous else 'gain < 1'},"
             f" got {worst:.4g}; use terminal='riccati', or a feedback."
         )
-    _check_equilibrium(problem, c, u)
+    c = _equilibrium(problem)
     metric = constants.matrix
     radius = _largest_level(metric, c, faces, erosion, time)
     weight = np.asarray(problem.cost[0]) if problem.cost is not None else np.zeros((n, n))
@@ -231,10 +222,7 @@ def contraction_terminal(
     return TerminalSet(region=region, cost=share * metric, center=c)
 
 
-def riccati_terminal(
-    problem: Problem, faces: Sequence[Face], erosion: Array, time: float,
-    *, center: ArrayLike | None = None, inputs: ArrayLike | None = None,
-) -> TerminalSet:  # fmt: skip
+def riccati_terminal(problem: Problem, faces: Sequence[Face], erosion: Array, time: float) -> TerminalSet:
     """A level set of the Riccati cost on which the tightened constraints and the regulator's inputs are kept.
 
     Raises
@@ -242,42 +230,40 @@ def riccati_terminal(
     ValueError
         As ``contraction_terminal``, or if the linearisation cannot be stabilised.
     """
-    n, m = problem.system.dimension, len(problem.system.input_names)
-    c = np.zeros(n) if center is None else np.asarray(center, dtype=float)
-    u = np.zeros(m) if inputs is None else np.asarray(inputs, dtype=float)
-    _check_equilibrium(problem, c, u)
-    value, gain, _ = riccati(problem, c, u)
+    c = _equilibrium(problem)
+    value, gain, _ = riccati(problem, c)
     radius = _largest_level(value, c, faces, erosion, time)
     box = problem.system.inputs
     assert box is not None
     reach = np.sqrt(np.einsum("ij,jk,ik->i", gain, np.linalg.inv(value), gain))
     with np.errstate(divide="ignore"):
-        room = np.minimum(box.high - u, u - box.low) / reach
+        room = np.minimum(box.high, -box.low) / reach
     radius = min(radius, float(np.min(room)))
     if radius <= 0:
         raise ValueError("`terminal` needs an equilibrium whose inputs lie inside their bounds.")
     return TerminalSet(region=Ellipsoid(c, np.linalg.inv(value) * radius**2), cost=value, center=c)
 
 
-def _check_equilibrium(problem: Problem, center: Array, inputs: Array) -> None:
-    box = problem.system.disturbance
-    middle = np.zeros(0) if box is None else np.asarray((box.low + box.high) / 2)
-    value = compile_numpy(problem.system.dynamics)(0.0, *center, *inputs, *middle)
-    moved = value if problem.system.time == "continuous" else value - center
-    if np.max(np.abs(moved)) > 1e-6 * (1 + np.max(np.abs(center))):
+def _equilibrium(problem: Problem) -> Array:
+    """The origin, at which the system is found to stand still without inputs."""
+    system = problem.system
+    c = np.zeros(system.dimension)
+    idle = np.zeros(len(system.input_names))
+    moved = float(np.max(np.abs(compile_numpy(system.dynamics)(0.0, *c, *idle, *middle_of(system.disturbance)))))
+    if moved > 1e-6:
         raise ValueError(
-            f"`terminal` needs an equilibrium, but at {center.tolist()} with inputs {inputs.tolist()} the state moves "
-            f"by {np.max(np.abs(moved)):.3g}; give a set instead."
+            f"`terminal` needs an equilibrium, but at the origin without inputs the state moves by {moved:.3g}; give a "
+            "set instead."
         )
+    return c
 
 
 def _largest_level(metric: Array, center: Array, faces: Sequence[Face], erosion: Array, time: float) -> float:
     """Largest r with {||z - c||_P <= r} inside the tightened constraints."""
     inverse = np.linalg.inv(metric)
-    best, part = np.inf, 0
-    for face in faces:
-        own = erosion[part : part + face.parts]
-        part += face.parts
+    best = np.inf
+    for face, parts in with_parts(faces):
+        own = erosion[parts]
         if not face.asked(np.array([time]))[0]:
             continue
         rows = face.rows(center[None], np.array([time]))[0]

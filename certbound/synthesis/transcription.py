@@ -13,7 +13,6 @@ A solver's word counts for nothing here: `Transcription.solve` rolls the inputs 
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 
 from certbound.problem.adapters import casadi_module
 from certbound.synthesis.costs import Cost
-from certbound.synthesis.faces import Face, Facets
+from certbound.synthesis.faces import Face, Facets, with_parts
 from certbound.synthesis.plant import Grid, Plant
 from certbound.synthesis.terminal import TerminalSet
 
@@ -179,13 +178,13 @@ class Transcription:
         return ca.vertcat(*rows) if rows else ca.SX(0, 1)
 
     def _gaps(self, ca: Any, state: Any, time_: Any, erosion: Any, weights: Any) -> tuple[Any, Any]:
-        gaps, choices, part, weight = [], [], 0, 0
-        for face in self.faces:
+        gaps, choices, weight = [], [], 0
+        for face, parts in with_parts(self.faces):
             own = weights[weight : weight + face.weights]
-            gaps.append(face.gap(ca, state, time_, erosion[part : part + face.parts], own))
+            gaps.append(face.gap(ca, state, time_, erosion[parts], own))
             if face.weights:
                 choices.append(ca.sum1(own) - 1)
-            part, weight = part + face.parts, weight + face.weights
+            weight += face.weights
         return ca.vertcat(*gaps), ca.vertcat(*choices) if choices else ca.SX(0, 1)
 
     # ---- solving -----------------------------------------------------------------------------------------
@@ -276,8 +275,7 @@ class Transcription:
 
     def _allowed(self, erosion: Array) -> Array:
         """Largest slack (points, faces): what the tube takes, so that the constraints themselves stay hard."""
-        places = np.cumsum([0, *(face.parts for face in self.faces)])
-        return np.stack([erosion[:, a:b].max(axis=1) for a, b in itertools.pairwise(places)], axis=1)
+        return np.stack([erosion[:, parts].max(axis=1) for _, parts in with_parts(self.faces)], axis=1)
 
     def _sides(self, times: Array) -> tuple[Array, Array]:
         asked = np.stack([face.asked(times[1:]) for face in self.faces], axis=1) if self.faces else np.zeros((0, 0))
@@ -300,12 +298,11 @@ class Transcription:
     def _variables(self, mode: Mode, inputs: Array, states: Array, times: Array, erosion: Array) -> Array:
         ends = states[self.grid.substeps :: self.grid.substeps]
         body = np.concatenate([inputs, ends], axis=1).ravel()
-        weights, part = [], 0
-        for face in self.faces:
+        weights = []
+        for face, parts in with_parts(self.faces):
             if isinstance(face, Facets):
-                chosen = face.best(states[1:], times[1:], erosion[:, part : part + face.parts])
+                chosen = face.best(states[1:], times[1:], erosion[:, parts])
                 weights.append(0.9 * chosen + 0.1 / face.weights)
-            part += face.parts
         extra = [np.concatenate(weights, axis=1).ravel()] if weights else []
         if mode == "scale":
             extra.append(np.zeros(1))
@@ -316,11 +313,10 @@ class Transcription:
 
     def missing(self, states: Array, times: Array, erosion: Array, scale: float = 1.0) -> Array:
         """e - h at the points, shape (points, faces): positive where a tightened constraint is missed."""
-        found, part = [], 0
-        for face in self.faces:
-            room = face.room(states[1:], times[1:], scale * erosion[:, part : part + face.parts])
+        found = []
+        for face, parts in with_parts(self.faces):
+            room = face.room(states[1:], times[1:], scale * erosion[:, parts])
             found.append(np.where(face.asked(times[1:]), -room, -np.inf))
-            part += face.parts
         return np.stack(found, axis=1) if found else np.zeros((len(states) - 1, 0))
 
     def _measured(

@@ -111,17 +111,14 @@ def _strided(a: Array, b: float, z: Array, peak: Array, width: Array, terms: int
     return top[:, 0] + np.log(total * stride), (scaled * k).sum(axis=1) / total
 
 
-def solve_excess(a: Array, b: float, target: Array, *, bessel: bool = False, guess: Array | None = None) -> Array:
+def solve_excess(a: Array, b: float, target: Array, *, bessel: bool = False) -> Array:
     """z with log E(z) = target, of the broadcast shape (0 where the target is -inf, inf where it is inf)."""
     a, target = np.broadcast_arrays(np.asarray(a, dtype=float), np.asarray(target, dtype=float))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        if guess is None:
-            big = np.maximum(target, 0.0) + 0.5 * b + 1
-            if bessel:
-                big = (big + 0.5 * b) ** 2 / np.maximum(4 * a, 1e-300)
-            x = np.minimum(target + np.log(b), np.log(big))
-        else:
-            x = np.log(guess)
+        big = np.maximum(target, 0.0) + 0.5 * b + 1
+        if bessel:
+            big = (big + 0.5 * b) ** 2 / np.maximum(4 * a, 1e-300)
+        x = np.minimum(target + np.log(b), np.log(big))
         usable = np.isfinite(target) & np.isfinite(x)
         x = np.where(usable, x, 0.0)
         for _ in range(60):

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import log_ndtr
 
 import certbound as cb
-from certbound.safety.limits import Limits, find_limits, find_smallest
+from certbound.safety.limits import Limits, find_limits, smaller_verdicts
 
 
 def walk(bound: float = 4.0, sigma: float = 1.0, steps: int = 16) -> cb.Problem:
@@ -59,17 +59,17 @@ def test_a_safe_verdict_is_refused() -> None:
 def test_the_smallest_probability_is_proved_and_far_below_what_was_asked() -> None:
     problem = cb.load("chain_rest")
     first = cb.verify_safety(problem)
-    best = find_smallest(first)
+    *_, best = smaller_verdicts(first)
     assert best.status == "SAFE"
     assert best.log10_delta < 2 * first.log10_delta
     assert cb.verify_safety(problem.replace(delta=best.problem.delta)).status == "SAFE"
     with pytest.raises(ValueError, match="SAFE one"):
-        find_smallest(cb.verify_safety(walk(), method="linear"))
+        next(smaller_verdicts(cb.verify_safety(walk(), method="linear")))
 
 
 def test_the_smallest_probability_is_near_the_truth_where_that_is_known() -> None:
     verdict = cb.verify_safety(walk(bound=20.0), method="linear")
-    best = find_smallest(verdict, method="linear")
+    best = [verdict, *smaller_verdicts(verdict, method="linear")][-1]
     truth = np.log10(4) + log_ndtr(-20.0 / 4.0) / np.log(10)
     assert truth - 0.6 < best.log10_delta <= verdict.log10_delta
 

@@ -33,4 +33,4 @@ def problem() -> cb.Problem:
 @pytest.fixture(scope="session")
 def planned(problem: cb.Problem) -> Any:
     """The cart's plan on the linear response."""
-    return cb.synthesize_plan(problem, tube="linear")
+    return cb.synthesize_plan(problem, method="linear")

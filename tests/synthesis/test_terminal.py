@@ -18,9 +18,9 @@ from certbound.synthesis.terminal import (
 from tests.synthesis.conftest import A, B, cart
 
 
-def stable() -> cb.Problem:
-    slope = [[0.8, 0.2], [0.0, 0.7]]
-    system = cb.linear_system(slope, [[0], [1]], inputs=cb.Box([-1], [1]), noise=cb.Gaussian(std=0.01))
+def stable(pushed: float = 0.0) -> cb.Problem:
+    slope, b = [[0.8, 0.2], [0.0, 0.7]], [0.0, pushed]
+    system = cb.linear_system(slope, [[0], [1]], b, inputs=cb.Box([-1], [1]), noise=cb.Gaussian(std=0.01))
     safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
     return cb.Problem(system, initial=[0, 0], safe=safe, horizon=10, cost=([1, 2], [1]))
 
@@ -72,7 +72,7 @@ def test_on_the_riccati_set_states_and_inputs_keep_their_bounds() -> None:
 
 def test_a_plan_ends_in_its_terminal_set() -> None:
     target = cb.Box([0.1, -0.1], [0.2, 0.1])
-    found = cb.synthesize_plan(cart(), tube="linear", terminal=target)
+    found = cb.synthesize_plan(cart(), method="linear", terminal=target)
     assert found.status == "SAFE"
     assert np.all(found.states[-1] >= target.low - 1e-6)
     assert np.all(found.states[-1] <= target.high + 1e-6)
@@ -82,7 +82,7 @@ def test_a_plan_ends_in_its_terminal_set() -> None:
     "terminal", ["riccati", TerminalSet(region=cb.Ball([0.3, 0], 0.05)), cb.Box([0.5, 0], [0.5, 0])]
 )
 def test_every_kind_of_terminal_set_is_met(terminal: object) -> None:
-    found = cb.synthesize_plan(cart(), tube="linear", terminal=terminal)  # type: ignore[arg-type]
+    found = cb.synthesize_plan(cart(), method="linear", terminal=terminal)  # type: ignore[arg-type]
     assert found.feasible
     if isinstance(terminal, cb.Box):
         np.testing.assert_allclose(found.states[-1], [0.5, 0], atol=1e-5)
@@ -107,6 +107,6 @@ def test_a_contraction_set_needs_contraction_and_an_equilibrium_inside() -> None
         contraction_terminal(problem, constants, faces, np.full(4, 0.1), 10.0)
     constants = cb.Constants(gain=0.9, sigma=0.1, dimension=2)
     with pytest.raises(ValueError, match="needs an equilibrium"):
-        contraction_terminal(problem, constants, faces, np.full(4, 0.1), 10.0, center=[0.5, 0.5])
+        contraction_terminal(stable(pushed=0.1), constants, faces, np.full(4, 0.1), 10.0)
     with pytest.raises(ValueError, match="must have its centre inside"):
         contraction_terminal(problem, constants, faces, np.full(4, 1.1), 10.0)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from certbound.cli.describe import attributes
 from certbound.cli.messages import InputError
-from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, examples, load_problem
+from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, examples, load_problem, option
 from certbound.cli.output import SETTINGS, console, print_json, spinner
 from certbound.errors import CertificateError, EngineError, contained
 
@@ -18,17 +19,19 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.safety.verification import Verdict
 
-__all__ = ["proved_certificate", "register"]
+__all__ = ["EXAMPLES", "check", "proved_certificate"]
 
+EXAMPLES = examples(
+    "certbound check unicycle.json --problem unicycle",
+    "certbound check my_system.json --problem my_system.toml --json",
+    "certbound check stated.json --allow-assumptions",
+)
 ATTEMPTS = 3
 
 CertificateArgument = Annotated[
     Path, typer.Argument(metavar="CERT", help="The file of verify --certificate.", show_default=False)
 ]
-ProblemOption = Annotated[
-    str | None,
-    typer.Option("--problem", metavar="PROBLEM", help="Prove also that it speaks of this problem.", show_default=False),
-]
+ProblemOption = Annotated[str | None, option("--problem", "PROBLEM", "Prove also that it speaks of this problem.")]
 AllowOption = Annotated[
     bool,
     typer.Option("--allow-assumptions", help="Exit with 0 also where the proof rests on the assumptions it names."),
@@ -38,18 +41,6 @@ WORDS = {
     "valid under assumptions": "[bold yellow]VALID UNDER ASSUMPTIONS[/]",
     "not proved": "[bold red]NOT PROVED[/]",
 }
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(
-        "check",
-        epilog=examples(
-            "certbound check unicycle.json --problem unicycle",
-            "certbound check my_system.json --problem my_system.toml --json",
-            "certbound check stated.json --allow-assumptions",
-        ),
-    )(check)
 
 
 def check(
@@ -70,9 +61,7 @@ def check(
     with spinner(f"checking {certificate.name}"):
         report = check_data(data, given, allow_assumptions=allow)
     result = {
-        "valid": report.valid,
-        "claim": report.claim,
-        "reason": report.reason,
+        **attributes(report, "valid", "claim", "reason"),
         "seconds": time.perf_counter() - started,
         "outcome": report.outcome,
         "assumptions": list(report.assumptions),

@@ -8,7 +8,6 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import typer
 
 from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
 from certbound.cli.describe import describe_constants
@@ -24,15 +23,10 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.tubes.constants import Constants
 
-__all__ = ["register"]
+__all__ = ["EXAMPLES", "derive"]
 
 EXAMPLES = examples("certbound derive chain --json", "certbound derive unicycle --time-limit 20")
 _log = logging.getLogger(__name__)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("derive", epilog=EXAMPLES)(derive)
 
 
 def derive(

@@ -15,14 +15,10 @@ from certbound.cli.messages import FAILED
 from certbound.cli.options import JsonOption, examples
 from certbound.cli.output import SETTINGS, console, print_json, spinner
 
-__all__ = ["register"]
+__all__ = ["EXAMPLES", "doctor"]
 
+EXAMPLES = examples("certbound doctor", "certbound doctor --json")
 EXTRAS = {"cluster": ["dask", "distributed"], "learn": ["sklearn"]}
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("doctor", epilog=examples("certbound doctor", "certbound doctor --json"))(doctor)
 
 
 def doctor(as_json: JsonOption = False) -> None:

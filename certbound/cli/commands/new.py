@@ -12,8 +12,9 @@ from certbound.cli.messages import InputError
 from certbound.cli.options import JsonOption, check_writable, examples
 from certbound.cli.output import SETTINGS, console, print_json, write_file
 
-__all__ = ["TEMPLATE", "register"]
+__all__ = ["EXAMPLES", "TEMPLATE", "new"]
 
+EXAMPLES = examples("certbound new my_system && certbound verify my_system.toml")
 TEMPLATE = """\
 # A certbound problem: a noisy system, where it starts, where it must stay, for how long, and how surely.
 # Check it with:  certbound verify {file}
@@ -52,11 +53,6 @@ halfspace = {{ normal = {{ speed = 1 }}, bound = 4 }}   # speed <= 4
 ball = {{ center = {{ angle = 0.9, speed = 2.5 }}, radius = 0.3 }}
 during = [0, 2]            # seconds; leave it out for the whole horizon
 """
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("new", epilog=examples("certbound new my_system && certbound verify my_system.toml"))(new)
 
 
 def new(

@@ -5,17 +5,12 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
-import typer
-
 from certbound.cli.options import JsonOption, examples
 from certbound.cli.output import SETTINGS, console, print_json
 
-__all__ = ["register"]
+__all__ = ["EXAMPLES", "problems"]
 
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("problems", epilog=examples("certbound problems", "certbound problems --quiet"))(problems)
+EXAMPLES = examples("certbound problems", "certbound problems --quiet")
 
 
 def problems(as_json: JsonOption = False) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,26 +12,30 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from certbound.cli.clock import Clock, TimeLimitOption
+from certbound.cli.describe import attributes
 from certbound.cli.messages import InputError
 from certbound.cli.options import (
     HorizonOption,
     JsonOption,
     ProblemArgument,
+    SeedOption,
     SetOption,
     check_writable,
     examples,
+    generator,
     integer,
     load_problem,
     number,
+    option,
 )
-from certbound.cli.output import SETTINGS, console, print_json
+from certbound.cli.output import SETTINGS, animated, console, print_json
 from certbound.display import one_line, rounded
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.simulation.executors import Progress
 
-__all__ = ["register"]
+__all__ = ["EXAMPLES", "simulate"]
 
 EXAMPLES = examples(
     "certbound simulate ou --paths 1e6 --seed 1",
@@ -41,45 +44,18 @@ EXAMPLES = examples(
     "certbound simulate ou --paths 1e4 --rare",
 )
 FIRST = 2000
+COUNTED = ("paths", "exits", "probability", "lower", "upper", "confidence")
+SPENT = ("steps", "scheme", "path_steps_per_second", "seconds")
 
 PathsOption = Annotated[
     int, typer.Option("--paths", parser=integer, metavar="N", help="Paths to simulate, such as 3e6.")
 ]
-SeedOption = Annotated[
-    int | None,
-    typer.Option(
-        "--seed", parser=integer, metavar="S", help="The same seed gives the same counts.", show_default=False
-    ),
-]
-StepOption = Annotated[
-    float | None,
-    typer.Option(
-        "--step", parser=number, metavar="H", help="Time step in seconds; T/1000 if left out.", show_default=False
-    ),
-]
+StepOption = Annotated[float | None, option("--step", "H", "Time step in seconds; T/1000 if left out.", number)]
 ConfidenceOption = Annotated[float, typer.Option("--confidence", parser=number, metavar="C", help="Of the limits.")]
 RareOption = Annotated[bool, typer.Option("--rare", help="Importance splitting, for rare exits.")]
-CheckpointOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--checkpoint", metavar="FILE", help="Keep finished work here, and go on from it.", show_default=False
-    ),
-]
-ClusterOption = Annotated[
-    str | None,
-    typer.Option("--cluster", metavar="ADDRESS", help="A dask scheduler, tcp://host:port.", show_default=False),
-]
-AgainstOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--against", metavar="CERT", help="Does the simulation contradict this certificate?", show_default=False
-    ),
-]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("simulate", epilog=EXAMPLES)(simulate)
+CheckpointOption = Annotated[Path | None, option("--checkpoint", "FILE", "Keep finished work here, and go on from it.")]
+ClusterOption = Annotated[str | None, option("--cluster", "ADDRESS", "A dask scheduler, tcp://host:port.")]
+AgainstOption = Annotated[Path | None, option("--against", "CERT", "Does the simulation contradict this certificate?")]
 
 
 def simulate(
@@ -99,8 +75,7 @@ def simulate(
 ) -> None:
     """Count how many random paths leave the safe set or the domain, with confidence limits."""
     check_writable(checkpoint)
-    if seed is not None and seed < 0:
-        raise InputError(f"`--seed` must not be negative, got {seed}", "give a whole number such as 1")
+    rng = generator(seed)
     if time_limit is not None and checkpoint is not None:
         raise InputError(
             "`--time-limit` and `--checkpoint` exclude each other", "stop a run with Ctrl-C and go on later"
@@ -109,9 +84,7 @@ def simulate(
     claim = None if against is None else _claimed(against)
     options: dict[str, Any] = {"paths": paths, "steps": _steps(subject, step), "confidence": confidence}
     if seed is not None or checkpoint is None:
-        import numpy as np
-
-        options["rng"] = np.random.default_rng(seed)
+        options["rng"] = rng
     with _executor(cluster) as executor, _progress_bar(paths) as progress:
         options |= {"executor": executor, "progress": progress, "checkpoint": checkpoint}
         result = _within(Clock(time_limit), _rare if rare else _plain, subject, options)
@@ -163,39 +136,14 @@ def _plain(problem: Problem, options: dict[str, Any]) -> dict[str, Any]:
     from certbound.simulation.estimates import simulate_exits
 
     found = simulate_exits(problem, **options)
-    return {
-        "paths": found.paths,
-        "exits": found.exits,
-        "probability": found.probability,
-        "lower": found.lower,
-        "upper": found.upper,
-        "confidence": found.confidence,
-        "by_constraint": found.by_constraint,
-        "steps": found.steps,
-        "scheme": found.scheme,
-        "path_steps_per_second": found.path_steps_per_second,
-        "seconds": found.seconds,
-    }
+    return attributes(found, *COUNTED, "by_constraint", *SPENT)
 
 
 def _rare(problem: Problem, options: dict[str, Any]) -> dict[str, Any]:
     from certbound.simulation.estimates import simulate_rare_exits
 
     found = simulate_rare_exits(problem, **options)
-    return {
-        "paths": found.paths,
-        "exits": found.exits,
-        "probability": found.probability,
-        "standard_error": found.standard_error,
-        "lower": found.lower,
-        "upper": found.upper,
-        "confidence": found.confidence,
-        "replicas": found.replicas,
-        "steps": found.steps,
-        "scheme": found.scheme,
-        "path_steps_per_second": found.path_steps_per_second,
-        "seconds": found.seconds,
-    }
+    return attributes(found, *COUNTED, "standard_error", "replicas", *SPENT)
 
 
 def _claimed(path: Path) -> float:
@@ -232,7 +180,7 @@ def _executor(address: str | None) -> Iterator[Any]:
 @contextlib.contextmanager
 def _progress_bar(paths: int) -> Iterator[Callable[[Progress], None] | None]:
     """A bar with rate and time left on standard error, on a terminal only."""
-    if SETTINGS.quiet or SETTINGS.verbose or not sys.stderr.isatty():
+    if not animated():
         yield None
         return
     from rich.console import Console

@@ -2,82 +2,55 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import sys
-from collections.abc import Callable, Iterator
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from certbound.cli.describe import attributes
 from certbound.cli.messages import InputError
 from certbound.cli.options import (
     DeltaOption,
     HorizonOption,
     JsonOption,
+    PlotOption,
     ProblemArgument,
+    SeedOption,
     SetOption,
-    check_picture,
     check_writable,
+    examples,
+    generator,
     integer,
     load_problem,
     number,
+    option,
 )
-from certbound.cli.output import SETTINGS, console, print_json, write_file
+from certbound.cli.output import SETTINGS, console, print_json, print_status, spinner, write_file
+from certbound.cli.pictures import check_picture, scene_of, write_picture
 from certbound.display import log10_text, name_text, one_line, plain
 
 if TYPE_CHECKING:
     from certbound.synthesis.controllers import ClosedLoop
     from certbound.synthesis.plans import Synthesis
 
-__all__ = ["register"]
+__all__ = ["EXAMPLES", "synthesize"]
 
-PATHS = 60
+EXAMPLES = examples("certbound synthesize chain --closed-loop 3000 --plan plan.json")
+RUNS = (
+    "runs", "violations", "lower", "upper", "max_input", "mean_final_cost", "mean_cost", "by_constraint", "seconds",
+)  # fmt: skip
 
-TubeOption = Annotated[
-    str, typer.Option("--tube", metavar="METHOD", help="auto, linear, or a tube method such as kummer, thm5, markov.")
+MethodOption = Annotated[
+    str, typer.Option("--method", "--tube", metavar="M", help="auto, linear, or a tube's (kummer, thm5, markov).")
 ]
-EpsilonOption = Annotated[
-    float | None,
-    typer.Option("--epsilon", parser=number, metavar="E", help="The paper's epsilon.", show_default=False),
-]
-TerminalOption = Annotated[
-    str | None,
-    typer.Option("--terminal", metavar="KIND", help="Terminal set: contraction or riccati.", show_default=False),
-]
-FeedbackOption = Annotated[
-    str | None,
-    typer.Option("--feedback", metavar="KIND", help="Ancillary feedback: riccati, lmi or [[K]].", show_default=False),
-]
-StepsOption = Annotated[
-    int | None,
-    typer.Option("--steps", parser=integer, metavar="N", help="Pieces, in continuous time.", show_default=False),
-]
-RunsOption = Annotated[
-    int | None,
-    typer.Option("--closed-loop", parser=integer, metavar="N", help="Noisy runs of the plan.", show_default=False),
-]
-SeedOption = Annotated[
-    int | None,
-    typer.Option("--seed", parser=integer, metavar="S", help="The same seed gives the same runs.", show_default=False),
-]
-PlanOption = Annotated[
-    Path | None,
-    typer.Option("--plan", metavar="FILE", help="Write the plan, for [plan] file.", show_default=False),
-]
-PlotOption = Annotated[
-    Path | None,
-    typer.Option("--plot", metavar="FILE", help="Draw tube, sets and sample paths.", show_default=False),
-]
+EpsilonOption = Annotated[float | None, option("--epsilon", "E", "The paper's epsilon.", number)]
+TerminalOption = Annotated[str | None, option("--terminal", "KIND", "Terminal set: contraction or riccati.")]
+FeedbackOption = Annotated[str | None, option("--feedback", "KIND", "Ancillary feedback: riccati, lmi or [[K]].")]
+StepsOption = Annotated[int | None, option("--steps", "N", "Pieces, in continuous time.", integer)]
+RunsOption = Annotated[int | None, option("--closed-loop", "N", "Noisy runs of the plan.", integer)]
+PlanOption = Annotated[Path | None, option("--plan", "FILE", "Write the plan, for [plan] file.")]
 SmallestOption = Annotated[bool, typer.Option("--smallest-delta", help="Find the smallest feasible delta as well.")]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    epilog = "Example: certbound synthesize chain --closed-loop 3000 --plan plan.json"
-    app.command("synthesize", epilog=epilog)(synthesize)
 
 
 def synthesize(
@@ -85,7 +58,7 @@ def synthesize(
     pairs: SetOption = None,
     delta: DeltaOption = None,
     horizon: HorizonOption = None,
-    tube: TubeOption = "auto",
+    method: MethodOption = "auto",
     epsilon: EpsilonOption = None,
     terminal: TerminalOption = None,
     feedback: FeedbackOption = None,
@@ -102,28 +75,26 @@ def synthesize(
     check_picture(plot)
     if closed_loop is not None and closed_loop < 1:
         raise InputError(f"`--closed-loop` must be at least 1, got {closed_loop}", "give a number of runs, like 3000")
-    if seed is not None and seed < 0:
-        raise InputError(f"`--seed` must not be negative, got {seed}", "give a whole number such as 1")
+    rng = generator(seed)
     gain = _gain(feedback)
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
-    import numpy as np
 
     from certbound.synthesis.controllers import simulate_closed_loop
     from certbound.synthesis.plans import synthesize_plan
 
-    with _told() as tell:
+    with spinner("planning") as tell:
         result = synthesize_plan(
-            subject, tube=tube, epsilon=epsilon, terminal=terminal, feedback=gain, steps=steps,
+            subject, method=method, epsilon=epsilon, terminal=terminal, feedback=gain, steps=steps,
             find_delta=smallest_delta, progress=tell,
         )  # fmt: skip
         runs = None
         if closed_loop is not None:
             tell(f"{closed_loop} noisy runs")
-            runs = simulate_closed_loop(result, runs=closed_loop, rng=np.random.default_rng(seed))
+            runs = simulate_closed_loop(result, runs=closed_loop, rng=rng)
     if plan is not None:
         write_file(plan, plan_text(result))
     if plot is not None:
-        write_file(plot, _picture(result, plot.suffix.lstrip(".") or "png"))
+        _draw(result, plot)
     answer = _answer(result, runs)
     if as_json:
         print_json(answer)
@@ -150,105 +121,44 @@ def plan_text(result: Synthesis) -> str:
         "plan": result.plan,
         "problem": result.source.name,
         "horizon": problem.horizon,
-        "feasible": result.feasible,
-        "status": result.status,
-        "log10_delta": result.log10_delta,
-        "tube": result.method,
-        "cost": result.cost,
-        "states": result.states,
+        **attributes(result, "feasible", "status", "log10_delta", "method", "cost", "states"),
     }
     if result.feedback is not None:
         content |= {"feedback": result.feedback, "nominal_inputs": result.inputs, "law": "u = plan + feedback x"}
     return json.dumps(plain(content), indent=1, allow_nan=False) + "\n"
 
 
-def _picture(result: Synthesis, suffix: str) -> bytes:
+def _draw(result: Synthesis, path: Path) -> None:
     """Tube, constraints and sample paths of the plan."""
-    import numpy as np
-
-    from certbound.plotting import Scene, draw_scene, noisy_reach
-    from certbound.simulation.estimates import sample_paths
+    from certbound.plotting import draw_scene
 
     verdict, problem = result.verdict, result.problem
     if verdict is None or verdict.reach is None:
         raise InputError("nothing was proved about the plan that could be drawn", "leave --plot out")
-    paths = times = None
-    with contextlib.suppress(ValueError):  # noise without a law cannot be sampled
-        paths = sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0))
-        times = np.linspace(0.0, float(problem.horizon), paths.shape[1])
-    scene = Scene(
-        problem=problem.replace(safe=result.source.safe),
-        reach=verdict.reach,
-        tube=noisy_reach(verdict),
-        times=times,
-        paths=paths,
-        title=f"{name_text(result.source.name)}: {result.status}, P(exit) <= {log10_text(result.log10_delta)}",
-    )
-    stream = BytesIO()
-    draw_scene(scene).savefig(stream, format=suffix, dpi=150)
-    return stream.getvalue()
-
-
-@contextlib.contextmanager
-def _told() -> Iterator[Callable[[str], None]]:
-    """A spinner whose text says what is being done, on a terminal only."""
-    if SETTINGS.quiet or SETTINGS.verbose or not sys.stderr.isatty():
-        yield lambda text: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("planning", total=None)
-        yield lambda text: progress.update(task, description=text)
+    title = f"{name_text(result.source.name)}: {result.status}, P(exit) <= {log10_text(result.log10_delta)}"
+    write_picture(path, draw_scene(scene_of(problem.replace(safe=result.source.safe), verdict, verdict.reach, title)))
 
 
 def _answer(result: Synthesis, runs: ClosedLoop | None) -> dict[str, Any]:
     found = result.infeasibility
     return {
-        "feasible": result.feasible,
-        "status": result.status,
-        "log10_delta": result.log10_delta,
+        **attributes(result, "feasible", "status", "log10_delta"),
         "delta": result.source.delta,
-        "reason": result.reason,
-        "tube": result.method,
-        "cost": result.cost,
-        "max_input": result.max_input,
+        **attributes(result, "reason", "method", "cost", "max_input"),
         "room": result.scale,
-        "softened": result.softened,
-        "smallest_delta": result.smallest_delta,
+        **attributes(result, "softened", "smallest_delta"),
         "infeasible": None
         if found is None
-        else {
-            "proved": found.proved,
-            "kind": found.kind,
-            "constraint": found.constraint,
-            "time": found.time,
-            "room_at_most": found.scale_bound,
-        },
+        else attributes(found, "proved", "kind", "constraint", "time") | {"room_at_most": found.scale_bound},
         "seconds": result.seconds,
-        "closed_loop": None
-        if runs is None
-        else {
-            "runs": runs.runs,
-            "violations": runs.violations,
-            "lower": runs.lower,
-            "upper": runs.upper,
-            "max_input": runs.max_input,
-            "mean_final_cost": runs.mean_final_cost,
-            "mean_cost": runs.mean_cost,
-            "by_constraint": runs.by_constraint,
-            "seconds": runs.seconds,
-        },
+        "closed_loop": None if runs is None else attributes(runs, *RUNS),
     }
 
 
 def _print(result: Synthesis, answer: dict[str, Any]) -> None:
     screen = console()
-    colors = {"SAFE": "bold green", "UNSAFE_NOMINAL": "bold red", "UNSAFE": "bold red", "UNKNOWN": "bold yellow"}
     word = "a plan" if result.feasible else "no plan"
-    screen.print(f"[{colors[result.status]}]{result.status}[/]  ", end="")
+    print_status(screen, result.status)
     screen.print(f"{name_text(result.source.name)}: {word} with tube ", end="", markup=False)
     screen.print(f"{result.method}, P(leaving) <= {log10_text(result.log10_delta)}", markup=False)
     if SETTINGS.quiet:

@@ -6,12 +6,10 @@ import contextlib
 import logging
 import time
 from collections.abc import Iterator
-from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import typer
 
 from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
 from certbound.cli.describe import describe_parameters
@@ -20,14 +18,15 @@ from certbound.cli.options import (
     DeltaOption,
     HorizonOption,
     JsonOption,
+    PlotOption,
     ProblemArgument,
     SetOption,
-    check_picture,
     check_writable,
     examples,
     load_problem,
 )
-from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
+from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.cli.pictures import check_picture, sampled, write_picture
 from certbound.display import name_text
 from certbound.errors import SolverError
 
@@ -36,25 +35,15 @@ if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
     from certbound.tubes.tube import Tube
 
-__all__ = ["register"]
+__all__ = ["EXAMPLES", "tune"]
 
 SAMPLES = 513
-PATHS = 60
 EXAMPLES = examples(
     "certbound tune ou --json",
     "certbound tune ou --plot tubes.png",
     "certbound tune chain_rest --delta 1e-6 --time-limit 30",
 )
-PlotOption = Annotated[
-    Path | None,
-    typer.Option("--plot", metavar="FILE", help="Draw all the tubes with simulated paths.", show_default=False),
-]
 _log = logging.getLogger(__name__)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("tune", epilog=EXAMPLES)(tune)
 
 
 def tune(
@@ -97,21 +86,13 @@ def tune(
 
 def _draw(problem: Problem, tubes: dict[str, Tube], best: str, path: Path) -> None:
     from certbound.plotting import draw_tubes
-    from certbound.simulation.estimates import sample_paths
 
-    sizes = None
+    sizes, metric = None, tubes[best].constants.metric
     with spinner("drawing"):
-        try:
-            states = sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0), deviation=True)
-        except ValueError as error:
-            _log.info("no sample paths are drawn: %s", error)
-        else:
-            metric = tubes[best].constants.metric
-            weighted = states if metric is None else states @ np.linalg.cholesky(metric)
-            sizes = np.linalg.norm(weighted, axis=-1)
-        stream = BytesIO()
-        draw_tubes(tubes, best, sizes).savefig(stream, format=path.suffix.lstrip(".") or "png", dpi=150)
-        write_file(path, stream.getvalue())
+        states = sampled(problem, deviation=True)
+        if states is not None:
+            sizes = np.linalg.norm(states if metric is None else states @ np.linalg.cholesky(metric), axis=-1)
+        write_picture(path, draw_tubes(tubes, best, sizes))
 
 
 def _rows(constants: Constants, horizon: float, delta: float) -> Iterator[tuple[Tube, dict[str, Any]]]:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import shlex
 import sys
 import time
 from dataclasses import asdict, replace
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,71 +15,52 @@ import typer
 
 from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
 from certbound.cli.commands.check import proved_certificate
-from certbound.cli.describe import describe_constants, describe_deviation
+from certbound.cli.describe import attributes, describe_constants, describe_deviation
 from certbound.cli.options import (
     DeltaOption,
     HorizonOption,
     JsonOption,
+    PlotOption,
     ProblemArgument,
     SetOption,
-    check_picture,
     check_writable,
     examples,
     integer,
     load_problem,
+    option,
 )
-from certbound.cli.output import SETTINGS, console, print_json, spinner, write_file
+from certbound.cli.output import SETTINGS, console, print_json, print_status, spinner, write_file
+from certbound.cli.pictures import check_picture, scene_of, write_picture
 from certbound.display import at_least_text, log10_text, name_text, one_line, rounded
 from certbound.errors import CertificateError, EngineError, contained
 
 if TYPE_CHECKING:
-    from certbound.plotting import Scene
     from certbound.problem.problem import Problem
-    from certbound.reach.sets import ReachTube
     from certbound.safety.answers import EngineAnswer
     from certbound.safety.verification import Verdict
 
-__all__ = ["register"]
+__all__ = ["EXAMPLES", "verify"]
 
-PATHS = 60
 EXAMPLES = examples(
     "certbound verify unicycle --horizon 2 --plot tube.png",
     "certbound verify my_system.toml --set sigma=0.1 --delta 1e-6 --json",
     "certbound verify chain --certificate chain.json --report chain.html",
     "certbound verify unicycle --smallest --time-limit 60",
 )
-_log = logging.getLogger(__name__)
 
 MethodOption = Annotated[
     str,
     typer.Option("--method", metavar="M", help="auto, linear, constants, barrier, values, or a tube's (kummer, thm3)."),
 ]
-CellsOption = Annotated[
-    int | None,
-    typer.Option("--cells", parser=integer, metavar="K", help="Cells per side of the initial set.", show_default=False),
-]
-CertificateOption = Annotated[
-    Path | None,
-    typer.Option("--certificate", metavar="FILE", help="Write the certificate.", show_default=False),
-]
-ReportOption = Annotated[
-    Path | None, typer.Option("--report", metavar="FILE", help="Write one HTML page.", show_default=False)
-]
-PlotOption = Annotated[
-    Path | None,
-    typer.Option("--plot", metavar="FILE", help="Draw tube, sets and sample paths.", show_default=False),
-]
+CellsOption = Annotated[int | None, option("--cells", "K", "Cells per side of the initial set.", integer)]
+CertificateOption = Annotated[Path | None, option("--certificate", "FILE", "Write the certificate.")]
+ReportOption = Annotated[Path | None, option("--report", "FILE", "Write one HTML page.")]
 ExplainOption = Annotated[
     bool, typer.Option("--explain", help="Show what each engine found, and for UNKNOWN what would be SAFE.")
 ]
 SmallestOption = Annotated[
     bool, typer.Option("--smallest", help="Once SAFE, go on to the smallest probability that can be proved.")
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("verify", epilog=EXAMPLES)(verify)
 
 
 def verify(
@@ -173,15 +152,9 @@ def _smallest(verdict: Verdict, method: str, cells: int | None, clock: Clock) ->
 
 def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any]:
     return {
-        "status": verdict.status,
-        "log10_delta": verdict.log10_delta,
-        "log10_lower": verdict.log10_lower,
+        **attributes(verdict, "status", "log10_delta", "log10_lower"),
         "delta": problem.delta,
-        "margin": verdict.margin,
-        "time": verdict.time,
-        "constraint": verdict.constraint,
-        "reason": verdict.reason,
-        "method": verdict.method,
+        **attributes(verdict, "margin", "time", "constraint", "reason", "method"),
         "constants": None if verdict.constants is None else describe_constants(verdict.constants),
         "tube": describe_deviation(verdict),
         "seconds": seconds,
@@ -190,12 +163,8 @@ def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any
 
 def _engines(verdict: Verdict) -> list[dict[str, Any]]:
     """What each engine answered, for --explain."""
-    rows = []
-    for name, answer in verdict.answers.items():
-        keys = ("log10_delta", "log10_lower", "margin", "constraint", "time", "reason")
-        found = {key: getattr(answer, key) for key in keys}
-        rows.append({"engine": name, "method": answer.method, "applicable": answer.applicable, **found})
-    return rows
+    keys = ("method", "applicable", "log10_delta", "log10_lower", "margin", "constraint", "time", "reason")
+    return [{"engine": name, **attributes(answer, *keys)} for name, answer in verdict.answers.items()]
 
 
 def _limits(verdict: Verdict, cells: int | None, clock: Clock) -> dict[str, Any]:
@@ -219,14 +188,13 @@ def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | Non
     if verdict.reach is None:
         sys.stderr.write("certbound: nothing was drawn or reported: no set was proved that could be\n")
         return
-    scene = _scene(problem, verdict, verdict.reach)
+    title = f"{name_text(problem.name)}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
+    scene = scene_of(problem, verdict, verdict.reach, title)
     if plot is not None:
         from certbound.plotting import draw_scene
 
         with spinner("drawing"):
-            stream = BytesIO()
-            draw_scene(scene).savefig(stream, format=plot.suffix.lstrip(".") or "png", dpi=150)
-            write_file(plot, stream.getvalue())
+            write_picture(plot, draw_scene(scene))
     if report is not None:
         from certbound.html_report import report_page
 
@@ -258,30 +226,10 @@ def _certify(problem: Problem, verdict: Verdict, path: Path) -> tuple[str, dict[
     return text, {"path": str(path), "log10_delta": proved, "reason": reason}
 
 
-def _scene(problem: Problem, verdict: Verdict, reach: ReachTube) -> Scene:
-    """What is drawn, with sample paths where the noise has a law to sample from."""
-    import numpy as np
-
-    from certbound.plotting import Scene, noisy_reach
-    from certbound.simulation.estimates import sample_paths
-
-    try:
-        paths = sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0))
-    except ValueError as error:
-        _log.info("no sample paths are drawn: %s", error)
-        paths = None
-    times = None if paths is None else np.linspace(0.0, float(problem.horizon), paths.shape[1])
-    title = f"{name_text(problem.name)}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
-    tube = noisy_reach(verdict)
-    return Scene(problem=problem, reach=reach, tube=tube, times=times, paths=paths, title=title)
-
-
 def _print(problem: Problem, result: dict[str, Any]) -> None:
     screen = console()
-    colors = {"SAFE": "bold green", "UNSAFE_NOMINAL": "bold red", "UNSAFE": "bold red", "UNKNOWN": "bold yellow"}
     unit = "s" if problem.system.time == "continuous" else "steps"
-    color = colors[result["status"]]
-    screen.print(f"[{color}]{result['status']}[/]  ", end="")
+    print_status(screen, result["status"])
     screen.print(
         f"{name_text(problem.name)}: P(leaving within {problem.horizon:g} {unit}) <= "
         f"{log10_text(result['log10_delta'])}{at_least_text(result['log10_lower'])}, asked {result['delta']!r}",

@@ -2,34 +2,21 @@
 
 The doors of this module take levels z_t (lower bounds) and second moments as ``(lo, hi)`` pairs, and
 return upper bounds: functions named ``log_...`` natural logarithms entry by entry, the others log10 of the
-probability of the whole event. Every event is one-sided; the two-sided one costs at most twice as much
-(`double`). Leading axes are a batch (directions, trial scales).
+probability of the whole event. Every event is one-sided; the two-sided one costs at most twice as much.
+Leading axes are a batch (directions, trial scales).
 
-Discrete time: `exceedance_chain`, `union`, `triple_below` (overlaps), `log_rectangle`. Continuous time: `log_window`
-(martingale windows), `crossing_rate` (smooth directions), `markov_clock` or `node_clock` with
-`clock_crossing` (rough directions). Scales: `least_scale`, `split_levels`. A scalar linear equation:
-`linear_radius`.
+Discrete time: `union`, `triple_below` (overlaps), `log_rectangle`. Continuous time: `crossing_rate` (smooth
+directions), `node_clock` with `clock_crossing` (rough directions).
 """
 
 from __future__ import annotations
 
-from certbound.gaussian.scalar.linear_equation import linear_exceedance, linear_radius
 from certbound.gaussian.scalar.normal import EPS, log_below_above, log_between, log_tail, log_tail_below
 from certbound.gaussian.scalar.ornstein_uhlenbeck import log_line_crossing, log_polygon_crossing
-from certbound.gaussian.scalar.pairs import (
-    Bounds,
-    double,
-    exceedance_chain,
-    log_pair,
-    log_window,
-    total,
-    total_symmetric,
-    union,
-)
+from certbound.gaussian.scalar.pairs import Bounds, log_pair, total, union
 from certbound.gaussian.scalar.rectangles import log_rectangle
 from certbound.gaussian.scalar.rice import crossing_rate
-from certbound.gaussian.scalar.scale import least_scale, split_levels
-from certbound.gaussian.scalar.slepian import Clock, clock_crossing, decorrelation_rates, markov_clock, node_clock
+from certbound.gaussian.scalar.slepian import Clock, clock_crossing, node_clock
 from certbound.gaussian.scalar.triples import triple_below
 
 __all__ = [
@@ -37,13 +24,7 @@ __all__ = [
     "Clock",
     "clock_crossing",
     "crossing_rate",
-    "decorrelation_rates",
-    "double",
     "EPS",
-    "exceedance_chain",
-    "least_scale",
-    "linear_exceedance",
-    "linear_radius",
     "log_below_above",
     "log_between",
     "log_line_crossing",
@@ -52,12 +33,8 @@ __all__ = [
     "log_rectangle",
     "log_tail",
     "log_tail_below",
-    "log_window",
-    "markov_clock",
     "node_clock",
-    "split_levels",
     "total",
-    "total_symmetric",
     "triple_below",
     "union",
 ]

@@ -164,7 +164,6 @@ def log_polygon_crossing(
     starts: ArrayLike,
     stops: ArrayLike,
     *,
-    origin: tuple[float, float] | None = None,
     fresh: ArrayLike = False,
 ) -> Array:
     """Natural logarithms of terms whose sum bounds P(U exceeds a polygon), one line per window.
@@ -180,11 +179,6 @@ def log_polygon_crossing(
         Clocks of the windows, > 0.
     starts, stops : array_like, shape (K,)
         Levels of the lines at the two ends of each window (they may jump from window to window).
-    origin : (float, float), optional
-        Instead of a stationary start: a Brownian motion from 0 at u = 0, under a line from the height
-        ``origin[0]`` at u = 0 to ``origin[1]`` at the start u_1 of the first window, both in units of
-        sqrt(u_1).
-
     fresh : array_like of bool, shape (K,)
         Windows whose past is not that of the same process (blocks of a comparison): only U at their start is
         known to be below the line before.
@@ -192,41 +186,21 @@ def log_polygon_crossing(
     Returns
     -------
     ndarray, shape (K + 1,)
-        The first entry is P(U > starts[0]), or the passage over the line from the origin.
+        The first entry is P(U > starts[0]).
     """
     d, q0, q1 = (np.atleast_1d(np.asarray(v, dtype=np.float64)) for v in (spans, starts, stops))
     if len(d) == 0:
-        if origin is None:
-            raise ValueError("`spans` must hold at least one window unless `origin` is given.")
-        return np.asarray([_log_from_origin(float(origin[0]), float(origin[1]))])
+        raise ValueError("`spans` must hold at least one window.")
     single = log_line_crossing(q0, q1, d)
     length = np.expm1(2 * d)
     forward, backward = (np.exp(d) * q1 - q0) / length, (np.exp(d) * q0 - q1) / length
     before, after = (q1[:-1], backward[:-1], length[:-1]), (q0[1:], forward[1:], length[1:])
-    if origin is None:
-        first = log_tail(q0[0])
-    else:
-        h, p = float(origin[0]), float(origin[1])
-        first = np.asarray(_log_from_origin(h, p))
-        # seen backwards from u_1, the line from the origin rises with slope h for ever
-        before = tuple(np.append(x, y) for x, y in zip((p, h, np.inf), before))  # type: ignore[assignment]  # three
-        after = (q0, forward, length)
-    linked = single[len(single) - len(before[0]) :]
+    linked = single[1:]
     jump = log_between(after[0], before[0])
     closed = lift(np.logaddexp(linked, jump), 8)
-    own = ~np.broadcast_to(np.asarray(fresh, dtype=bool), single.shape)[len(single) - len(linked) :]
+    own = ~np.broadcast_to(np.asarray(fresh, dtype=bool), single.shape)[1:]
     if np.any(own):
         refined = _log_excluding((before[0][own], *(x[own] for x in before[1:])), tuple(x[own] for x in after))
         closed[own] = np.minimum(closed[own], refined)
     linked[:] = closed
-    return np.concatenate([np.atleast_1d(first), single])
-
-
-def _log_from_origin(height: float, end: float) -> float:
-    """log P(a Brownian motion from 0 meets the line from h to p on [0, 1]) = Q(p) + e^{2h(h-p)} Q(2h - p)."""
-    if height <= 0:
-        return 0.0
-    tilt = 2 * height * (height - end)
-    reflected = float(log_tail(2 * height - end - 4 * EPS * (height + abs(end)))) + tilt
-    reflected += 16 * EPS * height * (height + abs(end))
-    return min(float(np.logaddexp(log_tail(end), reflected)) + 1e-13 * (1 + height * height), 0.0)
+    return np.concatenate([np.atleast_1d(log_tail(q0[0])), single])

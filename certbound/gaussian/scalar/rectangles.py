@@ -102,7 +102,7 @@ def _log_line(low: Array, high: Array, variance: Interval) -> Array:
     stop = np.where(np.isnan(stop), np.where(high < 0, -np.inf, np.inf), stop + _ROUND * np.abs(stop))
     start, stop = np.where(low == 0, 0.0, start), np.where(high == 0, 0.0, stop)
     # without any noise X = 0
-    still, holds = largest == 0, (low <= 0) & (high >= 0)
+    noiseless, holds = largest == 0, (low <= 0) & (high >= 0)
     value = log_between(np.where(np.isnan(start), -np.inf, start), np.where(np.isnan(stop), np.inf, stop))
-    return np.asarray(np.where(still, np.where(holds, 0.0, -np.inf), np.where(
+    return np.asarray(np.where(noiseless, np.where(holds, 0.0, -np.inf), np.where(
         (least == 0) & holds, 0.0, value)))

@@ -25,7 +25,6 @@ def crossing_rate(
     velocity_variance: Bounds,
     *,
     start_variance: Bounds | None = None,
-    residual_variance: ArrayLike | None = None,
 ) -> Any:
     """Upper bound of log10 P(exists t: xi_t > z_t) for a process xi with continuous derivative eta.
 
@@ -47,8 +46,6 @@ def crossing_rate(
         Enclosures of s^2, c and Var eta over each piece.
     start_variance : Bounds, optional
         Enclosure of s^2 at the start; that of the first piece when omitted.
-    residual_variance : array_like, optional
-        Upper bounds of v^2, where they are known better than by the formula.
 
     Returns
     -------
@@ -88,8 +85,6 @@ def crossing_rate(
     nearest = np.where((c_lo <= 0) & (c_hi >= 0), 0.0, np.minimum(np.abs(c_lo), np.abs(c_hi)))
     rest = np.maximum(up(e_hi - nearest * nearest / v_hi * (1 - 4 * EPS)), 0.0)
     rest = np.where(v_hi > 0, rest, e_hi)
-    if residual_variance is not None:
-        rest = np.minimum(rest, np.asarray(residual_variance, dtype=np.float64))
     log_density = _largest_density(low, high, v_lo, v_hi)
     near = log_density + _log_positive_part(mean, up(np.sqrt(rest)))
     far = _vanishing(low, v_hi, up(np.sqrt(e_hi)), fall)
@@ -152,8 +147,8 @@ def _vanishing(low: Array, v_hi: Array, deviation: Array, fall: Array) -> Array:
     """
     least = np.where(v_hi > 0, low / up(np.sqrt(v_hi)), np.inf) * (1 - 4 * EPS)
     one, two = np.maximum(least, 1.0), np.maximum(least, np.sqrt(2.0))
-    once = np.log(one) - 0.5 * one * one - LOG_ROOT_2PI
-    twice = 2 * np.log(two) - 0.5 * two * two - LOG_ROOT_2PI
-    value = np.logaddexp(np.log(deviation) + twice, np.log(0.4 * deviation + fall) + once) - np.log(low)
+    linear = np.log(one) - 0.5 * one * one - LOG_ROOT_2PI
+    square = 2 * np.log(two) - 0.5 * two * two - LOG_ROOT_2PI
+    value = np.logaddexp(np.log(deviation) + square, np.log(0.4 * deviation + fall) + linear) - np.log(low)
     value = value + 64 * EPS * (1 + two * two)
     return np.where((low > 0) & ~np.isnan(value), value, np.where((v_hi > 0) | (low < 0), np.inf, -np.inf))

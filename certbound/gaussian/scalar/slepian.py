@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.gaussian.scalar.normal import EPS, lift, log_tail
+from certbound.checks import frozen
+from certbound.gaussian.scalar.normal import EPS
 from certbound.gaussian.scalar.ornstein_uhlenbeck import log_polygon_crossing
-from certbound.gaussian.scalar.pairs import Bounds, ends, total
-from certbound.rigor.intervals import Interval
+from certbound.gaussian.scalar.pairs import total
 from certbound.rigor.rounding import quiet
 
-__all__ = ["Clock", "Windows", "clock_crossing", "decorrelation_rates", "group_windows", "markov_clock", "node_clock"]
+__all__ = ["Clock", "Windows", "clock_crossing", "group_windows", "node_clock"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -45,121 +45,6 @@ class Clock:
 
     increments: Array
     starts: Index
-
-
-@quiet
-def decorrelation_rates(variance: Bounds, noise: Bounds, covariance: Bounds, drift: Bounds) -> Array:
-    """Upper bounds of d psi(s, t)/dt over pairs of pieces, the ``rates`` of `markov_clock`.
-
-    Proves: for d xi = eta dt + dN with a martingale N of intensity ``noise``, d psi(s, t)/dt = cov(xi_t,
-    eta_t)/s_t^2 + noise_t/(2 s_t^2) - cov(xi_s, eta_t)/cov(xi_s, xi_t) for s < t, in interval arithmetic;
-    +inf where cov(xi_s, xi_t) may vanish. For xi_t = a_t^T Z_t, dZ = J Z dt + g dW: eta_t = (da/dt + J^T
-    a)^T Z_t, noise = |g^T a|^2.
-
-    Parameters
-    ----------
-    variance, noise : Bounds, shape (K,)
-        Enclosures of s_t^2 > 0 and of the intensity over each piece.
-    covariance, drift : Bounds, shape (K, K)
-        Enclosures of cov(xi_s, xi_t) and cov(xi_s, eta_t) for s in piece i and t in piece j, s <= t (entries
-        below the diagonal are not read).
-
-    Returns
-    -------
-    ndarray, shape (K, K)
-
-    Raises
-    ------
-    ValueError
-        If a variance or a covariance within one piece may vanish: begin later, or take shorter pieces.
-
-    Examples
-    --------
-    >>> one = np.ones((1, 1))
-    >>> decorrelation_rates([1.0], [2.0], one, -one).tolist()[0][0] - 1.0 < 1e-12
-    True
-    """
-    v, n = Interval(*ends(variance, "variance")), Interval(*ends(noise, "noise", least=0.0))
-    c, d = Interval(*ends(covariance, "covariance")), Interval(*ends(drift, "drift"))
-    count = len(v.lo)
-    if c.shape != (count, count) or d.shape != (count, count):
-        raise ValueError(f"`covariance` and `drift` must have shape ({count}, {count}), got {c.shape}, {d.shape}.")
-    if not (np.all(v.lo > 0) and np.all(np.diagonal(c.lo) > 0)):
-        raise ValueError("`variance` and `covariance` must be positive within each piece; use shorter pieces.")
-    own = Interval(np.diagonal(d.lo), np.diagonal(d.hi))
-    safe = c.lo > 0
-    ratio = d / Interval(np.where(safe, c.lo, 1.0), np.where(safe, c.hi, 1.0))
-    rate: Interval = ((own + n * 0.5) / v)[None, :] - ratio
-    return np.where(safe, rate.hi, np.inf)
-
-
-def markov_clock(durations: ArrayLike, rates: ArrayLike, *, limit: float = 0.35) -> Clock:
-    """The least clock that rates of decorrelation allow, by a forward maximum over the nodes.
-
-    Proves: clock(t) - clock(s) >= psi(s, t) = -log corr(xi_s, xi_t) for all s < t in one block, given
-    ``rates[i, j]`` >= d psi(s, t)/dt for all s in piece i and t in piece j with s < t (almost every t;
-    psi(., s) is absolutely continuous and psi(s, s) = 0). For s in piece i and t in piece j the integral of
-    the rates is at most rates[i, i] (t_{i+1} - s) + sum_{i<l<j} rates[i, l] h_l + rates[i, j] (t - t_j),
-    which is linear in t on piece j: a clock of slope >= rates[i, i] on each piece i that satisfies the
-    inequality at the nodes t_{j+1}, from every t_{i+1}, satisfies it throughout. Such is the smallest one
-    found going forward.
-
-    `decorrelation_rates` computes such rates from covariances.
-
-    Parameters
-    ----------
-    durations : array_like, shape (K,)
-        Lengths h of the pieces, > 0.
-    rates : array_like, shape (K, K) or (K,)
-        Upper bounds as above (entries below the diagonal are not read); +inf allowed off the diagonal. One
-        row of K means bounds that hold for every earlier s.
-    limit : float
-        A new block begins at the piece at whose end psi may exceed it: short blocks have a slower clock and
-        sum more probabilities.
-
-    Returns
-    -------
-    Clock
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, a duration is not positive, or a diagonal rate is not finite.
-
-    Examples
-    --------
-    >>> markov_clock([0.5, 0.5], [2.0, 2.0]).increments.round(9).tolist()
-    [1.0, 1.0]
-    """
-    h = np.atleast_1d(np.asarray(durations, dtype=np.float64))
-    rate = np.asarray(rates, dtype=np.float64)
-    count = len(h)
-    if h.ndim != 1 or not np.all((h > 0) & (h < np.inf)):
-        raise ValueError("`durations` must be a row of positive numbers.")
-    if rate.shape not in ((count,), (count, count)):
-        raise ValueError(f"`rates` must have shape ({count},) or ({count}, {count}), got {rate.shape}.")
-    own = rate if rate.ndim == 1 else np.diagonal(rate)
-    if np.any(np.isnan(rate)) or not np.all(own < np.inf):
-        raise ValueError("`rates` must not be NaN, and finite on the diagonal; split the first pieces.")
-    slope = np.maximum(own, 0.0)
-    if rate.ndim == 1:
-        return Clock(increments=_frozen(slope * h * (1 + 2 * EPS)), starts=np.zeros(1, dtype=np.intp))
-    increments = slope * h * (1 + 2 * EPS)
-    starts, block = [0], 0
-    clock = np.zeros(count + 1)
-    debt = np.zeros(count)  # debt[i]: bound of psi(s, t_j) - rates[i, i] (t_{i+1} - s)
-    for j in range(count):
-        before = slice(block, j)
-        step = rate[before, j] * h[j]
-        debt[before] = debt[before] + step + 4 * EPS * (np.abs(debt[before]) + np.abs(step))
-        if j > block and not np.all(debt[before] <= limit):
-            starts.append(j)
-            block = j
-        needed = clock[block + 1 : j + 1] + debt[block:j]
-        ahead = float(np.max(needed)) - clock[j] if j > block else 0.0
-        increments[j] = max(increments[j], ahead + 8 * EPS * (1 + abs(clock[j])))
-        clock[j + 1] = clock[j] + increments[j]
-    return Clock(increments=_frozen(increments), starts=np.asarray(starts, dtype=np.intp))
 
 
 def node_clock(durations: ArrayLike, near: ArrayLike, needs: ArrayLike, *, limit: float = 0.35) -> Clock:
@@ -214,13 +99,7 @@ def node_clock(durations: ArrayLike, near: ArrayLike, needs: ArrayLike, *, limit
         ahead = float(np.max(clock[block : j + 1] + asked)) - clock[j]
         increments[j] = max(increments[j], ahead + 8 * EPS * (1 + abs(clock[j])))
         clock[j + 1] = clock[j] + increments[j]
-    return Clock(increments=_frozen(increments), starts=np.asarray(starts, dtype=np.intp))
-
-
-def _frozen(array: Array) -> Array:
-    array = np.array(array, dtype=np.float64)
-    array.setflags(write=False)
-    return array
+    return Clock(increments=frozen(increments), starts=np.asarray(starts, dtype=np.intp))
 
 
 NO_CUTS: Index = np.zeros(1, dtype=np.intp)
@@ -313,12 +192,10 @@ def _cut(clock: Array, span: float, forced: Index) -> Index:
 
 
 @quiet
-def clock_crossing(
-    clock: Clock, levels: ArrayLike, *, continuous: ArrayLike = True, weight: float = _WEIGHT
-) -> float:
+def clock_crossing(clock: Clock, levels: ArrayLike) -> float:
     """Upper bound of log10 P(exists t: xi_t > z_t) for a process compared with an OU process by its `Clock`.
 
-    Proves: with A_k the exceedance in block k and x continuous at the block's start, P <= P(A_0) + sum_k
+    Proves: with A_k the exceedance in block k and x continuous from block to block, P <= P(A_0) + sum_k
     [P(A_k) - P(A_k, x > q at the end of block k - 1)], and P(A_k) by Slepian and the window sums of
     `log_polygon_crossing`; a boundary linear in the clock and >= 0 is concave in Brownian coordinates,
     hence above its chords.
@@ -326,15 +203,10 @@ def clock_crossing(
     Parameters
     ----------
     clock : Clock
-        From `markov_clock`.
+        From `node_clock`.
     levels : array_like, shape (K,) or (K, 2)
         Lower bounds of z_t/s_t on each piece: one number, or its two ends when z_t/s_t is at least the
         linear interpolation (in t) between them. +inf allowed.
-    continuous : array_like of bool
-        Per block start after the first (or one for all): xi is the same process across it. Where False,
-        nothing is subtracted.
-    weight : float
-        Clock of a window times the square of the least level.
 
     Returns
     -------
@@ -344,11 +216,11 @@ def clock_crossing(
     Notes
     -----
     Where xi starts from rest the rates grow like 1/(2t): begin at a small t_0, let the pieces grow
-    geometrically, and add a bound for [0, t_0] (`log_window`, or any crude one: z/s is large there).
+    geometrically, and add a bound for [0, t_0] (any crude one: z/s is large there).
 
     Examples
     --------
-    >>> clock = markov_clock([0.5] * 10, [1.0] * 10)
+    >>> clock = Clock(increments=np.full(10, 0.5), starts=np.zeros(1, dtype=int))
     >>> bool(-2.59 < clock_crossing(clock, [4.0] * 10) < -2.54)  # -2.592 by the differential equation
     True
     """
@@ -364,16 +236,13 @@ def clock_crossing(
     if least == np.inf:
         return -np.inf
     q = np.minimum(q, 3 * least + 40)
-    span = max(weight / max(least, 0.5) ** 2, float(np.sum(d)) / _MOST_WINDOWS)
-    linked = np.broadcast_to(np.asarray(continuous, dtype=bool), (len(clock.starts) - 1,))
+    span = max(_WEIGHT / max(least, 0.5) ** 2, float(np.sum(d)) / _MOST_WINDOWS)
     parts = np.maximum(np.ceil(3 * d / span), 1).astype(np.intp)
     nodes, left, right = _subdivide(d, q, parts)
     forced = (np.cumsum(parts) - parts)[clock.starts]
     lines = group_windows(nodes, left, right, span, forced)
     fresh = np.isin(lines.first, forced)
     logs = log_polygon_crossing(lines.spans, lines.starts, lines.stops, fresh=fresh)
-    restart = np.searchsorted(lines.first, forced[1:][~linked])
-    logs[1 + restart] = lift(np.logaddexp(logs[1 + restart], log_tail(lines.starts[restart])), 8)
     return float(total(logs))
 
 

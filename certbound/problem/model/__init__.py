@@ -5,8 +5,9 @@ Each name is loaded when it is first used, so that the checker reads a tape with
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from certbound.lazy import load_name
 
 if TYPE_CHECKING:
     from certbound.problem.model.analysis import (
@@ -27,29 +28,13 @@ if TYPE_CHECKING:
     from certbound.problem.model.tracing import trace
 
 _HOME = {
-    "adds_plainly": "analysis",
-    "arithmetic": "operations",
-    "ARITY": "tape",
-    "compile_numpy": "evaluation",
-    "compile_scalar": "evaluation",
-    "deciding": "analysis",
-    "edged": "analysis",
-    "enclosed": "operations",
-    "Graph": "graph",
-    "is_zero": "analysis",
-    "jacobian": "derivative",
-    "JUMPS": "tape",
-    "needed": "tape",
-    "Node": "tape",
-    "OPERATIONS": "operations",
-    "selected": "analysis",
-    "sources": "analysis",
-    "substitute": "graph",
-    "Tape": "tape",
-    "trace": "tracing",
-    "undefined_where": "operations",
-    "varying_outputs": "analysis",
-    "watched": "analysis",
+    "analysis": "adds_plainly deciding edged is_zero selected sources varying_outputs watched",
+    "derivative": "jacobian",
+    "evaluation": "compile_numpy compile_scalar",
+    "graph": "Graph substitute",
+    "operations": "OPERATIONS arithmetic enclosed undefined_where",
+    "tape": "ARITY JUMPS Node Tape needed",
+    "tracing": "trace",
 }
 
 __all__ = [
@@ -80,11 +65,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return load_name(__name__, _HOME, name)
 
 
 def __dir__() -> list[str]:

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.checks import positive_definite
-from certbound.simulation.blocks import MEMORY_LIMIT, Counts, check_count, entropy_of
-from certbound.simulation.checkpoint import stored_entropy
-from certbound.simulation.estimates.preparation import Setting, nominal_path, prepare
+from certbound.simulation.blocks import MEMORY_LIMIT, Counts, check_count
+from certbound.simulation.checkpoint import seed_of
+from certbound.simulation.estimates.preparation import Setting, prepare
 from certbound.simulation.estimates.statistics import bound_binomial, order_ranks
 from certbound.simulation.executors import Progress, run_work
 from certbound.simulation.kernel_source import kernel_source
@@ -188,20 +188,17 @@ def sup_deviation(
     if 16 * points * rows * bins > MEMORY_LIMIT:
         raise ValueError(f"`points` must be at most {MEMORY_LIMIT // (16 * rows * bins)}, got {points}.")
     marks = np.round(np.arange(1, points + 1) * setting.steps / max(points, 1)).astype(np.int64)
-    entropy = stored_entropy(checkpoint) if checkpoint is not None and rng is None else None
     source, p = kernel_source(setting.model, task)
-    shared = setting.fixed if setting.shared_nominal else None
-    nominal = np.zeros((0, 0)) if shared is None else nominal_path(setting, shared)
     work = setting.work(
         source=source,
         p=p,
-        nominal=nominal,
+        nominal=setting.nominal(),
         profile=profile,
         marks=marks,
         counts_shape=(rows, _OCTAVES * _FINE + 2),
         marginals_shape=(2, points, rows, bins),
         paths=paths,
-        entropy=entropy_of(rng) if entropy is None else entropy,
+        entropy=seed_of(rng, checkpoint),
     )
     outcome = run_work(work, executor, checkpoint, progress)
     return Deviations(

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.simulation.blocks import Counts, Work, check_count, entropy_of
-from certbound.simulation.checkpoint import stored_entropy
+from certbound.simulation.blocks import Counts, Work, check_count
+from certbound.simulation.checkpoint import seed_of
 from certbound.simulation.estimates.preparation import Setting, prepare
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
 from certbound.simulation.executors import Progress, run_work
-from certbound.simulation.gap_tests import Barrier, barriers_of
+from certbound.simulation.gap_tests import Barrier, barriers_of, tables_of
 from certbound.simulation.kernel_source import kernel_source
 from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
@@ -68,16 +68,6 @@ class ExitCounts:
     scheme: str
     seconds: float
     path_steps_per_second: float
-
-    @property
-    def largest_refuted(self) -> float:
-        """Every claim "the exit probability is below delta" with a delta below this number is refuted."""
-        return self.lower
-
-    @property
-    def smallest_supported(self) -> float:
-        """The smallest delta that the simulation supports: the true probability lies below it."""
-        return self.upper
 
     def refutes(self, delta: float) -> bool:
         """Whether the exit probability exceeds ``delta``, with error probability (1 - confidence)/2."""
@@ -144,8 +134,7 @@ def simulate_exits(
     paths, confidence = check_count("paths", paths), check_confidence(confidence)
     setting = prepare(problem, steps, scenario)
     barriers = barriers_of(problem, setting.times)
-    entropy = stored_entropy(checkpoint) if checkpoint is not None and rng is None else None
-    work = _exit_work(setting, barriers, paths, entropy_of(rng) if entropy is None else entropy)
+    work = _exit_work(setting, barriers, paths, seed_of(rng, checkpoint))
     outcome = run_work(work, executor, checkpoint, progress)
     counts = outcome.tally.counts
     exits = int(counts.sum())
@@ -172,12 +161,10 @@ def simulate_exits(
 
 def _exit_work(setting: Setting, barriers: list[Barrier], paths: int, entropy: int) -> Work:
     source, p = kernel_source(setting.model, Task(kind="exits", barriers=barriers))
-    moving = [barrier.offset for barrier in barriers if barrier.moving]
     return setting.work(
         source=source,
         p=p,
-        moving=np.hstack(moving) if moving else np.zeros((0, 0)),
-        windows=np.array([[b.first, b.last] for b in barriers], dtype=np.int64).reshape(-1, 2),
+        **tables_of(barriers),
         counts_shape=(len(barriers), 1 + min(setting.steps, _TIME_BINS)),
         paths=paths,
         entropy=entropy,

@@ -13,7 +13,7 @@ from certbound.problem.model import compile_scalar
 from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
 from certbound.simulation.stepping import Scenario, StepModel, step_model
 
-__all__ = ["FixedStart", "Setting", "nominal_path", "prepare"]
+__all__ = ["FixedStart", "Setting", "prepare"]
 
 Array = NDArray[np.float64]
 
@@ -56,6 +56,20 @@ class Setting:
     def shared_nominal(self) -> bool:
         """Whether all paths use one table of the noise-free path."""
         return self.fixed is not None and not self.model.own_disturbance and self.steps <= _LONGEST_NOMINAL
+
+    def nominal(self) -> Array:
+        """The noise-free path of the discretised model, shape (steps + 1, n), where all paths share it; else empty."""
+        if self.fixed is None or not self.shared_nominal:
+            return np.zeros((0, 0))
+        model = self.model
+        drift = compile_scalar(model.drift)
+        path = [self.fixed.tolist()]
+        inputs = model.table.tolist() if model.table.size else [()] * self.steps
+        with np.errstate(all="ignore"):
+            for k in range(self.steps):
+                value = drift(k * model.interval, *path[k], *inputs[k])
+                path.append([x + model.step * v for x, v in zip(path[k], value)] if model.step > 0.0 else value)
+        return np.array(path, dtype=float)
 
     def work(self, kind: type[Work] = Work, **fields: Any) -> Work:
         """A piece of work on this setting; ``fields`` are those that differ from task to task."""
@@ -126,19 +140,3 @@ def _start(problem: Any, scenario: Scenario) -> tuple[Callable[[np.random.Genera
     if initial.kind == "box" and np.array_equal(initial.low, initial.high):
         return FixedStart(np.asarray(initial.low)), np.asarray(initial.low)
     return initial.sample, None
-
-
-def nominal_path(setting: Setting, start: Array) -> Array:
-    """The noise-free path of the discretised model from one start, shape (steps + 1, n).
-
-    Only for models whose disturbance is fixed.
-    """
-    model = setting.model
-    drift = compile_scalar(model.drift)
-    path = [np.asarray(start, dtype=float).tolist()]
-    inputs = model.table.tolist() if model.table.size else [()] * setting.steps
-    with np.errstate(all="ignore"):
-        for k in range(setting.steps):
-            value = drift(k * model.interval, *path[k], *inputs[k])
-            path.append([x + model.step * v for x, v in zip(path[k], value)] if model.step > 0.0 else value)
-    return np.array(path, dtype=float)

@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, if_all, window_test
-from certbound.simulation.kernel_source import indent, vector
-from certbound.simulation.tape_text import Parameters, linear_form
+from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 
 __all__ = ["score_source"]
 

@@ -18,17 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.simulation.blocks import MEMORY_LIMIT, Tally, Work, check_count, entropy_of
-from certbound.simulation.checkpoint import stored_entropy
-from certbound.simulation.estimates.preparation import nominal_path, prepare
+from certbound.simulation.blocks import MEMORY_LIMIT, Tally, Work, check_count
+from certbound.simulation.checkpoint import seed_of
+from certbound.simulation.estimates.preparation import prepare
 from certbound.simulation.estimates.score import score_source
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
 from certbound.simulation.executors import Progress, run_work
-from certbound.simulation.gap_tests import Barrier, barriers_of
+from certbound.simulation.gap_tests import Barrier, barriers_of, tables_of
 from certbound.simulation.kernel_source import (
     SIGNATURE,
     close_noise,
-    indent,
     load_lines,
     module_head,
     nominal_lines,
@@ -36,7 +35,7 @@ from certbound.simulation.kernel_source import (
     step_lines,
 )
 from certbound.simulation.stepping import Scenario, StepModel
-from certbound.simulation.tape_text import Parameters
+from certbound.simulation.tape_text import Parameters, indent
 
 __all__ = ["RareExits", "simulate_rare_exits"]
 
@@ -149,20 +148,16 @@ def simulate_rare_exits(
         )
     barriers = barriers_of(problem, setting.times)
     source, p = _kernel_source(model, barriers, own)
-    moving = [barrier.offset for barrier in barriers if barrier.moving]
-    shared = setting.fixed if setting.shared_nominal else None
-    entropy = stored_entropy(checkpoint) if checkpoint is not None and rng is None else None
     work = setting.work(
         RareWork,
         source=source,
         p=p,
-        nominal=np.zeros((0, 0)) if shared is None else nominal_path(setting, shared),
-        moving=np.hstack(moving) if moving else np.zeros((0, 0)),
-        windows=np.array([[b.first, b.last] for b in barriers], dtype=np.int64).reshape(-1, 2),
+        nominal=setting.nominal(),
+        **tables_of(barriers),
         counts_shape=(replicas, 2),
         paths=replicas * particles,
         block=particles,
-        entropy=entropy_of(rng) if entropy is None else entropy,
+        entropy=seed_of(rng, checkpoint),
     )
     outcome = run_work(work, executor, checkpoint, progress)
     estimates = outcome.tally.counts[:, 0].copy().view(np.float64)

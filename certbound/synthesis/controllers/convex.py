@@ -24,7 +24,7 @@ from certbound.problem.adapters import casadi_module
 from certbound.problem.model import Tape, jacobian
 from certbound.problem.problem import Problem
 from certbound.synthesis.costs import cost_of
-from certbound.synthesis.faces import Face, Facets, Round
+from certbound.synthesis.faces import Face, Facets, Round, with_parts
 from certbound.synthesis.feedback import depends_on
 from certbound.synthesis.planning import Planner
 
@@ -274,10 +274,8 @@ class _Program:
                 self.slopes[k].value, self.gains[k].value = a, b
                 offsets.append(following - a @ states[k] - b @ inputs[k])
             self.offsets.value = np.array(offsets)
-        part = 0
-        for index, face in enumerate(owner.faces):
-            self._place(index, face, states[1:], times, taken[:, part : part + face.parts])
-            part += face.parts
+        for index, (face, parts) in enumerate(with_parts(owner.faces)):
+            self._place(index, face, states[1:], times, taken[:, parts])
         first_order = {"eps_abs": 1e-5, "eps_rel": 1e-5, "max_iter": 50_000}
         options = {"warm_start": True} | (first_order if owner.solver == "OSQP" else {})
         with warnings.catch_warnings():

@@ -20,7 +20,6 @@ with ``steady``.)
 
 from __future__ import annotations
 
-import importlib
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,15 +28,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.constants.matching import check_constants
-from certbound.errors import CertboundError, SolverError
+from certbound.errors import CertboundError
 from certbound.problem.adapters import casadi_module
 from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
 from certbound.safety.verification import Verdict, verify_safety
 from certbound.synthesis.controllers.held_steps import SPARE, HeldSteps, Link, ProvedStep
+from certbound.synthesis.controllers.nearest_input import NearestInput
 from certbound.synthesis.faces import Face, Round
-from certbound.synthesis.planning import Planner
+from certbound.synthesis.planning import Planner, check_tube
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 
@@ -45,7 +45,6 @@ __all__ = ["FilterReport", "SafetyFilter"]
 
 Array = NDArray[np.float64]
 
-SLACK_WEIGHT = 1e6
 KEPT = 1e-10
 """Room that must be left: more than the rounding of the noise-free state."""
 AIM = 1e-7
@@ -96,8 +95,10 @@ class SafetyFilter:
     ----------
     problem : Problem
         With inputs, without a disturbance; its delta and horizon are those of the guarantee.
-    tube : str or Tube
-        A tube method, or a tube for the problem's delta (or less) and horizon (or more), of its own constants.
+    method : str
+        Of the tube, as in `certbound.tune_tube`.
+    tube : Tube, optional
+        One for the problem's delta (or less) and horizon (or more), of its own constants, in place of a method.
     constants : Constants, optional
         Stated, or certified for this problem; certified ones for all inputs in one common metric when omitted.
     decay : float
@@ -136,7 +137,8 @@ class SafetyFilter:
         self,
         problem: Problem,
         *,
-        tube: str | Tube = "auto",
+        method: str = "auto",
+        tube: Tube | None = None,
         constants: Constants | None = None,
         decay: float = 0.5,
         steady: bool = False,
@@ -152,18 +154,21 @@ class SafetyFilter:
         self.planner = Planner(problem, steps=steps)
         guess = self.planner.guess()
         whole = problem.replace(plan=None)
-        if isinstance(tube, Tube):
-            _check_tube(tube, whole)
+        if tube is not None:
+            check_tube(whole, tube)
+            if tube.delta > whole.delta:
+                raise ValueError(f"`tube` must have delta <= {whole.delta:g}, got {tube.delta:g}; tune it for that.")
+            check_constants(whole, tube.constants, "tube")
         elif constants is not None:
             check_constants(whole, constants)
-        self.tube = tube if isinstance(tube, Tube) else self._tube(tube, constants)
+        self.tube = self._tube(method, constants) if tube is None else tube
         self._radii = self._floating_radii(steady)
         self._grid = replace(self.planner.grid, substeps=self._substeps(guess[0]))
         self._rooms, self._step = self._compiled()
         box = problem.system.inputs
         assert box is not None
         self._low, self._high = np.asarray(box.low), np.asarray(box.high)
-        self._program = _Program(len(self.planner.faces) * self._grid.substeps, self._low, self._high)
+        self._program = NearestInput(len(self.planner.faces) * self._grid.substeps, self._low, self._high)
         times = np.linspace(0.0, float(problem.horizon), self._grid.steps + 1)
         self._proofs = HeldSteps(problem=problem.replace(plan=guess), tube=self.tube, times=times)
         self._start = self._proofs.start(self.planner.start)
@@ -375,56 +380,6 @@ class SafetyFilter:
             raise ValueError(f"`verify` needs all {count} steps, got {len(self.applied)}; call step() first.")
         whole = self.problem.replace(plan=np.array(self.applied[:count]))
         return verify_safety(whole, method="linear" if self.tube.method == "linear" else "auto")
-
-
-class _Program:
-    """min ||u - wanted||^2 + penalty * xi subject to rows u >= least - xi, xi >= 0, u in its box; Clarabel.
-
-    All matrices keep one dense pattern, so that a solve costs no more than its numbers.
-    """
-
-    def __init__(self, faces: int, low: Array, high: Array) -> None:
-        self._solver: Any = importlib.import_module("clarabel")
-        sparse: Any = importlib.import_module("scipy.sparse")
-        self._low, self._high, self._faces = low, high, faces
-        m = len(low)
-        above, below = np.isfinite(high), np.isfinite(low)
-        self._bounds = np.concatenate([high[above], -low[below], [0.0]])
-        self._dense = np.zeros((faces + len(self._bounds), m + 1))
-        self._dense[faces:-1, :m] = np.concatenate([np.eye(m)[above], -np.eye(m)[below]])
-        self._dense[:faces, m] = self._dense[-1, m] = -1.0
-        rows, columns = self._dense.shape
-        places = np.tile(np.arange(rows), columns), np.arange(columns + 1) * rows
-        self._matrix = sparse.csc_matrix((self._dense.ravel(order="F"), *places), shape=self._dense.shape)
-        self._weight = sparse.csc_matrix(np.eye(m + 1))
-        self._settings = self._solver.DefaultSettings()
-        self._settings.verbose = False
-        self._cones = [self._solver.NonnegativeConeT(rows)]
-
-    def solve(self, wanted: Array, rows: Array, least: Array) -> Array:
-        """The input; faces that are not asked are left out of ``rows``."""
-        m, count = len(wanted), len(rows)
-        self._dense[: self._faces, :m] = 0.0
-        self._dense[:count, :m] = -rows
-        self._matrix.data[:] = self._dense.ravel(order="F")
-        right = np.concatenate([-least, np.ones(self._faces - count), self._bounds])
-        linear = np.append(-wanted, SLACK_WEIGHT)
-        found = self._solver.DefaultSolver(
-            self._weight, linear, self._matrix, right, self._cones, self._settings
-        ).solve()
-        answer = np.asarray(found.x)[:m]
-        if not np.all(np.isfinite(answer)):
-            raise SolverError(f"the filter's program was not solved ({found.status}); scale the inputs to like sizes.")
-        return np.asarray(np.clip(answer, self._low, self._high))
-
-
-def _check_tube(tube: Tube, problem: Problem) -> None:
-    """Refuse a tube that promises less than the problem asks, or is made from constants of another problem."""
-    if tube.delta > problem.delta:
-        raise ValueError(f"`tube` must have delta {problem.delta:g} or less, got {tube.delta:g}; tune it for that.")
-    if tube.horizon < problem.horizon:
-        raise ValueError(f"`tube` must cover the horizon {problem.horizon:g}, got one up to {tube.horizon:g}.")
-    check_constants(problem, tube.constants, "tube")
 
 
 def _better(found: ProvedStep | None, best: ProvedStep | None) -> bool:

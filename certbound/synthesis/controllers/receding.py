@@ -81,9 +81,9 @@ class PredictiveController:
     horizon : int
         Pieces of the prediction (steps in discrete time).
     plan : Synthesis, optional
-        Where the tube, its erosions and the first guess come from; made by ``synthesize_plan`` with ``tube`` when
+        Where the tube, its erosions and the first guess come from; made by ``synthesize_plan`` with ``method`` when
         omitted.
-    tube : str
+    method : str
         For the plan.
     terminal : "contraction", "riccati", TerminalSet or None
         At the end of every prediction, inside the constraints as tightened at the end of the problem's horizon.
@@ -118,7 +118,7 @@ class PredictiveController:
         *,
         horizon: int,
         plan: Synthesis | None = None,
-        tube: str = "auto",
+        method: str = "auto",
         terminal: str | TerminalSet | None = None,
         stage_cost: Callable[..., Any] | None = None,
         steps: int | None = None,
@@ -128,7 +128,7 @@ class PredictiveController:
         self.problem = problem
         self.planner = Planner(problem, stage_cost=stage_cost, steps=steps)
         made = plan is None
-        self.plan = synthesize_plan(problem, tube=tube, stage_cost=stage_cost, steps=steps) if made else plan
+        self.plan = synthesize_plan(problem, method=method, stage_cost=stage_cost, steps=steps) if made else plan
         assert self.plan is not None
         if self.plan.feedback is not None or len(self.plan.plan) != self.planner.grid.steps:
             raise ValueError("`plan` must be one of this problem, without a feedback and on the same pieces.")

@@ -52,6 +52,7 @@ class Attempts:
         self.find_delta, self.tell = find_delta, tell
         self.delta = float(planner.problem.delta)
         self.refused: dict[str, tuple[Constants | None, Solution]] = {}
+        self.trouble = "it could not be verified"
 
     def attempt(self, name: str, first: Solution) -> Synthesis | None:
         """The best plan for one tube; None where the linear response cannot be computed."""
@@ -297,12 +298,11 @@ class Attempts:
         planner = self.planner
         own = planner.program.applied_inputs(solution.inputs, solution.states)
         missing = planner.program.missing(solution.states, planner.grid.times(), tightened.erosion)
-        trouble = getattr(self, "trouble", "it could not be verified")
         return Synthesis(
             feasible=feasible,
             status="UNKNOWN" if verdict is None else verdict.status,
             log10_delta=0.0 if verdict is None else verdict.log10_delta,
-            reason=f"the plan could not be verified: {trouble}" if verdict is None else verdict.reason,
+            reason=f"the plan could not be verified: {self.trouble}" if verdict is None else verdict.reason,
             source=planner.problem, problem=planner.planned(solution, tightened), plan=solution.inputs,
             inputs=own[:: planner.grid.substeps],
             states=solution.states, times=planner.grid.times(), erosion=tightened.erosion,

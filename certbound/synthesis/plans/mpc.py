@@ -20,7 +20,7 @@ from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Region
 from certbound.reach.linear import refusal
-from certbound.synthesis.planning import Planner
+from certbound.synthesis.planning import Planner, check_tube
 from certbound.synthesis.plans.attempts import Attempts
 from certbound.synthesis.plans.outcome import Synthesis
 from certbound.synthesis.terminal import TerminalSet
@@ -36,7 +36,8 @@ _LOG = logging.getLogger(__name__)
 def synthesize_plan(
     problem: Problem,
     *,
-    tube: str | Tube = "auto",
+    method: str = "auto",
+    tube: Tube | None = None,
     epsilon: float | None = None,
     step: float | None = None,
     constants: Constants | None = None,
@@ -57,9 +58,10 @@ def synthesize_plan(
     ----------
     problem : Problem
         With inputs; an array plan serves as the first guess.
-    tube : str or Tube
-        "auto" (the linear response, then the Kummer tube), "linear", a tube method such as "kummer", "thm5" or
-        "markov", or a tube.
+    method : str
+        "auto" (the linear response, then the Kummer tube), "linear", or a tube method: "kummer", "thm5", "markov".
+    tube : Tube, optional
+        A tube for this problem, in place of a method.
     epsilon, step : float, optional
         The paper's free parameters, for its methods.
     constants : Constants, optional
@@ -103,16 +105,18 @@ def synthesize_plan(
     (True, 'SAFE')
     """
     began = time.perf_counter()
-    names = _chosen(tube, problem)
+    if tube is not None:
+        check_tube(problem, tube)
+    names = _chosen(method, problem) if tube is None else (tube.method,)
     if constants is not None and not constants.certified:
         refuse_contradiction(problem, constants)
     work = Attempts(
         Planner(problem, stage_cost=stage_cost, terminal=terminal, feedback=feedback, steps=steps),
-        given=tube if isinstance(tube, Tube) else None,
+        given=tube,
         parameters={name: value for name, value in (("epsilon", epsilon), ("step", step)) if value is not None},
         constants=constants, find_delta=find_delta, tell=progress or (lambda text: _LOG.info("%s", text)),
     )  # fmt: skip
-    for name, given in (("tube", tube.constants if isinstance(tube, Tube) else None), ("constants", constants)):
+    for name, given in (("tube", tube.constants if tube is not None else None), ("constants", constants)):
         if given is not None:
             check_constants(work.planner.nominal, given, name)
     work.tell("looking for the plan with the most room")
@@ -131,7 +135,7 @@ def synthesize_plan(
         if best is not None and best.status == "SAFE":
             break
     if best is None:
-        raise InfeasibleError("no tube could be computed along any plan; lower the noise, or name a tube.")
+        raise InfeasibleError("no tube could be computed along any plan; lower the noise, or name a `method`.")
     if best.infeasibility is not None:
         best = work.explained(best)
     return replace(best, seconds=time.perf_counter() - began)
@@ -141,18 +145,14 @@ def _rank(found: Synthesis) -> tuple[bool, bool, float, float]:
     return found.status != "SAFE", not found.feasible, found.log10_delta, -found.scale
 
 
-def _chosen(tube: str | Tube, problem: Problem) -> tuple[str, ...]:
-    if isinstance(tube, Tube):
-        if tube.horizon < problem.horizon:
-            raise ValueError(f"`tube` must cover the horizon {problem.horizon:g}, got one up to {tube.horizon:g}.")
-        return (tube.method,)
-    if tube == "auto":
+def _chosen(method: str, problem: Problem) -> tuple[str, ...]:
+    if method == "auto":
         return ("kummer",) if refusal(problem) else ("linear", "kummer")
-    if tube == "linear":
+    if method == "linear":
         refused = refusal(problem)
         if refused:
-            raise ValueError(f"`tube` 'linear' does not fit: {refused}; use 'kummer'.")
-    elif tube not in METHODS:
+            raise ValueError(f"`method` 'linear' does not fit: {refused}; use 'kummer'.")
+    elif method not in METHODS:
         known = ", ".join(["auto", "linear", *(name for name in METHODS if name != "auto")])
-        raise ValueError(f"`tube` must be a Tube or one of {known}, got {tube!r}.")
-    return (tube,)
+        raise ValueError(f"`method` must be one of {known}, got {method!r}.")
+    return (method,)

@@ -27,8 +27,8 @@ from certbound.problem.model import Node, Tape
 from certbound.problem.problem import Problem
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
-from certbound.synthesis.faces import Face, Plane, Round
-from certbound.synthesis.plant import Grid
+from certbound.synthesis.faces import Face, Plane, Round, with_parts
+from certbound.synthesis.plant import Grid, middle_of
 from certbound.synthesis.tightening import initial_center
 
 __all__ = ["bound_scale", "empty_at_once"]
@@ -44,19 +44,16 @@ def empty_at_once(faces: tuple[Face, ...], erosion: Array, times: Array) -> tupl
 
     Returns its label and time, or None where the check decides nothing.
     """
-    part = 0
     planes: list[tuple[Plane, int]] = []
-    for face in faces:
-        own = erosion[:, part : part + face.parts]
+    for face, parts in with_parts(faces):
         asked = face.asked(times[1:])
         if isinstance(face, Round) and not face.outside:
-            empty = asked & (own[:, 0] > face.size * (1 + 1e-12))
+            empty = asked & (erosion[:, parts.start] > face.size * (1 + 1e-12))
             if np.any(empty):
                 k = int(np.argmax(empty))
                 return face.label, float(times[k + 1])
         elif isinstance(face, Plane):
-            planes.append((face, part))
-        part += face.parts
+            planes.append((face, parts.start))
     for i, (first, a) in enumerate(planes):
         for second, b in planes[i + 1 :]:
             if first.coordinates != second.coordinates or not np.array_equal(first.normal, -second.normal):
@@ -94,12 +91,11 @@ def bound_scale(problem: Problem, grid: Grid, faces: tuple[Face, ...], erosion: 
         model = _relaxed(problem)
     except EnclosureError:
         return math.inf
-    planes, columns, part = [], [], 0
-    for face in faces:
+    planes, columns = [], []
+    for face, parts in with_parts(faces):
         if isinstance(face, Plane) and isinstance(face.center, np.ndarray):
             planes.append(face)
-            columns.append(part)
-        part += face.parts
+            columns.append(parts.start)
     if not planes:
         return math.inf
     taken = erosion[:, columns]
@@ -136,9 +132,8 @@ def _relaxed(problem: Problem) -> _Relaxed:
     system = problem.system
     tape = system.dynamics
     n, m = system.dimension, len(system.input_names)
-    box, noise = system.inputs, system.disturbance
+    box, middle = system.inputs, middle_of(system.disturbance)
     assert box is not None
-    middle = np.zeros(0) if noise is None else np.asarray((noise.low + noise.high) / 2)
     ranges = [Interval(np.array(0.0), np.array(float(problem.horizon)))]
     ranges += [Interval(np.array(-np.inf), np.array(np.inf)) for _ in range(n)]
     ranges += [Interval(np.array(a), np.array(b)) for a, b in zip(box.low, box.high)]

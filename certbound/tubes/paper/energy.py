@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.tubes.excess import log_excess
 
-__all__ = ["log_energy", "log_energy_growth"]
+__all__ = ["log_energy"]
 
 Array = NDArray[np.float64]
 
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 def log_energy(x: ArrayLike, rate: float) -> Any:
     """log Phi_{n,lam}(x) for vectors ``x`` of shape (..., n) and lam = ``rate``, at any size, in floating point.
 
-    It depends on ||x|| only, rises with it, is at least :func:`log_energy_growth`, and for a sub-Gaussian w with
-    proxy variance s^2 obeys E Phi(x + w) <= exp(lam^2 s^2/2) Phi(x) (Lemma 2 of the paper).
+    It depends on ||x|| only, rises with it, is at least (n/2) log(1 - e^2) + e lam ||x|| for every e in (0, 1), and
+    for a sub-Gaussian w with proxy variance s^2 obeys E Phi(x + w) <= exp(lam^2 s^2/2) Phi(x) (Lemma 2 of the paper).
 
     Raises
     ------
@@ -41,14 +41,3 @@ def log_energy(x: ArrayLike, rate: float) -> Any:
     excess, _ = log_excess(np.ones_like(size), vectors.shape[-1] / 2, size**2 / 4, bessel=True)
     result = np.logaddexp(0.0, excess)
     return float(result) if result.ndim == 0 else result
-
-
-def log_energy_growth(x: ArrayLike, rate: float, epsilon: float) -> Any:
-    """Lower bound (n/2) log(1 - e^2) + e lam ||x|| of log Phi_{n,lam}(x), e = ``epsilon`` in (0, 1) (Lemma 2-3)."""
-    if not 0 < epsilon < 1:
-        raise ValueError(f"`epsilon` must lie in (0, 1), got {epsilon}.")
-    vectors = np.asarray(x, dtype=float)
-    if vectors.ndim == 0:
-        raise ValueError("`x` must have shape (..., n); a scalar is [x].")
-    size = np.linalg.norm(vectors, axis=-1) * abs(rate)
-    return vectors.shape[-1] / 2 * np.log1p(-(epsilon**2)) + epsilon * size

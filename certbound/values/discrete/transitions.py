@@ -163,9 +163,9 @@ class Transition:
         self._ratio = ratio
         norm, omega = _rule_constants(POINTS)
         reach = [min(float(r) * POINTS / 2, 3.0) for r in ratio]
-        still = [dominance(0, r) for r in reach]
+        mass = [dominance(0, r) for r in reach]
         self.missing = sum(
-            norm**i * omega * float(ratio[i]) ** POINTS * dominance(POINTS, reach[i]) * math.prod(still) / still[i]
+            norm**i * omega * float(ratio[i]) ** POINTS * dominance(POINTS, reach[i]) * math.prod(mass) / mass[i]
             for i in range(self.n)
         ) * (1 + 1e-9)
         self.beyond = sum(
@@ -176,7 +176,7 @@ class Transition:
             for i in range(self.n)
         )
         self.sensitivity = [
-            dominance(1, reach[i]) * math.prod(still) / still[i] / tables.sigma[i] for i in range(self.n)
+            dominance(1, reach[i]) * math.prod(mass) / mass[i] / tables.sigma[i] for i in range(self.n)
         ]
         self.norm = norm**self.n
 

@@ -86,8 +86,8 @@ class UniformTables(Tables):
         hat[..., :-1] += parts["left"]
         hat[..., 1:] += parts["right"]
         parts["hat"] = hat
-        beside = np.maximum(high[:, 0] - nodes[-1], 0) + np.maximum(nodes[0] - low[:, 0], 0)
-        outside = np.minimum(beside / (2 * r), 1.0)[None]
+        beyond = np.maximum(high[:, 0] - nodes[-1], 0) + np.maximum(nodes[0] - low[:, 0], 0)
+        outside = np.minimum(beyond / (2 * r), 1.0)[None]
         block = Block(first=0, last=len(points), left=0, right=len(widths), parts=parts, mass=parts["whole"][0])
         return AxisKernel(
             points=points, nodes=nodes, sigma=r, error=0.0, blocks=[block], outside=outside, outside_mass=outside[0]

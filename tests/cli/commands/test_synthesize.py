@@ -78,7 +78,7 @@ def test_no_plan_is_exit_code_one(source: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--tube", "nonsense"], "`tube` must be"),
+        (["--method", "nonsense"], "`method` must be"),
         (["--closed-loop", "0"], "--closed-loop"),
         (["--seed", "-1"], "--seed"),
         (["--feedback", "nonsense"], "`feedback` must be"),
@@ -122,6 +122,6 @@ def test_the_picture_is_drawn(source: Path, tmp_path: Path) -> None:
 
 
 def test_runs_of_nothing_are_refused() -> None:
-    found = cb.synthesize_plan(cart(), tube="linear")
+    found = cb.synthesize_plan(cart(), method="linear")
     with pytest.raises(ValueError, match="`runs` must be a positive integer"):
         cb.simulate_closed_loop(found, runs=0)

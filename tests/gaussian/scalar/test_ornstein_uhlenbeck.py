@@ -7,7 +7,6 @@ from scipy.stats import norm
 
 from certbound.gaussian.scalar.normal import log_tail
 from certbound.gaussian.scalar.ornstein_uhlenbeck import log_line_crossing, log_polygon_crossing
-from certbound.gaussian.scalar.pairs import total
 
 
 def line_crossing_by_quadrature(q0, q1, span, prior=None):
@@ -44,26 +43,6 @@ def test_passages_after_a_free_window_match_quadrature(levels, spans):
     exact = np.log(line_crossing_by_quadrature(q1, q2, spans[1], prior=(q0, q1, spans[0])))
     got = log_polygon_crossing(spans, [q0, q1], [q1, q2])[2]
     assert exact - 1e-8 <= got <= exact + 1e-5
-
-
-def test_one_line_from_the_origin_is_the_bachelier_levy_formula():
-    height, end = 2.0, 2.7
-    exact = norm.sf(end) + np.exp(-2 * height * (end - height)) * norm.cdf(end - 2 * height)
-    got = log_polygon_crossing([], [], [], origin=(height, end))
-    assert got[0] == pytest.approx(np.log(exact), abs=1e-9)
-    assert got[0] >= np.log(exact)
-
-
-def test_cutting_a_line_into_windows_never_falls_below_its_exact_probability():
-    height, slope = 3.0, 0.4
-    exact = norm.sf(height + slope) + np.exp(-2 * height * slope) * norm.cdf(slope - height)
-    for count in (2, 5, 12):
-        u = np.geomspace(0.2, 1.0, count + 1)
-        q = (height + slope * u) / np.sqrt(u)
-        logs = log_polygon_crossing(
-            0.5 * np.diff(np.log(u)), q[:-1], q[1:], origin=(height / np.sqrt(u[0]), float(q[0]))
-        )
-        assert np.log10(exact) - 1e-9 <= total(logs) < np.log10(exact) + 0.1
 
 
 def test_terms_beyond_the_range_of_floats_stay_upper_bounds():

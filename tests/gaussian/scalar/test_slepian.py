@@ -7,64 +7,14 @@ import pytest
 from scipy.stats import norm
 
 from certbound.gaussian.scalar.normal import log_tail
-from certbound.gaussian.scalar.slepian import (
-    clock_crossing,
-    decorrelation_rates,
-    group_windows,
-    markov_clock,
-    node_clock,
-)
+from certbound.gaussian.scalar.slepian import Clock, clock_crossing, group_windows, node_clock
 
 LN10 = np.log(10.0)
 
 
-def binomial_excess(bound, hits, count):
-    """How many standard errors the observed frequency lies above the bound."""
-    return (hits / count - bound) / np.sqrt(max(bound, 1 / count) / count)
-
-
-def oscillator_covariances(times):
-    """cov(xi_s, xi_t) and cov(xi_s, eta_t) of the stationary velocity of x'' = -x - x' + noise, unit variance."""
-    lag = np.maximum(times[None, :] - times[:, None], 0)
-    w = np.sqrt(0.75)
-    decay = np.exp(-lag / 2)
-    velocity = decay * (np.cos(w * lag) - np.sin(w * lag) / (2 * w))
-    slope = decay * (-np.cos(w * lag) + (0.25 - 0.75) * np.sin(w * lag) / w)
-    return velocity, slope
-
-
-def oscillator_clock(count, horizon, fine=5):
-    edges = np.linspace(0, horizon, count + 1)
-    times = (edges[:-1, None] + np.diff(edges)[:, None] * np.linspace(0, 1, fine)).ravel()
-    corr, slope = (m.reshape(count, fine, count, fine) for m in oscillator_covariances(times))
-    pad = 1e-3
-    rates = decorrelation_rates(
-        np.ones(count),
-        np.full(count, 2.0),
-        (corr.min(axis=(1, 3)) - pad * 0.1, np.minimum(corr.max(axis=(1, 3)) + pad * 0.1, 1.0)),
-        (slope.min(axis=(1, 3)) - pad, slope.max(axis=(1, 3)) + pad),
-    )
-    return edges, markov_clock(np.diff(edges), rates)
-
-
-def test_the_clock_of_an_ornstein_uhlenbeck_process_is_its_own_time():
-    clock = markov_clock([0.5, 1.0, 0.25], np.full((3, 3), 2.0), limit=10.0)
-    assert clock.starts.tolist() == [0]
-    assert np.allclose(clock.increments, [1.0, 2.0, 0.5], rtol=1e-13)
-    assert np.all(clock.increments >= [1.0, 2.0, 0.5])
-
-
-def test_the_clock_dominates_the_decorrelation_between_all_pairs_of_times():
-    edges, clock = oscillator_clock(40, 4.0)
-    nodes = np.concatenate([[0], np.cumsum(clock.increments)])
-    assert len(clock.starts) > 3
-    for first, last in zip(clock.starts, [*clock.starts[1:], 40]):
-        times = np.linspace(edges[first], edges[last], 173)
-        corr = oscillator_covariances(times)[0]
-        ahead = np.interp(times, edges, nodes)
-        gap = ahead[None, :] - ahead[:, None]
-        later = times[None, :] > times[:, None]
-        assert np.all(gap[later] >= -np.log(corr[later]))
+def own_time(count, step=0.1, every=None):
+    """The clock of an Ornstein-Uhlenbeck process: its own time, in blocks of ``every`` pieces."""
+    return Clock(increments=np.full(count, step), starts=np.arange(0, count, every or count))
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -84,24 +34,6 @@ def test_the_lines_of_all_windows_lie_below_the_boundary(seed):
             chord = (left[k] * np.sinh(clock[k + 1] - x) + right[k] * np.sinh(x - clock[k])) / np.sinh(d)
             line = (start * np.sinh(end - x) + stop * np.sinh(x - begin)) / np.sinh(span)
             assert np.all(line <= chord + 1e-12)
-
-
-def test_slepian_bounds_simulated_oscillator_velocities():
-    rng = np.random.default_rng(5)
-    step, level = 0.02, 3.2
-    _, clock = oscillator_clock(80, 4.0)
-    bound = 10 ** clock_crossing(clock, np.full(80, level))
-    phi = np.array([[1 - step**2 / 2, step - step**2 / 2], [-step + step**2 / 2, 1 - step]])
-    x, v = rng.standard_normal((2, 25_000))
-    hit = v > level
-    for _ in range(200):
-        x, new = phi[0, 0] * x + phi[0, 1] * v, phi[1, 0] * x + phi[1, 1] * v
-        new = new + np.sqrt(2 * step * (1 - step)) * rng.standard_normal(len(x))
-        bridge = -2 * np.maximum(level - v, 0) * np.maximum(level - new, 0) / (2 * step)
-        hit |= (new > level) | (rng.random(len(x)) < np.exp(bridge))
-        v = new
-    assert binomial_excess(bound, hit.sum(), len(x)) < 4
-    assert bound < 1.6 * hit.mean()
 
 
 def exact_ou_crossing(level, horizon):
@@ -130,13 +62,13 @@ def exact_ou_crossing(level, horizon):
 @pytest.mark.parametrize("level", [2.0, 3.0, 4.0, 5.0])
 def test_the_crossing_of_an_ornstein_uhlenbeck_process_matches_its_differential_equation(level):
     exact = exact_ou_crossing(level, 5.0)
-    bound = 10 ** clock_crossing(markov_clock(np.full(50, 0.1), np.ones(50)), np.full(50, level))
+    bound = 10 ** clock_crossing(own_time(50), np.full(50, level))
     assert exact * (1 - 2e-3) <= bound
     assert bound <= exact * (1.4 if level < 3 else 1.17)
 
 
 def test_moving_and_jumping_boundaries_are_bounded_from_below_by_their_parts():
-    clock = markov_clock(np.full(40, 0.1), np.ones(40))
+    clock = own_time(40)
     t = np.linspace(0, 4, 41)
     curve = 3.5 + 0.8 * np.sin(3 * t)
     ramp = np.stack([curve[:-1], curve[1:]], axis=-1)
@@ -144,41 +76,29 @@ def test_moving_and_jumping_boundaries_are_bounded_from_below_by_their_parts():
     assert lines < stairs
     drop = np.where(np.arange(40) < 20, 5.0, 3.0)
     whole = clock_crossing(clock, drop)
-    half = clock_crossing(markov_clock(np.full(20, 0.1), np.ones(20)), np.full(20, 3.0))
+    half = clock_crossing(own_time(20), np.full(20, 3.0))
     assert half - 0.01 <= whole <= half + 0.05
     gap = np.where((np.arange(40) > 9) & (np.arange(40) < 20), np.inf, 4.0)
     assert clock_crossing(clock, gap) < clock_crossing(clock, np.full(40, 4.0)) - 0.05
 
 
-def test_restarted_blocks_cost_more_when_the_process_changes_between_them():
-    clock = markov_clock(np.full(40, 0.1), np.ones((40, 40)), limit=0.5)
-    assert len(clock.starts) > 4
+def test_restarted_blocks_cost_more():
+    clock = own_time(40, every=5)
     same = clock_crossing(clock, np.full(40, 3.0))
-    other = clock_crossing(clock, np.full(40, 3.0), continuous=False)
-    single = clock_crossing(markov_clock(np.full(40, 0.1), np.ones(40)), np.full(40, 3.0))
-    assert single < same < other
+    single = clock_crossing(own_time(40), np.full(40, 3.0))
+    assert single < same
 
 
 def test_a_process_that_does_not_move_has_the_probability_of_one_time():
-    clock = markov_clock([1.0, 1.0], [0.0, 0.0])
+    clock = own_time(2, step=0.0)
     assert clock_crossing(clock, [3.0, 3.0]) == pytest.approx(float(log_tail(3.0)) / LN10, abs=1e-3)
     assert clock_crossing(clock, [-0.1, 3.0]) == 0.0
     assert clock_crossing(clock, [np.inf, np.inf]) == -np.inf
 
 
-def test_malformed_clocks_are_refused_by_name():
-    with pytest.raises(ValueError, match="`durations`"):
-        markov_clock([0.0], [1.0])
-    with pytest.raises(ValueError, match="`rates` must have shape"):
-        markov_clock([1.0, 1.0], [1.0])
-    with pytest.raises(ValueError, match="finite on the diagonal"):
-        markov_clock([1.0], [np.inf])
+def test_malformed_levels_are_refused_by_name():
     with pytest.raises(ValueError, match="`levels` must have shape"):
-        clock_crossing(markov_clock([1.0], [1.0]), [1.0, 1.0])
-    with pytest.raises(ValueError, match="shape"):
-        decorrelation_rates([1.0], [1.0], np.ones((2, 2)), np.ones((2, 2)))
-    with pytest.raises(ValueError, match="positive within each piece"):
-        decorrelation_rates([1.0], [1.0], np.zeros((1, 1)), np.ones((1, 1)))
+        clock_crossing(own_time(1), [1.0, 1.0])
 
 
 def test_a_clock_at_the_nodes_is_the_least_that_serves() -> None:

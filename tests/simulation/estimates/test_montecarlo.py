@@ -34,7 +34,7 @@ def test_every_number_of_the_result_fits_the_others():
     assert result.exits_by_time.shape == (1, 101)
     assert len(result.times) == 101
     assert result.times[[0, -1]].tolist() == [0.0, 5.0]
-    assert result.largest_refuted == result.lower < result.probability < result.upper == result.smallest_supported
+    assert result.lower < result.probability < result.upper
     assert result.refutes(0.5 * result.lower)
     assert not result.refutes(result.probability)
     assert result.path_steps_per_second > 0

@@ -51,7 +51,7 @@ def test_nonlinear_dynamics_are_linearised_along_the_last_prediction() -> None:
     )  # fmt: skip
     safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
     problem = cb.Problem(system, initial=[0.8, 0], safe=safe, horizon=15, cost=([1, 1], [0.01]))
-    planned = cb.synthesize_plan(problem, tube="linear")
+    planned = cb.synthesize_plan(problem, method="linear")
     planner = cb.ConvexPlanner(problem, horizon=15)
     found = planner.solve([0.8, 0], erosion=planned.erosion, turns=6)
     assert not planner.linear

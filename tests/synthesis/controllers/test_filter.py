@@ -91,7 +91,7 @@ def test_stated_constants_guarantee_nothing() -> None:
 
 
 def test_a_one_time_tube_guarantees_nothing() -> None:
-    assert not cb.SafetyFilter(integrator(), tube="markov").guaranteed
+    assert not cb.SafetyFilter(integrator(), method="markov").guaranteed
 
 
 @pytest.mark.parametrize("decay", [0.0, 1.5, -1.0])
@@ -222,7 +222,7 @@ def test_between_the_samples_the_constraint_holds_too() -> None:
 
 def test_what_is_not_guaranteed_says_why() -> None:
     assert "stated, not proved" in cb.SafetyFilter(cart(), constants=CONSTANTS).reason
-    assert "no whole trajectory" in cb.SafetyFilter(integrator(), tube="markov").reason
+    assert "no whole trajectory" in cb.SafetyFilter(integrator(), method="markov").reason
     guard = cb.SafetyFilter(integrator(horizon=2))
     for _ in range(2):
         guard.step([0.0, 0.0])
@@ -275,7 +275,7 @@ def test_a_tube_that_promises_more_than_the_problem_asks_serves() -> None:
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: tube_of(integrator(), delta=0.2), "`tube` must have delta 0.001 or less, got 0.2"),
+        (lambda: tube_of(integrator(), delta=0.2), "`tube` must have delta <= 0.001, got 0.2"),
         (lambda: tube_of(integrator(), horizon=5), "`tube` must cover the horizon 30, got one up to 5"),
         (lambda: tube_of(noisy(0.0005)), "`tube` must hold for this problem on its whole domain, got gain 1"),
         (
@@ -298,11 +298,11 @@ def test_certified_constants_of_another_problem_are_refused_by_filters_plans_and
     with pytest.raises(ValueError, match="`constants` must hold for this problem"):
         cb.SafetyFilter(integrator(), constants=quiet)
     with pytest.raises(ValueError, match="`constants` must hold for this problem"):
-        cb.synthesize_plan(integrator(), tube="kummer", constants=quiet)
+        cb.synthesize_plan(integrator(), method="kummer", constants=quiet)
     with pytest.raises(ValueError, match="`tube` must hold for this problem"):
         cb.synthesize_plan(integrator(), tube=tube_of(noisy(0.0005)))
     free = [cb.Inside(cb.Box([-1, -1], [3, 1]))]
-    plan = cb.synthesize_plan(noisy(0.0005, safe=free, horizon=4), tube="kummer")
+    plan = cb.synthesize_plan(noisy(0.0005, safe=free, horizon=4), method="kummer")
     with pytest.raises(ValueError, match="`plan` must hold for this problem"):
         cb.PredictiveController(noisy(0.05, safe=free, horizon=4), horizon=2, plan=plan)
 

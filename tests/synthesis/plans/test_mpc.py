@@ -31,13 +31,13 @@ def test_the_plan_survives_the_noise(planned: Any) -> None:
 
 
 def test_less_noise_is_never_worse() -> None:
-    quiet, loud = (cb.synthesize_plan(cart(std=std), tube="linear") for std in (0.01, 0.03))
+    quiet, loud = (cb.synthesize_plan(cart(std=std), method="linear") for std in (0.01, 0.03))
     assert quiet.scale > loud.scale
     assert quiet.cost <= loud.cost + 1e-6
 
 
 def test_constants_give_a_plan_of_their_own(problem: cb.Problem) -> None:
-    found = cb.synthesize_plan(problem, tube="kummer")
+    found = cb.synthesize_plan(problem, method="kummer")
     assert found.method == "kummer"
     assert found.constants is not None
     assert found.constants.certified
@@ -46,7 +46,7 @@ def test_constants_give_a_plan_of_their_own(problem: cb.Problem) -> None:
 
 def test_a_one_time_bound_is_unknown_however_well_it_fits() -> None:
     constants = cb.Constants(gain=1.06, sigma=0.001, dimension=2, isotropic=True)
-    found = cb.synthesize_plan(cart(std=0.001), tube="markov", constants=constants)
+    found = cb.synthesize_plan(cart(std=0.001), method="markov", constants=constants)
     assert found.feasible
     assert found.status == "UNKNOWN"
     assert "one time" in found.reason
@@ -54,15 +54,15 @@ def test_a_one_time_bound_is_unknown_however_well_it_fits() -> None:
 
 def test_stated_constants_are_named_as_an_assumption(problem: cb.Problem) -> None:
     constants = cb.Constants(gain=1.06, sigma=0.01, dimension=2)
-    found = cb.synthesize_plan(problem, tube="kummer", constants=constants)
+    found = cb.synthesize_plan(problem, method="kummer", constants=constants)
     assert "assumed" in found.reason
     with pytest.raises(ValueError, match=r"`constants.sigma` must be at least 0.01, .* got 0.001"):
-        cb.synthesize_plan(problem, tube="kummer", constants=cb.Constants(gain=1.06, sigma=0.001, dimension=2))
+        cb.synthesize_plan(problem, method="kummer", constants=cb.Constants(gain=1.06, sigma=0.001, dimension=2))
 
 
 def test_an_infeasible_problem_says_why_and_what_would_do(problem: cb.Problem) -> None:
     constants = cb.Constants(gain=1.06, sigma=0.02, dimension=2)
-    found = cb.synthesize_plan(problem, tube="markov", constants=constants)
+    found = cb.synthesize_plan(problem, method="markov", constants=constants)
     assert not found.feasible
     assert found.infeasibility is not None
     assert found.infeasibility.proved
@@ -71,7 +71,7 @@ def test_an_infeasible_problem_says_why_and_what_would_do(problem: cb.Problem) -
     assert delta is not None
     assert problem.delta < delta < 1
     larger, smaller = (
-        cb.synthesize_plan(problem.replace(delta=delta * factor), tube="markov", constants=constants)
+        cb.synthesize_plan(problem.replace(delta=delta * factor), method="markov", constants=constants)
         for factor in (1.01, 0.99)
     )
     assert larger.feasible
@@ -79,7 +79,7 @@ def test_an_infeasible_problem_says_why_and_what_would_do(problem: cb.Problem) -
 
 
 def test_a_response_that_does_not_fit_is_no_proof() -> None:
-    found = cb.synthesize_plan(cart(std=0.3, delta=1e-6), tube="linear")
+    found = cb.synthesize_plan(cart(std=0.3, delta=1e-6), method="linear")
     assert not found.feasible
     assert found.status == "UNKNOWN"
     assert found.infeasibility is not None
@@ -96,7 +96,7 @@ def test_auto_says_what_it_looked_for() -> None:
     assert delta is not None
     assert delta > found.source.delta
     assert f"{delta:.4g}" in found.reason
-    assert cb.synthesize_plan(cart(std=0.07, horizon=12, delta=1.02 * delta), tube=found.method).feasible
+    assert cb.synthesize_plan(cart(std=0.07, horizon=12, delta=1.02 * delta), method=found.method).feasible
 
 
 def test_continuous_time_is_planned_and_proved() -> None:
@@ -105,7 +105,7 @@ def test_continuous_time_is_planned_and_proved() -> None:
     )
     safe = [cb.Inside(cb.Box([-0.2, -0.6], [1.2, 0.6])), cb.Inside(cb.Box([-0.2, -0.6], [0.8, 0.6]), during=(0.6, 0.6))]
     problem = cb.Problem(system, initial=[1, 0], safe=safe, horizon=0.6, delta=1e-2)
-    found = cb.synthesize_plan(problem, tube="linear", steps=4, feedback=[[-4.0, -3.0]])
+    found = cb.synthesize_plan(problem, method="linear", steps=4, feedback=[[-4.0, -3.0]])
     assert found.status == "SAFE"
     assert found.states[-1, 0] < 0.8
     assert np.all(np.abs(found.inputs) <= 6)
@@ -120,7 +120,7 @@ def test_continuous_time_is_planned_around_an_obstacle() -> None:
     safe = [cb.Outside(cb.Ball([0.5, -0.8], 0.3)), cb.Inside(cb.Box([-0.2, -2], [1.2, 2]))]
     end = cb.Inside(cb.Box([-0.2, -0.5], [0.2, 0.5]), during=(1.5, 1.5))
     problem = cb.Problem(system, initial=[1, 0], safe=[*safe, end], horizon=1.5, delta=1e-2)
-    found = cb.synthesize_plan(problem, tube="linear", steps=12)
+    found = cb.synthesize_plan(problem, method="linear", steps=12)
     assert found.status == "SAFE"
     assert np.linalg.norm(found.states - [0.5, -0.8], axis=1).min() > 0.3
 
@@ -138,7 +138,7 @@ def test_a_given_tube_serves(problem: cb.Problem) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"tube": "nonsense"}, "`tube` must be a Tube or one of"),
+        ({"method": "nonsense"}, "`method` must be one of"),
         ({"terminal": "nonsense"}, "`terminal` must be 'contraction', 'riccati'"),
         ({"terminal": cb.Box([-1, -0.79], [1, 0.79])}, "`terminal` must lie inside the tightened constraints"),
         ({"terminal": cb.Ball([0, 0, 0], 1)}, "`terminal` must have dimension 2"),
@@ -151,7 +151,12 @@ def test_a_given_tube_serves(problem: cb.Problem) -> None:
 )
 def test_bad_input_is_refused(problem: cb.Problem, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        cb.synthesize_plan(problem, **({"tube": "linear"} | changes))
+        cb.synthesize_plan(problem, **({"method": "linear"} | changes))
+
+
+def test_a_method_is_no_tube(problem: cb.Problem) -> None:
+    with pytest.raises(TypeError, match=r"`tube` must be a cb.Tube, got 'thm5'; the name of one goes under `method`"):
+        cb.synthesize_plan(problem, tube="thm5")  # type: ignore[arg-type]
 
 
 def test_a_terminal_of_another_type_is_refused(problem: cb.Problem) -> None:
@@ -182,12 +187,12 @@ def test_inputs_without_bounds_are_refused_where_the_jacobian_depends_on_them() 
     )  # fmt: skip
     problem = cb.Problem(system, initial=[0.1], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=5)
     with pytest.raises(ValueError, match="`inputs` must be bounded"):
-        cb.synthesize_plan(problem, tube="kummer")
+        cb.synthesize_plan(problem, method="kummer")
 
 
 @pytest.mark.parametrize("feedback", ["riccati", [[-4.0, -3.0]]])
 def test_a_feedback_narrows_the_tube_and_its_inputs_are_proved(problem: cb.Problem, feedback: Any) -> None:
-    found, blind = (cb.synthesize_plan(cart(std=0.03), tube="linear", feedback=f) for f in (feedback, None))
+    found, blind = (cb.synthesize_plan(cart(std=0.03), method="linear", feedback=f) for f in (feedback, None))
     assert found.status == "SAFE"
     assert found.scale > blind.scale
     assert any("inputs within their bounds" in c.label for c in found.problem.safe)
@@ -199,7 +204,7 @@ def test_a_feedback_narrows_the_tube_and_its_inputs_are_proved(problem: cb.Probl
 
 
 def test_the_closed_loop_is_the_system_under_the_feedback(problem: cb.Problem) -> None:
-    found = cb.synthesize_plan(problem, tube="linear", feedback=[[-4.0, -3.0]])
+    found = cb.synthesize_plan(problem, method="linear", feedback=[[-4.0, -3.0]])
     quiet = found.problem.replace(system=_silent(found.problem.system))
     (path,) = cb.sample_paths(quiet, paths=1, rng=np.random.default_rng(0))
     np.testing.assert_allclose(path, found.states, atol=1e-9)
@@ -229,7 +234,7 @@ def test_no_delta_at_all_is_said() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("delta", "feasible"), [(0.03, False), (0.05, True)])
 def test_markov_on_the_chain_is_infeasible_below_four_percent(delta: float, feasible: bool) -> None:
-    found = cb.synthesize_plan(cb.load("chain").replace(delta=delta), tube="markov")
+    found = cb.synthesize_plan(cb.load("chain").replace(delta=delta), method="markov")
     assert found.feasible is feasible
     assert found.status != "SAFE"
     assert feasible or (found.infeasibility is not None and found.infeasibility.proved)
@@ -238,9 +243,9 @@ def test_markov_on_the_chain_is_infeasible_below_four_percent(delta: float, feas
 @pytest.mark.slow
 def test_the_chain_is_planned_with_the_papers_tube_and_with_ours() -> None:
     chain = cb.load("chain")
-    paper = cb.synthesize_plan(chain, tube="thm5", epsilon=15 / 16, step=1)
-    ours = cb.synthesize_plan(chain.replace(delta=1e-6), tube="kummer", constants=paper.constants)
-    response = cb.synthesize_plan(chain, tube="linear")
+    paper = cb.synthesize_plan(chain, method="thm5", epsilon=15 / 16, step=1)
+    ours = cb.synthesize_plan(chain.replace(delta=1e-6), method="kummer", constants=paper.constants)
+    response = cb.synthesize_plan(chain, method="linear")
     assert paper.status == ours.status == response.status == "SAFE"
     runs = cb.simulate_closed_loop(response, runs=3000, rng=0)
     assert runs.lower <= 0.002
@@ -251,5 +256,5 @@ def test_the_chain_is_planned_with_the_papers_tube_and_with_ours() -> None:
 @pytest.mark.slow
 def test_ours_plans_the_chain_at_more_than_twice_the_noise_of_the_papers() -> None:
     loud = cb.load("chain", sigma=0.43 * 3.2)
-    assert cb.synthesize_plan(loud, tube="linear").status == "SAFE"
-    assert not cb.synthesize_plan(cb.load("chain", sigma=0.43 * 1.6), tube="thm5", epsilon=15 / 16, step=1).feasible
+    assert cb.synthesize_plan(loud, method="linear").status == "SAFE"
+    assert not cb.synthesize_plan(cb.load("chain", sigma=0.43 * 1.6), method="thm5", epsilon=15 / 16, step=1).feasible

@@ -1,0 +1,68 @@
+"""Pictures of verdicts and tubes, with sample paths where the noise has a law to sample from."""
+
+from __future__ import annotations
+
+import logging
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from certbound.cli.messages import InputError
+from certbound.cli.output import write_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from certbound.plotting import Scene
+    from certbound.problem.problem import Problem
+    from certbound.reach.sets import ReachTube
+    from certbound.safety.verification import Verdict
+
+__all__ = ["check_picture", "sampled", "scene_of", "write_picture"]
+
+PATHS = 60
+_log = logging.getLogger(__name__)
+
+
+def check_picture(path: Path | None) -> None:
+    """Refuse, before any work, to draw in a format that matplotlib does not write."""
+    if path is None or not path.suffix:
+        return
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    known = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix[1:].lower() not in known:
+        raise InputError(
+            f"`{path.name}` ends in {path.suffix}, which is no format of pictures", "end it in .png or .pdf"
+        )
+
+
+def write_picture(path: Path, figure: Figure) -> None:
+    """Write a figure in the format that the file's name ends in."""
+    stream = BytesIO()
+    figure.savefig(stream, format=path.suffix.lstrip(".") or "png", dpi=150)
+    write_file(path, stream.getvalue())
+
+
+def sampled(problem: Problem, *, deviation: bool = False) -> Any:
+    """Sample paths to draw, shape (path, time, state); None for noise without a law."""
+    import numpy as np
+
+    from certbound.simulation.estimates import sample_paths
+
+    try:
+        return sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0), deviation=deviation)
+    except ValueError as error:
+        _log.info("no sample paths are drawn: %s", error)
+        return None
+
+
+def scene_of(problem: Problem, verdict: Verdict, reach: ReachTube, title: str) -> Scene:
+    """What is drawn of a verdict."""
+    import numpy as np
+
+    from certbound.plotting import Scene, noisy_reach
+
+    paths = sampled(problem)
+    times = None if paths is None else np.linspace(0.0, float(problem.horizon), paths.shape[1])
+    return Scene(problem=problem, reach=reach, tube=noisy_reach(verdict), times=times, paths=paths, title=title)

@@ -1,0 +1,76 @@
+"""What only tests reach has no place in the package."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+from collections import Counter
+from pathlib import Path
+
+import certbound as cb
+import certbound.constants
+
+ROOT = Path(__file__).resolve().parents[1]
+ALONE = {
+    "certbound.checker.check.check_file": "a whole check in one call, for programs that hold no more than a file",
+    "certbound.constants.recheck.holds_gain": "the proof of a gain at a stated value: says whether a bound is tight",
+    "certbound.constants.recheck.holds_rate": "the proof of a rate at a stated value, likewise",
+}
+"""Functions and classes that nothing but tests reach, and why they are there."""
+
+
+@functools.cache
+def modules() -> dict[str, tuple[ast.Module, bool]]:
+    """Every module that is no test, parsed, and whether it is a room's door."""
+    found = {}
+    for folder in ("certbound", "experiments", "paper_figs", "docs"):
+        for path in (ROOT / folder).rglob("*.py"):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+            found[name] = ast.parse(path.read_text(encoding="utf-8")), path.stem == "__init__"
+    return found
+
+
+def words(tree: ast.AST) -> Counter[str]:
+    """Names that a piece of code reads, and with a dot before them attributes."""
+    nodes = [node for node in ast.walk(tree) if isinstance(node, ast.Name | ast.Attribute)]
+    return Counter(node.id if isinstance(node, ast.Name) else f".{node.attr}" for node in nodes)
+
+
+def unreached(known: dict[str, tuple[ast.Module, bool]]) -> set[str]:
+    """Functions and classes of the package that no other code reads, imports (doors apart) or offers to users."""
+    whole = {name: words(tree) for name, (tree, _) in known.items()}
+    imported = {
+        (node.module, alias.name)
+        for tree, door in known.values() if not door
+        for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names
+    }  # fmt: skip
+    public = {*cb.__all__, *certbound.constants.__all__, "connect"}  # `connect` is what the package's own door calls
+    everywhere = set().union(*whole.values())
+    found = set()
+    for module, (tree, _) in known.items():
+        doors = [".".join(module.split(".")[:end]) for end in range(1, module.count(".") + 2)]
+        for node in tree.body if module.startswith("certbound") else ():
+            if not isinstance(node, ast.FunctionDef | ast.ClassDef) or node.name in public or node.name[:2] == "__":
+                continue
+            if node.decorator_list and re.search("register|callback", ast.unparse(node.decorator_list[0])):
+                continue
+            if f".{node.name}" in everywhere or any((door, node.name) in imported for door in doors):
+                continue
+            if whole[module][node.name] == words(node)[node.name]:
+                found.add(f"{module}.{node.name}")
+    return found
+
+
+KERNELS = ("certbound.simulation.compiled.", "certbound.lazy.")
+"""What the text of generated kernels calls; what every door calls."""
+
+
+def test_every_function_is_reached_by_more_than_tests() -> None:
+    assert {name for name in unreached(modules()) if not name.startswith(KERNELS)} == set(ALONE)
+
+
+def test_a_planted_function_is_found() -> None:
+    planted = ast.parse("__all__ = ['alone']\ndef alone(): ...\ndef used(): ...\nused()"), False
+    found = unreached(modules() | {"certbound.rigor.planted": planted})
+    assert {name for name in found if "planted" in name} == {"certbound.rigor.planted.alone"}
