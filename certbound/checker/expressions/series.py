@@ -2,7 +2,8 @@
 
 A series is a list of coefficients; operations follow from the differential equations that the functions obey. Expanded
 at the middle of a piece and, for the last coefficient, over all of it, a function lies in its Taylor polynomial plus
-that coefficient times the last power (Lagrange's remainder).
+that coefficient times the last power (Lagrange's remainder). At a kink there are series up to the first power only,
+whose coefficient encloses the slopes on both sides (a Lipschitz function is the integral of its derivative).
 """
 
 from __future__ import annotations
@@ -159,7 +160,7 @@ def _arc(name: str) -> Callable[[Series], Series]:
 
 
 def _abs(x: Series) -> Series:
-    return _scale(x, kink(x[0]))
+    return _larger(x, _scale(x, arb(-1)))
 
 
 def _power(x: Series, exponent: float) -> Series:
@@ -191,11 +192,16 @@ def _hypot(x: Series, y: Series) -> Series:
 
 
 def _larger(x: Series, y: Series) -> Series:
-    return x if kink(x[0] - y[0]) == 1 else y
+    try:
+        return x if kink(x[0] - y[0]) == 1 else y
+    except Undecided:
+        if len(x) > 2:
+            raise
+        return [arb.max(x[0], y[0]), *(a.union(b) for a, b in zip(x[1:], y[1:]))]
 
 
 def _smaller(x: Series, y: Series) -> Series:
-    return y if kink(x[0] - y[0]) == 1 else x
+    return _scale(_larger(_scale(x, arb(-1)), _scale(y, arb(-1))), arb(-1))
 
 
 _UNARY: dict[str, Callable[[Series], Series]] = {
