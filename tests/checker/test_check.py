@@ -226,3 +226,21 @@ def test_proved_levels_are_rounded_up(contracting) -> None:
     refused = check_data(data)
     assert not refused.valid
     assert "more than the claimed" in refused.reason
+
+
+def test_a_nominal_curve_may_cross_a_kink_in_time() -> None:
+    """min(t, 0.5) bends inside a piece, where the dynamics has no series; twice the slope there is still refused."""
+    slow = cb.ContinuousSystem(
+        lambda t, x: [-0.5 * x[0] - 0.05 * np.minimum(t / 0.437, 0.5)], states=1, diffusion=[[0.05]]
+    )
+    safe = [cb.Inside(cb.Box([-1.0], [1.0]))]
+    problem = cb.Problem(slow, initial=[0.2], safe=safe, horizon=0.437, delta=1e-2)
+    data = parse(certificate_text(problem, cb.verify_safety(problem, method="kummer")))
+    assert data["claim"]["method"] == "constants"
+    assert check_data(data, problem_data(problem)).valid
+    nodes = data["problem"]["dynamics"]["nodes"]
+    bent = next(i for i, node in enumerate(nodes) if node[0] == "const" and float.fromhex(node[1]) == 0.5)
+    nodes[bent][1] = (0.6).hex()
+    report = check_data(data)
+    assert not report.valid
+    assert "defect" in report.reason

@@ -64,7 +64,7 @@ def row_sums(a: arb_mat) -> arb:
 
 
 def balance(a: arb_mat) -> list[arb]:
-    """Powers of two u for which the rows and columns of a_ij u_j / u_i about agree, in floats; any choice serves."""
+    """Powers of two u for which the rows and columns of a_ij u_j / u_i are about equal: any choice serves."""
     n = a.nrows()
     sizes = [[float(a[i, j].abs_upper()) if i != j else 0.0 for j in range(n)] for i in range(n)]
     exponents = [0] * n

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from math import comb
 
 from flint import arb, arb_mat
@@ -22,6 +23,8 @@ from certbound.checker.statement import Model, Structure
 __all__ = ["CurvePiece", "Norm", "Tube"]
 
 ORDER = 6
+KINK_PARTS, SLIP = 16, arb(2) ** -20
+"""Parts of a piece with a kink inside, and how much wider than its share each is taken."""
 CORNERS = 10
 
 
@@ -198,18 +201,33 @@ class Tube:
             values = expand(model.dynamics, [[arb(k)], *states, *inputs], 0, self.budget)
             return [[a - value[0] for a, value in zip(after, values)]], [arb(0)] * model.dimension
         span = (piece.start - piece.middle).union(piece.end - piece.middle)
+        try:
+            return self._expanded(k, inputs, arb(0), span, ORDER)
+        except Undecided:  # a kink inside the piece has series up to the first power: over short parts they do
+            share, found = span.rad() / KINK_PARTS, []
+            for i in range(KINK_PARTS):
+                middle = span.mid() + share * (2 * i + 1 - KINK_PARTS)
+                found.append(self._expanded(k, inputs, middle, arb(0, share * (1 + SLIP)), 1))
+            rests = [reduce(arb.max, (abs(rest[x]).upper() for _, rest in found)) for x in range(model.dimension)]
+            return [point for points, _ in found for point in points], [arb(0, rest) for rest in rests]
+
+    def _expanded(
+        self, k: int, inputs: list[list[arb]], centre: arb, span: arb, order: int
+    ) -> tuple[list[list[arb]], list[arb]]:
+        """The same over ``span`` about ``centre``, from the middle of the piece."""
+        model, piece = self.model, self.pieces[k]
         parts = []
-        for tau in (arb(0), span):
+        for tau in (centre, centre + span):
             time = [piece.middle + tau, arb(1)]
-            states = piece.series(tau, ORDER + 1)
-            parts.append((states, expand(model.dynamics, [time, *states, *inputs], ORDER, self.budget)))
+            states = piece.series(tau, order + 1)
+            parts.append((states, expand(model.dynamics, [time, *states, *inputs], order, self.budget)))
         (thin, thin_flow), (wide, wide_flow) = parts
         rows = [
-            [_velocity(thin[x], j) - thin_flow[x][j] for x in range(model.dimension)] for j in range(ORDER)
+            [_velocity(thin[x], j) - thin_flow[x][j] for x in range(model.dimension)] for j in range(order)
         ]
-        size = _powers(span, ORDER)[ORDER]
-        rest = [(_velocity(wide[x], ORDER) - wide_flow[x][ORDER]) * size for x in range(model.dimension)]
-        return replace(piece, coefficients=rows).hull(), rest
+        size = _powers(span, order)[order]
+        rest = [(_velocity(wide[x], order) - wide_flow[x][order]) * size for x in range(model.dimension)]
+        return (rows if order == 1 else replace(piece, coefficients=rows).hull()), rest
 
     def _with_disturbance(self, k: int, rest: list[arb]) -> list[list[arb]]:
         """Columns of the linear effect of d; what is left of it is added to ``rest``."""

@@ -2,7 +2,8 @@
 
 A series is a list of coefficients; operations follow from the differential equations that the functions obey. Expanded
 at the middle of a piece and, for the last coefficient, over all of it, a function lies in its Taylor polynomial plus
-that coefficient times the last power (Lagrange's remainder).
+that coefficient times the last power (Lagrange's remainder). At a kink there are series up to the first power only,
+whose coefficient encloses the slopes on both sides (a Lipschitz function is the integral of its derivative).
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def acos(x: Series) -> Series:
 
 
 def abs_(x: Series) -> Series:
-    return scale(x, balls.kink(x[0]))
+    return larger(x, scale(x, arb(-1)))
 
 
 def power(x: Series, exponent: float) -> Series:
@@ -169,11 +170,17 @@ def hypot(x: Series, y: Series) -> Series:
 
 
 def larger(x: Series, y: Series) -> Series:
-    return x if balls.kink(x[0] - y[0]) == 1 else y
+    try:
+        return x if balls.kink(x[0] - y[0]) == 1 else y
+    except balls.Undecided:
+        if len(x) > 2:
+            raise
+        return [arb.max(x[0], y[0]), *(a.union(b) for a, b in zip(x[1:], y[1:]))]
 
 
 def smaller(x: Series, y: Series) -> Series:
-    return y if balls.kink(x[0] - y[0]) == 1 else x
+    minus = arb(-1)
+    return scale(larger(scale(x, minus), scale(y, minus)), minus)
 
 
 def if_else_zero(condition: Series, x: Series) -> Series:

@@ -198,7 +198,7 @@ def _carried(
     pairs: Sequence[tuple[int, Sequence[arb]]], transitions: Sequence[arb_mat],
     columns: Sequence[tuple[arb_mat, arb_mat, arb_mat | None]], start: Sequence[arb], budget: Budget,
 ) -> tuple[arb_mat, arb_mat]:
-    """Pairs (node, row), nodes in order: sums of row . centre; of |row| . radius and what reaches y.
+    """Of pairs (node, row), nodes in order: sums of row . centre; of |row| . radius and what reaches y, in two columns.
 
     The last nodes' rows start; those of earlier nodes join them on the way back.
     """

@@ -21,21 +21,20 @@ from certbound.reach.remainder import Frame, Remainder
 from certbound.reach.sets import NominalPieces
 from certbound.rigor.intervals import Interval
 
-__all__ = ["WINDOW", "WINDOW_TURN", "Linearisation"]
+__all__ = ["WINDOW", "Linearisation"]
 
 Array = NDArray[np.float64]
 
 _FEWEST_PIECES, _MOST_PIECES = 50, 2000
-_STEP = 0.1
-"""||J|| h of a piece, in units of the states that balance J: how far a row turns."""
-_SERIES = 2.0
-"""||J|| h of a piece in the states' own units: how many terms the series of its transition matrix need."""
+_STEP, _OWN_STEP, _SERIES = 0.1, 0.03, 2.0
+"""||J|| h of a piece: in the states' own units; in those that balance J, where fewer pieces do; and, in the states' own
+again, what the series of a transition matrix need."""
 _ROUND = 1 + 1e-13
 _LARGE = 40  # states
-WINDOW = 0.05
-"""Time of the martingale windows that bound rows which turn."""
-WINDOW_TURN = 8.0
-"""||J|| times that time, at most: the transition matrix of a window is inverted, and next to singular beyond."""
+WINDOW, WINDOW_TURN, WINDOW_SPAN = 0.02, 0.1, 8.0
+"""The martingale windows that bound rows which turn: their share of the horizon; ||J|| times their time in balanced
+units, beyond which they know little of such a row; and in the states' own, since a window's transition matrix is
+inverted."""
 
 
 class Linearisation:
@@ -90,16 +89,16 @@ class Linearisation:
 
     @classmethod
     def of(cls, problem: Problem, *, cells: int | None = None, noise: bool = True) -> Linearisation:
-        """The linearisation on a grid that resolves the nominal Jacobians: see ``_STEP`` and ``_SERIES``."""
+        """The linearisation on a grid that resolves the nominal Jacobians: see ``_STEP``."""
         if problem.system.time == "discrete":
             return cls(problem, cells=cells, noise=noise)
         trial = cls(problem, noise=noise)
         while trial.lost and 4 * trial.pieces <= _MOST_PIECES:  # a coarse grid loses a stiff system's nominal at once
             trial = cls(problem, pieces=4 * trial.pieces, noise=noise)
         slopes = np.nan_to_num(trial.slopes[0])
-        sizes = [float(np.linalg.norm(found, axis=(-2, -1)).max()) for found in (balanced(slopes), slopes)]
-        least = problem.horizon * max(sizes[0] / _STEP, sizes[1] / _SERIES)
-        pieces = int(np.clip(np.ceil(least), _FEWEST_PIECES, _MOST_PIECES))
+        own, whole = (float(np.linalg.norm(found, axis=(-2, -1)).max()) for found in (balanced(slopes), slopes))
+        wanted = problem.horizon * min(whole / _STEP, max(own / _OWN_STEP, whole / _SERIES))
+        pieces = int(np.clip(np.ceil(wanted), _FEWEST_PIECES, _MOST_PIECES))
         alike = (cells is None or cells == 1) and trial._pieces(pieces) == trial.pieces
         return trial if alike else cls(problem, cells=cells, pieces=pieces, noise=noise)
 
@@ -349,9 +348,11 @@ class Linearisation:
     @cached_property
     def window(self) -> int:
         """Pieces of a martingale window."""
-        slope = self.slopes[0]
-        turn = float(np.abs(np.where(np.isfinite(slope), slope, 0.0)).sum(axis=-1).max()) * self.step
-        return max(1, min(round(WINDOW / self.step), int(WINDOW_TURN / max(turn, 1e-6))))
+        slope = np.nan_to_num(self.slopes[0], nan=0.0, posinf=0.0, neginf=0.0)
+        own, whole = (
+            max(float(np.abs(found).sum(axis=-1).max()) * self.step, 1e-9) for found in (balanced(slope), slope)
+        )
+        return max(1, min(round(WINDOW * self.pieces), int(WINDOW_TURN / own), int(WINDOW_SPAN / whole)))
 
     # ---- supports ----------------------------------------------------------------------------------------
 

@@ -68,7 +68,7 @@ def test_rows_that_move_with_the_flow_cost_little_in_every_window(share: float) 
     rows, extra = inner_rows(engine)
     assert rows.shape[2] == 3 + extra.shape[2]
     assert extra.shape[2] == 6
-    windows = WindowEvents(engine.response, 0, max(1, round(WINDOW / engine.step)), share)
+    windows = WindowEvents(engine.response, 0, max(1, round(WINDOW * engine.pieces)), share)
     covariance = engine.response.covariance[0, 1:]
     for d in range(3, 9):
         own = rows[0, :, d]

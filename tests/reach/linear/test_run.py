@@ -215,7 +215,7 @@ def test_bounds_of_the_remainder_prove_themselves(effort: int) -> None:
     assert np.all(sample[1] <= bounds[1])
     target = bounds[0].reshape(-1, 3), bounds[1].reshape(-1, 3)
     again = run.engine.model.bound(run.engine.frame, *implied, run.flat_extra, 3, target)
-    little = 0.02 * (target[1] - target[0])  # other boxes, other bounds
+    little = 0.04 * (target[1] - target[0])  # other boxes, other bounds
     assert np.all(again[0] >= target[0] - little)
     assert np.all(again[1] <= target[1] + little)
 
@@ -294,3 +294,24 @@ def test_leaving_costs_no_less_than_the_noise_at_one_time() -> None:
         least = run._one_time(Share.of(1e-4))
         assert -np.inf < least <= run.promise(Share.of(1e-4), 3)
         assert run.promise(Share.of(1e-4), 3, limit=least - 1.0) == least
+
+
+def test_units_of_time_change_no_bound() -> None:
+    """A hundred relaxation times, in units in which they are long or short."""
+    found = []
+    for rate in (2.0**-4, 2.0**10):
+        system = cb.linear_system([[-rate]], diffusion=[[0.1 * rate**0.5]])
+        safe = [cb.Inside(cb.Box([-0.5], [0.5]))]
+        problem = cb.Problem(system, initial=[0.0], safe=safe, horizon=100.0 / rate, delta=1e-3)
+        found.append(linear_answer(problem).log10_delta)
+        assert np.isfinite(linear_reach(problem).hull.hi).all()
+    assert found[0] == pytest.approx(found[1], rel=1e-3)
+    assert found[0] < -5
+
+
+def test_a_reach_tube_that_nothing_bounds_names_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("certbound.reach.linear.answer.level_scale", lambda *_: np.inf)
+    system = cb.linear_system([[-0.5]], diffusion=[[0.1]])
+    problem = cb.Problem(system, initial=[1.0], safe=[], horizon=2, delta=1e-2)
+    with pytest.raises(ArithmeticError, match=r"no bound of the deviation of x1 was found .*method='contraction'"):
+        linear_reach(problem)
