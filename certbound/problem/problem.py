@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from certbound.checks import frozen, nearest, number, positive_definite, vector
 from certbound.display import Shown, ask_later_room, name_text
 from certbound.problem.model import Tape, substitute, trace
-from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, Inside, Outside, check_start
+from certbound.problem.sets import Box, GaussianStart, Inside, Outside, Region, check_start
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
 __all__ = ["GaussianStart", "Problem"]
@@ -136,7 +136,7 @@ class Problem(Shown):
     @property
     def fixed_start(self) -> bool:
         """True when the initial set is a single point."""
-        return isinstance(self.initial, Box) and bool(np.all(self.initial.low == self.initial.high))
+        return bool(self.initial.is_point)
 
     def summary(self) -> str:
         """The problem in one line."""
@@ -308,19 +308,18 @@ def _check_dimension(name: str, region: Any, dimension: int) -> None:
         )
 
 
-def _start(value: Any, dimension: int) -> Box | Ball | Ellipsoid | GaussianStart:
-    starts = (Box, Ball, Ellipsoid, GaussianStart)
-    if not isinstance(value, starts) or type(value) not in starts:
-        if isinstance(value, (*starts, Mapping, str)) or hasattr(value, "halfspaces"):
-            kinds = "point, Box, Ball, Ellipsoid or GaussianStart"
-            raise TypeError(f"`initial` must be a {kinds}, got {value!r}.")
+def _start(value: Any, dimension: int) -> Region | GaussianStart:
+    if isinstance(value, Region | GaussianStart | Mapping | str):
+        if type(value) is not GaussianStart and not (Region in type(value).__bases__ and value.starts):
+            raise TypeError(f"`initial` must be a point, Box, Ball, Ellipsoid or GaussianStart, got {value!r}.")
+    else:
         point = vector("initial", value, dimension)
-        return Box(point, point)
-    if not isinstance(value, GaussianStart):
+        value = Box(point, point)
+    if not value.random:
         if value.moving or value.coordinates is not None:
             raise ValueError("`initial` must be a fixed set over all states, without `coordinates`.")
-        if isinstance(value, Box) and not value.bounded:
-            raise ValueError("`initial` must be bounded, got a box with infinite sides.")
+        if not np.all(np.isfinite([value.hull().lo, value.hull().hi])):
+            raise ValueError("`initial` must be bounded, got a set with infinite sides.")
     if value.dimension != dimension:
         raise ValueError(f"`initial` must have dimension {dimension} (the states), got {value.dimension}.")
     return value

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
-from certbound.problem.sets.regions import Ball, Box, Ellipsoid
+from certbound.problem.sets.constraints import GaussianStart, Inside
+from certbound.problem.sets.forms import Faces, Quadratic, Region
 
 __all__ = ["check_start"]
 
 Array = NDArray[np.float64]
 
 
-def check_start(initial: Box | Ball | Ellipsoid | GaussianStart, constraints: Sequence[Inside]) -> None:
+def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside]) -> None:
     """Refuse a start that violates a constraint, wholly or (where that is easily decided) in part.
 
     Raises
@@ -24,7 +24,7 @@ def check_start(initial: Box | Ball | Ellipsoid | GaussianStart, constraints: Se
     ValueError
         Naming the constraint and how the start violates it.
     """
-    center = _center(initial)
+    center = initial.middle
     for constraint in constraints:
         if constraint.during is not None and constraint.during[0] > 0:
             continue
@@ -36,77 +36,48 @@ def check_start(initial: Box | Ball | Ellipsoid | GaussianStart, constraints: Se
             )
 
 
-def _center(initial: Box | Ball | Ellipsoid | GaussianStart) -> Array:
-    if isinstance(initial, Box):
-        return np.asarray((initial.low + initial.high) / 2)
-    return np.asarray(initial.mean if isinstance(initial, GaussianStart) else initial.center)
-
-
-def _fault(initial: Any, center: Array, constraint: Inside) -> str:
+def _fault(initial: Region | GaussianStart, center: Array, constraint: Inside) -> str:
     text = "(" + ", ".join(f"{value:g}" for value in center) + ")"
     if not np.any(constraint.satisfied(center)) and not _on_boundary(center, constraint):
-        return f"the mean {text}" if isinstance(initial, GaussianStart) else f"its centre {text}"
-    if isinstance(initial, GaussianStart):
+        return f"the mean {text}" if initial.random else f"its centre {text}"
+    if initial.random:
         return ""
-    sticks_out = _leaves if not isinstance(constraint, Outside) else _touches
-    return "a part of it" if sticks_out(initial, center, constraint.region) else ""
+    sticks_out = _touches if constraint.outside else _leaves
+    return "a part of it" if sticks_out(initial, constraint.region) else ""
 
 
 def _on_boundary(point: Array, constraint: Inside) -> bool:
     """True for a start on the edge of an obstacle's closed set, which rounding must not decide."""
     moved = point + 1e-12 * (1.0 + np.abs(point)) * np.array([[1.0], [-1.0]])
-    return isinstance(constraint, Outside) and bool(np.any(constraint.satisfied(moved)))
+    return constraint.outside and bool(np.any(constraint.satisfied(moved)))
 
 
 def _slack(value: Any) -> Any:
     return 1e-9 * (1.0 + np.abs(value))
 
 
-def _leaves(initial: Any, center: Array, region: Any) -> bool:
+def _leaves(initial: Any, region: Region) -> bool:
     """Whether the start surely has a point outside the region."""
-    if isinstance(region, (Ball, Ellipsoid)):
-        if not isinstance(region, Ball):
-            return False
-        return bool(_farthest(initial, region) > region.radius + _slack(region.radius))
-    normals, bounds = region.halfspaces()
-    if not len(bounds):
-        return False
-    full = np.zeros((len(bounds), len(center)))
-    full[:, range(len(center)) if region.coordinates is None else list(region.coordinates)] = normals
-    reach = initial.support(full) - normals @ region.center_at()
-    return bool(np.any(reach > bounds + _slack(bounds)))
+    match region.form:
+        case Quadratic() as form:
+            farthest = initial.reaches(region.center_at(), region.places(initial.dimension))[1]
+            return form.even and bool(farthest > form.radius + _slack(form.radius))
+        case Faces() as form:
+            reach = initial.support(region.lifted(form.normals, initial.dimension))
+            return bool(np.any(reach - form.normals @ region.center_at() > form.bounds + _slack(form.bounds)))
 
 
-def _touches(initial: Any, center: Array, region: Any) -> bool:
+def _touches(initial: Any, region: Region) -> bool:
     """Whether the start surely has a point inside the region."""
-    if isinstance(region, Ball):
-        return bool(_nearest(initial, region) < region.radius - _slack(region.radius))
-    normals, bounds = region.halfspaces() if not isinstance(region, Ellipsoid) else (np.empty(0), np.empty(0))
-    if len(bounds) == 1 and region.coordinates is None:
-        return bool(-initial.support(-normals)[0] < bounds[0] - _slack(bounds[0]))
-    if isinstance(region, Box) and isinstance(initial, Box):
-        offset = region.center_at()
-        low, high = region.low + offset, region.high + offset
-        below = region.local(initial.low) < high - _slack(0.0)
-        above = region.local(initial.high) > low + _slack(0.0)
-        return bool(np.all(below & above))
+    match region.form:
+        case Quadratic() as form:
+            nearest = initial.reaches(region.center_at(), region.places(initial.dimension))[0]
+            return form.even and bool(nearest < form.radius - _slack(form.radius))
+        case Faces() as form if len(form.bounds) == 1 and region.coordinates is None:
+            nearest = -initial.support(-form.normals)[0] - form.normals[0] @ region.center_at()
+            return bool(nearest < form.bounds[0] - _slack(form.bounds[0]))
+        case Faces() as form if form.axial and initial.form.axial:
+            low, high = (ends[region.places(initial.dimension)] for ends in (initial.hull().lo, initial.hull().hi))
+            around = region.hull()
+            return bool(np.all((low < around.hi - _slack(0.0)) & (high > around.lo + _slack(0.0))))
     return False
-
-
-def _farthest(initial: Any, region: Ball) -> float:
-    """Largest distance of the start from the region's centre (for an ellipsoid: of its own centre)."""
-    origin = region.center_at()
-    if isinstance(initial, Box):
-        low, high = region.local(initial.low), region.local(initial.high)
-        return float(np.linalg.norm(np.maximum(np.abs(low - origin), np.abs(high - origin))))
-    reach = initial.radius if isinstance(initial, Ball) else 0.0
-    return float(np.linalg.norm(region.local(initial.center) - origin)) + reach
-
-
-def _nearest(initial: Any, region: Ball) -> float:
-    origin = region.center_at()
-    if isinstance(initial, Box):
-        closest = np.clip(origin, region.local(initial.low), region.local(initial.high))
-        return float(np.linalg.norm(closest - origin))
-    reach = initial.radius if isinstance(initial, Ball) else 0.0
-    return float(np.linalg.norm(region.local(initial.center) - origin)) - reach
