@@ -308,21 +308,23 @@ def _check_dimension(name: str, region: Any, dimension: int) -> None:
         )
 
 
-def _start(value: Any, dimension: int) -> Region | GaussianStart:
-    if isinstance(value, Region | GaussianStart | Mapping | str):
-        if type(value) is not GaussianStart and not (Region in type(value).__bases__ and value.starts):
+def _start(value: Any, dimension: int) -> Any:
+    kind: Any = type(value)
+    if issubclass(kind, Region | GaussianStart | Mapping | str):
+        if kind is not GaussianStart and not (Region in kind.__bases__ and kind.starts):
             raise TypeError(f"`initial` must be a point, Box, Ball, Ellipsoid or GaussianStart, got {value!r}.")
     else:
         point = vector("initial", value, dimension)
         value = Box(point, point)
-    if not value.random:
-        if value.moving or value.coordinates is not None:
+    start: Any = value
+    if not start.random:
+        if start.moving or start.coordinates is not None:
             raise ValueError("`initial` must be a fixed set over all states, without `coordinates`.")
-        if not np.all(np.isfinite([value.hull().lo, value.hull().hi])):
+        if not np.all(np.isfinite([start.hull().lo, start.hull().hi])):
             raise ValueError("`initial` must be bounded, got a set with infinite sides.")
-    if value.dimension != dimension:
-        raise ValueError(f"`initial` must have dimension {dimension} (the states), got {value.dimension}.")
-    return value
+    if start.dimension != dimension:
+        raise ValueError(f"`initial` must have dimension {dimension} (the states), got {start.dimension}.")
+    return start
 
 
 def _weight(name: str, value: Any, size: int, *, strict: bool) -> Array:

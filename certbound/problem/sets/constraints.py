@@ -36,7 +36,7 @@ class Inside:
         Short text for humans; made from the region when omitted.
     """
 
-    region: Any
+    region: Region
     during: Any = None
     label: Any = None
 

@@ -238,7 +238,8 @@ class Region:
         """`support` along directions of the coordinates that the set bounds."""
         match self.form:
             case Quadratic() as form:
-                reach = form.radius * np.linalg.norm(directions @ np.linalg.cholesky(form.shape), axis=-1)
+                square = np.einsum("...i,...i->...", directions, directions @ form.shape)
+                reach = form.radius * (np.linalg.norm(directions, axis=-1) if form.even else np.sqrt(square))
             case Faces() as form:
                 flat = directions.reshape(-1, self.dimension)
                 values = [linear_maximum(form.normals, form.bounds, direction) for direction in flat]

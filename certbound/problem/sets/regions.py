@@ -119,7 +119,7 @@ class Box(Region):
         return np.asarray(self.center_at(t) + rng.uniform(self.low, self.high, (count, self.dimension)))
 
     def corners(self, rng: np.random.Generator, count: int) -> Array:
-        return np.where(rng.random((count, self.dimension)) < 0.5, self.low, self.high)
+        return np.asarray(np.where(rng.random((count, self.dimension)) < 0.5, self.low, self.high))
 
     def reaches(self, point: Array, places: list[int]) -> tuple[float, float]:
         low, high = self.low[places], self.high[places]
