@@ -212,11 +212,9 @@ def _initial(start: Any) -> dict[str, Any]:
 
 
 def _region(data: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A region's own data, without the centre and the coordinates that a polytope may lack."""
-    stated = {name: exact(value) for name, value in data.items() if name not in ("low", "high", "center")}
-    for name in ("low", "high"):
-        if name in data:
-            stated[name] = [_end(x) for x in data[name]]
-    if "center" in data:
-        stated["center"] = tape_data(data["center"]) if isinstance(data["center"], Tape) else exact(data["center"])
-    return stated
+    def stated(name: str, value: Any) -> Any:
+        if name in ("low", "high"):
+            return [_end(x) for x in value]
+        return tape_data(value) if isinstance(value, Tape) else exact(value)
+
+    return {name: stated(name, value) for name, value in data.items()}

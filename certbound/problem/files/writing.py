@@ -135,7 +135,7 @@ class _Writer:
     def place(self, region: Any) -> dict[str, Any]:
         used = self.states if region.coordinates is None else [self.states[k] for k in region.coordinates]
         moving = isinstance(region.center, Tape)
-        return dict(zip(used, self.texts(region.center) if moving else region.center.tolist()))
+        return dict(zip(used, self.texts(region.center) if moving else region.center_at().tolist()))
 
     def region(self, region: Any) -> dict[str, Any]:
         table = region.data()

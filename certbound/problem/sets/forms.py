@@ -185,10 +185,13 @@ class Region:
             return Interval.point(np.asarray(self.center, dtype=float))
         return stack(self.center.evaluate(ARITHMETIC, [Interval.point(float(t))]))
 
+    def extent(self) -> Interval:
+        """A box around the set about its centre, rounded outward; infinite where nothing is known."""
+        return self.form.hull()
+
     def hull(self, t: float = 0.0) -> Interval:
-        """A box around the set at time t in its coordinates, rounded outward; infinite where nothing is known."""
-        around = self.form.hull()
-        return around if self.center is None else self._enclosed_center(t) + around
+        """A box around the set at time t in its coordinates, rounded outward."""
+        return self.extent() if self.center is None else self._enclosed_center(t) + self.extent()
 
     def places(self, dimension: int) -> list[int]:
         """The indices of the states that the set lives in, of ``dimension`` states."""
@@ -296,15 +299,17 @@ class Region:
         return place if self.coordinates is None else f"{place} in ({', '.join(states[k] for k in self.coordinates)})"
 
     def data(self) -> dict[str, Any]:
-        """What files say of it: its fields where its kind has a row in them, else its form as a polytope or ellipsoid."""
+        """What files say of it: its fields where they have a row for its kind, else its form."""
         if self.kind:
             return {"kind": self.kind, **{entry.name: getattr(self, entry.name) for entry in fields(self)}}  # type: ignore[arg-type]  # a shape is a dataclass
         match self.form:
             case Quadratic() as form:
-                stated = {"kind": "ellipsoid", "center": self.center, "shape": form.matrix}
+                center = self.center if self.moving else self.center_at()
+                return {"kind": "ellipsoid", "center": center, "shape": form.matrix, "coordinates": self.coordinates}
             case Faces() as form:
-                stated = {"kind": "polytope", "A": form.normals, "b": form.bounds, "center": self.center}
-        return {**stated, "coordinates": self.coordinates}
+                stated = {"kind": "polytope", "A": form.normals, "b": form.bounds}
+                place = {"center": self.center, "coordinates": self.coordinates}
+                return stated | {name: value for name, value in place.items() if value is not None}
 
     def grown(self, distance: float) -> Region:
         """The set with its boundary moved outward by at most ``distance`` (inward where negative).

@@ -39,7 +39,8 @@ class Cells:
         if self.round is None:
             return bound
         center, form = self.round
-        around = Interval.point(_round_radius(form, norm)) + Interval.point(norm.length(Interval.point(center) - starts))
+        shift = norm.length(Interval.point(center) - starts)
+        around = Interval.point(_round_radius(form, norm)) + Interval.point(shift)
         return np.asarray(np.minimum(bound, around.hi))
 
 

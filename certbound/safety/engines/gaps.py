@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from certbound.constants.enclosures import split_boxes
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Faces, Quadratic
+from certbound.problem.sets import Quadratic
 from certbound.rigor.intervals import Interval, sq
 
 __all__ = ["Gap", "gaps_of", "hull_of", "lies_inside"]
@@ -50,10 +50,10 @@ def gaps_of(problem: Problem) -> list[Gap]:
         region, center = constraint.region, constraint.region.center_at()
         radius: float | None = None
         match region.form:
-            case Quadratic() as form:
+            case Quadratic() as form if form.even:
                 rows, bounds, radius = np.eye(form.dimension), center, form.radius
-            case Faces() as form:
-                rows, bounds = form.normals, form.bounds
+            case _:
+                rows, bounds = region.halfspaces()
                 if region.center is not None:  # to the side on which less is safe
                     moved = Interval.point(bounds) + (Interval.point(rows) * center).sum(axis=-1)
                     bounds = moved.hi if constraint.outside else moved.lo
