@@ -320,7 +320,7 @@ def _start(value: Any, dimension: int) -> Any:
     if not start.random:
         if start.moving or start.coordinates is not None:
             raise ValueError("`initial` must be a fixed set over all states, without `coordinates`.")
-        if not np.all(np.isfinite([start.hull().lo, start.hull().hi])):
+        if not np.all(np.isfinite([start.extent().lo, start.extent().hi])):
             raise ValueError("`initial` must be bounded, got a set with infinite sides.")
     if start.dimension != dimension:
         raise ValueError(f"`initial` must have dimension {dimension} (the states), got {start.dimension}.")

@@ -150,7 +150,7 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "constraints": [
             {
                 "kind": constraint.word,
-                "region": _region(constraint.region.data()),
+                "region": _region(constraint.region.data(_KINDS)),
                 "during": None if constraint.during is None else exact([float(end) for end in constraint.during]),
                 "label": str(constraint.label),
             }
@@ -203,8 +203,11 @@ def _noise(system: Any) -> dict[str, Any]:
     return {**data, "independent": bool(law.independent)} if hasattr(law, "independent") else data
 
 
+_KINDS = ("box", "ball", "ellipsoid", "halfspace", "polytope")  # those that the checker has a row for
+
+
 def _initial(start: Any) -> dict[str, Any]:
-    data = start.data()
+    data = start.data(_KINDS)
     if data["kind"] == "polytope":  # by a box around it
         around = start.hull()
         data = {"kind": "box", "low": around.lo, "high": around.hi}

@@ -14,6 +14,7 @@ import pytest
 import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.checks import frozen
+from certbound.errors import CertificateError
 from certbound.plotting import Scene, draw_scene
 from certbound.problem.model import Tape, trace
 from certbound.problem.sets import Faces, Region
@@ -146,6 +147,24 @@ def test_its_certificate_is_accepted_and_a_forged_one_is_not(method: str) -> Non
     moved = parse(text)  # the obstacle stands where the paths begin
     moved["problem"]["constraints"][1]["region"]["center"] = [(0.3).hex(), (-0.2).hex()]
     assert not check_data(moved).valid
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"coordinates": [0, 0]}, "different states"),
+        ({"coordinates": [0, 2]}, r"must lie in 0\.\.1"),
+        ({"coordinates": [1]}, "must have 1 entries"),
+        ({"center": [(0.0).hex()]}, "must have 2 entries"),
+        ({"radius": (1.0).hex()}, "unknown entry"),
+    ],
+)
+def test_a_certificate_whose_faces_do_not_fit_is_refused(change: dict[str, Any], message: str) -> None:
+    problem = course()
+    data = parse(certificate_text(problem, cb.verify_safety(problem, method="linear")))
+    data["problem"]["constraints"][0]["region"] |= change
+    with pytest.raises(CertificateError, match=message):
+        check_data(data)
 
 
 def test_it_is_drawn_as_far_as_the_picture_goes() -> None:

@@ -154,11 +154,8 @@ def _faces(constraint: Inside, times: Array, paths: Array) -> list[tuple[Array, 
     region, n = constraint.region, paths.shape[-1]
     places = region.places(n)
     select = np.eye(n)[:, places]
-    local = paths[..., places]
-    if region.moving:
-        local = local - np.array([region.center_at(float(t)) for t in times])
-    elif region.center is not None:
-        local = local - region.center_at()
+    moving = np.array([region.center_at(float(t)) for t in times]) if region.moving else region.center_at()
+    local = paths[..., places] - moving
     if isinstance(region.form, Faces):
         A, b = region.form.normals, region.form.bounds
         room = np.asarray(b - local @ A.T)

@@ -11,6 +11,7 @@ import numpy as np
 from certbound.problem import sets
 from certbound.problem.files.formulas import formulas
 from certbound.problem.files.reading import LEVELS, RESERVED
+from certbound.problem.files.schema import Constraint, Start
 from certbound.problem.model import Tape
 from certbound.problem.noise import check_law
 from certbound.problem.problem import Problem
@@ -138,7 +139,7 @@ class _Writer:
         return dict(zip(used, self.texts(region.center) if moving else region.center_at().tolist()))
 
     def region(self, region: Any) -> dict[str, Any]:
-        table = region.data()
+        table = region.data(Constraint.choices)
         kind, _ = table.pop("kind"), table.pop("coordinates", None)
         if kind == "box":
             return {"box": self.intervals(region)} | ({} if region.center is None else {"center": self.place(region)})
@@ -166,7 +167,7 @@ class _Writer:
         return table if constraint.label == usual else table | {"label": constraint.label}
 
     def start(self) -> Mapping[str, Any]:
-        data = self.problem.initial.data()
+        data = self.problem.initial.data(Start.choices)
         match data["kind"]:
             case "gaussian":
                 return {"gaussian": {"mean": data["mean"].tolist(), "covariance": _rows(data["covariance"])}}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -61,7 +62,7 @@ class Inside:
 
     def satisfied(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
         """Whether states, shape (..., n), satisfy the constraint at time t (its window aside)."""
-        return np.asarray(self.region.contains(x, t))
+        return np.asarray(self.region.contains(x, t) != self.outside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +71,6 @@ class Outside(Inside):
 
     word: ClassVar[str] = "outside"
     outside: ClassVar[bool] = True
-
-    def satisfied(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
-        return np.asarray(~self.region.contains(x, t))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +106,7 @@ class GaussianStart:
         """The mean."""
         return np.asarray(self.mean)
 
-    def data(self) -> dict[str, Any]:
+    def data(self, kinds: Collection[str]) -> dict[str, Any]:
         """What files say of it."""
         return {"kind": "gaussian", "mean": self.mean, "covariance": self.covariance}
 

@@ -6,6 +6,7 @@ a shape says better where it knows better.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar
@@ -44,11 +45,9 @@ class Faces:
     even: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if self.axial and not (
-            np.all(np.abs(self.normals).sum(axis=1) == 1)
-            and np.all(np.isin(self.normals, (-1.0, 0.0, 1.0)))
-            and len(np.unique(self.normals, axis=0)) == len(self.normals)
-        ):
+        rows = {tuple(row) for row in self.normals.tolist()}
+        units = {tuple(row) for row in np.vstack([np.eye(self.dimension), -np.eye(self.dimension)]).tolist()}
+        if self.axial and not (rows <= units and len(rows) == len(self.normals)):
             raise ValueError("`axial` faces must bound one coordinate each, on one side each, by an entry of 1 or -1.")
 
     @property
@@ -136,7 +135,7 @@ class Region:
     center: Any
     coordinates: Any
     kind: ClassVar[str] = ""
-    """Its row in problem files and certificates, whose entries are its fields; without one its form is stated."""
+    """Its name in problem files and certificates, whose entries are its fields; without one its form is stated."""
     starts: ClassVar[bool] = True
     """Whether it may be an initial set."""
     random: ClassVar[bool] = False
@@ -252,7 +251,8 @@ class Region:
     def reaches(self, point: Array, places: list[int]) -> tuple[float, float]:
         """Distances from a point in some states that the set surely goes down to and up to."""
         distance = float(np.linalg.norm(self.middle[places] - point))
-        return distance, distance
+        more = self.form.radius if isinstance(self.form, Quadratic) and self.form.even else 0.0
+        return distance - more, distance + more
 
     def sample(self, rng: np.random.Generator, count: int, t: float = 0.0) -> Array:
         """Uniform random points, shape (count, dimension)."""
@@ -298,9 +298,9 @@ class Region:
         place = "a moving centre" if self.moving else "(" + ", ".join(f"{x:g}" for x in self.center_at()) + ")"
         return place if self.coordinates is None else f"{place} in ({', '.join(states[k] for k in self.coordinates)})"
 
-    def data(self) -> dict[str, Any]:
-        """What files say of it: its fields where they have a row for its kind, else its form."""
-        if self.kind:
+    def data(self, kinds: Collection[str]) -> dict[str, Any]:
+        """What files say of it: its fields if its kind is one of ``kinds``, which they have rows for, else its form."""
+        if self.kind in kinds:
             return {"kind": self.kind, **{entry.name: getattr(self, entry.name) for entry in fields(self)}}  # type: ignore[arg-type]  # a shape is a dataclass
         match self.form:
             case Quadratic() as form:

@@ -102,7 +102,7 @@ class Box(Region):
     @property
     def bounded(self) -> bool:
         """True when every side is finite."""
-        return bool(np.all(np.isfinite(self.low)) and np.all(np.isfinite(self.high)))
+        return bool(np.all(np.isfinite([self.low, self.high])))
 
     def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
         y = self.local(x) - self.center_at(t)
@@ -168,10 +168,6 @@ class Ball(Region):
     @cached_property
     def form(self) -> Quadratic:
         return Quadratic(np.eye(int(self.center.shape[0])), self.radius)
-
-    def reaches(self, point: Array, places: list[int]) -> tuple[float, float]:
-        distance = float(np.linalg.norm(self.center[places] - point))
-        return distance - self.radius, distance + self.radius
 
     def describe(self, states: tuple[str, ...], word: str) -> str:
         return f"{word} the ball of radius {self.radius:g} around {self._place(states)}"

@@ -143,9 +143,9 @@ def _classifier() -> Any:
 def _membership(problem: Problem) -> Any:
     """Membership in the initial set; it must have an interior."""
     initial = problem.initial
-    eye = np.eye(problem.system.dimension)
-    widths = np.zeros(len(eye)) if initial.random else initial.support(eye) + initial.support(-eye)
-    flat = [name for name, width in zip(problem.system.states, widths) if not width > 0]
+    states = problem.system.states
+    wide = np.zeros(len(states)) if initial.random else initial.extent().lo < initial.extent().hi
+    flat = [name for name, has_width in zip(states, wide) if not has_width]
     if flat:
         raise ValueError(
             f"`initial` must have an interior to be hit backwards, got no width in {', '.join(flat)}; "
