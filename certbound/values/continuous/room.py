@@ -99,10 +99,10 @@ def _beside(constraint: Inside, problem: Problem) -> list[tuple[int, int, float,
         low = min(faces[0])
     if 1 in faces:
         high = max(faces[1])
-    ends = [float(problem.initial.support(np.array([[sign]]))[0]) * sign for sign in (-1.0, 1.0)]
-    if ends[1] < low:
+    around = problem.initial.hull()
+    if around.hi[0] < low:
         return [(0, 1, low, max(faces[0]))]
-    if ends[0] > high:
+    if around.lo[0] > high:
         return [(0, 0, high, min(faces[1]))]
     raise InfeasibleError(f"the starts must lie on one side of '{constraint.label}'.")
 
