@@ -22,7 +22,7 @@ from certbound.display import name_text, rounded
 from certbound.plotting.panels import Panel, least_distance, panels_of, stairs
 from certbound.plotting.plane import outlines, plane_of, supports
 from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene, instants
-from certbound.problem.sets import Ball, Outside, clearance
+from certbound.problem.sets import Quadratic, clearance
 
 if TYPE_CHECKING:
     from certbound.reach.sets import ReachTube
@@ -229,8 +229,9 @@ def _plane_figure(scene: Scene, plane: tuple[int, int]) -> tuple[str, str, list[
     shapes = []
     for constraint in scene.problem.safe:
         region = constraint.region
-        if isinstance(constraint, Outside) and isinstance(region, Ball) and region.dimension == 2:
-            (x0, y0), r = region.center_at(0.0), region.radius
+        form = region.form
+        if constraint.outside and isinstance(form, Quadratic) and form.even and form.dimension == 2:
+            (x0, y0), r = region.center_at(0.0), form.radius
             ends = {"x0": x0 - r, "x1": x0 + r, "y0": y0 - r, "y1": y0 + r}
             shapes.append({"type": "circle", **ends, "fillcolor": VERMILION, "line": {"color": "#7a3500", "width": 1}})
     layout: Trace = {"xaxis": {"title": {"text": names[plane[0]]}}, "yaxis": {"title": {"text": names[plane[1]]}}}

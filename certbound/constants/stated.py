@@ -13,7 +13,6 @@ from certbound.display import rounded
 from certbound.errors import CertboundError
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.tubes.constants import Constants
 
@@ -44,7 +43,7 @@ def refuse_contradiction(problem: Problem, constants: Constants) -> None:
     if isinstance(system, DiscreteSystem) and constants.gaussian and not system.noise.gaussian:
         raise ValueError("`constants` assert Gaussian noise, and the problem's is not; leave `gaussian` out.")
     metric = constants.matrix
-    point = _start(problem)
+    point = problem.initial.middle
     varies = isinstance(system, ContinuousSystem) and isinstance(system.diffusion, Tape)
     sigma = float(np.ravel(constants.sigma)[0]) if varies else float(np.min(constants.sigma))
     _check_noise(constants, sigma, metric @ _covariance(system, point))
@@ -66,15 +65,6 @@ def proved_or_stated(problem: Problem, constants: Constants) -> Constants:
     except (CertboundError, ValueError):
         return replace(constants, proof=None)
     return constants if implies(again, constants) else replace(constants, proof=None)
-
-
-def _start(problem: Problem) -> Array:
-    """The middle of the initial set."""
-    start = problem.initial
-    if isinstance(start, GaussianStart):
-        return np.asarray(start.mean, dtype=float)
-    middle = getattr(start, "center", None)
-    return np.asarray((start.low + start.high) / 2 if middle is None else middle, dtype=float)
 
 
 def _covariance(system: ContinuousSystem | DiscreteSystem, point: Array) -> Array:

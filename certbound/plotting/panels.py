@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from certbound.plotting.plane import supports
 from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene, instants
-from certbound.problem.sets import Ball, Ellipsoid, Inside, Outside, clearance
+from certbound.problem.sets import Inside, Quadratic, clearance
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,20 +40,19 @@ def panels_of(problem: Problem) -> list[Panel]:
     found: list[Panel] = []
     for constraint in problem.safe:
         region = constraint.region
-        if isinstance(constraint, Outside) or region.moving or isinstance(region, (Ball, Ellipsoid)):
+        if constraint.outside or region.moving or isinstance(region.form, Quadratic):
             found.append(Panel(label=_distance_label(constraint), constraint=constraint, during=constraint.during))
             continue
-        where = slice(None) if region.coordinates is None else list(region.coordinates)
-        for a, b in zip(*region.halfspaces()):
-            row = np.zeros(problem.system.dimension)
-            row[where] = a
+        form = region.form
+        rows, bounds = region.lifted(form.normals, problem.system.dimension), form.bounds
+        for row, b in zip(rows, bounds if region.center is None else bounds + form.normals @ region.center_at()):
             _add_face(found, row, float(b), problem.system.states, constraint.during)
     return found
 
 
 def _distance_label(constraint: Inside) -> str:
     region = constraint.region
-    if isinstance(region, Ball) and not region.moving:
+    if region.form.even and not region.moving:
         place = ", ".join(f"{value:g}" for value in region.center_at())
         return f"distance to the ball around ({place})"
     label = str(constraint.label).removeprefix("outside ").removeprefix("inside ")
@@ -130,16 +129,16 @@ def _draw_paths(axes: Axes, scene: Scene, values: Array) -> None:
 def least_distance(tube: ReachTube, constraint: Inside) -> Array | None:
     """A lower bound of the distance to a round obstacle, in the middle of each piece."""
     region = constraint.region
-    if not isinstance(region, Ball) or not isinstance(constraint, Outside):
+    if not isinstance(region.form, Quadratic) or not region.form.even or not constraint.outside:
         return None
-    where = slice(None) if region.coordinates is None else list(region.coordinates)
+    where = region.places(tube.curve.dimension)
     middles = tube.curve.middles
     states = np.stack([tube.curve.value(float(t)) for t in middles], axis=1)
     offsets = states[..., where] - np.stack([region.center_at(float(t)) for t in middles])
     lengths = np.linalg.norm(offsets, axis=-1)
     rows = np.zeros(states.shape)
     rows[..., where] = offsets / lengths[..., None]
-    return np.asarray((lengths - region.radius - tube.spread(-rows)).min(axis=0))
+    return np.asarray((lengths - region.form.radius - tube.spread(-rows)).min(axis=0))
 
 
 def stairs(tube: ReachTube, values: Array) -> tuple[Array, Array]:

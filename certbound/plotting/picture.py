@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 from certbound.plotting.panels import draw_panel, panels_of
 from certbound.plotting.plane import draw_plane, plane_of
 from certbound.plotting.scene import BLUE, GREY, INK, INNER, OUTER, RIM, VERMILION, YELLOW, Scene
-from certbound.problem.sets import Outside
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,7 +69,7 @@ def _legend(scene: Scene) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    obstacles = any(isinstance(constraint, Outside) for constraint in scene.problem.safe)
+    obstacles = any(constraint.outside for constraint in scene.problem.safe)
     handles: list[Any] = [Line2D([], [], color=INK, linewidth=1.2, label="nominal")]
     handles.append(Patch(facecolor=INNER, label="noise-free"))
     if scene.tube is not None:

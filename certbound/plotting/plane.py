@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.plotting.scene import GREY, INK, RIM, VERMILION, YELLOW, Scene, instants
-from certbound.problem.sets import Ball, Box, Ellipsoid, Inside, Outside
+from certbound.problem.sets import Inside, Quadratic, Region
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,10 +51,10 @@ def draw_plane(axes: Axes, scene: Scene, plane: Plane) -> None:
     limits = _limits(scene.problem, plane, (*axes.get_xlim(), *axes.get_ylim()))
     for constraint in scene.problem.safe:
         if _lives_in(constraint.region, plane):
-            _draw_set(axes, constraint, limits, _band(scene, constraint, plane))
+            _draw_set(axes, constraint, plane, limits, _band(scene, constraint, plane))
     names = scene.problem.system.states
     axes.set(xlim=limits[:2], ylim=limits[2:], xlabel=names[plane[0]], ylabel=names[plane[1]])
-    if any(isinstance(c.region, Ball) and _lives_in(c.region, plane) for c in scene.problem.safe):
+    if any(c.region.form.even and _lives_in(c.region, plane) for c in scene.problem.safe):
         axes.set_aspect("equal", adjustable="box")
 
 
@@ -87,9 +87,9 @@ def _row(tube: ReachTube, plane: Plane, angle: float) -> Array:
     return row
 
 
-def _lives_in(region: Any, plane: Plane) -> bool:
-    coordinates = range(region.dimension) if region.coordinates is None else region.coordinates
-    return set(coordinates) == set(plane) or (isinstance(region, Box) and bool(set(coordinates) & set(plane)))
+def _lives_in(region: Region, plane: Plane) -> bool:
+    coordinates = set(region.places(region.dimension))
+    return coordinates == set(plane) or (region.form.axial and bool(coordinates & set(plane)))
 
 
 def _limits(problem: Problem, plane: Plane, limits: tuple[float, ...]) -> tuple[float, ...]:
@@ -97,52 +97,68 @@ def _limits(problem: Problem, plane: Plane, limits: tuple[float, ...]) -> tuple[
     left, right, bottom, top = limits
     for constraint in problem.safe:
         region = constraint.region
-        if isinstance(constraint, Outside) and isinstance(region, Ball) and _lives_in(region, plane):
+        if constraint.outside and isinstance(region.form, Quadratic) and region.form.even and _lives_in(region, plane):
             x, y = region.center_at(0.0)
-            grown = 1.25 * region.radius
+            grown = 1.25 * region.form.radius
             left, right = min(left, x - grown), max(right, x + grown)
             bottom, top = min(bottom, y - grown), max(top, y + grown)
     return left, right, bottom, top
 
 
-def _draw_set(axes: Axes, constraint: Inside, limits: tuple[float, ...], band: float) -> None:
+def _draw_set(axes: Axes, constraint: Inside, plane: Plane, limits: tuple[float, ...], band: float) -> None:
     """An obstacle with the band that the noise adds to it, or the border of where the state must stay."""
     from matplotlib.patches import Circle, Polygon
 
-    region, obstacle = constraint.region, isinstance(constraint, Outside)
+    region, obstacle = constraint.region, constraint.outside
+    centre = region.center_at(constraint.during[0] if constraint.during else 0.0)
     solid = {"facecolor": VERMILION, "edgecolor": RIM, "hatch": "////", "linewidth": 0.6, "zorder": 0.5}
     border = {"fill": False, "edgecolor": VERMILION, "linestyle": (0, (5, 2)), "linewidth": 1.2, "zorder": 6}
     style: dict[str, Any] = solid if obstacle else border
-    if isinstance(region, Ball):
-        centre = tuple(region.center_at(constraint.during[0] if constraint.during else 0.0))
-        axes.add_patch(Circle(centre, region.radius, **style))
+    if isinstance(region.form, Quadratic) and region.form.even:
+        axes.add_patch(Circle(tuple(centre), region.form.radius, **style))
         if band > 0:
-            radius = region.radius + (band if obstacle else -band)
-            axes.add_patch(Circle(centre, radius, facecolor=YELLOW, alpha=0.6, zorder=0.2, fill=obstacle))
+            radius = region.form.radius + (band if obstacle else -band)
+            axes.add_patch(Circle(tuple(centre), radius, facecolor=YELLOW, alpha=0.6, zorder=0.2, fill=obstacle))
         return
-    corners = _corners(region, limits)
-    if corners is not None:
+    corners = _corners(region, centre, plane, limits)
+    if len(corners):
         axes.add_patch(Polygon(corners, closed=True, **style))
 
 
-def _corners(region: Any, limits: tuple[float, ...]) -> Array | None:
-    """Outline of an ellipsoid or a box, cut to the picture."""
-    if isinstance(region, Ellipsoid):
+def _corners(region: Region, centre: Array, plane: Plane, limits: tuple[float, ...]) -> Array:
+    """Outline of a set about its centre, cut to a little more than the picture; empty where it is not in it."""
+    if isinstance(region.form, Quadratic):
         angles = np.linspace(0, 2 * np.pi, 90)
-        circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-        return np.asarray(region.center_at() + circle @ np.linalg.cholesky(region.shape).T)
-    if not isinstance(region, Box):
-        return None
+        circle = region.form.radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        return np.asarray(centre + circle @ np.linalg.cholesky(region.form.shape).T)
     left, right, bottom, top = limits
     width, height = right - left, top - bottom
-    low = np.maximum(region.low[:2] + region.center_at()[:2], [left - width, bottom - height])
-    high = np.minimum(region.high[:2] + region.center_at()[:2], [right + width, top + height])
-    return np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+    ends = [(left - width, right + width), (bottom - height, top + height)]
+    corners = np.array([[ends[0][i], ends[1][j]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
+    rows = region.lifted(region.form.normals, max(*plane, *region.places(region.dimension)) + 1)[:, list(plane)]
+    for row, bound in zip(rows, region.form.bounds + region.form.normals @ centre):
+        if np.any(row):
+            corners = _cut(corners, row, float(bound))
+    return corners
+
+
+def _cut(corners: Array, row: Array, bound: float) -> Array:
+    """The part of a convex polygon with row . x <= bound."""
+    kept: list[Array] = []
+    over = corners @ row - bound
+    for k in range(len(corners)):
+        here, following = k, (k + 1) % len(corners)
+        if over[here] <= 0:
+            kept.append(corners[here])
+        if over[here] * over[following] < 0:
+            share = over[here] / (over[here] - over[following])
+            kept.append(corners[here] + share * (corners[following] - corners[here]))
+    return np.array(kept).reshape(-1, 2)
 
 
 def _band(scene: Scene, constraint: Inside, plane: Plane) -> float:
     """The largest stochastic deviation in the plane: how far a round obstacle is grown in the picture."""
-    if scene.tube is None or not isinstance(constraint.region, Ball):
+    if scene.tube is None or not constraint.region.form.even:
         return 0.0
     rows = [_row(scene.reach, plane, angle) for angle in np.linspace(0, 2 * np.pi, 16, endpoint=False)]
     width = max(float(np.max(supports(scene.tube, row) - supports(scene.reach, row))) for row in rows)

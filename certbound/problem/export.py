@@ -11,7 +11,7 @@ import numpy as np
 from certbound.problem.adapters import casadi_module, to_casadi
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Ellipsoid, Inside, Outside
+from certbound.problem.sets import Faces, Inside, Quadratic
 from certbound.problem.systems import System
 
 __all__ = ["CasadiProblem", "export_casadi", "export_control", "runge_kutta"]
@@ -106,21 +106,19 @@ def _constraint_rows(ca: Any, problem: Problem, t: Any, x: Any) -> tuple[Any, tu
 def _values(ca: Any, constraint: Inside, t: Any, x: Any) -> list[Any]:
     """Expressions that are at most 0 exactly where a constraint holds."""
     region = constraint.region
-    own = x if region.coordinates is None else ca.vertcat(*(x[k] for k in region.coordinates))
+    own = ca.vertcat(*(x[k] for k in region.places(x.numel())))
     center = region.center
     if center is not None:
         own = own - (to_casadi(center, [t]) if isinstance(center, Tape) else ca.DM(center))
-    outside = isinstance(constraint, Outside)
-    if isinstance(region, Ball):
-        value = ca.sumsqr(own) - region.radius**2
-        return [-value if outside else value]
-    if isinstance(region, Ellipsoid):
-        value = ca.bilin(ca.DM(np.linalg.inv(region.shape)), own, own) - 1
-        return [-value if outside else value]
-    a, b = region.halfspaces()
-    faces = ca.DM(a) @ own - ca.DM(b)
-    entries = [faces[k] for k in range(len(b)) if np.isfinite(b[k])]
-    if not outside:
+    match region.form:
+        case Quadratic() as form:
+            square = ca.sumsqr(own) if form.even else ca.bilin(ca.DM(np.linalg.inv(form.shape)), own, own)
+            value = square - form.radius**2
+            return [-value if constraint.outside else value]
+        case Faces() as form:
+            faces = ca.DM(form.normals) @ own - ca.DM(form.bounds)
+            entries = [faces[k] for k in range(len(form.bounds))]
+    if not constraint.outside:
         return entries
     largest = entries[0]
     for entry in entries[1:]:

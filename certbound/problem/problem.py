@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from certbound.checks import frozen, nearest, number, positive_definite, vector
 from certbound.display import Shown, ask_later_room, name_text
 from certbound.problem.model import Tape, substitute, trace
-from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, Inside, Outside, check_start
+from certbound.problem.sets import Box, GaussianStart, Inside, Outside, Region, check_start
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
 __all__ = ["GaussianStart", "Problem"]
@@ -136,7 +136,7 @@ class Problem(Shown):
     @property
     def fixed_start(self) -> bool:
         """True when the initial set is a single point."""
-        return isinstance(self.initial, Box) and bool(np.all(self.initial.low == self.initial.high))
+        return bool(self.initial.is_point)
 
     def summary(self) -> str:
         """The problem in one line."""
@@ -309,22 +309,23 @@ def _check_dimension(name: str, region: Any, dimension: int) -> None:
         )
 
 
-def _start(value: Any, dimension: int) -> Box | Ball | Ellipsoid | GaussianStart:
-    starts = (Box, Ball, Ellipsoid, GaussianStart)
-    if not isinstance(value, starts) or type(value) not in starts:
-        if isinstance(value, (*starts, Mapping, str)) or hasattr(value, "halfspaces"):
-            kinds = "point, Box, Ball, Ellipsoid or GaussianStart"
-            raise TypeError(f"`initial` must be a {kinds}, got {value!r}.")
+def _start(value: Any, dimension: int) -> Any:
+    kind: Any = type(value)
+    if issubclass(kind, Region | GaussianStart | Mapping | str):
+        if kind is not GaussianStart and not (Region in kind.__bases__ and kind.starts):
+            raise TypeError(f"`initial` must be a point, Box, Ball, Ellipsoid or GaussianStart, got {value!r}.")
+    else:
         point = vector("initial", value, dimension)
-        return Box(point, point)
-    if not isinstance(value, GaussianStart):
-        if value.moving or value.coordinates is not None:
+        value = Box(point, point)
+    start: Any = value
+    if not start.random:
+        if start.moving or start.coordinates is not None:
             raise ValueError("`initial` must be a fixed set over all states, without `coordinates`.")
-        if isinstance(value, Box) and not value.bounded:
-            raise ValueError("`initial` must be bounded, got a box with infinite sides.")
-    if value.dimension != dimension:
-        raise ValueError(f"`initial` must have dimension {dimension} (the states), got {value.dimension}.")
-    return value
+        if not np.all(np.isfinite([start.extent().lo, start.extent().hi])):
+            raise ValueError("`initial` must be bounded, got a set with infinite sides.")
+    if start.dimension != dimension:
+        raise ValueError(f"`initial` must have dimension {dimension} (the states), got {start.dimension}.")
+    return start
 
 
 def _weight(name: str, value: Any, size: int, *, strict: bool) -> Array:

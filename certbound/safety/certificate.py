@@ -17,7 +17,6 @@ from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 from certbound.problem.noise import Law, check_law
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, HalfSpace, Outside, Polytope
 from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import Answered, EngineAnswer, is_at_most
 from certbound.safety.certificates import Proof, exact
@@ -150,8 +149,8 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "initial": _initial(problem.initial),
         "constraints": [
             {
-                "kind": "outside" if isinstance(constraint, Outside) else "inside",
-                "region": _region(constraint.region),
+                "kind": constraint.word,
+                "region": _region(constraint.region.data(_KINDS)),
                 "during": None if constraint.during is None else exact([float(end) for end in constraint.during]),
                 "label": str(constraint.label),
             }
@@ -200,28 +199,21 @@ def _noise(system: Any) -> dict[str, Any]:
     }
 
 
+_KINDS = ("box", "ball", "ellipsoid", "halfspace", "polytope")  # those that the checker has a row for
+
+
 def _initial(start: Any) -> dict[str, Any]:
-    if isinstance(start, GaussianStart):
-        return {"kind": "gaussian", "mean": exact(start.mean), "covariance": exact(start.covariance)}
-    if isinstance(start, Ball):
-        return {"kind": "ball", "center": exact(start.center), "radius": exact(float(start.radius))}
-    if isinstance(start, Ellipsoid):
-        return {"kind": "ellipsoid", "center": exact(start.center), "shape": exact(start.shape)}
-    return {"kind": "box", "low": exact(start.low), "high": exact(start.high)}
+    data = start.data(_KINDS)
+    if data["kind"] == "polytope":  # by a box around it
+        around = start.hull()
+        data = {"kind": "box", "low": around.lo, "high": around.hi}
+    return {name: exact(value) for name, value in data.items() if value is not None}
 
 
-def _region(region: Any) -> Mapping[str, Any]:
-    if isinstance(region, HalfSpace):
-        return {"kind": "halfspace", "normal": exact(region.normal), "bound": exact(float(region.bound))}
-    if isinstance(region, Polytope):
-        return {"kind": "polytope", "A": exact(region.A), "b": exact(region.b)}
-    where = {"coordinates": None if region.coordinates is None else [int(i) for i in region.coordinates]}
-    center = region.center
-    if center is not None:
-        center = tape_data(center) if isinstance(center, Tape) else exact(center)
-    if isinstance(region, Box):
-        ends = {"low": [_end(x) for x in region.low], "high": [_end(x) for x in region.high]}
-        return {"kind": "box", **ends, "center": center, **where}
-    if isinstance(region, Ball):
-        return {"kind": "ball", "center": center, "radius": exact(float(region.radius)), **where}
-    return {"kind": "ellipsoid", "center": center, "shape": exact(region.shape), **where}
+def _region(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    def stated(name: str, value: Any) -> Any:
+        if name in ("low", "high"):
+            return [_end(x) for x in value]
+        return tape_data(value) if isinstance(value, Tape) else exact(value)
+
+    return {name: stated(name, value) for name, value in data.items()}

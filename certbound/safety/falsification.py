@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from certbound.errors import CertboundError
 from certbound.problem.model import compile_numpy, varying_outputs
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Box, GaussianStart, Inside, Outside, clearance
+from certbound.problem.sets import Inside, Outside, clearance
 from certbound.reach.nominal import Flow
 from certbound.reach.sets import ReachTube, constraint_clearance
 from certbound.rigor.norms import Norm
@@ -83,16 +83,12 @@ def _rooms(constraint: Inside, flow: Flow, times: Array, paths: Array) -> Array:
 
 def _candidates(problem: Problem, flow: Flow, rng: np.random.Generator) -> tuple[Array, Array]:
     """Starts and constant disturbances: the middles first, then corners, then random ones."""
-    start, n = problem.initial, flow.dimension
-    if isinstance(start, GaussianStart):
-        starts = np.tile(np.asarray(start.mean), (PATHS, 1))
-    else:
-        starts = np.asarray(start.sample(rng, PATHS))
-        if isinstance(start, Box):
-            starts[1 : PATHS // 2] = np.where(rng.random((PATHS // 2 - 1, n)) < 0.5, start.low, start.high)
-            starts[0] = np.clip(0.5 * start.low + 0.5 * start.high, start.low, start.high)
-        else:
-            starts[0] = np.asarray(start.center)
+    start = problem.initial
+    starts = np.tile(start.middle, (PATHS, 1)) if start.random else np.asarray(start.sample(rng, PATHS))
+    if not start.random:
+        corners = start.corners(rng, PATHS // 2 - 1)
+        starts[1 : 1 + len(corners)] = corners
+        starts[0] = start.middle
     box = flow.disturbance
     signals = rng.uniform(box.lo, box.hi, (PATHS, box.shape[0]))
     signals[1::2] = np.where(rng.random(signals[1::2].shape) < 0.5, box.lo, box.hi)
@@ -159,7 +155,7 @@ def _proved(
         return None
     if reach.end < time:
         return None
-    opposite = Inside if isinstance(constraint, Outside) else Outside
+    opposite = Inside if constraint.outside else Outside
     room = constraint_clearance(reach, opposite(constraint.region, during=(time, time)), Norm(flow.dimension)).radius
     proved = np.any(np.isfinite(room) & (room > 0))
     return Violation(reach=reach, constraint=constraint, time=time, depth=depth, start=start) if proved else None

@@ -18,7 +18,7 @@ from certbound.display import power_above, rounded
 from certbound.errors import CertboundError
 from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, HalfSpace, Inside, Outside, Polytope, Region
+from certbound.problem.sets import Inside
 from certbound.problem.systems import ContinuousSystem, System
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import Verdict, verify_safety
@@ -203,29 +203,9 @@ def _widening(problem: Problem, verdict: Verdict, safe: Callable[[Callable[[], P
 def _wider(problem: Problem, distance: float) -> Problem:
     """Every constraint and the domain moved outward by ``distance``."""
     safe = [_moved(constraint, distance) for constraint in problem.safe]
-    domain = None if problem.domain is None else _grown(problem.domain, distance)
+    domain = None if problem.domain is None else problem.domain.grown(distance)
     return problem.replace(safe=safe, domain=domain)
 
 
 def _moved(constraint: Inside, distance: float) -> Inside:
-    sign = -1.0 if isinstance(constraint, Outside) else 1.0
-    return replace(constraint, region=_grown(constraint.region, sign * distance))
-
-
-def _grown(region: Region, distance: float) -> Region:
-    """The region with its boundary moved outward by at most ``distance``.
-
-    Raises
-    ------
-    ValueError
-        If nothing is left, or the region is an ellipsoid.
-    """
-    if isinstance(region, Box):
-        return replace(region, low=region.low - distance, high=region.high + distance)
-    if isinstance(region, Ball):
-        return replace(region, radius=region.radius + distance)
-    if isinstance(region, HalfSpace):
-        return replace(region, bound=region.bound + distance * float(np.linalg.norm(region.normal)))
-    if isinstance(region, Polytope):
-        return replace(region, b=region.b + distance * np.linalg.norm(region.A, axis=1))
-    raise ValueError("an ellipsoid cannot be moved outward evenly.")
+    return replace(constraint, region=constraint.region.grown(-distance if constraint.outside else distance))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.sets import Outside
+from certbound.problem.sets import Faces, Quadratic
 from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 
 __all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "tables_of", "window_test"]
@@ -119,17 +119,17 @@ def barriers_of(problem: Any, times: Array) -> list[Barrier]:
         end = int(np.searchsorted(times, stop + slack, side="right")) - 1
         if first > end:
             first = end = int(np.argmin(np.abs(times - 0.5 * (start + stop))))
-        embed = np.eye(problem.system.dimension)
-        if region.coordinates is not None:
-            embed = embed[list(region.coordinates)]
+        embed = np.eye(problem.system.dimension)[region.places(problem.system.dimension)]
         centers = np.array([region.center_at(t) for t in times]) if region.moving else region.center_at()
-        fields = _round_fields(region, embed, centers) if region.kind in _ROUND else None
-        if fields is None:
-            faces, bounds = region.halfspaces()
-            if len(bounds) == 0:
+        match region.form:
+            case Quadratic() as form:
+                fields = _round_fields(form, embed, centers)
+            case Faces() as form if len(form.bounds):
+                offset = form.bounds + centers @ form.normals.T
+                fields = {"round": False, "matrix": form.normals @ embed, "offset": offset}
+            case _:
                 continue
-            fields = {"round": False, "matrix": faces @ embed, "offset": bounds + centers @ faces.T}
-        fields |= {"label": constraint.label, "stay": not isinstance(constraint, Outside)}
+        fields |= {"label": constraint.label, "stay": not constraint.outside}
         fields |= {"first": min(first, last), "last": min(end, last), "always": first == 0 and end >= last}
         barriers.append(Barrier(**fields))
     return barriers
@@ -144,18 +144,10 @@ def tables_of(barriers: Sequence[Barrier]) -> dict[str, Any]:
     }
 
 
-_ROUND = ("ball", "ellipsoid")
-
-
-def _round_fields(region: Any, embed: Array, centers: Array) -> dict[str, Any]:
+def _round_fields(form: Quadratic, embed: Array, centers: Array) -> dict[str, Any]:
     """A ball or ellipsoid as ‖matrix x - offset‖ <= radius; an interval, in one dimension, as two faces."""
-    whiten, radius = np.eye(region.dimension), 1.0
-    if region.kind == "ball":
-        radius = float(region.radius)
-    else:
-        whiten = np.linalg.inv(np.linalg.cholesky(region.shape))
-    matrix, offset = whiten @ embed, centers @ whiten.T
-    if region.dimension == 1:
+    matrix, offset, radius = form.root @ embed, centers @ form.root.T, float(form.radius)
+    if form.dimension == 1:
         both = np.concatenate([radius + offset, radius - offset], axis=-1)
         return {"round": False, "matrix": np.vstack([matrix, -matrix]), "offset": both}
     return {"round": True, "matrix": matrix, "offset": offset, "radius": radius}

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.problem.adapters import to_casadi
 from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
+from certbound.problem.sets import Inside, Quadratic
 
 __all__ = ["Face", "Facets", "Plane", "Round", "faces_of", "with_parts"]
 
@@ -228,22 +228,19 @@ def with_parts(faces: Iterable[Face]) -> Iterator[tuple[Face, slice]]:
 
 
 def _faces(constraint: Inside, index: int, dimension: int) -> list[Face]:
-    region, outside = constraint.region, isinstance(constraint, Outside)
-    places = tuple(range(dimension)) if region.coordinates is None else tuple(region.coordinates)
+    region, outside = constraint.region, constraint.outside
+    places = tuple(region.places(dimension))
     common: dict[str, Any] = {
         "constraint": index, "during": constraint.during, "dimension": dimension, "coordinates": places,
         "center": np.zeros(len(places)) if region.center is None else region.center,
     }  # fmt: skip
     label = str(constraint.label)
-    if isinstance(region, Ball):
-        return [Round(label=label, matrix=np.eye(len(places)), size=float(region.radius), outside=outside, **common)]
-    if isinstance(region, Ellipsoid):
-        matrix = np.linalg.inv(np.linalg.cholesky(np.asarray(region.shape, dtype=float)))
+    if isinstance(region.form, Quadratic):
+        matrix = region.form.root
         unit = 1.0 / float(np.linalg.norm(matrix, 2))  # a Euclidean length, for people and for scaling
-        return [Round(label=label, matrix=matrix * unit, size=unit, outside=outside, **common)]
-    if not isinstance(region, Box | HalfSpace | Polytope):
-        raise TypeError(f"`safe` must hold sets of this package, got {type(region).__name__}.")
-    normals, bounds = (np.asarray(part, dtype=float) for part in region.halfspaces())
+        size = float(region.form.radius) * unit
+        return [Round(label=label, matrix=matrix * unit, size=size, outside=outside, **common)]
+    normals, bounds = region.form.normals, region.form.bounds
     if outside and len(bounds) > 1:
         return [Facets(label=label, normals=normals, bounds=bounds, **common)]
     sign = -1.0 if outside else 1.0

@@ -24,7 +24,7 @@ from certbound.constants.bounds import bound_constants
 from certbound.errors import InfeasibleError
 from certbound.problem.model import jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart, Region
+from certbound.problem.sets import Region
 from certbound.synthesis.costs import Cost, cost_of
 from certbound.synthesis.faces import Face, faces_of, with_parts
 from certbound.synthesis.feedback import close_loop, constrain_inputs, depends_on, resolve_feedback
@@ -34,7 +34,6 @@ from certbound.synthesis.tightening import (
     BallTube,
     Tightening,
     ball_tube,
-    initial_center,
     linear_tube,
     nominal_spread,
     spread_tube,
@@ -124,7 +123,7 @@ class Planner:
             raise ValueError("`problem` must have inputs to plan; give the system `inputs=`.")
         self.problem = problem
         self.grid = _grid(problem, steps)
-        self.start = initial_center(problem.initial)
+        self.start = problem.initial.middle
         self.feedback = None if feedback is None else resolve_feedback(problem, feedback, self.start)
         self.system = system if self.feedback is None else close_loop(system, self.feedback)
         self.plant = _plant(problem, self.system.dynamics, self.feedback)
@@ -186,9 +185,9 @@ class Planner:
 
     def _initial_inputs(self, gain: Array) -> Array:
         initial = self.problem.initial
-        if isinstance(initial, GaussianStart):
+        if initial.random:
             return np.zeros(len(gain))
-        return np.maximum(np.asarray(initial.support(gain)) - gain @ self.start, 0.0)
+        return np.asarray(np.maximum(initial.support(gain) - gain @ self.start, 0.0))
 
     def first_plan(self) -> Solution:
         """The plan with the most room, in standard deviations of the linearised noise."""

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, Region
+from certbound.problem.sets import Ellipsoid, Quadratic, Region
 from certbound.synthesis.faces import Face, Facets, Round, with_parts
 from certbound.synthesis.plant import middle_of
 from certbound.tubes.constants import Constants
@@ -50,44 +50,33 @@ class TerminalSet:
     center: Array | None = None
 
     @property
-    def is_point(self) -> bool:
-        """Whether the set is a single point (in its coordinates)."""
-        return isinstance(self.region, Box) and bool(np.all(self.region.low == self.region.high))
-
-    @property
     def rows(self) -> int:
         """Number of scalar constraints."""
-        if self.is_point:
-            return self.region.dimension
-        return 1 if isinstance(self.region, Ball | Ellipsoid) else len(self.region.halfspaces()[1])
-
-    def _local(self, ca: Any, state: Any) -> Any:
-        places = range(state.numel()) if self.region.coordinates is None else self.region.coordinates
-        return ca.vertcat(*[state[i] for i in places])
+        form = self.region.form
+        if self.region.is_point:
+            return form.dimension
+        return 1 if isinstance(form, Quadratic) else len(form.bounds)
 
     def symbolic(self, ca: Any, state: Any) -> Any:
         """Scalar constraints as CasADi expressions: >= 0, and = 0 for a point."""
-        local, region = self._local(ca, state), self.region
-        if isinstance(region, Box) and self.is_point:
-            return local - ca.DM(region.low)
-        if isinstance(region, Ball | Ellipsoid):
-            shape = np.eye(region.dimension) * region.radius**2 if isinstance(region, Ball) else region.shape
-            offset = local - ca.DM(np.asarray(region.center))
-            return 1 - ca.bilin(ca.DM(np.linalg.inv(shape)), offset, offset)
-        normals, bounds = region.halfspaces()
-        return ca.DM(bounds) - ca.DM(normals) @ local
+        region, form = self.region, self.region.form
+        local = ca.vertcat(*[state[i] for i in region.places(state.numel())])
+        if region.is_point:
+            return local - ca.DM(region.middle)
+        offset = local if region.center is None else local - ca.DM(region.center_at())
+        if isinstance(form, Quadratic):
+            return 1 - ca.bilin(ca.DM(np.linalg.inv(form.matrix)), offset, offset)
+        return ca.DM(form.bounds) - ca.DM(form.normals) @ offset
 
     def room(self, state: Array) -> float:
         """At least 0 inside; a small negative number just outside."""
-        local, region = self.region.local(state), self.region
-        if isinstance(region, Box) and self.is_point:
-            return -float(np.max(np.abs(local - region.low)))
-        if isinstance(region, Ball | Ellipsoid):
-            shape = np.eye(region.dimension) * region.radius**2 if isinstance(region, Ball) else region.shape
-            offset = local - np.asarray(region.center)
-            return 1.0 - float(offset @ np.linalg.solve(shape, offset))
-        normals, bounds = region.halfspaces()
-        return float(np.min(bounds - normals @ local))
+        region, form = self.region, self.region.form
+        if region.is_point:
+            return -float(np.max(np.abs(region.local(state) - region.middle)))
+        offset = region.local(state) - region.center_at()
+        if isinstance(form, Quadratic):
+            return 1.0 - float(offset @ np.linalg.solve(form.matrix, offset))
+        return float(np.min(form.bounds - form.normals @ offset))
 
 
 def check_terminal(terminal: TerminalSet, faces: Sequence[Face], erosion: Array, time: float) -> None:
@@ -134,17 +123,9 @@ def _room_of_region(region: Region, face: Face, erosion: Array, time: float) -> 
 
 
 def _middle(region: Region, dimension: int) -> Array:
-    full = np.zeros(dimension)
-    places = list(range(dimension) if region.coordinates is None else region.coordinates)
-    if isinstance(region, Box):
-        low, high = np.maximum(region.low, -1e6), np.minimum(region.high, 1e6)
-        full[places] = (low + high) / 2
-    elif isinstance(region, Ball | Ellipsoid):
-        full[places] = region.center_at(0.0)
-    else:
-        eye = np.eye(len(places))
-        full[places] = (region.local_support(eye, 0.0) - region.local_support(-eye, 0.0)) / 2
-    return full
+    eye = np.eye(region.dimension)
+    low, high = np.maximum(-region.local_support(-eye, 0.0), -1e6), np.minimum(region.local_support(eye, 0.0), 1e6)
+    return region.lifted((low + high) / 2, dimension)
 
 
 def linearise(problem: Problem, state: ArrayLike, inputs: ArrayLike) -> tuple[Array, Array]:

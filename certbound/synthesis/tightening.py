@@ -18,7 +18,7 @@ from certbound.constants.enclosures import enclose
 from certbound.gaussian.response import StepEvents, level_scale
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Box, Ellipsoid, GaussianStart
+from certbound.problem.sets import Box, Quadratic
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.reach.linear import Events, Linearisation, LinearRun, Share, Supports
 from certbound.reach.nominal import initial_cells
@@ -35,7 +35,6 @@ __all__ = [
     "ScaledTube",
     "Tightening",
     "ball_tube",
-    "initial_center",
     "linear_tube",
     "nominal_spread",
     "spread_tube",
@@ -186,20 +185,13 @@ def _noise(problem: Problem, time: float, state: Array) -> Array:
     return np.asarray(matrix @ matrix.T)
 
 
-def initial_center(initial: Any) -> Array:
-    """The nominal start: the middle of the initial set."""
-    if isinstance(initial, Box):
-        return np.asarray(np.clip(0.5 * initial.low + 0.5 * initial.high, initial.low, initial.high), dtype=float)
-    return np.asarray(initial.mean if isinstance(initial, GaussianStart) else initial.center, dtype=float)
-
-
 def _start_covariance(initial: Any) -> Array:
-    if isinstance(initial, GaussianStart):
+    if initial.random:
         return np.asarray(initial.covariance, dtype=float)
-    if isinstance(initial, Box):
-        return np.diag(((initial.high - initial.low) / 2) ** 2) / 9
-    shape = initial.shape if isinstance(initial, Ellipsoid) else np.eye(initial.dimension) * initial.radius**2
-    return np.asarray(shape) / 9
+    if isinstance(initial.form, Quadratic):
+        return np.asarray(initial.form.matrix / 9)
+    around = initial.hull()
+    return np.diag(((around.hi - around.lo) / 2) ** 2) / 9
 
 
 def nominal_spread(
@@ -208,7 +200,7 @@ def nominal_spread(
     """rho (points + 1,) with ||x_t - z_t||_P <= rho for every start and disturbance (Thm K5, in floating point)."""
     norm, slope = constants.norm, constants.worst_slope
     step = grid.step / grid.substeps
-    start = np.atleast_2d(initial_center(problem.initial))
+    start = np.atleast_2d(problem.initial.middle)
     found = [float(initial_cells(problem).radii(norm, Interval.point(start))[0])]
     held = np.repeat(inputs, grid.substeps, axis=0)
     for k in range(grid.points):

@@ -284,7 +284,7 @@ class Transcription:
         unions = sum(1 for face in self.faces if face.weights) * self.grid.points
         rest = self._input_row_count()
         last = np.zeros(0 if self.terminal is None else self.terminal.rows)
-        last_high = np.full(len(last), 0.0 if self.terminal is not None and self.terminal.is_point else np.inf)
+        last_high = np.full(len(last), 0.0 if self.terminal is not None and self.terminal.region.is_point else np.inf)
         low = np.concatenate([np.zeros(equal), gaps, np.zeros(unions + rest), last])
         open_ = [np.full(gaps.size, np.inf), np.zeros(unions), np.full(rest, np.inf), last_high]
         return low, np.concatenate([np.zeros(equal), *open_])

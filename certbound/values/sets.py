@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.model import Tape, arithmetic
-from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope, Region
-from certbound.rigor.intervals import Interval, sq, sqrt, stack
+from certbound.problem.sets import Faces, Inside, Quadratic, Region
+from certbound.rigor.intervals import Interval, sq, stack
 
 __all__ = ["active_at", "box_around", "contains", "respected"]
 
@@ -32,7 +31,7 @@ def respected(
     safe, broken = np.ones(len(boxes), dtype=bool), np.zeros(len(boxes), dtype=bool)
     for constraint in constraints:
         inside, outside = contains(constraint.region, boxes, step, interiors=interiors)
-        if isinstance(constraint, Outside):
+        if constraint.outside:
             inside, outside = outside, inside
         safe &= inside
         broken |= outside
@@ -41,34 +40,18 @@ def respected(
 
 def contains(region: Region, boxes: Interval, step: int, *, interiors: bool = False) -> tuple[Mask, Mask]:
     """Boxes that surely lie in a region, and boxes that surely do not meet it (but for points of their faces)."""
-    local = boxes if region.coordinates is None else boxes[:, list(region.coordinates)]
-    if isinstance(region, Box):
-        y = local if region.center is None else local - _center(region, step)
-        inside = (y.lo >= region.low) & (y.hi <= region.high)
-        outside = (y.hi < region.low) | (y.lo > region.high)
-        if interiors:
-            outside |= (y.hi <= region.low) | (y.lo >= region.high)
-        return np.asarray(inside.all(axis=1)), np.asarray(outside.any(axis=1))
-    if isinstance(region, HalfSpace | Polytope):
-        normals, bounds = region.halfspaces()
-        values = (Interval.point(normals) * local[:, None, :]).sum(axis=-1)
-        outside = (values.lo >= bounds) if interiors else (values.lo > bounds)
-        return np.asarray((values.hi <= bounds).all(axis=1)), np.asarray(outside.any(axis=1))
-    if isinstance(region, Ball):
-        square = sq(local - _center(region, step)).sum(axis=-1)
-        limit = sq(Interval.point(region.radius))
-        return np.asarray(square.hi <= limit.lo), np.asarray(square.lo > limit.hi)
-    assert isinstance(region, Ellipsoid)
-    y = local - _center(region, step)
-    whole = (y * (_inverse(region.shape)[None] * y[:, None, :]).sum(axis=-1)).sum(axis=-1)
-    return np.asarray(whole.hi <= 1), np.asarray(whole.lo > 1)
-
-
-def _center(region: Region, step: int) -> Interval:
-    center = region.center
-    if not isinstance(center, Tape):
-        return Interval.point(center)
-    return stack(center.evaluate(arithmetic("interval"), [Interval.point(float(step))]))
+    y = region.relative(boxes[:, region.places(boxes.shape[1])], step)
+    match region.form:
+        case Faces() as form:
+            values = form.values(y)
+            outside = (values.lo >= form.bounds) if interiors else (values.lo > form.bounds)
+            return np.asarray((values.hi <= form.bounds).all(axis=1)), np.asarray(outside.any(axis=1))
+        case Quadratic() as form if form.even:
+            square, limit = sq(y).sum(axis=-1), sq(Interval.point(form.radius))
+        case Quadratic() as form:
+            square = (y * (_inverse(form.shape)[None] * y[:, None, :]).sum(axis=-1)).sum(axis=-1)
+            limit = Interval.point(form.radius) * form.radius
+    return np.asarray(square.hi <= limit.lo), np.asarray(square.lo > limit.hi)
 
 
 def _inverse(matrix: Array) -> Interval:
@@ -102,41 +85,9 @@ def box_around(constraints: Sequence[Inside], dimension: int, step: int) -> tupl
     """Ends of a box that contains every safe state, shapes (n,); infinite where nothing bounds a state."""
     low, high = np.full(dimension, -np.inf), np.full(dimension, np.inf)
     for constraint in constraints:
-        if isinstance(constraint, Outside):
+        if constraint.outside:
             continue
-        region = constraint.region
-        places = list(range(dimension)) if region.coordinates is None else list(region.coordinates)
-        below, above = _ends(region, step)
-        low[places] = np.maximum(low[places], below)
-        high[places] = np.minimum(high[places], above)
-    return low, high
-
-
-def _ends(region: Region, step: int) -> tuple[Array, Array]:
-    """Ends of a box around a region, in its coordinates."""
-    if isinstance(region, Box):
-        if region.center is None:
-            return region.low, region.high
-        center = _center(region, step)
-        low = np.where(np.isfinite(region.low), np.nextafter(region.low + center.lo, -np.inf), -np.inf)
-        return low, np.where(np.isfinite(region.high), np.nextafter(region.high + center.hi, np.inf), np.inf)
-    if isinstance(region, Ball | Ellipsoid):
-        spread = Interval.point(np.full(region.dimension, region.radius)) if isinstance(region, Ball) else None
-        if isinstance(region, Ellipsoid):
-            spread = sqrt(Interval.point(np.diag(region.shape)))
-        assert spread is not None
-        center = _center(region, step)
-        return (center - spread).lo, (center + spread).hi
-    normals, bounds = region.halfspaces()
-    low, high = np.full(region.dimension, -np.inf), np.full(region.dimension, np.inf)
-    for normal, bound in zip(normals, bounds):
-        places = np.flatnonzero(normal)
-        if len(places) != 1:
-            continue
-        place = int(places[0])
-        end = Interval.point(bound) / Interval.point(normal[place])
-        if normal[place] > 0:
-            high[place] = min(high[place], float(end.hi))
-        else:
-            low[place] = max(low[place], float(end.lo))
+        places, around = constraint.region.places(dimension), constraint.region.hull(step)
+        low[places] = np.maximum(low[places], around.lo)
+        high[places] = np.minimum(high[places], around.hi)
     return low, high

@@ -215,25 +215,24 @@ def _region(value: object, path: str, dimension: int, budget: Budget) -> Region:
     kind = value.get("kind") if isinstance(value, dict) else None
     if not isinstance(kind, str) or kind not in _KINDS:
         raise CertificateError(f"`{path}.kind` must be one of {', '.join(_KINDS)}.")
-    record = Record(value, path, ("kind", *_KINDS[kind]))
-    everything = tuple(range(dimension))
-    if kind == "halfspace":
-        faces, bounds = [record.array("normal", dimension)], [record.number("bound")]
-    elif kind == "polytope":
-        faces, bounds = record.array("A", None, dimension), record.array("b", None)
-        if len(faces) != len(bounds) or not faces:
-            raise CertificateError(f"`{path}` must have as many rows of A as entries of b.")
-    if kind in ("halfspace", "polytope"):
-        if not all(any(face) for face in faces):
-            raise CertificateError(f"`{path}` must not have a face without direction.")
-        return Region(kind=kind, coordinates=everything, center=[0.0] * dimension, faces=faces, bounds=bounds)
-    coordinates = everything
+    record = Record(value, path, ("kind", *_KINDS[kind]), ("center", "coordinates") if kind == "polytope" else ())
+    coordinates = tuple(range(dimension))
     if record["coordinates"] is not None:
         coordinates = tuple(wholes(record["coordinates"], record.at("coordinates"), 0, dimension - 1))
         if not coordinates or len(set(coordinates)) != len(coordinates):
             raise CertificateError(f"`{path}.coordinates` must be different states.")
     k = len(coordinates)
     center = _center(record["center"], record.at("center"), k)
+    if kind in ("halfspace", "polytope"):
+        if kind == "halfspace":
+            faces, bounds = [record.array("normal", k)], [record.number("bound")]
+        else:
+            faces, bounds = record.array("A", None, k), record.array("b", None)
+        if len(faces) != len(bounds) or not faces:
+            raise CertificateError(f"`{path}` must have as many rows of A as entries of b.")
+        if not all(any(face) for face in faces):
+            raise CertificateError(f"`{path}` must not have a face without direction.")
+        return Region(kind=kind, coordinates=coordinates, center=center, faces=faces, bounds=bounds)
     if kind == "box":
         ends = [[None if x is None else number(x, path) for x in entries(record[name], path, k, k)]
                 for name in ("low", "high")]

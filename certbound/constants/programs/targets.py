@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.constants.programs.least_erosion import Rooms
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
+from certbound.problem.sets import Faces, Inside
 
 __all__ = ["Target", "constraint_targets", "cut_rooms", "nominal_paths", "rooms_of", "stated_rooms"]
 
@@ -111,7 +111,7 @@ def nominal_paths(problem: Problem, *, paths: int = _PATHS) -> tuple[Array, Arra
     """Times (K + 1,) and sampled noise-free paths (paths, K + 1, n), the first from the middle of everything."""
     system, tape = problem.system, problem.closed_loop
     rng = np.random.default_rng(0)
-    x = np.concatenate([_middle(problem.initial)[None], problem.initial.sample(rng, paths - 1)])
+    x = np.concatenate([problem.initial.middle[None], problem.initial.sample(rng, paths - 1)])
     box = system.disturbance
     d = np.zeros((paths, 0)) if box is None else box.sample(rng, paths)
     if box is not None:
@@ -149,55 +149,31 @@ def nominal_paths(problem: Problem, *, paths: int = _PATHS) -> tuple[Array, Arra
     return times, np.nan_to_num(result[good])
 
 
-def _middle(initial: Any) -> Array:
-    if isinstance(initial, Box):
-        return np.asarray((initial.low + initial.high) / 2)
-    return np.asarray(getattr(initial, "mean", None) if not hasattr(initial, "center") else initial.center)
-
-
 def _faces(constraint: Inside, times: Array, paths: Array) -> list[tuple[Array, Array]]:
     """(direction, room at each time) of each face."""
     region, n = constraint.region, paths.shape[-1]
-    places = list(range(n) if region.coordinates is None else region.coordinates)
+    places = region.places(n)
     select = np.eye(n)[:, places]
-    if region.moving:
-        local = paths[..., places] - np.array([region.center_at(float(t)) for t in times])
-    else:
-        local = paths[..., places]
-    outside = isinstance(constraint, Outside)
-    if isinstance(region, Box | HalfSpace | Polytope):
-        A, b = _halfspaces(region)
+    moving = np.array([region.center_at(float(t)) for t in times]) if region.moving else region.center_at()
+    local = paths[..., places] - moving
+    if isinstance(region.form, Faces):
+        A, b = region.form.normals, region.form.bounds
         room = np.asarray(b - local @ A.T)
-        if not outside:
+        if not constraint.outside:
             return [(select @ a[:, None], room[..., j].min(axis=0)) for j, a in enumerate(A)]
         # the face that separates best where the paths come nearest
         distance = -room / np.linalg.norm(A, axis=1)
         nearest = distance.max(axis=-1)
         face = int(np.argmax(distance.reshape(-1, len(b))[int(np.argmin(nearest))]))
         return [(select @ A[face][:, None], nearest.min(axis=0) * float(np.linalg.norm(A[face])))]
-    offset = local if region.moving else local - region.center_at(0.0)
-    size, scale = 1.0, np.eye(len(places))
-    if isinstance(region, Ball):
-        size = float(region.radius)
-    else:
-        assert isinstance(region, Ellipsoid)
-        values, vectors = np.linalg.eigh(np.asarray(region.shape, dtype=float))
-        scale = np.asarray((vectors / np.sqrt(values)) @ vectors.T)
-    distance = np.linalg.norm(offset @ scale, axis=-1)
-    if not outside:
+    values, vectors = np.linalg.eigh(region.form.shape)
+    size, scale = region.form.radius, np.asarray((vectors / np.sqrt(values)) @ vectors.T)
+    distance = np.linalg.norm(local @ scale, axis=-1)
+    if not constraint.outside:
         return [(select @ scale, np.asarray((size - distance).min(axis=0)))]
-    closest = offset.reshape(-1, offset.shape[-1])[int(np.argmin(distance))] @ scale
+    closest = local.reshape(-1, local.shape[-1])[int(np.argmin(distance))] @ scale
     normal = closest / max(float(np.linalg.norm(closest)), 1e-300)
     return [(select @ scale @ normal[:, None], np.asarray((distance - size).min(axis=0)))]
-
-
-def _halfspaces(region: Any) -> tuple[Array, Array]:
-    """Faces of a polyhedron in its own coordinates, without its (moving) centre."""
-    if isinstance(region, Box):
-        eye = np.eye(region.dimension)
-        upper, lower = np.isfinite(region.high), np.isfinite(region.low)
-        return np.concatenate([eye[upper], -eye[lower]]), np.concatenate([region.high[upper], -region.low[lower]])
-    return region.halfspaces()  # type: ignore[no-any-return]  # sets hold Any
 
 
 def _joined(targets: list[Target]) -> list[Target]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.response.martingale_windows import logsumexp
 from certbound.gaussian.scalar import log_rectangle
-from certbound.problem.sets import Box, Inside, Outside
+from certbound.problem.sets import Inside
 from certbound.rigor.intervals import Interval
 
 __all__ = ["log_occupancy"]
@@ -49,11 +49,11 @@ def log_occupancy(
         Whether a disturbance is in y.
     """
     region = constraint.region
-    if not (isinstance(constraint, Outside) and isinstance(region, Box)) or region.moving or len(nominal) > _STEPS:
+    if not (constraint.outside and region.form.axial) or region.moving or len(nominal) > _STEPS:
         return 0.0
-    states = np.arange(nominal.shape[1]) if region.coordinates is None else np.asarray(region.coordinates)
-    bounded = np.isfinite(region.low) | np.isfinite(region.high)
-    states, low, high = states[bounded], region.low[bounded], region.high[bounded]
+    around, states = region.hull(), np.array(region.places(nominal.shape[1]))
+    bounded = np.isfinite(around.lo) | np.isfinite(around.hi)
+    states, low, high = states[bounded], around.lo[bounded], around.hi[bounded]
     if not len(states):
         return 0.0
     times = np.arange(float(len(nominal)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from certbound.checks import nearest
 from certbound.problem import sets
 from certbound.problem.files.parser import CONSTANTS, constant, is_function, parse
 from certbound.problem.files.plans import read_plan
-from certbound.problem.files.schema import BallTable, Constraint, EllipsoidTable, Specification, Start
+from certbound.problem.files.schema import Constraint, Specification, Start
 from certbound.problem.model import OPERATIONS, Graph, Tape
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
@@ -302,16 +303,15 @@ class _Reader:
                 mean = self.array(table.gaussian.mean, "initial.gaussian.mean")
                 covariance = self.matrix(table.gaussian.covariance, "initial.gaussian.covariance")
                 return sets.GaussianStart(mean, covariance)
-        region = self.round(getattr(table, table.chosen), f"initial.{table.chosen}")
+        region = self.shape(getattr(table, table.chosen), table.chosen, f"initial.{table.chosen}")
         if region.moving:
             raise ValueError(f"`initial.{table.chosen}` must not move with t.")
         if region.coordinates is not None:
             order = np.argsort(region.coordinates)
             if len(order) != len(self.states):
                 raise ValueError(f"`initial.{table.chosen}` must give every state.")
-            if isinstance(region, sets.Ball):
-                return sets.Ball(region.center[order], region.radius)
-            return sets.Ellipsoid(region.center[order], region.shape[np.ix_(order, order)])
+            shape = {} if table.ellipsoid is None else {"shape": region.shape[np.ix_(order, order)]}
+            return replace(region, center=region.center[order], coordinates=None, **shape)
         return region
 
     def _ordered(self, values: list[Any], coordinates: tuple[int, ...] | None, where: str) -> list[Any]:
@@ -321,13 +321,24 @@ class _Reader:
             raise ValueError(f"`{where}` must give every state.")
         return [values[coordinates.index(k)] for k in range(len(values))]
 
-    def round(self, table: BallTable | EllipsoidTable, where: str) -> Any:
-        center, coordinates = self.place(table.center, f"{where}.center")
-        if isinstance(table, BallTable):
-            radius = self.number(table.radius, f"{where}.radius")
-            return sets.Ball(center, radius, coordinates=coordinates)
-        shape = self.matrix(table.shape, f"{where}.shape")
-        return sets.Ellipsoid(center, shape, coordinates=coordinates)
+    def shape(self, table: Any, kind: str, where: str) -> Any:
+        """A set from its table, whose entries are its fields: centres and normals by state."""
+        fields: dict[str, Any] = {}
+        for name, value in table:
+            place = f"{where}.{name}"
+            if name == "center":
+                fields["center"], fields["coordinates"] = self.place(value, place)
+            elif name == "normal":
+                values, coordinates = self.by_state(value, place)
+                fields["normal"] = np.zeros(len(self.states))
+                chosen = list(range(len(self.states)) if coordinates is None else coordinates)
+                fields["normal"][chosen] = self.array(values, place)
+            elif isinstance(value, list):
+                read = self.matrix if any(isinstance(row, list) for row in value) else self.array
+                fields[name] = read(value, place)
+            else:
+                fields[name] = self.number(value, place)
+        return _SHAPES[kind](**fields)
 
     def constraint(self, kind: Callable[..., Any], table: Constraint, where: str) -> Any:
         during = None if table.during is None else self.array(table.during, f"{where}.during")
@@ -343,20 +354,10 @@ class _Reader:
                 full = [moves.get(k, 0.0) for k in range(len(self.states))]
                 center = self.place(full, f"{where}.center")[0]
             return self.box(table.box, where, np.inf, center)
-        if table.ball is not None or table.ellipsoid is not None:
-            chosen = table.ball or table.ellipsoid
-            assert chosen is not None
-            return self.round(chosen, where)
-        if table.halfspace is not None:
-            values, coordinates = self.by_state(table.halfspace.normal, f"{where}.normal")
-            normal = np.zeros(len(self.states))
-            normal[list(range(len(self.states)) if coordinates is None else coordinates)] = self.array(
-                values, f"{where}.normal"
-            )
-            return sets.HalfSpace(normal, self.number(table.halfspace.bound, f"{where}.bound"))
-        assert table.polytope is not None
-        faces = self.matrix(table.polytope.A, f"{where}.A")
-        return sets.Polytope(faces, self.array(table.polytope.b, f"{where}.b"))
+        return self.shape(getattr(table, table.chosen), table.chosen, where)
+
+
+_SHAPES: dict[str, Any] = {shape.kind: shape for name in sets.__all__ if hasattr(shape := getattr(sets, name), "kind")}
 
 
 def _forbidden(name: str, inputs: Sequence[str]) -> Callable[[], int]:

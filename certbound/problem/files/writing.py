@@ -11,6 +11,7 @@ import numpy as np
 from certbound.problem import sets
 from certbound.problem.files.formulas import formulas
 from certbound.problem.files.reading import RESERVED
+from certbound.problem.files.schema import Constraint, Start
 from certbound.problem.model import Tape
 from certbound.problem.noise import check_law
 from certbound.problem.problem import Problem
@@ -79,8 +80,8 @@ class _Writer:
         problem, system = self.problem, self.system
         dynamics = dict(zip(self.states, self.texts(system.dynamics)))
         noise, plan, cost = self.noise(), self.plan(), problem.cost
-        stay = [self.constraint(c) for c in problem.safe if not isinstance(c, sets.Outside)]
-        avoid = [self.constraint(c) for c in problem.safe if isinstance(c, sets.Outside)]
+        stay = [self.constraint(c) for c in problem.safe if not c.outside]
+        avoid = [self.constraint(c) for c in problem.safe if c.outside]
         return {
             "name": problem.name,
             "time": system.time,
@@ -130,22 +131,28 @@ class _Writer:
     def place(self, region: Any) -> dict[str, Any]:
         used = self.states if region.coordinates is None else [self.states[k] for k in region.coordinates]
         moving = isinstance(region.center, Tape)
-        return dict(zip(used, self.texts(region.center) if moving else region.center.tolist()))
+        return dict(zip(used, self.texts(region.center) if moving else region.center_at().tolist()))
 
     def region(self, region: Any) -> dict[str, Any]:
-        if isinstance(region, sets.Box):
-            table = {"box": self.intervals(region)}
-            return table | ({} if region.center is None else {"center": self.place(region)})
-        if isinstance(region, sets.Ball):
-            return {"ball": {"center": self.place(region), "radius": region.radius}}
-        if isinstance(region, sets.Ellipsoid):
-            return {"ellipsoid": {"center": self.place(region), "shape": _rows(region.shape)}}
-        if isinstance(region, sets.HalfSpace):
-            normal = {name: value for name, value in zip(self.states, region.normal.tolist()) if value}
-            return {"halfspace": {"normal": normal, "bound": region.bound}}
-        if isinstance(region, sets.Polytope):
-            return {"polytope": {"A": _rows(region.A), "b": region.b.tolist()}}
-        raise TypeError(f"a {type(region).__name__} cannot be written; use a set of this package.")
+        table = region.data(Constraint.choices)
+        kind, _ = table.pop("kind"), table.pop("coordinates", None)
+        if kind == "box":
+            return {"box": self.intervals(region)} | ({} if region.center is None else {"center": self.place(region)})
+        if kind == "polytope" and region.kind != kind:
+            table = self.resting(region)
+        written = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in table.items()}
+        if "center" in written:
+            written["center"] = self.place(region)
+        if "normal" in written:
+            written["normal"] = {name: value for name, value in zip(self.states, written["normal"]) if value}
+        return {kind: written}
+
+    def resting(self, region: sets.Region) -> dict[str, Any]:
+        """A set without a row of its own as a polytope over all states."""
+        if region.moving:
+            raise ValueError(f"a moving {type(region).__name__} cannot be written; use a Box, Ball or Ellipsoid.")
+        normals, bounds = region.halfspaces()
+        return {"A": region.lifted(normals, len(self.states)), "b": bounds + normals @ region.center_at()}
 
     def constraint(self, constraint: sets.Inside) -> dict[str, Any]:
         table = self.region(constraint.region)
@@ -155,14 +162,18 @@ class _Writer:
         return table if constraint.label == usual else table | {"label": constraint.label}
 
     def start(self) -> Mapping[str, Any]:
-        initial = self.problem.initial
-        if isinstance(initial, sets.GaussianStart):
-            return {"gaussian": {"mean": initial.mean.tolist(), "covariance": _rows(initial.covariance)}}
-        if isinstance(initial, sets.Box):
-            if self.problem.fixed_start:
-                return {"point": initial.low.tolist()}
-            return {"box": [[low, high] for low, high in zip(initial.low.tolist(), initial.high.tolist())]}
-        return self.region(initial)
+        data = self.problem.initial.data(Start.choices)
+        match data["kind"]:
+            case "gaussian":
+                return {"gaussian": {"mean": data["mean"].tolist(), "covariance": _rows(data["covariance"])}}
+            case "box" if self.problem.fixed_start:
+                return {"point": data["low"].tolist()}
+            case "box":
+                return {"box": [[low, high] for low, high in zip(data["low"].tolist(), data["high"].tolist())]}
+            case "polytope":
+                name = type(self.problem.initial).__name__
+                raise ValueError(f"a {name} cannot be written as a start; use a Box, Ball or Ellipsoid.")
+        return self.region(self.problem.initial)
 
 
 def _rows(matrix: Any) -> list[list[float]]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
 from certbound.problem.sets.distances import clearance
+from certbound.problem.sets.forms import Faces, Quadratic, Region
 from certbound.problem.sets.initial import check_start
-from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope, Region
+from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 
 __all__ = [
     "Ball",
@@ -13,10 +14,12 @@ __all__ = [
     "check_start",
     "clearance",
     "Ellipsoid",
+    "Faces",
     "GaussianStart",
     "HalfSpace",
     "Inside",
     "Outside",
     "Polytope",
+    "Quadratic",
     "Region",
 ]

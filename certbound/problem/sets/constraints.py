@@ -1,7 +1,8 @@
-"""Constraints on the state, and random starts; the sets themselves are offered here too."""
+"""Constraints on the state, and random starts."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.checks import positive_definite, vector
-from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
+from certbound.problem.sets.forms import Region
 
 __all__ = ["GaussianStart", "Inside", "Outside"]
 
@@ -27,7 +28,7 @@ class Inside:
 
     Parameters
     ----------
-    region : Box, Ball, Ellipsoid, HalfSpace or Polytope
+    region : Box, Ball, Ellipsoid, HalfSpace, Polytope or another Region
         Closed set.
     during : (float, float), optional
         First and last time (step) at which the constraint holds; the whole horizon when omitted, and (T, T)
@@ -36,14 +37,15 @@ class Inside:
         Short text for humans; made from the region when omitted.
     """
 
-    region: Any
+    region: Region
     during: Any = None
     label: Any = None
 
     word: ClassVar[str] = "inside"
+    outside: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if type(self.region) not in (Box, Ball, Ellipsoid, HalfSpace, Polytope):  # own classes may differ
+        if Region not in type(self.region).__bases__:  # a class made from a shape may mean something else
             kinds = "Box, Ball, Ellipsoid, HalfSpace or Polytope"
             raise TypeError(f"`region` must be a {kinds} itself, got {self.region!r}; compose your set from these.")
         window = None
@@ -56,11 +58,11 @@ class Inside:
 
     def named(self, states: tuple[str, ...]) -> Any:
         """The same constraint, its label made from the states' names unless the user gave one."""
-        return self if self.label is not None else replace(self, label=_describe(self, states))
+        return self if self.label is not None else replace(self, label=self.region.describe(states, self.word))
 
     def satisfied(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
         """Whether states, shape (..., n), satisfy the constraint at time t (its window aside)."""
-        return np.asarray(self.region.contains(x, t))
+        return np.asarray(self.region.contains(x, t) != self.outside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,51 +70,7 @@ class Outside(Inside):
     """The state stays outside a region (an obstacle); parameters as for ``Inside``."""
 
     word: ClassVar[str] = "outside"
-
-    def satisfied(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
-        return np.asarray(~self.region.contains(x, t))
-
-
-def _describe(constraint: Inside, states: tuple[str, ...]) -> str:
-    region = constraint.region
-    used = states if region.coordinates is None else tuple(states[index] for index in region.coordinates)
-    center = "a moving centre" if region.moving else _listed(region.center_at())
-    among = "" if region.coordinates is None else f" in ({', '.join(used)})"
-    if isinstance(region, Box):
-        ends = sorted(zip(used, region.low, region.high), key=lambda end: states.index(end[0]))
-        parts = [_interval(*end) for end in ends if np.isfinite(end[1:]).any()] or ["everywhere"]
-        text = ", ".join(parts if len(parts) <= 4 else [*parts[:2], f"... ({len(parts)} intervals)"])
-        text += " (moving)" if region.moving else ""
-        return text if constraint.word == "inside" else f"outside {text}"
-    if isinstance(region, HalfSpace):
-        sign = "<=" if constraint.word == "inside" else ">"
-        return f"{_linear(region.normal, used)} {sign} {region.bound:g}"
-    if isinstance(region, Ball):
-        text = f"the ball of radius {region.radius:g} around {center}{among}"
-    elif isinstance(region, Ellipsoid):
-        text = f"the ellipsoid around {center}{among}"
-    else:
-        text = f"a polytope of {len(region.halfspaces()[1])} faces"
-    return f"{constraint.word} {text}"
-
-
-def _listed(values: Array) -> str:
-    return "(" + ", ".join(f"{value:g}" for value in values) + ")"
-
-
-def _interval(name: str, low: float, high: float) -> str:
-    if np.isinf(low) or np.isinf(high):
-        return f"{name} <= {high:g}" if np.isinf(low) else f"{name} >= {low:g}"
-    return f"{low:g} <= {name} <= {high:g}"
-
-
-def _linear(normal: Array, used: tuple[str, ...]) -> str:
-    text = ""
-    for value, name in zip(normal, used):
-        if value:
-            sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
-            text += sign + ("" if abs(value) == 1 else f"{abs(value):g}*") + name
-    return text
+    outside: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +88,8 @@ class GaussianStart:
     mean: Any
     covariance: Any
 
-    kind: ClassVar[str] = "gaussian"
+    random: ClassVar[bool] = True
+    is_point: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         mean = vector("mean", self.mean)
@@ -141,6 +100,15 @@ class GaussianStart:
     def dimension(self) -> int:
         """Number of states."""
         return len(self.mean)
+
+    @property
+    def middle(self) -> Array:
+        """The mean."""
+        return np.asarray(self.mean)
+
+    def data(self, kinds: Collection[str]) -> dict[str, Any]:
+        """What files say of it."""
+        return {"kind": "gaussian", "mean": self.mean, "covariance": self.covariance}
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Random starts, shape (count, n)."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.problem.sets.constraints import Inside, Outside
-from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
+from certbound.problem.sets.constraints import Inside
+from certbound.problem.sets.forms import Faces, Quadratic, Region
 
 __all__ = ["clearance", "face_erosion", "round_erosion"]
 
@@ -70,28 +70,21 @@ def clearance(
     region = constraint.region
     y = region.local(x) - region.center_at(t)
     block = _block(region, np.shape(x)[-1], inverse_metric)
-    inside = not isinstance(constraint, Outside)
-    if isinstance(region, (Box, HalfSpace, Polytope)):
-        normals, bounds = region.halfspaces()
-        if not len(bounds):
-            return np.full(y.shape[:-1], np.inf if inside else -np.inf)
-        room = (bounds - y @ normals.T) / face_erosion(normals, block)
-        return np.asarray(np.min(room, axis=-1) if inside else np.max(-room, axis=-1))
-    if isinstance(region, Ball):
-        room = region.radius - np.linalg.norm(y, axis=-1)
-    elif isinstance(region, Ellipsoid):
-        factor = np.linalg.inv(np.linalg.cholesky(region.shape))
-        room, block = 1.0 - np.linalg.norm(y @ factor.T, axis=-1), factor @ block @ factor.T
-    else:
-        raise TypeError(f"`constraint` must hold a set of this package, got {type(region).__name__}.")
-    return np.asarray((room if inside else -room) / round_erosion(block))
+    inside = not constraint.outside
+    match region.form:
+        case Faces() as form:
+            if not len(form.bounds):
+                return np.full(y.shape[:-1], np.inf if inside else -np.inf)
+            room = (form.bounds - y @ form.normals.T) / face_erosion(form.normals, block)
+            return np.asarray(np.min(room, axis=-1) if inside else np.max(-room, axis=-1))
+        case Quadratic() as form:
+            room = form.radius - np.linalg.norm(y @ form.root.T, axis=-1)
+            return np.asarray((room if inside else -room) / round_erosion(form.root @ block @ form.root.T))
 
 
-def _block(region: object, dimension: int, inverse_metric: ArrayLike | None) -> Array:
+def _block(region: Region, dimension: int, inverse_metric: ArrayLike | None) -> Array:
     inverse = np.eye(dimension) if inverse_metric is None else np.asarray(inverse_metric, dtype=float)
     if inverse.shape != (dimension, dimension):
         raise ValueError(f"`inverse_metric` must have shape {(dimension, dimension)}, got {inverse.shape}.")
-    coordinates = getattr(region, "coordinates", None)
-    if coordinates is None:
-        return inverse
-    return np.asarray(inverse[np.ix_(list(coordinates), list(coordinates))])
+    places = region.places(dimension)
+    return np.asarray(inverse[np.ix_(places, places)])

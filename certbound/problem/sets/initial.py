@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
+from certbound.problem.sets.constraints import GaussianStart, Inside
 from certbound.problem.sets.distances import clearance
-from certbound.problem.sets.regions import Ball, Box, Ellipsoid
+from certbound.problem.sets.forms import Faces, Quadratic, Region
 
 __all__ = ["check_start"]
 
@@ -19,7 +19,7 @@ _ROUNDING, _SLACK = 1e-12, 1e-9
 """Shares of a state's size by which the start's centre, and its farthest part, may miss a constraint."""
 
 
-def check_start(initial: Box | Ball | Ellipsoid | GaussianStart, constraints: Sequence[Inside]) -> None:
+def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside]) -> None:
     """Refuse a start that violates a constraint, wholly or (where that is easily decided) in part.
 
     Raises
@@ -27,7 +27,7 @@ def check_start(initial: Box | Ball | Ellipsoid | GaussianStart, constraints: Se
     ValueError
         Naming the constraint and how the start violates it.
     """
-    center = _center(initial)
+    center = initial.middle
     for constraint in constraints:
         if constraint.during is not None and constraint.during[0] > 0:
             continue
@@ -39,29 +39,23 @@ def check_start(initial: Box | Ball | Ellipsoid | GaussianStart, constraints: Se
             )
 
 
-def _center(initial: Box | Ball | Ellipsoid | GaussianStart) -> Array:
-    if isinstance(initial, Box):
-        return np.asarray((initial.low + initial.high) / 2)
-    return np.asarray(initial.mean if isinstance(initial, GaussianStart) else initial.center)
-
-
-def _fault(initial: Any, center: Array, constraint: Inside) -> str:
+def _fault(initial: Region | GaussianStart, center: Array, constraint: Inside) -> str:
     size = _size(initial, constraint.region)
     if _misses(center, constraint, size):
         text = "(" + ", ".join(f"{value:g}" for value in center) + ")"
-        return f"the mean {text}" if isinstance(initial, GaussianStart) else f"its centre {text}"
-    if isinstance(initial, GaussianStart):
+        return f"the mean {text}" if initial.random else f"its centre {text}"
+    if initial.random:
         return ""
-    sticks_out = _leaves if not isinstance(constraint, Outside) else _touches
-    return "a part of it" if sticks_out(initial, center, constraint.region, _SLACK * size) else ""
+    sticks_out = _touches if constraint.outside else _leaves
+    return "a part of it" if sticks_out(initial, constraint.region, _SLACK * size) else ""
 
 
-def _size(initial: Any, region: Any) -> Array:
+def _size(initial: Any, region: Region) -> Array:
     """How large each state is in the start and in the set's centre, shape (n,): what rounding is measured by."""
     eye = np.eye(initial.dimension)
-    ends = [initial.mean] if isinstance(initial, GaussianStart) else [initial.support(eye), initial.support(-eye)]
+    ends = [initial.mean] if initial.random else [initial.support(eye), initial.support(-eye)]
     size: Array = np.max(np.abs(ends), axis=0)
-    size[slice(None) if region.coordinates is None else list(region.coordinates)] += np.abs(region.center_at())
+    size[region.places(initial.dimension)] += np.abs(region.center_at())
     return size
 
 
@@ -73,51 +67,31 @@ def _misses(center: Array, constraint: Inside, size: Array) -> bool:
         return bool(clearance(constraint, center, np.diag(size**2)) < -_ROUNDING)
 
 
-def _leaves(initial: Any, center: Array, region: Any, slack: Array) -> bool:
+def _leaves(initial: Any, region: Region, slack: Array) -> bool:
     """Whether the start surely has a point outside the region."""
-    if isinstance(region, (Ball, Ellipsoid)):
-        if not isinstance(region, Ball):
-            return False
-        return bool(_farthest(initial, region) > region.radius + np.max(region.local(slack)))
-    normals, bounds = region.halfspaces()
-    if not len(bounds):
-        return False
-    full = np.zeros((len(bounds), len(center)))
-    full[:, range(len(center)) if region.coordinates is None else list(region.coordinates)] = normals
-    reach = initial.support(full) - normals @ region.center_at()
-    return bool(np.any(reach > bounds + np.abs(full) @ slack))
+    places = region.places(initial.dimension)
+    match region.form:
+        case Quadratic() as form:
+            farthest = initial.reaches(region.center_at(), places)[1]
+            return form.even and bool(farthest > form.radius + np.max(slack[places]))
+        case Faces() as form:
+            rows = region.lifted(form.normals, initial.dimension)
+            reach = initial.support(rows) - form.normals @ region.center_at()
+            return bool(np.any(reach > form.bounds + np.abs(rows) @ slack))
 
 
-def _touches(initial: Any, center: Array, region: Any, slack: Array) -> bool:
+def _touches(initial: Any, region: Region, slack: Array) -> bool:
     """Whether the start surely has a point inside the region."""
-    if isinstance(region, Ball):
-        return bool(_nearest(initial, region) < region.radius - np.max(region.local(slack)))
-    normals, bounds = region.halfspaces() if not isinstance(region, Ellipsoid) else (np.empty(0), np.empty(0))
-    if len(bounds) == 1 and region.coordinates is None:
-        return bool(-initial.support(-normals)[0] < bounds[0] - np.abs(normals[0]) @ slack)
-    if isinstance(region, Box) and isinstance(initial, Box):
-        offset = region.center_at()
-        low, high = region.low + offset, region.high + offset
-        below = region.local(initial.low) < high - region.local(slack)
-        above = region.local(initial.high) > low + region.local(slack)
-        return bool(np.all(below & above))
+    places = region.places(initial.dimension)
+    match region.form:
+        case Quadratic() as form:
+            nearest = initial.reaches(region.center_at(), places)[0]
+            return form.even and bool(nearest < form.radius - np.max(slack[places]))
+        case Faces() as form if len(form.bounds) == 1 and region.coordinates is None:
+            nearest = -initial.support(-form.normals)[0] - form.normals[0] @ region.center_at()
+            return bool(nearest < form.bounds[0] - np.abs(form.normals[0]) @ slack)
+        case Faces() as form if form.axial and initial.form.axial:
+            low, high = (ends[places] for ends in (initial.hull().lo, initial.hull().hi))
+            around = region.hull()
+            return bool(np.all((low < around.hi - slack[places]) & (high > around.lo + slack[places])))
     return False
-
-
-def _farthest(initial: Any, region: Ball) -> float:
-    """Largest distance of the start from the region's centre (for an ellipsoid: of its own centre)."""
-    origin = region.center_at()
-    if isinstance(initial, Box):
-        low, high = region.local(initial.low), region.local(initial.high)
-        return float(np.linalg.norm(np.maximum(np.abs(low - origin), np.abs(high - origin))))
-    reach = initial.radius if isinstance(initial, Ball) else 0.0
-    return float(np.linalg.norm(region.local(initial.center) - origin)) + reach
-
-
-def _nearest(initial: Any, region: Ball) -> float:
-    origin = region.center_at()
-    if isinstance(initial, Box):
-        closest = np.clip(origin, region.local(initial.low), region.local(initial.high))
-        return float(np.linalg.norm(closest - origin))
-    reach = initial.radius if isinstance(initial, Ball) else 0.0
-    return float(np.linalg.norm(region.local(initial.center) - origin)) - reach

@@ -1,4 +1,4 @@
-"""Sets of states.
+"""The shapes of sets of states.
 
 A set may live in some of the coordinates only (``coordinates``); its centre may move: ``center`` is then a
 tape over ``("t",)``, made from a function of t. What a set says at time t, it says about its shape moved to
@@ -7,7 +7,8 @@ tape over ``("t",)``, made from a function of t. What a set says at time t, it s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,72 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.checks import frozen, matrix, number, pick, positive_definite, vector
 from certbound.problem.model import Tape, compile_numpy, trace
+from certbound.problem.sets.forms import Faces, Quadratic, Region, linear_maximum
 
-__all__ = ["Ball", "Box", "Ellipsoid", "HalfSpace", "Polytope", "Region"]
+__all__ = ["Ball", "Box", "Ellipsoid", "HalfSpace", "Polytope"]
 
 Array = NDArray[np.float64]
 Center = Array | Tape
-
-
-class Region:
-    """What every set offers."""
-
-    center: Any
-    coordinates: Any
-    kind: ClassVar[str] = "region"
-
-    @property
-    def dimension(self) -> int:
-        """Number of coordinates that the set lives in."""
-        raise NotImplementedError
-
-    @property
-    def moving(self) -> bool:
-        """True when the centre is a function of time."""
-        return isinstance(self.center, Tape)
-
-    def center_at(self, t: float = 0.0) -> Array:
-        """The centre at time t, shape (dimension,); zeros for a set without one."""
-        if self.center is None:
-            return np.zeros(self.dimension)
-        return compile_numpy(self.center)(t) if isinstance(self.center, Tape) else self.center
-
-    def local(self, x: ArrayLike) -> Array:
-        """The set's coordinates of states, shape (..., dimension)."""
-        array = np.asarray(x, dtype=float)
-        if self.coordinates is not None:
-            if array.ndim == 0 or array.shape[-1] <= max(self.coordinates):
-                least = max(self.coordinates) + 1
-                raise ValueError(f"`x` must have {least} or more entries, got shape {array.shape}.")
-            return np.asarray(array[..., list(self.coordinates)])
-        if array.ndim == 0 or array.shape[-1] != self.dimension:
-            raise ValueError(f"`x` must end in an axis of {self.dimension}, got shape {array.shape}.")
-        return array
-
-    def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
-        """Whether states, shape (..., n), lie in the closed set at time t."""
-        raise NotImplementedError
-
-    def support(self, directions: ArrayLike, t: float = 0.0) -> Array:
-        """max a.x over the set at time t, for directions a of shape (..., n); inf where unbounded."""
-        raw = np.asarray(directions, dtype=float)
-        value = self.local_support(self.local(raw), t)
-        if self.coordinates is None:
-            return value
-        rest = np.delete(raw, list(self.coordinates), axis=-1)
-        return np.where(np.any(rest != 0, axis=-1), np.inf, value)
-
-    def local_support(self, directions: Array, t: float) -> Array:
-        """`support` along directions of the coordinates that the set bounds."""
-        raise NotImplementedError
-
-    def sample(self, rng: np.random.Generator, count: int, t: float = 0.0) -> Array:
-        """Uniform random points, shape (count, dimension)."""
-        raise NotImplementedError
-
-    def halfspaces(self) -> tuple[Array, Array]:
-        """(A, b) with the set equal to {A (x - center) <= b} in its coordinates; polyhedra only."""
-        raise TypeError(f"a {type(self).__name__} is no polyhedron; use Box, HalfSpace or Polytope.")
 
 
 def _center(name: str, value: Any, length: int | None) -> Center:
@@ -143,14 +84,25 @@ class Box(Region):
             raise ValueError("`low` must be below inf and `high` above -inf.")
         _set(self, low=low, high=high, center=center, coordinates=pick(self.coordinates, len(low)))
 
+    @cached_property
+    def form(self) -> Faces:
+        eye = np.eye(len(self.low))
+        upper, lower = np.isfinite(self.high), np.isfinite(self.low)
+        bounds = np.concatenate([self.high[upper], -self.low[lower]])
+        return Faces(frozen(np.vstack([eye[upper], -eye[lower]])), frozen(bounds), axial=True)
+
     @property
-    def dimension(self) -> int:
-        return len(self.low)
+    def is_point(self) -> bool:
+        return bool(np.all(self.low == self.high))
+
+    @property
+    def middle(self) -> Array:
+        return np.asarray(np.clip(0.5 * self.low + 0.5 * self.high, self.low, self.high) + self.center_at())
 
     @property
     def bounded(self) -> bool:
         """True when every side is finite."""
-        return bool(np.all(np.isfinite(self.low)) and np.all(np.isfinite(self.high)))
+        return bool(np.all(np.isfinite([self.low, self.high])))
 
     def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
         y = self.local(x) - self.center_at(t)
@@ -166,13 +118,24 @@ class Box(Region):
             raise ValueError("a box with infinite sides cannot be sampled; give finite sides.")
         return np.asarray(self.center_at(t) + rng.uniform(self.low, self.high, (count, self.dimension)))
 
-    def halfspaces(self) -> tuple[Array, Array]:
-        eye = np.eye(self.dimension)
-        upper, lower = np.isfinite(self.high), np.isfinite(self.low)
-        return (
-            frozen(np.vstack([eye[upper], -eye[lower]])),
-            frozen(np.concatenate([self.high[upper], -self.low[lower]])),
-        )
+    def corners(self, rng: np.random.Generator, count: int) -> Array:
+        return np.asarray(np.where(rng.random((count, self.dimension)) < 0.5, self.low, self.high))
+
+    def reaches(self, point: Array, places: list[int]) -> tuple[float, float]:
+        low, high = self.low[places], self.high[places]
+        farthest = np.maximum(np.abs(low - point), np.abs(high - point))
+        return float(np.linalg.norm(np.clip(point, low, high) - point)), float(np.linalg.norm(farthest))
+
+    def describe(self, states: tuple[str, ...], word: str) -> str:
+        used = [states[place] for place in self.places(len(states))]
+        ends = sorted(zip(used, self.low, self.high), key=lambda end: states.index(end[0]))
+        parts = [_interval(*end) for end in ends if np.isfinite(end[1:]).any()] or ["everywhere"]
+        text = ", ".join(parts if len(parts) <= 4 else [*parts[:2], f"... ({len(parts)} intervals)"])
+        text += " (moving)" if self.moving else ""
+        return text if word == "inside" else f"outside {text}"
+
+    def grown(self, distance: float) -> Box:
+        return replace(self, low=self.low - distance, high=self.high + distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,18 +165,15 @@ class Ball(Region):
         size = center.shape[0]
         _set(self, center=center, radius=radius, coordinates=pick(self.coordinates, size))
 
-    @property
-    def dimension(self) -> int:
-        return int(self.center.shape[0])
+    @cached_property
+    def form(self) -> Quadratic:
+        return Quadratic(np.eye(int(self.center.shape[0])), self.radius)
 
-    def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
-        return np.asarray(np.linalg.norm(self.local(x) - self.center_at(t), axis=-1) <= self.radius)
+    def describe(self, states: tuple[str, ...], word: str) -> str:
+        return f"{word} the ball of radius {self.radius:g} around {self._place(states)}"
 
-    def local_support(self, directions: Array, t: float) -> Array:
-        return np.asarray(directions @ self.center_at(t) + self.radius * np.linalg.norm(directions, axis=-1))
-
-    def sample(self, rng: np.random.Generator, count: int, t: float = 0.0) -> Array:
-        return np.asarray(self.center_at(t) + self.radius * _in_unit_ball(rng, count, self.dimension))
+    def grown(self, distance: float) -> Ball:
+        return replace(self, radius=self.radius + distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,27 +201,9 @@ class Ellipsoid(Region):
         center = _center("center", self.center, len(shape))
         _set(self, center=center, shape=shape, coordinates=pick(self.coordinates, len(shape)))
 
-    @property
-    def dimension(self) -> int:
-        return len(self.shape)
-
-    def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
-        y = self.local(x) - self.center_at(t)
-        return np.asarray(np.einsum("...i,...i->...", y, y @ np.linalg.inv(self.shape)) <= 1.0)
-
-    def local_support(self, directions: Array, t: float) -> Array:
-        spread = np.sqrt(np.einsum("...i,...i->...", directions, directions @ self.shape))
-        return np.asarray(directions @ self.center_at(t) + spread)
-
-    def sample(self, rng: np.random.Generator, count: int, t: float = 0.0) -> Array:
-        points = _in_unit_ball(rng, count, self.dimension)
-        return np.asarray(self.center_at(t) + points @ np.linalg.cholesky(self.shape).T)
-
-
-def _in_unit_ball(rng: np.random.Generator, count: int, dimension: int) -> Array:
-    points = rng.standard_normal((count, dimension))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return np.asarray(points * rng.uniform(size=(count, 1)) ** (1.0 / dimension))
+    @cached_property
+    def form(self) -> Quadratic:
+        return Quadratic(self.shape, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,6 +222,7 @@ class HalfSpace(Region):
     bound: Any
 
     kind: ClassVar[str] = "halfspace"
+    starts: ClassVar[bool] = False
     center = None
     coordinates = None
 
@@ -289,12 +232,9 @@ class HalfSpace(Region):
             raise ValueError("`normal` must not be all 0.")
         _set(self, normal=normal, bound=bound)
 
-    @property
-    def dimension(self) -> int:
-        return len(self.normal)
-
-    def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
-        return np.asarray(self.local(x) @ self.normal <= self.bound)
+    @cached_property
+    def form(self) -> Faces:
+        return Faces(frozen(self.normal[None]), frozen([self.bound]))
 
     def local_support(self, directions: Array, t: float) -> Array:
         scale = directions @ self.normal / (self.normal @ self.normal)
@@ -302,11 +242,16 @@ class HalfSpace(Region):
         parallel = residual <= 1e-14 * np.linalg.norm(directions, axis=-1)
         return np.where(parallel & (scale >= 0), scale * self.bound, np.inf)
 
-    def sample(self, rng: np.random.Generator, count: int, t: float = 0.0) -> Array:
-        raise ValueError("a half-space is unbounded and cannot be sampled; use a Box.")
+    def describe(self, states: tuple[str, ...], word: str) -> str:
+        text = ""
+        for value, name in zip(self.normal, states):
+            if value:
+                sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
+                text += sign + ("" if abs(value) == 1 else f"{abs(value):g}*") + name
+        return f"{text} {'<=' if word == 'inside' else '>'} {self.bound:g}"
 
-    def halfspaces(self) -> tuple[Array, Array]:
-        return frozen(self.normal[None]), frozen([self.bound])
+    def grown(self, distance: float) -> HalfSpace:
+        return replace(self, bound=self.bound + distance * float(np.linalg.norm(self.normal)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,6 +270,7 @@ class Polytope(Region):
     b: Any
 
     kind: ClassVar[str] = "polytope"
+    starts: ClassVar[bool] = False
     center = None
     coordinates = None
 
@@ -333,43 +279,18 @@ class Polytope(Region):
         if not np.all(np.any(faces != 0, axis=1)):
             raise ValueError("`A` must not have a row that is all 0.")
         _set(self, A=faces, b=vector("b", self.b, len(faces)))
-        if _linear_maximum(faces, self.b, np.zeros(faces.shape[1])) is None:
+        if linear_maximum(faces, self.b, np.zeros(faces.shape[1])) is None:
             raise ValueError("`A`, `b` must describe a set with a point in it, got an empty one.")
 
-    @property
-    def dimension(self) -> int:
-        return int(self.A.shape[1])
+    @cached_property
+    def form(self) -> Faces:
+        return Faces(self.A, self.b)
 
-    def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
-        return np.asarray(np.all(self.local(x) @ self.A.T <= self.b, axis=-1))
-
-    def local_support(self, directions: Array, t: float) -> Array:
-        flat = directions.reshape(-1, self.dimension)
-        values = [_linear_maximum(self.A, self.b, direction) for direction in flat]
-        return np.array(values, dtype=float).reshape(directions.shape[:-1])
-
-    def sample(self, rng: np.random.Generator, count: int, t: float = 0.0) -> Array:
-        eye = np.eye(self.dimension)
-        high, low = self.support(eye), np.negative(self.support(-eye))
-        if not np.all(np.isfinite(high) & np.isfinite(low)):
-            raise ValueError("an unbounded polytope cannot be sampled; add faces.")
-        points = np.empty((0, self.dimension))
-        for _ in range(1000):
-            draw = rng.uniform(low, high, (max(4 * count, 1000), self.dimension))
-            points = np.vstack([points, draw[self.contains(draw)]])
-            if len(points) >= count:
-                return np.asarray(points[:count])
-        raise ValueError("the polytope fills too little of its bounding box to be sampled; use a Box.")
-
-    def halfspaces(self) -> tuple[Array, Array]:
-        return self.A, self.b
+    def grown(self, distance: float) -> Polytope:
+        return replace(self, b=self.b + distance * np.linalg.norm(self.A, axis=1))
 
 
-def _linear_maximum(faces: Array, bounds: Array, direction: Array) -> float | None:
-    """max direction.x over {faces x <= bounds}: inf if unbounded, None if the set is empty."""
-    from scipy.optimize import linprog
-
-    result = linprog(-direction, A_ub=faces, b_ub=bounds, bounds=(None, None), method="highs")
-    if result.status == 2:
-        return None
-    return -float(result.fun or 0.0) if result.status == 0 else np.inf
+def _interval(name: str, low: float, high: float) -> str:
+    if np.isinf(low) or np.isinf(high):
+        return f"{name} <= {high:g}" if np.isinf(low) else f"{name} >= {low:g}"
+    return f"{low:g} <= {name} <= {high:g}"

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.constants.bounds import constants_along
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart
 from certbound.reach.contraction.slopes import LocalSlopes
 from certbound.reach.contraction.uniform import bound_forcing, integrate_radius, jump_sizes
 from certbound.reach.nominal import Curve, Flow, initial_cells, nominal_curve
@@ -201,7 +200,7 @@ def local_tube(
     ValueError
         If the method's level is one time: such a bound must not be combined with local constants (7.7).
     """
-    if isinstance(problem.initial, GaussianStart) and np.any(problem.initial.covariance):
+    if problem.initial.random and np.any(problem.initial.covariance):
         raise InfeasibleError(
             "no local tube: local constants need a bounded initial set, and `initial` is a GaussianStart; use "
             'method "linear", or give `domain=cb.Box(low, high)` for constants that hold on a domain.'
@@ -255,7 +254,7 @@ def random_start(problem: Problem, constants: Constants) -> Start:
 
     Proved through s^2 P - P C P > 0. The tube then needs nu = n, see `Constants.effective_dimension`.
     """
-    if not isinstance(problem.initial, GaussianStart) or not np.any(problem.initial.covariance):
+    if not problem.initial.random or not np.any(problem.initial.covariance):
         return Start()
     covariance = np.asarray(problem.initial.covariance, dtype=float)
     metric = constants.matrix

@@ -13,7 +13,6 @@ from certbound.errors import EngineError
 from certbound.gaussian.response import LinearResponse, continuous_response, discrete_response
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear.inclusion import Gathering
 from certbound.reach.nominal import initial_cells
@@ -66,7 +65,7 @@ class Linearisation:
         split = initial_cells(problem, cells)
         self.centres = np.asarray(split.centres)
         self.radii = np.asarray((split.boxes - self.centres).mag)
-        random = noise and isinstance(problem.initial, GaussianStart)
+        random = noise and problem.initial.random
         self.start_covariance = (
             np.asarray(problem.initial.covariance) if random else np.zeros((self.n, self.n))
         )

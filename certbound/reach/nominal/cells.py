@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart
+from certbound.problem.sets import Quadratic
 from certbound.rigor import intervals as iv
 from certbound.rigor.definite import eigenvalue_upper, is_positive_definite
 from certbound.rigor.intervals import Interval
@@ -26,20 +26,21 @@ MOST_CELLS = 4096
 class Cells:
     """Boxes (B, n) whose union contains the initial set, and a float point of each.
 
-    ``round`` is the initial set itself when it is a ball or an ellipsoid in one cell.
+    ``round`` is the initial set itself, when it is one cell and a ball or an ellipsoid: its centre and its form.
     """
 
     centres: Array
     boxes: Interval
-    round: Ball | Ellipsoid | None = None
+    round: tuple[Array, Quadratic] | None = None
 
     def radii(self, norm: Norm, starts: Interval) -> Array:
         """Upper bounds of sup ||x_0 - p(0)||_P per cell, shape (B,); ``starts`` encloses p(0), (B, n)."""
         bound = largest_over_box(norm, self.boxes - starts)
         if self.round is None:
             return bound
-        shift = norm.length(Interval.point(np.asarray(self.round.center)) - starts)
-        around = Interval.point(_round_radius(self.round, norm)) + Interval.point(shift)
+        center, form = self.round
+        shift = norm.length(Interval.point(center) - starts)
+        around = Interval.point(_round_radius(form, norm)) + Interval.point(shift)
         return np.asarray(np.minimum(bound, around.hi))
 
 
@@ -56,15 +57,15 @@ def initial_cells(problem: Problem, cells: int | None = None) -> Cells:
     if cells is not None and (isinstance(cells, bool) or int(cells) != cells or cells < 1):
         raise ValueError(f"`cells` must be a positive integer (parts along each side), got {cells!r}.")
     start = problem.initial
-    if isinstance(start, GaussianStart):
-        mean = np.asarray(start.mean)[None]
+    if start.random:
+        mean = start.middle[None]
         return Cells(centres=mean, boxes=Interval.point(mean))
-    low, high = _hull(start)
+    low, high = start.hull().lo, start.hull().hi
     parts = 1 if cells is None else int(cells)
     if parts == 1:
         centre = np.clip(0.5 * low + 0.5 * high, low, high)
-        shape = start if isinstance(start, (Ball, Ellipsoid)) else None
-        return Cells(centres=centre[None], boxes=Interval(low[None], high[None]), round=shape)
+        whole = (start.center_at(), start.form) if start.form.round else None
+        return Cells(centres=centre[None], boxes=Interval(low[None], high[None]), round=whole)
     wide = low < high
     if parts ** int(np.count_nonzero(wide)) > MOST_CELLS:
         raise ValueError(
@@ -81,29 +82,19 @@ def initial_cells(problem: Problem, cells: int | None = None) -> Cells:
     return Cells(centres=np.clip(0.5 * lows + 0.5 * highs, lows, highs), boxes=Interval(lows, highs))
 
 
-def _hull(start: Box | Ball | Ellipsoid) -> tuple[Array, Array]:
-    if isinstance(start, Box):
-        return np.asarray(start.low, dtype=float), np.asarray(start.high, dtype=float)
-    centre = Interval.point(np.asarray(start.center, dtype=float))
-    if isinstance(start, Ball):
-        reach = Interval.point(np.full(start.dimension, float(start.radius)))
-    else:
-        reach = iv.sqrt(Interval.point(np.diag(start.shape)))
-    return (centre - reach).lo, (centre + reach).hi
-
-
-def _round_radius(start: Ball | Ellipsoid, norm: Norm) -> float:
+def _round_radius(form: Quadratic, norm: Norm) -> float:
     """Upper bound of ||y||_P over the ball or ellipsoid {y} around its centre; inf if not proved."""
     matrix = np.eye(norm.dimension) if norm.matrix is None else norm.matrix
-    if isinstance(start, Ball):
+    if form.even:
         if norm.matrix is None:
-            return float(start.radius)
+            return float(form.radius)
         largest = iv.sqrt(Interval.point(float(eigenvalue_upper(matrix))))
-        return float((largest * float(start.radius)).hi)
-    inner = np.linalg.inv(start.shape) * (1 - 1e-9)
+        return float((largest * float(form.radius)).hi)
+    inner = np.linalg.inv(form.shape) * (1 - 1e-9)
     inner = (inner + inner.T) / 2
     point = Interval.point(inner)
-    if not bool(is_positive_definite(point - point @ Interval.point(start.shape) @ point)):
+    if not bool(is_positive_definite(point - point @ Interval.point(form.shape) @ point)):
         return float(np.inf)
     root = Interval.point(ball_root(inner))  # the ellipsoid lies in {y^T inner y <= 1}
-    return float(iv.sqrt(Interval.point(float(eigenvalue_upper(root.T @ Interval.point(matrix) @ root)))).hi)
+    longest = iv.sqrt(Interval.point(float(eigenvalue_upper(root.T @ Interval.point(matrix) @ root))))
+    return float((longest * form.radius).hi)

@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart
 from certbound.reach.nominal import Curve, Flow
 from certbound.reach.sets import ReachTube
 from certbound.rigor.intervals import Interval
@@ -187,10 +186,7 @@ def time_grid(flow: Flow, pieces: int | None) -> Array:
 def draw(flow: Flow, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
     """Starts (count, n), uniform in the initial set, and constant disturbances (count, q), uniform in D."""
     initial = flow.problem.initial
-    if isinstance(initial, GaussianStart):
-        starts = np.tile(np.asarray(initial.mean), (count, 1))
-    else:
-        starts = initial.sample(rng, count)
+    starts = np.tile(initial.middle, (count, 1)) if initial.random else initial.sample(rng, count)
     box = flow.problem.system.disturbance
     if box is None:
         return starts, np.zeros((count, 0))

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid
 from certbound.reach.nominal import Flow
 from certbound.reach.sampled.boxes import SampledTube, boxes_tube, draw, noise_free_states, scenario_count, time_grid
 
@@ -144,13 +143,12 @@ def _classifier() -> Any:
 def _membership(problem: Problem) -> Any:
     """Membership in the initial set; it must have an interior."""
     initial = problem.initial
-    if isinstance(initial, Box):
-        flat = [name for name, a, b in zip(problem.system.states, initial.low, initial.high) if not a < b]
-    else:
-        flat = [] if isinstance(initial, Ball | Ellipsoid) else list(problem.system.states)
-    if flat or (isinstance(initial, Ball) and not initial.radius > 0):
+    states = problem.system.states
+    wide = np.zeros(len(states)) if initial.random else initial.extent().lo < initial.extent().hi
+    flat = [name for name, has_width in zip(states, wide) if not has_width]
+    if flat:
         raise ValueError(
-            f"`initial` must have an interior to be hit backwards, got no width in {', '.join(flat) or 'any state'}; "
+            f"`initial` must have an interior to be hit backwards, got no width in {', '.join(flat)}; "
             'give it a width, or use method "sampled".'
         )
     return initial.contains

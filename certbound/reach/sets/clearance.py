@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.model import Tape
-from certbound.problem.sets import Ball, Ellipsoid, Inside, Outside, Region
+from certbound.problem.sets import Faces, Inside, Quadratic, Region
 from certbound.reach.nominal import Curve, Series, expand, polynomial_range
 from certbound.reach.sets.separation import polyhedral_weights, round_directions
 from certbound.rigor import intervals as iv
@@ -84,7 +84,7 @@ def constraint_clearance(tube: Sets, constraint: Inside, norm: Norm) -> Clearanc
     curve = tube.curve
     asked, span = _window(curve, constraint)
     relative = _relative(curve, constraint.region, span)
-    if isinstance(constraint, Outside):
+    if constraint.outside:
         room = _outside(tube, constraint.region, norm, relative, span)
     else:
         room = _inside(tube, constraint.region, norm, relative, span)
@@ -106,7 +106,7 @@ def _window(curve: Curve, constraint: Inside) -> tuple[NDArray[np.bool_], Interv
 def _relative(curve: Curve, region: Region, span: Interval) -> list[Series]:
     """Series of C p(s) - o(s) in the region's coordinates, valid for s in ``span``."""
     states = curve.series()
-    chosen = states if region.coordinates is None else [states[i] for i in region.coordinates]
+    chosen = [states[i] for i in region.places(len(states))]
     if not isinstance(region.center, Tape):
         if region.center is None:
             return chosen
@@ -143,11 +143,7 @@ def _lift(direction: Interval, region: Region, dimension: int) -> Interval:
     """A direction of the region's coordinates as one of the whole state."""
     if region.coordinates is None:
         return direction
-    shape = (*direction.shape[:-1], dimension)
-    low, high = np.zeros(shape), np.zeros(shape)
-    low[..., list(region.coordinates)] = direction.lo
-    high[..., list(region.coordinates)] = direction.hi
-    return Interval(low, high)
+    return Interval(region.lifted(direction.lo, dimension), region.lifted(direction.hi, dimension))
 
 
 def _room(tube: Sets, norm: Norm, gap: Interval, lifted: Interval) -> tuple[Array, Array]:
@@ -172,9 +168,9 @@ def _least(radius: Array, factor: Array) -> Clearance:
 
 
 def _inside(tube: Sets, region: Region, norm: Norm, relative: list[Series], span: Interval) -> Clearance:
-    if isinstance(region, (Ball, Ellipsoid)):
-        return _inside_round(tube, region, norm, relative, span)
-    faces, bounds = region.halfspaces()
+    if isinstance(region.form, Quadratic):
+        return _inside_round(tube, region, region.form, norm, relative, span)
+    faces, bounds = region.form.normals, region.form.bounds
     shape = (tube.curve.cells, tube.curve.pieces)
     if len(faces) == 0:
         return Clearance(radius=np.full(shape[1], np.inf), factor=np.ones(shape[1]))
@@ -188,21 +184,16 @@ def _inside(tube: Sets, region: Region, norm: Norm, relative: list[Series], span
 
 
 def _inside_round(
-    tube: Sets, region: Ball | Ellipsoid, norm: Norm, relative: list[Series], span: Interval
+    tube: Sets, region: Region, form: Quadratic, norm: Norm, relative: list[Series], span: Interval
 ) -> Clearance:
-    n, size = tube.curve.dimension, region.dimension
-    if isinstance(region, Ball):
-        scale, bound = np.eye(size), float(region.radius)
-    else:
-        scale, bound = ball_root(region.shape).T, 1.0
+    scale = np.eye(form.dimension) if form.even else ball_root(form.shape).T
     squared: Series = []
     for row in scale:
         series = _combine(relative, row)
         squared = _added(squared, product(series, series))
     ranges = polynomial_range(squared, span)
     largest = iv.sqrt(Interval(np.maximum(ranges.lo, 0.0), np.maximum(ranges.hi, 0.0)))
-    rows = np.zeros((size, n))
-    rows[:, list(range(n) if region.coordinates is None else region.coordinates)] = scale
+    rows = region.lifted(scale, tube.curve.dimension)
     spread = Interval.point(tube.radius) * tube.norm.section(rows)
     lifted = Interval.point(rows)
     if tube.generators is not None:
@@ -213,7 +204,7 @@ def _inside_round(
         image = (lifted @ tube.box.reshape(*tube.box.shape, 1))[..., 0]
         spread = spread + Interval.point(iv.sqrt(_nonnegative(iv.sq(image).sum(axis=-1))).hi)
     section = norm.section(rows)
-    room = Interval.point((bound - largest - spread).lo)
+    room = Interval.point((form.radius - largest - spread).lo)
     radius = (room / section).lo
     euclidean = float(np.linalg.norm(rows, 2))
     return _least(radius, np.full(radius.shape, section / euclidean))
@@ -242,7 +233,7 @@ def _outside(
 ) -> Clearance:
     """The best of a few separating directions per cell and piece."""
     shape = (tube.curve.cells, tube.curve.pieces)
-    picked = list(range(tube.curve.dimension) if region.coordinates is None else region.coordinates)
+    picked = region.places(tube.curve.dimension)
     points = np.stack([np.broadcast_to(series[0].mid, shape) for series in relative], axis=-1)
     best, scale = np.full(shape, -np.inf), np.ones(shape)
     for matrix in (norm.shape[np.ix_(picked, picked)], np.eye(len(picked))):
@@ -256,19 +247,19 @@ def _outside(
 
 def _directions(region: Region, points: Array, matrix: Array) -> list[tuple[Interval, Interval]]:
     """Pairs (direction a, upper bound of the obstacle's support in it) per cell and piece."""
-    if isinstance(region, (Ball, Ellipsoid)):
-        shape = region.radius**2 * np.eye(region.dimension) if isinstance(region, Ball) else region.shape
-        direction = Interval.point(round_directions(points, shape, matrix))
-        if isinstance(region, Ball):
-            height = iv.sqrt(iv.sq(direction).sum(axis=-1)) * float(region.radius)
-        else:
-            row = direction.reshape(*direction.shape[:-1], 1, direction.shape[-1])
-            height = iv.sqrt(_nonnegative((row @ Interval.point(region.shape) @ row.T)[..., 0, 0]))
-        return [(direction, height)]
-    faces, bounds = region.halfspaces()
-    pairs = []
-    for weights in polyhedral_weights(points, faces, bounds, matrix):
-        direction = Interval.point(weights) @ Interval.point(faces)
-        height = (Interval.point(weights) * Interval.point(bounds)).sum(axis=-1)
-        pairs.append((direction, height))
-    return pairs
+    match region.form:
+        case Quadratic() as form:
+            direction = Interval.point(round_directions(points, form.matrix, matrix))
+            if form.even:
+                length = iv.sqrt(iv.sq(direction).sum(axis=-1))
+            else:
+                row = direction.reshape(*direction.shape[:-1], 1, direction.shape[-1])
+                length = iv.sqrt(_nonnegative((row @ Interval.point(form.shape) @ row.T)[..., 0, 0]))
+            return [(direction, length * float(form.radius))]
+        case Faces() as form:
+            pairs = []
+            for weights in polyhedral_weights(points, form.normals, form.bounds, matrix):
+                direction = Interval.point(weights) @ Interval.point(form.normals)
+                height = (Interval.point(weights) * Interval.point(form.bounds)).sum(axis=-1)
+                pairs.append((direction, height))
+            return pairs

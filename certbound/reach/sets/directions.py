@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
+from certbound.problem.sets import Faces, Inside, Quadratic, Region
 from certbound.reach.sets.separation import polyhedral_weights
 from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
@@ -104,38 +104,38 @@ Rows = Iterator[tuple[str, Array, Array]]
 
 def _constraint(constraint: Inside, curve: NominalPieces) -> Rows:
     region, label = constraint.region, str(constraint.label)
-    if not isinstance(constraint, Outside):
-        if isinstance(region, Ball | Ellipsoid):
-            yield from _inside_round(region, label, curve)
-            return
-        a, b = _facets(region, curve)
-        for index in range(len(a)):
-            rows = np.broadcast_to(a[index], (curve.pieces, a.shape[1])).copy()
-            text = label if len(a) == 1 else f"{label} [side {index + 1}]"
-            yield text, rows, curve.least(rows, b[:, index])
-    elif isinstance(region, HalfSpace):
-        rows = np.broadcast_to(-region.normal, (curve.pieces, len(region.normal))).copy()
-        yield label, rows, curve.least(rows, Interval.point(np.full(curve.pieces, -region.bound)))
-    elif isinstance(region, Box | Polytope):
-        yield _outside_facet(region, label, curve)
-    else:
-        yield _outside_round(region, label, curve)
+    match region.form:
+        case Quadratic() as form if constraint.outside:
+            yield _outside_round(region, form, label, curve)
+        case Quadratic() as form:
+            yield from _inside_round(region, form, label, curve)
+        case Faces() as form if constraint.outside:
+            yield _outside_facet(region, form, label, curve)
+        case Faces() as form:
+            a, b = _facets(region, form, curve)
+            for index in range(len(a)):
+                rows = np.broadcast_to(a[index], (curve.pieces, a.shape[1])).copy()
+                text = label if len(a) == 1 else f"{label} [side {index + 1}]"
+                yield text, rows, curve.least(rows, b[:, index])
 
 
-def _outside_facet(region: Box | Polytope, label: str, curve: NominalPieces) -> tuple[str, Array, Array]:
+def _outside_facet(region: Region, form: Faces, label: str, curve: NominalPieces) -> tuple[str, Array, Array]:
     """The facet that the piece keeps farthest away from; for a box a mixture of facets, weighed by the noise."""
-    a, b = _facets(region, curve)
+    a, b = _facets(region, form, curve)
     if not len(a):
         raise ValueError(f"`safe` must not keep outside all states ({label}); give the box a finite side.")
+    if len(a) == 1:
+        rows = np.broadcast_to(-a[0], (curve.pieces, a.shape[1])).copy()
+        return label, rows, curve.least(rows, -b[:, 0])
     norms = np.linalg.norm(a, axis=1)
     middle = curve.controls.mean(axis=1)
     best = np.argmax((middle @ a.T - b.mid) / norms, axis=1)
     rows = -a[best]
-    if isinstance(region, Box) and curve.covariance is not None and len(a) > 1:
+    if form.axial and curve.covariance is not None:
         taken = 0.0 if curve.extent is None else curve.extent @ np.abs(a).T
         mixed = _mixed(middle, a, b.mid + taken, curve.covariance)
         rows = np.where(np.isfinite(mixed).all(axis=1, keepdims=True), mixed, rows)
-    weights = np.maximum(-rows @ a.T, 0.0) if isinstance(region, Box) else np.eye(len(a))[best]
+    weights = np.maximum(-rows @ a.T, 0.0) if form.axial else np.eye(len(a))[best]
     return label, rows, curve.least(rows, -(b * weights).sum(axis=1))
 
 
@@ -157,18 +157,17 @@ def _mixed(points: Array, faces: Array, bounds: Array, covariance: Array) -> Arr
     return np.asarray(np.stack(options)[best, np.arange(len(points))])
 
 
-def _facets(region: Box | HalfSpace | Polytope, curve: NominalPieces) -> tuple[Array, Interval]:
+def _facets(region: Region, form: Faces, curve: NominalPieces) -> tuple[Array, Interval]:
     """Rows (F, n) over all states and bounds (N, F) with the set equal to {rows . x <= bounds} on every piece."""
-    a, b = region.halfspaces()
-    rows = _embed(region, a, curve.controls.shape[2])
-    bounds = Interval.point(np.broadcast_to(b, (curve.pieces, len(b))))
+    rows = region.lifted(form.normals, curve.controls.shape[2])
+    bounds = Interval.point(np.broadcast_to(form.bounds, (curve.pieces, len(form.bounds))))
     if region.center is None:
         return rows, bounds
     centre = _centre(region, curve)
-    return rows, bounds + (Interval.point(a)[None] * centre[:, None, :]).sum(axis=-1)
+    return rows, bounds + (Interval.point(form.normals)[None] * centre[:, None, :]).sum(axis=-1)
 
 
-def _centre(region: Ball | Ellipsoid | Box | HalfSpace | Polytope, curve: NominalPieces) -> Interval:
+def _centre(region: Region, curve: NominalPieces) -> Interval:
     """Enclosure of the centre over each piece: shape (N, k)."""
     if isinstance(region.center, Tape):
         values = enclose(region.center, [curve.span()])
@@ -176,34 +175,26 @@ def _centre(region: Ball | Ellipsoid | Box | HalfSpace | Polytope, curve: Nomina
     return Interval.point(np.broadcast_to(region.center_at(), (curve.pieces, region.dimension)))
 
 
-def _embed(region: Ball | Ellipsoid | Box | HalfSpace | Polytope, rows: Array, dimension: int) -> Array:
-    coordinates = range(dimension) if region.coordinates is None else region.coordinates
-    full = np.zeros((len(rows), dimension))
-    full[:, list(coordinates)] = rows
-    return full
-
-
-def _outside_round(region: Ball | Ellipsoid, label: str, curve: NominalPieces) -> tuple[str, Array, Array]:
+def _outside_round(region: Region, form: Quadratic, label: str, curve: NominalPieces) -> tuple[str, Array, Array]:
     """Separation by the direction from the centre (for an ellipsoid: the normal of its level set)."""
     centre = _centre(region, curve)
-    coordinates = list(range(curve.controls.shape[2]) if region.coordinates is None else region.coordinates)
+    coordinates = region.places(curve.controls.shape[2])
     offset = curve.controls.mean(axis=1)[:, coordinates] - centre.mid
-    normal = np.linalg.solve(region.shape, offset.T).T if isinstance(region, Ellipsoid) else offset
+    normal = offset if form.even else np.linalg.solve(form.shape, offset.T).T
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = np.where(length > 0, normal / np.maximum(length, 1e-300), np.eye(len(coordinates))[0])
     direction = Interval.point(normal)
-    if isinstance(region, Ellipsoid):
-        square = ((direction[:, :, None] * region.shape[None]).sum(axis=1) * direction).sum(axis=-1)
-        support = Interval(np.zeros(len(square)), np.sqrt(np.maximum(square.hi, 0)) * (1 + 1e-15))
-    else:
+    if form.even:
         square = (direction * direction).sum(axis=-1)
-        support = region.radius * Interval(np.zeros(len(square)), np.sqrt(square.hi) * (1 + 1e-15))
+    else:
+        square = ((direction[:, :, None] * form.shape[None]).sum(axis=1) * direction).sum(axis=-1)
+    support = form.radius * Interval(np.zeros(len(square)), np.sqrt(np.maximum(square.hi, 0)) * (1 + 1e-15))
     offset_bound = -((direction * centre).sum(axis=-1) + Interval(support.hi, support.hi))
-    rows = _embed(region, -normal, curve.controls.shape[2])
+    rows = region.lifted(-normal, curve.controls.shape[2])
     return label, rows, curve.least(rows, offset_bound)
 
 
-def _inside_round(region: Ball | Ellipsoid, label: str, curve: NominalPieces) -> Rows:
+def _inside_round(region: Region, form: Quadratic, label: str, curve: NominalPieces) -> Rows:
     """A polygon (in one dimension an interval, beyond two a cross-polytope's dual) inside the round set."""
     centre = _centre(region, curve)
     k = centre.shape[-1]
@@ -214,17 +205,15 @@ def _inside_round(region: Ball | Ellipsoid, label: str, curve: NominalPieces) ->
         directions, scale = np.stack([np.cos(angles), np.sin(angles)], 1), np.cos(np.pi / _POLYGON) * (1 - 1e-9)
     else:
         directions, scale = np.concatenate([np.eye(k), -np.eye(k)]), (1 - 1e-12) / np.sqrt(k)
-    if isinstance(region, Ellipsoid):
-        matrix = np.linalg.inv(np.linalg.cholesky(region.shape))
+    if not form.even:
+        matrix = form.root
         scale *= 1 - 1e-9
-        image = Interval.point(matrix) @ Interval.point(region.shape) @ Interval.point(matrix.T)
+        image = Interval.point(matrix) @ Interval.point(form.shape) @ Interval.point(matrix.T)
         if not bool(np.all(is_positive_definite(image - (1 - 1e-9) ** 2 * np.eye(k)))):
             raise ValueError(f"`shape` of {label} is too badly conditioned; rescale the states.")
-        directions, radius = directions @ matrix, 1.0
-    else:
-        radius = region.radius
+        directions = directions @ matrix
     for index, direction in enumerate(directions):
         rows = np.broadcast_to(direction, (curve.pieces, k))
-        offset = (Interval.point(rows) * centre).sum(axis=-1) + float(radius * scale)
-        full = _embed(region, rows, curve.controls.shape[2])
+        offset = (Interval.point(rows) * centre).sum(axis=-1) + float(form.radius * scale)
+        full = region.lifted(rows, curve.controls.shape[2])
         yield f"{label} [direction {index + 1}]", full, curve.least(full, offset)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Ellipsoid, Inside, Region
+from certbound.problem.sets import Inside, Quadratic
 from certbound.reach.contraction import bound_forcing, integrate_radius, jump_sizes, random_start
 from certbound.reach.nominal import Curve, Flow, initial_cells
 from certbound.reach.sets import ReachTube, polyhedral_weights, round_directions
@@ -192,17 +192,17 @@ def _separations(problem: Problem, curve: Curve, norm: Norm, cell: int) -> list[
 
 
 def _separation(constraint: Inside, points: Array, curve: Curve, norm: Norm) -> Any:
-    region: Region = constraint.region
-    states = list(range(points.shape[1]) if region.coordinates is None else region.coordinates)
+    region = constraint.region
+    states = region.places(points.shape[1])
     centres = np.array([region.center_at(float(t)) for t in curve.middles])
     offsets = points[:, states] - centres
     matrices = [norm.shape[np.ix_(states, states)], np.eye(len(states))]
-    if isinstance(region, (Ball, Ellipsoid)):
-        shape = region.shape if isinstance(region, Ellipsoid) else float(region.radius) ** 2 * np.eye(len(states))
+    if isinstance(region.form, Quadratic):
+        shape = region.form.matrix
         options = [round_directions(offsets, shape, m) for m in matrices]
         rooms = [_room(a, offsets, np.sqrt(np.einsum("ki,ij,kj->k", a, shape, a)), matrices[0]) for a in options]
         return exact(np.array(options)[np.argmax(rooms, axis=0), np.arange(len(offsets))])
-    faces, bounds = region.halfspaces()
+    faces, bounds = region.form.normals, region.form.bounds
     options = [w for m in matrices for w in polyhedral_weights(offsets, faces, bounds, m)]
     rooms = [_room(w @ faces, offsets, w @ bounds, matrices[0]) for w in options]
     best = np.argmax(rooms, axis=0)

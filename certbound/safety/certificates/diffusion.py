@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from certbound.errors import CertificateError
 from certbound.gaussian.response import MartingaleEvent, SplitEvents, WindowEvents, logsumexp
 from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart
 from certbound.reach.linear import Accepted, DiffusionRun, Reference, Share, depends_on_state
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificates.linear import (
@@ -146,7 +145,7 @@ class _StatedRun(DiffusionRun):
                 granted.append(_factors(event.martingale, part))
             worst = max(worst, logsumexp(np.array([nonlinear.log, *asked])))
             part_low, part_high = (x[cell * pieces : (cell + 1) * pieces] for x in held)
-            random = isinstance(self.engine.problem.initial, GaussianStart)
+            random = self.engine.problem.initial.random
             silent = self.held.reference is self.references[1] and not random
             stopped.append({
                 "windows": [int(k) for k in own.martingales.frame.starts],

@@ -21,7 +21,7 @@ from certbound.errors import CertificateError
 from certbound.gaussian.response import StepEvents, WindowEvents, level_scale, logsumexp
 from certbound.problem.model import Tape, compile_numpy, jacobian, varying_outputs
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, Inside, Region
+from certbound.problem.sets import Inside, Quadratic
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear import Linearisation, LinearRun, Share, correlated
 from certbound.safety.answers import EngineAnswer
@@ -390,12 +390,12 @@ def _separations(problem: Problem, run: LinearRun, cell: int) -> list[Any]:
 
 
 def _separation(constraint: Inside, rows: Array) -> Any:
-    region: Region = constraint.region
-    states = list(range(rows.shape[1]) if region.coordinates is None else region.coordinates)
-    if isinstance(region, (Ball, Ellipsoid)):
-        return exact(-rows[:, states])
-    faces, _ = region.halfspaces()
-    if isinstance(region, Box):  # every face reads one state: the row tells their weights
-        return [exact(row) for row in np.maximum(-rows[:, states] @ faces.T, 0.0)]
-    distance = np.abs(faces[None] + rows[:, None, states]).sum(axis=-1)
+    region = constraint.region
+    own = rows[:, region.places(rows.shape[1])]
+    if isinstance(region.form, Quadratic):
+        return exact(-own)
+    faces = region.form.normals
+    if region.form.axial:  # every face reads one state: the row tells their weights
+        return [exact(row) for row in np.maximum(-own @ faces.T, 0.0)]
+    distance = np.abs(faces[None] + own[:, None]).sum(axis=-1)
     return [int(face) for face in np.argmin(distance, axis=1)]

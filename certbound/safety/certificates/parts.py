@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from certbound.errors import CertificateError
-from certbound.problem.sets import HalfSpace, Inside, Outside
+from certbound.problem.sets import Inside
 
 __all__ = ["Proof", "exact", "needs_direction"]
 
@@ -30,4 +30,4 @@ def exact(value: Any) -> Any:
 
 def needs_direction(constraint: Inside) -> bool:
     """Whether the proof names a direction that keeps the obstacle off, piece by piece."""
-    return isinstance(constraint, Outside) and not isinstance(constraint.region, HalfSpace)
+    return constraint.outside and constraint.region.kind != "halfspace"

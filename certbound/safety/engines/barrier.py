@@ -28,7 +28,6 @@ from certbound.constants.enclosures import bound_supremum, enclose
 from certbound.errors import EngineError
 from certbound.problem.model import Tape, compile_numpy, jacobian, substitute, trace
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, GaussianStart, HalfSpace, Polytope
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.nominal import initial_cells
 from certbound.rigor.intervals import Interval
@@ -131,11 +130,11 @@ def _refusal(problem: Problem) -> str | None:
         return f"the barrier engine searches in at most {_MOST_STATES} states."
     if problem.input_sequence is not None:
         return "the barrier engine needs a plan without steps in time."
-    if isinstance(problem.initial, GaussianStart):
+    if problem.initial.random:
         return "the barrier engine needs a bounded initial set."
     for constraint in problem.constraints:
         region = constraint.region
-        if constraint.during is not None or region.moving or not isinstance(region, Ball | Box | HalfSpace | Polytope):
+        if constraint.during is not None or region.moving or (region.form.round and not region.form.even):
             return f"the barrier engine does not treat windows, moving sets and ellipsoids ('{constraint.label}')."
     if not np.isfinite(hull_of(gaps_of(problem))).all():
         return "the barrier engine needs safe sets or a domain that bound every state."

@@ -29,7 +29,6 @@ from certbound.constants.stated import proved_or_stated, refuse_contradiction
 from certbound.display import log10_text, rounded
 from certbound.errors import CertboundError, EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart
 from certbound.reach.contraction import (
     contraction_tube,
     local_constants,
@@ -177,7 +176,7 @@ class _Work:
             self.method != "auto"
             or count < 2
             or not common.applicable
-            or isinstance(self.problem.initial, GaussianStart)
+            or self.problem.initial.random
         ):
             return common
         if common.tube is not None and common.reach is not None:
@@ -209,7 +208,7 @@ class _Work:
 
     def local_answer(self, why: str) -> EngineAnswer:
         """With constants along the reach tube plus the room that the tube needs (Thm K4)."""
-        if isinstance(self.problem.initial, GaussianStart):
+        if self.problem.initial.random:
             return EngineAnswer(
                 applicable=False, reason=f"{why} Local constants need a bounded initial set.", method=self.name
             )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from certbound.constants.enclosures import split_boxes
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Outside
+from certbound.problem.sets import Quadratic
 from certbound.rigor.intervals import Interval, sq
 
 __all__ = ["Gap", "gaps_of", "hull_of", "lies_inside"]
@@ -47,17 +47,19 @@ def gaps_of(problem: Problem) -> list[Gap]:
     n = problem.system.dimension
     found = []
     for constraint in problem.constraints:
-        region = constraint.region
-        places = list(range(n)) if region.coordinates is None else [int(place) for place in region.coordinates]
-        rows, bounds = (np.eye(len(places)), region.center_at()) if isinstance(region, Ball) else region.halfspaces()
-        if not len(rows) and not isinstance(constraint, Outside):
-            continue  # a box without finite sides
-        full = np.zeros((len(rows), n))
-        full[:, places] = rows
-        found.append(Gap(
-            rows=full, bounds=np.asarray(bounds), outside=isinstance(constraint, Outside),
-            radius=region.radius if isinstance(region, Ball) else None,
-        ))  # fmt: skip
+        region, center = constraint.region, constraint.region.center_at()
+        radius: float | None = None
+        match region.form:
+            case Quadratic() as form if form.even:
+                rows, bounds, radius = np.eye(form.dimension), center, form.radius
+            case _:
+                rows, bounds = region.halfspaces()
+                if region.center is not None:  # to the side on which less is safe
+                    moved = Interval.point(bounds) + (Interval.point(rows) * center).sum(axis=-1)
+                    bounds = moved.hi if constraint.outside else moved.lo
+                if not len(rows) and not constraint.outside:
+                    continue  # a box without finite sides
+        found.append(Gap(rows=region.lifted(rows, n), bounds=bounds, outside=constraint.outside, radius=radius))
     return found
 
 

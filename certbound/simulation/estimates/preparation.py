@@ -137,6 +137,6 @@ def _start(problem: Any, scenario: Scenario) -> tuple[Callable[[np.random.Genera
         if point.shape != (n,) or not np.all(np.isfinite(point)):
             raise ValueError(f"`initial` must hold {n} finite numbers, got {scenario.initial!r}.")
         return FixedStart(point), point
-    if initial.kind == "box" and np.array_equal(initial.low, initial.high):
-        return FixedStart(np.asarray(initial.low)), np.asarray(initial.low)
+    if initial.is_point:
+        return FixedStart(initial.middle), initial.middle
     return initial.sample, None

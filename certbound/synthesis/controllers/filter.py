@@ -32,7 +32,6 @@ from certbound.errors import CertboundError
 from certbound.problem.adapters import casadi_module
 from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart
 from certbound.safety.verification import Verdict, verify_safety
 from certbound.synthesis.controllers.held_steps import SPARE, HeldSteps, Link, ProvedStep
 from certbound.synthesis.controllers.nearest_input import NearestInput
@@ -146,7 +145,7 @@ class SafetyFilter:
     ) -> None:
         if problem.system.disturbance is not None:
             raise ValueError("`problem` must have no disturbance for the filter: its noise-free state is not known.")
-        if isinstance(problem.initial, GaussianStart):
+        if problem.initial.random:
             raise ValueError("`problem` must start in a set for the filter, got a random start.")
         if not 0 < decay <= 1:
             raise ValueError(f"`decay` must lie in (0, 1], got {decay}.")

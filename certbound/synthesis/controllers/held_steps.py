@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.errors import EnclosureError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball
 from certbound.reach.contraction import bound_forcing, integrate_radius, jump_sizes, values_on_pieces
 from certbound.reach.nominal import Curve, Flow, initial_cells, nominal_curve
 from certbound.reach.sets import ReachTube, constraint_clearance
@@ -125,7 +124,7 @@ class HeldSteps:
             ReachTube(curve=here, box=(cells.boxes - point).reshape(1, 1, -1)),
             ReachTube(curve=here, radius=[[link.radius]], metric=self.tube.constants.metric),
         ]
-        if isinstance(cells.round, Ball):
+        if cells.round is not None and cells.round[1].even:
             euclidean = cells.radii(Norm(len(state)), point.reshape(1, -1))
             around.append(ReachTube(curve=here, radius=euclidean[:, None]))
         rooms = np.max([self._rooms(reach)[:, 0] for reach in around], axis=0)

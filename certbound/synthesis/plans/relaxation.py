@@ -29,7 +29,6 @@ from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
 from certbound.synthesis.faces import Face, Plane, Round, with_parts
 from certbound.synthesis.plant import Grid, middle_of
-from certbound.synthesis.tightening import initial_center
 
 __all__ = ["bound_scale", "empty_at_once"]
 
@@ -217,7 +216,7 @@ def _propose(
     equal, right = lil_matrix((steps * n, size)), np.tile(offset, steps)
     rows = int(asked.sum())
     less, most = lil_matrix((rows, size)), np.zeros(rows)
-    start = initial_center(problem.initial)
+    start = problem.initial.middle
     normals = [_full(plane) for plane in planes]
     row = 0
     for k in range(steps):
@@ -273,7 +272,7 @@ def _dual_bound(model: _Relaxed, problem: Problem, planes: list[Plane], taken: A
             if len(model.low):
                 total -= _least(adjoint * free, model.low, model.high)
             adjoint = adjoint * state
-        total -= sum((adjoint[0, i] * arb(float(v)) for i, v in enumerate(initial_center(problem.initial))), arb(0))
+        total -= sum((adjoint[0, i] * arb(float(v)) for i, v in enumerate(problem.initial.middle)), arb(0))
         if not lower(weight) > 0:
             return math.inf
         return upper(total / weight)

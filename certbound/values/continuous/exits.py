@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Node, Tape, compile_numpy, edged, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Box, GaussianStart
+from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Reader, enclose, squared_diffusion
@@ -120,7 +120,7 @@ def _check(problem: Problem, target: Any, seconds: float) -> None:
         )
     if target is not None:
         raise InfeasibleError("value functions in continuous time do not serve targets yet.")
-    if isinstance(problem.initial, GaussianStart):
+    if problem.initial.random:
         raise InfeasibleError("value functions in continuous time do not serve a random start; use a set of starts.")
     if problem.input_sequence is not None:
         raise InfeasibleError("value functions in continuous time need a feedback law; the plan is an array.")

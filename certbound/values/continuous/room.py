@@ -8,7 +8,7 @@ import numpy as np
 
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Outside, Polytope
+from certbound.problem.sets import Inside, Quadratic, Region
 
 __all__ = ["Room", "safe_room", "starts_of"]
 
@@ -67,35 +67,27 @@ def _refuse_windows(constraint: Inside, problem: Problem) -> None:
 def _faces(constraint: Inside, problem: Problem) -> list[tuple[int, int, float, float]]:
     """(state, side, inner place, outer place) of each face of a constraint."""
     n, region = problem.system.dimension, constraint.region
-    if n > 1 and (isinstance(constraint, Outside) or not isinstance(region, (Box, HalfSpace, Polytope))):
+    if n > 1 and (constraint.outside or region.form.round):
         raise InfeasibleError(f"value functions in two states serve boxes only, not '{constraint.label}'.")
-    if isinstance(constraint, Outside):
-        return _beside(constraint, problem)
-    return _of_region(region, constraint.label)
+    return _beside(constraint, problem) if constraint.outside else _of_region(region, constraint.label)
 
 
-def _of_region(region: object, label: str) -> list[tuple[int, int, float, float]]:
+def _of_region(region: Region, label: str) -> list[tuple[int, int, float, float]]:
+    center = region.center_at()
+    if isinstance(region.form, Quadratic):  # in one state
+        reach, middle = float(np.sqrt(region.form.matrix[0, 0])), float(center[0])
+        size = abs(middle) + reach
+        return [(0, 0, *_rounded(middle - reach, 0, size)), (0, 1, *_rounded(middle + reach, 1, size))]
     faces: list[tuple[int, int, float, float]] = []
-    if isinstance(region, (Ball, Ellipsoid)):
-        reach = float(region.radius if isinstance(region, Ball) else np.sqrt(region.shape[0, 0]))
-        center = float(region.center[0])
-        return [(0, 0, *_rounded(center - reach, 0, abs(center) + reach)),
-                (0, 1, *_rounded(center + reach, 1, abs(center) + reach))]  # fmt: skip
-    if isinstance(region, Box):
-        names = range(len(region.low)) if region.coordinates is None else region.coordinates
-        for axis, low, high in zip(names, region.low, region.high):
-            faces += [(axis, 0, low, low)] if np.isfinite(low) else []
-            faces += [(axis, 1, high, high)] if np.isfinite(high) else []
-        return faces
-    if not isinstance(region, (HalfSpace, Polytope)):
-        raise InfeasibleError(f"value functions do not serve '{label}'.")
-    for normal, bound in zip(*region.halfspaces()):
+    for normal, bound in zip(region.form.normals, region.form.bounds):
         used = np.flatnonzero(normal)
         if len(used) != 1:
             raise InfeasibleError(f"value functions serve faces along the coordinates only, not '{label}'.")
-        axis, side = int(used[0]), int(normal[used[0]] > 0)
-        place = float(bound / normal[axis])
-        faces.append((axis, side, *_rounded(place, side, abs(place))))
+        axis, side = region.places(len(normal))[used[0]], int(normal[used[0]] > 0)
+        offset, middle = float(bound / normal[used[0]]), float(center[used[0]])
+        exact = region.form.axial and not middle
+        size = 0.0 if exact else abs(offset) + abs(middle)
+        faces.append((axis, side, *_rounded(offset + middle, side, size)))
     return faces
 
 
@@ -107,10 +99,10 @@ def _beside(constraint: Inside, problem: Problem) -> list[tuple[int, int, float,
         low = min(faces[0])
     if 1 in faces:
         high = max(faces[1])
-    ends = [float(problem.initial.support(np.array([[sign]]))[0]) * sign for sign in (-1.0, 1.0)]
-    if ends[1] < low:
+    around = problem.initial.hull()
+    if around.hi[0] < low:
         return [(0, 1, low, max(faces[0]))]
-    if ends[0] > high:
+    if around.lo[0] > high:
         return [(0, 0, high, min(faces[1]))]
     raise InfeasibleError(f"the starts must lie on one side of '{constraint.label}'.")
 
@@ -124,13 +116,7 @@ def _rounded(place: float, side: int, size: float) -> Ends:
 def starts_of(problem: Problem) -> list[tuple[float, float]]:
     """The bounding box of the starts, rounded outward."""
     start = problem.initial
-    if isinstance(start, Box):
-        return [(float(a), float(b)) for a, b in zip(start.low, start.high)]
-    if isinstance(start, Ball):
-        reach = np.full(start.dimension, start.radius)
-    elif isinstance(start, Ellipsoid):
-        reach = np.sqrt(np.diagonal(start.shape))
-    else:
+    if start.random:
         raise InfeasibleError(f"value functions do not serve starts of the kind {type(start).__name__}.")
-    slack = 1e-15 * (np.abs(start.center) + reach)
-    return [(float(a), float(b)) for a, b in zip(start.center - reach - slack, start.center + reach + slack)]
+    around = start.hull()
+    return [(float(a), float(b)) for a, b in zip(around.lo, around.hi)]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Box, GaussianStart, Inside, Region
+from certbound.problem.sets import Box, Inside, Region
 from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.fields import Tables
@@ -190,7 +190,7 @@ class _Work:
         self.shocks = shocks_of(system.noise, system.noise_matrix)
         self.dynamics = Dynamics(problem, parts)
         self.boxes: Boxes = boxes_of(problem, self.shocks, self.dynamics)
-        self.random = isinstance(problem.initial, GaussianStart)
+        self.random = problem.initial.random
         self.start_shocks = self._start_shocks()
         self._lengths: dict[int, list[tuple[Array, Array]]] = {}
 
@@ -207,7 +207,7 @@ class _Work:
 
     def _start_shocks(self) -> Shocks | None:
         initial = self.problem.initial
-        if not isinstance(initial, GaussianStart):
+        if not initial.random:
             return None
         if not np.any(initial.covariance):
             self.random = False
@@ -280,7 +280,6 @@ class _Work:
     def _at_random(self, above: ValueFunction, below: ValueFunction) -> tuple[float, float]:
         """Mean over a Gaussian start: one more convolution, read at the mean."""
         assert self.start_shocks is not None
-        assert isinstance(self.problem.initial, GaussianStart)
         mean = self.problem.initial.mean
         tables = Tables(above.grid, self.start_shocks, mean, mean)
         point = Grid(axes=tuple(np.array([value]) for value in mean))
@@ -321,11 +320,11 @@ class _Work:
 
     def _start_region(self) -> Region:
         initial = self.problem.initial
-        return Box(initial.mean, initial.mean) if isinstance(initial, GaussianStart) else initial
+        return Box(initial.mean, initial.mean) if initial.random else initial
 
     def _start_grid(self, region: Region, share: float) -> Grid:
         low, high = box_around([Inside(region)], self.n, 0)
-        least = 1 if isinstance(region, Box) else {1: 1, 2: 24, 3: 10}[self.n]
+        least = 1 if region.form.axial else {1: 1, 2: 24, 3: 10}[self.n]
         axes = []
         for i, (places, lengths) in enumerate(self._lengths_at(0, 0)):
             near = lengths[max(np.searchsorted(places, low[i]) - 1, 0) : np.searchsorted(places, high[i]) + 1]

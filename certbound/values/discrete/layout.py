@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Ball, Box, Ellipsoid, GaussianStart, HalfSpace, Inside, Outside, Polytope, Region
+from certbound.problem.sets import Faces, Inside, Outside, Quadratic, Region
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import tail
 from certbound.values.discrete.kernels import REACH
@@ -69,13 +69,11 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
 
 def _start_box(problem: Problem, spread: Array) -> tuple[Array, Array]:
     initial = problem.initial
-    eye = np.eye(problem.system.dimension)
-    if isinstance(initial, GaussianStart):
+    if initial.random:
         away = REACH * np.sqrt(np.diag(initial.covariance)) * (1 + 1e-12)
         return initial.mean - away, initial.mean + away
-    if isinstance(initial, Box):
-        return initial.low, initial.high
-    return -initial.support(-eye) * 1.0 - 1e-9 * spread, initial.support(eye) + 1e-9 * spread
+    around = initial.hull()
+    return around.lo, around.hi
 
 
 def _needed(problem: Problem, t: int) -> bool:
@@ -161,22 +159,21 @@ def _finer(
 ) -> tuple[Array, list[float]]:
     """Widths cut down along a round or slanted constraint, and faces that become nodes."""
     region = constraint.region
-    used = list(range(region.dimension)) if region.coordinates is None else list(region.coordinates)
+    used = region.places(region.dimension)
     if axis not in used:
         return widths, []
     place = used.index(axis)
     center = region.center_at(t)[place]
-    if isinstance(region, Box):
-        return widths, [float(end + center) for end in (region.low[place], region.high[place]) if np.isfinite(end)]
-    if isinstance(region, HalfSpace | Polytope):
-        normals, bounds = region.halfspaces()
-        alone = [np.count_nonzero(row) == 1 for row in normals]
-        faces = [float(b / row[place]) for row, b, one in zip(normals, bounds, alone) if one and row[place]]
-        slanted = any(row[place] and not one for row, one in zip(normals, alone))
-        return (np.minimum(widths, fine) if slanted else widths), faces
-    assert isinstance(region, Ball | Ellipsoid)
-    if not isinstance(constraint, Outside):
-        return np.minimum(widths, fine), []
-    half = float(region.radius) if isinstance(region, Ball) else float(np.sqrt(region.shape[place, place]))
-    near = np.abs(places - center) <= half + float(np.max(np.diff(places)))
-    return np.where(near, np.minimum(widths, fine), widths), []
+    match region.form:
+        case Faces() as form:
+            alone = [np.count_nonzero(row) == 1 for row in form.normals]
+            rows = [(row[place], bound, one) for row, bound, one in zip(form.normals, form.bounds, alone) if row[place]]
+            slanted = not all(one for _, _, one in rows)
+            faces = [float(bound / entry + center) for entry, bound, one in rows if one]
+            return (np.minimum(widths, fine) if slanted else widths), faces
+        case Quadratic() as form:
+            if not constraint.outside:
+                return np.minimum(widths, fine), []
+            half = float(form.radius * np.sqrt(form.shape[place, place]))
+            near = np.abs(places - center) <= half + float(np.max(np.diff(places)))
+            return np.where(near, np.minimum(widths, fine), widths), []
