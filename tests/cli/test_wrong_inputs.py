@@ -159,7 +159,7 @@ def test_the_files_are_right_but_for_what_is_changed(tmp_path: Path) -> None:
         ("mathematics", "np.sin"),
         ("scalar_noise", "np.eye(2)"),
         ("too_many", "must return 1 values"),
-        ("bare_noise", "cb.Gaussian(std=...)"),
+        ("bare_noise", "cb.Gaussian(std=..."),
         ("nothing", "must be a cb.Problem"),
         ("dividing", "division by zero"),
         ("missing", "has no 'missing'"),

@@ -224,8 +224,8 @@ class _Reader:
             return {}
         if table.diffusion is not None or table.law not in LAWS:
             raise ValueError(
-                f"`noise` must hold `law` ({', '.join(LAWS)}), one level and at most `matrix` in discrete "
-                f"time, got {table.law!r}; `diffusion` is for continuous time."
+                f"`noise.law` must be one of {', '.join(LAWS)} in discrete time, beside one level and at most `matrix`, "
+                f"got {table.law!r}; `diffusion` is for continuous time."
             )
         build, entries = LAWS[table.law], dict(table.model_extra or {})
         flags = {key: entries.pop(key) for key in list(entries) if any(key in law.flags for law in LAWS.values())}
