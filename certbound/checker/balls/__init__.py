@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from certbound.checker.balls.eigen import cholesky, largest_eigenvalue
 from certbound.checker.balls.matrices import (
-    balance,
     column,
     diagonal,
     identity,
@@ -18,7 +17,6 @@ from certbound.checker.balls.matrices import (
 from certbound.checker.balls.normal import below_and_above, tail
 
 __all__ = [
-    "balance",
     "below_and_above",
     "cholesky",
     "column",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,11 +10,8 @@ from flint import arb, arb_mat
 from certbound.checker.report import Budget
 
 __all__ = [
-    "balance", "column", "diagonal", "identity", "is_positive_definite", "magnitude", "matrix", "quadratic", "row_sums",
-    "upper",
+    "column", "diagonal", "identity", "is_positive_definite", "magnitude", "matrix", "quadratic", "row_sums", "upper",
 ]  # fmt: skip
-
-_SWEEPS, _FARTHEST = 20, 300
 
 
 def matrix(rows: Sequence[Sequence[Any]]) -> arb_mat:
@@ -61,23 +57,6 @@ def row_sums(a: arb_mat) -> arb:
     for start in range(0, len(values), columns):
         best = arb.max(best, sum(values[start : start + columns], arb(0)))
     return best.upper()
-
-
-def balance(a: arb_mat) -> list[arb]:
-    """Powers of two u for which the rows and columns of a_ij u_j / u_i are about equal: any choice serves."""
-    n = a.nrows()
-    sizes = [[float(a[i, j].abs_upper()) if i != j else 0.0 for j in range(n)] for i in range(n)]
-    exponents = [0] * n
-    for _ in range(_SWEEPS):
-        before = list(exponents)
-        for i in range(n):
-            row = sum(sizes[i][j] * 2.0 ** (exponents[j] - exponents[i]) for j in range(n))
-            down = sum(sizes[j][i] * 2.0 ** (exponents[i] - exponents[j]) for j in range(n))
-            if 0 < row < math.inf and 0 < down < math.inf:
-                exponents[i] = max(-_FARTHEST, min(_FARTHEST, exponents[i] + round(math.log2(row / down) / 2)))
-        if exponents == before:
-            break
-    return [arb(2) ** exponent for exponent in exponents]
 
 
 def quadratic(first: arb_mat, form: arb_mat, second: arb_mat) -> arb:

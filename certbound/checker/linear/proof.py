@@ -17,7 +17,7 @@ from itertools import pairwise
 
 from flint import arb, arb_mat, ctx
 
-from certbound.checker.balls import balance, column, diagonal, identity, magnitude, row_sums, upper
+from certbound.checker.balls import column, diagonal, identity, magnitude, row_sums, upper
 from certbound.checker.linear.diffusion import Along, Asked, StateNoise, Stopped
 from certbound.checker.linear.events import Windows, chain, sub_gaussian
 from certbound.checker.linear.families import Family, leaving
@@ -26,6 +26,7 @@ from certbound.checker.linear.response import (
     Load,
     Piece,
     Supports,
+    balance,
     continuous_piece,
     covariances,
     discrete_piece,

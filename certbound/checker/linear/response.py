@@ -12,6 +12,7 @@ Discrete time: F = A, Gamma = I, Q = W, D = S = 0. Source: Thm K7 of docs/theory
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,10 +22,12 @@ from certbound.checker.balls import column, diagonal, identity, magnitude, row_s
 from certbound.checker.report import Budget, Unproved
 
 __all__ = [
-    "Load", "Piece", "Supports", "continuous_piece", "covariances", "discrete_piece", "over_piece", "supports",
+    "Load", "Piece", "Supports", "balance", "continuous_piece", "covariances", "discrete_piece", "over_piece",
+    "supports",
 ]  # fmt: skip
 
 _TERMS = 60
+_SWEEPS, _FARTHEST = 20, 300
 _SMALL = arb(2) ** -100
 _ROWS, _BLOCK = 512, 3e6
 """Rows that are carried back together, and products of numbers between two looks at the clock."""
@@ -77,6 +80,23 @@ def _series(
         if rest is not None and rest < _SMALL * (1 + row_sums(total)):
             return total + arb_mat(n, n, [arb(0, rest)] * (n * n))
     raise Unproved("the pieces are too long for the slope: its norm times a piece's length is beyond all use")
+
+
+def balance(a: arb_mat) -> list[arb]:
+    """Powers of two u for which the rows and columns of a_ij u_j / u_i are about equal: any choice serves."""
+    n = a.nrows()
+    sizes = [[float(a[i, j].abs_upper()) if i != j else 0.0 for j in range(n)] for i in range(n)]
+    exponents = [0] * n
+    for _ in range(_SWEEPS):
+        before = list(exponents)
+        for i in range(n):
+            row = sum(sizes[i][j] * 2.0 ** (exponents[j] - exponents[i]) for j in range(n))
+            down = sum(sizes[j][i] * 2.0 ** (exponents[i] - exponents[j]) for j in range(n))
+            if 0 < row < math.inf and 0 < down < math.inf:
+                exponents[i] = max(-_FARTHEST, min(_FARTHEST, exponents[i] + round(math.log2(row / down) / 2)))
+        if exponents == before:
+            break
+    return [arb(2) ** exponent for exponent in exponents]
 
 
 def continuous_piece(

@@ -7,9 +7,9 @@ import random
 import pytest
 from flint import arb, arb_mat
 
-from certbound.checker.balls import balance, column, diagonal, matrix, row_sums
+from certbound.checker.balls import column, diagonal, matrix, row_sums
 from certbound.checker.linear import response
-from certbound.checker.linear.response import Load, continuous_piece, supports
+from certbound.checker.linear.response import Load, balance, continuous_piece, supports
 from certbound.checker.report import Budget, Unproved
 
 UNITS = [arb(2) ** 40, arb(1), arb(2) ** -30]
