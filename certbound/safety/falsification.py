@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.errors import CertboundError
-from certbound.problem.model import compile_numpy, varying_outputs
+from certbound.problem.model import compile_numpy, edged, varying_outputs
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Outside, clearance
 from certbound.reach.nominal import Flow
@@ -104,7 +104,7 @@ def _follow(flow: Flow, starts: Array, signals: Array) -> tuple[Array, Array]:
     paths = np.empty((len(starts), steps + 1, flow.dimension))
     paths[:, 0] = x = starts
     with np.errstate(all="ignore"):
-        if paths.size <= _WHOLE and not any(varying_outputs(flow.state_jacobian)):
+        if paths.size <= _WHOLE and not edged(flow.tape) and not any(varying_outputs(flow.state_jacobian)):
             advance, pushes = _affine(flow, times, rows, signals)
             for k in range(steps):
                 paths[:, k + 1] = x = x @ advance.T + pushes[:, k]

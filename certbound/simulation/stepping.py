@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.problem.model import Node, Tape, compile_numpy, jacobian, trace
+from certbound.problem.model import Node, Tape, compile_numpy, edged, jacobian, trace
 from certbound.problem.noise import Law, check_law
 from certbound.simulation.tape_text import live_nodes
 from certbound.simulation.transition import exact_transition
@@ -246,7 +246,7 @@ def _affine(tape: Tape, n: int) -> tuple[Array, Array] | None:
     if any(tape.nodes[index] == Node("input", (0,)) for index in live_nodes(tape)):
         return None
     derivative = jacobian(tape, tuple(range(1, len(tape.inputs))))
-    if not _constant(derivative):
+    if edged(tape) or not _constant(derivative):  # what jumps has derivative 0 between its jumps
         return None
     zeros = [0.0] * len(tape.inputs)
     return compile_numpy(derivative)(*zeros), compile_numpy(tape)(*zeros)

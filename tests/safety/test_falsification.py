@@ -128,3 +128,10 @@ def test_affine_dynamics_are_followed_as_step_by_step(time: str, monkeypatch: py
     assert np.array_equal(times, again)
     assert np.abs(single).max() > 1
     assert np.allclose(whole, single, rtol=1e-12, atol=1e-12)
+
+
+def test_what_jumps_is_not_followed_as_affine() -> None:
+    system = DiscreteSystem(lambda x: [0.5 * x[0] + np.sign(x[0] - 1.0)], states=1, noise=Gaussian(std=0.01))
+    flow = Flow(Problem(system, initial=[3.0], safe=[Inside(Box([-9.0], [9.0]))], horizon=2))
+    paths = falsification._follow(flow, np.array([[3.0]]), np.zeros((1, 0)))[1]
+    assert paths[0, :, 0] == pytest.approx([3.0, 2.5, 2.25])

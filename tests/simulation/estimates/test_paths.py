@@ -43,6 +43,15 @@ def test_a_linear_system_has_the_moments_of_its_scheme(scheme):
     assert abs(paths.var() / variance - 1) < 5 * np.sqrt(2 / 40_000)
 
 
+def test_a_jump_beside_a_linear_part_is_no_linear_system():
+    def pulled(x):
+        return [-0.5 * np.sign(x[0]) - x[0]]
+
+    system = cb.ContinuousSystem(pulled, states=1, diffusion=[[1e-9]])
+    paths = sample_paths(cb.Problem(system, initial=[0.2], safe=[], horizon=0.25), paths=1, rng=0)
+    assert paths[0, -1, 0] == pytest.approx(0.7 * np.exp(-0.25) - 0.5, abs=1e-3)
+
+
 def test_twelve_coupled_states_have_the_covariance_of_the_scheme():
     gain = np.zeros((12, 2))
     gain[0, 0], gain[5, 1], gain[5, 0] = 1.0, 0.5, 0.3
