@@ -239,9 +239,9 @@ class ErosionProgram:
 
     def propose(self, value: float, alpha: float, beta: float, clearances: ArrayLike) -> Array:
         """The metric of least max_j a_j^T P^-1 a_j / clearance_j^2."""
-        weights = (np.asarray(clearances, dtype=float) / self._sizes) ** 2
+        weights = np.asarray(clearances, dtype=float) / self._sizes
         self._value.value, self._alpha.value, self._beta.value = float(value), float(alpha), float(beta)
-        self._weights.value = weights / weights.max()
+        self._weights.value = (weights / weights.max()) ** 2
         self.status = solve(self._problem)
         return _symmetric(self._root.T @ self._metric.value @ self._root)
 

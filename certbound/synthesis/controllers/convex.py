@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.errors import SolverError
 from certbound.problem.adapters import casadi_module
-from certbound.problem.model import Tape, jacobian
+from certbound.problem.model import Tape, edged, jacobian
 from certbound.problem.problem import Problem
 from certbound.synthesis.costs import cost_of
 from certbound.synthesis.faces import Face, Facets, Round, with_parts
@@ -106,7 +106,7 @@ class ConvexPlanner:
         n, m = system.dimension, len(system.input_names)
         slots = range(1 + n + m + len(system.disturbance_names))
         bent = depends_on(jacobian(system.dynamics, range(1, 1 + n + m)), slots)
-        self.linear = not bent and not depends_on(system.dynamics, [0])
+        self.linear = not bent and not edged(system.dynamics) and not depends_on(system.dynamics, [0])
         self._last: tuple[Array, Array] | None = None
 
     @cached_property

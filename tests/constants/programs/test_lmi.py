@@ -112,7 +112,8 @@ def test_the_erosion_program_is_best_for_the_clearances_it_was_given():
         assert certify_gain(own, members) ** 2 <= 0.9806 + 1e-6
         assert ratios(own, weights).max() < 0.99 * ratios(other, weights).max()
     assert np.sort(ratios(found[0], choices[0]))[-2] > 0.999 * ratios(found[0], choices[0]).max()
-    np.testing.assert_allclose(program.propose(0.9806, 0.7, 0.3, 3 * choices[0]), found[0], rtol=1e-6)
+    for scale in (3, 1e200):
+        np.testing.assert_allclose(program.propose(0.9806, 0.7, 0.3, scale * choices[0]), found[0], rtol=1e-6)
 
 
 def test_a_feedback_and_its_metric_are_designed_together():
