@@ -224,7 +224,7 @@ class _Reader:
             return {}
         if table.diffusion is not None or table.law not in LAWS:
             raise ValueError(
-                f"`noise.law` must be one of {', '.join(LAWS)} in discrete time, beside one level and at most `matrix`, "
+                f"`noise.law` must be one of {', '.join(LAWS)} in discrete time, with one level and at most `matrix`, "
                 f"got {table.law!r}; `diffusion` is for continuous time."
             )
         build, entries = LAWS[table.law], dict(table.model_extra or {})
