@@ -31,7 +31,7 @@ BUDGETS = {
 }  # fmt: skip
 """Seconds of processor time that an answer may take; a slower one is a finding."""
 PATHS = 10_000
-FINER = (4, 16, 64)
+FINER = (4, 16, 64, 256)
 """Refinements of the time step that must confirm a contradiction in continuous time."""
 MARGIN = 1e-9
 """Share by which log10 of a probability may differ from its limit by rounding."""
