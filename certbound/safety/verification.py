@@ -161,8 +161,8 @@ def verify_safety(
         With a plan if its system has inputs.
     method : str
         "auto" runs every engine that fits and keeps the smallest probability (those in reserve only where the others
-        have not proved SAFE); an engine's name runs that one (`certbound.safety.portfolio`: linear, constants,
-        barrier, values); a tube method such as "kummer" or "thm3" runs the constants engine with that tube.
+        have not proved SAFE); the name of an engine (``ENGINES`` of `certbound.safety.portfolio`), such as "linear" or
+        "values", runs that one; a tube method such as "kummer" or "thm3" runs the constants engine with that tube.
     cells : int, optional
         Parts along each side of the initial set.
     constants : Constants, optional
