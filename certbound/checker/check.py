@@ -9,10 +9,7 @@ from typing import Any
 
 from flint import arb, ctx
 
-from certbound.checker.barrier import check_barrier
 from certbound.checker.claims import ENGINES, assumptions, claim, engine_of
-from certbound.checker.constants import check_constants
-from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, read, text
 from certbound.checker.report import Budget, Report, Unproved
 from certbound.checker.statement import first_difference, read_model
@@ -26,8 +23,6 @@ VERSION = 1
 SECONDS = 300.0
 """Time that a check may take."""
 PRECISION = 128
-
-_ENGINES = {"linear": check_linear, "constants": check_constants, "barrier": check_barrier}
 
 
 def check_file(
@@ -95,7 +90,7 @@ def check_data(
                 difference = first_difference(record["problem"], problem)
                 if difference:
                     raise Unproved(f"the certificate speaks of another problem: {difference}")
-            proved = _ENGINES[engine](model, proof, budget)
+            proved = ENGINES[engine].prove(model, proof, budget)
             _compare(proved, level)
         except Unproved as error:
             return Report(
@@ -130,4 +125,4 @@ def _reason(engine: str, proved: float, compared: bool, assumed: Sequence[str]) 
     found = f"the probability is at most 10^{rounded(proved, up=True)}"
     bound = "no noise can break them" if proved <= -1e12 else found
     but = "but what the claim assumes " if assumed else ""
-    return f"every inequality {but}was proved again in ball arithmetic, by {ENGINES[engine]}: {bound}{same}"
+    return f"every inequality {but}was proved again in ball arithmetic, by {ENGINES[engine].words}: {bound}{same}"

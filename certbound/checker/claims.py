@@ -7,28 +7,51 @@ assumption: the claim says for which disturbances it holds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 from flint import arb
 
+from certbound.checker.barrier import check_barrier
+from certbound.checker.constants import check_constants
+from certbound.checker.linear import check_linear
 from certbound.checker.reading import number
+from certbound.checker.report import Budget
 from certbound.checker.statement import Model
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["ENGINES", "STATED", "assumptions", "claim", "engine_of", "foresees"]
+__all__ = ["ENGINES", "STATED", "Engine", "assumptions", "claim", "engine_of"]
 
-ENGINES = {
-    "linear": "linear response (Thm K7)",
-    "constants": "contraction constants (Thms K2, K5)",
-    "barrier": "a barrier that is the exponential of a polynomial",
-}
 STATED = "the stated constants hold"
 """How a certificate's own list names what `assumptions` derives from the proof."""
 
 _ANY = "for every disturbance in its set, even one that sees coming noise"
 _BLIND = "for every disturbance in its set that does not see coming noise"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Engine:
+    """One way to prove a certificate.
+
+    Parameters
+    ----------
+    words : str
+        What it is, for the report.
+    prove : callable
+        ``prove(model, proof, budget)`` to an upper bound of the probability that a constraint is broken.
+    foresees : callable
+        ``foresees(model)``: whether the bound covers even disturbances that see coming noise. Bounds that rest on
+        supermartingales do not: foresight would spoil these.
+    assumes : callable
+        ``assumes(model, proof)`` to what the proof takes for granted, in words; None where nothing.
+    """
+
+    words: str
+    prove: Callable[[Model, object, Budget], arb]
+    foresees: Callable[[Model], bool] = lambda model: False
+    assumes: Callable[[Model, Mapping[str, object]], str | None] = lambda model, proof: None
 
 
 def engine_of(proof: object, method: str) -> str:
@@ -46,25 +69,22 @@ def engine_of(proof: object, method: str) -> str:
     return engine
 
 
-def foresees(model: Model, engine: str) -> bool:
-    """Whether the engine's bound covers even disturbances that see coming noise.
-
-    The linear response bounds a Gaussian process that no disturbance moves, and all else path by path. The other
-    proofs, and noise that depends on the state, rest on supermartingales, which foresight would spoil.
-    """
-    return engine == "linear" and not isinstance(model.noise.diffusion, Tape)
-
-
 def assumptions(model: Model, proof: Mapping[str, object], named: Sequence[str]) -> list[str]:
     """What the proof takes for granted, and what else the file says that it assumes, in quotes."""
-    own = []
-    if proof["engine"] == "constants" and proof.get("assumed") is True:
-        own.append(_stated(model, proof))
+    found = ENGINES[str(proof["engine"])].assumes(model, proof)
+    own = [] if found is None else [found]
     return own + [f"as the file says, {quoted(item, 200)}" for item in named if not (own and item == STATED)]
 
 
-def _stated(model: Model, proof: Mapping[str, object]) -> str:
+def _additive(model: Model) -> bool:
+    """The linear response bounds a Gaussian process that no disturbance moves, and all else path by path."""
+    return not isinstance(model.noise.diffusion, Tape)
+
+
+def _stated(model: Model, proof: Mapping[str, object]) -> str | None:
     """The stated constants; rounded down, they are no weaker an assumption than the proof's."""
+    if proof.get("assumed") is not True:
+        return None
     name, unit = ("rate", " 1/s") if model.continuous else ("gain", " per step")
     rate, sigma, nu = (
         rounded(number(proof.get(key), f"proof.{key}"), up=False) for key in ("rate", "sigma", "nu")
@@ -80,7 +100,7 @@ def claim(model: Model, engine: str, level: float, assumed: Sequence[str]) -> st
     """The claim as one sentence."""
     unit = "s" if model.continuous else "steps"
     start = "a normal start" if model.initial.covariance is not None else "every start in the initial set"
-    whose = "" if not model.disturbance else f", {_ANY if foresees(model, engine) else _BLIND},"
+    whose = "" if not model.disturbance else f", {_ANY if ENGINES[engine].foresees(model) else _BLIND},"
     safe = "at most" if arb(level) <= arb(model.delta).log() / arb(10).log() else "more than"
     words = (
         f"from {start}{whose} the problem {quoted(model.name)} breaks one of its {len(model.constraints)} constraints "
@@ -88,3 +108,11 @@ def claim(model: Model, engine: str, level: float, assumed: Sequence[str]) -> st
         f"({safe} delta = {plainly(model.delta)})"
     )
     return words + "".join(f"; assuming that {item}" for item in assumed)
+
+
+ENGINES = {
+    "linear": Engine(words="linear response (Thm K7)", prove=check_linear, foresees=_additive),
+    "constants": Engine(words="contraction constants (Thms K2, K5)", prove=check_constants, assumes=_stated),
+    "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
+}
+"""By the name that a proof gives: all that the checker knows of an engine."""

@@ -39,7 +39,8 @@ def fitted_constants_along(source: Any, times: ArrayLike, boxes: Interval, *, re
 
     Raises
     ------
-    As `constants_along`; a fit that fails leaves the identity.
+    EnclosureError, ValueError
+        As `constants_along`; a fit that fails leaves the identity.
 
     Source: Thm K4 and Sec. 6 of docs/theory.md.
     """

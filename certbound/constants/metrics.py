@@ -185,7 +185,8 @@ def bound_metrics(
     ------
     TypeError
         If ``problem`` is no Problem.
-    As ``bound_constants``.
+    InfeasibleError, EnclosureError, ValueError
+        As ``bound_constants``.
 
     Source: "one metric per constraint", Sec. 4 and 6 of docs/theory.md.
     """

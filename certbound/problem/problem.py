@@ -49,6 +49,8 @@ class Problem(Shown):
         For humans.
     parameters : mapping, optional
         Parameters that the problem was built with, for the record.
+    source : mapping, optional
+        The content of the problem file it came from, for saving it as written; dropped by ``replace``.
 
     Raises
     ------
@@ -77,7 +79,6 @@ class Problem(Shown):
     name: str = field(default="problem", kw_only=True)
     parameters: Any = field(default=None, kw_only=True)
     source: Any = field(default=None, kw_only=True, repr=False)
-    """The content of the problem file it came from, for saving it as written; dropped by ``replace``."""
     _closed_loop: Tape | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:

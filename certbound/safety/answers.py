@@ -1,4 +1,4 @@
-"""What an engine answers, before a verdict is made of it."""
+"""What an engine answers, before a verdict is made of it, and the shape of the proof that a certificate states."""
 
 from __future__ import annotations
 
@@ -12,14 +12,21 @@ from flint import arb
 from numpy.typing import NDArray
 
 from certbound.display import Shown, rounded
+from certbound.errors import CertificateError
 from certbound.reach.sets import ReachTube
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
 
-__all__ = ["AS_IT_IS", "Answered", "Deviation", "EngineAnswer", "Request", "is_at_most", "is_more_than", "settled"]
+__all__ = [
+    "AS_IT_IS", "Answered", "Deviation", "EngineAnswer", "Proof", "Request", "exact", "is_at_most", "is_more_than",
+    "settled",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
+
+Proof = tuple[dict[str, Any], float, list[str]]
+"""The proof's data, the claimed log10 of the probability, and what is assumed."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -153,6 +160,19 @@ class Request:
 
 AS_IT_IS = Request()
 """Nothing but the problem."""
+
+
+def exact(value: Any) -> Any:
+    """Floats as hexadecimal strings, arrays as nested lists of them."""
+    if isinstance(value, (float, np.floating)):
+        if not np.isfinite(value):
+            raise CertificateError(f"the proof holds the number {value}, which no certificate can state.")
+        return float(value).hex()
+    if isinstance(value, np.ndarray):
+        return exact(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [exact(item) for item in value]
+    return value
 
 
 class Answered(Protocol):

@@ -18,8 +18,7 @@ from certbound.problem.model import Tape
 from certbound.problem.noise import Law, check_law
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
-from certbound.safety.answers import Answered, EngineAnswer, is_at_most
-from certbound.safety.certificates import Proof, exact
+from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most
 from certbound.safety.portfolio import ENGINES
 
 __all__ = ["FORMAT", "VERSION", "certificate_data", "certificate_text", "problem_data", "restated"]

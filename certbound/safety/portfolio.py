@@ -1,7 +1,6 @@
 """The engines of ``verify_safety``, one row each: whatever asks, explains, certifies or tests engines reads the rows.
 
-A new engine is a module in `certbound.safety.engines`, its row here, and, for certificates, a writer in
-`certbound.safety.certificates` with its proof in the checker.
+An engine from outside is a row too: ``ENGINES["mine"] = Engine(name="mine", ...)``. How one is added: CONTRIBUTING.md.
 """
 
 from __future__ import annotations
@@ -10,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from certbound.problem.problem import Problem
-from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificates import Proof, barrier_proof, constants_proof, response_proof
+from certbound.safety.answers import EngineAnswer, Proof
+from certbound.safety.certificates import barrier_proof, constants_proof, response_proof
 from certbound.safety.engines import barrier_engine, constants_engine, linear_engine, values_engine
 
 __all__ = ["ENGINES", "Engine", "engine_named"]
@@ -26,7 +25,9 @@ class Engine:
     name : str
         What ``method=`` and ``--method`` take, and what certificates call it.
     words : str
-        What it does, for tables and messages.
+        What it does.
+    when : str
+        When it is asked, and where it says most: with ``words`` the table of the documentation.
     prove : callable
         ``prove(problem, request)`` to an `EngineAnswer`; ``prove(problem)`` asks for nothing but the problem.
     write : callable, optional
@@ -43,6 +44,7 @@ class Engine:
 
     name: str
     words: str
+    when: str
     prove: Callable[..., EngineAnswer]
     write: Callable[[Problem, EngineAnswer, int], Proof] | None = None
     methods: bool = False
@@ -57,6 +59,8 @@ ENGINES: dict[str, Engine] = {
         Engine(
             name="linear",
             words="the exact Gaussian response of the linearised model with a rigorous remainder (Thm K7)",
+            when="always; says most where the noise is small against the curvature of the model, and where there are "
+            "many states",
             prove=linear_engine,
             write=response_proof,
             again=True,
@@ -64,6 +68,8 @@ ENGINES: dict[str, Engine] = {
         Engine(
             name="constants",
             words="rate or gain, noise and a metric, a tube by formula, set erosion (Thms K1 to K5, Table I)",
+            when="always, but beyond 60 states only while `linear` has not settled the question; takes over where the "
+            "noise is too large for a linearisation, and takes constants that you state",
             prove=constants_engine,
             write=constants_proof,
             methods=True,
@@ -71,6 +77,7 @@ ENGINES: dict[str, Engine] = {
         Engine(
             name="barrier",
             words="the exponential of a polynomial that grows slowly in the mean (continuous time, few states)",
+            when="while nothing else has proved SAFE",
             prove=barrier_engine,
             write=barrier_proof,
             reserve=True,
@@ -78,6 +85,8 @@ ENGINES: dict[str, Engine] = {
         Engine(
             name="values",
             words="the probability itself as a function on a grid, from both sides (Thm K8, up to three states)",
+            when="while nothing else has proved SAFE; the only one with a lower bound, so the only one that answers "
+            "UNSAFE",
             prove=values_engine,
             reserve=True,
             dear=True,

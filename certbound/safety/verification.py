@@ -43,9 +43,6 @@ class Verdict(Shown):
     log10_delta : float
         log10 of the smallest bound on that probability that was proved: finite, at most 0 (0: nothing was). SAFE
         exactly when it is at most log10 of the problem's delta.
-    log10_lower : float or None
-        log10 of a proved lower bound of the probability from the worst start, under the worst disturbance; None where
-        no engine has one.
     margin : float or None
         Least Euclidean distance to breaking a constraint that the tube at delta leaves; negative: it does not fit.
     time, constraint
@@ -62,6 +59,9 @@ class Verdict(Shown):
         What the verdict is about.
     answers : mapping
         What every engine answered, by name.
+    log10_lower : float or None
+        log10 of a proved lower bound of the probability from the worst start, under the worst disturbance; None where
+        no engine has one.
     """
 
     status: str
@@ -161,8 +161,8 @@ def verify_safety(
         With a plan if its system has inputs.
     method : str
         "auto" runs every engine that fits and keeps the smallest probability (those in reserve only where the others
-        have not proved SAFE); an engine's name runs that one (`certbound.safety.portfolio`: linear, constants,
-        barrier, values); a tube method such as "kummer" or "thm3" runs the constants engine with that tube.
+        have not proved SAFE); the name of an engine (``ENGINES`` of `certbound.safety.portfolio`), such as "linear" or
+        "values", runs that one; a tube method such as "kummer" or "thm3" runs the constants engine with that tube.
     cells : int, optional
         Parts along each side of the initial set.
     constants : Constants, optional

@@ -53,14 +53,14 @@ class Constants(Shown):
 
     Parameters
     ----------
-    rate, gain : float or array_like, optional
-        Exactly one: matrix measure bound c in 1/s (continuous time) or Lipschitz bound L > 0 per step (discrete
-        time); an array holds one value per piece of ``times``.
     sigma : float or array_like
         Noise level in the metric: g g^T <= sigma^2 P^-1 (CT), variance proxy of the noise (DT, measured in the
         metric of the next step).
     dimension : int
         State dimension n.
+    rate, gain : float or array_like, optional
+        Exactly one: matrix measure bound c in 1/s (continuous time) or Lipschitz bound L > 0 per step (discrete
+        time); an array holds one value per piece of ``times``.
     effective_dimension : float, optional
         nu with tr(P g g^T) <= nu sigma^2 at every time and state; ``dimension`` when omitted.
     metric : array_like, shape (n, n), optional
@@ -70,11 +70,13 @@ class Constants(Shown):
     gaussian : bool
         Asserts that the noise of a discrete-time system is Gaussian (implied by ``isotropic``; a Wiener process
         always is).
+    times : array_like, optional
+        Piece ends, one entry more than the per-piece values, which hold on [times[k], times[k+1]).
     noise_bound : float or array_like, optional
         Almost-sure bound of ||w_t|| in the metric of the next step (discrete time): every tube is then cut by the
         almost-sure bound, pointwise.
-    times : array_like, optional
-        Piece ends, one entry more than the per-piece values, which hold on [times[k], times[k+1]).
+    proof : Proof, optional
+        How they were proved, of constants that certbound found; None: stated.
 
     Source: Assumptions 1-3 (paper), with E4 and Sec. 7.2-7.3 of docs/theory.md.
     """

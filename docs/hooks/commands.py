@@ -1,17 +1,26 @@
-"""Fills the page on the command line from the commands themselves when the site is built."""
+"""Fills in the commands and the table of engines from the program itself when the site is built."""
 
 from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["command_sections", "on_page_markdown"]
-
-PLACE = "<!-- commands -->"
+__all__ = ["command_sections", "engine_table", "on_page_markdown"]
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace the placeholder by one section a command."""
-    return markdown.replace(PLACE, command_sections()) if PLACE in markdown else markdown
+    """Replace the placeholders by one section a command, and by one row an engine."""
+    for place, text in (("<!-- commands -->", command_sections), ("<!-- engines -->", engine_table)):
+        if place in markdown:
+            markdown = markdown.replace(place, text())
+    return markdown
+
+
+def engine_table() -> str:
+    """What every engine does, and when it is asked, as a Markdown table."""
+    from certbound.safety.portfolio import ENGINES
+
+    rows = [f"| `{row.name}` | {_cell(row.words)} | {_cell(row.when)} |" for row in ENGINES.values()]
+    return "\n".join(["| engine | what it does | when it is asked |", "|---|---|---|", *rows])
 
 
 def command_sections() -> str:

@@ -16,8 +16,8 @@ import numpy as np
 
 import certbound as cb
 from certbound.checker import parse
+from certbound.safety.answers import exact
 from certbound.safety.certificate import certificate_text, problem_data
-from certbound.safety.certificates.parts import exact
 from certbound.safety.verification import verify_safety
 from tests.checker import conftest
 from tests.checker.linear.test_diffusion import growth

@@ -16,8 +16,8 @@ from certbound.checker.expressions.arithmetic import Undecided, generalised_kink
 from certbound.checker.expressions.operations import OPERATIONS
 from certbound.errors import CertificateError
 from certbound.problem.model.tape import ARITY, JUMPS
+from certbound.safety.answers import exact
 from certbound.safety.certificate import certificate_text, problem_data
-from certbound.safety.certificates.parts import exact
 from certbound.safety.verification import verify_safety
 from tests.checker.mutations import rejected
 

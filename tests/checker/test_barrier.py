@@ -13,8 +13,8 @@ import pytest
 import certbound as cb
 from certbound.checker import check_data
 from certbound.errors import CertificateError
+from certbound.safety.answers import exact
 from certbound.safety.certificate import problem_data
-from certbound.safety.certificates.parts import exact
 
 
 def by_hand(problem: cb.Problem, theta: float, growth: float, start: float, boundary: float) -> dict[str, Any]:

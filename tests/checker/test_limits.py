@@ -17,7 +17,7 @@ from certbound.checker.expressions.quadratic import Quadratic
 from certbound.checker.linear.events import sub_gaussian
 from certbound.checker.report import Budget, Unproved
 from certbound.errors import CertificateError
-from certbound.safety.certificates.parts import exact
+from certbound.safety.answers import exact
 from tests.checker.test_adversary import linear
 
 Data = dict[str, Any]

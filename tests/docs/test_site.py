@@ -31,7 +31,9 @@ def anchors(page: Path) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("page", pages(), ids=lambda page: page.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize(
+    "page", [*pages(), ROOT / "CONTRIBUTING.md"], ids=lambda page: page.relative_to(ROOT).as_posix()
+)
 def test_every_internal_link_leads_to_a_page_and_a_heading(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`]*`", "", text)):
@@ -76,8 +78,9 @@ def test_the_table_of_engines_says_what_their_rows_say() -> None:
     from certbound.safety.portfolio import ENGINES
 
     text = (DOCS / "explanation.md").read_text(encoding="utf-8")
-    table = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", text, flags=re.MULTILINE)
-    assert table == [(name, row.words) for name, row in ENGINES.items()]
+    filled = runpy.run_path(str(DOCS / "hooks" / "commands.py"))["on_page_markdown"](text)
+    table = re.findall(r"^\| `(\w+)` \| ([^|]+) \| ([^|]+) \|$", filled, flags=re.MULTILINE)
+    assert table == [(name, row.words, row.when) for name, row in ENGINES.items()]
 
 
 def test_every_page_is_reached_from_the_navigation() -> None:

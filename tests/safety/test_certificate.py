@@ -13,9 +13,8 @@ import pytest
 import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
-from certbound.safety.answers import EngineAnswer
+from certbound.safety.answers import EngineAnswer, exact
 from certbound.safety.certificate import certificate_data, certificate_text, problem_data, restated
-from certbound.safety.certificates.parts import exact
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import verify_safety
 

@@ -50,7 +50,7 @@ EXAMPLES = examples(
 
 MethodOption = Annotated[
     str,
-    typer.Option("--method", metavar="M", help="auto, linear, constants, barrier, values, or a tube's (kummer, thm3)."),
+    typer.Option("--method", metavar="M", help="auto, an engine's (linear, values, ...), or a tube's (kummer, thm3)."),
 ]
 CellsOption = Annotated[int | None, option("--cells", "K", "Cells per side of the initial set.", integer)]
 CertificateOption = Annotated[Path | None, option("--certificate", "FILE", "Write the certificate.")]
@@ -120,7 +120,7 @@ def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> 
     try:
         for engine in ENGINES if method == "auto" else (method,):
             if engine in ENGINES and ENGINES[engine].reserve and best is not None and best.status == "SAFE":
-                break
+                continue
             with clock.running():
                 found = verify_safety(problem, method=engine, cells=cells)
             answers |= found.answers

@@ -89,10 +89,11 @@ def log_pair(
 
     Parameters
     ----------
-    below, above : array_like
-        Levels; they broadcast with the moments.
-    variance_below, variance_above, covariance : Bounds
-        Enclosures of Var X, Var Y >= 0 and cov(X, Y).
+    below : array_like
+    variance_below : Bounds
+    above : array_like
+    variance_above, covariance : Bounds
+        The levels, and enclosures of Var X, Var Y >= 0 and cov(X, Y), which broadcast with each other.
     """
     v_lo, v_hi = ends(variance_below, "variance_below", least=0.0)
     w_lo, w_hi = ends(variance_above, "variance_above", least=0.0)

@@ -67,7 +67,13 @@ class Inside:
 
 @dataclass(frozen=True, eq=False)
 class Outside(Inside):
-    """The state stays outside a region (an obstacle); parameters as for ``Inside``."""
+    """The state stays outside a region (an obstacle).
+
+    Parameters
+    ----------
+    region, during, label
+        As for ``Inside``.
+    """
 
     word: ClassVar[str] = "outside"
     outside: ClassVar[bool] = True

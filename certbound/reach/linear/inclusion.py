@@ -57,7 +57,6 @@ class Supports:
         In discrete time N + 1 rows, one a node.
     generators : ndarray, shape (G, n)
         Zonotope of the initial set about the nominal start.
-    step : float
     continuous : bool
     outputs : ndarray of int, optional
         States that the remainder or the disturbance moves by more than a rounding error (discrete time).

@@ -5,6 +5,5 @@ from __future__ import annotations
 from certbound.safety.certificates.barrier import barrier_proof
 from certbound.safety.certificates.constants import constants_proof
 from certbound.safety.certificates.diffusion import response_proof
-from certbound.safety.certificates.parts import Proof, exact
 
-__all__ = ["Proof", "barrier_proof", "constants_proof", "exact", "response_proof"]
+__all__ = ["barrier_proof", "constants_proof", "response_proof"]

@@ -8,8 +8,7 @@ import numpy as np
 
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
-from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificates.parts import Proof, exact
+from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.engines import Barrier
 
 __all__ = ["barrier_proof"]

@@ -20,8 +20,8 @@ from certbound.reach.contraction import bound_forcing, integrate_radius, jump_si
 from certbound.reach.nominal import Curve, Flow, initial_cells
 from certbound.reach.sets import ReachTube, polyhedral_weights, round_directions
 from certbound.rigor.norms import Norm
-from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificates.parts import Proof, exact, needs_direction
+from certbound.safety.answers import EngineAnswer, Proof, exact
+from certbound.safety.certificates.parts import needs_direction
 from certbound.safety.engines import Erosion, erode, joined
 from certbound.tubes.constants import Constants
 from certbound.tubes.kummer import Search, exit_level, moderate_parameters

@@ -16,7 +16,7 @@ from certbound.errors import CertificateError
 from certbound.gaussian.response import MartingaleEvent, SplitEvents, WindowEvents, logsumexp
 from certbound.problem.problem import Problem
 from certbound.reach.linear import Accepted, DiffusionRun, Reference, Share, depends_on_state
-from certbound.safety.answers import EngineAnswer
+from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.linear import (
     EFFORTS,
     PADS,
@@ -28,7 +28,6 @@ from certbound.safety.certificates.linear import (
     proof_data,
     widened,
 )
-from certbound.safety.certificates.parts import Proof, exact
 
 __all__ = ["diffusion_proof", "response_proof"]
 

@@ -24,8 +24,8 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear import Linearisation, LinearRun, Share, correlated
-from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificates.parts import Proof, exact, needs_direction
+from certbound.safety.answers import EngineAnswer, Proof, exact
+from certbound.safety.certificates.parts import needs_direction
 
 __all__ = ["EFFORTS", "PADS", "SLACK", "Stated", "engine_of", "grids", "linear_proof", "proof_data", "widened"]
 

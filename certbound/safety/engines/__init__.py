@@ -1,4 +1,4 @@
-"""The engines that bound a probability: linear, constants, barrier."""
+"""The engines that bound a probability, a module each, and what their certificates restate of them."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class Synthesis:
     feasible : bool
         A plan keeps the tightened constraints. Whether that means anything is for ``status`` to say: a one-time bound
         such as Markov's may have a feasible plan, and its status is UNKNOWN.
-    status, log10_delta, verdict
+    status, log10_delta
         What ``verify_safety`` proved about ``problem``; status UNKNOWN and 0 where nothing was.
     reason : str
         The verdict's reason, or why there is no plan.
@@ -60,6 +60,8 @@ class Synthesis:
     infeasibility : Infeasibility or None
     smallest_delta : float or None
         Smallest delta for which a plan was found, where it was looked for.
+    verdict : Verdict or None
+        All that was proved about ``problem``.
     seconds : float
     """
 

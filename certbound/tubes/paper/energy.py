@@ -19,10 +19,16 @@ Array = NDArray[np.float64]
 
 
 def log_energy(x: ArrayLike, rate: float) -> Any:
-    """log Phi_{n,lam}(x) for vectors ``x`` of shape (..., n) and lam = ``rate``, at any size, in floating point.
+    """log Phi_{n,lam}(x) for vectors x and lam = ``rate``, at any size, in floating point.
 
     It depends on ||x|| only, rises with it, is at least (n/2) log(1 - e^2) + e lam ||x|| for every e in (0, 1), and
     for a sub-Gaussian w with proxy variance s^2 obeys E Phi(x + w) <= exp(lam^2 s^2/2) Phi(x) (Lemma 2 of the paper).
+
+    Parameters
+    ----------
+    x : array_like, shape (..., n)
+    rate : float
+        lam, in 1 over the unit of ``x``.
 
     Raises
     ------
