@@ -102,7 +102,8 @@ class LinearResponse:
         rounding = 2 * _gamma(n * n) * np.einsum("bmi,bmij,bmj->bm", abs(first), abs(v), abs(second))
         own = [np.einsum("bmi,bmij,bmj->bm", r, w, r) + _gamma(n * n) * 2 * np.einsum(
             "bmi,bmij,bmj->bm", abs(r), abs(w), abs(r)) for r in (first, second)]
-        error = np.sqrt(np.maximum(own[0], 0) * np.maximum(own[1], 0)) * (1 + 1e-12) + rounding + _TINY
+        roots = [np.sqrt(np.maximum(square, 0)) for square in own]  # of the factors: their product may pass all floats
+        error = roots[0] * roots[1] * (1 + 1e-12) + rounding + _TINY
         return value - error, value + error
 
 

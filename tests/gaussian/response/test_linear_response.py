@@ -65,3 +65,12 @@ def test_an_event_is_found_once() -> None:
     assert events.along(rows) is events.along(rows.copy())
     assert events.along(-rows) is events.along(rows)  # the same law
     assert events.along(2 * rows) is not events.along(rows)
+
+
+@pytest.mark.parametrize("size", [1e-90, 1.0, 1e160])
+def test_variances_of_any_size_are_enclosed(size: float) -> None:
+    response = discrete_response(np.full((1, 3, 1, 1), 0.5), np.array([[size]]), 0.0, np.array([[0.0]]))
+    low, high = response.variance(np.full((1, 4, 1), 1e10), np.arange(4))
+    exact = size * 1e20 * np.array([0.0, 1.0, 1.25, 1.3125])
+    assert np.all((low <= exact) & (exact <= high))
+    assert np.all(high - low <= 1e-10 * exact + 1e-299)
