@@ -352,10 +352,7 @@ def _noise_matrices(model: Model) -> list[Array]:
     assert isinstance(system, ContinuousSystem)
     if not isinstance(system.diffusion, Tape):
         return [np.asarray(system.diffusion, dtype=float)]
-    slots = model.dimension + 1
-    low = np.maximum(model.ranges.lo[:slots], -1e3)
-    high = np.minimum(model.ranges.hi[:slots], 1e3)
-    points = np.random.default_rng(0).uniform(low, high, (16, slots))
+    points = random_points(np.random.default_rng(0), model.ranges[: model.dimension + 1], 16)
     with np.errstate(all="ignore"):
         values = np.broadcast_to(compile_numpy(system.diffusion)(*points.T), (16, *system.diffusion.shape))
     return [np.asarray(G) for G in values if np.all(np.isfinite(G))]

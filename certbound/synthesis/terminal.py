@@ -124,8 +124,10 @@ def _room_of_region(region: Region, face: Face, erosion: Array, time: float) -> 
 
 def _middle(region: Region, dimension: int) -> Array:
     eye = np.eye(region.dimension)
-    low, high = np.maximum(-region.local_support(-eye, 0.0), -1e6), np.minimum(region.local_support(eye, 0.0), 1e6)
-    return region.lifted((low + high) / 2, dimension)
+    low, high = -region.local_support(-eye, 0.0), region.local_support(eye, 0.0)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    ends = np.where(bounded, low, 0.0), np.where(bounded, high, 0.0)
+    return region.lifted(np.where(bounded, (ends[0] + ends[1]) / 2, np.clip(0.0, low, high)), dimension)
 
 
 def linearise(problem: Problem, state: ArrayLike, inputs: ArrayLike) -> tuple[Array, Array]:
