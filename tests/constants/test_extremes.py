@@ -66,5 +66,5 @@ def test_a_constant_map_has_a_metric_for_each_constraint(slope):
 def test_noise_that_depends_on_large_numbers_is_sampled_where_the_domain_lies():
     system = cb.ContinuousSystem(lambda x: [-x[0]], states=1, diffusion=lambda t, x: [[1e-4 * x[0]]])
     stay, domain = cb.Inside(cb.HalfSpace([-1.0], -7e3)), cb.Box([2e3], [4e4])
-    (found,) = cb.bound_metrics(cb.Problem(system, initial=[9e3], safe=[stay], horizon=0.1, domain=domain))
+    found, _ = cb.bound_metrics(cb.Problem(system, initial=[9e3], safe=[stay], horizon=0.1, domain=domain))
     assert found.certified
