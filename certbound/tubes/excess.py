@@ -143,6 +143,8 @@ def log_excess_one(a: float, b: float, z: float, *, bessel: bool = False, digits
     """Scalar :func:`log_excess`, to ``digits``; a plain loop is quicker than arrays here."""
     if not 0 < z < 300 or a > 1e4:
         return _strided_one(a, b, z, bessel)
+    if (a + 1.0) * z < 1e-200 * b:  # one term is all, and the others would vanish
+        return math.log(z) - math.log(b), 1.0
     term = total = moment = z / b
     k = 1.0
     step = 0.0 if bessel else 1.0

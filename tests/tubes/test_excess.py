@@ -91,3 +91,10 @@ def test_far_out_the_scalar_sum_agrees_with_the_array():
             value, slope = log_excess(np.asarray(a), b, np.asarray(z), bessel=bessel)
             got = log_excess_one(a, b, z, bessel=bessel)
             assert got == pytest.approx((float(value), float(slope)), rel=1e-6)
+
+
+@pytest.mark.parametrize("z", [5e-324, 1e-310, 1e-205, 1e-150])
+def test_next_to_zero_the_first_term_is_all(z):
+    value, slope = log_excess_one(20.0, 0.56, z)
+    assert value == pytest.approx(math.log(z / 0.56) if z > 1e-300 else math.log(z) - math.log(0.56), rel=1e-13)
+    assert slope == pytest.approx(1.0)
