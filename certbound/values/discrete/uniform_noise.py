@@ -21,7 +21,7 @@ from certbound.rigor.rounding import product_error
 from certbound.values.discrete.fields import Mesh, Tables
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.kernels import AxisKernel, Block
-from certbound.values.discrete.shocks import Shocks
+from certbound.values.discrete.shocks import Inapplicable, Shocks
 from certbound.values.discrete.steps import Step
 from certbound.values.discrete.transitions import Places, Transition
 from certbound.values.grids import Grid
@@ -30,6 +30,8 @@ __all__ = ["UniformField", "UniformTables", "UniformTransition"]
 
 Array = NDArray[np.float64]
 _UNIT = 2.0**-53
+_MOST_WEIGHTS = 8_000_000
+"""Of a kernel along one axis, which holds every pair of a point and a node, a dozen times over: about a gigabyte."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -57,6 +59,11 @@ class UniformTables(Tables):
             starts[i] = first - step[i]
             counts.append(max(2, math.ceil((last - first) / step[i]) + 1) + 2)
         self.mesh = Mesh(start=starts, step=step, count=tuple(counts))
+        if max(count * len(axis) for count, axis in zip(counts, grid.axes)) > _MOST_WEIGHTS:
+            raise Inapplicable(
+                "value functions would need a grid of very many cells along one state: the safe set is very many "
+                "halfwidths of the uniform noise wide. Use another engine, which is at its best there."
+            )
         self.kernels = [self._uniform_kernel(i) for i in range(n)]
         self._beside = {}
         size = max(float(np.abs(self._windows(i)).max() / self.reach[i]) for i in range(n))

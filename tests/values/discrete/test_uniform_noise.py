@@ -81,3 +81,10 @@ def test_several_steps_agree_with_simulation(dimension: int) -> None:
 def test_uniform_noise_that_is_mixed_is_refused() -> None:
     with pytest.raises(Inapplicable, match="an entry of its own"):
         shocks_of(cb.Uniform(halfwidth=0.1).resolve(2), np.array([[1.0, 0.5], [0.0, 1.0]]))
+
+
+def test_a_kernel_that_would_fill_the_memory_is_refused() -> None:
+    system = cb.DiscreteSystem(lambda x: 0.9 * x, states=1, noise=cb.Uniform(halfwidth=1e-4))
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-0.4], [0.4]))], horizon=3)
+    with pytest.raises(Inapplicable, match="very many halfwidths of the uniform noise wide"):
+        bound_failure(problem)
