@@ -400,6 +400,7 @@ class Run:
     def _outside_reach(self, tube: Any, noise: bool, steps: int) -> tuple[int, int]:
         """Paths outside the tube's box hulls at some time of the grid."""
         units = self.draft.units
+        noise = noise and "noise: none" not in self.draft.features  # such paths are followed by the better scheme
         left: Any = False
         hull = tube.hull
         rough = bool(self.draft.features & {"model: jump", "model: kink"})
