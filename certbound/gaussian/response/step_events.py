@@ -63,11 +63,11 @@ class StepEvents:
         following = np.einsum("ti,tij->tj", rows[1:], self.response.transition[0, : len(rows) - 1])
         # the row at t + 1 seen from t is w F up to the rounding of this product
         cross_lo, _ = self.response.covariance_of(following[None], rows[None, :-1], nodes[:-1])
-        scale = np.sqrt(np.maximum(high[:-1], 0) * np.maximum(high[1:], 0)) * ROUND
-        low_scale = np.sqrt(np.maximum(low[:-1], 0) * np.maximum(low[1:], 0)) / ROUND
+        least, most = np.sqrt(np.maximum(low, 0)), np.sqrt(np.maximum(high, 0))
+        scale, low_scale = most[:-1] * most[1:] * ROUND, least[:-1] * least[1:] / ROUND
         size = np.einsum("ti,tij->t", np.abs(rows[1:]), np.abs(self.response.transition[0, : len(rows) - 1]))
         loss = size * _product_rounding(rows.shape[1]) * self.sizes[: len(rows) - 1]
-        cross = cross_lo[0] - loss * np.sqrt(np.maximum(high[:-1], 0)) * ROUND
+        cross = cross_lo[0] - loss * most[:-1] * ROUND
         with np.errstate(divide="ignore", invalid="ignore"):
             correlation = np.where(cross >= 0, cross / scale, cross / low_scale)
         correlation = np.where(np.isfinite(correlation), np.clip(correlation - 1e-14, -1.0, 1.0), -1.0)

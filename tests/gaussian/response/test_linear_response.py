@@ -74,3 +74,6 @@ def test_variances_of_any_size_are_enclosed(size: float) -> None:
     exact = size * 1e20 * np.array([0.0, 1.0, 1.25, 1.3125])
     assert np.all((low <= exact) & (exact <= high))
     assert np.all(high - low <= 1e-10 * exact + 1e-299)
+    assert StepEvents(response, 0, True).along(np.full((4, 1), 1e10)).correlation[1:] == pytest.approx(
+        0.5 * np.sqrt([1 / 1.25, 1.25 / 1.3125]), rel=1e-9
+    )
