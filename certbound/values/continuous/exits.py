@@ -86,7 +86,7 @@ def bound_exits(
     >>> import certbound as cb
     >>> system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=0.4)
     >>> problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1)
-    >>> found = bound_exits(problem)
+    >>> found = bound_exits(problem, seconds=2.0)
     >>> -3.12 < found.lower < -3.085 < found.upper < -3.07  # 8.2e-4
     True
     """
