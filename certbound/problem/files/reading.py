@@ -223,9 +223,11 @@ class _Reader:
         if table is None:
             return {}
         if table.diffusion is not None or table.law not in LAWS:
+            continuous = table.diffusion is not None
+            cure = "; `diffusion` is for continuous time." if continuous else nearest(f"{table.law}", LAWS)
             raise ValueError(
                 f"`noise.law` must be one of {', '.join(LAWS)} in discrete time, with one level and at most `matrix`, "
-                f"got {table.law!r}; `diffusion` is for continuous time."
+                f"got {table.law!r}{cure}"
             )
         build, entries = LAWS[table.law], dict(table.model_extra or {})
         flags = {key: entries.pop(key) for key in list(entries) if any(key in law.flags for law in LAWS.values())}
