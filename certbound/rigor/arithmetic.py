@@ -47,7 +47,7 @@ class Interval:
 
     __slots__ = ("hi", "lo")
     __array_ufunc__ = None  # lets ndarray + Interval reach Interval.__radd__
-    __hash__ = None  # type: ignore[assignment]
+    __hash__ = None  # type: ignore[assignment]  # as Python marks it
     lo: Array
     hi: Array
 

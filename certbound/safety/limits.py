@@ -146,7 +146,7 @@ def _horizon(problem: Problem, safe: Callable[[Callable[[], Problem]], bool]) ->
     low, high = 0, int(problem.horizon)
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if safe(lambda: problem.replace(horizon=middle)) else (low, middle)  # noqa: B023
+        low, high = (middle, high) if safe(lambda: problem.replace(horizon=middle)) else (low, middle)  # noqa: B023  (called at once)
     return float(low) if low else None
 
 

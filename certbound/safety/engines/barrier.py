@@ -181,7 +181,7 @@ class _Work:
                 return best
             if self.n == _MOST_STATES and hoped > _FAR * math.log10(self.problem.delta):
                 return best  # more points only raise what is hoped for, and here they take many seconds
-            points = tuple(np.concatenate([have, more]) for have, more in zip(points, worst))  # type: ignore[assignment]
+            points = tuple(np.concatenate([have, more]) for have, more in zip(points, worst))  # type: ignore[assignment]  # as many as before
         return best
 
     def _points(self) -> tuple[Array, Array, Array]:

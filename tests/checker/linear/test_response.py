@@ -7,10 +7,13 @@ import random
 import pytest
 from flint import arb, arb_mat
 
+import certbound as cb
+from certbound.checker import check_data, parse
 from certbound.checker.balls import column, diagonal, matrix, row_sums
 from certbound.checker.linear import response
 from certbound.checker.linear.response import Load, balance, continuous_piece, supports
 from certbound.checker.report import Budget, Unproved
+from certbound.safety.certificate import certificate_text
 
 UNITS = [arb(2) ** 40, arb(1), arb(2) ** -30]
 
@@ -70,3 +73,14 @@ def test_rows_are_carried_back_alike_in_blocks_of_any_size(block: int, monkeypat
             expected = (middle - wide, middle + wide, reach)
             values = (found.low[node][i], found.high[node][i], found.reach[node][i])
             assert all(abs(x - y) < 1e-12 for x, y in zip(values, expected))
+
+
+def test_states_that_hardly_drive_each_other_keep_their_own_units() -> None:
+    """About the origin the couplings are 0 or far below 1, so that units which balance them have no limit."""
+    system = cb.ContinuousSystem(
+        lambda x: [-x[0] + 0.3 * x[1] ** 2, -x[1] + 0.2 * x[2], -2 * x[2] + 0.1 * x[3] * x[0], -x[3]],
+        states=4, diffusion=[[0.15 * (i == j) for j in range(4)] for i in range(4)],
+    )  # fmt: skip
+    problem = cb.Problem(system, initial=[0.0] * 4, safe=[cb.Inside(cb.Ball([0.0] * 4, 1.3))], horizon=3, delta=1e-2)
+    report = check_data(parse(certificate_text(problem, cb.verify_safety(problem, method="linear"))))
+    assert report.valid, report.reason
