@@ -65,10 +65,8 @@ class _Proof:
         n = model.dimension
         if n > MOST_STATES:
             raise Unproved(f"{n} states are too many for this proof")
-        rows = None if record["metric"] is None else record.array("metric", n, n)
-        if rows is not None and any(rows[i][j] != rows[j][i] for i in range(n) for j in range(i)):
-            raise CertificateError("`proof.metric` must be symmetric.")
-        self.norm = Norm(identity(n) if rows is None else matrix(rows), budget)
+        metric = identity(n) if record["metric"] is None else matrix(record.symmetric("metric", n))
+        self.norm = Norm(metric, budget)
         self._read_times()
         self.rate, self.sigma = arb(record.number("rate")), arb(record.number("sigma", least=0.0))
         if not model.continuous and not self.rate > 0:

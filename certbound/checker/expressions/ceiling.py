@@ -79,8 +79,8 @@ class Ceiling:
             program.prepare([])
 
     def prove(
-        self, box: Sequence[Side], bound: arb, skip: Callable[[list[arb], list[arb]], bool] = lambda *_: False,
-        member: Callable[[list[arb], list[arb]], bool] = lambda *_: True,
+        self, box: Sequence[Side], bound: arb, skip: Callable[[Sequence[arb], Sequence[arb]], bool] = lambda *_: False,
+        member: Callable[[Sequence[arb], Sequence[arb]], bool] = lambda *_: True,
     ) -> bool:
         """Whether the expression is at most ``bound`` on the part of a box that ``skip`` does not rule out.
 

@@ -110,11 +110,8 @@ class _Cell:
         self.frames = self._frames()
         start = self.nominal[0][0] if continuous else self.nominal[0]
         self.start = [arb.max(high - p, p - low).upper() for (low, high), p in zip(box, map(arb, start))]
-        middles = [(low + high) / 2 for low, high in model.disturbance] if model.disturbance else []
-        self.middle = [arb(x) for x in middles]
-        self.reach = [
-            arb.max(arb(high) - m, m - arb(low)) for (low, high), m in zip(model.disturbance, self.middle)
-        ]
+        self.middle = [arb((low + high) / 2) for low, high in model.disturbance]
+        self.reach = [arb.max(arb(high) - m, m - arb(low)) for (low, high), m in zip(model.disturbance, self.middle)]
         self.grid = self._grid()
         self.demands = demands(model, self.grid, record.items("separations"), record.at("separations"), budget)
         self.state: StateNoise | None = None
@@ -166,14 +163,11 @@ class _Cell:
         return frames
 
     def _grid(self) -> Grid:
-        h = self.shared.length
-        if self.model.continuous:
-            times = [(h * k, h * (k + 1)) for k in range(self.shared.count)]
-            hulls = [[[arb(x) for x in point] for point in item] for item in self.nominal]
-        else:
-            times = [(arb(k), arb(k)) for k in range(self.shared.count + 1)]
-            hulls = [[[arb(x) for x in item]] for item in self.nominal]
-        return Grid(times=times, hulls=hulls)
+        h, given = self.shared.length, self.nominal
+        times = [(h * k, h * (k + 1)) for k in range(self.shared.count)]
+        if not self.model.continuous:
+            times, given = [(arb(k), arb(k)) for k in range(self.shared.count + 1)], [[item] for item in given]
+        return Grid(times=times, hulls=[[[arb(x) for x in point] for point in item] for item in given])
 
     # ---- the proof ---------------------------------------------------------------------------------------
 
@@ -213,12 +207,12 @@ class _Cell:
         found = Stopped(Windows(self.pieces, [], state.windows, self.budget), excess, state.coordinates, self.budget)
         count = self.shared.count
         asked = [
-            Asked(rows=[self.rows[k][d] for k in range(count)], levels=[arb(0)] * count, factors=factors)
+            Asked(rows=[rows[d] for rows in self.rows], levels=[arb(0)] * count, factors=factors)
             for d, factors in enumerate(state.rows)
         ]
         for number_, demand in enumerate(self.demands):
-            factors = None if state.rooms is None else state.rooms[number_]
-            asked.append(Asked(rows=demand.rows, levels=rooms[number_], factors=factors))
+            given = None if state.rooms is None else state.rooms[number_]
+            asked.append(Asked(rows=demand.rows, levels=rooms[number_], factors=given))
         return found.paid, found.along(asked)
 
     @cached_property
@@ -253,7 +247,8 @@ class _Cell:
         n, count, continuous = self.model.dimension, self.shared.count, self.model.continuous
         one = identity(n)
         unit = [[one[i, j] for j in range(n)] for i in range(n)]
-        asked = [self._asked(k) for k in range(count if continuous else count + 1)]
+        inner = self.rows if continuous else [*self.rows, []]
+        asked = [[*rows, *(demand.rows[k] for demand in self.demands)] for k, rows in enumerate(inner)]
         if continuous:
             self.budget.hold(n * sum(map(len, asked)))
         loads = [self._load(k) for k in range(count)]
@@ -271,19 +266,15 @@ class _Cell:
         found = supports([p.transition for p in self.pieces], nodes, loads, self.start, self.budget)
         if not continuous:
             return found
-        low, high, reach = [], [], []
+        parts = []
         for k in range(count):
             self.budget.check()
             gain = self._gain(k)
-            parts = over_piece(self.pieces[k], asked[k], found, k, self._box(k), None if gain is None else gain[1])
-            low.append(parts[0])
-            high.append(parts[1])
-            reach.append(parts[2])
+            parts.append(
+                over_piece(self.pieces[k], asked[k], found, k, self._box(k), None if gain is None else gain[1])
+            )
+        low, high, reach = (list(part) for part in zip(*parts))
         return Supports(low=low, high=high, reach=reach)
-
-    def _asked(self, k: int) -> list[list[arb]]:
-        inner = self.rows[k] if k < self.shared.count else []
-        return [*inner, *(demand.rows[k] for demand in self.demands)]
 
     def _box(self, k: int) -> tuple[list[arb], list[arb]]:
         """Middle and radius of B on piece k."""
@@ -379,12 +370,11 @@ class _Cell:
         self, values: list[arb_mat], rooms: list[list[arb | None]], found: tuple[arb, list[Along]] | None
     ) -> arb:
         """Probability that Z or M leave their levels, or exceed what the demands leave."""
-        count, inner = self.shared.count, len(self.rows[0])
-        families = []
-        for d in range(inner):
-            rows = [self.rows[k][d] for k in range(count)]
-            levels = [level[d] for level in self.levels]
-            families.append(Family(label="the levels", rows=rows, levels=levels, both=True))
+        inner = len(self.rows[0])
+        families = [
+            Family(label="the levels", rows=[r[d] for r in self.rows], levels=[z[d] for z in self.levels], both=True)
+            for d in range(inner)
+        ]
         for number_, (demand, left) in enumerate(zip(self.demands, rooms)):
             if found is not None:
                 part = found[1][inner + number_]
@@ -402,14 +392,10 @@ class _Cell:
         if not model.continuous:
             if self.record["window_levels"] is not None:
                 raise CertificateError(f"`{self.record.at('window_levels')}` must be null in discrete time.")
-            if not model.noise.gaussian:
-                return leaving(
-                    families, lambda family: sub_gaussian(family.rows, family.levels, values, budget), budget
-                )
             moves = [piece.transition for piece in self.pieces]
-            return leaving(
-                families, lambda family: chain(family.rows, family.levels, moves, values, budget), budget, normal=True
-            )
+            if model.noise.gaussian:
+                return leaving(families, lambda f: chain(f.rows, f.levels, moves, values, budget), budget, normal=True)
+            return leaving(families, lambda f: sub_gaussian(f.rows, f.levels, values, budget), budget)
         given = self.record.array("window_levels", len(self.shared.windows), model.dimension)
         windows = Windows(self.pieces, values, self.shared.windows, budget)
         paid = windows.coordinates([[arb(x) for x in item] for item in given])

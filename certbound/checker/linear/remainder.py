@@ -261,7 +261,7 @@ class _Frame:
             except ZeroDivisionError as error:
                 raise Unproved("the frame of an output is not regular") from error
         self.cuts = [
-            (self._form(row), low, high)
+            Cut(self._form(row), low, high)
             for number, (row, low, high) in enumerate(zip(polytope.rows, polytope.low, polytope.high))
             if number not in chosen and m > 1 and _lives_in(row, states)
         ]
@@ -290,14 +290,7 @@ class _Frame:
 
     def meets(self, box: _Box) -> bool:
         """False only where the box has no point in the polytope."""
-        for form, low, high in self.cuts:
-            value = reach = arb(0)
-            for place, factor in enumerate(form):
-                value += factor * box.centre[self.start + place]
-                reach += abs(factor) * box.radius[self.start + place]
-            if value - reach > high or value + reach < low:
-                return False
-        return True
+        return all(cut.meets(box.centre[self.start :], box.radius[self.start :]) for cut in self.cuts)
 
     def cuts_at(self, box: _Box) -> list[Cut]:
         """The cuts in the coordinates xi of the box."""
@@ -309,7 +302,7 @@ class _Frame:
             for i, factor in enumerate(form, start):
                 whole[i] = factor * box.radius[i]
                 value += factor * box.centre[i]
-            result.append((whole, low - value, high - value))
+            result.append(Cut(whole, low - value, high - value))
         return result
 
     def unturned(self, box: _Box) -> tuple[list[arb], list[dict[int, arb]]]:
