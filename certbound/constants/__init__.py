@@ -19,9 +19,9 @@ from certbound.lazy import load_name, names_in
 
 _HOME = {
     "bounds": "bound_constants constants_along",
-    "metrics": "bound_metrics propose_metrics split_delta",
+    "metrics": "bound_metrics propose_metrics split_delta jacobian_set",
     "fitted": "fitted_constants_along",
-    "jacobians": "matrix_measure induced_norm diagonal_weights jacobian_set "
+    "jacobians": "matrix_measure induced_norm diagonal_weights "
     "AffineSet SectorSet VertexPolytope IntervalMatrixSet UnionSet",
     "recheck": "certify_rate certify_gain",
     "programs": "design_feedback",

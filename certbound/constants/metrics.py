@@ -34,10 +34,11 @@ from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.systems import ContinuousSystem, DiscreteSystem
+from certbound.problem.sets import Box
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 from certbound.tubes.constants import Constants
 
-__all__ = ["bound_metrics", "improve", "propose_metrics", "split_delta"]
+__all__ = ["bound_metrics", "improve", "jacobian_set", "propose_metrics", "split_delta"]
 
 Array = NDArray[np.float64]
 
@@ -263,10 +264,32 @@ def check_objective(objective: str) -> None:
         raise ValueError(f'`objective` must be "rate" or "erosion", got {objective!r}.')
 
 
-def model_set(model: Model) -> AffineSet:
+def jacobian_set(source: Problem | System, domain: Box | None = None, *, tolerance: float = 1e-3) -> AffineSet:
+    """The Jacobian D_x f of a model over a domain, as an affine set.
+
+    Proves: D_x f(t, x, u, d) lies in the set for every time, state of the domain, input and disturbance.
+
+    Parameters
+    ----------
+    source : Problem, ContinuousSystem or DiscreteSystem
+        A problem's closed loop, or a system over all inputs that it allows.
+    domain : Box, optional
+        States; the problem's domain, or all of R^n, when omitted.
+    tolerance : float
+        Wanted distance between a range and its sampled part, relative to the range's size.
+
+    Raises
+    ------
+    EnclosureError
+        If the Jacobian is unbounded, undefined or jumping on the domain.
+    """
+    return model_set(model_of(source, domain, None), tolerance=tolerance)
+
+
+def model_set(model: Model, *, tolerance: float = 1e-3) -> AffineSet:
     """The affine set of all Jacobians of a model over its ranges."""
     tape = jacobian(model.dynamics, model.state_slots)
-    return affine_set(tape, [model.ranges[slot] for slot in range(len(model.ranges))])
+    return affine_set(tape, [model.ranges[slot] for slot in range(len(model.ranges))], tolerance=tolerance)
 
 
 def erosion_ratio(constants: Constants, rooms: Rooms, horizon: float, delta: float) -> float:
@@ -294,8 +317,7 @@ def _least_erosion(model: Model, euclidean: Constants, targets: Rooms, horizon: 
     radius = RadiusModel(
         continuous=model.continuous, dimension=model.dimension, horizon=horizon, delta=delta, gaussian=_gaussian(model)
     )
-    found = [euclidean]
-    matrices = _noise_matrices(model)
+    found, matrices = [euclidean], _noise_matrices(model)
     if model.dimension > 1 and any(G.any() for G in matrices):
         for members in _candidate_sets(model):
             for proposal in _tried(members, lambda s: erosion_proposals(s, targets, matrices, radius)):

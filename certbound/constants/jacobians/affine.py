@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.checks import frozen
 from certbound.constants.jacobians.arguments import (
     UNIT,
     factor,
     finite_array,
-    frozen,
     is_near,
     matrix_batch,
     metric_roots,

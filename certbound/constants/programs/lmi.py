@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.constants.jacobians import JacobianSet, frozen
+from certbound.checks import frozen
+from certbound.constants.jacobians import JacobianSet
 from certbound.constants.programs.sectors import Sector, contraction_value, lmi_blocks, transformed
 from certbound.errors import InfeasibleError, SolverError
 
