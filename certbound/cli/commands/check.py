@@ -12,7 +12,7 @@ import typer
 from certbound.cli.describe import attributes
 from certbound.cli.messages import InputError
 from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, examples, load_problem, option
-from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.errors import CertificateError, EngineError, contained
 
 if TYPE_CHECKING:
@@ -66,10 +66,7 @@ def check(
         "outcome": report.outcome,
         "assumptions": list(report.assumptions),
     }
-    if as_json:
-        print_json(result)
-    else:
-        _print(result)
+    show(result, as_json, lambda: _print(result))
     raise typer.Exit(0 if report.valid else 1)
 
 
