@@ -133,10 +133,7 @@ def _proposals(problem: Problem, *, quick: bool) -> Iterator[Constants]:
 
 
 def _better(first: EngineAnswer, second: EngineAnswer) -> EngineAnswer:
-    if second.log10_delta != first.log10_delta:
-        return second if second.log10_delta < first.log10_delta else first
-    margins = (-math.inf if a.margin is None else a.margin for a in (first, second))
-    return first if next(margins) >= next(margins) else second
+    return min(first, second, key=lambda a: (a.log10_delta, math.inf if a.margin is None else -a.margin))
 
 
 class _Work:
@@ -172,12 +169,7 @@ class _Work:
         While no constraint is broken the state is in the domain, so that all constants hold up to the first event.
         """
         count = len(self.problem.constraints)
-        if (
-            self.method != "auto"
-            or count < 2
-            or not common.applicable
-            or self.problem.initial.random
-        ):
+        if self.method != "auto" or count < 2 or not common.applicable or self.problem.initial.random:
             return common
         if common.tube is not None and common.reach is not None:
             erosion = erode(common.reach, self.problem, common.reach.norm)
