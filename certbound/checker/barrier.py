@@ -92,12 +92,8 @@ def _refuse(model: Model) -> None:
 class _Expressions:
     """V and the expression that bounds its growth, over (t, states, disturbances).
 
-    Attributes
-    ----------
-    value, generator : int
-        Nodes of the graph.
-    defined : list of int
-        The dynamics and the diffusion themselves, which must exist wherever the generator is bounded.
+    ``value`` and ``generator`` are nodes of the graph; ``defined`` are the dynamics and the diffusion themselves, which
+    must exist wherever the generator is bounded.
     """
 
     def __init__(self, model: Model, record: Record, budget: Budget) -> None:

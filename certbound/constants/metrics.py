@@ -128,21 +128,10 @@ def propose_metrics(
 def improve(
     model: Model, euclidean: Constants, *, objective: str, horizon: float | None = None, delta: float | None = None
 ) -> Constants:
-    """The best certified constants of a model: in the identity metric, or in one that was proposed.
+    """The best certified constants of a model: in the identity metric (``euclidean``), or in one that was proposed.
 
-    Parameters
-    ----------
-    model : Model
-    euclidean : Constants
-        Certified, in the identity metric.
-    objective : "rate" or "erosion"
-    horizon, delta : float, optional
-        For erosion; the problem's own when omitted.
-
-    Raises
-    ------
-    ValueError
-        For erosion without horizon, delta or constraints.
+    ``horizon`` and ``delta`` are for the objective "erosion", the problem's own when omitted: without them, or without
+    constraints, that is a ValueError.
     """
     check_objective(objective)
     if objective == "erosion":

@@ -23,17 +23,9 @@ Array = NDArray[np.float64]
 class Model:
     """Dynamics over boxes.
 
-    Parameters
-    ----------
-    system : ContinuousSystem or DiscreteSystem
-    dynamics : Tape
-        f, with the plan substituted where it is a feedback law.
-    ranges : Interval, shape (len(dynamics.inputs),)
-        Time, states, inputs, disturbances; infinite ends are legal.
-    bounded_by_user : bool
-        Whether the states' ranges were given.
-    problem : Problem, optional
-        Where the model comes from.
+    ``dynamics`` is f, with the plan substituted where it is a feedback law; ``ranges``, shape (len(dynamics.inputs),),
+    are those of time, states, inputs and disturbances, whose ends may be infinite; ``bounded_by_user`` says whether the
+    states' were given; ``problem`` is where the model comes from.
     """
 
     system: ContinuousSystem | DiscreteSystem

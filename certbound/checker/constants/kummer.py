@@ -46,14 +46,9 @@ class Kummer:
 
 
 def exit_probability(data: Kummer, budget: Budget) -> arb:
-    """Upper bound of P(exists t: ||S_t||_P > r_t).
+    """Upper bound of P(exists t: ||S_t||_P > r_t); `Unproved` where v_0 is too small for a random start.
 
     In discrete time radii[k] belongs to step k (radii[0] to the start), in continuous time to piece k.
-
-    Raises
-    ------
-    Unproved
-        If v_0 is too small for a random start.
     """
     v: list[arb] = [data.v0]
     steps: list[arb] = []

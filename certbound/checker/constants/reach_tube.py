@@ -128,16 +128,7 @@ class CurvePiece:
 
 
 class Tube:
-    """Defects and radii along the curve of one cell.
-
-    Parameters
-    ----------
-    model, structure
-        The problem.
-    norm : Norm
-    pieces : sequence of CurvePiece
-        In discrete time one a step, the last one the horizon.
-    """
+    """Defects and radii along the curve of one cell; in discrete time a piece is a step, the last one the horizon."""
 
     def __init__(
         self, model: Model, structure: Structure, norm: Norm, pieces: Sequence[CurvePiece], budget: Budget
@@ -258,12 +249,7 @@ class Tube:
         return result
 
     def prove(self, start: arb, slope: arb, eta: Sequence[arb], radii: Sequence[arb]) -> None:
-        """The stated defects and radii hold.
-
-        Raises
-        ------
-        Unproved
-        """
+        """Prove that the stated defects and radii hold."""
         rho = start
         for k, piece in enumerate(self.pieces):
             if k < len(eta) and not self.defect(k) <= eta[k]:

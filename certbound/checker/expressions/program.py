@@ -22,21 +22,11 @@ Step = tuple[int, Callable[..., arb], int, int]
 
 
 class Program:
-    """Some nodes of a graph as a program.
+    """Some nodes of a graph (``outputs``) as a program.
 
-    Parameters
-    ----------
-    graph : Graph
-    outputs : sequence of int
-        Nodes whose values are returned.
-    guards : iterable of int
-        Nodes that are evaluated, and must be finite and decided, but are not returned.
-    variables : int
-        Inputs below this number change from run to run; the others are parameters.
-    generalised : bool
-        The slope of |x| is all of [-1, 1] where x may be 0, instead of undecided.
-    unbounded : bool
-        Guards need only be defined, not finite.
+    ``guards`` are evaluated too, and must be decided and finite (``unbounded``: only defined), but are not returned.
+    Inputs below ``variables`` change from run to run, the others are parameters. ``generalised``: the slope of |x| is
+    all of [-1, 1] where x may be 0, instead of undecided.
     """
 
     def __init__(

@@ -116,14 +116,7 @@ def sub_gaussian(
 class Windows:
     """Windows of consecutive pieces in continuous time.
 
-    Parameters
-    ----------
-    pieces : sequence of Piece
-    covariances : sequence of arb_mat
-        At the nodes.
-    starts : sequence of int
-        First piece of every window; they rise from 0.
-    budget : Budget
+    ``covariances`` are those at the nodes, ``starts`` the first piece of every window; they rise from 0.
     """
 
     def __init__(
@@ -245,13 +238,7 @@ class Windows:
 
 
 def _variance(row: arb_mat, covariance: arb_mat) -> arb:
-    """row covariance row^T, which is not negative.
-
-    Raises
-    ------
-    Unproved
-        If it is, or is not a number: then there is no such noise.
-    """
+    """row covariance row^T, which is not negative: where it is, or is no number, there is no such noise."""
     value = quadratic(row, covariance, row)
     if not value.upper() >= 0:
         raise Unproved("a variance is negative or not a number")

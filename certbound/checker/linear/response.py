@@ -187,17 +187,8 @@ def supports(
 ) -> Supports:
     """Bounds at the nodes along ``rows[k]`` (a list of rows at node k), by the adjoint rows of every earlier piece.
 
-    Parameters
-    ----------
-    transitions : sequence of arb_mat
-        F of every piece.
-    rows : sequence
-        N + 1 lists of rows.
-    loads : sequence of Load
-        One a piece.
-    start : sequence of arb
-        Half-widths of the box of y at node 0.
-    budget : Budget
+    ``transitions`` and ``loads`` have one entry a piece, ``rows`` one more; ``start`` are the half-widths of the box of
+    y at node 0.
     """
     n = transitions[0].nrows()
     budget.hold(3 * (n + 1) * sum(map(len, rows)))
@@ -258,21 +249,8 @@ def over_piece(
 ) -> tuple[list[arb], list[arb], list[arb]]:
     """From a piece's start to all of it: the chord between both ends, its bulge, and what the piece adds.
 
-    Parameters
-    ----------
-    piece : Piece
-    rows : sequence of rows
-    found : Supports
-        At node k: along the unit rows, ``rows``, and ``rows`` times the transition matrix.
-    k : int
-    box : (list, list) of arb
-        Middle and radius of the remainder's box.
-    gain : list of arb, optional
-        Bound of |E (d - d0)|.
-
-    Returns
-    -------
-    low, high, reach : list of arb
+    ``found`` holds at node k bounds along the unit rows, ``rows``, and ``rows`` times the transition matrix; ``box``
+    are middle and radius of the remainder's box, ``gain`` a bound of |E (d - d0)|. Returns low, high and reach.
     """
     n, count = piece.transition.nrows(), len(rows)
     h, one = piece.length, identity(n)

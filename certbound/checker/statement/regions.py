@@ -169,13 +169,7 @@ def _sides(low: list[float | None], high: list[float | None]) -> tuple[list[list
 
 
 def read_constraint(value: object, path: str, dimension: int, horizon: float, budget: Budget) -> Constraint:
-    """One constraint of a certificate.
-
-    Raises
-    ------
-    CertificateError
-        If it is malformed.
-    """
+    """One constraint of a certificate."""
     record = Record(value, path, ("kind", "region", "during", "label"))
     if record["kind"] not in ("inside", "outside"):
         raise CertificateError(f"`{path}.kind` must be \"inside\" or \"outside\".")

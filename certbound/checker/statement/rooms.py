@@ -60,11 +60,6 @@ def demands(
     model: Model, grid: Grid, separations: list[object], path: str, budget: Budget, *, polygons: bool = True
 ) -> list[Demand]:
     """Every constraint of the model as demands along a nominal curve (without ``polygons``: but for round safe sets).
-
-    Raises
-    ------
-    CertificateError
-        If the directions that keep obstacles off are malformed.
     """
     if len(separations) != len(model.constraints):
         raise CertificateError(f"`{path}` must have {len(model.constraints)} entries, got {len(separations)}.")

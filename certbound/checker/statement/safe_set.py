@@ -72,14 +72,7 @@ class Part:
 class SafeSet:
     """The constraints of a model at rest.
 
-    Parameters
-    ----------
-    model : Model
-
-    Raises
-    ------
-    Unproved
-        If a constraint has a window or moves, or nothing bounds a state.
+    One that has a window or moves, or a state that nothing bounds, is `Unproved`.
     """
 
     def __init__(self, model: Model) -> None:

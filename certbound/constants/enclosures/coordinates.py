@@ -34,19 +34,9 @@ class Spread(NamedTuple):
 
 
 class Metric:
-    """A norm sqrt(x^T P x) and the bounds in it.
+    """A norm sqrt(x^T P x) and the bounds in it; P = ``matrix``, shape (n, n), the identity when omitted.
 
-    Parameters
-    ----------
-    matrix : array_like, shape (n, n), optional
-        P, symmetric positive definite; the identity when omitted.
-    dimension : int
-        n.
-
-    Raises
-    ------
-    ValueError
-        If P is not square of order n, not finite, not symmetric or not positive definite.
+    Raises ------ ValueError If P is not square of order n, not finite, not symmetric or not positive definite.
     """
 
     def __init__(self, matrix: ArrayLike | None, dimension: int) -> None:
@@ -92,20 +82,9 @@ class Metric:
 
     @quiet
     def measure(self, jacobians: Interval, spread: Spread | None = None) -> Array:
-        """Upper bounds of mu_P(J) over batches of Jacobians.
+        """Upper bounds of mu_P(J) over batches of Jacobians (N, n, n), with linear terms ``spread`` around them.
 
-        Proves: J^T P + P J <= 2 c P for every J in the member of the batch.
-
-        Parameters
-        ----------
-        jacobians : Interval, shape (N, n, n)
-        spread : Spread, optional
-            Linear terms around them.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            +inf where the Jacobian is unbounded.
+        Proves: J^T P + P J <= 2 c P for every J in the member of the batch; +inf where the Jacobian is unbounded.
         """
         if self.matrix is None:  # symmetrise first: it cancels skew parts exactly
             jacobians = _half_sum(jacobians)

@@ -32,23 +32,10 @@ def bound_ranges(
     tolerance: float = 1e-3,
     boxes: int = _BOXES,
 ) -> list[tuple[float, float]]:
-    """Enclosures of the ranges of some nodes.
+    """Enclosures of the ranges of some nodes, over a box of one scalar interval per input slot.
 
-    Parameters
-    ----------
-    tape : Tape
-    nodes : sequence of int
-        Indices of nodes.
-    inputs : sequence of scalar Interval
-        The box, one interval per input slot.
-    tolerance : float
-        Bisection stops once an outer end is within this share of the range's size from a sampled value.
-    boxes : int
-        Limit on the boxes evaluated per end.
-
-    Returns
-    -------
-    list of (float, float)
+    Bisection stops once an outer end is within ``tolerance``, as a share of the range's size, from a sampled value, or
+    after so many ``boxes`` per end.
     """
     if not nodes:
         return []

@@ -56,20 +56,9 @@ class _Form:
 def affine_set(tape: Tape, inputs: Sequence[Interval], *, tolerance: float = 1e-3) -> AffineSet:
     """The values of a square matrix-valued tape over a box, as J0 + sum theta_k M_k with theta in a box.
 
-    Proves: the set contains the matrix at every point of the box.
-
-    Parameters
-    ----------
-    tape : Tape, shape (n, n)
-    inputs : sequence of scalar Interval
-        One per slot; infinite ends are allowed.
-    tolerance : float
-        Wanted distance between a range and its sampled part, relative to the range's size.
-
-    Raises
-    ------
-    EnclosureError
-        If a parameter has no finite range.
+    Proves: the set contains the matrix at every point of the box, of one scalar interval per slot (infinite ends are
+    allowed). ``tolerance`` is the wanted distance between a range and its sampled part, relative to the range's size. A
+    parameter without a finite range is an EnclosureError.
     """
     if len(tape.shape) != 2 or tape.shape[0] != tape.shape[1]:
         raise ValueError(f"`tape` must be square, got shape {tape.shape}.")

@@ -127,20 +127,11 @@ def center_metric(
     tolerance: float = 1e-6,
     max_steps: int = 150,
 ) -> Center:
-    """P and diagonal multipliers that nearly minimise c or L^2 over the blocks.
+    """P and diagonal multipliers that nearly minimise c (continuous time) or L^2 (discrete time) over the blocks.
 
-    Parameters
-    ----------
-    blocks : sequence of ndarray or Sector
-    continuous : bool
-        The value is c (continuous time) or L^2 (discrete time).
-    lower : float
-        A known lower bound of the value (spectral), which lets the search stop.
-    tolerance : float
-        The search stops once the value is this close to ``lower``, or once the gains from one centre to the
-        next, extrapolated, have less than this to go.
-    max_steps : int
-        Limit on Newton steps.
+    The search stops once the value is within ``tolerance`` of ``lower``, a known (spectral) lower bound, or once the
+    gains from one centre to the next, extrapolated, have less than that to go; at the latest after ``max_steps`` Newton
+    steps.
     """
     root = np.asarray(np.linalg.cholesky(starting_metric(blocks, continuous=continuous)).T)
     inverse = np.asarray(np.linalg.inv(root), dtype=float)
@@ -177,10 +168,8 @@ def starting_metric(blocks: Sequence[Array | Sector], *, continuous: bool) -> Ar
 def lyapunov_metric(matrix: Array, share: float, *, continuous: bool) -> Array:
     """P of largest eigenvalue 1 in which one Jacobian contracts, with a margin of ``share`` of its decay.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the equation is singular in floating point (a Jordan block on the stability limit, very unlike units).
+    numpy.linalg.LinAlgError where the equation is singular in floating point (a Jordan block on the stability limit,
+    very unlike units).
     """
     from scipy.linalg import LinAlgWarning, solve_continuous_lyapunov, solve_discrete_lyapunov
 
