@@ -47,20 +47,10 @@ PACKAGES = ("numpy", "scipy", "casadi", "cvxpy", "clarabel", "python-flint", "nu
 def report_page(
     scene: Scene, verdict: Verdict, *, command: str = "", probability: str = "", certificate: str = ""
 ) -> str:
-    """The page as one string.
+    """The page as one string: a problem, tubes and sample paths (``scene``) and what was proved (``verdict``).
 
-    Parameters
-    ----------
-    scene : Scene
-        Problem, tubes and sample paths to show.
-    verdict : Verdict
-        What was proved.
-    command : str
-        The command that gives the verdict again.
-    probability : str
-        The certified bound in words, such as ``3.7e-4``.
-    certificate : str
-        Text of the certificate that was written; the page shows its hash, as ``sha256sum`` prints it.
+    ``command`` gives the verdict again; ``probability`` is the certified bound in words, such as ``3.7e-4``; of the
+    text of a ``certificate`` that was written the page shows the hash, as ``sha256sum`` prints it.
     """
     from plotly.offline import get_plotlyjs
 

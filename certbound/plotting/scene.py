@@ -35,20 +35,10 @@ INNER, OUTER, RIM = "#86B9DD", "#C3E0F2", "#7a3500"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
-    """What a picture shows.
+    """What a picture shows: the constraints of ``problem``, the noise-free tube ``reach``, whose curve is the nominal.
 
-    Parameters
-    ----------
-    problem : Problem
-        Whose constraints are drawn.
-    reach : ReachTube
-        Noise-free tube: its curve is the nominal.
-    tube : ReachTube, optional
-        Tube with the stochastic deviation.
-    times, paths : ndarray, shapes (K + 1,) and (paths, K + 1, n), optional
-        Sample paths.
-    title : str
-        One line over the picture.
+    ``tube`` has the stochastic deviation; ``times``, shape (K + 1,), and ``paths``, shape (paths, K + 1, n), are sample
+    paths.
     """
 
     problem: Problem

@@ -27,18 +27,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, init=False)
 class System:
-    """What continuous and discrete time share.
+    """What continuous and discrete time share: names of the signals, and where u and d live.
 
-    Parameters
-    ----------
-    states : tuple of str
-        Names of the states.
-    inputs, disturbance : Box or None
-        Where u and d live.
-    input_names, disturbance_names : tuple of str
-        Their names.
-    dynamics : Tape
-        f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,).
+    ``dynamics`` is f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,).
     """
 
     states: tuple[str, ...]
