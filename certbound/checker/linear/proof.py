@@ -90,8 +90,7 @@ class _Cell:
 
     def __init__(self, shared: Shared, record: Record, box: list[tuple[arb, arb]], budget: Budget) -> None:
         budget.check()
-        self.shared, self.model, self.budget = shared, shared.model, budget
-        self.record = record
+        self.shared, self.model, self.record, self.budget = shared, shared.model, record, budget
         model, n, count = shared.model, shared.model.dimension, shared.count
         continuous = model.continuous
         varying, moving = len(shared.structure.varying), len(shared.structure.moving)
@@ -150,8 +149,7 @@ class _Cell:
     def _frames(self) -> list[list[int]]:
         """Rows that serve as coordinates for each output's remainder; null: the unit rows."""
         record, structure, units = self.record, self.shared.structure, list(self.shared.units)
-        frames = []
-        most = len(self.rows[0]) - 1
+        frames, most = [], len(self.rows[0]) - 1
         for i, item in enumerate(record.items("frames", self.model.dimension, self.model.dimension)):
             active = structure.active_states(i)
             if item is not None:
@@ -186,10 +184,9 @@ class _Cell:
             return self._probability(outputs)
 
     def _probability(self, outputs: Sequence[OutputRemainder]) -> arb:
-        model, budget = self.model, self.budget
-        n = model.dimension
-        start = model.initial.covariance if model.initial.covariance is not None else identity(n) * 0
-        values = covariances(self.pieces, start, budget)
+        start = self.model.initial.covariance
+        start = identity(self.model.dimension) * 0 if start is None else start
+        values = covariances(self.pieces, start, self.budget)
         bounds = self._supports()
         rooms = self._rooms(bounds)
         found = None if self.state is None else self._stopped(self.state, rooms)

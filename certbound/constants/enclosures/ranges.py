@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.constants.enclosures.enclosure import enclose
-from certbound.problem.model import Node, Tape
+from certbound.problem.model import Graph, Node, Tape
 from certbound.rigor.intervals import Interval
 
 __all__ = ["bound_ranges", "extract"]
@@ -56,22 +56,7 @@ def bound_ranges(
 
 def extract(tape: Tape, node: int) -> Tape:
     """The scalar function that a node computes, as a tape of its own over the same inputs."""
-    needed: set[int] = set()
-    stack = [node]
-    while stack:
-        index = stack.pop()
-        if index not in needed:
-            needed.add(index)
-            if tape.nodes[index].op != "input":
-                stack.extend(tape.nodes[index].args)
-    order = sorted(needed)
-    place = {index: position for position, index in enumerate(order)}
-    kept = []
-    for index in order:
-        old = tape.nodes[index]
-        args = old.args if old.op == "input" else tuple(place[arg] for arg in old.args)
-        kept.append(Node(old.op, args, old.value))
-    return Tape(inputs=tape.inputs, nodes=tuple(kept), outputs=(place[node],), shape=(1,))
+    return Graph.starting_with(tape).tape([node], (1,))
 
 
 def _negated(tape: Tape) -> Tape:

@@ -125,8 +125,7 @@ class RadiusModel:
         rate = 2 * value if self.continuous else float(np.log(max(value, _LEAST)))
         growth = np.expm1(rate * times) if abs(rate) > 1e-12 else times
         scale = 1.0 if abs(rate) <= 1e-12 else (rate if self.continuous else float(np.expm1(rate)))
-        result: Array = np.asarray(growth / scale)
-        return result
+        return np.asarray(growth / scale)
 
     def _squares(self, value: float, nu: float, times: Array, room: Array, a: Array, v0: Array) -> Array:
         """max_t r_t^2 / room_t^2 for each (a, v0): Newton's method on the probability of Thm K2, log in log."""
@@ -157,8 +156,7 @@ class RadiusModel:
                 x = x + step
                 if not np.any(np.abs(step) >= 1e-4):  # nan: out of range, and counted as endless below
                     break
-            result: Array = np.nan_to_num(np.exp(x), nan=np.inf)
-        return result
+            return np.asarray(np.nan_to_num(np.exp(x), nan=np.inf))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
