@@ -13,9 +13,7 @@ What a user may want of it, each name loaded when it is first used:
 
 from __future__ import annotations
 
-from typing import Any
-
-from certbound.lazy import load_name, names_in
+from certbound.lazy import lazily, names_in
 
 _HOME = {
     "bounds": "bound_constants constants_along",
@@ -29,10 +27,4 @@ _HOME = {
 
 __all__ = names_in(_HOME)
 
-
-def __getattr__(name: str) -> Any:
-    return load_name(__name__, _HOME, name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazily(__name__, _HOME, __all__)
