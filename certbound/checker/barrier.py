@@ -37,13 +37,7 @@ def check_barrier(model: Model, value: object, budget: Budget) -> arb:
     """Upper bound of the probability that a constraint is broken.
 
     It holds for every start and every disturbance that does not see coming noise (it makes exp(V) a supermartingale).
-
-    Raises
-    ------
-    CertificateError
-        If the proof's data are malformed.
-    Unproved
-        If an inequality could not be proved.
+    CertificateError where the proof's data are malformed, Unproved where an inequality could not be proved.
     """
     record = Record(value, "proof", _PROOF)
     _refuse(model)

@@ -42,13 +42,7 @@ def check_constants(model: Model, value: object, budget: Budget) -> arb:
     """Upper bound of the probability that a constraint is broken.
 
     It holds for every start and every disturbance that does not see coming noise (Thm K2 rests on a supermartingale).
-
-    Raises
-    ------
-    CertificateError
-        If the proof's data are malformed.
-    Unproved
-        If an inequality could not be proved.
+    CertificateError where the proof's data are malformed, Unproved where an inequality could not be proved.
     """
     return _Proof(model, Record(value, "proof", _PROOF), budget).probability()
 

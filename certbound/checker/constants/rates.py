@@ -35,7 +35,7 @@ class Contraction:
         graph, n = structure.graph, model.dimension
         self.fixed = [[arb(0)] * n for _ in range(n)]
         forms: dict[int, list[list[arb]]] = {}
-        for (i, j), node in structure.state_nodes.items():
+        for (i, j), node in structure.states.nodes.items():
             constant, parts = _affine(graph, node)
             self.fixed[i][j] = constant
             for atom, factor in parts.items():

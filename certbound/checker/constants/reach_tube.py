@@ -136,11 +136,9 @@ class Tube:
         self.model, self.norm, self.pieces, self.budget = model, norm, pieces, budget
         self.reach = [(arb(b) - arb(a)) / 2 for a, b in model.disturbance]
         self.middle = [(arb(b) + arb(a)) / 2 for a, b in model.disturbance]
-        self.entries = list(structure.disturbance_nodes)
-        graph = structure.graph
+        self.entries, nodes = list(structure.disturbances.nodes), list(structure.disturbances.nodes.values())
         self.gain = Program(
-            graph, list(structure.disturbance_nodes.values()), structure.outputs,
-            variables=len(model.dynamics.inputs), generalised=True,
+            structure.graph, nodes, structure.outputs, variables=len(model.dynamics.inputs), generalised=True
         )
         self.gain.prepare([])
 

@@ -65,12 +65,7 @@ class Expansion:
     def run(self, inputs: Sequence[tuple[arb, dict[int, arb]]], size: int) -> Quadratic:
         """The expression over a box of ``size`` coordinates; every variable is a centre and its linear coefficients.
 
-        Raises
-        ------
-        Undecided
-            If a jump is undecided or something is undefined somewhere in the box.
-        Unproved
-            If the budget of the graph is used up.
+        Undecided where a jump is undecided or something is undefined somewhere in the box.
         """
         with self._budget.passing():
             return self._run(inputs, size)

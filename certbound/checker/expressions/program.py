@@ -85,12 +85,7 @@ class Program:
     def run(self, variables: Sequence[arb]) -> list[arb]:
         """Enclosures of the outputs.
 
-        Raises
-        ------
-        Undecided
-            If a jump is undecided or something is undefined somewhere in the balls.
-        Unproved
-            If the time of the graph's budget is used up.
+        Undecided where a jump is undecided or something is undefined somewhere in the balls.
         """
         self._budget.check()
         values = self._template.copy()
@@ -115,15 +110,7 @@ def _execute(steps: list[Step], values: list[arb]) -> None:
 
 
 def expand(tape: Tape, inputs: Sequence[Series], order: int, budget: Budget) -> list[Series]:
-    """Coefficients 0 .. ``order`` of a tape's outputs along series of its inputs.
-
-    Raises
-    ------
-    Undecided
-        If something jumps or is undefined there.
-    Unproved
-        If the time is used up.
-    """
+    """Coefficients 0 .. ``order`` of a tape's outputs along series of its inputs; Undecided where something jumps."""
     values: list[Series] = []
     for node in tape.nodes:
         budget.check()

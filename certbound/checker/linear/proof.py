@@ -60,23 +60,16 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     """Upper bound of the probability that a constraint is broken.
 
     It holds for every start and every disturbance, even one that sees coming noise; where the noise depends on the
-    state, for every disturbance that does not.
-
-    Raises
-    ------
-    CertificateError
-        If the proof's data are malformed.
-    Unproved
-        If an inequality could not be proved.
+    state, for every disturbance that does not. CertificateError where the proof's data are malformed, Unproved where an
+    inequality could not be proved.
     """
     record = Record(value, "proof", _PROOF)
     if model.continuous and model.dimension > MOST_STATES:
         raise Unproved(f"{model.dimension} states are too many for this proof in continuous time")
-    structure = structure_of(model, budget)
-    shared = Shared(model, structure, record)
+    shared = Shared(model, structure_of(model, budget), record)
     boxes = cells_of(model, record)
     entries = record.items("cells", len(boxes), len(boxes))
-    outputs = remainders(model, structure, budget)
+    outputs = remainders(model, shared.structure, budget)
     worst = arb(0)
     for index, (entry, box) in enumerate(zip(entries, boxes)):
         with budget.passing():
@@ -93,7 +86,7 @@ class _Cell:
         self.shared, self.model, self.record, self.budget = shared, shared.model, record, budget
         model, n, count = shared.model, shared.model.dimension, shared.count
         continuous = model.continuous
-        varying, moving = len(shared.structure.varying), len(shared.structure.moving)
+        varying, moving = len(shared.structure.states.varying), len(shared.structure.disturbances.varying)
         self.nominal = record.array("nominal", *((count, 4, n) if continuous else (count + 1, n)))
         if continuous and any(a[3] != b[0] for a, b in pairwise(self.nominal)):
             raise Unproved("the nominal curve jumps")
@@ -125,8 +118,7 @@ class _Cell:
         record, units, n = self.record, self.shared.units, self.model.dimension
         given = record.items("rows", self.shared.count, self.shared.count)
         extra = len(listed(given[0], record.at("rows"), 0, MOST_ROWS))
-        rows = []
-        zero, one = arb(0), arb(1)
+        rows, zero, one = [], arb(0), arb(1)
         self.budget.hold((len(units) + self.shared.count * extra) * (n // 8 + 1))  # of the same 0
         fixed = [[one if j == unit else zero for j in range(n)] for unit in units]
         for item in numbers(given, record.at("rows"), self.shared.count, extra, len(units)):
@@ -151,7 +143,7 @@ class _Cell:
         record, structure, units = self.record, self.shared.structure, list(self.shared.units)
         frames, most = [], len(self.rows[0]) - 1
         for i, item in enumerate(record.items("frames", self.model.dimension, self.model.dimension)):
-            active = structure.active_states(i)
+            active = structure.states.active(i)
             if item is not None:
                 frames.append(wholes(item, f"{record.at('frames')}[{i}]", 0, most))
             elif any(j not in units for j in active):
@@ -220,7 +212,7 @@ class _Cell:
         """
         largest = identity(self.model.dimension) * 0
         for slopes in self.slopes:
-            largest = largest + magnitude(self.shared.full(slopes))
+            largest = largest + magnitude(self.shared.structure.states.matrix(slopes))
         if self.model.continuous and row_sums(largest) * self.shared.length <= _MILD * len(self.slopes):
             return [arb(1)] * self.model.dimension
         return balance(largest)
@@ -230,11 +222,13 @@ class _Cell:
         fixed = identity(self.model.dimension) * 0 if state is not None else self.model.noise.covariance()
         self.budget.hold(self.shared.count * self.model.dimension**2 * (8 if self.model.continuous else 4))
         result = []
-        for k, (slope, drifts) in enumerate(zip(map(shared.full, self.slopes), self.drifts)):
+        jacobian = shared.structure.states
+        for k, (slope, drifts) in enumerate(zip(map(jacobian.matrix, self.slopes), self.drifts)):
             self.budget.check()
             noise = fixed if state is None else state.noise(k)
             if self.model.continuous:
-                result.append(continuous_piece(slope, shared.drift(drifts), shared.length, noise, self.natural))
+                drift = jacobian.matrix(drifts, constants=False)
+                result.append(continuous_piece(slope, drift, shared.length, noise, self.natural))
             else:
                 result.append(discrete_piece(slope, noise))
         return result
@@ -282,7 +276,7 @@ class _Cell:
         """E with its columns scaled by the disturbance's radii, and the bound of |E (d - d0)|."""
         if not self.reach:
             return None
-        gain = self.shared.full(self.gains[k], gains=True)
+        gain = self.shared.structure.disturbances.matrix(self.gains[k])
         n, q = self.model.dimension, len(self.reach)
         scaled = arb_mat(n, q, [gain[i, j] * self.reach[j] for i in range(n) for j in range(q)])
         return scaled, [sum((abs(scaled[i, j]) for j in range(q)), arb(0)) for i in range(n)]

@@ -87,11 +87,12 @@ def remainders(model: Model, structure: Structure, budget: Budget) -> list[Outpu
         velocities = [_polynomial(graph, _rate(graph, curve), tau) for curve in curves]
     else:
         states, velocities = fresh(n), fresh(n)
-    slopes = dict(zip(structure.varying, fresh(len(structure.varying))))
+    varying, moving = structure.states.varying, structure.disturbances.varying
+    slopes = dict(zip(varying, fresh(len(varying))))
     if model.continuous:
-        drifts = dict(zip(structure.varying, fresh(len(structure.varying))))
+        drifts = dict(zip(varying, fresh(len(varying))))
         slopes = {e: graph.add(a, graph.mul(tau, drifts[e])) for e, a in slopes.items()}
-    gains = dict(zip(structure.moving, fresh(len(structure.moving))))
+    gains = dict(zip(moving, fresh(len(moving))))
     centre = fresh(q)
     inputs = fresh(0 if model.plan is None else len(model.plan[0]))
     time = graph.add(middle, tau) if model.continuous else middle
@@ -110,7 +111,7 @@ def remainders(model: Model, structure: Structure, budget: Budget) -> list[Outpu
         budget.check()
         result.append(OutputRemainder(
             graph, graph.sub(values[i], velocities[i]), nodes[model.dynamics.outputs[i]], count=count,
-            time=model.continuous, states=structure.active_states(i), disturbances=structure.active_disturbances(i),
+            time=model.continuous, states=structure.states.active(i), disturbances=structure.disturbances.active(i),
             dimension=n, budget=budget,
         ))
     return result

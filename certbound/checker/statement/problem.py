@@ -101,12 +101,8 @@ def _names(record: Record, name: str, least: int) -> tuple[str, ...]:
 def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     """The problem in a certificate.
 
-    Raises
-    ------
-    CertificateError
-        If a field is missing, has the wrong size, or makes no sense.
-    Unproved
-        If it is too large for the budget.
+    CertificateError where a field is missing, has the wrong size, or makes no sense; Unproved where it is too large for
+    the budget.
     """
     record = Record(value, path, _FIELDS)
     time = record["time"]
