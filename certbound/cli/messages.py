@@ -77,12 +77,7 @@ def computing(engine: str, problem: Problem) -> Iterator[None]:
     """What fails in the block is a failure of certbound's, for the problem was checked when it was read.
 
     Two refusals stay the user's to mend: a plan that is missing, and a domain of the user's on which the model is
-    undefined or its slopes unbounded.
-
-    Raises
-    ------
-    EngineError, SolverError
-        For every other failure.
+    undefined or its slopes unbounded. Every other failure is an EngineError or a SolverError.
     """
     _ = problem.closed_loop
     try:

@@ -89,12 +89,8 @@ class Model:
 def model_of(source: Any, domain: Any, horizon: float | None) -> Model:
     """The model of a system, a problem or a python-control system, over a domain.
 
-    Raises
-    ------
-    TypeError
-        If ``source`` or ``domain`` is of another type.
-    ValueError
-        If the domain's dimension is wrong, or the horizon is not positive.
+    Another type of ``source`` or ``domain`` is a TypeError, a domain of the wrong dimension or a horizon that is not
+    positive a ValueError.
     """
     problem = source if isinstance(source, Problem) else None
     system: Any = problem.system if problem is not None else source

@@ -36,15 +36,11 @@ class NoiseBound:
 def bound_noise(model: Model, norm: Metric, pieces: Interval | None = None) -> NoiseBound:
     """Certified sigma and nu of a model's noise in a metric.
 
-    Proves: P^{1/2} g g^T P^{1/2} <= sigma^2 I and tr(P g g^T) <= nu sigma^2 over the model's ranges, or piece
-    by piece over ``pieces`` (CT); for DT the same with the variance proxy G S G^T in place of g g^T.
-    ``isotropic`` is True only if P g g^T (the covariance of Gaussian noise in DT) is a multiple of the
-    identity in rational arithmetic.
+    Proves: P^{1/2} g g^T P^{1/2} <= sigma^2 I and tr(P g g^T) <= nu sigma^2 over the model's ranges, or piece by piece
+    over ``pieces`` (CT); for DT the same with the variance proxy G S G^T in place of g g^T. ``isotropic`` is True only
+    if P g g^T (the covariance of Gaussian noise in DT) is a multiple of the identity in rational arithmetic.
 
-    Raises
-    ------
-    EnclosureError, ValueError, InfeasibleError
-        If g is undefined, jumps or is unbounded over the ranges.
+    EnclosureError, ValueError or InfeasibleError where g is undefined, jumps or is unbounded over the ranges.
     """
     system = model.system
     if isinstance(system, ContinuousSystem) and isinstance(system.diffusion, Tape):

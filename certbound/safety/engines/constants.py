@@ -77,16 +77,9 @@ def constants_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     """The best answer from constants: global ones, or local ones along the reach tube where none are global.
 
     It covers the disturbances that do not see coming noise. Where it is asked to be quick, proposed metrics and local
-    constants are left out.
-
-    Raises
-    ------
-    ValueError
-        If stated constants contradict the problem's own noise.
-    EnclosureError
-        If the Jacobian is unbounded or undefined on the domain that the user gave.
-    EngineError
-        If the nominal is lost before the horizon.
+    constants are left out. ValueError where stated constants contradict the problem's own noise, EnclosureError where
+    the Jacobian is unbounded or undefined on the domain that the user gave, EngineError where the nominal is lost
+    before the horizon.
     """
     method, constants, quick = asked.method, asked.constants, asked.quick
     if constants is not None:
