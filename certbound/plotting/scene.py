@@ -23,7 +23,6 @@ __all__ = [
     "VERMILION",
     "YELLOW",
     "Scene",
-    "instants",
     "noisy_reach",
 ]
 
@@ -54,6 +53,14 @@ class Scene:
         inner = [(self.reach, INNER)]
         return inner if self.tube is None else [(self.tube, OUTER), *inner]
 
+    def nominal(self, count: int = 400) -> tuple[Array, Array]:
+        """Times at which the nominal is drawn, shape (K,), and its states then, shape (K, n)."""
+        curve = self.reach.curve
+        times = np.asarray(curve.starts)
+        if curve.continuous:
+            times = np.linspace(float(times[0]), self.reach.end, count)
+        return times, np.array([self.reach.center(float(t)) for t in times])
+
 
 def noisy_reach(verdict: Verdict) -> ReachTube | None:
     """The reach tube of a verdict with the stochastic deviation at the problem's delta, where there is one."""
@@ -75,10 +82,3 @@ def noisy_reach(verdict: Verdict) -> ReachTube | None:
     if not np.all(np.isfinite(radius)):
         return None
     return verdict.reach.grown(radius, log10_delta=verdict.tube.log10_delta, method=verdict.method)
-
-
-def instants(tube: ReachTube, count: int = 400) -> Array:
-    """Times at which the nominal is drawn."""
-    if tube.curve.continuous:
-        return np.linspace(float(tube.curve.starts[0]), tube.end, count)
-    return np.asarray(tube.curve.starts)
