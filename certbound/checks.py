@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "assign",
     "frozen",
     "matrix",
     "names",
@@ -32,6 +33,12 @@ def frozen(value: Any) -> Array:
     array = np.array(value, dtype=float) + 0.0
     array.setflags(write=False)
     return array
+
+
+def assign(instance: object, **values: Any) -> None:
+    """Set fields of a frozen record, while it is made."""
+    for name, value in values.items():
+        object.__setattr__(instance, name, value)
 
 
 def _floats(name: str, value: Any) -> Array:

@@ -55,12 +55,7 @@ class Engine:
 
 
 def engine_of(proof: object, method: str) -> str:
-    """The engine that a proof names, which ``claim.method`` must name too.
-
-    Raises
-    ------
-    CertificateError
-    """
+    """The engine that a proof names, which ``claim.method`` must name too."""
     engine = proof.get("engine") if isinstance(proof, Mapping) else None
     if not isinstance(engine, str) or engine not in ENGINES:
         raise CertificateError(f"`proof.engine` must be one of {', '.join(ENGINES)}.")

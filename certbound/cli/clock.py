@@ -57,12 +57,7 @@ class Clock:
     def running(self) -> Iterator[None]:
         """Raise ``OutOfTime`` in the block when the time is over (between two steps of Python).
 
-        Raises
-        ------
-        OutOfTime
-            When the time is over.
-        InputError
-            On systems without interval timers.
+        InputError on systems without interval timers.
         """
         if self.limit is None:
             yield

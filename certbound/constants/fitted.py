@@ -66,11 +66,6 @@ def noise_spread(constants: Constants) -> float:
     """log of the largest mean square of ||X - x||_P that the constants allow over their pieces, in floating point.
 
     It solves v' = 2 c v + nu sigma^2 (CT) or v+ = L^2 v + nu sigma^2 (DT) from v = 0; -inf without noise.
-
-    Raises
-    ------
-    ValueError
-        If the constants have no time pieces.
     """
     if constants.times is None:
         raise ValueError("`constants` must have time pieces, got constants that hold at all times.")

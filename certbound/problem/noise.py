@@ -163,10 +163,7 @@ class Law:
 def check_law(law: Law, task: str, error: type[Exception] = TypeError) -> None:
     """Refuse a law that has no name of its own: a class made from another law may draw otherwise.
 
-    Raises
-    ------
-    TypeError or ``error``
-        If it has none; ``task`` says what it was wanted for.
+    ``task`` says what it was wanted for, ``error`` which exception that is.
     """
     if not law.name:
         raise error(

@@ -15,10 +15,7 @@ _HALVINGS = 60
 def cholesky(a: arb_mat, budget: Budget | None = None) -> arb_mat:
     """Lower triangular L with L L^T = a, for every symmetric matrix in the ball matrix.
 
-    Raises
-    ------
-    Unproved
-        If it is not shown to be positive definite.
+    `Unproved` where that is not shown to be positive definite.
     """
     n = a.nrows()
     low = [[arb(0)] * n for _ in range(n)]

@@ -22,19 +22,9 @@ _NODE = 6
 
 
 class Graph:
-    """A growing set of expressions over numbered inputs.
+    """A growing set of expressions over numbered inputs; ``budget`` limits what is built and what runs over it.
 
-    Parameters
-    ----------
-    budget : Budget, optional
-        Limits on what is built and on what runs over it.
-
-    Attributes
-    ----------
-    nodes : list of Node
-        Operations; arguments come before their users.
-    masks : list of int
-        Bit i is set where a node depends on input i.
+    ``nodes`` are operations, arguments before their users; bit i of ``masks`` is set where a node depends on input i.
 
     Examples
     --------

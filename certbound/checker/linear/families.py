@@ -38,21 +38,8 @@ def leaving(
 ) -> arb:
     """Upper bound of the probability that some event happens.
 
-    Parameters
-    ----------
-    families : sequence of Family
-    exceedance : callable
-        P(rows[k] . Z_k > levels[k] for some k) of a family.
-    budget : Budget
-    paid : arb, optional
-        What is paid once, for all families together.
-    normal : bool
-        Whether Z is a centred normal vector over finitely many times, so that symmetric events are correlated.
-
-    Raises
-    ------
-    Unproved
-        If a family leaves nothing.
+    ``exceedance`` gives P(rows[k] . Z_k > levels[k] for some k) of a family; ``paid`` is paid once, for all together.
+    ``normal``: Z is a centred normal vector over finitely many times, so that symmetric events are correlated.
     """
     single = []
     for family in families:

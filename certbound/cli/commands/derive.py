@@ -13,7 +13,7 @@ from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
 from certbound.cli.describe import describe_constants
 from certbound.cli.messages import computing
 from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, examples, load_problem
-from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.display import log10_text, name_text
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
 
@@ -52,10 +52,7 @@ def derive(
         ],
         "seconds": seconds,
     }
-    if as_json:
-        print_json(result)
-    else:
-        _print(constants, result)
+    show(result, as_json, lambda: _print(constants, result))
 
 
 def _bound(subject: Problem, clock: Clock) -> tuple[Constants, list[Constants], str]:

@@ -31,11 +31,7 @@ class Sector:
 def lmi_blocks(jacobians: JacobianSet, *, form: str = "auto") -> list[Array | Sector]:
     """The pieces that a program imposes one inequality each for: vertices, or centred sectors.
 
-    Parameters
-    ----------
-    jacobians : JacobianSet
-    form : {"auto", "vertices", "sector"}
-        ``auto`` keeps vertices up to ``VERTEX_LIMIT`` of them.
+    ``form`` is "vertices", "sector", or "auto", which keeps vertices up to ``VERTEX_LIMIT`` of them.
     """
     if form not in ("auto", "vertices", "sector"):
         raise ValueError(f'`form` must be "auto", "vertices" or "sector", got {form!r}.')

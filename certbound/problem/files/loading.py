@@ -66,10 +66,7 @@ def load(source: str | Path, **parameters: Any) -> Problem:
 def loads(text: str, *, folder: Path | None = None, **parameters: Any) -> Problem:
     """A problem from the text of a problem file; ``plan.file`` is read from ``folder`` only.
 
-    Raises
-    ------
-    ValueError, TypeError
-        As for ``load``.
+    Errors are those of ``load``.
     """
     from pydantic import ValidationError
 

@@ -21,16 +21,8 @@ Array = NDArray[np.float64]
 def compile_numpy(tape: Tape) -> Callable[..., Array]:
     """A function that evaluates ``tape`` on arrays, in plain floating point (nothing is certified).
 
-    Parameters
-    ----------
-    tape : Tape
-        Function of ``len(tape.inputs)`` scalars with output shape ``tape.shape``.
-
-    Returns
-    -------
-    callable
-        ``evaluate(*inputs)`` with one number or array per input slot, broadcast against each other to a shape
-        ``batch``; returns an array of shape ``(*batch, *tape.shape)``. Undefined operations give nan or inf.
+    ``evaluate(*inputs)`` takes one number or array per input slot, broadcast against each other to a shape ``batch``,
+    and returns an array of shape ``(*batch, *tape.shape)``. Undefined operations give nan or inf.
 
     Examples
     --------

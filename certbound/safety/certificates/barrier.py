@@ -22,10 +22,7 @@ _LOG10 = math.log(10.0)
 def barrier_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
     """The proof's data, the claimed log10 of the probability, and no assumptions.
 
-    Raises
-    ------
-    CertificateError
-        If no barrier was found, or it bounds nothing once its levels have been rounded for the checker.
+    CertificateError where no barrier was found, or it bounds nothing once its levels have been rounded for the checker.
     """
     barrier: Barrier | None = answer.details
     if barrier is None:
