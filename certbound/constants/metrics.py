@@ -291,7 +291,8 @@ def erosion_ratio(constants: Constants, rooms: Rooms, horizon: float, delta: flo
         times = np.arange(int(horizon) + 2.0)
     tube = tune_tube(constants, horizon=horizon, delta=delta, objective=(times, values))
     asked = np.isfinite(room)  # elsewhere nothing is asked, and an endless radius is no erosion
-    ratios = np.asarray(tube.radius(rooms.times))[asked] / room[asked]
+    with np.errstate(over="ignore"):  # a ratio beyond all floats is endless
+        ratios = np.asarray(tube.radius(rooms.times))[asked] / room[asked]
     return float(np.max(ratios, initial=0.0))
 
 

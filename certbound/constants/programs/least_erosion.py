@@ -52,13 +52,15 @@ class Rooms:
     rooms: Array
 
     def coarse(self, count: int = _NODES) -> Rooms:
-        """At most ``count`` of the times, dense after the start, the tightest one of each group."""
+        """``count`` of the times, dense after the start: the tightest of each group, and of each direction missed."""
         if len(self.times) <= count:
             return self
         ends = np.unique(np.round(len(self.times) * np.linspace(0, 1, count + 1) ** 2).astype(int))
         smallest = np.min(self.rooms, axis=1, keepdims=True)
         tightness = np.min(self.rooms / smallest, axis=0)
         keep = [a + int(np.argmin(tightness[a:b])) for a, b in pairwise(ends)]
+        missed = ~np.any(np.isfinite(self.rooms[:, keep]), axis=1)  # a short window beside a tighter direction
+        keep = sorted({*keep, *np.argmin(self.rooms[missed], axis=1).tolist()})
         return Rooms(directions=self.directions, times=self.times[keep], rooms=self.rooms[:, keep])
 
     @property
