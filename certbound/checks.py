@@ -10,19 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "assign",
-    "frozen",
-    "matrix",
-    "names",
-    "nearest",
-    "number",
-    "pick",
-    "positive_definite",
-    "symmetric",
-    "vector",
-]
-
 Array = NDArray[np.float64]
 _SLACK, _ROUNDING = 1e-12, 1e-14
 """How far a semidefinite matrix with a diagonal of 1 may miss it, and how far its computed eigenvalues may."""

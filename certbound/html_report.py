@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from certbound.reach.sets import ReachTube
     from certbound.safety.verification import Verdict
 
-__all__ = ["report_page"]
-
 Array = NDArray[np.float64]
 Trace = dict[str, Any]
 

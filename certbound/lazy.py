@@ -7,8 +7,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-__all__ = ["lazily", "names_in"]
-
 
 def names_in(homes: Mapping[str, str]) -> list[str]:
     """All names of a table from modules to the names that they hold, in its order."""

@@ -24,8 +24,6 @@ from certbound.checker.statement import Model, SafeSet
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["check_barrier"]
-
 MOST_STATES = 6
 MOST_TERMS = 500
 MOST_POWER = 12

@@ -22,8 +22,6 @@ from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["ENGINES", "STATED", "Engine", "assumptions", "claim", "engine_of"]
-
 STATED = "the stated constants hold"
 """How a certificate's own list names what `assumptions` derives from the proof."""
 

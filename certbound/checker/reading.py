@@ -16,8 +16,6 @@ from typing import Any, NoReturn
 
 from certbound.errors import CertificateError
 
-__all__ = ["Record", "number", "numbers", "parse", "read", "text", "whole", "wholes"]
-
 LARGEST_FILE = 16 * 2**20
 """Bytes."""
 MOST_ENTRIES = 2_000_000

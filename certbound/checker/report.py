@@ -11,8 +11,6 @@ from flint import ctx
 
 from certbound.errors import CertboundError
 
-__all__ = ["NOT_PROVED", "UNDER_ASSUMPTIONS", "VALID", "Budget", "Report", "Unproved"]
-
 VALID = "valid"
 UNDER_ASSUMPTIONS = "valid under assumptions"
 NOT_PROVED = "not proved"

@@ -15,8 +15,6 @@ import typer
 from certbound.cli.messages import InputError
 from certbound.cli.options import number, option
 
-__all__ = ["Clock", "OutOfTime", "TimeLimitOption", "positive"]
-
 
 class OutOfTime(BaseException):
     """The time limit has passed; like KeyboardInterrupt, it is no error that a handler may swallow."""

@@ -23,8 +23,6 @@ from certbound.errors import (
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
 
-__all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "InputError", "computing", "explain", "split_cure", "write_error"]
-
 BAD_INPUT = 2
 FAILED = 3
 INTERRUPTED = 130

@@ -17,18 +17,6 @@ from certbound.display import plain
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = [
-    "SETTINGS",
-    "Settings",
-    "animated",
-    "console",
-    "logging_to_stderr",
-    "print_status",
-    "show",
-    "spinner",
-    "write_file",
-]
-
 
 class Settings:
     """The global options of this run."""

@@ -22,8 +22,6 @@ from certbound.errors import EnclosureError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants
 
-__all__ = ["bound_constants", "constants_along"]
-
 Array = NDArray[np.float64]
 
 

@@ -19,8 +19,6 @@ from certbound.errors import EnclosureError, InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants, Proof
 
-__all__ = ["certify", "record", "relative_widths", "slope_weights"]
-
 Array = NDArray[np.float64]
 
 FIRST_BUDGET = 4000

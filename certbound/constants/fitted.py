@@ -15,8 +15,6 @@ from certbound.errors import SolverError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants
 
-__all__ = ["fitted_constants_along", "noise_spread"]
-
 
 def fitted_constants_along(source: Any, times: ArrayLike, boxes: Interval, *, refine: int = 16) -> Constants:
     """Constants per time piece in the better of two metrics: the identity, and one fitted to the boxes.

@@ -13,8 +13,6 @@ from certbound.errors import CertboundError
 from certbound.problem.problem import Problem
 from certbound.tubes.constants import Constants
 
-__all__ = ["check_constants", "implies"]
-
 
 def check_constants(problem: Problem, constants: Constants, name: str = "constants") -> None:
     """Refuse constants that cannot be those of ``problem``, for every input that it allows (of its plan, with one).

@@ -38,8 +38,6 @@ from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 from certbound.tubes.constants import Constants
 
-__all__ = ["bound_metrics", "improve", "jacobian_set", "propose_metrics", "split_delta"]
-
 Array = NDArray[np.float64]
 
 _GAIN = 1e-3

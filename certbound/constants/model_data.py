@@ -14,8 +14,6 @@ from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System, from_control
 from certbound.rigor.intervals import Interval
 
-__all__ = ["Model", "model_of"]
-
 Array = NDArray[np.float64]
 
 

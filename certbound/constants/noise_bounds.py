@@ -18,8 +18,6 @@ from certbound.rigor.definite import eigenvalue_upper
 from certbound.rigor.intervals import Interval, matmul
 from certbound.rigor.rounding import TINY, lower, quiet, upper
 
-__all__ = ["NoiseBound", "bound_noise"]
-
 Array = NDArray[np.float64]
 
 

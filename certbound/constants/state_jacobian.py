@@ -11,8 +11,6 @@ from certbound.constants.enclosures import Spread, enclose
 from certbound.problem.model import OPERATIONS, Node, Tape, compile_numpy, jacobian, sources
 from certbound.rigor.intervals import Interval
 
-__all__ = ["StateJacobian"]
-
 Array = NDArray[np.float64]
 PERIOD = 6.283185307179588
 """A float above 2 pi."""

@@ -16,8 +16,6 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.tubes.constants import Constants
 
-__all__ = ["proved_or_stated", "refuse_contradiction"]
-
 Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9  # what floating-point evaluations of the problem's own numbers may be wrong by, and more

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.reach.sets import ReachTube
 
-__all__ = ["Panel", "draw_panel", "least_distance", "panels_of", "stairs"]
-
 Array = NDArray[np.float64]
 
 

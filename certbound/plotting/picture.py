@@ -11,8 +11,6 @@ from certbound.plotting.scene import BLUE, GREY, INK, INNER, OUTER, RIM, VERMILI
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_scene"]
-
 PANELS = 6
 
 

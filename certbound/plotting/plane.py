@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.reach.sets import ReachTube
 
-__all__ = ["draw_plane", "outlines", "plane_of", "supports"]
-
 Array = NDArray[np.float64]
 Plane = tuple[int, int]
 

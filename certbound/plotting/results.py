@@ -21,8 +21,6 @@ from certbound.tubes.tube import Tube
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw"]
-
 Array = NDArray[np.float64]
 
 

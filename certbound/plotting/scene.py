@@ -13,19 +13,6 @@ if TYPE_CHECKING:
     from certbound.reach.sets import ReachTube
     from certbound.safety.verification import Verdict
 
-__all__ = [
-    "BLUE",
-    "GREY",
-    "INK",
-    "INNER",
-    "OUTER",
-    "RIM",
-    "VERMILION",
-    "YELLOW",
-    "Scene",
-    "noisy_reach",
-]
-
 Array = NDArray[np.float64]
 
 INK, GREY, BLUE, VERMILION, YELLOW = "#000000", "#8c8c8c", "#0072B2", "#D55E00", "#F0E442"

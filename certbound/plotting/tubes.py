@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from certbound.tubes.tube import Tube
 
-__all__ = ["draw_tubes"]
-
 Array = NDArray[np.float64]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")

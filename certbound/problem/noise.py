@@ -21,10 +21,6 @@ from numpy.typing import NDArray
 from certbound.checks import frozen, positive_definite, vector
 from certbound.rigor.intervals import Interval, sq
 
-__all__ = [
-    "LAWS", "Bounded", "BoxLaw", "Gaussian", "Law", "Rademacher", "SubGaussian", "Uniform", "check_law", "known_laws",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 LAWS: dict[str, type[Law]] = {}

@@ -16,8 +16,6 @@ from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.sets import Box, GaussianStart, Inside, Outside, Region, check_start
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
-__all__ = ["GaussianStart", "Problem"]
-
 Array = NDArray[np.float64]
 
 

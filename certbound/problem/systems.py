@@ -20,8 +20,6 @@ from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.noise import Gaussian, Law, known_laws
 from certbound.problem.sets import Box
 
-__all__ = ["ContinuousSystem", "DiscreteSystem", "System", "from_control", "linear_system"]
-
 Array = NDArray[np.float64]
 
 

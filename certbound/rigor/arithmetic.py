@@ -14,11 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.rigor.rounding import LARGEST, TINY, lower, product_error, quiet, upper
 
-__all__ = [
-    "Interval", "IntervalLike", "add", "concatenate", "divide", "matmul", "multiply", "power", "stack",
-    "subtract",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 

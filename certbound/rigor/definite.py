@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from certbound.rigor.arithmetic import Interval, IntervalLike, matmul
 from certbound.rigor.rounding import STEP, TINY, lower, product_error, quiet, upper
 
-__all__ = ["eigenvalue_lower", "eigenvalue_upper", "finite_part", "is_positive_definite", "perron_upper"]
-
 Array = NDArray[np.float64]
 
 

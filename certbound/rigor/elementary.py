@@ -16,12 +16,6 @@ from numpy.typing import NDArray
 from certbound.rigor.arithmetic import Interval, power
 from certbound.rigor.rounding import LIBRARY_ULPS, STEP, TINY, lower, quiet, upper
 
-__all__ = [
-    "abs_", "across_cut", "acos", "and_", "asin", "atan", "atan2", "beyond_one", "cos", "cosh", "equal", "exp", "floor",
-    "hypot", "if_else_zero", "kink", "less", "less_equal", "log", "maximum", "minimum", "not_", "or_", "pow_",
-    "power_undefined", "sign", "sin", "sinh", "sq", "sqrt", "tan", "tan_undefined", "tanh",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Function = Callable[[Any], Any]

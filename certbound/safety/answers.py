@@ -18,11 +18,6 @@ from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
 
-__all__ = [
-    "AS_IT_IS", "Answered", "Deviation", "EngineAnswer", "Proof", "Request", "exact", "is_at_most", "is_more_than",
-    "settled",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 Proof = tuple[dict[str, Any], float, list[str]]

@@ -21,8 +21,6 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most
 from certbound.safety.portfolio import ENGINES
 
-__all__ = ["FORMAT", "VERSION", "certificate_data", "certificate_text", "problem_data", "restated"]
-
 FORMAT = "certbound certificate"
 VERSION = 1
 _ROUNDING = 1e-6  # other versions of the ball arithmetic may round otherwise

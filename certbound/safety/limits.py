@@ -22,8 +22,6 @@ from certbound.problem.systems import ContinuousSystem, System
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import Verdict, verify_safety
 
-__all__ = ["Limits", "find_limits", "smaller_verdicts"]
-
 _HALVINGS = 5
 _WIDENINGS = 4
 _LEAST_EXPONENT = -300.0  # deltas are floats

@@ -22,8 +22,6 @@ from certbound.safety.portfolio import ENGINES, engine_named
 if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
 
-__all__ = ["EngineAnswer", "Verdict", "best_lower", "verify_safety"]
-
 _log = logging.getLogger(__name__)
 
 

@@ -7,8 +7,6 @@ from flint import arb, arb_mat
 from certbound.checker.balls.matrices import identity, is_positive_definite, matrix, row_sums
 from certbound.checker.report import Budget, Unproved
 
-__all__ = ["cholesky", "largest_eigenvalue"]
-
 _HALVINGS = 60
 
 

@@ -21,8 +21,6 @@ from flint import arb
 from certbound.checker.balls import upper
 from certbound.checker.report import Budget, Unproved
 
-__all__ = ["Kummer", "exit_probability", "growth_integral", "lower_excess", "partial_excess"]
-
 MOST_POWER = 1e5
 _LARGEST = arb(10) ** 7
 _CLOSE, _MOST_PARTS = 0.998, 1024

@@ -23,8 +23,6 @@ from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Grid, Model, cells_of, demands, round_demands, structure_of
 from certbound.errors import CertificateError
 
-__all__ = ["check_constants"]
-
 MOST_PIECES = 20_000
 MOST_DEGREE = 12
 MOST_STATES = 200

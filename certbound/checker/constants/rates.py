@@ -18,8 +18,6 @@ from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, Structure
 from certbound.problem.model import JUMPS, Tape
 
-__all__ = ["Contraction", "Spread"]
-
 Box = list[tuple[arb, arb]]
 
 MOST_VERTICES = 4096

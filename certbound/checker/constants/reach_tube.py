@@ -21,8 +21,6 @@ from certbound.checker.expressions import Program, Undecided, expand
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, Structure
 
-__all__ = ["CurvePiece", "Norm", "Tube"]
-
 ORDER = 6
 KINK_PARTS, SLIP = 16, arb(2) ** -20
 """Parts of a piece with a kink inside, and how much wider than its share each is taken."""

@@ -11,12 +11,6 @@ from collections.abc import Callable
 
 from flint import arb
 
-__all__ = [
-    "Undecided", "acos", "asin", "at_most", "atan", "atan2", "between", "cos", "cosh", "equal", "exp", "floor",
-    "generalised_kink", "holds", "hypot", "increasing", "is_wide", "kink", "less", "log", "power", "sign", "sin",
-    "sinh", "sqrt", "square", "tanh", "wave",
-]  # fmt: skip
-
 _WIDE = 1e-9
 
 

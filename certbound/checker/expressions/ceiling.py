@@ -20,8 +20,6 @@ from certbound.checker.expressions.program import Program
 from certbound.checker.report import Budget
 from certbound.problem.model import JUMPS
 
-__all__ = ["Ceiling", "Side", "middle_of"]
-
 _MOST_BOXES = 200_000
 _DEEPEST = 40
 _EVEN = 6

@@ -12,8 +12,6 @@ from certbound.checker.expressions.operations import OPERATIONS
 from certbound.checker.expressions.quadratic import Quadratic
 from certbound.checker.expressions.taylor import Model, constant
 
-__all__ = ["Expansion"]
-
 _ZERO = arb(0)
 _MANY = 100
 """Terms whose time and memory are worth counting."""

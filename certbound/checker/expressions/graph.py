@@ -14,8 +14,6 @@ from certbound.checker.expressions.operations import OPERATIONS
 from certbound.checker.report import Budget, Unproved
 from certbound.problem.model import Node, Tape
 
-__all__ = ["Graph"]
-
 MOST_NODES = 400_000
 _NODE = 6
 """Memory of a node, in balls."""

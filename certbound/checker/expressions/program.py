@@ -16,8 +16,6 @@ from certbound.checker.expressions.series import Series, constant
 from certbound.checker.report import Budget
 from certbound.problem.model import Tape
 
-__all__ = ["Program", "expand"]
-
 Step = tuple[int, Callable[..., arb], int, int]
 
 

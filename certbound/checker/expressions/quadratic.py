@@ -15,8 +15,6 @@ from flint import arb
 
 from certbound.checker.report import Budget
 
-__all__ = ["Cut", "Quadratic"]
-
 _MOST = 60
 _VAIN = 0.12
 

@@ -15,11 +15,6 @@ from flint import arb
 
 from certbound.checker.expressions import arithmetic as balls
 
-__all__ = [
-    "Model", "abs_", "acos", "add", "asin", "atan", "atan2", "constant", "cos", "cosh", "div", "exp", "hypot", "log",
-    "maximum", "minimum", "mul", "neg", "power", "sin", "sinh", "smooth", "sqrt", "tan", "tanh",
-]  # fmt: skip
-
 _ZERO = arb(0)
 
 K = TypeVar("K")

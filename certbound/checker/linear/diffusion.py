@@ -28,8 +28,6 @@ from certbound.checker.statement import Model
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["Along", "Asked", "StateNoise", "Stopped"]
-
 _FIELDS = ("windows", "reference", "low", "high", "coordinates", "rows", "rooms")
 
 

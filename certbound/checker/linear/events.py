@@ -21,8 +21,6 @@ from certbound.checker.balls import below_and_above, identity, magnitude, quadra
 from certbound.checker.linear.response import Piece
 from certbound.checker.report import Budget, Unproved
 
-__all__ = ["Windows", "chain", "sub_gaussian", "union_of_pairs"]
-
 _NEGLIGIBLE = 1e-3
 
 Level = arb | None

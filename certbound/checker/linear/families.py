@@ -16,8 +16,6 @@ from flint import arb
 from certbound.checker.balls import upper
 from certbound.checker.report import Budget, Unproved
 
-__all__ = ["Family", "leaving"]
-
 _LIKELY = 0.005
 """Below that a product saves next to nothing over a sum."""
 

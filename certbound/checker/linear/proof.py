@@ -41,8 +41,6 @@ from certbound.checker.statement import Grid, Model, cells_of, demands, structur
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["check_linear"]
-
 MOST_ROWS = 64
 MOST_STATES = 100
 _BITS, _MOST_BITS = 128, 3000

@@ -23,8 +23,6 @@ from certbound.checker.expressions import Cut, Expansion, Graph, Program, Quadra
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, Structure
 
-__all__ = ["OutputRemainder", "PieceData", "Polytope", "remainders"]
-
 _MOST_BOXES = 4000
 _MOST_PARTS = 8
 _ENOUGH = 0.1  # of the width of a box of the remainder: an error that may leave room for a proof

@@ -21,11 +21,6 @@ from flint import arb, arb_mat
 from certbound.checker.balls import column, diagonal, identity, magnitude, row_sums
 from certbound.checker.report import Budget, Unproved
 
-__all__ = [
-    "Load", "Piece", "Supports", "balance", "continuous_piece", "covariances", "discrete_piece", "over_piece",
-    "supports",
-]  # fmt: skip
-
 _TERMS = 60
 _SWEEPS, _FARTHEST = 20, 300
 _SMALL = arb(2) ** -100

@@ -11,8 +11,6 @@ from certbound.checker.report import Unproved
 from certbound.checker.statement import Model, Structure
 from certbound.errors import CertificateError
 
-__all__ = ["Shared"]
-
 MOST_PIECES = 4000
 
 

@@ -16,8 +16,6 @@ from certbound.checker.statement.tapes import read_tape
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["Initial", "Model", "Noise", "read_model"]
-
 MOST_STATES = 400
 MOST_STEPS = 100_000
 _SLACK = arb(2) ** -39

@@ -20,8 +20,6 @@ from certbound.checker.statement.tapes import read_tape
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["POLYGON", "Constraint", "Region", "read_constraint"]
-
 POLYGON = 24
 
 Row = list[arb]

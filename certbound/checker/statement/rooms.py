@@ -16,8 +16,6 @@ from certbound.checker.statement.regions import Constraint, Region
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["Demand", "Grid", "RoundDemand", "demands", "round_demands"]
-
 _STRICT = arb(2) ** -300
 
 

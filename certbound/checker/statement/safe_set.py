@@ -12,8 +12,6 @@ from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint
 from certbound.problem.model import Tape
 
-__all__ = ["Part", "SafeSet"]
-
 _MOST_BOXES = 20_000
 _DEEPEST = 40
 

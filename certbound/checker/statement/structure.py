@@ -17,8 +17,6 @@ from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.problem.model import JUMPS
 
-__all__ = ["Structure", "structure_of"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Entries:

@@ -11,8 +11,6 @@ from certbound.checker.reading import entries as listed
 from certbound.errors import CertificateError
 from certbound.problem.model import Node, Tape
 
-__all__ = ["canonical", "read_tape"]
-
 
 def read_tape(value: object, path: str, inputs: tuple[str, ...], shape: tuple[int, ...]) -> Tape:
     """A tape over the given inputs: {"nodes": [[op, ...arguments]], "outputs": [...]}.

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.safety.verification import Verdict
 
-__all__ = ["EXAMPLES", "check", "proved_certificate"]
-
 EXAMPLES = examples(
     "certbound check unicycle.json --problem unicycle",
     "certbound check my_system.json --problem my_system.toml --json",

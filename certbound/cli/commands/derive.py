@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.tubes.constants import Constants
 
-__all__ = ["EXAMPLES", "derive"]
-
 EXAMPLES = examples("certbound derive chain --json", "certbound derive unicycle --time-limit 20")
 _log = logging.getLogger(__name__)
 

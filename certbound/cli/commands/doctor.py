@@ -15,8 +15,6 @@ from certbound.cli.messages import FAILED
 from certbound.cli.options import JsonOption, examples
 from certbound.cli.output import SETTINGS, console, show, spinner
 
-__all__ = ["EXAMPLES", "doctor"]
-
 EXAMPLES = examples("certbound doctor", "certbound doctor --json")
 EXTRAS = {"cluster": ["dask", "distributed"], "learn": ["sklearn"]}
 

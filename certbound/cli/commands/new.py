@@ -12,8 +12,6 @@ from certbound.cli.messages import InputError
 from certbound.cli.options import JsonOption, check_writable, examples
 from certbound.cli.output import SETTINGS, console, show, write_file
 
-__all__ = ["EXAMPLES", "TEMPLATE", "new"]
-
 EXAMPLES = examples("certbound new my_system && certbound verify my_system.toml")
 TEMPLATE = """\
 # A certbound problem: a noisy system, where it starts, where it must stay, for how long, and how surely.

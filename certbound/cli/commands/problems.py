@@ -8,8 +8,6 @@ from typing import Any
 from certbound.cli.options import JsonOption, examples
 from certbound.cli.output import SETTINGS, console, show
 
-__all__ = ["EXAMPLES", "problems"]
-
 EXAMPLES = examples("certbound problems", "certbound problems --quiet")
 
 

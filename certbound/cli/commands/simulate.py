@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.simulation.executors import Progress
 
-__all__ = ["EXAMPLES", "simulate"]
-
 EXAMPLES = examples(
     "certbound simulate ou --paths 1e6 --seed 1",
     "certbound simulate unicycle --paths 1e9 --time-limit 60",

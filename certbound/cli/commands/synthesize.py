@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from certbound.synthesis.controllers import ClosedLoop
     from certbound.synthesis.plans import Synthesis
 
-__all__ = ["EXAMPLES", "synthesize"]
-
 EXAMPLES = examples("certbound synthesize chain --closed-loop 3000 --plan plan.json")
 RUNS = (
     "runs", "violations", "lower", "upper", "max_input", "mean_final_cost", "mean_cost", "by_constraint", "seconds",

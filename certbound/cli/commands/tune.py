@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
     from certbound.tubes.tube import Tube
 
-__all__ = ["EXAMPLES", "tune"]
-
 SAMPLES = 513
 EXAMPLES = examples(
     "certbound tune ou --json",

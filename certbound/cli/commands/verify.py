@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from certbound.safety.answers import EngineAnswer
     from certbound.safety.verification import Verdict
 
-__all__ = ["EXAMPLES", "verify"]
-
 EXAMPLES = examples(
     "certbound verify unicycle --horizon 2 --plot tube.png",
     "certbound verify my_system.toml --set sigma=0.1 --delta 1e-6 --json",

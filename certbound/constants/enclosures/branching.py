@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from certbound.rigor.intervals import Interval
 
-__all__ = ["Supremum", "bound_supremum", "random_points", "split_boxes"]
-
 Array = NDArray[np.float64]
 
 ROUND = 2048

@@ -21,8 +21,6 @@ from certbound.rigor.definite import eigenvalue_upper, finite_part, perron_upper
 from certbound.rigor.intervals import Interval, matmul
 from certbound.rigor.rounding import TINY, lower, product_error, quiet, upper
 
-__all__ = ["Metric", "Spread"]
-
 Array = NDArray[np.float64]
 
 

@@ -18,8 +18,6 @@ from certbound.errors import EnclosureError
 from certbound.problem.model import OPERATIONS, Node, Tape, enclosed, undefined_where
 from certbound.rigor.intervals import Interval
 
-__all__ = ["enclose"]
-
 Mask = NDArray[np.bool_]
 CHUNK = 8192
 """Boxes evaluated at a time: the intermediate results stay in the processor's cache."""

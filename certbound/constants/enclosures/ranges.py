@@ -15,8 +15,6 @@ from certbound.constants.enclosures.enclosure import enclose
 from certbound.problem.model import Graph, Node, Tape
 from certbound.rigor.intervals import Interval
 
-__all__ = ["bound_ranges", "extract"]
-
 Array = NDArray[np.float64]
 
 _BOXES = 4000

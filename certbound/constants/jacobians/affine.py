@@ -19,8 +19,6 @@ from certbound.constants.jacobians.arguments import (
     square_matrix,
 )
 
-__all__ = ["AffineForm", "AffineSet", "SectorSet"]
-
 Array = NDArray[np.float64]
 
 _VERTEX_LIMIT = 1 << 16

@@ -5,16 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "factor",
-    "finite_array",
-    "is_near",
-    "matrix_batch",
-    "metric_roots",
-    "parameter_range",
-    "square_matrix",
-]
-
 Array = NDArray[np.float64]
 
 UNIT = float(np.finfo(float).eps)

@@ -26,8 +26,6 @@ from certbound.constants.jacobians.arguments import (
     square_matrix,
 )
 
-__all__ = ["IntervalMatrixSet", "JacobianSet", "UnionSet", "VertexPolytope", "as_set"]
-
 Array = NDArray[np.float64]
 
 

@@ -24,8 +24,6 @@ from certbound.errors import EnclosureError
 from certbound.problem.model import Node, Tape
 from certbound.rigor.intervals import Interval
 
-__all__ = ["affine_set"]
-
 Array = NDArray[np.float64]
 
 _NARROW = 1e-13

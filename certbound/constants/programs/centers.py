@@ -23,8 +23,6 @@ from certbound.checks import frozen
 from certbound.constants.jacobians import JacobianSet
 from certbound.constants.programs.sectors import Sector, contraction_value, lmi_blocks, transformed
 
-__all__ = ["Center", "center_metric", "center_multipliers", "lyapunov_metric", "reachable_value", "starting_metric"]
-
 Array = NDArray[np.float64]
 
 _SHRINK = 0.1

@@ -25,8 +25,6 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.excess import log_excess, log_phi
 from certbound.tubes.schedule import make_schedule
 
-__all__ = ["RadiusModel", "Rooms", "TightMetric", "erosion_factors", "noise_numbers", "tighten"]
-
 Array = NDArray[np.float64]
 
 _ROUNDS = 2

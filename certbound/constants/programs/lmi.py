@@ -26,8 +26,6 @@ from certbound.constants.jacobians import JacobianSet
 from certbound.constants.programs.sectors import Sector, contraction_value, lmi_blocks, transformed
 from certbound.errors import InfeasibleError, SolverError
 
-__all__ = ["ErosionProgram", "FeedbackDesign", "RateProgram", "design_feedback", "solve"]
-
 Array = NDArray[np.float64]
 
 

@@ -15,8 +15,6 @@ from certbound.constants.programs.lmi import RateProgram
 from certbound.constants.programs.sectors import VERTEX_LIMIT, lmi_blocks
 from certbound.errors import SolverError
 
-__all__ = ["Proposal", "erosion_proposals", "rate_proposals", "sampled_polytope", "smallest_value", "spectral_bound"]
-
 Array = NDArray[np.float64]
 
 _FEW_BLOCKS = 4

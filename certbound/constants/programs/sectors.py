@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from certbound.constants.jacobians import AffineSet, IntervalMatrixSet, JacobianSet, SectorSet, UnionSet, VertexPolytope
 
-__all__ = ["VERTEX_LIMIT", "Sector", "centred", "contraction_value", "lmi_blocks", "transformed", "varying"]
-
 Array = NDArray[np.float64]
 
 VERTEX_LIMIT = 32

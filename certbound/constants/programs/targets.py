@@ -18,8 +18,6 @@ from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside
 
-__all__ = ["Target", "constraint_targets", "cut_rooms", "nominal_paths", "rooms_of", "stated_rooms"]
-
 Array = NDArray[np.float64]
 
 _STEPS = 400

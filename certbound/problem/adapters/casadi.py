@@ -8,8 +8,6 @@ from typing import Any
 
 from certbound.problem.model import OPERATIONS, Graph, Tape
 
-__all__ = ["casadi_module", "from_casadi", "to_casadi"]
-
 
 def casadi_module() -> Any:
     """The casadi module, with its NumPy mode chosen (legacy, silent) unless the user chose one before."""

@@ -11,8 +11,6 @@ import numpy as np
 
 from certbound.problem.sets import Box
 
-__all__ = ["Imported", "import_control", "is_control_system"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Imported:

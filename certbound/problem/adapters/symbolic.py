@@ -11,8 +11,6 @@ from certbound.problem.adapters.casadi import casadi_module, from_casadi
 from certbound.problem.adapters.sympy import from_sympy
 from certbound.problem.model import Tape, trace
 
-__all__ = ["is_symbolic", "read_model", "symbol_names", "symbolic_tape"]
-
 _CASADI = ("SX", "MX", "Function")
 
 

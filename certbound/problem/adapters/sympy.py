@@ -8,8 +8,6 @@ from typing import Any
 
 from certbound.problem.model import ARITY, Graph, Tape
 
-__all__ = ["from_sympy"]
-
 _RENAMED = {"Abs": "abs", "Not": "not"}
 _FOLDED = {"Max": "max", "Min": "min", "And": "and", "Or": "or"}
 _COMPARISONS = {

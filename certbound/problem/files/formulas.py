@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from certbound.problem.files.parser import is_function
 from certbound.problem.model import Tape
 
-__all__ = ["formulas"]
-
 _INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2)}
 _DEEPEST = 12
 _ATOM = 5

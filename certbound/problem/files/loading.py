@@ -16,8 +16,6 @@ from certbound.problem.files.plans import write_plan
 from certbound.problem.files.toml import toml_text
 from certbound.problem.problem import Problem
 
-__all__ = ["load", "loads", "save"]
-
 _LARGEST = 20_000_000
 
 

@@ -14,8 +14,6 @@ from typing import NamedTuple
 from certbound.checks import nearest
 from certbound.problem.model import ARITY, OPERATIONS, Graph, arithmetic
 
-__all__ = ["CONSTANTS", "constant", "is_function", "parse"]
-
 CONSTANTS: Mapping[str, float] = {"pi": math.pi}
 
 _LONGEST, _DEEPEST = 20_000, 60

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["read_plan", "write_plan"]
-
 Array = NDArray[np.float64]
 
 

@@ -21,8 +21,6 @@ from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
 
-__all__ = ["RESERVED", "read_problem"]
-
 Array = NDArray[np.float64]
 
 RESERVED = frozenset({"t", *filter(is_function, OPERATIONS), *CONSTANTS})

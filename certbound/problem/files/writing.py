@@ -17,8 +17,6 @@ from certbound.problem.noise import check_law
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 
-__all__ = ["content_of", "describe_problem"]
-
 
 def content_of(problem: Problem, plan_file: str) -> dict[str, Any]:
     """Content of a problem's file: as it was in its own file, or with the traced model as expressions."""

@@ -7,8 +7,6 @@ from typing import Any
 
 from certbound.checks import nearest, number
 
-__all__ = ["merged", "whole"]
-
 
 def merged(model: str, defaults: Mapping[str, float], given: Mapping[str, Any]) -> dict[str, float]:
     """The defaults with the given values in their place.

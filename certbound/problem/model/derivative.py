@@ -9,8 +9,6 @@ from certbound.problem.model.graph import Graph
 from certbound.problem.model.operations import OPERATIONS, operands
 from certbound.problem.model.tape import Tape
 
-__all__ = ["jacobian"]
-
 
 def jacobian(tape: Tape, columns: Sequence[int] | None = None) -> Tape:
     """Derivative of every output with respect to the given inputs (``columns``: slots; all when omitted).

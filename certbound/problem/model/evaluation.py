@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.problem.model.operations import OPERATIONS
 from certbound.problem.model.tape import Tape
 
-__all__ = ["compile_numpy", "compile_scalar"]
-
 Array = NDArray[np.float64]
 
 

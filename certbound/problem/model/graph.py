@@ -16,8 +16,6 @@ from typing import Any
 from certbound.problem.model.operations import OPERATIONS
 from certbound.problem.model.tape import ARITY, Node, Tape, needed
 
-__all__ = ["Graph", "substitute"]
-
 _COMPARE: dict[str, Callable[[float, float], bool]] = {
     "lt": lambda a, b: a < b,
     "le": lambda a, b: a <= b,

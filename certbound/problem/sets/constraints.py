@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.checks import assign, positive_definite, vector
 from certbound.problem.sets.forms import Region
 
-__all__ = ["GaussianStart", "Inside", "Outside"]
-
 Array = NDArray[np.float64]
 
 

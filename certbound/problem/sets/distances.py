@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.problem.sets.constraints import Inside
 from certbound.problem.sets.forms import Faces, Quadratic, Region
 
-__all__ = ["clearance", "face_erosion", "round_erosion"]
-
 Array = NDArray[np.float64]
 
 

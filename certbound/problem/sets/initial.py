@@ -12,8 +12,6 @@ from certbound.problem.sets.constraints import GaussianStart, Inside
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
 
-__all__ = ["check_start"]
-
 Array = NDArray[np.float64]
 _ROUNDING, _SLACK = 1e-12, 1e-9
 """Shares of a state's size by which the start's centre, and its farthest part, may miss a constraint."""

@@ -18,8 +18,6 @@ from certbound.checks import assign, frozen, matrix, number, pick, positive_defi
 from certbound.problem.model import Tape, compile_numpy, trace
 from certbound.problem.sets.forms import Faces, Quadratic, Region, linear_maximum
 
-__all__ = ["Ball", "Box", "Ellipsoid", "HalfSpace", "Polytope"]
-
 Array = NDArray[np.float64]
 Center = Array | Tape
 

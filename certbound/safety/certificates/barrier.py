@@ -11,8 +11,6 @@ from certbound.problem.problem import Problem
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.engines import Barrier
 
-__all__ = ["barrier_proof"]
-
 _SLACK = 0.01
 _MORE = (1.0, 5.0, 25.0)
 _LEAST = 1e-6

@@ -27,8 +27,6 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.kummer import Search, exit_level, moderate_parameters
 from certbound.tubes.question import Question, Start
 
-__all__ = ["STATED", "constants_proof"]
-
 STATED = "the stated constants hold"
 """The assumption as a certificate names it; the checker derives which constants those are."""
 

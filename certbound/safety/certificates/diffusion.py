@@ -29,8 +29,6 @@ from certbound.safety.certificates.linear import (
     widened,
 )
 
-__all__ = ["diffusion_proof", "response_proof"]
-
 Array = NDArray[np.float64]
 
 _ROUNDS = 10

@@ -27,8 +27,6 @@ from certbound.reach.linear import Linearisation, LinearRun, Share, correlated
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.parts import separations
 
-__all__ = ["EFFORTS", "PADS", "SLACK", "Stated", "engine_of", "grids", "linear_proof", "proof_data", "widened"]
-
 Array = NDArray[np.float64]
 Events = StepEvents | WindowEvents
 

@@ -8,8 +8,6 @@ from typing import Any
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside
 
-__all__ = ["separations"]
-
 
 def separations(problem: Problem, stated: Callable[[int, Inside], Any]) -> list[Any]:
     """What is stated of every obstacle to keep it off, piece by piece, by its number; null for other constraints."""

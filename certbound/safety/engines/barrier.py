@@ -34,8 +34,6 @@ from certbound.rigor.intervals import Interval
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
 
-__all__ = ["Barrier", "barrier_engine"]
-
 Array = NDArray[np.float64]
 
 _MOST_STATES = 3

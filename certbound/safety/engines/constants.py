@@ -54,8 +54,6 @@ from certbound.tubes.question import Start
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
-__all__ = ["ONE_TIME", "constants_engine"]
-
 Array = NDArray[np.float64]
 
 ONE_TIME = ("prop1", "prop1_cosh", "prop2", "markov", "chebyshev")

@@ -20,8 +20,6 @@ from certbound.problem.sets import Inside
 from certbound.reach.sets import ReachTube, constraint_clearance
 from certbound.rigor.norms import Norm
 
-__all__ = ["Erosion", "Tightest", "erode"]
-
 Array = NDArray[np.float64]
 
 

@@ -22,15 +22,6 @@ from certbound.tubes.question import Question, Start
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import least_exit_level
 
-__all__ = [
-    "BELOW",
-    "deviation_pieces",
-    "joined",
-    "log10_sum",
-    "room_level",
-    "smallest_level",
-]
-
 Array = NDArray[np.float64]
 Profile = tuple[Array, Array]
 

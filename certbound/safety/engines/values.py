@@ -12,8 +12,6 @@ from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.values.continuous import ExitBounds, bound_exits
 from certbound.values.discrete import FailureBounds, bound_failure
 
-__all__ = ["values_engine"]
-
 _SECONDS = 20.0  # about what may be spent
 _FLOOR = -300.0
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
