@@ -29,34 +29,17 @@ EXPONENT = 40.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Barrier:
-    """One constraint on the steps ``first`` .. ``last``.
+    """One constraint on the steps ``first`` .. ``last``."""
 
-    Parameters
-    ----------
-    label : str
-        Text for humans.
-    stay : bool
-        True: inside the region; False: outside it.
-    round : bool
-        True: the region is {‖matrix x - offset‖ <= radius}; False: it is {matrix x <= offset}.
-    matrix : ndarray, shape (rows, n)
-    offset : ndarray, shape (rows,) or (steps + 1, rows)
-        The second shape: one row per step, for a region that moves.
-    radius : float
-    first, last : int
-    always : bool
-        Whether these are all steps: then the kernel asks no further.
-    """
-
-    label: str
-    stay: bool
-    round: bool
-    matrix: Array
-    offset: Array
+    label: str  # text for humans
+    stay: bool  # True: inside the region; False: outside it
+    round: bool  # True: the region is {‖matrix x - offset‖ <= radius}; False: it is {matrix x <= offset}
+    matrix: Array  # (rows, n)
+    offset: Array  # (rows,) or (steps + 1, rows): the second shape: one row per step, for a region that moves
     radius: float = 0.0
     first: int
     last: int
-    always: bool = False
+    always: bool = False  # whether these are all steps: then the kernel asks no further
 
     @property
     def moving(self) -> bool:

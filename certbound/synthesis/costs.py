@@ -21,20 +21,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cost:
-    """Sum over the pieces of step * stage(t, z, u), and an end cost (z - c)' end (z - c).
+    """Sum over the pieces of step * stage(t, z, u), and an end cost (z - c)' end (z - c)."""
 
-    Parameters
-    ----------
-    stage : (Q, R) or Tape
-        Quadratic weights, or a function over ("t", *states, *inputs) of shape (1,).
-    end : ndarray, shape (n, n)
-    center : ndarray, shape (n,)
-        c.
-    """
-
-    stage: tuple[Array, Array] | Tape
-    end: Array
-    center: Array
+    stage: tuple[Array, Array] | Tape  # quadratic weights, or a function over ("t", *states, *inputs) of shape (1,)
+    end: Array  # (n, n)
+    center: Array  # (n,): c
 
     def symbolic(self, ca: Any, time: Any, state: Any, inputs: Any) -> Any:
         """Stage cost as a CasADi expression."""

@@ -35,30 +35,14 @@ _ANGLES = 24
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Face:
-    """What every face offers.
+    """What every face offers."""
 
-    Parameters
-    ----------
-    label : str
-        Of its constraint, for humans.
-    constraint : int
-        Index into ``problem.constraints``.
-    during : (float, float) or None
-        When it is asked.
-    dimension : int
-        Of the state.
-    coordinates : tuple of int
-        State indices that the set lives in.
-    center : Tape or ndarray
-        Where the set's origin is.
-    """
-
-    label: str
-    constraint: int
-    during: tuple[float, float] | None
-    dimension: int
-    coordinates: tuple[int, ...]
-    center: Any
+    label: str  # of its constraint, for humans
+    constraint: int  # index into ``problem.constraints``
+    during: tuple[float, float] | None  # when it is asked
+    dimension: int  # of the state
+    coordinates: tuple[int, ...]  # state indices that the set lives in
+    center: Any  # where the set's origin is
 
     @property
     def weights(self) -> int:

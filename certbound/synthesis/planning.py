@@ -66,20 +66,11 @@ def check_tube(problem: Problem, tube: Tube) -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tightened:
-    """A tube along a plan and what it takes.
+    """A tube along a plan and what it takes."""
 
-    Parameters
-    ----------
-    erosion : ndarray, shape (points, parts)
-    inputs : ndarray, shape (points + 1, m)
-        Taken from the input bounds by the feedback.
-    tube : Tube or None
-        Where it comes from constants.
-    """
-
-    erosion: Array
-    inputs: Array
-    tube: Tube | None = None
+    erosion: Array  # (points, parts)
+    inputs: Array  # (points + 1, m): taken from the input bounds by the feedback
+    tube: Tube | None = None  # where it comes from constants
 
     def more(self, factor: float, extra: Array) -> Tightened:
         """Everything larger by a factor, and the erosions by ``extra`` (parts,) on top."""

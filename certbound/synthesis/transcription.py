@@ -44,36 +44,18 @@ _UNBOUNDED = 1e19  # what IPOPT takes for infinity
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """A plan that a solver proposed and a rollout measured.
+    """A plan that a solver proposed and a rollout measured."""
 
-    Parameters
-    ----------
-    inputs : ndarray, shape (N, m)
-    states : ndarray, shape (points + 1, n)
-        Rolled out from the inputs.
-    success : bool
-        The rollout meets every tightened constraint up to `TOLERANCE` (with slack in mode ``soft``: the solver
-        ended well).
-    scale : float
-        s; 1 outside mode ``scale``.
-    cost : float
-    slack : ndarray, shape (points, faces)
-        By how much each tightened constraint is missed.
-    pressure : ndarray, shape (points, faces)
-        Multipliers of the tightened constraints: where they hold the plan back.
-    status : str
-        The solver's word.
-    seconds : float
-    """
-
-    inputs: Array
-    states: Array
+    inputs: Array  # (N, m)
+    states: Array  # (points + 1, n): rolled out from the inputs
+    # the rollout meets every tightened constraint up to `TOLERANCE` (with slack in mode ``soft``: the solver
+    # ended well)
     success: bool
-    scale: float
+    scale: float  # s; 1 outside mode ``scale``
     cost: float
-    slack: Array
-    pressure: Array
-    status: str
+    slack: Array  # (points, faces): by how much each tightened constraint is missed
+    pressure: Array  # (points, faces): multipliers of the tightened constraints: where they hold the plan back
+    status: str  # the solver's word
     seconds: float
     iterations: int
 

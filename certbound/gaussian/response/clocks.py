@@ -157,18 +157,11 @@ class SteadyEvent:
 
 @dataclass(frozen=True, eq=False)
 class ClockEvents:
-    """Windows for every row, clocks or crossing rates for the rows that stay the same.
-
-    Parameters
-    ----------
-    windows : WindowEvents
-    diffusion : ndarray, shape (n, m), or (N, n, m) where it differs from piece to piece
-    memory : dict
-        What was computed for this cell's response before; shared by events with other levels.
-    """
+    """Windows for every row, clocks or crossing rates for the rows that stay the same."""
 
     windows: WindowEvents
-    diffusion: Array
+    diffusion: Array  # (n, m), or (N, n, m) where it differs from piece to piece
+    # what was computed for this cell's response before; shared by events with other levels
     memory: dict[Any, Any] = field(default_factory=dict)
 
     @property

@@ -40,24 +40,13 @@ Nodes = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class WindowEvents:
-    """Continuous time: reflection in windows of ``length`` pieces.
-
-    Parameters
-    ----------
-    response : LinearResponse
-    cell : int
-    length : int
-        Pieces per window.
-    shared_log : float
-        Log probability granted to the event that some coordinate of M leaves its level in some window.
-    memory : dict
-        What does not depend on ``shared_log``; events with other shares may share it.
-    """
+    """Continuous time: reflection in windows of ``length`` pieces."""
 
     response: LinearResponse
     cell: int
-    length: int
-    shared_log: float
+    length: int  # pieces per window
+    shared_log: float  # log probability granted to the event that some coordinate of M leaves its level in some window
+    # what does not depend on ``shared_log``; events with other shares may share it
     memory: dict[Any, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

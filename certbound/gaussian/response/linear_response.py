@@ -50,34 +50,20 @@ def _norm(a: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearResponse:
-    """Linear data of a batch of nominal curves (axis 0: cells of X0; axis 1: pieces or steps).
+    """Linear data of a batch of nominal curves (axis 0: cells of X0; axis 1: pieces or steps)."""
 
-    Parameters
-    ----------
-    step : float
-        Length h of a piece (1 in discrete time); the exact length is h up to one rounding.
-    slope, drift : ndarray, shape (B, N, n, n)
-        A and K of Jhat(tau) = A + tau K.
-    transition : ndarray, shape (B, N, n, n)
-        F; the exact transition matrix differs by at most ``transition_error`` in every entry.
-    transition_error : ndarray, shape (B, N)
-    deviation : ndarray, shape (B, N, n, n)
-        Entrywise bound of |Phi(t, s) - I| for s <= t in one piece (0 in discrete time).
-    covariance, covariance_error : ndarray, shape (B, N + 1, n, n)
-        V and W with -W <= V_exact - V <= W as quadratic forms.
-    slope_error : float
-        Entrywise bound of the exact slope minus its floats.
-    """
-
-    step: float
+    step: float  # length h of a piece (1 in discrete time); the exact length is h up to one rounding
+    # (B, N, n, n): A and K of Jhat(tau) = A + tau K
     slope: Array
     drift: Array
+    # (B, N, n, n): F; the exact transition matrix differs by at most ``transition_error`` in every entry
     transition: Array
-    transition_error: Array
-    deviation: Array
+    transition_error: Array  # (B, N)
+    deviation: Array  # (B, N, n, n): entrywise bound of |Phi(t, s) - I| for s <= t in one piece (0 in discrete time)
+    # (B, N + 1, n, n): V and W with -W <= V_exact - V <= W as quadratic forms
     covariance: Array
     covariance_error: Array
-    slope_error: float = 0.0
+    slope_error: float = 0.0  # entrywise bound of the exact slope minus its floats
 
     @property
     def pieces(self) -> int:

@@ -33,18 +33,10 @@ _FAR_ABOVE = 20.0  # levels with (z/s)^2 this much above the least do not matter
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Clock:
-    """A clock on K pieces, linear in time on each: clock(t) - clock(s) >= -log corr within every block.
+    """A clock on K pieces, linear in time on each: clock(t) - clock(s) >= -log corr within every block."""
 
-    Parameters
-    ----------
-    increments : ndarray, shape (K,)
-        Clock of each piece.
-    starts : ndarray of int
-        First piece of each block, beginning with 0.
-    """
-
-    increments: Array
-    starts: Index
+    increments: Array  # (K,): clock of each piece
+    starts: Index  # first piece of each block, beginning with 0
 
 
 def node_clock(durations: ArrayLike, near: ArrayLike, needs: ArrayLike, *, limit: float = 0.35) -> Clock:

@@ -56,27 +56,13 @@ _LIKELY = -4.0  # log of a probability from which on a product is worth more tha
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Outcome:
-    """What one run proved.
+    """What one run proved."""
 
-    Parameters
-    ----------
-    log_probability : float
-        Natural logarithm of a bound on P(unsafe); 0 when nothing was proved.
-    nonlinear : Share
-        delta_N.
-    bounds : (ndarray, ndarray), shape (B, N, n), or None
-        The proved enclosure of the remainder beta, None when it fed itself.
-    cell : int
-        The worst cell.
-    logs : tuple of float
-        What every requirement costs there.
-    """
-
-    log_probability: float
-    nonlinear: Share
-    bounds: tuple[Array, Array] | None
-    cell: int = 0
-    logs: tuple[float, ...] = ()
+    log_probability: float  # natural logarithm of a bound on P(unsafe); 0 when nothing was proved
+    nonlinear: Share  # delta_N
+    bounds: tuple[Array, Array] | None  # (B, N, n): the proved enclosure of the remainder beta, None when it fed itself
+    cell: int = 0  # the worst cell
+    logs: tuple[float, ...] = ()  # what every requirement costs there
 
 
 class LinearRun:

@@ -31,39 +31,21 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
-    """Derivatives of the dynamics of a problem's closed loop.
-
-    Attributes
-    ----------
-    active : ndarray
-        States whose column of the Jacobian is not constant.
-    constant_slope : Interval, shape (n, n)
-        Constant entries of the Jacobian (up to rounding), 0 where the entry varies.
-    blocks : list of groups of lists of int
-        Positions in ``active`` that second derivatives couple, in groups whose outputs do not meet.
-    entries : list of (int, int)
-        Output and state of every entry of the Jacobian that varies.
-    second_index : list of (int, int)
-        Entry and state (-1: time) of every second derivative kept; of a mixed pair only one.
-    sources : list of lists of int
-        States that every such entry depends on.
-    kinked : bool
-        Whether abs, min or max let the Jacobian jump.
-    timed : list of int
-        Outputs that depend on time explicitly.
-    value, varying, second, time, time2, gain : Tape
-        f, its varying entries, their derivatives, derivatives by time, and the one by the disturbance.
-    """
+    """Derivatives of the dynamics of a problem's closed loop."""
 
     problem: Problem
-    active: Indices = field(init=False)
+    active: Indices = field(init=False)  # states whose column of the Jacobian is not constant
+    # (n, n): constant entries of the Jacobian (up to rounding), 0 where the entry varies
     constant_slope: Interval = field(init=False)
+    # positions in ``active`` that second derivatives couple, in groups whose outputs do not meet
     blocks: list[list[list[int]]] = field(init=False)
-    entries: list[tuple[int, int]] = field(init=False)
+    entries: list[tuple[int, int]] = field(init=False)  # output and state of every entry of the Jacobian that varies
+    # entry and state (-1: time) of every second derivative kept; of a mixed pair only one
     second_index: list[tuple[int, int]] = field(init=False)
-    sources: list[list[int]] = field(init=False)
-    kinked: bool = field(init=False)
-    timed: list[int] = field(init=False)
+    sources: list[list[int]] = field(init=False)  # states that every such entry depends on
+    kinked: bool = field(init=False)  # whether abs, min or max let the Jacobian jump
+    timed: list[int] = field(init=False)  # outputs that depend on time explicitly
+    # f, its varying entries, their derivatives, derivatives by time, and the one by the disturbance
     value: Tape = field(init=False)
     varying: Tape = field(init=False)
     second: Tape = field(init=False)

@@ -65,18 +65,10 @@ class Sets(Protocol):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Clearance:
-    """Room of one constraint over the time pieces.
+    """Room of one constraint over the time pieces."""
 
-    Parameters
-    ----------
-    radius : ndarray, shape (K,)
-        Proved r per piece; inf where the constraint is not asked, -inf where nothing could be proved.
-    factor : ndarray, shape (K,)
-        Euclidean distance per unit of r along the binding direction (for people; not rounded).
-    """
-
-    radius: Array
-    factor: Array
+    radius: Array  # (K,): proved r per piece; inf where the constraint is not asked, -inf where nothing could be proved
+    factor: Array  # (K,): Euclidean distance per unit of r along the binding direction (for people; not rounded)
 
 
 def constraint_clearance(tube: Sets, constraint: Inside, norm: Norm) -> Clearance:

@@ -30,24 +30,14 @@ _POLYGON = 24
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NominalPieces:
-    """A nominal curve, piece by piece: every p_t of a piece lies in the convex hull of its control points.
+    """A nominal curve, piece by piece: every p_t of a piece lies in the convex hull of its control points."""
 
-    Parameters
-    ----------
-    times : ndarray, shape (N + 1,) in continuous time, (N,) steps in discrete time
-    controls : ndarray, shape (N, C, n)
-    continuous : bool
-    covariance : ndarray, shape (N, n, n), optional
-        About that of the deviation: where an obstacle is a corner, it decides how its faces are mixed.
-    extent : ndarray, shape (N, n), optional
-        About how far the state lies from the curve without noise.
-    """
-
-    times: Array
-    controls: Array
+    times: Array  # (N + 1,) in continuous time, (N,) steps in discrete time
+    controls: Array  # (N, C, n)
     continuous: bool
+    # (N, n, n): about that of the deviation: where an obstacle is a corner, it decides how its faces are mixed
     covariance: Array | None = None
-    extent: Array | None = None
+    extent: Array | None = None  # (N, n): about how far the state lies from the curve without noise
 
     @property
     def pieces(self) -> int:

@@ -33,24 +33,13 @@ class FixedStart:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Setting:
-    """Grid, step and starts of a simulation.
-
-    Parameters
-    ----------
-    model : StepModel
-    steps : int
-    times : ndarray, shape (steps + 1,)
-    start : callable
-        ``start(rng, count)`` draws starts.
-    fixed : ndarray, shape (n,), or None
-        The start, if all paths share one.
-    """
+    """Grid, step and starts of a simulation."""
 
     model: StepModel
     steps: int
-    times: Array
-    start: Callable[[np.random.Generator, int], Array]
-    fixed: Array | None
+    times: Array  # (steps + 1,)
+    start: Callable[[np.random.Generator, int], Array]  # ``start(rng, count)`` draws starts
+    fixed: Array | None  # (n,): the start, if all paths share one
 
     @property
     def shared_nominal(self) -> bool:

@@ -47,25 +47,14 @@ class Link:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProvedStep:
-    """What one step leaves.
+    """What one step leaves."""
 
-    Parameters
-    ----------
-    state : ndarray, shape (n,)
-        Noise-free state to go on from.
-    link : Link
-        At the end of the step.
-    room : ndarray, shape (constraints,)
-        Room of every constraint over the step, in the metric, beyond what this step and the beginning of the next one
-        take; inf where it is not asked.
-    proved : bool
-        This step keeps every constraint.
-    """
-
-    state: Array
-    link: Link
+    state: Array  # (n,): noise-free state to go on from
+    link: Link  # at the end of the step
+    # (constraints,): room of every constraint over the step, in the metric, beyond what this step and the
+    # beginning of the next one take; inf where it is not asked
     room: Array
-    proved: bool
+    proved: bool  # this step keeps every constraint
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,21 +75,11 @@ class _Held(Flow):
 
 @dataclass(eq=False, kw_only=True)
 class HeldSteps:
-    """The steps of one problem around one tube.
+    """The steps of one problem around one tube."""
 
-    Parameters
-    ----------
-    problem : Problem
-        With an array plan, which is not used, and without a disturbance.
-    tube : Tube
-        Its constants hold for every input.
-    times : ndarray, shape (steps + 1,)
-        Ends of the steps, from 0 to the horizon.
-    """
-
-    problem: Problem
-    tube: Tube
-    times: Array
+    problem: Problem  # with an array plan, which is not used, and without a disturbance
+    tube: Tube  # its constants hold for every input
+    times: Array  # (steps + 1,): ends of the steps, from 0 to the horizon
     _norm: Norm = field(init=False)
     _radii: dict[int, float] = field(init=False, default_factory=dict)
     _pieces: int = field(init=False, default=1)

@@ -23,20 +23,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AlmostSureProfile(MonotoneProfile):
-    """b_t from b_0 = ``start``.
+    """b_t from b_0 = ``start``."""
 
-    Parameters
-    ----------
-    schedule : Schedule
-        Gains.
-    bounds : ndarray (K,)
-        h per piece.
-    start : float
-        Bound of ||S_0||.
-    """
-
-    bounds: Array
-    start: float = 0.0
+    bounds: Array  # (K,): h per piece
+    start: float = 0.0  # bound of ||S_0||
 
     def to_dict(self) -> dict[str, Any]:
         """Parameters as plain data."""

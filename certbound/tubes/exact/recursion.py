@@ -33,25 +33,14 @@ _TABLE_RATIO = 2e-3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recursion:
-    """Exit from the ball of radius R at one of the steps 1, ..., T.
+    """Exit from the ball of radius R at one of the steps 1, ..., T."""
 
-    Parameters
-    ----------
-    gains, sigmas : ndarray (K,)
-        L and sigma per group of steps, in the order of time.
-    counts : ndarray (K,)
-        Steps per group.
-    dimension : int
-        n.
-    radius : float
-        R, in the unit of sigma.
-    """
-
+    # (K,): L and sigma per group of steps, in the order of time
     gains: Array
     sigmas: Array
-    counts: NDArray[np.intp]
-    dimension: int
-    radius: float
+    counts: NDArray[np.intp]  # (K,): steps per group
+    dimension: int  # n
+    radius: float  # R, in the unit of sigma
 
     @cached_property
     def size(self) -> int:

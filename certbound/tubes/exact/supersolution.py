@@ -45,34 +45,17 @@ the durations, which come from at most 12 rounded operations, each of them withi
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Supersolution:
-    """The problem on xi in [0, 1].
+    """The problem on xi in [0, 1]."""
 
-    Parameters
-    ----------
-    pieces : tuple of (float, float)
-        (duration in theta, kappa), in the order of time.
-    dimension : int
-        n.
-    nu : float
-        Effective dimension (read for ``worst`` only).
-    worst : bool
-        Any noise below sigma (True) or exactly sigma (False).
-    target : float
-        Probability of interest: it sets the mesh and what small corrections may cost.
-    inflation : float
-        Relative room left in H, which widens the radius for a given probability by about as much; for probabilities
-        below 1e-3 it grows with the square of their logarithm.
-    coarseness : float
-        Factor on the mesh widths and steps.
-    """
-
-    pieces: tuple[tuple[float, float], ...]
-    dimension: int
-    nu: float
-    worst: bool
-    target: float
+    pieces: tuple[tuple[float, float], ...]  # (duration in theta, kappa), in the order of time
+    dimension: int  # n
+    nu: float  # effective dimension (read for ``worst`` only)
+    worst: bool  # any noise below sigma (True) or exactly sigma (False)
+    target: float  # probability of interest: it sets the mesh and what small corrections may cost
+    # relative room left in H, which widens the radius for a given probability by about as much; for probabilities
+    # below 1e-3 it grows with the square of their logarithm
     inflation: float = 3e-4
-    coarseness: float = 1.0
+    coarseness: float = 1.0  # factor on the mesh widths and steps
 
     @cached_property
     def controls(self) -> list[tuple[float, float]]:

@@ -47,21 +47,11 @@ class Component:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MixtureProgram:
-    """The linear program for one schedule whose pieces are the intervals of time to cover.
+    """The linear program for one schedule whose pieces are the intervals of time to cover."""
 
-    Parameters
-    ----------
-    schedule : Schedule
-        Refined data: one row per piece.
-    clearance : ndarray (K,)
-        r_t on each piece (infinite where nothing is asked).
-    ends : ndarray
-        Candidate end times, among the schedule's times.
-    """
-
-    schedule: Schedule
-    clearance: Array
-    ends: NDArray[np.intp]
+    schedule: Schedule  # refined data: one row per piece
+    clearance: Array  # (K,): r_t on each piece (infinite where nothing is asked)
+    ends: NDArray[np.intp]  # candidate end times, among the schedule's times
 
     @cached_property
     def _squares(self) -> Array:

@@ -36,30 +36,14 @@ _OVERFLOWING = 1e300  # variance beyond which nothing is looked for
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Search:
-    """One tuning problem on the nodes of a (graded) schedule.
+    """One tuning problem on the nodes of a (graded) schedule."""
 
-    Parameters
-    ----------
-    schedule : Schedule
-        Data; its piece ends are the nodes.
-    kind : str
-        ``"scale"`` (least s with r_t <= s clearance_t), ``"final"``, ``"mean"``, or ``"probability"`` (Thm K2).
-    weights : ndarray (K + 1,)
-        Clearance at the nodes (infinite where nothing is asked); ones for the largest radius.
-    log_delta : float
-        Level of the tube (unused for ``"probability"``).
-    bessel : bool
-        Search the Bessel form.
-    start : Start
-        Deviation at time 0.
-    """
-
-    schedule: Schedule
-    kind: str
-    weights: Array
-    log_delta: float = 0.0
-    bessel: bool = False
-    start: Start = field(default_factory=Start)
+    schedule: Schedule  # data; its piece ends are the nodes
+    kind: str  # ``"scale"`` (least s with r_t <= s clearance_t), ``"final"``, ``"mean"``, or ``"probability"`` (Thm K2)
+    weights: Array  # (K + 1,): clearance at the nodes (infinite where nothing is asked); ones for the largest radius
+    log_delta: float = 0.0  # level of the tube (unused for ``"probability"``)
+    bessel: bool = False  # search the Bessel form
+    start: Start = field(default_factory=Start)  # deviation at time 0
 
     @classmethod
     def of(

@@ -23,30 +23,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline:
-    """One named formula.
+    """One named formula."""
 
-    Parameters
-    ----------
-    time : str
-        ``"continuous"``, ``"discrete"`` or ``"both"``.
-    kind : str
-        Roots of :class:`certbound.tubes.paper.radii.RootProfile`, or ``"windows"``.
-    level : str
-        ``"trajectory"`` or ``"one time"``.
-    tail : str
-        Kind of B.
-    printed : bool
-        A variant that keeps an error of the paper: never certified, never chosen.
-    title : str
-        Its source.
-    """
-
-    time: str
-    kind: str
-    level: str
-    title: str
-    tail: str = "growth"
-    printed: bool = False
+    time: str  # ``"continuous"``, ``"discrete"`` or ``"both"``
+    kind: str  # roots of :class:`certbound.tubes.paper.radii.RootProfile`, or ``"windows"``
+    level: str  # ``"trajectory"`` or ``"one time"``
+    title: str  # its source
+    tail: str = "growth"  # kind of B
+    printed: bool = False  # a variant that keeps an error of the paper: never certified, never chosen
 
 
 _CT, _DT, _ONE, _ALL = "continuous", "discrete", "one time", "trajectory"

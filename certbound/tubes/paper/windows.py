@@ -60,20 +60,10 @@ class _Piece:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WindowProfile(MonotoneProfile):
-    """Radius of the module's formula.
+    """Radius of the module's formula; ``schedule`` is not refined."""
 
-    Parameters
-    ----------
-    schedule : Schedule
-        Data, not refined.
-    tail : Tail
-        B with the number of events.
-    step : float
-        Window length.
-    """
-
-    tail: Tail
-    step: float
+    tail: Tail  # B with the number of events
+    step: float  # window length
 
     @cached_property
     def grid(self) -> Schedule:
