@@ -116,13 +116,13 @@ class Constants(Shown):
         if times is not None:
             if times.ndim != 1 or len(times) < 2 or times[0] != 0 or np.any(np.diff(times) <= 0):
                 raise ValueError("`times` must rise strictly from 0 and have at least two entries.")
-            object.__setattr__(self, "times", _frozen(times))
+            object.__setattr__(self, "times", _read_only(times))
         nu = float(self.dimension) if self.effective_dimension is None else float(self.effective_dimension)
         if not 0 < nu <= self.dimension:
             raise ValueError(f"`effective_dimension` must lie in (0, {self.dimension}], got {nu}.")
         object.__setattr__(self, "effective_dimension", nu)
         if self.metric is not None:
-            object.__setattr__(self, "metric", _frozen(_checked_metric(self.metric, self.dimension)))
+            object.__setattr__(self, "metric", _read_only(_checked_metric(self.metric, self.dimension)))
         if self.isotropic:
             object.__setattr__(self, "gaussian", True)
             if nu != self.dimension:
@@ -283,7 +283,7 @@ _PROVED = (
 )
 
 
-def _frozen(array: Array) -> Array:
+def _read_only(array: Array) -> Array:
     copy: Array = np.array(array, dtype=float)
     copy.setflags(write=False)
     return copy
@@ -298,7 +298,7 @@ def _values(name: str, value: ArrayLike | None, times: Array | None) -> float | 
     if times is None or array.ndim != 1 or len(array) != len(times) - 1:
         expected = "a number, or an array together with `times`" if times is None else f"{len(times) - 1} values"
         raise ValueError(f"`{name}` must be {expected}, got shape {array.shape}.")
-    return _frozen(array)
+    return _read_only(array)
 
 
 def _checked_metric(metric: ArrayLike, dimension: int) -> Array:

@@ -169,9 +169,9 @@ def _product(middle: Array, radius: Array, other: Array, width: Array) -> Interv
     return Interval(np.where(known, centre - spread, -np.inf), np.where(known, centre + spread, np.inf))
 
 
-def _second(d: dict[str, Interval], usable: Flags, own: Interval, twice: str, once: str) -> Interval:
+def _second(d: dict[str, Interval], usable: Flags, own: Interval, second: str, first: str) -> Interval:
     """psi differentiated twice by t or by s: -D''/D + (D'/D)^2 + ``own``."""
-    result: Interval = _ratio(d[once], d["00"], usable) ** 2 - _ratio(d[twice], d["00"], usable) + own
+    result: Interval = _ratio(d[first], d["00"], usable) ** 2 - _ratio(d[second], d["00"], usable) + own
     return result
 
 

@@ -70,11 +70,11 @@ def log_any_exceedance(events: StepEvents, rows: Sequence[Array], levels: Sequen
                                   np.where(late, first, second), np.minimum(node, past))
 
     own = tuple((variance[0][a, b].clip(0.0), variance[1][a, b].clip(0.0)) for a, b in ((t - 1, j), (t, j), (s, i)))
-    twice = triple_below(
+    counted = triple_below(
         z[t - 1, j], z[t, j], z[s, i], (own[0], own[1], own[2]),
         (between(j, t, j, t - 1), between(j, t - 1, i, s), between(j, t, i, s)),
     )
-    total = np.exp(whole) * (1 + 1e-14) - float(np.sum(twice)) * (1 - 1e-12)
+    total = np.exp(whole) * (1 + 1e-14) - float(np.sum(counted)) * (1 - 1e-12)
     return min(float(np.log(max(total, 1e-300))) + 1e-14, whole, 0.0)
 
 
