@@ -14,7 +14,7 @@ from certbound.gaussian.response import LinearResponse, continuous_response, dis
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
-from certbound.reach.linear.inclusion import Gathering
+from certbound.reach.linear.inclusion import Gathering, Supports
 from certbound.reach.nominal import initial_cells
 from certbound.reach.remainder import Frame, Remainder
 from certbound.reach.sets import NominalPieces
@@ -102,6 +102,16 @@ class Linearisation:
         return trial if alike else cls(problem, cells=cells, pieces=pieces, noise=noise)
 
     # ---- nominal data ------------------------------------------------------------------------------------
+
+    @property
+    def cells(self) -> int:
+        """Number B of cells of the initial set."""
+        return len(self.centres)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Cells, pieces and states: (B, N, n)."""
+        return self.cells, self.pieces, self.n
 
     @cached_property
     def inputs(self) -> Array:
@@ -228,8 +238,7 @@ class Linearisation:
     @cached_property
     def tangents(self) -> tuple[Array, Array, Array]:
         """The same without the correction: derivatives along the nominal curve."""
-        cells = len(self.centres)
-        x = self.nodes
+        cells, x = self.cells, self.nodes
         inputs = np.broadcast_to(self.inputs, (cells, *self.inputs.shape))
 
         def at(nodes: Array, times: Array) -> Array:
@@ -261,7 +270,7 @@ class Linearisation:
         assert isinstance(self.system, ContinuousSystem)
         g = self.system.diffusion
         if isinstance(g, Tape):
-            shape = (len(self.centres), self.pieces, *g.shape)
+            shape = (self.cells, self.pieces, *g.shape)
             middle = (self.nodes[:, :-1] + self.nodes[:, 1:]) / 2
             time = np.broadcast_to((self.times[:-1] + self.times[1:]) / 2, shape[:2])
             with np.errstate(all="ignore"):
@@ -292,7 +301,7 @@ class Linearisation:
     def frame(self) -> Frame:
         """Enclosures of the nominal data, cells and pieces in one batch (piece index fastest)."""
         slope, drift, gain = self.slopes
-        cells, pieces, n = len(self.centres), self.pieces, self.n
+        cells, pieces, n = self.shape
 
         def flat(a: Array) -> Array:
             return a.reshape(cells * pieces, *a.shape[2:])
@@ -378,6 +387,14 @@ class Linearisation:
             centre=h * middle, second=h * second, first=response.deviation,
             curve=h * h / 8 * (bend @ (identity + response.deviation)) * _ROUND,
             generators=np.swapaxes(generators, -1, -2), box=(box + rounding)[..., 0] * _ROUND, size=size_e * _ROUND,
+        )
+
+    def supports(self, cell: int, rows: Array, outputs: NDArray[np.int64] | None = None) -> Supports:
+        """Bounds of y and R of one cell along ``rows``; see `Supports`."""
+        radii = self.radii[cell]
+        return Supports(
+            self.response, self.gathering.of_cell(cell), cell, rows, np.diag(radii)[radii > 0],
+            continuous=self.continuous, outputs=outputs,
         )
 
     @cached_property
