@@ -49,7 +49,6 @@ def contraction_tube(
     *,
     cells: int | None = None,
     curve: Curve | None = None,
-    forcing: Array | None = None,
 ) -> ReachTube:
     """Noise-free reach tube in the constants' metric (Thm K5).
 
@@ -66,8 +65,6 @@ def contraction_tube(
         Parts along each side of the initial set, one curve each.
     curve : Curve, optional
         The curves, when they are known already; they must start one in each cell.
-    forcing : ndarray, shape (B, K), optional
-        `bound_forcing` in the same metric, when it is known already.
 
     Returns
     -------
@@ -89,10 +86,9 @@ def contraction_tube(
     if curve is None:
         curve = nominal_curve(flow, parts.centres)
     norm = constants.norm
-    eta = bound_forcing(flow, curve, norm) if forcing is None else forcing
     slopes = values_on_pieces(constants.slope, constants.times, curve)
     rho = parts.radii(norm, curve.initial())
-    radius, _ = integrate_radius(curve, jump_sizes(curve, norm), rho, slopes, eta)
+    radius, _ = integrate_radius(curve, jump_sizes(curve, norm), rho, slopes, bound_forcing(flow, curve, norm))
     proved = first_infinite(radius)
     if proved == 0:
         raise EnclosureError(

@@ -25,7 +25,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import Flow
-from certbound.reach.sampled.boxes import SampledTube, boxes_tube, draw, noise_free_states, scenario_count, time_grid
+from certbound.reach.sampled.boxes import (
+    SampledTube,
+    boxes_tube,
+    noise_free_boxes,
+    noise_free_states,
+    scenario_count,
+    time_grid,
+)
 
 __all__ = ["LearnedTube", "estimate_reach_by_classifier"]
 
@@ -158,16 +165,9 @@ def _forward(
     flow: Flow, grid: Array, chosen: NDArray[Any], rng: np.random.Generator, count: int
 ) -> tuple[list[Array], Array, Array]:
     """States at the chosen grid times of ``count`` new trajectories, and the boxes around them on every piece."""
-    pieces = len(grid) - 1
-    low, high = np.full((pieces, flow.dimension), np.inf), np.full((pieces, flow.dimension), -np.inf)
-    kept: dict[float, Array] = {}
-    wanted = {float(grid[k]) for k in chosen}
-    for piece, t, x in noise_free_states(flow, grid, *draw(flow, rng, count)):
-        for k in {piece, piece + 1} if piece + 1 < pieces and t == grid[piece + 1] else {piece}:
-            low[k], high[k] = np.minimum(low[k], x.min(axis=0)), np.maximum(high[k], x.max(axis=0))
-        if t in wanted:
-            kept[t] = x.copy()
-    return [kept[float(grid[k])] for k in chosen], low, high
+    wanted = [float(grid[k]) for k in chosen]
+    low, high, kept = noise_free_boxes(flow, grid, count, rng, wanted)
+    return [kept[t] for t in wanted], low, high
 
 
 def _disturbances(flow: Flow, rng: np.random.Generator) -> Array:

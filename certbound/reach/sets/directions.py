@@ -77,15 +77,10 @@ class Requirement:
 def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
     """Every constraint of the problem (its domain last, numbered -1) as requirements along ``curve``."""
     found = []
-    for number, constraint in enumerate(problem.safe):
-        needed = curve.required(constraint.during)
+    for number, constraint in enumerate(problem.constraints):
+        own, needed = number if number < len(problem.safe) else -1, curve.required(constraint.during)
         for label, rows, room in _constraint(constraint, curve):
-            found.append(Requirement(
-                label=label, constraint=number, rows=rows, room=np.where(needed, room, np.inf)
-            ))
-    if problem.domain is not None:
-        for label, rows, room in _constraint(Inside(problem.domain, label="the model's domain"), curve):
-            found.append(Requirement(label=label, constraint=-1, rows=rows, room=room))
+            found.append(Requirement(label=label, constraint=own, rows=rows, room=np.where(needed, room, np.inf)))
     return found
 
 
