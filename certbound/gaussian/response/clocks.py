@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from certbound.gaussian.response.decorrelation import decorrelation
 from certbound.gaussian.response.events import WindowEvent, WindowEvents
 from certbound.gaussian.response.linear_response import LinearResponse, continuous_response
-from certbound.gaussian.response.martingale_windows import logsumexp
+from certbound.gaussian.response.martingale_windows import logsumexp, remembered
 from certbound.gaussian.response.moments import smooth_moments
 from certbound.gaussian.scalar import Clock, clock_crossing, crossing_rate, node_clock
 from certbound.rigor.intervals import Interval
@@ -187,12 +187,8 @@ class ClockEvents:
 
     def bound(self, row: Array) -> ClockBound | RateBound | None:
         """The sharper bound along ``row``; None where none is proved."""
-        key = row.tobytes()
-        if key not in self.memory:
-            smooth = not np.any(np.abs(row) @ np.abs(self.diffusion))
-            self.memory[key] = self._rate(row) if smooth else self._clock(row)
-        found: ClockBound | RateBound | None = self.memory[key]
-        return found
+        smooth = not np.any(np.abs(row) @ np.abs(self.diffusion))
+        return remembered(self.memory, row.tobytes(), lambda: self._rate(row) if smooth else self._clock(row))
 
     @cached_property
     def parts(self) -> int:
@@ -214,10 +210,7 @@ class ClockEvents:
     @property
     def fine(self) -> LinearResponse:
         """The same response on the parts."""
-        if b"fine" not in self.memory:
-            self.memory[b"fine"] = self._refined()
-        found: LinearResponse = self.memory[b"fine"]
-        return found
+        return remembered(self.memory, b"fine", self._refined)
 
     def _refined(self) -> LinearResponse:
         response, parts = self.windows.response, self.parts

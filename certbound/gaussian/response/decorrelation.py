@@ -43,8 +43,7 @@ class Decorrelation:
 
 def _ratio(x: Interval, y: Interval, usable: Flags) -> Interval:
     """x / y where y > 0 (``usable``), anything elsewhere."""
-    result: Interval = x / Interval(np.where(usable, y.lo, 1.0), np.where(usable, y.hi, 1.0))
-    return result
+    return x / Interval(np.where(usable, y.lo, 1.0), np.where(usable, y.hi, 1.0))
 
 
 def _of(own: Interval, index: Index) -> Interval:
@@ -171,15 +170,13 @@ def _product(middle: Array, radius: Array, other: Array, width: Array) -> Interv
 
 def _second(d: dict[str, Interval], usable: Flags, own: Interval, second: str, first: str) -> Interval:
     """psi differentiated twice by t or by s: -D''/D + (D'/D)^2 + ``own``."""
-    result: Interval = _ratio(d[first], d["00"], usable) ** 2 - _ratio(d[second], d["00"], usable) + own
-    return result
+    return _ratio(d[first], d["00"], usable) ** 2 - _ratio(d[second], d["00"], usable) + own
 
 
 def _mixed(d: dict[str, Interval], usable: Flags) -> Interval:
     """psi differentiated by s and t."""
     product = _ratio(d["10"], d["00"], usable) * _ratio(d["01"], d["00"], usable)
-    result: Interval = product - _ratio(d["11"], d["00"], usable)
-    return result
+    return product - _ratio(d["11"], d["00"], usable)
 
 
 def _slope_at_middles(row: RowMoments, part: Index) -> Array:
