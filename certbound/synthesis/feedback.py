@@ -35,7 +35,6 @@ def resolve_feedback(problem: Problem, feedback: str | ArrayLike, start: Array) 
 
     Parameters
     ----------
-    problem : Problem
     feedback : {"riccati", "lmi"} or array_like of shape (m, n)
         "riccati": the linear-quadratic regulator of the linearisation at ``start``; "lmi": K and a metric together,
         with the smallest c or L over all Jacobians.
@@ -116,7 +115,6 @@ def close_loop(system: System, gain: Array) -> System:
 
     Parameters
     ----------
-    system : ContinuousSystem or DiscreteSystem
     gain : ndarray, shape (m, n)
         K.
     """
@@ -146,7 +144,6 @@ def constrain_inputs(problem: Problem, gain: Array, plan: Array, used: Array) ->
 
     Parameters
     ----------
-    problem : Problem
     gain : ndarray, shape (m, n)
     plan : ndarray, shape (N, m)
     used : ndarray, shape (N, 2 m)

@@ -84,11 +84,8 @@ def check_terminal(terminal: TerminalSet, faces: Sequence[Face], erosion: Array,
 
     Parameters
     ----------
-    terminal : TerminalSet
-    faces : sequence of Face
     erosion : ndarray, shape (parts,)
         At that time.
-    time : float
 
     Raises
     ------
@@ -176,7 +173,6 @@ def contraction_terminal(
 
     Parameters
     ----------
-    problem : Problem
     constants : Constants
         With a gain below 1 (rate below 0).
     faces, erosion, time

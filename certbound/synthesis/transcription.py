@@ -65,10 +65,6 @@ class Transcription:
 
     Parameters
     ----------
-    plant : Plant
-    grid : Grid
-    faces : sequence of Face
-    cost : Cost
     terminal : TerminalSet, optional
         Where the last state must lie.
     options : dict, optional

@@ -224,8 +224,6 @@ class RowResponse:
 
     Parameters
     ----------
-    response : LinearResponse
-    cell : int
     rows : ndarray, shape (M, D, n)
         Rows at nodes 0 .. M - 1 (M <= N + 1).
     columns : ndarray of int, optional

@@ -59,8 +59,6 @@ class Martingales:
 
     Parameters
     ----------
-    response : LinearResponse
-    cell : int
     excess : Interval, shape (N, n, m)
         g - ghat over the tube, piece by piece.
     shared_log : float

@@ -39,8 +39,6 @@ def log_occupancy(
     ----------
     constraint : Outside
         Of a box that does not move; anything else is answered by 0.
-    response : LinearResponse
-    cell : int
     nominal : ndarray, shape (T + 1, n)
         p_t.
     moved, remainder : ndarray, shape (T + 1, n)

@@ -39,7 +39,6 @@ def log_any_exceedance(events: StepEvents, rows: Sequence[Array], levels: Sequen
 
     Parameters
     ----------
-    events : StepEvents
     rows : sequence of ndarray, shape (nodes, n)
     levels : sequence of ndarray, shape (nodes,)
         +inf where nothing is asked.

@@ -67,7 +67,6 @@ def local_contraction_tube(
 
     Parameters
     ----------
-    problem : Problem or Flow
     metric : array_like, shape (n, n), optional
         P; the identity when omitted.
     cells : int, optional
@@ -153,7 +152,6 @@ def local_constants(
 
     Parameters
     ----------
-    problem : Problem
     reach : ReachTube
         Noise-free tube over the whole horizon.
     extra : array_like, shape (K,) or ()

@@ -29,7 +29,6 @@ class LocalSlopes:
 
     Parameters
     ----------
-    flow : Flow
     norm : Norm
         The metric P.
     """

@@ -58,7 +58,6 @@ def contraction_tube(
 
     Parameters
     ----------
-    problem : Problem or Flow
     constants : Constants
         rate (continuous time) or gain (discrete time) in its metric; sigma is not used.
     cells : int, optional

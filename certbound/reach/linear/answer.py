@@ -150,7 +150,6 @@ def linear_answer(
 
     Parameters
     ----------
-    problem : Problem
     cells : int, optional
         Cells along each side of the initial set; as few as serve when omitted.
     thorough : bool

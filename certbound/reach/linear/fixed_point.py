@@ -36,7 +36,6 @@ class Inclusion:
 
     Parameters
     ----------
-    engine : Linearisation
     outer : sequence of sequence of ndarray, optional
         Rows of every cell (shape (N, n) each, N + 1 in discrete time) that R is bounded along beside the inner ones.
     """

@@ -49,15 +49,12 @@ class Supports:
 
     Parameters
     ----------
-    response : LinearResponse
     gathering : Gathering
         Of this cell.
-    cell : int
     rows : ndarray, shape (N, D, n)
         In discrete time N + 1 rows, one a node.
     generators : ndarray, shape (G, n)
         Zonotope of the initial set about the nominal start.
-    continuous : bool
     outputs : ndarray of int, optional
         States that the remainder or the disturbance moves by more than a rounding error (discrete time).
     """

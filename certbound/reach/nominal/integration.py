@@ -44,7 +44,6 @@ def nominal_curve(problem: Problem | Flow, points: ArrayLike, *, times: ArrayLik
 
     Parameters
     ----------
-    problem : Problem or Flow
     points : array_like, shape (B, n) or (n,)
         States at time 0, one per cell.
     times : array_like, optional

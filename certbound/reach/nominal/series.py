@@ -25,7 +25,6 @@ def expand(tape: Tape, inputs: Sequence[Series], order: int) -> list[Series]:
 
     Parameters
     ----------
-    tape : Tape
     inputs : sequence of Series
         One series per input slot.
     order : int

@@ -30,8 +30,6 @@ def sampled_range(model: Derivatives, frame: Frame, low: Array, high: Array, row
 
     Parameters
     ----------
-    model : Derivatives
-    frame : Frame
     low, high : ndarray, shape (M, D)
         Bounds of s along the active coordinates (first) and along ``rows``.
     rows : ndarray, shape (M, D - active, active)

@@ -202,7 +202,6 @@ def noise_free_states(
 
     Parameters
     ----------
-    flow : Flow
     grid : ndarray
         Ends of the pieces; time may run backwards (a falling grid).
     starts : ndarray, shape (count, n)

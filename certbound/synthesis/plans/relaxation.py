@@ -76,8 +76,6 @@ def bound_scale(problem: Problem, grid: Grid, faces: tuple[Face, ...], erosion: 
 
     Parameters
     ----------
-    problem : Problem
-    grid : Grid
     faces : tuple of Face
         Other faces than fixed planes are left out.
     erosion : ndarray, shape (points, parts)
