@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.problem.adapters import to_casadi
-from certbound.problem.model import Tape
+from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 
@@ -81,8 +81,6 @@ class Face:
         """Coordinates relative to the centre, shape (K, q)."""
         chosen = states[:, list(self.coordinates)]
         if isinstance(self.center, Tape):
-            from certbound.problem.model import compile_numpy
-
             return np.asarray(chosen - compile_numpy(self.center)(times))
         return np.asarray(chosen - self.center)
 
@@ -92,6 +90,10 @@ class Face:
         if isinstance(self.center, Tape):
             return chosen - to_casadi(self.center, [time])
         return chosen - ca.DM(np.asarray(self.center))
+
+    def _taken(self, states: Array, erosion: ArrayLike) -> Array:
+        """Erosions (K, parts)."""
+        return np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), self.parts))
 
     def _embedded(self, rows: Array) -> Array:
         """Rows over the set's coordinates as rows over the whole state."""
@@ -107,12 +109,16 @@ class Plane(Face):
     normal: Array
     bound: float
 
+    @property
+    def row(self) -> Array:
+        """The normal over the whole state."""
+        return self._embedded(self.normal)
+
     def rows(self, states: Array, times: Array) -> Array:
-        return np.broadcast_to(self._embedded(self.normal[None]), (len(states), 1, self.dimension))
+        return np.broadcast_to(self.row, (len(states), 1, self.dimension))
 
     def room(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
-        taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), 1))[:, 0]
-        return np.asarray(self.bound - self.local(states, times) @ self.normal - taken)
+        return np.asarray(self.bound - self.local(states, times) @ self.normal - self._taken(states, erosion)[:, 0])
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:
         return self.bound - ca.dot(ca.DM(self.normal), self.relative(ca, state, time)) - erosion[0]
@@ -149,9 +155,8 @@ class Round(Face):
         return np.asarray(extents.max(axis=1, keepdims=True) * factor)
 
     def room(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
-        taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), 1))[:, 0]
         value = np.linalg.norm(self.local(states, times) @ self.matrix.T, axis=1) - self.size
-        return np.asarray((value if self.outside else -value) - taken)
+        return np.asarray((value if self.outside else -value) - self._taken(states, erosion)[:, 0])
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:
         image = ca.DM(self.matrix) @ self.relative(ca, state, time)
@@ -181,14 +186,15 @@ class Facets(Face):
         return np.broadcast_to(full, (len(states), *full.shape))
 
     def room(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
-        taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), self.parts))
-        return np.asarray(np.max(self.local(states, times) @ self.normals.T - self.bounds - taken, axis=1))
+        return np.asarray(np.max(self.values(states, times, erosion), axis=1))
+
+    def values(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
+        """By how much every facet is passed, (K, facets)."""
+        return self.local(states, times) @ self.normals.T - self.bounds - self._taken(states, erosion)
 
     def best(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
         """Weights (K, facets) that choose the facet with the most room."""
-        taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), self.parts))
-        value = self.local(states, times) @ self.normals.T - self.bounds - taken
-        return np.asarray(np.eye(self.parts)[np.argmax(value, axis=1)])
+        return np.asarray(np.eye(self.parts)[np.argmax(self.values(states, times, erosion), axis=1)])
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:
         value = ca.DM(self.normals) @ self.relative(ca, state, time) - ca.DM(self.bounds) - erosion

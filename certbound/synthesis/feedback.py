@@ -7,6 +7,7 @@ bounds during piece k, which the verdict proves like every other constraint.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from certbound.checks import matrix
 from certbound.constants.jacobians import jacobian_set
 from certbound.constants.programs import design_feedback
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
-from certbound.problem.model import Tape, jacobian, substitute, trace
+from certbound.problem.model import Tape, jacobian, needed, substitute, trace
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside, Polytope
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
@@ -95,19 +96,10 @@ def _designed(problem: Problem, start: Array) -> Array:
         raise ValueError(f"`feedback` 'lmi' found no gain: {error}") from error
 
 
-def depends_on(tape: Tape, slots: Any) -> bool:
+def depends_on(tape: Tape, slots: Container[int]) -> bool:
     """Whether the outputs of a tape depend on any of the input slots."""
-    wanted, needed = set(slots), set(tape.outputs)
-    for index in range(len(tape.nodes) - 1, -1, -1):
-        if index not in needed:
-            continue
-        node = tape.nodes[index]
-        if node.op == "input":
-            if node.args[0] in wanted:
-                return True
-        else:
-            needed.update(node.args)
-    return False
+    live = needed(tape.nodes, tape.outputs)
+    return any(use and node.op == "input" and node.args[0] in slots for use, node in zip(live, tape.nodes, strict=True))
 
 
 def close_loop(system: System, gain: Array) -> System:

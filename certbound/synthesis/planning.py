@@ -39,7 +39,7 @@ from certbound.synthesis.tightening import (
     spread_tube,
     tighten,
 )
-from certbound.synthesis.transcription import Solution, Transcription
+from certbound.synthesis.transcription import Mode, Solution, Transcription
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
@@ -189,7 +189,7 @@ class Planner:
             if not np.all(np.isfinite(states)) or np.abs(states).max() > 1e6:
                 states = np.tile(self.start, (self.grid.points + 1, 1))
             shape = self.tightened(spread_tube(self.problem, self.plant, self.grid, states, guess), states)
-            found = self.program.solve("scale", self.start, shape.erosion, guess, tightening=shape.inputs)
+            found = self.plan("scale", shape, guess)
             if not np.all(np.isfinite(found.states)):
                 break
             best = found
@@ -324,17 +324,9 @@ class Planner:
             assert self.terminal is not None
             check_terminal(self.terminal, self.faces, last, horizon)
 
-    def widest(self, tightened: Tightened, guess: Array) -> Solution:
-        """The plan with the largest s such that s times the erosion fits."""
-        return self.program.solve("scale", self.start, tightened.erosion, guess, tightening=tightened.inputs)
-
-    def cheapest(self, tightened: Tightened, guess: Array) -> Solution:
-        """The plan of least cost in the tightened constraints."""
-        return self.program.solve("cost", self.start, tightened.erosion, guess, tightening=tightened.inputs)
-
-    def softest(self, tightened: Tightened, guess: Array) -> Solution:
-        """The plan that misses the tightened constraints least."""
-        return self.program.solve("soft", self.start, tightened.erosion, guess, tightening=tightened.inputs)
+    def plan(self, mode: Mode, tightened: Tightened, guess: Array) -> Solution:
+        """The best plan in the tightened constraints, by a mode of `certbound.synthesis.transcription`."""
+        return self.program.solve(mode, self.start, tightened.erosion, guess, tightening=tightened.inputs)
 
 
 def _grid(problem: Problem, steps: int | None) -> Grid:

@@ -111,8 +111,7 @@ def _room_of_region(region: Region, face: Face, erosion: Array, time: float) -> 
     room = face.room(middle, np.array([time]), erosion[None])
     if isinstance(face, Facets):
         spread = np.array([float(region.support(a)) - float(a @ middle[0]) for a in rows])
-        local = face.local(middle, np.array([time])) @ face.normals.T - face.bounds - erosion
-        return float(np.max(local[0] - spread))
+        return float(np.max(face.values(middle, np.array([time]), erosion)[0] - spread))
     reach = max(float(region.support(a)) - float(a @ middle[0]) for a in rows)
     if isinstance(face, Round) and not face.outside:
         reach *= 1.0 if rows.shape[0] == 2 else float(np.sqrt(len(face.coordinates)))
@@ -248,8 +247,7 @@ def _largest_level(metric: Array, center: Array, faces: Sequence[Face], erosion:
         rows = face.rows(center[None], np.array([time]))[0]
         reach = np.sqrt(np.einsum("ij,jk,ik->i", rows, inverse, rows))
         if isinstance(face, Facets):
-            local = (face.local(center[None], np.array([time])) @ face.normals.T - face.bounds - own)[0]
-            level = float(np.max(local / reach))
+            level = float(np.max(face.values(center[None], np.array([time]), own)[0] / reach))
         else:
             taken = face.erosion(reach[None])[0, 0] if isinstance(face, Round) else float(np.max(reach))
             level = float(face.room(center[None], np.array([time]), own[None])[0]) / float(taken)

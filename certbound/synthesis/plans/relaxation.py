@@ -117,11 +117,9 @@ class _Relaxed:
 
     def floats(self) -> tuple[Array, Array, Array, Array]:
         """A, B, C, c as floats."""
-        parts = [np.array([[float(v) for v in row] for row in m]).reshape(len(m), -1) for m in self._matrices()]
+        matrices = (self.state, self.inputs, self.free)
+        parts = [np.array([[float(v) for v in row] for row in m]).reshape(len(m), -1) for m in matrices]
         return parts[0], parts[1], parts[2], np.array([float(v) for v in self.offset])
-
-    def _matrices(self) -> list[list[list[Fraction]]]:
-        return [self.state, self.inputs, self.free]
 
 
 def _relaxed(problem: Problem) -> _Relaxed:
@@ -145,7 +143,7 @@ def _relaxed(problem: Problem) -> _Relaxed:
         lows, highs = np.asarray(values.lo).reshape(-1), np.asarray(values.hi).reshape(-1)
     if not (np.all(np.isfinite(lows)) and np.all(np.isfinite(highs))):
         raise EnclosureError("a nonlinear term of the dynamics is unbounded.")
-    slot = {k: tape.nodes[k].args[0] for k in nodes if k not in free}
+    place = {k: tape.nodes[k].args[0] - 1 for k in nodes if k not in free}
     state = [[Fraction(0)] * n for _ in range(n)]
     inputs = [[Fraction(0)] * m for _ in range(n)]
     unknown = [[Fraction(0)] * len(free) for _ in range(n)]
@@ -154,14 +152,12 @@ def _relaxed(problem: Problem) -> _Relaxed:
         constant, terms = forms[output]
         offset.append(constant)
         for k, value in terms.items():
-            if k in slot:
-                place = slot[k] - 1
-                if place < n:
-                    state[row][place] += value
-                else:
-                    inputs[row][place - n] += value
-            else:
+            if k not in place:
                 unknown[row][free.index(k)] += value
+            elif place[k] < n:
+                state[row][place[k]] += value
+            else:
+                inputs[row][place[k] - n] += value
     return _Relaxed(state=state, inputs=inputs, free=unknown, offset=offset, low=lows, high=highs)
 
 
@@ -215,7 +211,6 @@ def _propose(
     rows = int(asked.sum())
     less, most = lil_matrix((rows, size)), np.zeros(rows)
     start = problem.initial.middle
-    normals = [_full(plane) for plane in planes]
     row = 0
     for k in range(steps):
         base = k * width  # u_k, q_k, z_{k+1}
@@ -228,7 +223,7 @@ def _propose(
         else:
             right[block] += a @ start
         for j in np.flatnonzero(asked[k]):
-            less[row, base + m + q : base + width] = normals[j]
+            less[row, base + m + q : base + width] = planes[j].row
             less[row, size - 1] = taken[k, j]
             most[row] = _bound(planes[j])
             row += 1
@@ -256,7 +251,7 @@ def _dual_bound(model: _Relaxed, problem: Problem, planes: list[Plane], taken: A
         weight = sum((arb(float(x)) * arb(float(e)) for x, e in zip(multipliers.ravel(), taken.ravel())), arb(0))
         total = arb(0)
         adjoint = arb_mat(1, n)
-        normals = [arb_mat([[arb(float(v)) for v in _full(plane)]]) for plane in planes]
+        normals = [arb_mat([[arb(float(v)) for v in plane.row]]) for plane in planes]
         for k in range(steps - 1, -1, -1):
             for j, plane in enumerate(planes):
                 value = float(multipliers[k, j])
@@ -292,12 +287,6 @@ def _ball(value: Fraction) -> arb:
 def _balls(matrix: list[list[Fraction]]) -> arb_mat:
     rows = [[_ball(value) for value in row] for row in matrix]
     return arb_mat(rows) if rows and rows[0] else arb_mat(len(rows), 0)
-
-
-def _full(plane: Plane) -> Array:
-    full = np.zeros(plane.dimension)
-    full[list(plane.coordinates)] = plane.normal
-    return full
 
 
 def _bound(plane: Plane) -> float:
