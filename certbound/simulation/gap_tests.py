@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from certbound.problem.sets import Faces, Quadratic
 from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 
-__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "tables_of", "window_test"]
+__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "starts_at_once", "tables_of", "window_test"]
 
 Array = NDArray[np.float64]
 
@@ -162,7 +162,8 @@ def if_all(*conditions: str, word: str = "if") -> str:
     return f"{word} {' and '.join(condition for condition in conditions if condition) or 'True'}:"
 
 
-def _starts(number: int, barrier: Barrier) -> str:
+def starts_at_once(number: int, barrier: Barrier) -> str:
+    """Condition for a constraint to hold at the start; none if it always does."""
     return "" if barrier.always else f"windows[{number}, 0] == 0"
 
 
@@ -193,7 +194,7 @@ def _faces(
     def out(names: list[str]) -> str:
         return (" or " if barrier.stay else " and ").join(f"{name} < 0.0" for name in names)
 
-    start = [*gaps(old, "x", "0"), if_all(_starts(number, barrier), f"({out(old)})"), f"    left = {number}"]
+    start = [*gaps(old, "x", "0"), if_all(starts_at_once(number, barrier), f"({out(old)})"), f"    left = {number}"]
     step = [
         *gaps(new, "y", "k + 1"),
         if_all(f"({out(new)})", *window_test(number, barrier, "k + 1")),
@@ -256,7 +257,7 @@ def _round(
 
     beyond = f"{'>' if barrier.stay else '<'} {radius} * {radius}"
     start = distance(old, "x", "0")
-    start += [if_all(_starts(number, barrier), f"{old} {beyond}"), f"    left = {number}"]
+    start += [if_all(starts_at_once(number, barrier), f"{old} {beyond}"), f"    left = {number}"]
     step = distance(new, "y", "k + 1")
     step += [if_all(f"{new} {beyond}", *window_test(number, barrier, "k + 1")), f"    left = {number}"]
     end = [f"{old} = {new}"]

@@ -161,14 +161,7 @@ def chain_of(constants: Constants, schedule: Schedule, radius: float) -> Recursi
 def bound_exact_exit(constants: Constants, *, horizon: float, radius: float, target: float = 1e-3) -> float:
     """Upper bound of P(exists t <= T: ||S_t||_P > radius) for noise that is exactly isotropic.
 
-    Parameters
-    ----------
-    constants : Constants
-        With ``isotropic=True``.
-    horizon, radius : float
-        T, and the constant radius.
-    target : float
-        Expected size of the probability: it sets the mesh.
+    ``target`` is the expected size of the probability: it sets the mesh.
 
     Raises
     ------
@@ -218,16 +211,8 @@ def _check_continuous(constants: Constants) -> None:
 def first_passage_tube(question: Question, delta: float, *, worst: bool, above: float) -> Tube:
     """The tube of least constant radius: P(||S_t|| <= R for all t <= T) >= 1 - delta.
 
-    Parameters
-    ----------
-    question : Question
-        ``isotropic=True`` for the exact law (``worst=False``); continuous time for the worst case.
-    delta : float
-        The level.
-    worst : bool
-        Which law.
-    above : float
-        A radius that is known to be large enough (the search starts below it).
+    The exact law needs ``isotropic=True``, the worst case continuous time; ``above`` is a radius that is known to be
+    large enough: the search starts below it.
 
     Raises
     ------

@@ -303,14 +303,12 @@ class _Bernstein:
         left, right = m[:, :-1], m[:, 1:]
         chord = 3 * (u[:, 1:] - u[:, :-1]) / h
         value = np.stack([chord - 2 * left - right, 2 * right + left - chord]) * (2 / h)
-        size = np.stack([np.abs(chord) + 2 * np.abs(left) + np.abs(right)] * 2) * (2 / h)
-        size[1] = (np.abs(chord) + np.abs(left) + 2 * np.abs(right)) * (2 / h)
-        return _Bernstein(value, size)
+        ends = np.abs(chord) + 2 * np.abs(left) + np.abs(right), np.abs(chord) + np.abs(left) + 2 * np.abs(right)
+        return _Bernstein(value, np.stack(ends) * (2 / h))
 
     def times(self, y: Array) -> _Bernstein:
         """Product with y, whose coefficients on a cell are its ends."""
-        degree = len(self.value) - 1
-        return _Bernstein(_by_line(self.value, y, degree), _by_line(self.size, y, degree))
+        return _Bernstein(_by_line(self.value, y), _by_line(self.size, y))
 
     def raised(self, degree: int) -> _Bernstein:
         """The same polynomial with more coefficients."""
@@ -320,8 +318,9 @@ class _Bernstein:
         return _Bernstein(value, size)
 
 
-def _by_line(c: Array, y: Array, degree: int) -> Array:
-    low, high = y[:-1], y[1:]
+def _by_line(c: Array, y: Array) -> Array:
+    """Coefficients of the product with lines that have the values ``y`` at the ends of the cells."""
+    degree, low, high = len(c) - 1, y[:-1], y[1:]
     result = np.zeros((degree + 2, *c.shape[1:]))
     for k in range(degree + 1):
         result[k] += c[k] * low * ((degree + 1 - k) / (degree + 1))
@@ -330,12 +329,8 @@ def _by_line(c: Array, y: Array, degree: int) -> Array:
 
 
 def _raise(c: Array) -> Array:
-    degree = len(c) - 1
-    result = np.zeros((degree + 2, *c.shape[1:]))
-    for k in range(degree + 1):
-        result[k] += c[k] * ((degree + 1 - k) / (degree + 1))
-        result[k + 1] += c[k] * ((k + 1) / (degree + 1))
-    return result
+    """The same polynomials with one coefficient more."""
+    return _by_line(c, np.ones(2))
 
 
 def _local(u: Array, m: Array) -> Array:

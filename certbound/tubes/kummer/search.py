@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from certbound.tubes.excess import log_excess_value, log_excess_values, log_phi, log_phi_one, solve_excess
 from certbound.tubes.kummer.profile import log_initial, log_target
+from certbound.tubes.objective import mean_over_time
 from certbound.tubes.question import Question, Start
 from certbound.tubes.schedule import Schedule
 
@@ -254,11 +255,7 @@ class Search:
             return math.inf
         with np.errstate(over="ignore", invalid="ignore"):
             z = solve_excess(np.asarray(a), self.half, log_target(a, info, log_x, self.log_delta), bessel=self.bessel)
-            radius = np.sqrt(2 * v * z) * self.schedule.unit
-        times = self.schedule.times
-        if self.schedule.continuous:
-            return float(np.trapezoid(radius, times) / times[-1])
-        return float(np.mean(np.interp(np.arange(1.0, times[-1] + 1), times, radius)))
+            return mean_over_time(self.schedule, np.sqrt(2 * v * z) * self.schedule.unit)
 
     def _active(self, v: Array) -> NDArray[np.intp]:
         """Nodes that no later node dominates: z_t rises in t, so only records of v/clearance^2 from the end count."""
