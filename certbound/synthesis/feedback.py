@@ -103,13 +103,7 @@ def depends_on(tape: Tape, slots: Container[int]) -> bool:
 
 
 def close_loop(system: System, gain: Array) -> System:
-    """The system x+ = f(t, x, w + K x, d) (or dx = ...) with inputs w without bounds.
-
-    Parameters
-    ----------
-    gain : ndarray, shape (m, n)
-        K.
-    """
+    """The system x+ = f(t, x, w + K x, d) (or dx = ...), K = ``gain`` (m, n), with inputs w without bounds."""
     names = system.input_names
 
     def law(x: Any, u: Any) -> Any:
@@ -134,12 +128,8 @@ def constrain_inputs(problem: Problem, gain: Array, plan: Array, used: Array) ->
     Neighbouring pieces share one constraint, with the tightest of their bounds, where that leaves each of them at least
     half of its own room: fewer constraints are verified sooner.
 
-    Parameters
-    ----------
-    gain : ndarray, shape (m, n)
-    plan : ndarray, shape (N, m)
-    used : ndarray, shape (N, 2 m)
-        Largest K z + e and -K z + e on each piece, e what the tube takes: bounds less this is the room of a piece.
+    K = ``gain`` (m, n); ``used`` (N, 2 m) are the largest K z + e and -K z + e on each piece, e what the tube takes:
+    bounds less this is the room of a piece.
     """
     box = problem.system.inputs
     assert box is not None

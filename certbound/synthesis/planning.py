@@ -220,12 +220,7 @@ class Planner:
     def constants(self, plan: Array, *, metric: Any = None) -> Constants:
         """Certified constants in the one common metric, for every input that the problem allows.
 
-        Parameters
-        ----------
-        plan : ndarray, shape (N, m)
-            Around which the metric is chosen.
-        metric : "euclidean" or ndarray, shape (n, n), optional
-            The metric instead.
+        The metric is chosen around ``plan`` (N, m), unless ``metric`` names one: "euclidean", or a matrix (n, n).
 
         Raises
         ------

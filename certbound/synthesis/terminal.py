@@ -80,12 +80,7 @@ class TerminalSet:
 
 
 def check_terminal(terminal: TerminalSet, faces: Sequence[Face], erosion: Array, time: float) -> None:
-    """Refuse a terminal set that sticks out of the tightened constraints at the last time.
-
-    Parameters
-    ----------
-    erosion : ndarray, shape (parts,)
-        At that time.
+    """Refuse a terminal set that sticks out of the constraints as ``erosion`` (parts,) tightens them at the last time.
 
     Raises
     ------
@@ -137,14 +132,11 @@ def linearise(problem: Problem, state: ArrayLike, inputs: ArrayLike) -> tuple[Ar
 
 
 def riccati(problem: Problem, state: ArrayLike | None = None) -> tuple[Array, Array, Array]:
-    """S, K and the closed loop's matrix of the linear-quadratic regulator at a state without inputs (python-control).
+    """S (n, n), K (m, n) with u = K z, and A + B K of the linear-quadratic regulator at a state without inputs.
 
     Without a cost of the problem, Q = I and R = I.
 
-    Returns
-    -------
-    (ndarray, ndarray, ndarray)
-        S (n, n), the cost-to-go matrix; K (m, n) with u = K z; A + B K.
+    S is the cost-to-go matrix (python-control).
 
     Raises
     ------
@@ -170,12 +162,7 @@ def contraction_terminal(
 ) -> TerminalSet:
     """The largest ball of the contraction metric that fits into the tightened constraints, with its cost.
 
-    Parameters
-    ----------
-    constants : Constants
-        With a gain below 1 (rate below 0).
-    faces, erosion, time
-        The tightened constraints at the last time.
+    The constants must contract (a gain below 1, a rate below 0); the erosion is that of the last time.
 
     Raises
     ------

@@ -63,12 +63,7 @@ class Solution:
 class Transcription:
     """One family of optimal control problems: grid, plant, faces and cost are fixed, start and erosions vary.
 
-    Parameters
-    ----------
-    terminal : TerminalSet, optional
-        Where the last state must lie.
-    options : dict, optional
-        For IPOPT.
+    ``terminal`` is where the last state must lie; ``warm``: a solve begins at the multipliers of the last one.
     """
 
     def __init__(

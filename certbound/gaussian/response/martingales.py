@@ -57,14 +57,8 @@ def quantile(log_probability: float) -> float:
 class Martingales:
     """The part of the noise that depends on the state, for one cell of the initial set.
 
-    Parameters
-    ----------
-    excess : Interval, shape (N, n, m)
-        g - ghat over the tube, piece by piece.
-    shared_log : float
-        Log probability granted to the event that some coordinate of M leaves its level in some window.
-    frame : Windowed, optional
-        What `Windowed` found for this response and cell before.
+    ``excess`` (N, n, m) is g - ghat over the tube, piece by piece; ``shared_log`` the log probability granted to the
+    event that some coordinate of M leaves its level in some window; ``frame`` what `Windowed` found before.
     """
 
     def __init__(

@@ -37,11 +37,7 @@ _UNIT = 2.0**-53
 def log_any_exceedance(events: StepEvents, rows: Sequence[Array], levels: Sequence[Array]) -> float:
     """Upper bound of log P(exists t and j: rows[j][t] . Z_t > levels[j][t]), for Gaussian noise.
 
-    Parameters
-    ----------
-    rows : sequence of ndarray, shape (nodes, n)
-    levels : sequence of ndarray, shape (nodes,)
-        +inf where nothing is asked.
+    Every row has the shape (nodes, n), its levels (nodes,), with +inf where nothing is asked.
     """
     if any(np.any(z < 0) for z in levels):
         return 0.0

@@ -25,13 +25,7 @@ LARGEST_BATCH = 8_000
 
 
 class LocalSlopes:
-    """Bounds of mu_P(D_x f) (CT) or ||D_x f||_P (DT) around pieces of a curve.
-
-    Parameters
-    ----------
-    norm : Norm
-        The metric P.
-    """
+    """Bounds of mu_P(D_x f) (CT) or ||D_x f||_P (DT) around pieces of a curve, P the metric of ``norm``."""
 
     def __init__(self, flow: Flow, norm: Norm) -> None:
         self.flow, self.norm = flow, norm

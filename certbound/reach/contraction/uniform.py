@@ -148,16 +148,9 @@ def _largest_image(norm: Norm, slope: Interval, width: Interval) -> Array:
 def integrate_radius(curve: Curve, gaps: Array, rho: Array, slopes: Array, eta: Array) -> tuple[Array, Array]:
     """rho over each piece, shape (B, K), and after the last one, shape (B,), rounded up.
 
-    Parameters
-    ----------
-    curve : Curve
-        Of K pieces (or steps).
-    gaps : ndarray, shape (B, K)
-        Size of the curve's jump after each piece, see `jump_sizes`.
-    rho : ndarray, shape (B,)
-        Radius at the start of the first piece.
-    slopes, eta : ndarray, shapes broadcastable to (B, K)
-        c (CT) or L (DT), and the forcing. Once a radius is infinite it stays so.
+    ``gaps`` (B, K) are the jumps of the curve after each of its K pieces (see `jump_sizes`), ``rho`` (B,) the radius at
+    the start of the first one; ``slopes`` and ``eta``, broadcastable to (B, K), are c (CT) or L (DT), and the forcing.
+    Once a radius is infinite it stays so.
     """
     slopes = np.broadcast_to(slopes, eta.shape)
     radius = np.empty(eta.shape)

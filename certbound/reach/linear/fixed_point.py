@@ -34,10 +34,8 @@ _WIDER = 0.05  # of the remainder's share in a polytope
 class Inclusion:
     """Supports of y and R for all cells of a linearisation, and the bounds of beta that they prove.
 
-    Parameters
-    ----------
-    outer : sequence of sequence of ndarray, optional
-        Rows of every cell (shape (N, n) each, N + 1 in discrete time) that R is bounded along beside the inner ones.
+    ``outer`` holds rows of every cell, (N, n) each (N + 1 in discrete time), that R is bounded along beside the inner
+    ones.
     """
 
     def __init__(self, engine: Linearisation, outer: Sequence[Sequence[Array]] | None = None) -> None:

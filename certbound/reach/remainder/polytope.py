@@ -67,18 +67,8 @@ def linear_range(matrix: Array, radius: Array, normals: Array, room: Array) -> A
 
     For alpha >= 0, g . d <= |g - alpha w| . e + alpha room: the least value over the kinks alpha = g_j / w_j counts.
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (Q, n, a)
-        Rows g.
-    radius : ndarray, shape (Q, a)
-    normals : ndarray, shape (Q, D, a)
-    room : ndarray, shape (Q, D)
-
-    Returns
-    -------
-    ndarray, shape (Q, n)
-        Rounded up.
+    ``matrix`` (Q, n, a) holds the rows g, ``radius`` (Q, a) is e, ``normals`` (Q, D, a) and ``room`` (Q, D) are the
+    faces. The bounds (Q, n) are rounded up.
 
     Examples
     --------

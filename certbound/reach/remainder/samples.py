@@ -28,11 +28,7 @@ _ROUNDING = 1e-13  # of the nominal state
 def sampled_range(model: Derivatives, frame: Frame, low: Array, high: Array, rows: Array) -> tuple[Array, Array]:
     """Range of beta at the middle of every piece over the points: two arrays (M, n).
 
-    Parameters
-    ----------
-    low, high : ndarray, shape (M, D)
-        Bounds of s along the active coordinates (first) and along ``rows``.
-    rows : ndarray, shape (M, D - active, active)
+    ``low`` and ``high`` (M, D) bound s along the active coordinates (first) and along ``rows`` (M, D - active, active).
     """
     base = _remainder(model, frame, np.zeros((len(frame), 1, len(model.active))))[:, 0]
     lower, upper = base.copy(), base.copy()

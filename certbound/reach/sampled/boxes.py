@@ -83,12 +83,7 @@ class SampledTube(ReachTube):
 def scenario_count(constraints: int, epsilon: float, confidence: float) -> int:
     """The least N with P(Binomial(N, epsilon) <= constraints - 1) <= 1 - confidence.
 
-    Parameters
-    ----------
-    constraints : int
-        Bound of the number of samples that decide the set (support constraints).
-    epsilon, confidence : float
-        In (0, 1).
+    ``constraints`` bounds the number of samples that decide the set (support constraints); the others lie in (0, 1).
 
     Raises
     ------

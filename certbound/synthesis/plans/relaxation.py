@@ -74,12 +74,7 @@ def bound_scale(problem: Problem, grid: Grid, faces: tuple[Face, ...], erosion: 
     Proves: for every input sequence within the bounds, some plane constraint a_j . z_k + s e_jk <= b_j is broken for
     every s above the bound. Discrete time, bounded inputs, a point start (or the middle of the initial set).
 
-    Parameters
-    ----------
-    faces : tuple of Face
-        Other faces than fixed planes are left out.
-    erosion : ndarray, shape (points, parts)
-        Taken as exact.
+    Faces other than fixed planes are left out; ``erosion`` (points, parts) is taken as exact.
     """
     box = problem.system.inputs
     if grid.continuous or box is None or not box.bounded:
