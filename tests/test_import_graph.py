@@ -17,7 +17,7 @@ PACKAGE = ROOT / "certbound"
 
 # What a line names may import the lines above it: rooms, sub-rooms, and single modules that stand between these.
 ORDER = """
-errors lazy _version
+errors lazy arrays _version
 checks
 display
 rigor
@@ -81,7 +81,7 @@ LEVEL |= {
     f"checker.{unit}": level for level, line in enumerate(CHECKER_ORDER.split("\n")) for unit in line.split()
 } | {"checker": 99}
 
-GROUND = {"errors", "_version", "checks", "display", "rigor"}
+GROUND = {"errors", "arrays", "_version", "checks", "display", "rigor"}
 KNOWS_ONLY = {  # rooms that may be taken out and used elsewhere
     "tubes": GROUND,
     "gaussian": GROUND | {"problem"},

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.arrays import Array
+
 __all__ = ["BLOCK", "MEMORY_LIMIT", "Tally", "Work", "check_count", "entropy_of", "run_blocks"]
 
-Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 BLOCK = 1024

@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.model import Tape
 from certbound.simulation.gap_tests import Bridge
 from certbound.simulation.stepping import StepModel
@@ -31,8 +31,6 @@ __all__ = [
     "open_noise",
     "step_lines",
 ]
-
-Array = NDArray[np.float64]
 
 _WORDS = "word_0, word_1, word_2, word_3"  # the state of the noise's stream
 _STORED = "stream[4], stream[5], stream[6], stream[7]"

@@ -7,16 +7,15 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.problem.model import Node, Tape, compile_numpy, edged, jacobian, trace
 from certbound.problem.noise import Law, check_law
 from certbound.simulation.tape_text import live_nodes
 from certbound.simulation.transition import exact_transition
 
 __all__ = ["Scenario", "StepModel", "step_model"]
-
-Array = NDArray[np.float64]
 
 _LARGEST_EXACT = 16
 

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, barrier_source
 from certbound.simulation.tape_text import Parameters, indent, linear_form
 
 __all__ = ["LOWEST", "Lines", "Task", "task_source"]
 
-Array = NDArray[np.float64]
 Lines = tuple[list[str], list[str], list[str], list[str]]
 
 LOWEST = -40

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+
+from certbound.arrays import Array
 
 __all__ = ["exact_transition"]
-
-Array = NDArray[np.float64]
 
 
 def exact_transition(matrix: Array, offset: Array, diffusion: Array, step: float) -> tuple[Array, Array, Array]:

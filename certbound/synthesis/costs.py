@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.adapters import to_casadi
 from certbound.problem.model import Tape, compile_numpy, trace
 from certbound.problem.problem import Problem
 from certbound.synthesis.plant import Grid
 
 __all__ = ["Cost", "cost_of"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -19,16 +19,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array, Mask
 from certbound.problem.adapters import to_casadi
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 
 __all__ = ["Face", "Facets", "Plane", "Round", "faces_of", "with_parts"]
-
-Array = NDArray[np.float64]
 
 _ANGLES = 24
 
@@ -54,7 +53,7 @@ class Face:
         """Number of erosions that the face takes."""
         return 1
 
-    def asked(self, times: Array) -> NDArray[np.bool_]:
+    def asked(self, times: Array) -> Mask:
         """Whether the constraint is asked at each time."""
         if self.during is None:
             return np.ones(len(times), dtype=bool)

@@ -11,8 +11,9 @@ from collections.abc import Container
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.checks import matrix
 from certbound.constants.jacobians import jacobian_set
 from certbound.constants.programs import design_feedback
@@ -24,8 +25,6 @@ from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 from certbound.synthesis.terminal import linearise, riccati
 
 __all__ = ["close_loop", "constrain_inputs", "depends_on", "resolve_feedback"]
-
-Array = NDArray[np.float64]
 
 _MOST_VERTICES = 64
 LARGER = 2.0

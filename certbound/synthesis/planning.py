@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.bounds import bound_constants
 from certbound.errors import InfeasibleError
 from certbound.problem.model import jacobian
@@ -45,8 +46,6 @@ from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
 __all__ = ["Path", "Planner", "Tightened", "check_tube"]
-
-Array = NDArray[np.float64]
 
 PIECES = 40
 ROUNDING = 1e-7

@@ -8,16 +8,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.adapters import to_casadi
 from certbound.problem.export import runge_kutta
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.sets import Box
 
 __all__ = ["Grid", "Plant", "middle_of"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

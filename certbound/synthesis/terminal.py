@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ellipsoid, Quadratic, Region
@@ -27,8 +28,6 @@ from certbound.synthesis.plant import middle_of
 from certbound.tubes.constants import Constants
 
 __all__ = ["TerminalSet", "check_terminal", "contraction_terminal", "linearise", "riccati", "riccati_terminal"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.gaussian.response import StepEvents, level_scale
 from certbound.problem.model import Tape, compile_numpy, jacobian
@@ -41,7 +41,6 @@ __all__ = [
     "tighten",
 ]
 
-Array = NDArray[np.float64]
 Rows = Callable[[Array, Array], Array]
 
 CORNERS = 8

@@ -20,8 +20,8 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.adapters import casadi_module
 from certbound.synthesis.costs import Cost
 from certbound.synthesis.faces import Face, Facets, with_parts
@@ -30,7 +30,6 @@ from certbound.synthesis.terminal import TerminalSet
 
 __all__ = ["Mode", "Solution", "Transcription"]
 
-Array = NDArray[np.float64]
 Mode = Literal["cost", "scale", "soft"]
 
 PENALTY = 1e4

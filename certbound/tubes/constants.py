@@ -9,14 +9,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.display import Shown, plain, span_text
 from certbound.rigor.norms import Norm
 
 __all__ = ["Constants", "Proof", "check_delta"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -267,7 +266,6 @@ class Constants(Shown):
         if self.proof is None or not self.certified:
             return None
         return self.worst_slope - self.proof.sampled
-
 
 _PROVED = (
     "rate",

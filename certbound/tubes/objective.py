@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.tubes.schedule import Schedule
 
 __all__ = ["Clearance", "Objective", "make_objective", "mean_over_time", "read_clearance"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

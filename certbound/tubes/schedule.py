@@ -15,13 +15,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.tubes.constants import Constants
 
 __all__ = ["Schedule", "make_schedule", "spread"]
-
-Array = NDArray[np.float64]
 
 
 def integral(rate: Array, length: Array) -> Array:
@@ -135,7 +133,7 @@ class Schedule:
         extra = (self.times[:-1, None] + self.lengths[:, None] * fraction).ravel()
         return self.refined(extra if self.continuous else np.append(np.ceil(extra), 1.0))
 
-    def locate(self, t: Array) -> NDArray[np.intp]:
+    def locate(self, t: Array) -> Index:
         """Piece that holds each time."""
         last = len(self.lengths) - 1
         return np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, last)

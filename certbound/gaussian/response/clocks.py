@@ -15,8 +15,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.response.decorrelation import decorrelation
 from certbound.gaussian.response.events import WindowEvent, WindowEvents
 from certbound.gaussian.response.linear_response import LinearResponse, continuous_response
@@ -26,8 +26,6 @@ from certbound.gaussian.scalar import Clock, clock_crossing, crossing_rate, node
 from certbound.rigor.intervals import Interval
 
 __all__ = ["ClockBound", "ClockEvents", "RateBound", "SteadyEvent"]
-
-Array = NDArray[np.float64]
 
 _PART, _FEWEST_PARTS = 0.05, 100  # ||J|| times the length of a part; parts of the horizon
 _LIMITS = (0.35, 3.0)  # of -log corr in a block: short blocks have a slower clock, long ones add fewer probabilities

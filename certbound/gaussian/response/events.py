@@ -15,8 +15,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.response.martingale_windows import (  # fmt: skip
     ROUND,
@@ -34,9 +34,6 @@ from certbound.gaussian.scalar import log_tail
 
 __all__ = ["WindowEvent", "WindowEvents"]
 
-Array = NDArray[np.float64]
-Nodes = NDArray[np.int64]
-
 
 @dataclass(frozen=True, eq=False)
 class WindowEvents:
@@ -53,7 +50,7 @@ class WindowEvents:
         object.__setattr__(self, "response", one_cell(self.response, self.cell))
 
     @cached_property
-    def bounds(self) -> Nodes:
+    def bounds(self) -> Integers:
         """Window borders: node numbers from 0 to N."""
         return np.append(np.arange(0, self.response.pieces, self.length, dtype=np.int64), self.response.pieces)
 

@@ -14,14 +14,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 
 __all__ = ["LinearResponse", "RowResponse", "discrete_response", "continuous_response"]
-
-Array = NDArray[np.float64]
-Nodes = NDArray[np.int64]
 
 _UNIT = 2.0**-53
 _TINY = 1e-300
@@ -70,11 +67,11 @@ class LinearResponse:
         """Number of pieces N."""
         return int(self.slope.shape[1])
 
-    def variance(self, rows: Array, nodes: Nodes) -> tuple[Array, Array]:
+    def variance(self, rows: Array, nodes: Integers) -> tuple[Array, Array]:
         """Lower and upper bounds of the variances r V r^T of ``rows`` (B, M, n) at ``nodes`` (M,)."""
         return self.covariance_of(rows, rows, nodes)
 
-    def covariance_of(self, first: Array, second: Array, nodes: Nodes) -> tuple[Array, Array]:
+    def covariance_of(self, first: Array, second: Array, nodes: Integers) -> tuple[Array, Array]:
         """Bounds of cov(first Z, second Z) at ``nodes``; rows (B, M, n)."""
         n = first.shape[-1]
         used = np.flatnonzero((first != 0).any(axis=(0, 1)) | (second != 0).any(axis=(0, 1)))
@@ -230,7 +227,7 @@ class RowResponse:
         States that b_j is expected to move; what it does to the others is bounded coarsely (all when omitted).
     """
 
-    def __init__(self, response: LinearResponse, cell: int, rows: Array, columns: Nodes | None = None) -> None:
+    def __init__(self, response: LinearResponse, cell: int, rows: Array, columns: Integers | None = None) -> None:
         self.nodes, asked, self.dimension = rows.shape
         n = self.dimension
         places: dict[bytes, int] = {}

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.scalar import log_below_above, log_tail
@@ -18,8 +18,6 @@ __all__ = [
     "remembered", "size_of", "spread_of",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
-Nodes = NDArray[np.int64]
 Found = TypeVar("Found")
 
 ROUND = 1 + 1e-14
@@ -132,8 +130,8 @@ class Course:
     """
 
     windows: Windows
-    starts: Nodes
-    window: Nodes
+    starts: Integers
+    window: Integers
     off: Array
     profile: Array
 
@@ -146,7 +144,7 @@ def remembered(memory: dict[Any, Any], key: object, compute: Callable[[], Found]
     return found
 
 
-def size_of(response: LinearResponse, nodes: Nodes) -> Array:
+def size_of(response: LinearResponse, nodes: Integers) -> Array:
     """Bound of the standard deviation along any row with entries in [-1, 1], at ``nodes``."""
     total = np.abs(response.covariance[0, nodes]).sum(axis=(1, 2)) + np.abs(
         response.covariance_error[0, nodes]).sum(axis=(1, 2))

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index, Integers
 from certbound.gaussian.response.clocks import ClockEvents, SteadyEvent
 from certbound.gaussian.response.events import WindowEvent, WindowEvents
 from certbound.gaussian.response.linear_response import LinearResponse
@@ -30,8 +30,6 @@ from certbound.gaussian.scalar import log_tail
 from certbound.rigor.intervals import Interval
 
 __all__ = ["MartingaleEvent", "Martingales", "SplitEvent", "SplitEvents"]
-
-Array = NDArray[np.float64]
 
 _ROUND = 1 + 1e-12
 _UNIT = 2.0**-53
@@ -194,8 +192,8 @@ class MartingaleEvent:
     """One family of rows: kappa of every window, and what a level loses to coordinates and rounding on every piece."""
 
     kappa: Array
-    window: NDArray[np.intp]
-    starts: NDArray[np.int64]
+    window: Index
+    starts: Integers
     cost: Array
 
     @property

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.response.martingale_windows import (
     ROUND,
@@ -20,8 +20,6 @@ from certbound.gaussian.response.martingale_windows import (
 from certbound.gaussian.scalar import log_below_above, log_tail
 
 __all__ = ["StepEvent", "StepEvents"]
-
-Array = NDArray[np.float64]
 
 _KEPT = 16  # bounds that an event remembers
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.gaussian.scalar.normal import EPS, LOG_ROOT_2PI, lift, log_tail, mills_deficit
 from certbound.gaussian.scalar.pairs import Bounds, ends, levels_of, standard_levels, total
 from certbound.rigor.rounding import down, quiet, up
 
 __all__ = ["crossing_rate"]
-
-Array = NDArray[np.float64]
 
 
 @quiet

@@ -13,8 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.bounds import constants_along
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
@@ -38,8 +39,6 @@ __all__ = [
     "radius_over_pieces",
     "random_start",
 ]
-
-Array = NDArray[np.float64]
 
 BLOCK = 16
 ITERATIONS = 12

@@ -7,8 +7,8 @@ are rigorous at every stage (`certbound.constants.enclosures.coordinates`), so t
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.constants.enclosures import Metric, split_boxes
 from certbound.constants.state_jacobian import StateJacobian
 from certbound.reach.nominal import Curve, Flow
@@ -16,8 +16,6 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm
 
 __all__ = ["LocalSlopes"]
-
-Array = NDArray[np.float64]
 
 ROUNDS = 5
 TOLERANCE = 0.03
@@ -82,7 +80,7 @@ class LocalSlopes:
         np.maximum.at(settled, owners, values)
         return settled
 
-    def _near(self, boxes: Interval, slots: Interval, centres: Interval, radius: Array) -> NDArray[np.bool_]:
+    def _near(self, boxes: Interval, slots: Interval, centres: Interval, radius: Array) -> Mask:
         """False only where no point of the box is within ``radius`` of the centre: a . y <= ||a||_P* ||y||_P."""
         low, high = slots.lo.copy(), slots.hi.copy()
         low[:, list(self.jacobian.active)], high[:, list(self.jacobian.active)] = boxes.lo, boxes.hi

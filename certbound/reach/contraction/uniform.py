@@ -17,8 +17,8 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import EnclosureError
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import Curve, Flow, bound_defect, bound_disturbance_slope, initial_cells, nominal_curve
@@ -37,8 +37,6 @@ __all__ = [
     "jump_sizes",
     "values_on_pieces",
 ]
-
-Array = NDArray[np.float64]
 
 CORNER_LIMIT = 6
 

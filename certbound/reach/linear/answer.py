@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear import answer_tubes, shares
@@ -21,8 +22,6 @@ from certbound.reach.linear.shares import Share
 from certbound.reach.sets import ReachTube, Requirement
 
 __all__ = ["LinearAnswer", "linear_answer", "linear_reach", "refusal"]
-
-Array = NDArray[np.float64]
 
 _REFINEMENTS = 3
 _MANY = 20  # nonlinear coordinates beyond which a probability below the target is not refined

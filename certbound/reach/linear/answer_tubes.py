@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.response import level_along, level_scale, logsumexp
 from certbound.reach.linear.deviation_tube import DeviationTube
 from certbound.reach.linear.inclusion import Supports
@@ -16,8 +16,6 @@ from certbound.reach.sets import ReachTube
 from certbound.rigor.intervals import Interval
 
 __all__ = ["LEAST", "deviation_along", "deviation_tube", "levels_of_coordinates", "reach_tube"]
-
-Array = NDArray[np.float64]
 
 _FEW = 20  # states up to which each has an event of its own in the deviation tube
 LEAST = -1e12  # log10 of the smallest probability that is told apart from 0

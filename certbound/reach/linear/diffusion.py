@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.gaussian.response import (
     ClockEvents,
@@ -37,8 +37,6 @@ from certbound.reach.sets import Requirement
 from certbound.rigor.intervals import Interval
 
 __all__ = ["DiffusionRun", "depends_on_state"]
-
-Array = NDArray[np.float64]
 
 _ROUNDS = 12
 _SETTLE = 6

@@ -8,16 +8,14 @@ later. Everything here proposes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.reach.linear.fixed_point import Inclusion
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.shares import Share
 from certbound.reach.remainder import fitted_slopes
 
 __all__ = ["fitted"]
-
-Array = NDArray[np.float64]
 
 _PICARD = 10
 _CLOSE = 0.02

@@ -10,8 +10,8 @@ import logging
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.reach.linear.inclusion import Supports
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.rows import inner_rows
@@ -19,7 +19,6 @@ from certbound.reach.remainder import sampled_range
 
 __all__ = ["PADS", "Inclusion"]
 
-Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
 _GUESSES = 30

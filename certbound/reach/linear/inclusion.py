@@ -9,14 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.gaussian.response import LinearResponse, RowResponse
 
 __all__ = ["Gathering", "Supports"]
-
-Array = NDArray[np.float64]
-Nodes = NDArray[np.int64]
 
 _ROUND = 1 + 1e-13
 _UNIT = 2.0**-53
@@ -61,7 +58,7 @@ class Supports:
 
     def __init__(
         self, response: LinearResponse, gathering: Gathering, cell: int, rows: Array, generators: Array,
-        *, continuous: bool, outputs: Nodes | None = None,
+        *, continuous: bool, outputs: Integers | None = None,
     ) -> None:
         self.gathering, self.continuous, self.step = gathering, continuous, response.step
         self.rows = rows

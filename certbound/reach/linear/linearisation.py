@@ -7,8 +7,8 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 from certbound.gaussian.response import LinearResponse, continuous_response, discrete_response
 from certbound.problem.model import Tape, compile_numpy
@@ -21,8 +21,6 @@ from certbound.reach.sets import NominalPieces
 from certbound.rigor.intervals import Interval
 
 __all__ = ["WINDOW", "Linearisation"]
-
-Array = NDArray[np.float64]
 
 _FEWEST_PIECES, _MOST_PIECES = 50, 2000
 _STEP, _OWN_STEP, _SERIES = 0.1, 0.03, 2.0
@@ -389,7 +387,7 @@ class Linearisation:
             generators=np.swapaxes(generators, -1, -2), box=(box + rounding)[..., 0] * _ROUND, size=size_e * _ROUND,
         )
 
-    def supports(self, cell: int, rows: Array, outputs: NDArray[np.int64] | None = None) -> Supports:
+    def supports(self, cell: int, rows: Array, outputs: Integers | None = None) -> Supports:
         """Bounds of y and R of one cell along ``rows``; see `Supports`."""
         radii = self.radii[cell]
         return Supports(
@@ -398,7 +396,7 @@ class Linearisation:
         )
 
     @cached_property
-    def moved(self) -> NDArray[np.int64] | None:
+    def moved(self) -> Integers | None:
         """States that the remainder or a disturbance moves by more than a rounding error; None for all."""
         if self.continuous or self.n < _LARGE:
             return None

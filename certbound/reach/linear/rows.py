@@ -6,13 +6,11 @@ Any rows are valid; these bound what the Hessians see, and move so that bounds a
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.reach.linear.linearisation import Linearisation
 
 __all__ = ["inner_rows"]
-
-Array = NDArray[np.float64]
 
 
 def inner_rows(engine: Linearisation) -> tuple[Array, Array]:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.response import (
     ClockEvents,
     SplitEvents,
@@ -35,7 +35,6 @@ from certbound.reach.sets import Requirement, requirements
 
 __all__ = ["Events", "LinearRun", "Outcome", "correlated"]
 
-Array = NDArray[np.float64]
 Events = StepEvents | ClockEvents | SplitEvents
 
 _MARGIN = 2.0  # times that width is what a proof is expected to need

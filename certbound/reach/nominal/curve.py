@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from math import comb
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.reach.nominal.series import Series, polynomial_range
 from certbound.rigor.intervals import Interval, stack
 
 __all__ = ["Curve"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
@@ -21,8 +22,6 @@ from certbound.reach.nominal.series import Series, expand
 from certbound.rigor.intervals import Interval, stack
 
 __all__ = ["Flow"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

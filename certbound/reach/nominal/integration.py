@@ -15,8 +15,9 @@ import itertools
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.errors import EngineError
 from certbound.problem.problem import Problem
 from certbound.reach.nominal.curve import Curve
@@ -25,8 +26,6 @@ from certbound.reach.nominal.series import taylor_bounds
 from certbound.rigor.intervals import Interval, stack
 
 __all__ = ["bound_defect", "bound_disturbance_slope", "defect_series", "nominal_curve", "time_grid"]
-
-Array = NDArray[np.float64]
 
 ORDER = 6
 PIECES = 128  # at least, where the grid is chosen

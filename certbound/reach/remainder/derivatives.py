@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import (
     JUMPS,
@@ -25,16 +25,13 @@ from certbound.rigor.intervals import Interval
 
 __all__ = ["Derivatives"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
     """Derivatives of the dynamics of a problem's closed loop."""
 
     problem: Problem
-    active: Indices = field(init=False)  # states whose column of the Jacobian is not constant
+    active: Index = field(init=False)  # states whose column of the Jacobian is not constant
     # (n, n): constant entries of the Jacobian (up to rounding), 0 where the entry varies
     constant_slope: Interval = field(init=False)
     # positions in ``active`` that second derivatives couple, in groups whose outputs do not meet

@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index, Mask
 from certbound.constants.enclosures import enclose
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.frame import Frame
@@ -24,10 +24,6 @@ from certbound.reach.remainder.polytope import Boxes, Polytope, linear_range
 from certbound.rigor.intervals import Interval
 
 __all__ = ["Expansion", "Parts"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 _UNIT = 2.0**-53
 _WIDE = 1 + 1e-11  # covers the rounding errors of every sum of radii
@@ -179,7 +175,7 @@ class Expansion:
         motion = np.stack([half * rate.mag * _WIDE + _LEAST for rate in rates], axis=1)
         return motion, half * np.abs(drift[:, self.chosen])
 
-    def _base(self, items: Indices, order: int) -> tuple[Interval, Interval | None]:
+    def _base(self, items: Index, order: int) -> tuple[Interval, Interval | None]:
         """What beta is counted from at the middle of a piece, and beta itself there over the piece."""
         if self.nominal is None or order == 1:
             return self.frame.middle_velocity[items], None
@@ -201,7 +197,7 @@ class Expansion:
         total = Interval(lower, upper) + rest
         return total.lo, total.hi, middle
 
-    def _gradients(self, items: Indices, first: Interval | None) -> tuple[Array, Array]:
+    def _gradients(self, items: Index, first: Interval | None) -> tuple[Array, Array]:
         """J(t_m, c) - J_m entry by entry: floats and radii."""
         if first is None:
             nothing = np.zeros((len(items), 0))

@@ -10,8 +10,8 @@ from __future__ import annotations
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import Tape
 from certbound.reach.nominal import Series, expand, polynomial_range, taylor_bounds
@@ -20,8 +20,6 @@ from certbound.reach.remainder.frame import Frame
 from certbound.rigor.intervals import Interval, stack
 
 __all__ = ["NominalDefect", "bound_defect_over_pieces", "product"]
-
-Array = NDArray[np.float64]
 
 _ORDER = 4
 

@@ -6,13 +6,10 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from certbound.arrays import Array, Index, Mask
 
 __all__ = ["Boxes", "Polytope", "grid", "linear_range"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 _WIDE = 1 + 1e-11
 _LEAST = 1e-290
@@ -22,17 +19,17 @@ _LEAST = 1e-290
 class Boxes:
     """Boxes centre + [-radius, radius], shape (Q, active) each, of the pieces ``items`` (Q,)."""
 
-    items: Indices
+    items: Index
     centre: Array
     radius: Array
 
     def __len__(self) -> int:
         return len(self.items)
 
-    def __getitem__(self, chosen: Indices | Mask) -> Boxes:
+    def __getitem__(self, chosen: Index | Mask) -> Boxes:
         return Boxes(self.items[chosen], self.centre[chosen], self.radius[chosen])
 
-    def halved(self, along: Indices) -> Boxes:
+    def halved(self, along: Index) -> Boxes:
         """Every box cut in two along its coordinate ``along``."""
         number = np.arange(len(self))
         half, old = self.radius[number, along] / 2, self.centre[number, along]

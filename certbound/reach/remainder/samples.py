@@ -9,15 +9,13 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.frame import Frame
 
 __all__ = ["fitted_slopes", "sampled_range"]
-
-Array = NDArray[np.float64]
 
 _POINTS = {1: 17, 2: 9, 3: 7, 4: 3, 5: 3, 6: 3}
 _DIRECTIONS = 64

@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import Curve, Flow
 from certbound.reach.sets import ReachTube
@@ -33,8 +33,6 @@ from certbound.rigor.intervals import Interval
 from certbound.simulation.estimates import sample_paths
 
 __all__ = ["SampledTube", "estimate_reach", "noise_free_states", "scenario_count"]
-
-Array = NDArray[np.float64]
 
 _PIECES = 25
 _STEPS = 200  # of the noise-free integration over the horizon, at least

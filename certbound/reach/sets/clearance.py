@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.problem.model import Tape
 from certbound.problem.sets import Faces, Inside, Quadratic, Region
 from certbound.reach.nominal import Curve, Series, expand, polynomial_range
@@ -33,8 +33,6 @@ from certbound.rigor.norms import Norm, ball_root
 from certbound.rigor.series import product
 
 __all__ = ["Clearance", "constraint_clearance"]
-
-Array = NDArray[np.float64]
 
 
 class Sets(Protocol):
@@ -85,7 +83,7 @@ def constraint_clearance(tube: Sets, constraint: Inside, norm: Norm) -> Clearanc
     return Clearance(radius=np.where(asked, radius, np.inf), factor=room.factor)
 
 
-def _window(curve: Curve, constraint: Inside) -> tuple[NDArray[np.bool_], Interval]:
+def _window(curve: Curve, constraint: Inside) -> tuple[Mask, Interval]:
     """Pieces on which the constraint is asked, and the offsets s at which it is, shape (K,)."""
     if constraint.during is None:
         return np.ones(curve.pieces, dtype=bool), curve.span

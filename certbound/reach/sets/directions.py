@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
@@ -22,8 +22,6 @@ from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
 
 __all__ = ["NominalPieces", "Requirement", "requirements"]
-
-Array = NDArray[np.float64]
 
 _POLYGON = 24
 
@@ -51,7 +49,7 @@ class NominalPieces:
             return Interval(self.times[:-1] - slip, self.times[1:] + slip)
         return Interval.point(self.times)
 
-    def required(self, during: tuple[float, float] | None) -> NDArray[np.bool_]:
+    def required(self, during: tuple[float, float] | None) -> Mask:
         """Pieces that meet the time window ``during``."""
         span = self.span()
         if during is None:
@@ -82,7 +80,6 @@ def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
         for label, rows, room in _constraint(constraint, curve):
             found.append(Requirement(label=label, constraint=own, rows=rows, room=np.where(needed, room, np.inf)))
     return found
-
 
 Rows = Iterator[tuple[str, Array, Array]]
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.checks import positive_definite
 from certbound.simulation.blocks import MEMORY_LIMIT, Counts, check_count
 from certbound.simulation.checkpoint import seed_of
@@ -21,8 +22,6 @@ from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import LOWEST, Task
 
 __all__ = ["Deviations", "Measure", "Quantile", "sup_deviation"]
-
-Array = NDArray[np.float64]
 
 _OCTAVES = 64  # histograms reach from 2**LOWEST to 2**(LOWEST + 64)
 _FINE, _COARSE = 2000, 100  # bins per octave: 0.035 % and 0.7 %

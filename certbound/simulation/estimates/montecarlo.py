@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.simulation.blocks import Counts, Work, check_count
 from certbound.simulation.checkpoint import seed_of
 from certbound.simulation.estimates.preparation import Setting, prepare
@@ -21,8 +21,6 @@ from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
 
 __all__ = ["ExitCounts", "simulate_exits"]
-
-Array = NDArray[np.float64]
 
 _TIME_BINS = 200
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.simulation.blocks import BLOCK, MEMORY_LIMIT, check_count, entropy_of
 from certbound.simulation.estimates.preparation import prepare
 from certbound.simulation.kernel_source import kernel_source
@@ -14,8 +14,6 @@ from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
 
 __all__ = ["sample_paths"]
-
-Array = NDArray[np.float64]
 
 
 def sample_paths(

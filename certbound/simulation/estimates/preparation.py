@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.model import compile_scalar
 from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
 from certbound.simulation.stepping import Scenario, StepModel, step_model
 
 __all__ = ["FixedStart", "Setting", "prepare"]
-
-Array = NDArray[np.float64]
 
 _DEFAULT_STEPS = 1000
 _LONGEST_NOMINAL = 20_000  # steps; longer paths are advanced by the kernel

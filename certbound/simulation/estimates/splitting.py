@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.simulation.blocks import MEMORY_LIMIT, Tally, Work, check_count
 from certbound.simulation.checkpoint import seed_of
 from certbound.simulation.estimates.preparation import Setting, prepare
@@ -38,8 +38,6 @@ from certbound.simulation.stepping import Scenario, StepModel
 from certbound.simulation.tape_text import Parameters, indent
 
 __all__ = ["RareExits", "simulate_rare_exits"]
-
-Array = NDArray[np.float64]
 
 _PARTICLES = 500
 _DISCARDED = 0.1
@@ -210,7 +208,6 @@ class RareWork(Work):
         tally.counts[block, 0] = result[0, 0].view(np.int64)[0]
         tally.counts[block, 1] = int(result[0, 0, 1])
         return done
-
 
 _FOLLOW = """
 @njit(nogil=True, error_model="numpy")

@@ -17,8 +17,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.errors import SolverError
 from certbound.problem.adapters import casadi_module
 from certbound.problem.model import Tape, edged, jacobian
@@ -29,8 +30,6 @@ from certbound.synthesis.feedback import depends_on
 from certbound.synthesis.planning import Planner
 
 __all__ = ["ConvexPlan", "ConvexPlanner"]
-
-Array = NDArray[np.float64]
 
 PENALTY = 1e4
 KEPT = 1e-6

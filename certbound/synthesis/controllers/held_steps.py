@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.errors import EnclosureError
 from certbound.problem.problem import Problem
 from certbound.reach.contraction import bound_forcing, integrate_radius, jump_sizes, values_on_pieces
@@ -27,8 +28,6 @@ from certbound.rigor.norms import Norm
 from certbound.tubes.tube import Tube
 
 __all__ = ["SPARE", "HeldSteps", "Link", "ProvedStep"]
-
-Array = NDArray[np.float64]
 
 CHARGE = 1e-4
 """Share of the tube that the integrator's error may take in one step before more pieces are tried."""

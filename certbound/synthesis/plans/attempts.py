@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import CertboundError
 from certbound.safety.verification import Verdict, verify_safety
 from certbound.synthesis.planning import FITTED, Planner, Tightened
@@ -23,7 +23,6 @@ from certbound.tubes.tube import Tube
 
 __all__ = ["Attempts"]
 
-Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
 WIDENING = 6

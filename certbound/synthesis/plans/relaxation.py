@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 from flint import arb, arb_mat, fmpq
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.constants.enclosures import enclose
 from certbound.errors import EnclosureError
 from certbound.problem.model import Node, Tape
@@ -32,7 +32,6 @@ from certbound.synthesis.plant import Grid, middle_of
 
 __all__ = ["bound_scale", "empty_at_once"]
 
-Array = NDArray[np.float64]
 Form = dict[int, Fraction]
 
 _BITS = 256
@@ -192,7 +191,7 @@ def _forms(tape: Tape, first_disturbance: int, middle: Array) -> list[tuple[Frac
 
 
 def _propose(
-    model: _Relaxed, problem: Problem, planes: list[Plane], taken: Array, asked: NDArray[np.bool_]
+    model: _Relaxed, problem: Problem, planes: list[Plane], taken: Array, asked: Mask
 ) -> Array | None:
     """Multipliers (points, planes) of the linear program, in floating point; None where the solver has no optimum."""
     optimize: Any = importlib.import_module("scipy.optimize")

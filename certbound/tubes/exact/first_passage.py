@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.rigor.balls import lower, precision
 from certbound.tubes.ballpath import integral
@@ -31,8 +31,6 @@ from certbound.tubes.schedule import Schedule, make_schedule
 from certbound.tubes.tube import Tube
 
 __all__ = ["ConstantProfile", "bound_exact_exit", "bound_worst_exit", "chain_of", "first_passage_tube"]
-
-Array = NDArray[np.float64]
 
 _LARGEST_CHAIN = 2.0e10
 _MOST_KERNELS = 12

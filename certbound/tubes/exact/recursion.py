@@ -17,14 +17,12 @@ from functools import cache, cached_property
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.rigor.balls import bessel_excess, precision, upper
 from certbound.rigor.rounding import LIBRARY_ULPS, UNIT
 
 __all__ = ["Recursion", "legendre_rule"]
-
-Array = NDArray[np.float64]
 
 _POINTS = 14
 _TINY = 1e-290  # more than what entries below the smallest float add up to
@@ -38,7 +36,7 @@ class Recursion:
     # (K,): L and sigma per group of steps, in the order of time
     gains: Array
     sigmas: Array
-    counts: NDArray[np.intp]  # (K,): steps per group
+    counts: Index  # (K,): steps per group
     dimension: int  # n
     radius: float  # R, in the unit of sigma
 

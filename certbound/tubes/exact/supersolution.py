@@ -25,13 +25,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.tubes.line_search import golden
 
 __all__ = ["Supersolution"]
-
-Array = NDArray[np.float64]
 
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) * math.sqrt(3) / 6
 _ROUNDING = 128 * 2.0**-53

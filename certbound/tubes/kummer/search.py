@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.tubes.excess import log_excess_value, log_excess_values, log_phi, log_phi_one, solve_excess
 from certbound.tubes.kummer.profile import log_initial, log_target
 from certbound.tubes.objective import mean_over_time
@@ -22,7 +22,6 @@ from certbound.tubes.schedule import Schedule
 
 __all__ = ["Search", "log_gain", "moderate_parameters", "simplex"]
 
-Array = NDArray[np.float64]
 Point = tuple[float, ...]
 
 _POWERS = np.array([0.1, 1.5, 20.0])
@@ -257,7 +256,7 @@ class Search:
             z = solve_excess(np.asarray(a), self.half, log_target(a, info, log_x, self.log_delta), bessel=self.bessel)
             return mean_over_time(self.schedule, np.sqrt(2 * v * z) * self.schedule.unit)
 
-    def _active(self, v: Array) -> NDArray[np.intp]:
+    def _active(self, v: Array) -> Index:
         """Nodes that no later node dominates: z_t rises in t, so only records of v/clearance^2 from the end count."""
         if self.kind == "final":
             return np.array([len(v) - 1])

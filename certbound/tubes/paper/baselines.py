@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from certbound.tubes.paper.radii import RootProfile, Tail, best_epsilon, best_growth, growth, sharp_tail
 from certbound.tubes.paper.windows import WindowProfile, event_count, window_scale
@@ -17,8 +16,6 @@ from certbound.tubes.schedule import Schedule, integral
 from certbound.tubes.tube import Profile, Tube
 
 __all__ = ["BASELINES", "Baseline", "baseline_tube", "check_method"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +28,6 @@ class Baseline:
     title: str  # its source
     tail: str = "growth"  # kind of B
     printed: bool = False  # a variant that keeps an error of the paper: never certified, never chosen
-
 
 _CT, _DT, _ONE, _ALL = "continuous", "discrete", "one time", "trajectory"
 _MOST_WINDOWS = 512

@@ -19,9 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
 from certbound.rigor.balls import bessel_excess, precision, solve_upward
 from certbound.tubes.ballpath import BallPath, ball_path, integral
@@ -30,8 +28,6 @@ from certbound.tubes.line_search import golden
 from certbound.tubes.piecewise import MonotoneProfile
 
 __all__ = ["RootProfile", "Tail", "best_epsilon", "best_growth", "growth", "growth_ball", "sharp_tail"]
-
-Array = NDArray[np.float64]
 
 
 def growth(epsilon: float, dimension: float, level: float) -> float:
