@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
-from certbound.problem.model import Node, Tape, compile_numpy, edged, jacobian, trace
+from certbound.problem.model import Node, Tape, compile_numpy, edged, is_zero, jacobian, trace
 from certbound.problem.noise import Law, check_law
 from certbound.simulation.tape_text import live_nodes
 from certbound.simulation.transition import exact_transition
@@ -247,14 +247,9 @@ def _milstein(diffusion: Tape, n: int) -> Tape | None:
     if diffusion.shape != (n, n):
         return None
     derivative = jacobian(diffusion, tuple(range(1, n + 1)))
-    zero = [derivative.nodes[o].op == "const" and derivative.nodes[o].value == 0.0 for o in derivative.outputs]
-    entry = np.array(zero).reshape(n, n, n)
     for i in range(n):
-        for j in range(n):
-            node = diffusion.nodes[diffusion.outputs[i * n + j]]
-            if i != j and not (node.op == "const" and node.value == 0.0):
-                return None
-        if not all(entry[i, i, k] for k in range(n) if k != i):
+        others = [k for k in range(n) if k != i]
+        if not all(is_zero(diffusion, i * n + k) and is_zero(derivative, (i * n + i) * n + k) for k in others):
             return None
     outputs = tuple(derivative.outputs[(i * n + i) * n + i] for i in range(n))
     return Tape(inputs=derivative.inputs, nodes=derivative.nodes, outputs=outputs, shape=(n,))

@@ -20,27 +20,13 @@ __all__ = ["Constants", "Proof", "check_delta"]
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Proof:
-    """What the rigorous recheck established; built by ``certbound.constants`` alone, never by a user.
+    """What the rigorous recheck established; built by ``certbound.constants`` alone, never by a user."""
 
-    Parameters
-    ----------
-    sampled : float
-        Largest value of the bounded quantity that sampling found: no valid constant lies below it.
-    boxes : int
-        Number of boxes that the branch and bound proved.
-    status : str
-        What proposed the metric: ``closed form`` or the status of the solver.
-    domain : str
-        Where the constants hold, in words.
-    fingerprint : str
-        ``Constants.fingerprint`` of what was proved: altered constants are no longer certified.
-    """
-
-    sampled: float
-    boxes: int
-    status: str
-    domain: str
-    fingerprint: str
+    sampled: float  # largest value of the bounded quantity that sampling found: no valid constant lies below it
+    boxes: int  # number of boxes that the branch and bound proved
+    status: str  # what proposed the metric: ``closed form`` or the status of the solver
+    domain: str  # where the constants hold, in words
+    fingerprint: str  # ``Constants.fingerprint`` of what was proved: altered constants are no longer certified
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)

@@ -260,19 +260,16 @@ def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = No
     """
     run = _run(problem, cells=cells, noise=noise)
     outcome = run.probability(Share.of(problem.delta / 2), 2 if noise else 1)
+    answer = LinearAnswer(run=run, outcome=outcome, shown=outcome)
     if outcome.bounds is None:
-        raise ArithmeticError(LinearAnswer(run=run, outcome=outcome, shown=outcome).reason)
-    if noise:
-        answer = LinearAnswer(run=run, outcome=outcome, shown=outcome)
-        tube = answer.tube
-        assert tube is not None
-        for name, half in zip(problem.system.states, tube.half_widths.T, strict=True):
-            if not np.all(np.isfinite(half)):
-                raise ArithmeticError(
-                    f"no bound of the deviation of {name} was found at delta = {problem.delta:.3g}; "
-                    "shorten the horizon, or use method='contraction'."
-                )
-        reach = answer.reach
-        assert reach is not None
-        return reach
-    return answer_tubes.reach_tube(run, outcome.bounds, -np.inf, None)
+        raise ArithmeticError(answer.reason)
+    tube = answer.tube if noise else None
+    for name, half in zip(problem.system.states, () if tube is None else tube.half_widths.T):
+        if not np.all(np.isfinite(half)):
+            raise ArithmeticError(
+                f"no bound of the deviation of {name} was found at delta = {problem.delta:.3g}; "
+                "shorten the horizon, or use method='contraction'."
+            )
+    reach = answer.reach if noise else answer.noise_free_reach
+    assert reach is not None
+    return reach

@@ -380,7 +380,8 @@ class Linearisation:
         box = (h * h / 4 * np.abs(slope) + h * second) @ size_e[..., None]
         generators = h * (middle @ gain) * self.d_radius
         rounding = 16 * (n + 4) * 2.0**-53 * h * (np.abs(middle) @ size_e[..., None])
-        bend = np.abs(response.drift) + _square(np.abs(slope) + h * np.abs(response.drift))
+        size = np.abs(slope) + h * np.abs(response.drift)
+        bend = np.abs(response.drift) + size @ size * _ROUND
         return Gathering(
             centre=h * middle, second=h * second, first=response.deviation,
             curve=h * h / 8 * (bend @ (identity + response.deviation)) * _ROUND,
@@ -411,7 +412,3 @@ def balanced(slopes: Array) -> Array:
     largest = np.abs(slopes).reshape(-1, *slopes.shape[-2:]).max(axis=0)
     units = matrix_balance(largest, permute=False, separate=True)[1][0]
     return np.asarray(slopes / units[:, None] * units)
-
-
-def _square(a: Array) -> Array:
-    return np.asarray(a @ a * (1 + 1e-13))

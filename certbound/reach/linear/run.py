@@ -153,13 +153,11 @@ class LinearRun(Inclusion):
 
     def probability(self, nonlinear: Share, effort: int = 2) -> Outcome:
         """Thm K7' with delta_N = exp(nonlinear.log): the outcome of the worst cell."""
-        if self.hopeless(nonlinear):
-            return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=None)
-        levels, events = self.levels(nonlinear)
-        bounds = self.include(levels, effort)
-        if bounds is None:
-            return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=None)
-        if not events:  # the noise-free reachable set alone
+        bounds = None
+        if not self.hopeless(nonlinear):
+            levels, events = self.levels(nonlinear)
+            bounds = self.include(levels, effort)
+        if bounds is None or not events:  # without events the noise-free reachable set alone
             return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=bounds)
         outcomes = [self._cell(cell, bounds, events[cell], nonlinear) for cell in range(len(self.supports))]
         return max(outcomes, key=lambda outcome: outcome.log_probability)

@@ -24,16 +24,6 @@ __all__ = ["Curve"]
 class Curve:
     """A batch of piecewise polynomial curves on common time pieces.
 
-    Parameters
-    ----------
-    continuous : bool
-        False: discrete time, the pieces are the steps 0, 1, ..., K - 1.
-    starts, ends : ndarray, shape (K,)
-        Piece k is [starts[k], ends[k]], and starts[k + 1] = ends[k] in continuous time; in discrete time
-        starts = ends = the steps.
-    coefficients : ndarray, shape (B, K, degree + 1, n)
-        One curve per cell of the initial set.
-
     Examples
     --------
     >>> line = Curve(continuous=True, starts=[0.0], ends=[2.0], coefficients=[[[[1.0], [0.5]]]])
@@ -41,10 +31,12 @@ class Curve:
     array([[1.5]])
     """
 
-    continuous: bool
+    continuous: bool  # False: discrete time, the pieces are the steps 0, 1, ..., K - 1
+    # (K,): piece k is [starts[k], ends[k]], and starts[k + 1] = ends[k] in continuous time; in discrete time
+    # starts = ends = the steps
     starts: Array
     ends: Array
-    coefficients: Array
+    coefficients: Array  # (B, K, degree + 1, n): one curve per cell of the initial set
 
     def __post_init__(self) -> None:
         for name in ("starts", "ends", "coefficients"):

@@ -28,21 +28,14 @@ __all__ = ["Flow"]
 class Flow:
     """The map f(t, x, d) of a problem's closed loop.
 
-    Parameters
-    ----------
-    problem : Problem
-        With a plan if its system has inputs.
-    only : array_like, shape (q,), optional
-        Study this one constant disturbance instead of the whole set D.
-
     Raises
     ------
     ValueError
         If the system has inputs and the problem has no plan.
     """
 
-    problem: Problem
-    only: ArrayLike | None = None
+    problem: Problem  # with a plan if its system has inputs
+    only: ArrayLike | None = None  # (q,): study this one constant disturbance instead of the whole set D
     tape: Tape = field(init=False)
     dimension: int = field(init=False)
 

@@ -160,9 +160,7 @@ class Derivatives:
         slots = self.slots(Interval.point(time), Interval.point(state), inputs, disturbance)
         result = np.broadcast_to(self.constant_slope.mid, (len(state), n, n)).copy()
         if self.entries:
-            values = enclose(self.varying, slots, undefined="infinite")
-            finite = np.isfinite(values.lo) & np.isfinite(values.hi)
-            mid = np.where(finite, values.mid, 0.0)
+            mid = _middle(enclose(self.varying, slots, undefined="infinite"))
             for column, (i, j) in enumerate(self.entries):
                 result[:, i, j] = mid[:, column]
         return result
@@ -173,8 +171,7 @@ class Derivatives:
         if self.gain is None:
             return np.zeros((len(state), n, q))
         slots = self.slots(Interval.point(time), Interval.point(state), inputs, disturbance)
-        values = enclose(self.gain, slots, undefined="infinite").broadcast_to((len(state), n, q))
-        return np.asarray(np.where(np.isfinite(values.lo) & np.isfinite(values.hi), values.mid, 0.0))
+        return _middle(enclose(self.gain, slots, undefined="infinite").broadcast_to((len(state), n, q)))
 
     def reference_hessians(self, frame: Frame) -> Array:
         """Float Hessians over the active coordinates, of every output that has one: (M, outputs, active, active)."""
@@ -184,8 +181,7 @@ class Derivatives:
         result = np.zeros((len(frame), len(outputs), len(self.active), len(self.active)))
         if outputs:
             slots = self.slots(frame.middle_time, frame.middle, frame.inputs, frame.disturbance_middle)
-            values = enclose(self.second, slots, undefined="infinite")
-            middle = np.where(np.isfinite(values.lo) & np.isfinite(values.hi), values.mid, 0.0)
+            middle = _middle(enclose(self.second, slots, undefined="infinite"))
             for column, (entry, state) in enumerate(index):
                 if state >= 0:
                     i, j = entries[entry]
@@ -205,3 +201,8 @@ class Derivatives:
             low, high = (value, value) if widths is None else (widths[0][i], widths[1][i])
             slots.append(Interval(np.full(len(state), low), np.full(len(state), high)))
         return slots
+
+
+def _middle(values: Interval) -> Array:
+    """The middles of enclosures; 0 where there is none."""
+    return np.asarray(np.where(np.isfinite(values.lo) & np.isfinite(values.hi), values.mid, 0.0))

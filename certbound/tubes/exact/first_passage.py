@@ -68,6 +68,11 @@ class ConstantProfile:
         return {"kind": "constant", "radius": self.value}
 
 
+def _backwards(schedule: Schedule) -> list[tuple[float, float, float]]:
+    """(rate, noise, length) of every piece, the last one first."""
+    return list(zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist()))[::-1]
+
+
 def _exact_pieces(schedule: Schedule, square: float) -> tuple[tuple[float, float], ...]:
     """(duration, kappa) per piece along a boundary y_b <= R^2 with y_b(T) = R^2; pieces without noise are left out.
 
@@ -77,8 +82,7 @@ def _exact_pieces(schedule: Schedule, square: float) -> tuple[tuple[float, float
     pieces: list[tuple[float, float]] = []
     with precision():
         y = arb(square)
-        path = zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist())
-        for rate, noise, length in reversed(list(path)):
+        for rate, noise, length in _backwards(schedule):
             if noise == 0 and rate > 0:
                 raise InfeasibleError("`method` 'exact' needs noise wherever the rate is positive; use 'worst_case'.")
             if noise == 0:
@@ -109,8 +113,7 @@ def _worst_pieces(schedule: Schedule, dimension: int, square: float) -> tuple[tu
     pieces: list[tuple[float, float]] = []
     with precision():
         y = arb(square)
-        path = zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist())
-        for rate, noise, length in reversed(list(path)):
+        for rate, noise, length in _backwards(schedule):
             if 2 * arb(rate) * y + arb(kappa) * arb(noise) > 0:
                 y, duration = _moved(y, rate, noise, length, kappa)
                 if math.isnan(duration):
