@@ -180,10 +180,8 @@ def sup_deviation(
     task, profile = _task(setting, measure or Measure(), points != 0)
     rows, bins = 1 if task.directions is None else len(task.directions), _OCTAVES * _COARSE + 2
     marks = _marks(points, setting.steps, rows * bins)
-    source, p = kernel_source(setting.model, task)
     work = setting.work(
-        source=source,
-        p=p,
+        kernel_source(setting.model, task),
         nominal=setting.nominal(),
         profile=profile,
         marks=marks,

@@ -72,9 +72,9 @@ def sample_paths(
             f"`paths` must be at most {MEMORY_LIMIT // per_path} with {points + 1} stored times of {n} "
             f"states ({MEMORY_LIMIT // 2**20} MiB), got {paths}; lower `paths` or `points`."
         )
-    source, p = kernel_source(setting.model, Task(kind="record", own_nominal=deviation))
+    kernel = kernel_source(setting.model, Task(kind="record", own_nominal=deviation))
     marks = np.arange(points + 1, dtype=np.int64) * (setting.steps // points)
-    work = setting.work(source=source, p=p, marks=marks, counts_shape=(1, 1), paths=paths, entropy=entropy_of(rng))
+    work = setting.work(kernel, marks=marks, counts_shape=(1, 1), paths=paths, entropy=entropy_of(rng))
     out = np.empty((paths, points + 1, n))
     for block in range(work.blocks):
         work.run_block(block, work.tally(), out[block * BLOCK : (block + 1) * BLOCK])

@@ -58,12 +58,14 @@ class Setting:
                 path.append([x + model.step * v for x, v in zip(path[k], value)] if model.step > 0.0 else value)
         return np.array(path, dtype=float)
 
-    def work(self, kind: type[Work] = Work, **fields: Any) -> Work:
-        """A piece of work on this setting; ``fields`` are those that differ from task to task."""
-        model = self.model
+    def work(self, kernel: tuple[str, Array], kind: type[Work] = Work, **fields: Any) -> Work:
+        """A piece of work on this setting, by a kernel's source and parameters; ``fields`` differ from task to task."""
+        model, (source, p) = self.model, kernel
         drawn = model.signal is None and model.switching == 0.0
         none = np.zeros(0)
         defaults: dict[str, Any] = {
+            "source": source,
+            "p": p,
             "sample_start": self.start,
             "low": model.low if drawn and model.disturbance_count else np.zeros(model.disturbance_count),
             "high": model.high if drawn and model.disturbance_count else np.zeros(model.disturbance_count),

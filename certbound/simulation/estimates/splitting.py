@@ -140,11 +140,9 @@ def simulate_rare_exits(
     own = not setting.shared_nominal
     _check_memory(setting, particles, own)
     barriers = barriers_of(problem, setting.times)
-    source, p = _kernel_source(model, barriers, own)
     work = setting.work(
+        _kernel_source(model, barriers, own),
         RareWork,
-        source=source,
-        p=p,
         nominal=setting.nominal(),
         **tables_of(barriers),
         counts_shape=(replicas, 2),
