@@ -151,6 +151,8 @@ class KummerProfile(PiecewiseProfile):
         a = arb(self.a)
         spent = phi_ball(a, info)
         target = (self.initial / arb(self.delta) - spent) * (-a * info).exp()
+        if target.is_zero():  # no noise, and a start at 0: E_a(0) = 0
+            return arb(0)
         if not (target > 0):
             return arb.pos_inf()
         known = self._known.get(key)
