@@ -5,14 +5,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from certbound.lazy import load_name
+from certbound.lazy import lazily
 
 __all__ = ["bound_reach"]
 
 _HOME = {"dispatch": "bound_reach"}
 
-
-def __getattr__(name: str) -> Any:
-    return load_name(__name__, _HOME, name)
+__getattr__, __dir__ = lazily(__name__, _HOME, __all__)
