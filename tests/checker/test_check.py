@@ -157,6 +157,20 @@ def test_cells_of_the_initial_set_are_all_checked(stepping) -> None:
         check_data(data)
 
 
+def test_constants_prove_a_problem_without_noise_and_none_with_noise() -> None:
+    def stating(size: float) -> Any:
+        system = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=size * np.eye(2))
+        problem = cb.Problem(system, initial=[0.2, 0], safe=[cb.Inside(cb.Ball([0, 0], 1.0))], horizon=2.0, delta=1e-2)
+        verdict = verify_safety(problem, method="constants")
+        assert verdict.status == "SAFE"
+        assert "0 % of the room" in verdict.reason or size > 0
+        return parse(certificate_text(problem, verdict))
+
+    silent, noisy = stating(0.0), stating(1e-3)
+    assert check_data(silent).valid
+    assert "not shown to bound the noise" in check_data({**silent, "problem": noisy["problem"]}).reason
+
+
 def test_stated_constants_are_named_as_an_assumption() -> None:
     system = cb.DiscreteSystem(lambda x: [0.5 * x[0]], states=1, noise=cb.Gaussian(std=0.1))
     problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3)

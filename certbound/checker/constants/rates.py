@@ -217,7 +217,7 @@ class Spread:
     def contradicts(self, point: Box, sigma: arb, nu: arb) -> bool:
         """Whether noise that is constant exceeds the constants at all, or other noise does at a point (t, state)."""
         covariance = self._covariance(point)
-        if covariance is None or all(entry.is_zero() for entry in covariance.entries()):
+        if covariance is None:
             return False
         return not self._holds(point, sigma if self.program is None else sigma * (1 + _SLACK), nu)
 
@@ -225,6 +225,8 @@ class Spread:
         covariance = self._covariance(box)
         if covariance is None:
             return False
+        if all(entry.is_zero() for entry in covariance.entries()):  # no noise exceeds nothing
+            return True
         n, square = self.model.dimension, sigma * sigma
         rest = identity(n) * square - self.root.transpose() * covariance * self.root
         bounded = is_positive_definite(rest, self.budget)

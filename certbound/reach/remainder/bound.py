@@ -140,6 +140,7 @@ class Remainder(Derivatives):
         reach = Interval(frame.disturbance_low, frame.disturbance_high) - frame.disturbance_middle
         return ((gain - frame.input_gain) * reach[None, None, :]).sum(axis=-1)
 
+    @np.errstate(over="ignore", invalid="ignore")  # boxes next to all floats: what overflows bounds nothing
     def _group(self, expansion: Expansion, group: list[list[int]], asked: _Asked) -> tuple[Array, Array]:
         """Bounds over the boxes of one group of blocks, displaced together."""
         m, n = expansion.frame.spread.shape

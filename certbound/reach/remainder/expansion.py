@@ -194,7 +194,8 @@ class Expansion:
         lower, upper = value.lo - base.hi - moved - slack, value.hi - base.lo - moved + slack
         if rest is None:
             return lower, upper, middle
-        total = Interval(lower, upper) + rest
+        known = np.isfinite(lower) & np.isfinite(upper)
+        total = Interval(np.where(known, lower, -np.inf), np.where(known, upper, np.inf)) + rest
         return total.lo, total.hi, middle
 
     def _gradients(self, items: Index, first: Interval | None) -> tuple[Array, Array]:

@@ -195,6 +195,22 @@ def test_only_a_plain_sum_with_the_disturbance_needs_no_look_at_the_states(dynam
         assert np.all(beta >= lower[k] - 0.05)
 
 
+@pytest.mark.parametrize("width", [1e80, 1e110, 1e160, 1e300])
+@pytest.mark.parametrize("count", [0, 1])
+def test_over_boxes_next_to_all_floats_the_remainder_is_bounded_or_infinite_without_a_warning(
+    width: float, count: int
+) -> None:
+    system = cb.ContinuousSystem(lambda x: [x[1], -(x[0] ** 3) - x[0] * x[1]], states=2, diffusion=np.eye(2) * 0.1)
+    engine = Linearisation(cb.Problem(system, initial=[0.1, 0.2], safe=[], horizon=1.0, delta=1e-2), pieces=5)
+    high, rows = np.full((5, 2 + count), width), np.ones((5, count, 2))
+    lower, upper = engine.model.bound(engine.frame, -high, high, rows)
+    assert not np.isnan(lower).any()
+    assert not np.isnan(upper).any()
+    least = 0.5 * np.longdouble(width) ** 3
+    assert np.all(lower[:, 1] < -least)
+    assert np.all(upper[:, 1] > least)
+
+
 @pytest.mark.parametrize("width", [0.21, 0.3, 1.0])
 def test_kinks_couple_coordinates_without_a_second_derivative(width: float) -> None:
     engine = Linearisation(creased())
