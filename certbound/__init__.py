@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from certbound._version import __version__
 from certbound.display import connect
-from certbound.lazy import load_name, names_in
+from certbound.lazy import lazily, names_in
 
 if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the table below
     from certbound.constants.bounds import bound_constants as bound_constants
@@ -113,10 +113,4 @@ def _constants(data: dict[str, Any]) -> Any:
 
 connect(draw=_draw, content=_content, constants=_constants)
 
-
-def __getattr__(name: str) -> Any:
-    return load_name(__name__, _HOME, name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazily(__name__, _HOME, __all__)

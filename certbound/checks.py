@@ -10,18 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "frozen",
-    "matrix",
-    "names",
-    "nearest",
-    "number",
-    "pick",
-    "positive_definite",
-    "symmetric",
-    "vector",
-]
-
 Array = NDArray[np.float64]
 _SLACK, _ROUNDING = 1e-12, 1e-14
 """How far a semidefinite matrix with a diagonal of 1 may miss it, and how far its computed eigenvalues may."""
@@ -32,6 +20,12 @@ def frozen(value: Any) -> Array:
     array = np.array(value, dtype=float) + 0.0
     array.setflags(write=False)
     return array
+
+
+def assign(instance: object, **values: Any) -> None:
+    """Set fields of a frozen record, while it is made."""
+    for name, value in values.items():
+        object.__setattr__(instance, name, value)
 
 
 def _floats(name: str, value: Any) -> Array:

@@ -16,11 +16,6 @@ from certbound._version import __version__
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = [
-    "Record", "Shown", "ask_later_room", "at_least_text", "connect", "load_result", "log10_text", "name_text",
-    "one_line", "plain", "power_above", "rounded", "span_text",
-]  # fmt: skip
-
 Rows = list[tuple[str, str]]
 
 _LATER: dict[str, Callable[..., Any]] = {}

@@ -11,11 +11,6 @@ import contextlib
 import logging
 from collections.abc import Iterator
 
-__all__ = [
-    "CertboundError", "CertificateError", "EnclosureError", "EngineError", "InfeasibleError", "SolverError",
-    "contained",
-]  # fmt: skip
-
 _LONGEST = 200  # letters of a foreign message that are repeated
 _log = logging.getLogger(__name__)
 

@@ -21,14 +21,12 @@ from certbound._version import __version__
 from certbound.display import name_text, rounded
 from certbound.plotting.panels import Panel, least_distance, panels_of, stairs
 from certbound.plotting.plane import outlines, plane_of, supports
-from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene, instants
-from certbound.problem.sets import Quadratic, clearance
+from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene
+from certbound.problem.sets import Quadratic
 
 if TYPE_CHECKING:
     from certbound.reach.sets import ReachTube
     from certbound.safety.verification import Verdict
-
-__all__ = ["report_page"]
 
 Array = NDArray[np.float64]
 Trace = dict[str, Any]
@@ -47,20 +45,10 @@ PACKAGES = ("numpy", "scipy", "casadi", "cvxpy", "clarabel", "python-flint", "nu
 def report_page(
     scene: Scene, verdict: Verdict, *, command: str = "", probability: str = "", certificate: str = ""
 ) -> str:
-    """The page as one string.
+    """The page as one string: a problem, tubes and sample paths (``scene``) and what was proved (``verdict``).
 
-    Parameters
-    ----------
-    scene : Scene
-        Problem, tubes and sample paths to show.
-    verdict : Verdict
-        What was proved.
-    command : str
-        The command that gives the verdict again.
-    probability : str
-        The certified bound in words, such as ``3.7e-4``.
-    certificate : str
-        Text of the certificate that was written; the page shows its hash, as ``sha256sum`` prints it.
+    ``command`` gives the verdict again; ``probability`` is the certified bound in words, such as ``3.7e-4``; of the
+    text of a ``certificate`` that was written the page shows the hash, as ``sha256sum`` prints it.
     """
     from plotly.offline import get_plotlyjs
 
@@ -223,7 +211,7 @@ def _plane_figure(scene: Scene, plane: tuple[int, int]) -> tuple[str, str, list[
         shown = scene.paths[:25, :: max(1, scene.paths.shape[1] // 200)]
         x, y = _broken(shown[..., plane[0]]), _broken(shown[..., plane[1]])
         traces.append({"x": x, "y": y, "name": "sample paths", **_line(GREY, 0.7), "opacity": 0.6})
-    centre = np.array([scene.reach.center(float(t)) for t in instants(scene.reach, 200)])
+    _, centre = scene.nominal(200)
     nominal = {"x": _list(centre[:, plane[0]]), "y": _list(centre[:, plane[1]])}
     traces.append({**nominal, "name": "nominal", **_line(INK, 2)})
     shapes = []
@@ -243,8 +231,7 @@ def _plane_figure(scene: Scene, plane: tuple[int, int]) -> tuple[str, str, list[
 
 
 def _panel_figure(scene: Scene, panel: Panel) -> tuple[str, str, list[Trace], Trace]:
-    t = instants(scene.reach, 200)
-    centre = np.array([scene.reach.center(float(time)) for time in t])
+    t, centre = scene.nominal(200)
     traces: list[Trace] = []
     row = panel.direction
     if row is not None:
@@ -255,22 +242,18 @@ def _panel_figure(scene: Scene, panel: Panel) -> tuple[str, str, list[Trace], Tr
             area = {"fill": "toself", "fillcolor": color, "hoverinfo": "skip", **_line(color, 0)}
             label = "with noise" if tube.noise else "noise-free"
             traces.append({"x": _list(np.concatenate([x, x[::-1]])), "y": _list(ends), "name": label, **area})
-        nominal, limits = centre @ row, [value for value in (panel.low, panel.high) if np.isfinite(value)]
     else:
-        nominal = np.array([float(clearance(panel.constraint, x, None, float(s))) for x, s in zip(centre, t)])
-        limits = [0.0]
         bound = None if scene.tube is None else least_distance(scene.tube, panel.constraint)
         if bound is not None and scene.tube is not None:
             x, y = stairs(scene.tube, bound)
             traces.append({"x": _list(x), "y": _list(y), "name": "certified least distance", **_line(BLUE, 2)})
     if scene.paths is not None and scene.times is not None:
         every = max(1, len(scene.times) // 200)
-        states, times = scene.paths[:25, ::every], scene.times[::every]
-        values = states @ row if row is not None else np.stack(
-            [clearance(panel.constraint, states[:, k], None, float(s)) for k, s in enumerate(times)], axis=1
-        )  # fmt: skip
+        times = scene.times[::every]
+        values = panel.values(scene.paths[:25, ::every], times)
         repeated = _broken(np.broadcast_to(times, values.shape))
         traces.append({"x": repeated, "y": _broken(values), "name": "sample paths", **_line(GREY, 0.7), "opacity": 0.6})
+    nominal, limits = panel.values(centre, t), panel.limits
     traces.append({"x": _list(t), "y": _list(nominal), "name": "nominal", **_line(INK, 2)})
     start, end = panel.during or (0.0, float(scene.problem.horizon))
     for limit in limits:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
-
-__all__ = ["load_name", "names_in"]
 
 
 def names_in(homes: Mapping[str, str]) -> list[str]:
@@ -15,17 +13,17 @@ def names_in(homes: Mapping[str, str]) -> list[str]:
     return [name for names in homes.values() for name in names.split()]
 
 
-def load_name(package: str, homes: Mapping[str, str], name: str) -> Any:
-    """A name from its module, from then on an attribute of the package.
+def lazily(
+    package: str, homes: Mapping[str, str], offered: Sequence[str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """``__getattr__`` and ``__dir__`` of a package: a name comes from its module, and is an attribute from then on."""
 
-    Raises
-    ------
-    AttributeError
-        If no module of the table holds it.
-    """
-    for home, names in homes.items():
-        if name in names.split():
-            value = getattr(importlib.import_module(f"{package}.{home}"), name)
-            setattr(sys.modules[package], name, value)
-            return value
-    raise AttributeError(f"module {package!r} has no attribute {name!r}")
+    def load(name: str) -> Any:
+        for home, names in homes.items():
+            if name in names.split():
+                value = getattr(importlib.import_module(f"{package}.{home}"), name)
+                setattr(sys.modules[package], name, value)
+                return value
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+
+    return load, lambda: sorted(offered)

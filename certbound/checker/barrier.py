@@ -12,8 +12,7 @@ noise. Source: docs/theory.md, Section 10.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 from flint import arb
 
@@ -25,11 +24,10 @@ from certbound.checker.statement import Model, SafeSet
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["check_barrier"]
-
 MOST_STATES = 6
 MOST_TERMS = 500
 MOST_POWER = 12
+Test = Callable[[Sequence[arb], Sequence[arb]], bool]
 _PROOF = ("engine", "center", "scale", "exponents", "coefficients", "growth", "start", "boundary")
 
 
@@ -37,13 +35,7 @@ def check_barrier(model: Model, value: object, budget: Budget) -> arb:
     """Upper bound of the probability that a constraint is broken.
 
     It holds for every start and every disturbance that does not see coming noise (it makes exp(V) a supermartingale).
-
-    Raises
-    ------
-    CertificateError
-        If the proof's data are malformed.
-    Unproved
-        If an inequality could not be proved.
+    CertificateError where the proof's data are malformed, Unproved where an inequality could not be proved.
     """
     record = Record(value, "proof", _PROOF)
     _refuse(model)
@@ -60,25 +52,22 @@ def check_barrier(model: Model, value: object, budget: Budget) -> arb:
     if not polynomial.prove([nothing, *initial, *rest], start):
         raise Unproved("the barrier was not shown to stay below its level on the initial set")
     negative = Ceiling(graph, graph.neg(expressions.value), [], count=count, budget=budget)
+    excluded, held = _on_states(safe.excludes, n), _on_states(safe.holds, n)
     for part in safe.boundary():
-
-        def beside(centre: list[arb], radius: list[arb], part: Any = part) -> bool:
-            return bool(part.skip(centre[1 : n + 1], radius[1 : n + 1]))
-
-        def member(centre: list[arb], radius: list[arb], part: Any = part) -> bool:
-            return bool(part.exact and safe.holds(centre[1 : n + 1], radius[1 : n + 1]))
-
-        if not negative.prove([nothing, *part.box, *rest], -boundary, beside, member):
+        member = held if part.exact else lambda *_: False
+        if not negative.prove([nothing, *part.box, *rest], -boundary, _on_states(part.skip, n), member):
             raise Unproved("the barrier was not shown to reach its level where a constraint breaks")
     drift = Ceiling(graph, expressions.generator, expressions.defined, count=count, budget=budget)
     box: list[Side] = [(arb(0), arb(model.horizon)), *safe.hull]
     box += [(arb(low), arb(high)) for low, high in model.disturbance]
-    if not drift.prove(
-        box, growth, lambda centre, radius: safe.excludes(centre[1 : n + 1], radius[1 : n + 1]),
-        lambda centre, radius: safe.holds(centre[1 : n + 1], radius[1 : n + 1]),
-    ):
+    if not drift.prove(box, growth, excluded, held):
         raise Unproved("the barrier was not shown to grow as slowly as stated")
     return upper((start - boundary + arb.max(growth, arb(0)) * arb(model.horizon)).exp())
+
+
+def _on_states(test: Test, n: int) -> Test:
+    """A test of boxes of states for boxes of (t, states, disturbances)."""
+    return lambda centre, radius: test(centre[1 : n + 1], radius[1 : n + 1])
 
 
 def _refuse(model: Model) -> None:
@@ -95,12 +84,8 @@ def _refuse(model: Model) -> None:
 class _Expressions:
     """V and the expression that bounds its growth, over (t, states, disturbances).
 
-    Attributes
-    ----------
-    value, generator : int
-        Nodes of the graph.
-    defined : list of int
-        The dynamics and the diffusion themselves, which must exist wherever the generator is bounded.
+    ``value`` and ``generator`` are nodes of the graph; ``defined`` are the dynamics and the diffusion themselves, which
+    must exist wherever the generator is bounded.
     """
 
     def __init__(self, model: Model, record: Record, budget: Budget) -> None:

@@ -16,8 +16,6 @@ from certbound.checker.statement import first_difference, read_model
 from certbound.checker.words import plainly, rounded
 from certbound.errors import CertificateError
 
-__all__ = ["SECONDS", "VERSION", "check_data", "check_file"]
-
 FORMAT = "certbound certificate"
 VERSION = 1
 SECONDS = 300.0

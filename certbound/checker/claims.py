@@ -22,8 +22,6 @@ from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["ENGINES", "STATED", "Engine", "assumptions", "claim", "engine_of"]
-
 STATED = "the stated constants hold"
 """How a certificate's own list names what `assumptions` derives from the proof."""
 
@@ -55,12 +53,7 @@ class Engine:
 
 
 def engine_of(proof: object, method: str) -> str:
-    """The engine that a proof names, which ``claim.method`` must name too.
-
-    Raises
-    ------
-    CertificateError
-    """
+    """The engine that a proof names, which ``claim.method`` must name too."""
     engine = proof.get("engine") if isinstance(proof, Mapping) else None
     if not isinstance(engine, str) or engine not in ENGINES:
         raise CertificateError(f"`proof.engine` must be one of {', '.join(ENGINES)}.")

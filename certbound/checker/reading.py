@@ -16,8 +16,6 @@ from typing import Any, NoReturn
 
 from certbound.errors import CertificateError
 
-__all__ = ["Record", "number", "numbers", "parse", "read", "text", "whole", "wholes"]
-
 LARGEST_FILE = 16 * 2**20
 """Bytes."""
 MOST_ENTRIES = 2_000_000
@@ -151,6 +149,13 @@ class Record:
     def array(self, name: str, *shape: int | None) -> Any:
         """An entry that is an array of numbers of the given shape (None: any length)."""
         return numbers(self[name], self.at(name), *shape)
+
+    def symmetric(self, name: str, n: int) -> list[list[float]]:
+        """An entry that is a symmetric matrix of numbers."""
+        rows: list[list[float]] = self.array(name, n, n)
+        if any(rows[i][j] != rows[j][i] for i in range(n) for j in range(i)):
+            raise CertificateError(f"`{self.at(name)}` must be symmetric.")
+        return rows
 
     def items(self, name: str, low: int = 0, high: int = 100_000) -> list[Any]:
         """An entry that is a list of ``low`` to ``high`` entries."""

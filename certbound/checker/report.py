@@ -11,8 +11,6 @@ from flint import ctx
 
 from certbound.errors import CertboundError
 
-__all__ = ["NOT_PROVED", "UNDER_ASSUMPTIONS", "VALID", "Budget", "Report", "Unproved"]
-
 VALID = "valid"
 UNDER_ASSUMPTIONS = "valid under assumptions"
 NOT_PROVED = "not proved"
@@ -70,13 +68,8 @@ class Report:
 class Budget:
     """Limits on the checker's own time, number of boxes and memory.
 
-    Parameters
-    ----------
-    seconds : float
-    boxes : int
-        Sub-boxes over all pieces together.
-    balls : int
-        Balls of 128 bits held at a time, each some 50 to 100 bytes.
+    ``boxes`` are sub-boxes over all pieces together, ``balls`` balls of 128 bits held at a time, each some 50 to 100
+    bytes. What goes beyond a limit is `Unproved`.
     """
 
     def __init__(self, seconds: float, boxes: int = 2_000_000, balls: int = MOST_BALLS) -> None:
@@ -89,34 +82,19 @@ class Budget:
         return time.monotonic() - self.started
 
     def check(self) -> None:
-        """Stop when the time is used up.
-
-        Raises
-        ------
-        Unproved
-        """
+        """Stop when the time is used up."""
         if self.elapsed > self.seconds:
             raise Unproved(f"the check was not finished within its limit of {self.seconds:g} s")
 
     def box(self) -> None:
-        """Count one sub-box.
-
-        Raises
-        ------
-        Unproved
-        """
+        """Count one sub-box."""
         self.boxes -= 1
         if self.boxes < 0:
             raise Unproved("the check needs more sub-boxes than its limit")
         self.check()
 
     def hold(self, count: int) -> None:
-        """Take the memory of so many balls, before they are made.
-
-        Raises
-        ------
-        Unproved
-        """
+        """Take the memory of so many balls, before they are made."""
         self.balls -= count * ctx.prec // 128
         if self.balls < 0:
             raise Unproved("the check needs more memory than its limit")

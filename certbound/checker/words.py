@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 
-__all__ = ["DIGITS", "plainly", "quoted", "rounded"]
-
 DIGITS = 6
 
 

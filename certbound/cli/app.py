@@ -15,8 +15,6 @@ from certbound.cli.commands import check, derive, doctor, new, problems, simulat
 from certbound.cli.messages import BAD_INPUT, INTERRUPTED, explain, write_error
 from certbound.cli.output import SETTINGS, logging_to_stderr
 
-__all__ = ["app", "run"]
-
 _ClickException = typer.BadParameter.__mro__[2]  # whichever click typer brings: vendored or its own
 _log = logging.getLogger(__name__)
 

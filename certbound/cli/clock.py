@@ -15,8 +15,6 @@ import typer
 from certbound.cli.messages import InputError
 from certbound.cli.options import number, option
 
-__all__ = ["Clock", "OutOfTime", "TimeLimitOption", "positive"]
-
 
 class OutOfTime(BaseException):
     """The time limit has passed; like KeyboardInterrupt, it is no error that a handler may swallow."""
@@ -57,12 +55,7 @@ class Clock:
     def running(self) -> Iterator[None]:
         """Raise ``OutOfTime`` in the block when the time is over (between two steps of Python).
 
-        Raises
-        ------
-        OutOfTime
-            When the time is over.
-        InputError
-            On systems without interval timers.
+        InputError on systems without interval timers.
         """
         if self.limit is None:
             yield

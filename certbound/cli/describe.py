@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
     from certbound.tubes.tube import Tube
 
-__all__ = ["attributes", "describe_constants", "describe_deviation", "describe_parameters"]
-
 
 def attributes(found: Any, *names: str) -> dict[str, Any]:
     """Some attributes of a result, by name."""

@@ -23,8 +23,6 @@ from certbound.errors import (
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
 
-__all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "InputError", "computing", "explain", "split_cure", "write_error"]
-
 BAD_INPUT = 2
 FAILED = 3
 INTERRUPTED = 130
@@ -46,28 +44,24 @@ def explain(error: Exception, command: str) -> tuple[int, str, str]:
     not be read or written, or where an extra is missing; all else is a failure of a solver or of certbound.
     """
     help_line = f"see `certbound {command} --help`" if command else "see `certbound --help`"
+    why, cure = split_cure(str(error))
     if isinstance(error, InputError):
         return BAD_INPUT, error.why, error.cure
     if isinstance(error, (SolverError, InfeasibleError)):
-        why, cure = split_cure(str(error))
         return FAILED, why, cure or "try another --method or a smaller problem; --verbose shows the details"
     if isinstance(error, (EnclosureError, CertificateError)):
-        why, cure = split_cure(str(error))
         return BAD_INPUT, why, cure or help_line
     if isinstance(error, SyntaxError):
         place = f"line {error.lineno} of {error.filename}"
         return BAD_INPUT, f"{place} is not Python: {error.msg}", "mend the module"
     if isinstance(error, OSError):
         subject = f"`{error.filename}`: " if error.filename else ""
-        why = f"{subject}{error.strerror or error}"
-        return BAD_INPUT, why, "check the path and its permissions"
+        return BAD_INPUT, f"{subject}{error.strerror or error}", "check the path and its permissions"
     if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("certbound."):
         return BAD_INPUT, f"the module `{error.name}` is not installed", _install_hint(error.name or "")
     if isinstance(error, (ValueError, TypeError)) and _refused(error):
-        why, cure = split_cure(str(error))
         return BAD_INPUT, why, cure or help_line
     if isinstance(error, CertboundError):
-        why, cure = split_cure(str(error))
         return FAILED, why, cure or "run again with --verbose for the details"
     return (
         FAILED,
@@ -81,12 +75,7 @@ def computing(engine: str, problem: Problem) -> Iterator[None]:
     """What fails in the block is a failure of certbound's, for the problem was checked when it was read.
 
     Two refusals stay the user's to mend: a plan that is missing, and a domain of the user's on which the model is
-    undefined or its slopes unbounded.
-
-    Raises
-    ------
-    EngineError, SolverError
-        For every other failure.
+    undefined or its slopes unbounded. Every other failure is an EngineError or a SolverError.
     """
     _ = problem.closed_loop
     try:

@@ -18,24 +18,6 @@ if TYPE_CHECKING:
 
     from certbound.problem.problem import Problem
 
-__all__ = [
-    "DeltaOption",
-    "HorizonOption",
-    "JsonOption",
-    "PlotOption",
-    "ProblemArgument",
-    "SeedOption",
-    "SetOption",
-    "check_writable",
-    "examples",
-    "generator",
-    "integer",
-    "load_problem",
-    "number",
-    "option",
-    "settings_of",
-]
-
 
 def number(text: str) -> float:
     """A finite number from the command line; ``1e6`` is one, ``nan`` is not.

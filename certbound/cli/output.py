@@ -17,19 +17,6 @@ from certbound.display import plain
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = [
-    "SETTINGS",
-    "Settings",
-    "animated",
-    "console",
-    "logging_to_stderr",
-    "plain",
-    "print_json",
-    "print_status",
-    "spinner",
-    "write_file",
-]
-
 
 class Settings:
     """The global options of this run."""
@@ -50,9 +37,12 @@ def console() -> Console:
     return Console(file=sys.stdout, highlight=False, soft_wrap=not terminal, width=width)
 
 
-def print_json(value: Mapping[str, Any]) -> None:
-    """One JSON object on standard output, on one line; nothing else is printed there."""
-    sys.stdout.write(json.dumps(plain(value), allow_nan=False) + "\n")
+def show(result: Mapping[str, Any], as_json: bool, in_words: Callable[[], None]) -> None:
+    """A command's result: one JSON object on one line, with nothing beside it on standard output, or words."""
+    if not as_json:
+        in_words()
+        return
+    sys.stdout.write(json.dumps(plain(result), allow_nan=False) + "\n")
     sys.stdout.flush()
 
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from certbound.reach.sets import ReachTube
     from certbound.safety.verification import Verdict
 
-__all__ = ["check_picture", "sampled", "scene_of", "write_picture"]
-
 PATHS = 60
 _log = logging.getLogger(__name__)
 

@@ -13,15 +13,13 @@ What a user may want of it, each name loaded when it is first used:
 
 from __future__ import annotations
 
-from typing import Any
-
-from certbound.lazy import load_name, names_in
+from certbound.lazy import lazily, names_in
 
 _HOME = {
     "bounds": "bound_constants constants_along",
-    "metrics": "bound_metrics propose_metrics split_delta",
+    "metrics": "bound_metrics propose_metrics split_delta jacobian_set",
     "fitted": "fitted_constants_along",
-    "jacobians": "matrix_measure induced_norm diagonal_weights jacobian_set "
+    "jacobians": "matrix_measure induced_norm diagonal_weights "
     "AffineSet SectorSet VertexPolytope IntervalMatrixSet UnionSet",
     "recheck": "certify_rate certify_gain",
     "programs": "design_feedback",
@@ -29,10 +27,4 @@ _HOME = {
 
 __all__ = names_in(_HOME)
 
-
-def __getattr__(name: str) -> Any:
-    return load_name(__name__, _HOME, name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazily(__name__, _HOME, __all__)

@@ -14,14 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.constants.certification import certify, record, relative_widths, slope_weights
 from certbound.constants.enclosures import Metric, split_boxes
+from certbound.constants.metrics import check_objective, improve
 from certbound.constants.model_data import Model, model_of
 from certbound.constants.noise_bounds import bound_noise
 from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import EnclosureError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants
-
-__all__ = ["bound_constants", "constants_along"]
 
 Array = NDArray[np.float64]
 
@@ -82,30 +81,15 @@ def bound_constants(
     (-0.5, 0.1, True, True)
     """
     model = model_of(source, domain, horizon)
-    if objective not in ("rate", "erosion"):
-        raise ValueError(f'`objective` must be "rate" or "erosion", got {objective!r}.')
+    check_objective(objective)
     if not isinstance(metric, str):
         return certify(model, metric, tolerance=tolerance, budget=budget)
     if metric not in ("auto", "euclidean"):
         raise ValueError(f'`metric` must be "auto", "euclidean" or a matrix, got {metric!r}.')
-    if metric == "euclidean":
-        return certify(model, None, tolerance=tolerance, budget=budget)
-    return _propose(model, objective, horizon, delta, tolerance, budget)
-
-
-def _propose(
-    model: Model,
-    objective: str,
-    horizon: float | None,
-    delta: float | None,
-    tolerance: float,
-    budget: int,
-) -> Constants:
-    """The identity metric, so that a valid bound exists, and whatever the semidefinite programs propose."""
-    from certbound.constants import metrics  # which certifies its proposals here
-
     euclidean = certify(model, None, tolerance=tolerance, budget=budget)
-    return metrics.improve(model, euclidean, objective=objective, horizon=horizon, delta=delta)
+    if metric == "euclidean":
+        return euclidean
+    return improve(model, euclidean, objective=objective, horizon=horizon, delta=delta)
 
 
 def constants_along(

@@ -19,8 +19,6 @@ from certbound.errors import EnclosureError, InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants, Proof
 
-__all__ = ["certify", "record", "relative_widths", "slope_weights"]
-
 Array = NDArray[np.float64]
 
 FIRST_BUDGET = 4000
@@ -120,8 +118,7 @@ def slope_weights(norm: Metric, spread: Any, fallback: Array) -> Array:
     with np.errstate(all="ignore"):  # weights only order the halving: an overflow is as good as any
         seen = np.abs(norm.transform(safe))
         weights = np.where(finite[:, None], spread.reach, 0.0) * np.sqrt(np.sum(seen**2, axis=(-1, -2)))
-    result: Array = np.where(finite[:, None], weights, fallback)
-    return result
+    return np.where(finite[:, None], weights, fallback)
 
 
 def _scale(jacobian: StateJacobian, norm: Metric) -> float:

@@ -15,8 +15,6 @@ from certbound.errors import SolverError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants
 
-__all__ = ["fitted_constants_along", "noise_spread"]
-
 
 def fitted_constants_along(source: Any, times: ArrayLike, boxes: Interval, *, refine: int = 16) -> Constants:
     """Constants per time piece in the better of two metrics: the identity, and one fitted to the boxes.
@@ -66,11 +64,6 @@ def noise_spread(constants: Constants) -> float:
     """log of the largest mean square of ||X - x||_P that the constants allow over their pieces, in floating point.
 
     It solves v' = 2 c v + nu sigma^2 (CT) or v+ = L^2 v + nu sigma^2 (DT) from v = 0; -inf without noise.
-
-    Raises
-    ------
-    ValueError
-        If the constants have no time pieces.
     """
     if constants.times is None:
         raise ValueError("`constants` must have time pieces, got constants that hold at all times.")

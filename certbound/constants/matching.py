@@ -13,17 +13,12 @@ from certbound.errors import CertboundError
 from certbound.problem.problem import Problem
 from certbound.tubes.constants import Constants
 
-__all__ = ["check_constants", "implies"]
-
 
 def check_constants(problem: Problem, constants: Constants, name: str = "constants") -> None:
     """Refuse constants that cannot be those of ``problem``, for every input that it allows (of its plan, with one).
 
-    Raises
-    ------
-    ValueError
-        If time or dimension differ, or certified constants are not proved for this problem too; ``name`` says in
-        which argument they came.
+    ValueError where time or dimension differ, or certified constants are not proved for this problem too; ``name`` says
+    in which argument they came.
     """
     continuous, n = problem.system.time == "continuous", problem.system.dimension
     if constants.continuous != continuous:

@@ -34,10 +34,9 @@ from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.systems import ContinuousSystem, DiscreteSystem
+from certbound.problem.sets import Box
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 from certbound.tubes.constants import Constants
-
-__all__ = ["bound_metrics", "improve", "propose_metrics", "split_delta"]
 
 Array = NDArray[np.float64]
 
@@ -111,9 +110,7 @@ def propose_metrics(
         targets = None if objective == "rate" or directions is not None else _targets(model, horizon)
     if objective == "rate":
         return [p.metric for p in rate_proposals(members, continuous=continuous)]
-    _require(horizon, delta)
-    assert horizon is not None
-    assert delta is not None
+    horizon, delta = _required(horizon, delta)
     if targets is None:
         targets = stated_rooms(directions, clearances, members.dimension, horizon)
     if not matrices:
@@ -127,29 +124,14 @@ def propose_metrics(
 def improve(
     model: Model, euclidean: Constants, *, objective: str, horizon: float | None = None, delta: float | None = None
 ) -> Constants:
-    """The best certified constants of a model: in the identity metric, or in one that was proposed.
+    """The best certified constants of a model: in the identity metric (``euclidean``), or in one that was proposed.
 
-    Parameters
-    ----------
-    model : Model
-    euclidean : Constants
-        Certified, in the identity metric.
-    objective : "rate" or "erosion"
-    horizon, delta : float, optional
-        For erosion; the problem's own when omitted.
-
-    Raises
-    ------
-    ValueError
-        For erosion without horizon, delta or constraints.
+    ``horizon`` and ``delta`` are for the objective "erosion", the problem's own when omitted: without them, or without
+    constraints, that is a ValueError.
     """
     check_objective(objective)
     if objective == "erosion":
-        horizon = _horizon(model, horizon)
-        delta = _delta(model) if delta is None else delta
-        _require(horizon, delta)
-        assert horizon is not None
-        assert delta is not None
+        horizon, delta = _required(_horizon(model, horizon), _delta(model) if delta is None else delta)
         return _least_erosion(model, euclidean, _targets(model, horizon), horizon, delta)
     if model.dimension == 1:
         return euclidean
@@ -263,10 +245,32 @@ def check_objective(objective: str) -> None:
         raise ValueError(f'`objective` must be "rate" or "erosion", got {objective!r}.')
 
 
-def model_set(model: Model) -> AffineSet:
+def jacobian_set(source: Problem | System, domain: Box | None = None, *, tolerance: float = 1e-3) -> AffineSet:
+    """The Jacobian D_x f of a model over a domain, as an affine set.
+
+    Proves: D_x f(t, x, u, d) lies in the set for every time, state of the domain, input and disturbance.
+
+    Parameters
+    ----------
+    source : Problem, ContinuousSystem or DiscreteSystem
+        A problem's closed loop, or a system over all inputs that it allows.
+    domain : Box, optional
+        States; the problem's domain, or all of R^n, when omitted.
+    tolerance : float
+        Wanted distance between a range and its sampled part, relative to the range's size.
+
+    Raises
+    ------
+    EnclosureError
+        If the Jacobian is unbounded, undefined or jumping on the domain.
+    """
+    return model_set(model_of(source, domain, None), tolerance=tolerance)
+
+
+def model_set(model: Model, *, tolerance: float = 1e-3) -> AffineSet:
     """The affine set of all Jacobians of a model over its ranges."""
     tape = jacobian(model.dynamics, model.state_slots)
-    return affine_set(tape, [model.ranges[slot] for slot in range(len(model.ranges))])
+    return affine_set(tape, [model.ranges[slot] for slot in range(len(model.ranges))], tolerance=tolerance)
 
 
 def erosion_ratio(constants: Constants, rooms: Rooms, horizon: float, delta: float) -> float:
@@ -285,7 +289,8 @@ def erosion_ratio(constants: Constants, rooms: Rooms, horizon: float, delta: flo
         times = np.arange(int(horizon) + 2.0)
     tube = tune_tube(constants, horizon=horizon, delta=delta, objective=(times, values))
     asked = np.isfinite(room)  # elsewhere nothing is asked, and an endless radius is no erosion
-    ratios = np.asarray(tube.radius(rooms.times))[asked] / room[asked]
+    with np.errstate(over="ignore"):  # a ratio beyond all floats is endless
+        ratios = np.asarray(tube.radius(rooms.times))[asked] / room[asked]
     return float(np.max(ratios, initial=0.0))
 
 
@@ -294,8 +299,7 @@ def _least_erosion(model: Model, euclidean: Constants, targets: Rooms, horizon: 
     radius = RadiusModel(
         continuous=model.continuous, dimension=model.dimension, horizon=horizon, delta=delta, gaussian=_gaussian(model)
     )
-    found = [euclidean]
-    matrices = _noise_matrices(model)
+    found, matrices = [euclidean], _noise_matrices(model)
     if model.dimension > 1 and any(G.any() for G in matrices):
         for members in _candidate_sets(model):
             for proposal in _tried(members, lambda s: erosion_proposals(s, targets, matrices, radius)):
@@ -311,21 +315,22 @@ def _candidate_sets(model: Model) -> list[JacobianSet]:
         structured = model_set(model)
     except EnclosureError:
         structured = None
+    given: list[JacobianSet] = [] if structured is None else [structured]
     slots = StateJacobian(model.dynamics, model.state_slots, model.ranges)
     bounded = bool(np.isfinite(slots.box.lo).all() and np.isfinite(slots.box.hi).all())
     if not bounded or not slots.active:
-        return [] if structured is None else [structured]
+        return given
     matrices = slots.values(random_points(np.random.default_rng(0), slots.box, _SAMPLES))
     matrices = matrices[np.isfinite(matrices).all(axis=(1, 2))]
     if not len(matrices):
-        return [] if structured is None else [structured]
+        return given
     sampled = sampled_polytope(matrices)
     if structured is None:
         return [sampled]
     directions = np.random.default_rng(1).normal(size=(16, model.dimension, model.dimension))
     widths = [members.support(directions) + members.support(-directions) for members in (structured, sampled)]
     loose = bool(np.any(widths[0] > 1.1 * widths[1] + 1e-12 * np.abs(structured.J0).max()))
-    return [structured, sampled] if loose else [structured]
+    return [*given, sampled] if loose else given
 
 
 def _tried(members: JacobianSet, propose: Callable[[JacobianSet], list[Proposal]]) -> list[Proposal]:
@@ -370,23 +375,21 @@ def _delta(model: Model) -> float | None:
     return None if model.problem is None else float(model.problem.delta)
 
 
-def _require(horizon: float | None, delta: float | None) -> None:
-    for name, value in (("horizon", horizon), ("delta", delta)):
-        if value is None:
-            raise ValueError(f'`objective="erosion"` needs `{name}=`; give it, or pass a Problem.')
-    if delta is not None and not 0 < delta < 1:
+def _required(horizon: float | None, delta: float | None) -> tuple[float, float]:
+    if horizon is None or delta is None:
+        name = "horizon" if horizon is None else "delta"
+        raise ValueError(f'`objective="erosion"` needs `{name}=`; give it, or pass a Problem.')
+    if not 0 < delta < 1:
         raise ValueError(f"`delta` must lie in (0, 1), got {delta}.")
-    if horizon is not None and not 0 < horizon < np.inf:
+    if not 0 < horizon < np.inf:
         raise ValueError(f"`horizon` must be positive and finite, got {horizon}.")
+    return horizon, delta
 
 
 def _targets(model: Model, horizon: float | None) -> Rooms:
     if model.problem is None:
         raise ValueError('`objective="erosion"` needs a Problem, whose constraints say along what to erode.')
-    _require(horizon, 0.5)
-    assert horizon is not None
-    times, targets = constraint_targets(model.problem)
-    return cut_rooms(rooms_of(times, targets), horizon)
+    return cut_rooms(rooms_of(*constraint_targets(model.problem)), _required(horizon, 0.5)[0])
 
 
 def _ratios(constants: Constants, rooms: Rooms, horizon: float, deltas: Array) -> Array:

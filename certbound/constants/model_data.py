@@ -14,8 +14,6 @@ from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System, from_control
 from certbound.rigor.intervals import Interval
 
-__all__ = ["Model", "model_of"]
-
 Array = NDArray[np.float64]
 
 
@@ -23,17 +21,9 @@ Array = NDArray[np.float64]
 class Model:
     """Dynamics over boxes.
 
-    Parameters
-    ----------
-    system : ContinuousSystem or DiscreteSystem
-    dynamics : Tape
-        f, with the plan substituted where it is a feedback law.
-    ranges : Interval, shape (len(dynamics.inputs),)
-        Time, states, inputs, disturbances; infinite ends are legal.
-    bounded_by_user : bool
-        Whether the states' ranges were given.
-    problem : Problem, optional
-        Where the model comes from.
+    ``dynamics`` is f, with the plan substituted where it is a feedback law; ``ranges``, shape (len(dynamics.inputs),),
+    are those of time, states, inputs and disturbances, whose ends may be infinite; ``bounded_by_user`` says whether the
+    states' were given; ``problem`` is where the model comes from.
     """
 
     system: ContinuousSystem | DiscreteSystem
@@ -97,12 +87,8 @@ class Model:
 def model_of(source: Any, domain: Any, horizon: float | None) -> Model:
     """The model of a system, a problem or a python-control system, over a domain.
 
-    Raises
-    ------
-    TypeError
-        If ``source`` or ``domain`` is of another type.
-    ValueError
-        If the domain's dimension is wrong, or the horizon is not positive.
+    Another type of ``source`` or ``domain`` is a TypeError, a domain of the wrong dimension or a horizon that is not
+    positive a ValueError.
     """
     problem = source if isinstance(source, Problem) else None
     system: Any = problem.system if problem is not None else source

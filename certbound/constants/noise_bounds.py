@@ -18,8 +18,6 @@ from certbound.rigor.definite import eigenvalue_upper
 from certbound.rigor.intervals import Interval, matmul
 from certbound.rigor.rounding import TINY, lower, quiet, upper
 
-__all__ = ["NoiseBound", "bound_noise"]
-
 Array = NDArray[np.float64]
 
 
@@ -36,15 +34,11 @@ class NoiseBound:
 def bound_noise(model: Model, norm: Metric, pieces: Interval | None = None) -> NoiseBound:
     """Certified sigma and nu of a model's noise in a metric.
 
-    Proves: P^{1/2} g g^T P^{1/2} <= sigma^2 I and tr(P g g^T) <= nu sigma^2 over the model's ranges, or piece
-    by piece over ``pieces`` (CT); for DT the same with the variance proxy G S G^T in place of g g^T.
-    ``isotropic`` is True only if P g g^T (the covariance of Gaussian noise in DT) is a multiple of the
-    identity in rational arithmetic.
+    Proves: P^{1/2} g g^T P^{1/2} <= sigma^2 I and tr(P g g^T) <= nu sigma^2 over the model's ranges, or piece by piece
+    over ``pieces`` (CT); for DT the same with the variance proxy G S G^T in place of g g^T. ``isotropic`` is True only
+    if P g g^T (the covariance of Gaussian noise in DT) is a multiple of the identity in rational arithmetic.
 
-    Raises
-    ------
-    EnclosureError, ValueError, InfeasibleError
-        If g is undefined, jumps or is unbounded over the ranges.
+    EnclosureError, ValueError or InfeasibleError where g is undefined, jumps or is unbounded over the ranges.
     """
     system = model.system
     if isinstance(system, ContinuousSystem) and isinstance(system.diffusion, Tape):
@@ -64,9 +58,8 @@ def bound_noise(model: Model, norm: Metric, pieces: Interval | None = None) -> N
     covariance = matmul(matmul(gain, proxy), np.swapaxes(gain, 0, 1))
     square, trace = _level(norm, Interval(covariance.lo[None], covariance.hi[None]))
     isotropic = exact is not None and _is_isotropic(norm, exact)
-    sigma = _root(square[0])
-    if isotropic and norm.matrix is None:
-        sigma = _exact_sigma(exact, sigma)
+    known = exact[0][0] if exact is not None and isotropic and norm.matrix is None else Fraction(float(square[0]))
+    sigma = _root(known)
     nu = _effective(trace, np.array([sigma]), min(gain.shape))
     value = sigma if pieces is None else np.full(len(pieces), sigma)
     nu = float(model.dimension) if isotropic else nu
@@ -102,7 +95,7 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
         bounded = np.asarray(np.isfinite(squares))
         if not bounded.all():
             _refuse(tape, pieces[:, :slots][int(np.argmin(bounded))], True)
-        roots = np.array([_root(entry) for entry in squares])
+        roots = np.array([_root(Fraction(float(entry))) for entry in squares])
         nu = _effective(traces, roots, min(tape.shape))
         return NoiseBound(sigma=roots, effective_dimension=nu, isotropic=False, gaussian=True)
     function = compile_numpy(tape)
@@ -133,7 +126,7 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
         if not np.isfinite(found.upper):
             _refuse(tape, found.worst, model.bounded_by_user)
         results.append(found.upper)
-    sigma = _root(results[0])
+    sigma = _root(Fraction(results[0]))
     nu = _effective(np.array([results[1]]), np.array([sigma]), min(tape.shape))
     return NoiseBound(sigma=sigma, effective_dimension=nu, isotropic=False, gaussian=True)
 
@@ -161,10 +154,10 @@ def _refuse(tape: Tape, box: Interval, bounded_by_user: bool) -> None:
 
 
 @quiet
-def _root(square: float) -> float:
-    """An upper bound of the square root, exact where the square is that of a float."""
-    root = float(np.sqrt(square))
-    while Fraction(root) ** 2 < Fraction(float(square)):
+def _root(square: Fraction) -> float:
+    """The least float that is at least the square root."""
+    root = float(np.nextafter(np.sqrt(float(square)), 0.0))
+    while Fraction(root) ** 2 < square:
         root = float(np.nextafter(root, np.inf))
     return root
 
@@ -201,16 +194,3 @@ def _is_isotropic(norm: Metric, covariance: Rational) -> bool:
     level = covariance[0][0]
     pairs = ((i, j) for i in range(norm.dimension) for j in range(norm.dimension))
     return level > 0 and all(covariance[i][j] == (level if i == j else 0) for i, j in pairs)
-
-
-def _exact_sigma(covariance: Rational | None, fallback: float) -> float:
-    """The least float that is at least the square root of the common variance."""
-    assert covariance is not None
-    level = covariance[0][0]
-    root = float(np.sqrt(float(level)))
-    root = float(np.nextafter(root, 0.0))
-    for _ in range(4):
-        if Fraction(root) ** 2 >= level:
-            return root
-        root = float(np.nextafter(root, np.inf))
-    return fallback

@@ -29,8 +29,6 @@ from certbound.errors import EnclosureError
 from certbound.rigor.definite import eigenvalue_lower, eigenvalue_upper, is_positive_definite
 from certbound.rigor.intervals import Interval, down, matmul, up
 
-__all__ = ["certify_gain", "certify_rate", "holds_gain", "holds_rate"]
-
 Array = NDArray[np.float64]
 
 VERTEX_WORK = 2e7

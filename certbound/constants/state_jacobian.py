@@ -11,8 +11,6 @@ from certbound.constants.enclosures import Spread, enclose
 from certbound.problem.model import OPERATIONS, Node, Tape, compile_numpy, jacobian, sources
 from certbound.rigor.intervals import Interval
 
-__all__ = ["StateJacobian"]
-
 Array = NDArray[np.float64]
 PERIOD = 6.283185307179588
 """A float above 2 pi."""
@@ -23,21 +21,9 @@ SLOPE_LIMIT = 20_000
 class StateJacobian:
     """D_x f over a box of (t, states, inputs, disturbances), with only the active ones as coordinates.
 
-    Parameters
-    ----------
-    dynamics : Tape
-        f, shape (n,).
-    columns : sequence of int
-        Input slots of the states.
-    ranges : Interval, shape (len(dynamics.inputs),)
-        Where each input slot lives; infinite ends are legal.
-
-    Attributes
-    ----------
-    active : tuple of int
-        Slots that the Jacobian depends on.
-    box : Interval, shape (len(active),)
-        Their ranges; one period of an angle is enough.
+    ``dynamics`` is f, shape (n,), ``columns`` are the input slots of the states, ``ranges``, shape
+    (len(dynamics.inputs),), say where each input slot lives; infinite ends are legal. ``active`` are the slots that the
+    Jacobian depends on, ``box``, shape (len(active),), their ranges; one period of an angle is enough.
     """
 
     def __init__(self, dynamics: Tape, columns: Sequence[int], ranges: Interval) -> None:
@@ -111,10 +97,7 @@ class StateJacobian:
     def explain(self, box: Interval) -> str:
         """Why the Jacobian is unbounded over one box (k,): the entry's name.
 
-        Raises
-        ------
-        EnclosureError
-            If it is undefined or jumps there; the message names the expression and the box.
+        Where it is undefined or jumps there, an EnclosureError names the expression and the box.
         """
         enclosed = enclose(self.tape, self._inputs(box.reshape(1, -1)), undefined="raise")[0]
         rows, columns = np.nonzero(~(np.isfinite(enclosed.lo) & np.isfinite(enclosed.hi)))

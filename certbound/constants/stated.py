@@ -16,26 +16,18 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.tubes.constants import Constants
 
-__all__ = ["proved_or_stated", "refuse_contradiction"]
-
 Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9  # what floating-point evaluations of the problem's own numbers may be wrong by, and more
 
 
 def refuse_contradiction(problem: Problem, constants: Constants) -> None:
-    """Refuse constants that the problem's own numbers contradict.
+    """Refuse constants that the problem's own numbers contradict, with a ValueError.
 
-    sigma and nu are compared with the constant noise in the constants' metric, g g^T <= sigma^2 P^-1 and
-    tr(P g g^T) <= nu sigma^2 (G S G^T with the variance proxy S in discrete time), or with g(0, x) where g depends on
-    the state; rate or gain with the Jacobian at x, the middle of the initial set (but for inputs without a plan). What
-    agrees is not proved by that.
-
-    Raises
-    ------
-    ValueError
-        If sigma, the effective dimension, the rate or the gain is smaller than that, or the noise is not of the kind
-        that the constants assert.
+    sigma and nu are compared with the constant noise in the constants' metric, g g^T <= sigma^2 P^-1 and tr(P g g^T) <=
+    nu sigma^2 (G S G^T with the variance proxy S in discrete time), or with g(0, x) where g depends on the state; rate
+    or gain with the Jacobian at x, the middle of the initial set (but for inputs without a plan); the kind of noise
+    with what the constants assert. What agrees is not proved by that.
     """
     system = problem.system
     if constants.dimension != system.dimension:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.plotting.plane import supports
-from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene, instants
+from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene
 from certbound.problem.sets import Inside, Quadratic, clearance
 
 if TYPE_CHECKING:
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from certbound.problem.problem import Problem
     from certbound.reach.sets import ReachTube
-
-__all__ = ["Panel", "draw_panel", "least_distance", "panels_of", "stairs"]
 
 Array = NDArray[np.float64]
 
@@ -33,6 +31,18 @@ class Panel:
     high: float = np.inf
     constraint: Any = None
     during: tuple[float, float] | None = None
+
+    @property
+    def limits(self) -> list[float]:
+        """Where the constraint is broken: the finite limits, or a distance of 0."""
+        return [0.0] if self.direction is None else [end for end in (self.low, self.high) if np.isfinite(end)]
+
+    def values(self, states: Array, times: Array) -> Array:
+        """The function along states (..., K, n) at times (K,)."""
+        if self.direction is not None:
+            return np.asarray(states @ self.direction)
+        distances = [clearance(self.constraint, states[..., k, :], None, float(t)) for k, t in enumerate(times)]
+        return np.stack(distances, axis=-1)
 
 
 def panels_of(problem: Problem) -> list[Panel]:
@@ -78,45 +88,24 @@ def _add_face(found: list[Panel], row: Array, bound: float, states: tuple[str, .
 
 def draw_panel(axes: Axes, scene: Scene, panel: Panel) -> None:
     """Sample paths, tubes, nominal and limits of one constraint over time."""
-    if panel.direction is None:
-        ends = _draw_distance(axes, scene, panel)
-    else:
-        ends = _draw_direction(axes, scene, panel.direction, panel)
+    row = panel.direction
+    if row is not None:
+        for order, (tube, color) in enumerate(scene.tubes):
+            x, high = stairs(tube, supports(tube, row))
+            _, low = stairs(tube, -supports(tube, -row))
+            axes.fill_between(x, low, high, color=color, linewidth=0, zorder=1 + order)
+    elif scene.tube is not None and (bound := least_distance(scene.tube, panel.constraint)) is not None:
+        axes.plot(*stairs(scene.tube, bound), color=BLUE, linewidth=1.2, zorder=4)
+    if scene.paths is not None and scene.times is not None:
+        _draw_paths(axes, scene, panel.values(scene.paths, scene.times))
+    t, centre = scene.nominal()
+    axes.plot(t, panel.values(centre, t), color=INK, linewidth=1.1, zorder=5)
     start, end = panel.during or (0.0, float(scene.problem.horizon))
-    for limit in ends:
-        if np.isfinite(limit):
-            axes.plot([start, end], [limit, limit], color=VERMILION, linestyle=(0, (5, 2)), linewidth=1.2, zorder=6)
+    for limit in panel.limits:
+        axes.plot([start, end], [limit, limit], color=VERMILION, linestyle=(0, (5, 2)), linewidth=1.2, zorder=6)
     axes.set_title(panel.label, loc="left", fontsize=8)
     axes.margins(x=0)
     axes.autoscale_view()
-
-
-def _draw_direction(axes: Axes, scene: Scene, row: Array, panel: Panel) -> tuple[float, float]:
-    for order, (tube, color) in enumerate(scene.tubes):
-        x, high = stairs(tube, supports(tube, row))
-        _, low = stairs(tube, -supports(tube, -row))
-        axes.fill_between(x, low, high, color=color, linewidth=0, zorder=1 + order)
-    if scene.paths is not None:
-        _draw_paths(axes, scene, scene.paths @ row)
-    t = instants(scene.reach)
-    axes.plot(t, [scene.reach.center(float(time)) @ row for time in t], color=INK, linewidth=1.1, zorder=5)
-    return panel.low, panel.high
-
-
-def _draw_distance(axes: Axes, scene: Scene, panel: Panel) -> tuple[float, float]:
-    def distance(states: Array, time: float) -> Array:
-        return clearance(panel.constraint, states, None, float(time))
-
-    if scene.paths is not None and scene.times is not None:
-        values = [distance(scene.paths[:, k], time) for k, time in enumerate(scene.times)]
-        _draw_paths(axes, scene, np.stack(values, axis=1))
-    bound = None if scene.tube is None else least_distance(scene.tube, panel.constraint)
-    if bound is not None and scene.tube is not None:
-        axes.plot(*stairs(scene.tube, bound), color=BLUE, linewidth=1.2, zorder=4)
-    t = instants(scene.reach)
-    nominal = [float(distance(scene.reach.center(float(time)), time)) for time in t]
-    axes.plot(t, nominal, color=INK, linewidth=1.1, zorder=5)
-    return 0.0, np.inf
 
 
 def _draw_paths(axes: Axes, scene: Scene, values: Array) -> None:

@@ -11,24 +11,11 @@ from certbound.plotting.scene import BLUE, GREY, INK, INNER, OUTER, RIM, VERMILI
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_scene"]
-
 PANELS = 6
 
 
 def draw_scene(scene: Scene) -> Figure:
-    """Draw a scene.
-
-    Parameters
-    ----------
-    scene : Scene
-        What to draw.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Not attached to pyplot; ``savefig`` works on it.
-    """
+    """Draw a scene in a figure that is not attached to pyplot; ``savefig`` works on it."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 

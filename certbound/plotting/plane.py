@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.plotting.scene import GREY, INK, RIM, VERMILION, YELLOW, Scene, instants
+from certbound.plotting.scene import GREY, INK, RIM, VERMILION, YELLOW, Scene
 from certbound.problem.sets import Inside, Quadratic, Region
 
 if TYPE_CHECKING:
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from certbound.problem.problem import Problem
     from certbound.reach.sets import ReachTube
-
-__all__ = ["draw_plane", "outlines", "plane_of", "supports"]
 
 Array = NDArray[np.float64]
 Plane = tuple[int, int]
@@ -45,8 +43,7 @@ def draw_plane(axes: Axes, scene: Scene, plane: Plane) -> None:
     if scene.paths is not None:
         segments = list(scene.paths[..., list(plane)])
         axes.add_collection(LineCollection(segments, colors=GREY, linewidths=0.4, alpha=0.5, zorder=3))
-    nominal = np.array([scene.reach.center(float(t))[list(plane)] for t in instants(scene.reach)])
-    axes.plot(*nominal.T, color=INK, linewidth=1.2, zorder=5)
+    axes.plot(*scene.nominal()[1][:, list(plane)].T, color=INK, linewidth=1.2, zorder=5)
     axes.autoscale_view()
     limits = _limits(scene.problem, plane, (*axes.get_xlim(), *axes.get_ylim()))
     for constraint in scene.problem.safe:

@@ -21,26 +21,14 @@ from certbound.tubes.tube import Tube
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw"]
-
 Array = NDArray[np.float64]
 
 
 @singledispatch
 def draw(result: Any, axes: Axes) -> None:
-    """Draw a result.
+    """Draw a result into axes: a Verdict, Problem, Tube, ReachTube, Deviation or Constants.
 
-    Parameters
-    ----------
-    result : Verdict, Problem, Tube, ReachTube, Deviation or Constants
-        What to draw.
-    axes : matplotlib.axes.Axes
-        Where.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there is nothing to draw.
+    What cannot be drawn is a TypeError, or a ValueError where nothing was proved.
     """
     raise TypeError(f"a {type(result).__name__} cannot be drawn.")
 

@@ -13,20 +13,6 @@ if TYPE_CHECKING:
     from certbound.reach.sets import ReachTube
     from certbound.safety.verification import Verdict
 
-__all__ = [
-    "BLUE",
-    "GREY",
-    "INK",
-    "INNER",
-    "OUTER",
-    "RIM",
-    "VERMILION",
-    "YELLOW",
-    "Scene",
-    "instants",
-    "noisy_reach",
-]
-
 Array = NDArray[np.float64]
 
 INK, GREY, BLUE, VERMILION, YELLOW = "#000000", "#8c8c8c", "#0072B2", "#D55E00", "#F0E442"
@@ -35,20 +21,10 @@ INNER, OUTER, RIM = "#86B9DD", "#C3E0F2", "#7a3500"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
-    """What a picture shows.
+    """What a picture shows: the constraints of ``problem``, the noise-free tube ``reach``, whose curve is the nominal.
 
-    Parameters
-    ----------
-    problem : Problem
-        Whose constraints are drawn.
-    reach : ReachTube
-        Noise-free tube: its curve is the nominal.
-    tube : ReachTube, optional
-        Tube with the stochastic deviation.
-    times, paths : ndarray, shapes (K + 1,) and (paths, K + 1, n), optional
-        Sample paths.
-    title : str
-        One line over the picture.
+    ``tube`` has the stochastic deviation; ``times``, shape (K + 1,), and ``paths``, shape (paths, K + 1, n), are sample
+    paths.
     """
 
     problem: Problem
@@ -63,6 +39,14 @@ class Scene:
         """The tubes with their colours, the wider one first."""
         inner = [(self.reach, INNER)]
         return inner if self.tube is None else [(self.tube, OUTER), *inner]
+
+    def nominal(self, count: int = 400) -> tuple[Array, Array]:
+        """Times at which the nominal is drawn, shape (K,), and its states then, shape (K, n)."""
+        curve = self.reach.curve
+        times = np.asarray(curve.starts)
+        if curve.continuous:
+            times = np.linspace(float(times[0]), self.reach.end, count)
+        return times, np.array([self.reach.center(float(t)) for t in times])
 
 
 def noisy_reach(verdict: Verdict) -> ReachTube | None:
@@ -85,10 +69,3 @@ def noisy_reach(verdict: Verdict) -> ReachTube | None:
     if not np.all(np.isfinite(radius)):
         return None
     return verdict.reach.grown(radius, log10_delta=verdict.tube.log10_delta, method=verdict.method)
-
-
-def instants(tube: ReachTube, count: int = 400) -> Array:
-    """Times at which the nominal is drawn."""
-    if tube.curve.continuous:
-        return np.linspace(float(tube.curve.starts[0]), tube.end, count)
-    return np.asarray(tube.curve.starts)

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from certbound.tubes.tube import Tube
 
-__all__ = ["draw_tubes"]
-
 Array = NDArray[np.float64]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
@@ -25,14 +23,9 @@ HEIGHT = 3.0
 def draw_tubes(tubes: Mapping[str, Tube], chosen: str, deviations: Array | None = None) -> Figure:
     """A figure of r_t for every tube, the chosen one in bold, over the sizes ||S_t||_P of sample paths.
 
-    Parameters
-    ----------
-    tubes : mapping
-        Label to tube; all for the same constants and horizon.
-    chosen : str
-        The label to bring out. The chart ends at three times its largest radius: wider tubes leave it.
-    deviations : ndarray (path, time), optional
-        Norms at equally spaced times from 0 to the horizon.
+    All tubes (by label) are for the same constants and horizon; the chart ends at three times the largest radius of the
+    ``chosen`` one: wider tubes leave it. ``deviations``, shape (path, time), are norms at equally spaced times from 0
+    to the horizon.
     """
     from matplotlib.figure import Figure
 

@@ -14,8 +14,6 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside, Quadratic
 from certbound.problem.systems import System
 
-__all__ = ["CasadiProblem", "export_casadi", "export_control", "runge_kutta"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CasadiProblem:

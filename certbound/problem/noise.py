@@ -21,10 +21,6 @@ from numpy.typing import NDArray
 from certbound.checks import frozen, positive_definite, vector
 from certbound.rigor.intervals import Interval, sq
 
-__all__ = [
-    "LAWS", "Bounded", "BoxLaw", "Gaussian", "Law", "Rademacher", "SubGaussian", "Uniform", "check_law", "known_laws",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 LAWS: dict[str, type[Law]] = {}
@@ -163,10 +159,7 @@ class Law:
 def check_law(law: Law, task: str, error: type[Exception] = TypeError) -> None:
     """Refuse a law that has no name of its own: a class made from another law may draw otherwise.
 
-    Raises
-    ------
-    TypeError or ``error``
-        If it has none; ``task`` says what it was wanted for.
+    ``task`` says what it was wanted for, ``error`` which exception that is.
     """
     if not law.name:
         raise error(

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.checks import frozen, nearest, number, positive_definite, vector
+from certbound.checks import assign, frozen, nearest, number, positive_definite, vector
 from certbound.display import Shown, ask_later_room, name_text
 from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.sets import Box, GaussianStart, Inside, Outside, Region, check_start
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
-
-__all__ = ["GaussianStart", "Problem"]
 
 Array = NDArray[np.float64]
 
@@ -87,20 +85,17 @@ class Problem(Shown):
         if not isinstance(self.name, str):
             raise TypeError(f"`name` must be text, got {self.name!r}.")
         discrete = self.system.time == "discrete"
-        self._set("horizon", _horizon(self.horizon, discrete))
-        self._set("delta", _delta(self.delta))
-        self._set("safe", self._constraints())
-        self._set("domain", self._domain())
-        self._set("initial", _start(self.initial, self.system.dimension))
-        self._set("parameters", dict(self.parameters or {}))
-        self._set("plan", self._checked_plan())
-        self._set("cost", self._cost())
+        assign(self, horizon=_horizon(self.horizon, discrete))
+        assign(self, delta=_delta(self.delta))
+        assign(self, safe=self._constraints())
+        assign(self, domain=self._domain())
+        assign(self, initial=_start(self.initial, self.system.dimension))
+        assign(self, parameters=dict(self.parameters or {}))
+        assign(self, plan=self._checked_plan())
+        assign(self, cost=self._cost())
         check_start(self.initial, self.constraints)
         if self.plan is not None or self.system.inputs is None:
-            self._set("_closed_loop", self._closed())
-
-    def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
+            assign(self, _closed_loop=self._closed())
 
     @property
     def constraints(self) -> tuple[Inside, ...]:

@@ -14,31 +14,20 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.checks import frozen, matrix, names, number, vector
+from certbound.checks import assign, frozen, matrix, names, number, vector
 from certbound.problem.adapters import import_control, is_control_system, is_symbolic, read_model, symbol_names
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.noise import Gaussian, Law, known_laws
 from certbound.problem.sets import Box
-
-__all__ = ["ContinuousSystem", "DiscreteSystem", "System", "from_control", "linear_system"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class System:
-    """What continuous and discrete time share.
+    """What continuous and discrete time share: names of the signals, and where u and d live.
 
-    Parameters
-    ----------
-    states : tuple of str
-        Names of the states.
-    inputs, disturbance : Box or None
-        Where u and d live.
-    input_names, disturbance_names : tuple of str
-        Their names.
-    dynamics : Tape
-        f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,).
+    ``dynamics`` is f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,).
     """
 
     states: tuple[str, ...]
@@ -75,19 +64,19 @@ class System:
         options = {name: symbol_names(value) if name.endswith("names") else value for name, value in options.items()}
         if states is None:
             raise TypeError("`states` must be given: a number, or the states' names.")
-        self._set("states", _state_names(states))
-        self._set("inputs", _signal_box("inputs", options["inputs"], "u"))
-        self._set("disturbance", _signal_box("disturbance", options["disturbance"], "d"))
+        assign(self, states=_state_names(states))
+        assign(self, inputs=_signal_box("inputs", options["inputs"], "u"))
+        assign(self, disturbance=_signal_box("disturbance", options["disturbance"], "d"))
         if self.disturbance is not None and not self.disturbance.bounded:
             ends = ", ".join(f"[{low:g}, {high:g}]" for low, high in zip(self.disturbance.low, self.disturbance.high))
             raise ValueError(f"`disturbance` must be a bounded box, got the sides {ends}; give each finite ends.")
         input_names = _signal_names("input_names", options["input_names"], self.inputs, "u", self.states)
-        self._set("input_names", input_names)
+        assign(self, input_names=input_names)
         taken = (*self.states, *input_names)
         given = options["disturbance_names"]
         disturbance_names = _signal_names("disturbance_names", given, self.disturbance, "d", taken)
-        self._set("disturbance_names", disturbance_names)
-        self._set("dynamics", self._traced(f))
+        assign(self, disturbance_names=disturbance_names)
+        assign(self, dynamics=self._traced(f))
 
     def _traced(self, f: Any) -> Tape:
         arguments: dict[str, Sequence[str]] = {"t": ["t"], "x": self.states}
@@ -103,9 +92,6 @@ class System:
                 f"got shape {tape.shape}."
             )
         return Tape(inputs=inputs, nodes=tape.nodes, outputs=tape.outputs, shape=(self.dimension,))
-
-    def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -161,7 +147,7 @@ class ContinuousSystem(System):
             "disturbance_names": disturbance_names,
         }
         self._common(f, states, options)
-        self._set("diffusion", _diffusion(diffusion, self.states))
+        assign(self, diffusion=_diffusion(diffusion, self.states))
 
     @property
     def noise_dimension(self) -> int:
@@ -234,8 +220,8 @@ class DiscreteSystem(System):
             )
         matrix_value = np.eye(self.dimension) if noise_matrix is None else noise_matrix
         gain = _noise_matrix("noise_matrix", matrix_value, self.states)
-        self._set("noise_matrix", gain)
-        self._set("noise", law.resolve(gain.shape[1]))
+        assign(self, noise_matrix=gain)
+        assign(self, noise=law.resolve(gain.shape[1]))
 
     @property
     def noise_dimension(self) -> int:

@@ -14,11 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from certbound.rigor.rounding import LARGEST, TINY, lower, product_error, quiet, upper
 
-__all__ = [
-    "Interval", "IntervalLike", "add", "concatenate", "divide", "matmul", "multiply", "power", "stack",
-    "subtract",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 
@@ -168,8 +163,7 @@ class Interval:
     def contains(self, value: ArrayLike | Interval) -> NDArray[np.bool_]:
         """Elementwise: does the interval contain the number (or the other interval)?"""
         lo, hi = (value.lo, value.hi) if isinstance(value, Interval) else (np.asarray(value),) * 2
-        result: NDArray[np.bool_] = np.asarray((self.lo <= lo) & (hi <= self.hi))
-        return result
+        return np.asarray((self.lo <= lo) & (hi <= self.hi))
 
     def hull(self, other: IntervalLike) -> Interval:
         """Smallest intervals that contain both."""
@@ -313,17 +307,12 @@ def power(x: Interval, exponent: int) -> Interval:
         return x
     if n % 2 == 0:
         return Interval._raw(_power_end(x.mig, n, down=True), _power_end(x.mag, n, down=False))
-    lo = np.where(
-        x.lo >= 0,
-        _power_end(np.maximum(x.lo, 0.0), n, down=True),
-        -_power_end(np.maximum(-x.lo, 0.0), n, down=False),
-    )
-    hi = np.where(
-        x.hi >= 0,
-        _power_end(np.maximum(x.hi, 0.0), n, down=False),
-        -_power_end(np.maximum(-x.hi, 0.0), n, down=True),
-    )
-    return Interval._raw(lo, hi)
+
+    def odd(end: Array, low: bool) -> Array:
+        above, below = np.maximum(end, 0.0), np.maximum(-end, 0.0)
+        return np.where(end >= 0, _power_end(above, n, down=low), -_power_end(below, n, down=not low))
+
+    return Interval._raw(odd(x.lo, True), odd(x.hi, False))
 
 
 def _power_end(base: Array, n: int, *, down: bool) -> Array:

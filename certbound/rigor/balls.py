@@ -13,19 +13,6 @@ from contextlib import AbstractContextManager
 
 from flint import arb, ctx
 
-__all__ = [
-    "PRECISION",
-    "ball",
-    "bessel_excess",
-    "excess_floor",
-    "excess_tangent",
-    "kummer_excess",
-    "lower",
-    "precision",
-    "solve_upward",
-    "upper",
-]
-
 PRECISION = 96
 """Working precision in bits: enough that rounding to a float costs the last place only."""
 

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from certbound.rigor.arithmetic import Interval, IntervalLike, matmul
 from certbound.rigor.rounding import STEP, TINY, lower, product_error, quiet, upper
 
-__all__ = ["eigenvalue_lower", "eigenvalue_upper", "is_positive_definite", "perron_upper"]
-
 Array = NDArray[np.float64]
 
 
@@ -64,7 +62,7 @@ def eigenvalue_upper(A: IntervalLike) -> Array:
     lo[..., diagonal, diagonal] = hi[..., diagonal, diagonal]  # lambda_max rises with the diagonal
     if n == 2:
         return _largest_of_two(hi[..., 0, 0], hi[..., 1, 1], np.maximum(-lo[..., 0, 1], hi[..., 0, 1]))
-    s, finite = _finite_part(Interval._raw(lo, hi))
+    s, finite = finite_part(Interval._raw(lo, hi))
     v: Array = np.linalg.eigh(s.mid)[1]
     top = _collatz(matmul(v.swapaxes(-1, -2), matmul(s, v)))
     defect = _defect(v)
@@ -107,7 +105,7 @@ def is_positive_definite(A: IntervalLike) -> NDArray[np.bool_]:
     return np.asarray(possible & (eigenvalue_lower(scaled) > 0))
 
 
-def _finite_part(x: Interval) -> tuple[Interval, NDArray[np.bool_]]:
+def finite_part(x: Interval) -> tuple[Interval, NDArray[np.bool_]]:
     """Matrices with those that hold an unbounded entry replaced by 0, and the mask of the bounded ones."""
     finite = np.asarray(np.isfinite(x.lo).all(axis=(-1, -2)) & np.isfinite(x.hi).all(axis=(-1, -2)))
     keep = finite[..., None, None]
@@ -139,8 +137,7 @@ def _sum_up(x: Array, axis: int | tuple[int, ...]) -> Array:
 def _defect(v: Array) -> Array:
     """Upper bounds of the spectral norm of V^T V - I."""
     gram = matmul(v.swapaxes(-1, -2), v) - np.eye(v.shape[-1])
-    result: Array = np.max(_sum_up(gram.mag, axis=-1), axis=-1)
-    return result
+    return np.asarray(np.max(_sum_up(gram.mag, axis=-1), axis=-1))
 
 
 def _quotient(n: Array, w: Array) -> Array:

@@ -16,12 +16,6 @@ from numpy.typing import NDArray
 from certbound.rigor.arithmetic import Interval, power
 from certbound.rigor.rounding import LIBRARY_ULPS, STEP, TINY, lower, quiet, upper
 
-__all__ = [
-    "abs_", "across_cut", "acos", "and_", "asin", "atan", "atan2", "beyond_one", "cos", "cosh", "equal", "exp", "floor",
-    "hypot", "if_else_zero", "kink", "less", "less_equal", "log", "maximum", "minimum", "not_", "or_", "pow_",
-    "power_undefined", "sign", "sin", "sinh", "sq", "sqrt", "tan", "tan_undefined", "tanh",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Function = Callable[[Any], Any]
@@ -139,8 +133,7 @@ def _holds_multiple(x: Interval, period: float, shift: float) -> Mask:
     first, last = x.lo / period - shift, x.hi / period - shift
     first = first - 2.0**-50 * (np.abs(first) + 1.0)
     last = last + 2.0**-50 * (np.abs(last) + 1.0)
-    result: Mask = np.ceil(first) <= np.floor(last)
-    return result
+    return np.asarray(np.ceil(first) <= np.floor(last))
 
 
 def _wave(function: Function, x: Interval, shift: float) -> Interval:
@@ -257,13 +250,11 @@ def equal(x: Interval, y: Interval) -> Interval:
 
 
 def _false(x: Interval) -> Mask:
-    result: Mask = (x.lo == 0) & (x.hi == 0)
-    return result
+    return np.asarray((x.lo == 0) & (x.hi == 0))
 
 
 def _true(x: Interval) -> Mask:
-    result: Mask = (x.lo > 0) | (x.hi < 0)
-    return result
+    return np.asarray((x.lo > 0) | (x.hi < 0))
 
 
 def not_(x: Interval) -> Interval:
@@ -306,21 +297,18 @@ def kink(x: Interval) -> Interval:
 
 def beyond_one(x: Interval) -> Mask:
     """Where asin and acos are undefined."""
-    result: Mask = (x.lo < -1) | (x.hi > 1)
-    return result
+    return np.asarray((x.lo < -1) | (x.hi > 1))
 
 
 @quiet
 def tan_undefined(x: Interval) -> Mask:
     """Where the tangent is undefined, or not resolved."""
-    result: Mask = (x.mag > FAR) | _holds_multiple(x, np.pi, 0.5)
-    return result
+    return np.asarray((x.mag > FAR) | _holds_multiple(x, np.pi, 0.5))
 
 
 def across_cut(y: Interval, x: Interval) -> Mask:
     """Where atan2 meets its cut."""
-    result: Mask = (y.lo <= 0) & (y.hi >= 0) & (x.lo <= 0)
-    return result
+    return np.asarray((y.lo <= 0) & (y.hi >= 0) & (x.lo <= 0))
 
 
 def power_undefined(x: Interval, exponent: float) -> Mask:

@@ -17,8 +17,6 @@ from certbound.rigor import intervals as iv
 from certbound.rigor.definite import eigenvalue_lower, eigenvalue_upper
 from certbound.rigor.intervals import Interval
 
-__all__ = ["Norm", "ball_root", "largest_over_box"]
-
 Array = NDArray[np.float64]
 
 CORNERS = 10

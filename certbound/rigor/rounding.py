@@ -13,11 +13,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "LARGEST", "LIBRARY_ULPS", "STEP", "TINY", "UNIT", "down", "lower", "matmul_error", "product_error",
-    "quiet", "up", "upper",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 UNIT = 2.0**-53

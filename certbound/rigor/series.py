@@ -19,12 +19,6 @@ import numpy as np
 from certbound.rigor import elementary as iv
 from certbound.rigor.arithmetic import Interval
 
-__all__ = [
-    "Series", "abs_", "acos", "add", "asin", "atan", "atan2", "circular", "derivative", "divide", "exp", "hyperbolic",
-    "hypot", "if_else_zero", "integral", "jump", "kink", "log", "maximum", "minimum", "power", "product", "sq", "sqrt",
-    "subtract", "tan", "tanh",
-]  # fmt: skip
-
 Series = list[Interval]
 
 ZERO = Interval.point(0.0)

@@ -18,11 +18,6 @@ from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
 
-__all__ = [
-    "AS_IT_IS", "Answered", "Deviation", "EngineAnswer", "Proof", "Request", "exact", "is_at_most", "is_more_than",
-    "settled",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 Proof = tuple[dict[str, Any], float, list[str]]
@@ -134,20 +129,10 @@ class EngineAnswer:
 class Request:
     """What an engine is asked besides the problem: made once, and each engine reads what it knows.
 
-    Parameters
-    ----------
-    method : str
-        "auto", or a tube method by name.
-    cells : int, optional
-        Parts along each side of the initial set.
-    constants : Constants, optional
-        Used instead of certified ones.
-    quick : bool
-        Another engine has proved SAFE or been conclusive: what is slow and then seldom decides may be left out.
-    thorough : bool
-        Without it an engine may spare itself: it is asked again where that matters.
-    before : Any
-        The ``details`` of its first answer, then.
+    ``method`` is "auto", or a tube method by name; ``cells`` are parts along each side of the initial set;
+    ``constants`` are used instead of certified ones. ``quick``: another engine has proved SAFE or been conclusive, and
+    what is slow and then seldom decides may be left out. Not ``thorough``: an engine may spare itself, as it is asked
+    again where that matters, with the ``details`` of its first answer as ``before``.
     """
 
     method: str = "auto"

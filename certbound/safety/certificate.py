@@ -21,8 +21,6 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most
 from certbound.safety.portfolio import ENGINES
 
-__all__ = ["FORMAT", "VERSION", "certificate_data", "certificate_text", "problem_data", "restated"]
-
 FORMAT = "certbound certificate"
 VERSION = 1
 _ROUNDING = 1e-6  # other versions of the ball arithmetic may round otherwise
@@ -69,7 +67,10 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     best: tuple[str, Proof] | None = None
     for name, answer in _answers(problem, verdict):
         try:
-            found = _written(name, problem, answer, attempt)
+            write = ENGINES[name].write
+            if write is None:
+                raise CertificateError("certificates do not state what this engine proves.")
+            found = write(problem, answer, attempt)
         except CertificateError as error:
             refusals.append(f"{name}: {error}")
             continue
@@ -95,26 +96,14 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
 
     What a certificate states can be weaker than what its engine proved, so that another engine's may be needed.
     """
-
-    def rank(name: str) -> tuple[bool, float]:
-        return not verdict.answers[name].certified, verdict.answers[name].log10_delta
-
-    useful = [name for name, answer in verdict.answers.items() if answer.applicable and answer.log10_delta < 0]
-    for name in sorted(useful, key=rank):
-        yield name, verdict.answers[name]
+    useful = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_delta < 0]
+    yield from sorted(useful, key=lambda item: (not item[1].certified, item[1].log10_delta))
     for name, row in ENGINES.items():
         asked = verdict.answers.get(name)
         if row.reserve and row.write and verdict.status == "SAFE" and asked is not None and not asked.applicable:
             answer = row.prove(problem)
             if answer.applicable and answer.log10_delta < 0:
                 yield name, answer
-
-
-def _written(name: str, problem: Problem, answer: EngineAnswer, attempt: int) -> Proof:
-    write = ENGINES[name].write
-    if write is None:
-        raise CertificateError("certificates do not state what this engine proves.")
-    return write(problem, answer, attempt)
 
 
 # ---- the problem -------------------------------------------------------------------------------------------

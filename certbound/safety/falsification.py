@@ -19,8 +19,6 @@ from certbound.reach.nominal import Flow
 from certbound.reach.sets import ReachTube, constraint_clearance
 from certbound.rigor.norms import Norm
 
-__all__ = ["Violation", "find_violation"]
-
 Array = NDArray[np.float64]
 
 PATHS = 64

@@ -18,12 +18,9 @@ from certbound.display import power_above, rounded
 from certbound.errors import CertboundError
 from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside
 from certbound.problem.systems import ContinuousSystem, System
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import Verdict, verify_safety
-
-__all__ = ["Limits", "find_limits", "smaller_verdicts"]
 
 _HALVINGS = 5
 _WIDENINGS = 4
@@ -32,18 +29,10 @@ _LEAST_EXPONENT = -300.0  # deltas are floats
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Each with everything else as asked; None where nothing was found.
+    """What would be SAFE, each with everything else as asked; None where nothing was found.
 
-    Parameters
-    ----------
-    delta : float or None
-        Probability that is certified as it stands.
-    horizon : float or None
-        A horizon that is SAFE.
-    noise : float or None
-        A factor on the noise with which the problem is SAFE.
-    widening : float or None
-        A distance by which every constraint would have to give way (Euclidean, in the states' units).
+    ``delta`` is the probability that is certified as it stands, ``horizon`` one that is SAFE, ``noise`` a factor on the
+    noise, ``widening`` a distance by which every constraint would have to give way (Euclidean, in the states' units).
     """
 
     delta: float | None
@@ -64,19 +53,9 @@ class Limits:
 
 
 def find_limits(verdict: Verdict, *, cells: int | None = None) -> Limits:
-    """Bisect for what would be SAFE.
+    """Bisect for what would be SAFE, of a verdict that is not; ``cells`` are parts along each side of the initial set.
 
-    Parameters
-    ----------
-    verdict : Verdict
-        Not SAFE.
-    cells : int, optional
-        Parts along each side of the initial set.
-
-    Raises
-    ------
-    ValueError
-        If the verdict is SAFE or knows no problem.
+    A SAFE verdict, or one that knows no problem, is a ValueError.
     """
     problem = verdict.problem
     if problem is None or verdict.status == "SAFE":
@@ -104,12 +83,8 @@ def smaller_verdicts(verdict: Verdict, *, method: str = "auto", cells: int | Non
     """SAFE verdicts of the same problem at smaller and smaller delta, each as it is found.
 
     The engines share delta among the events that they count, so that a smaller one that is asked for often gives a
-    smaller bound: the exponent is doubled while that succeeds, and then bisected.
-
-    Raises
-    ------
-    ValueError
-        If ``verdict`` is not SAFE or knows no problem.
+    smaller bound: the exponent is doubled while that succeeds, and then bisected. A verdict that is not SAFE, or knows
+    no problem, is a ValueError.
     """
     problem = verdict.problem
     if problem is None or verdict.status != "SAFE":
@@ -184,10 +159,9 @@ def _noisier(problem: Problem, factor: float) -> Problem:
 
 def _widening(problem: Problem, verdict: Verdict, safe: Callable[[Callable[[], Problem]], bool]) -> float | None:
     """Nearly the least distance, from the verdict's own margin on."""
-    missing = -verdict.margin if verdict.margin is not None and -math.inf < verdict.margin < 0 else None
-    if missing is None:
+    if verdict.margin is None or not -math.inf < verdict.margin < 0:
         return None
-    low, high = 0.0, 1.05 * missing
+    low, high = 0.0, -1.05 * verdict.margin
     for _ in range(_WIDENINGS):
         if safe(lambda: _wider(problem, high)):  # noqa: B023
             break
@@ -202,10 +176,6 @@ def _widening(problem: Problem, verdict: Verdict, safe: Callable[[Callable[[], P
 
 def _wider(problem: Problem, distance: float) -> Problem:
     """Every constraint and the domain moved outward by ``distance``."""
-    safe = [_moved(constraint, distance) for constraint in problem.safe]
+    safe = [replace(c, region=c.region.grown(-distance if c.outside else distance)) for c in problem.safe]
     domain = None if problem.domain is None else problem.domain.grown(distance)
     return problem.replace(safe=safe, domain=domain)
-
-
-def _moved(constraint: Inside, distance: float) -> Inside:
-    return replace(constraint, region=constraint.region.grown(-distance if constraint.outside else distance))

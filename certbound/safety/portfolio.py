@@ -13,8 +13,6 @@ from certbound.safety.answers import EngineAnswer, Proof
 from certbound.safety.certificates import barrier_proof, constants_proof, response_proof
 from certbound.safety.engines import barrier_engine, constants_engine, linear_engine, values_engine
 
-__all__ = ["ENGINES", "Engine", "engine_named"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Engine:

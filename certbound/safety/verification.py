@@ -22,8 +22,6 @@ from certbound.safety.portfolio import ENGINES, engine_named
 if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
 
-__all__ = ["EngineAnswer", "Verdict", "best_lower", "verify_safety"]
-
 _log = logging.getLogger(__name__)
 
 
@@ -233,10 +231,8 @@ def _violation(problem: Problem) -> Violation | None:
 def _checked(problem: Problem, request: Request) -> None:
     """Refuse what is wrong with a request before any engine runs: from then on whatever fails is an engine.
 
-    Raises
-    ------
-    ValueError
-        If the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit it.
+    ValueError where the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit
+    it.
     """
     from certbound.tubes.paper import check_method
 

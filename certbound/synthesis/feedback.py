@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certbound.checks import matrix
-from certbound.constants.jacobians import jacobian_set
+from certbound.constants.metrics import jacobian_set
 from certbound.constants.programs import design_feedback
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
 from certbound.problem.model import Tape, jacobian, substitute, trace

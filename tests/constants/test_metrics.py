@@ -113,6 +113,22 @@ def test_a_smaller_delta_never_erodes_less_and_each_metric_is_best_for_its_own_d
     assert ratio(common, 2e-3) < ratio(other, 1e-9)
 
 
+def test_a_short_window_beside_a_tighter_direction_keeps_a_time():
+    times = np.linspace(0.025, 10.0, 400)
+    window = np.where(np.abs(times - 5.0) < 0.03, 2.0 - 0.1 * times, np.inf)
+    rooms = Rooms(directions=tuple(np.eye(2)[:, :, None]), times=times, rooms=np.stack([np.ones(400), window]))
+    coarse = rooms.coarse()
+    assert len(coarse.times) <= 25
+    assert np.all(np.diff(coarse.times) > 0)
+    assert coarse.rooms[1].min() == window.min()
+
+
+def test_a_radius_that_leaves_all_floats_behind_erodes_endlessly():
+    times = np.linspace(1e-3, 1.0, 400)
+    rooms = Rooms(directions=(np.array([[1.0]]),), times=times, rooms=np.full((1, 400), 1e-9))
+    assert erosion_ratio(cb.Constants(rate=1e3, sigma=1.0, dimension=1), rooms, 1.0, 1e-3) == np.inf
+
+
 @pytest.mark.parametrize("continuous", [True, False])
 @pytest.mark.parametrize("value", [-0.3, 0.02])
 def test_the_fitted_radius_agrees_with_the_tuned_kummer_tube(continuous, value):

@@ -426,9 +426,10 @@ class Run:
         points = oracle.starts(draft, rng, 400) if draft.start[0] != "gaussian" else np.tile(draft.start[1], (2, 1))
         if violation is not None:
             points = np.vstack([points, violation.start / draft.units.state])
-        for policy in oracle.policies(draft, rng):
-            if np.any(oracle.exits(draft, points, rng, steps=4 * oracle.STEPS, policy=policy, noise=False)):
-                return
+        for factor in FINER[:3] if draft.continuous else (1,):  # a window's end may fall between two steps
+            for policy in oracle.policies(draft, rng):
+                if np.any(oracle.exits(draft, points, rng, steps=factor * oracle.STEPS, policy=policy, noise=False)):
+                    return
         if draft.disturbance is None:
             self.report("verify", "contradiction", "UNSAFE_NOMINAL, and no noise-free path leaves", self.verdict.reason)
 

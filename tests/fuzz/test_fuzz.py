@@ -139,6 +139,16 @@ def test_a_nominal_that_stays_inside_contradicts_unsafe_nominal():
     assert kinds(run) == {("verify", "contradiction")}
 
 
+def test_a_nominal_that_leaves_between_two_steps_as_a_window_begins_contradicts_nothing():
+    late = Wall(shape=Shape(kind="box", data=(np.array([-1.0]), np.array([0.5]))), during=(0.6885, 2.0))
+    one = ("box", np.ones(1), np.ones(1))  # above 0.5 until log 2 = 0.6931; a 512th of the horizon is 0.0078
+    run = run_of(walk(continuous=True, noise=None, dynamics=(-symbol("x0"),), start=one, walls=(late,)))
+    run.verify()
+    assert run.verdict.status == "UNSAFE_NOMINAL"
+    run._leaves_without_noise()
+    assert kinds(run) == set()
+
+
 def test_warnings_errors_and_slow_answers_are_findings(monkeypatch):
     run = run_of(walk())
     run._attempt("verify", lambda: np.float64(np.inf) - np.float64(np.inf))

@@ -7,18 +7,13 @@ from flint import arb, arb_mat
 from certbound.checker.balls.matrices import identity, is_positive_definite, matrix, row_sums
 from certbound.checker.report import Budget, Unproved
 
-__all__ = ["cholesky", "largest_eigenvalue"]
-
 _HALVINGS = 60
 
 
 def cholesky(a: arb_mat, budget: Budget | None = None) -> arb_mat:
     """Lower triangular L with L L^T = a, for every symmetric matrix in the ball matrix.
 
-    Raises
-    ------
-    Unproved
-        If it is not shown to be positive definite.
+    `Unproved` where that is not shown to be positive definite.
     """
     n = a.nrows()
     low = [[arb(0)] * n for _ in range(n)]

@@ -9,10 +9,6 @@ from flint import arb, arb_mat
 
 from certbound.checker.report import Budget
 
-__all__ = [
-    "column", "diagonal", "identity", "is_positive_definite", "magnitude", "matrix", "quadratic", "row_sums", "upper",
-]  # fmt: skip
-
 
 def matrix(rows: Sequence[Sequence[Any]]) -> arb_mat:
     """A matrix of balls from rows of balls or floats."""

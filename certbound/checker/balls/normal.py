@@ -6,8 +6,6 @@ from flint import arb
 
 from certbound.checker.balls.matrices import upper
 
-__all__ = ["below_and_above", "tail"]
-
 _PARTS = 20
 
 

@@ -14,13 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 from flint import arb
 
 from certbound.checker.balls import upper
 from certbound.checker.report import Budget, Unproved
-
-__all__ = ["Kummer", "exit_probability", "lower_excess", "partial_excess"]
 
 MOST_POWER = 1e5
 _LARGEST = arb(10) ** 7
@@ -45,14 +44,9 @@ class Kummer:
 
 
 def exit_probability(data: Kummer, budget: Budget) -> arb:
-    """Upper bound of P(exists t: ||S_t||_P > r_t).
+    """Upper bound of P(exists t: ||S_t||_P > r_t); `Unproved` where v_0 is too small for a random start.
 
     In discrete time radii[k] belongs to step k (radii[0] to the start), in continuous time to piece k.
-
-    Raises
-    ------
-    Unproved
-        If v_0 is too small for a random start.
     """
     v: list[arb] = [data.v0]
     steps: list[arb] = []
@@ -110,27 +104,23 @@ def _least_continuous(data: Kummer, v: list[arb], info: list[arb], budget: Budge
             parts *= 4
             bound = _least_on(data, excess, radius, (v[k], v[k + 1]), (info[k], info[k + 1]), k, parts, budget)
         bounds[k] = bound
-    values = list(bounds.values())
-    least = values[0]
-    for value in values[1:]:
-        least = arb.min(least, value)
-    return least
+    return reduce(arb.min, bounds.values())
 
 
 def _advance(data: Kummer, v: arb, slope: arb, sigma: arb, length: arb) -> tuple[arb, arb]:
     """v at the end of a piece, and the piece's part of I."""
     square = sigma * sigma
     if data.continuous:
-        grown, back = v * (2 * slope * length).exp(), square * _integral(-2 * slope, length) / v
+        grown, back = v * (2 * slope * length).exp(), square * growth_integral(-2 * slope, length) / v
         if data.bessel:
             return grown, back
-        return grown + square * _integral(2 * slope, length), back.log1p()
+        return grown + square * growth_integral(2 * slope, length), back.log1p()
     grown = slope * slope * v
     ratio = square / grown
     return (grown, ratio) if data.bessel else (grown + square, ratio.log1p())
 
 
-def _integral(rate: arb, length: arb) -> arb:
+def growth_integral(rate: arb, length: arb) -> arb:
     """int_0^length e^{rate s} ds."""
     if rate.is_zero():
         return length

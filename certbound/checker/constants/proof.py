@@ -23,8 +23,6 @@ from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Grid, Model, cells_of, demands, round_demands, structure_of
 from certbound.errors import CertificateError
 
-__all__ = ["check_constants"]
-
 MOST_PIECES = 20_000
 MOST_DEGREE = 12
 MOST_STATES = 200
@@ -42,13 +40,7 @@ def check_constants(model: Model, value: object, budget: Budget) -> arb:
     """Upper bound of the probability that a constraint is broken.
 
     It holds for every start and every disturbance that does not see coming noise (Thm K2 rests on a supermartingale).
-
-    Raises
-    ------
-    CertificateError
-        If the proof's data are malformed.
-    Unproved
-        If an inequality could not be proved.
+    CertificateError where the proof's data are malformed, Unproved where an inequality could not be proved.
     """
     return _Proof(model, Record(value, "proof", _PROOF), budget).probability()
 
@@ -65,10 +57,8 @@ class _Proof:
         n = model.dimension
         if n > MOST_STATES:
             raise Unproved(f"{n} states are too many for this proof")
-        rows = None if record["metric"] is None else record.array("metric", n, n)
-        if rows is not None and any(rows[i][j] != rows[j][i] for i in range(n) for j in range(i)):
-            raise CertificateError("`proof.metric` must be symmetric.")
-        self.norm = Norm(identity(n) if rows is None else matrix(rows), budget)
+        metric = identity(n) if record["metric"] is None else matrix(record.symmetric("metric", n))
+        self.norm = Norm(metric, budget)
         self._read_times()
         self.rate, self.sigma = arb(record.number("rate")), arb(record.number("sigma", least=0.0))
         if not model.continuous and not self.rate > 0:

@@ -18,8 +18,6 @@ from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, Structure
 from certbound.problem.model import JUMPS, Tape
 
-__all__ = ["Contraction", "Spread"]
-
 Box = list[tuple[arb, arb]]
 
 MOST_VERTICES = 4096
@@ -28,23 +26,14 @@ _SLACK = arb(2) ** -30
 
 
 class Contraction:
-    """Bounds of the Jacobian in the norm of P.
-
-    Parameters
-    ----------
-    model : Model
-    structure : Structure
-    metric : arb_mat
-        P.
-    budget : Budget
-    """
+    """Bounds of the Jacobian in the norm of P, the ``metric``."""
 
     def __init__(self, model: Model, structure: Structure, metric: arb_mat, budget: Budget) -> None:
         self.model, self.metric, self.budget = model, metric, budget
         graph, n = structure.graph, model.dimension
         self.fixed = [[arb(0)] * n for _ in range(n)]
         forms: dict[int, list[list[arb]]] = {}
-        for (i, j), node in structure.state_nodes.items():
+        for (i, j), node in structure.states.nodes.items():
             constant, parts = _affine(graph, node)
             self.fixed[i][j] = constant
             for atom, factor in parts.items():
@@ -64,12 +53,7 @@ class Contraction:
             self.relevant |= graph.masks[node]
 
     def prove(self, box: Box, bound: arb, what: str) -> None:
-        """The rate (CT) or gain (DT) is at most ``bound`` over a box of all inputs of the dynamics.
-
-        Raises
-        ------
-        Unproved
-        """
+        """Prove that the rate (CT) or gain (DT) is at most ``bound`` over a box of all inputs of the dynamics."""
         if not _everywhere(box, lambda part: self._holds(part, bound), self.relevant, self.budget):
             raise Unproved(f"{what} {float(bound):.9g} was not shown to bound the Jacobian")
 
@@ -226,12 +210,7 @@ class Spread:
                 self.relevant |= graph.masks[node]
 
     def prove(self, box: Box, sigma: arb, nu: arb) -> None:
-        """The constants hold on a box of (t, states).
-
-        Raises
-        ------
-        Unproved
-        """
+        """Prove that the constants hold on a box of (t, states)."""
         if not _everywhere(box, lambda part: self._holds(part, sigma, nu), self.relevant, self.budget):
             raise Unproved(f"sigma = {float(sigma):.9g} and nu = {float(nu):.6g} were not shown to bound the noise")
 

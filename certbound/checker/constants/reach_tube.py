@@ -16,11 +16,10 @@ from math import comb
 from flint import arb, arb_mat
 
 from certbound.checker.balls import cholesky, column, largest_eigenvalue, magnitude
+from certbound.checker.constants.kummer import growth_integral
 from certbound.checker.expressions import Program, Undecided, expand
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, Structure
-
-__all__ = ["CurvePiece", "Norm", "Tube"]
 
 ORDER = 6
 KINK_PARTS, SLIP = 16, arb(2) ** -20
@@ -127,16 +126,7 @@ class CurvePiece:
 
 
 class Tube:
-    """Defects and radii along the curve of one cell.
-
-    Parameters
-    ----------
-    model, structure
-        The problem.
-    norm : Norm
-    pieces : sequence of CurvePiece
-        In discrete time one a step, the last one the horizon.
-    """
+    """Defects and radii along the curve of one cell; in discrete time a piece is a step, the last one the horizon."""
 
     def __init__(
         self, model: Model, structure: Structure, norm: Norm, pieces: Sequence[CurvePiece], budget: Budget
@@ -144,11 +134,9 @@ class Tube:
         self.model, self.norm, self.pieces, self.budget = model, norm, pieces, budget
         self.reach = [(arb(b) - arb(a)) / 2 for a, b in model.disturbance]
         self.middle = [(arb(b) + arb(a)) / 2 for a, b in model.disturbance]
-        self.entries = list(structure.disturbance_nodes)
-        graph = structure.graph
+        self.entries, nodes = list(structure.disturbances.nodes), list(structure.disturbances.nodes.values())
         self.gain = Program(
-            graph, list(structure.disturbance_nodes.values()), structure.outputs,
-            variables=len(model.dynamics.inputs), generalised=True,
+            structure.graph, nodes, structure.outputs, variables=len(model.dynamics.inputs), generalised=True
         )
         self.gain.prepare([])
 
@@ -167,12 +155,12 @@ class Tube:
         if not (piece.start >= edges[0] - slack and piece.end <= edges[1] + slack):
             raise Unproved(f"piece {k} does not lie between two changes of the plan")
         first, last = arb(0), slack
-        beside = [arb(x) for x in plan[row]]
+        inputs = [arb(x) for x in plan[row]]
         # an end that misses the plan's change by rounding sees both rows
         for edge, other in ((piece.start - edges[0], row - 1), (edges[1] - piece.end, row + 1)):
             if not edge >= first and 0 <= other < len(plan) and last > 0:
-                beside = [a.union(arb(b)) for a, b in zip(beside, plan[other])]
-        return beside
+                inputs = [a.union(arb(b)) for a, b in zip(inputs, plan[other])]
+        return inputs
 
     def defect(self, k: int) -> arb:
         """Upper bound of |p' - f(p, d, t)|_P over piece k and all d (discrete time: of |p_{k+1} - f(p_k, d, k)|_P)."""
@@ -257,12 +245,7 @@ class Tube:
         return result
 
     def prove(self, start: arb, slope: arb, eta: Sequence[arb], radii: Sequence[arb]) -> None:
-        """The stated defects and radii hold.
-
-        Raises
-        ------
-        Unproved
-        """
+        """Prove that the stated defects and radii hold."""
         rho = start
         for k, piece in enumerate(self.pieces):
             if k < len(eta) and not self.defect(k) <= eta[k]:
@@ -270,7 +253,7 @@ class Tube:
             after = rho
             if self.model.continuous:
                 length = piece.end - piece.start
-                after = (slope * length).exp() * rho + _integral(slope, length) * eta[k]
+                after = (slope * length).exp() * rho + growth_integral(slope, length) * eta[k]
             if not arb.max(rho, after) <= radii[k]:
                 raise Unproved(f"the reach tube was not shown to have the stated radius on piece {k}")
             if self.model.continuous and k + 1 < len(self.pieces):
@@ -291,15 +274,3 @@ def _powers(x: arb, most: int) -> list[arb]:
 
 def _velocity(series: list[arb], j: int) -> arb:
     return (j + 1) * series[j + 1] if j + 1 < len(series) else arb(0)
-
-
-def _integral(rate: arb, length: arb) -> arb:
-    """int_0^length e^{rate s} ds."""
-    x = rate * length
-    if abs(x) < 0.25:
-        total = term = arb(1)
-        for k in range(1, 60):
-            term = term * x / (k + 1)
-            total += term
-        return length * (total + arb(0, arb(2) ** -200))
-    return x.expm1() / rate

@@ -11,12 +11,6 @@ from collections.abc import Callable
 
 from flint import arb
 
-__all__ = [
-    "Undecided", "acos", "asin", "at_most", "atan", "atan2", "between", "cos", "cosh", "equal", "exp", "floor",
-    "generalised_kink", "holds", "hypot", "increasing", "is_wide", "kink", "less", "log", "power", "sign", "sin",
-    "sinh", "sqrt", "square", "tanh", "wave",
-]  # fmt: skip
-
 _WIDE = 1e-9
 
 
@@ -31,22 +25,13 @@ def is_wide(x: arb) -> bool:
 
 def increasing(function: Callable[[arb], arb]) -> Callable[[arb], arb]:
     """An increasing function, evaluated at both ends of wide balls."""
-
-    def evaluate(x: arb) -> arb:
-        return function(x.lower()).union(function(x.upper())) if is_wide(x) else function(x)
-
-    return evaluate
+    return lambda x: function(x.lower()).union(function(x.upper())) if is_wide(x) else function(x)
 
 
 def between(function: Callable[[arb], arb], size: Callable[[], arb]) -> Callable[[arb], arb]:
     """An increasing function with values in [-size, size], also on unbounded balls (but not of what is undefined)."""
-
-    def evaluate(x: arb) -> arb:
-        if not x.is_finite():
-            return x if x.is_nan() else arb(0, 1) * size()
-        return function(x.lower()).union(function(x.upper())) if is_wide(x) else function(x)
-
-    return evaluate
+    inner = increasing(function)
+    return lambda x: inner(x) if x.is_finite() else x if x.is_nan() else arb(0, 1) * size()
 
 
 def square(x: arb) -> arb:
@@ -58,11 +43,7 @@ def square(x: arb) -> arb:
 
 def wave(function: Callable[[arb], arb]) -> Callable[[arb], arb]:
     """A function with values in [-1, 1], also on unbounded balls (but not of what is undefined)."""
-
-    def evaluate(x: arb) -> arb:
-        return function(x) if x.is_finite() else x if x.is_nan() else arb(0, 1)
-
-    return evaluate
+    return lambda x: function(x) if x.is_finite() else x if x.is_nan() else arb(0, 1)
 
 
 sqrt, exp, log = increasing(arb.sqrt), increasing(arb.exp), increasing(arb.log)

@@ -20,8 +20,6 @@ from certbound.checker.expressions.program import Program
 from certbound.checker.report import Budget
 from certbound.problem.model import JUMPS
 
-__all__ = ["Ceiling", "Side", "middle_of"]
-
 _MOST_BOXES = 200_000
 _DEEPEST = 40
 _EVEN = 6
@@ -40,18 +38,9 @@ class _Found:
 
 
 class Ceiling:
-    """An expression over the inputs 0 .. ``count`` - 1 of a graph.
+    """An expression (``node``) over the inputs 0 .. ``count`` - 1 of a graph.
 
-    Parameters
-    ----------
-    graph : Graph
-    node : int
-        The expression.
-    defined : sequence of int
-        Further nodes that must be defined wherever the expression is bounded.
-    count : int
-        Number of inputs.
-    budget : Budget
+    The nodes ``defined`` must be defined too wherever it is bounded.
     """
 
     def __init__(self, graph: Graph, node: int, defined: Sequence[int], *, count: int, budget: Budget) -> None:
@@ -79,20 +68,14 @@ class Ceiling:
             program.prepare([])
 
     def prove(
-        self, box: Sequence[Side], bound: arb, skip: Callable[[list[arb], list[arb]], bool] = lambda *_: False,
-        member: Callable[[list[arb], list[arb]], bool] = lambda *_: True,
+        self, box: Sequence[Side], bound: arb, skip: Callable[[Sequence[arb], Sequence[arb]], bool] = lambda *_: False,
+        member: Callable[[Sequence[arb], Sequence[arb]], bool] = lambda *_: True,
     ) -> bool:
         """Whether the expression is at most ``bound`` on the part of a box that ``skip`` does not rule out.
 
-        Parameters
-        ----------
-        box : sequence of (low, high)
-            Exact ends, one pair an input.
-        bound : arb
-        skip : callable
-            Whether a box, given by centres and radii, surely has no point of interest.
-        member : callable
-            Whether all points of a box are of interest: one that exceeds the bound settles that nothing is proved.
+        ``box`` has exact ends, one pair an input. ``skip`` says whether a box, given by centres and radii, surely has
+        no point of interest; ``member`` whether all its points are: one that exceeds the bound settles that nothing is
+        proved.
         """
         first = list(box)
         widths, point = [high - low for low, high in first], [arb(0)] * len(first)

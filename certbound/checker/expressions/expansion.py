@@ -12,8 +12,6 @@ from certbound.checker.expressions.operations import OPERATIONS
 from certbound.checker.expressions.quadratic import Quadratic
 from certbound.checker.expressions.taylor import Model, constant
 
-__all__ = ["Expansion"]
-
 _ZERO = arb(0)
 _MANY = 100
 """Terms whose time and memory are worth counting."""
@@ -24,14 +22,8 @@ _Step = tuple[str, tuple[int, ...], float]
 class Expansion:
     """A node of a graph as a program over Taylor models: parameters are evaluated once, boxes many times.
 
-    Parameters
-    ----------
-    graph : Graph
-    node : int
-    guard : int
-        A node that must be defined too.
-    variables : int
-        Inputs below this number vary over the box; the others are parameters.
+    ``guard`` is a node that must be defined too; inputs below ``variables`` vary over the box, the others are
+    parameters.
     """
 
     def __init__(self, graph: Graph, node: int, guard: int, *, variables: int) -> None:
@@ -71,12 +63,7 @@ class Expansion:
     def run(self, inputs: Sequence[tuple[arb, dict[int, arb]]], size: int) -> Quadratic:
         """The expression over a box of ``size`` coordinates; every variable is a centre and its linear coefficients.
 
-        Raises
-        ------
-        Undecided
-            If a jump is undecided or something is undefined somewhere in the box.
-        Unproved
-            If the budget of the graph is used up.
+        Undecided where a jump is undecided or something is undefined somewhere in the box.
         """
         with self._budget.passing():
             return self._run(inputs, size)
@@ -121,13 +108,7 @@ class Expansion:
 
 
 def _value(op: str, args: tuple[int, ...], value: float, values: list[Model | None]) -> Model | None:
-    """A node's model; None is what is not defined.
-
-    Raises
-    ------
-    Undecided
-        If a jump, a kink or a branch cut may lie in the box.
-    """
+    """A node's model; None is what is not defined. A jump, a kink or a branch cut in the box is `Undecided`."""
     if op == "const":
         return constant(arb(value))
     given = [model for model in (values[arg] for arg in args) if model is not None]

@@ -14,27 +14,15 @@ from certbound.checker.expressions.operations import OPERATIONS
 from certbound.checker.report import Budget, Unproved
 from certbound.problem.model import Node, Tape
 
-__all__ = ["Graph"]
-
 MOST_NODES = 400_000
 _NODE = 6
 """Memory of a node, in balls."""
 
 
 class Graph:
-    """A growing set of expressions over numbered inputs.
+    """A growing set of expressions over numbered inputs; ``budget`` limits what is built and what runs over it.
 
-    Parameters
-    ----------
-    budget : Budget, optional
-        Limits on what is built and on what runs over it.
-
-    Attributes
-    ----------
-    nodes : list of Node
-        Operations; arguments come before their users.
-    masks : list of int
-        Bit i is set where a node depends on input i.
+    ``nodes`` are operations, arguments before their users; bit i of ``masks`` is set where a node depends on input i.
 
     Examples
     --------

@@ -15,8 +15,6 @@ from certbound.checker.expressions import arithmetic as balls
 from certbound.checker.expressions import series as ts
 from certbound.checker.expressions import taylor as tm
 
-__all__ = ["OPERATIONS", "Operation", "function", "is_partial"]
-
 
 class Builder(Protocol):
     """What derivatives are made with: ``graph.Graph``, which leaves out what is exactly 0."""

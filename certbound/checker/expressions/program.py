@@ -16,27 +16,15 @@ from certbound.checker.expressions.series import Series, constant
 from certbound.checker.report import Budget
 from certbound.problem.model import Tape
 
-__all__ = ["Program", "expand"]
-
 Step = tuple[int, Callable[..., arb], int, int]
 
 
 class Program:
-    """Some nodes of a graph as a program.
+    """Some nodes of a graph (``outputs``) as a program.
 
-    Parameters
-    ----------
-    graph : Graph
-    outputs : sequence of int
-        Nodes whose values are returned.
-    guards : iterable of int
-        Nodes that are evaluated, and must be finite and decided, but are not returned.
-    variables : int
-        Inputs below this number change from run to run; the others are parameters.
-    generalised : bool
-        The slope of |x| is all of [-1, 1] where x may be 0, instead of undecided.
-    unbounded : bool
-        Guards need only be defined, not finite.
+    ``guards`` are evaluated too, and must be decided and finite (``unbounded``: only defined), but are not returned.
+    Inputs below ``variables`` change from run to run, the others are parameters. ``generalised``: the slope of |x| is
+    all of [-1, 1] where x may be 0, instead of undecided.
     """
 
     def __init__(
@@ -95,12 +83,7 @@ class Program:
     def run(self, variables: Sequence[arb]) -> list[arb]:
         """Enclosures of the outputs.
 
-        Raises
-        ------
-        Undecided
-            If a jump is undecided or something is undefined somewhere in the balls.
-        Unproved
-            If the time of the graph's budget is used up.
+        Undecided where a jump is undecided or something is undefined somewhere in the balls.
         """
         self._budget.check()
         values = self._template.copy()
@@ -125,15 +108,7 @@ def _execute(steps: list[Step], values: list[arb]) -> None:
 
 
 def expand(tape: Tape, inputs: Sequence[Series], order: int, budget: Budget) -> list[Series]:
-    """Coefficients 0 .. ``order`` of a tape's outputs along series of its inputs.
-
-    Raises
-    ------
-    Undecided
-        If something jumps or is undefined there.
-    Unproved
-        If the time is used up.
-    """
+    """Coefficients 0 .. ``order`` of a tape's outputs along series of its inputs; Undecided where something jumps."""
     values: list[Series] = []
     for node in tape.nodes:
         budget.check()

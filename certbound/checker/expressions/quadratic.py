@@ -9,18 +9,37 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from flint import arb
 
 from certbound.checker.report import Budget
 
-__all__ = ["Cut", "Quadratic"]
-
 _MOST = 60
 _VAIN = 0.12
 
 Point = list[arb]
-Cut = tuple[Sequence[arb], arb, arb]
+
+
+class Cut(NamedTuple):
+    """low <= form . x <= high."""
+
+    form: Sequence[arb]
+    low: arb
+    high: arb
+
+    def meets(self, centre: Sequence[arb], radius: Sequence[arb]) -> bool:
+        """False only where a box has no point within the cut."""
+        value = reach = arb(0)
+        for factor, x, size in zip(self.form, centre, radius):
+            value += factor * x
+            reach += abs(factor) * size
+        return not (value - reach > self.high or value + reach < self.low)
+
+    def holds(self, point: Sequence[arb]) -> bool:
+        """Whether a point surely lies within the cut."""
+        value = sum((factor * x for factor, x in zip(self.form, point)), arb(0))
+        return bool(value >= self.low and value <= self.high)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,7 +74,7 @@ class Quadratic:
             if self.budget is not None:
                 self.budget.check()
             centre, radius = stack.pop()
-            if not _meets(centre, radius, cuts):
+            if not all(cut.meets(centre, radius) for cut in cuts):
                 continue
             value, slope = self._at(centre, active)
             spread = arb(0)
@@ -79,7 +98,7 @@ class Quadratic:
                 continue
             if vain:
                 return None
-            if (value > top or value < bottom) and _holds(centre, cuts):
+            if (value > top or value < bottom) and all(cut.holds(centre) for cut in cuts):
                 return False if value > high + self.error or value < low - self.error else None
             if not any(size > 0 for size in radius):
                 return None
@@ -103,29 +122,6 @@ class Quadratic:
             if not offset.is_zero():
                 value += (self.gradient[a] + slope[a]) * offset / 2
         return value, slope
-
-
-def _meets(centre: Point, radius: Point, cuts: Sequence[Cut]) -> bool:
-    """False only where the box has no point within the cuts."""
-    for form, low, high in cuts:
-        value = reach = arb(0)
-        for factor, x, size in zip(form, centre, radius):
-            value += factor * x
-            reach += abs(factor) * size
-        if value - reach > high or value + reach < low:
-            return False
-    return True
-
-
-def _holds(point: Point, cuts: Sequence[Cut]) -> bool:
-    """Whether the point surely lies within the cuts."""
-    for form, low, high in cuts:
-        value = arb(0)
-        for factor, x in zip(form, point):
-            value += factor * x
-        if not (value >= low and value <= high):
-            return False
-    return True
 
 
 def _halves(centre: Point, radius: Point, shares: Point, slope: Point, upwards: bool) -> list[tuple[Point, Point]]:

@@ -14,12 +14,6 @@ from flint import arb
 
 from certbound.checker.expressions import arithmetic as balls
 
-__all__ = [
-    "Series", "abs_", "acos", "add", "asin", "atan", "atan2", "circular", "constant", "div", "exp", "hyperbolic",
-    "hypot", "if_else_zero", "integrated", "known", "larger", "log", "mul", "power", "scale", "smaller", "sq", "sqrt",
-    "step", "sub", "tan", "tanh",
-]  # fmt: skip
-
 Series = list[arb]
 
 

@@ -9,17 +9,11 @@ quadratic parts of an expression cancels here too.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from flint import arb
 
 from certbound.checker.expressions import arithmetic as balls
-from certbound.checker.expressions.arithmetic import Undecided
-
-__all__ = [
-    "Model", "abs_", "acos", "add", "asin", "atan", "atan2", "constant", "cos", "cosh", "div", "exp", "hypot", "log",
-    "maximum", "minimum", "mul", "neg", "power", "sin", "sinh", "smooth", "sqrt", "tan", "tanh",
-]  # fmt: skip
 
 _ZERO = arb(0)
 
@@ -78,18 +72,11 @@ def constant(value: arb) -> Model:
     return Model(value, {}, {}, _ZERO, {})
 
 
-def _merged(first: dict[K, arb], second: dict[K, arb]) -> dict[K, arb]:
+def _merged(first: dict[K, Any], second: dict[K, Any]) -> dict[K, Any]:
+    """The sums of balls, or of floats, under the same key."""
     result = dict(first)
     for key, x in second.items():
-        known = result.get(key)
-        result[key] = x if known is None else known + x
-    return result
-
-
-def _blamed(first: dict[int, float], second: dict[int, float]) -> dict[int, float]:
-    result = dict(first)
-    for a, x in second.items():
-        result[a] = result.get(a, 0.0) + x
+        result[key] = result[key] + x if key in result else x
     return result
 
 
@@ -109,7 +96,7 @@ def _shared(amount: arb, *parts: dict[int, arb]) -> dict[int, float]:
 def add(x: Model, y: Model) -> Model:
     return Model(
         x.value + y.value, _merged(x.linear, y.linear), _merged(x.squares, y.squares), x.error + y.error,
-        _blamed(x.blame, y.blame),
+        _merged(x.blame, y.blame),
     )  # fmt: skip
 
 
@@ -126,12 +113,8 @@ def mul(x: Model, y: Model) -> Model:
         return y.scaled(x.value)
     u, v = x.value, y.value
     (l1, q1), (l2, q2) = x.norms(), y.norms()
-    linear = {a: c * v for a, c in x.linear.items()}
-    for a, c in y.linear.items():
-        linear[a] = linear[a] + c * u if a in linear else c * u
-    squares = {p: c * v for p, c in x.squares.items()}
-    for p, c in y.squares.items():
-        squares[p] = squares[p] + c * u if p in squares else c * u
+    linear = _merged({a: c * v for a, c in x.linear.items()}, {a: c * u for a, c in y.linear.items()})
+    squares = _merged({p: c * v for p, c in x.squares.items()}, {p: c * u for p, c in y.squares.items()})
     for a, c in x.linear.items():
         for b, d in y.linear.items():
             pair = (a, b) if a <= b else (b, a)
@@ -143,7 +126,7 @@ def mul(x: Model, y: Model) -> Model:
     blame = _shared(rest, x.linear, y.linear)
     for model, factor in ((x, v), (y, u)):
         weight = abs(float(factor.mid()))
-        blame = _blamed(blame, {a: weight * c for a, c in model.blame.items()})
+        blame = _merged(blame, {a: weight * c for a, c in model.blame.items()})
     return Model(u * v, linear, squares, error, blame)
 
 
@@ -166,7 +149,7 @@ def _composed(x: Model, value: arb, first: arb, half: arb, third: arb) -> Model 
     rest = abs(half) * cross + abs(third) * reach * reach * reach / 6
     size = abs(first)
     weight = float(size.mid())
-    blame = _blamed({a: weight * c for a, c in x.blame.items()}, _shared(rest, x.linear))
+    blame = _merged({a: weight * c for a, c in x.blame.items()}, _shared(rest, x.linear))
     return Model(value, linear, squares, rest + size * x.error, blame)
 
 
@@ -262,27 +245,11 @@ def power(x: Model, exponent: float) -> Model | None:
     return _composed(x, at(x.value, 0), *found)
 
 
-def _sign(x: Model) -> int:
-    """1 or -1 where the model has one sign.
-
-    Raises
-    ------
-    Undecided
-        If it may be 0.
-    """
-    whole = x.range()
-    if whole > 0:
-        return 1
-    if whole < 0:
-        return -1
-    raise Undecided
-
-
 def _with_error(x: Model, amount: arb, *parts: dict[int, arb]) -> Model | None:
     """The model with a further error, blamed on the coordinates of some linear parts."""
     if not amount.is_finite():
         return None
-    return Model(x.value, x.linear, x.squares, x.error + amount, _blamed(x.blame, _shared(amount, *parts)))
+    return Model(x.value, x.linear, x.squares, x.error + amount, _merged(x.blame, _shared(amount, *parts)))
 
 
 def _moved(x: Model) -> Model:
@@ -314,7 +281,7 @@ def atan2(y: Model, x: Model) -> Model | None:
     |log(1 + w) - w + w^2/2| <= |w|^3/(3 (1 - |Re w|)^3).
     """
     if not x.range() > 0:
-        _sign(y)
+        balls.kink(y.range())
     angle = balls.atan2(y.value, x.value)
     square = x.value * x.value + y.value * y.value
     across, up = x.value / square, y.value / square
@@ -337,7 +304,7 @@ def hypot(x: Model, y: Model) -> Model | None:
 
 
 def _larger(x: Model, y: Model) -> bool:
-    return _sign(add(x, neg(y))) > 0
+    return bool(balls.kink(add(x, neg(y)).range()) > 0)
 
 
 def maximum(x: Model, y: Model) -> Model:
@@ -349,4 +316,4 @@ def minimum(x: Model, y: Model) -> Model:
 
 
 def abs_(x: Model) -> Model:
-    return x if _sign(x) > 0 else neg(x)
+    return x if balls.kink(x.range()) > 0 else neg(x)

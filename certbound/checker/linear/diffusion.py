@@ -28,33 +28,16 @@ from certbound.checker.statement import Model
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["Along", "Asked", "StateNoise", "Stopped"]
-
 _FIELDS = ("windows", "reference", "low", "high", "coordinates", "rows", "rooms")
 
 
 class StateNoise:
-    """What a certificate states about noise that depends on the state, for one cell.
+    """What a certificate states about noise that depends on the state, for one cell (its entry ``stopped``).
 
-    Parameters
-    ----------
-    model : Model
-    value : object
-        The cell's entry ``stopped``.
-    path : str
-    pieces, units, rows, demands : int
-        Numbers of pieces, of states with levels, of rows with levels, of demands.
-
-    Attributes
-    ----------
-    reference : list of arb_mat or None
-        ghat of every piece; None: 0.
-    low, high : list of list of float
-        H, piece by piece and state by state of ``units``.
-    coordinates : arb
-        Levels of M's coordinates, in units of kappa.
-    rows, rooms : list of list of arb
-        Levels along the rows and the demands, in units of kappa, window by window; no ``rooms``: all room is M's.
+    ``pieces``, ``units``, ``rows`` and ``demands`` are numbers: of pieces, of states with levels, of rows with levels,
+    of demands. ``reference`` is ghat of every piece (None: 0); ``low`` and ``high`` are H, piece by piece and state by
+    state. Levels are in units of kappa: ``coordinates`` of M's coordinates; ``rows`` and ``rooms`` along the rows and
+    the demands, window by window (no ``rooms``: all room is M's).
     """
 
     def __init__(
@@ -162,15 +145,8 @@ class Along:
 class Stopped:
     """Levels of the stopped martingales.
 
-    Parameters
-    ----------
-    windows : Windows
-        Windows of the pieces; their covariances are not used.
-    excess : sequence of arb_mat
-        g - ghat on every piece.
-    factor : arb
-        Levels of the coordinates, in units of kappa.
-    budget : Budget
+    Of ``windows`` the covariances are not used; ``excess`` is g - ghat on every piece, ``factor`` the levels of the
+    coordinates in units of kappa.
     """
 
     def __init__(self, windows: Windows, excess: Sequence[arb_mat], factor: arb, budget: Budget) -> None:

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 from flint import arb, arb_mat
 
-from certbound.checker.balls import below_and_above, identity, quadratic, tail, upper
+from certbound.checker.balls import below_and_above, identity, magnitude, quadratic, tail, upper
 from certbound.checker.linear.response import Piece
 from certbound.checker.report import Budget, Unproved
-
-__all__ = ["Windows", "chain", "sub_gaussian", "union_of_pairs"]
 
 _NEGLIGIBLE = 1e-3
 
@@ -115,14 +114,7 @@ def sub_gaussian(
 class Windows:
     """Windows of consecutive pieces in continuous time.
 
-    Parameters
-    ----------
-    pieces : sequence of Piece
-    covariances : sequence of arb_mat
-        At the nodes.
-    starts : sequence of int
-        First piece of every window; they rise from 0.
-    budget : Budget
+    ``covariances`` are those at the nodes, ``starts`` the first piece of every window; they rise from 0.
     """
 
     def __init__(
@@ -195,7 +187,8 @@ class Windows:
                 continue
             seen = [value for pair in ends.values() for value in pair]
             direction = [
-                ((_largest([v[i] for v in seen]) - _largest([-v[i] for v in seen])) / 2).mid() for i in range(self.n)
+                ((reduce(arb.max, [v[i] for v in seen]) - reduce(arb.max, [-v[i] for v in seen])) / 2).mid()
+                for i in range(self.n)
             ]
             for k, pair in ends.items():
                 costs[k] = self._cost(rows[k], k, direction, pair, window)
@@ -243,13 +236,7 @@ class Windows:
 
 
 def _variance(row: arb_mat, covariance: arb_mat) -> arb:
-    """row covariance row^T, which is not negative.
-
-    Raises
-    ------
-    Unproved
-        If it is, or is not a number: then there is no such noise.
-    """
+    """row covariance row^T, which is not negative: where it is, or is no number, there is no such noise."""
     value = quadratic(row, covariance, row)
     if not value.upper() >= 0:
         raise Unproved("a variance is negative or not a number")
@@ -258,15 +245,4 @@ def _variance(row: arb_mat, covariance: arb_mat) -> arb:
 
 def _bend(piece: Piece, after: arb_mat) -> arb_mat:
     """h^2/8 sup |Phi''| |Phi(t_{k+1}, t_e)|: how far a row seen from the window's end bulges from its chord."""
-    one = identity(after.nrows())
-    whole = piece.size + piece.drift * piece.length
-    inner = (piece.drift + whole * whole) * (one + piece.deviation)
-    size = arb_mat(after.nrows(), after.ncols(), [x.abs_upper() for x in after.entries()])
-    return inner * size * (piece.length * piece.length / 8)
-
-
-def _largest(values: Sequence[arb]) -> arb:
-    best = values[0]
-    for value in values[1:]:
-        best = arb.max(best, value)
-    return best
+    return piece.curvature * magnitude(after) * (piece.length * piece.length / 8)

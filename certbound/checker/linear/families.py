@@ -16,8 +16,6 @@ from flint import arb
 from certbound.checker.balls import upper
 from certbound.checker.report import Budget, Unproved
 
-__all__ = ["Family", "leaving"]
-
 _LIKELY = 0.005
 """Below that a product saves next to nothing over a sum."""
 
@@ -38,21 +36,8 @@ def leaving(
 ) -> arb:
     """Upper bound of the probability that some event happens.
 
-    Parameters
-    ----------
-    families : sequence of Family
-    exceedance : callable
-        P(rows[k] . Z_k > levels[k] for some k) of a family.
-    budget : Budget
-    paid : arb, optional
-        What is paid once, for all families together.
-    normal : bool
-        Whether Z is a centred normal vector over finitely many times, so that symmetric events are correlated.
-
-    Raises
-    ------
-    Unproved
-        If a family leaves nothing.
+    ``exceedance`` gives P(rows[k] . Z_k > levels[k] for some k) of a family; ``paid`` is paid once, for all together.
+    ``normal``: Z is a centred normal vector over finitely many times, so that symmetric events are correlated.
     """
     single = []
     for family in families:

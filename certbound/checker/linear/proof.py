@@ -41,8 +41,6 @@ from certbound.checker.statement import Grid, Model, cells_of, demands, structur
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-__all__ = ["check_linear"]
-
 MOST_ROWS = 64
 MOST_STATES = 100
 _BITS, _MOST_BITS = 128, 3000
@@ -60,23 +58,16 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     """Upper bound of the probability that a constraint is broken.
 
     It holds for every start and every disturbance, even one that sees coming noise; where the noise depends on the
-    state, for every disturbance that does not.
-
-    Raises
-    ------
-    CertificateError
-        If the proof's data are malformed.
-    Unproved
-        If an inequality could not be proved.
+    state, for every disturbance that does not. CertificateError where the proof's data are malformed, Unproved where an
+    inequality could not be proved.
     """
     record = Record(value, "proof", _PROOF)
     if model.continuous and model.dimension > MOST_STATES:
         raise Unproved(f"{model.dimension} states are too many for this proof in continuous time")
-    structure = structure_of(model, budget)
-    shared = Shared(model, structure, record)
+    shared = Shared(model, structure_of(model, budget), record)
     boxes = cells_of(model, record)
     entries = record.items("cells", len(boxes), len(boxes))
-    outputs = remainders(model, structure, budget)
+    outputs = remainders(model, shared.structure, budget)
     worst = arb(0)
     for index, (entry, box) in enumerate(zip(entries, boxes)):
         with budget.passing():
@@ -90,11 +81,10 @@ class _Cell:
 
     def __init__(self, shared: Shared, record: Record, box: list[tuple[arb, arb]], budget: Budget) -> None:
         budget.check()
-        self.shared, self.model, self.budget = shared, shared.model, budget
-        self.record = record
+        self.shared, self.model, self.record, self.budget = shared, shared.model, record, budget
         model, n, count = shared.model, shared.model.dimension, shared.count
         continuous = model.continuous
-        varying, moving = len(shared.structure.varying), len(shared.structure.moving)
+        varying, moving = len(shared.structure.states.varying), len(shared.structure.disturbances.varying)
         self.nominal = record.array("nominal", *((count, 4, n) if continuous else (count + 1, n)))
         if continuous and any(a[3] != b[0] for a, b in pairwise(self.nominal)):
             raise Unproved("the nominal curve jumps")
@@ -110,11 +100,8 @@ class _Cell:
         self.frames = self._frames()
         start = self.nominal[0][0] if continuous else self.nominal[0]
         self.start = [arb.max(high - p, p - low).upper() for (low, high), p in zip(box, map(arb, start))]
-        middles = [(low + high) / 2 for low, high in model.disturbance] if model.disturbance else []
-        self.middle = [arb(x) for x in middles]
-        self.reach = [
-            arb.max(arb(high) - m, m - arb(low)) for (low, high), m in zip(model.disturbance, self.middle)
-        ]
+        self.middle = [arb((low + high) / 2) for low, high in model.disturbance]
+        self.reach = [arb.max(arb(high) - m, m - arb(low)) for (low, high), m in zip(model.disturbance, self.middle)]
         self.grid = self._grid()
         self.demands = demands(model, self.grid, record.items("separations"), record.at("separations"), budget)
         self.state: StateNoise | None = None
@@ -129,8 +116,7 @@ class _Cell:
         record, units, n = self.record, self.shared.units, self.model.dimension
         given = record.items("rows", self.shared.count, self.shared.count)
         extra = len(listed(given[0], record.at("rows"), 0, MOST_ROWS))
-        rows = []
-        zero, one = arb(0), arb(1)
+        rows, zero, one = [], arb(0), arb(1)
         self.budget.hold((len(units) + self.shared.count * extra) * (n // 8 + 1))  # of the same 0
         fixed = [[one if j == unit else zero for j in range(n)] for unit in units]
         for item in numbers(given, record.at("rows"), self.shared.count, extra, len(units)):
@@ -153,10 +139,9 @@ class _Cell:
     def _frames(self) -> list[list[int]]:
         """Rows that serve as coordinates for each output's remainder; null: the unit rows."""
         record, structure, units = self.record, self.shared.structure, list(self.shared.units)
-        frames = []
-        most = len(self.rows[0]) - 1
+        frames, most = [], len(self.rows[0]) - 1
         for i, item in enumerate(record.items("frames", self.model.dimension, self.model.dimension)):
-            active = structure.active_states(i)
+            active = structure.states.active(i)
             if item is not None:
                 frames.append(wholes(item, f"{record.at('frames')}[{i}]", 0, most))
             elif any(j not in units for j in active):
@@ -166,14 +151,11 @@ class _Cell:
         return frames
 
     def _grid(self) -> Grid:
-        h = self.shared.length
-        if self.model.continuous:
-            times = [(h * k, h * (k + 1)) for k in range(self.shared.count)]
-            hulls = [[[arb(x) for x in point] for point in item] for item in self.nominal]
-        else:
-            times = [(arb(k), arb(k)) for k in range(self.shared.count + 1)]
-            hulls = [[[arb(x) for x in item]] for item in self.nominal]
-        return Grid(times=times, hulls=hulls)
+        h, given = self.shared.length, self.nominal
+        times = [(h * k, h * (k + 1)) for k in range(self.shared.count)]
+        if not self.model.continuous:
+            times, given = [(arb(k), arb(k)) for k in range(self.shared.count + 1)], [[item] for item in given]
+        return Grid(times=times, hulls=[[[arb(x) for x in point] for point in item] for item in given])
 
     # ---- the proof ---------------------------------------------------------------------------------------
 
@@ -192,10 +174,9 @@ class _Cell:
             return self._probability(outputs)
 
     def _probability(self, outputs: Sequence[OutputRemainder]) -> arb:
-        model, budget = self.model, self.budget
-        n = model.dimension
-        start = model.initial.covariance if model.initial.covariance is not None else identity(n) * 0
-        values = covariances(self.pieces, start, budget)
+        start = self.model.initial.covariance
+        start = identity(self.model.dimension) * 0 if start is None else start
+        values = covariances(self.pieces, start, self.budget)
         bounds = self._supports()
         rooms = self._rooms(bounds)
         found = None if self.state is None else self._stopped(self.state, rooms)
@@ -213,12 +194,12 @@ class _Cell:
         found = Stopped(Windows(self.pieces, [], state.windows, self.budget), excess, state.coordinates, self.budget)
         count = self.shared.count
         asked = [
-            Asked(rows=[self.rows[k][d] for k in range(count)], levels=[arb(0)] * count, factors=factors)
+            Asked(rows=[rows[d] for rows in self.rows], levels=[arb(0)] * count, factors=factors)
             for d, factors in enumerate(state.rows)
         ]
         for number_, demand in enumerate(self.demands):
-            factors = None if state.rooms is None else state.rooms[number_]
-            asked.append(Asked(rows=demand.rows, levels=rooms[number_], factors=factors))
+            given = None if state.rooms is None else state.rooms[number_]
+            asked.append(Asked(rows=demand.rows, levels=rooms[number_], factors=given))
         return found.paid, found.along(asked)
 
     @cached_property
@@ -229,7 +210,7 @@ class _Cell:
         """
         largest = identity(self.model.dimension) * 0
         for slopes in self.slopes:
-            largest = largest + magnitude(self.shared.full(slopes))
+            largest = largest + magnitude(self.shared.structure.states.matrix(slopes))
         if self.model.continuous and row_sums(largest) * self.shared.length <= _MILD * len(self.slopes):
             return [arb(1)] * self.model.dimension
         return balance(largest)
@@ -239,11 +220,13 @@ class _Cell:
         fixed = identity(self.model.dimension) * 0 if state is not None else self.model.noise.covariance()
         self.budget.hold(self.shared.count * self.model.dimension**2 * (8 if self.model.continuous else 4))
         result = []
-        for k, (slope, drifts) in enumerate(zip(map(shared.full, self.slopes), self.drifts)):
+        jacobian = shared.structure.states
+        for k, (slope, drifts) in enumerate(zip(map(jacobian.matrix, self.slopes), self.drifts)):
             self.budget.check()
             noise = fixed if state is None else state.noise(k)
             if self.model.continuous:
-                result.append(continuous_piece(slope, shared.drift(drifts), shared.length, noise, self.natural))
+                drift = jacobian.matrix(drifts, constants=False)
+                result.append(continuous_piece(slope, drift, shared.length, noise, self.natural))
             else:
                 result.append(discrete_piece(slope, noise))
         return result
@@ -253,7 +236,8 @@ class _Cell:
         n, count, continuous = self.model.dimension, self.shared.count, self.model.continuous
         one = identity(n)
         unit = [[one[i, j] for j in range(n)] for i in range(n)]
-        asked = [self._asked(k) for k in range(count if continuous else count + 1)]
+        inner = self.rows if continuous else [*self.rows, []]
+        asked = [[*rows, *(demand.rows[k] for demand in self.demands)] for k, rows in enumerate(inner)]
         if continuous:
             self.budget.hold(n * sum(map(len, asked)))
         loads = [self._load(k) for k in range(count)]
@@ -271,19 +255,15 @@ class _Cell:
         found = supports([p.transition for p in self.pieces], nodes, loads, self.start, self.budget)
         if not continuous:
             return found
-        low, high, reach = [], [], []
+        parts = []
         for k in range(count):
             self.budget.check()
             gain = self._gain(k)
-            parts = over_piece(self.pieces[k], asked[k], found, k, self._box(k), None if gain is None else gain[1])
-            low.append(parts[0])
-            high.append(parts[1])
-            reach.append(parts[2])
+            parts.append(
+                over_piece(self.pieces[k], asked[k], found, k, self._box(k), None if gain is None else gain[1])
+            )
+        low, high, reach = (list(part) for part in zip(*parts))
         return Supports(low=low, high=high, reach=reach)
-
-    def _asked(self, k: int) -> list[list[arb]]:
-        inner = self.rows[k] if k < self.shared.count else []
-        return [*inner, *(demand.rows[k] for demand in self.demands)]
 
     def _box(self, k: int) -> tuple[list[arb], list[arb]]:
         """Middle and radius of B on piece k."""
@@ -294,7 +274,7 @@ class _Cell:
         """E with its columns scaled by the disturbance's radii, and the bound of |E (d - d0)|."""
         if not self.reach:
             return None
-        gain = self.shared.full(self.gains[k], gains=True)
+        gain = self.shared.structure.disturbances.matrix(self.gains[k])
         n, q = self.model.dimension, len(self.reach)
         scaled = arb_mat(n, q, [gain[i, j] * self.reach[j] for i in range(n) for j in range(q)])
         return scaled, [sum((abs(scaled[i, j]) for j in range(q)), arb(0)) for i in range(n)]
@@ -379,12 +359,11 @@ class _Cell:
         self, values: list[arb_mat], rooms: list[list[arb | None]], found: tuple[arb, list[Along]] | None
     ) -> arb:
         """Probability that Z or M leave their levels, or exceed what the demands leave."""
-        count, inner = self.shared.count, len(self.rows[0])
-        families = []
-        for d in range(inner):
-            rows = [self.rows[k][d] for k in range(count)]
-            levels = [level[d] for level in self.levels]
-            families.append(Family(label="the levels", rows=rows, levels=levels, both=True))
+        inner = len(self.rows[0])
+        families = [
+            Family(label="the levels", rows=[r[d] for r in self.rows], levels=[z[d] for z in self.levels], both=True)
+            for d in range(inner)
+        ]
         for number_, (demand, left) in enumerate(zip(self.demands, rooms)):
             if found is not None:
                 part = found[1][inner + number_]
@@ -402,14 +381,10 @@ class _Cell:
         if not model.continuous:
             if self.record["window_levels"] is not None:
                 raise CertificateError(f"`{self.record.at('window_levels')}` must be null in discrete time.")
-            if not model.noise.gaussian:
-                return leaving(
-                    families, lambda family: sub_gaussian(family.rows, family.levels, values, budget), budget
-                )
             moves = [piece.transition for piece in self.pieces]
-            return leaving(
-                families, lambda family: chain(family.rows, family.levels, moves, values, budget), budget, normal=True
-            )
+            if model.noise.gaussian:
+                return leaving(families, lambda f: chain(f.rows, f.levels, moves, values, budget), budget, normal=True)
+            return leaving(families, lambda f: sub_gaussian(f.rows, f.levels, values, budget), budget)
         given = self.record.array("window_levels", len(self.shared.windows), model.dimension)
         windows = Windows(self.pieces, values, self.shared.windows, budget)
         paid = windows.coordinates([[arb(x) for x in item] for item in given])

@@ -23,8 +23,6 @@ from certbound.checker.expressions import Cut, Expansion, Graph, Program, Quadra
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, Structure
 
-__all__ = ["OutputRemainder", "PieceData", "Polytope", "remainders"]
-
 _MOST_BOXES = 4000
 _MOST_PARTS = 8
 _ENOUGH = 0.1  # of the width of a box of the remainder: an error that may leave room for a proof
@@ -87,11 +85,12 @@ def remainders(model: Model, structure: Structure, budget: Budget) -> list[Outpu
         velocities = [_polynomial(graph, _rate(graph, curve), tau) for curve in curves]
     else:
         states, velocities = fresh(n), fresh(n)
-    slopes = dict(zip(structure.varying, fresh(len(structure.varying))))
+    varying, moving = structure.states.varying, structure.disturbances.varying
+    slopes = dict(zip(varying, fresh(len(varying))))
     if model.continuous:
-        drifts = dict(zip(structure.varying, fresh(len(structure.varying))))
+        drifts = dict(zip(varying, fresh(len(varying))))
         slopes = {e: graph.add(a, graph.mul(tau, drifts[e])) for e, a in slopes.items()}
-    gains = dict(zip(structure.moving, fresh(len(structure.moving))))
+    gains = dict(zip(moving, fresh(len(moving))))
     centre = fresh(q)
     inputs = fresh(0 if model.plan is None else len(model.plan[0]))
     time = graph.add(middle, tau) if model.continuous else middle
@@ -110,7 +109,7 @@ def remainders(model: Model, structure: Structure, budget: Budget) -> list[Outpu
         budget.check()
         result.append(OutputRemainder(
             graph, graph.sub(values[i], velocities[i]), nodes[model.dynamics.outputs[i]], count=count,
-            time=model.continuous, states=structure.active_states(i), disturbances=structure.active_disturbances(i),
+            time=model.continuous, states=structure.states.active(i), disturbances=structure.disturbances.active(i),
             dimension=n, budget=budget,
         ))
     return result
@@ -261,7 +260,7 @@ class _Frame:
             except ZeroDivisionError as error:
                 raise Unproved("the frame of an output is not regular") from error
         self.cuts = [
-            (self._form(row), low, high)
+            Cut(self._form(row), low, high)
             for number, (row, low, high) in enumerate(zip(polytope.rows, polytope.low, polytope.high))
             if number not in chosen and m > 1 and _lives_in(row, states)
         ]
@@ -290,14 +289,7 @@ class _Frame:
 
     def meets(self, box: _Box) -> bool:
         """False only where the box has no point in the polytope."""
-        for form, low, high in self.cuts:
-            value = reach = arb(0)
-            for place, factor in enumerate(form):
-                value += factor * box.centre[self.start + place]
-                reach += abs(factor) * box.radius[self.start + place]
-            if value - reach > high or value + reach < low:
-                return False
-        return True
+        return all(cut.meets(box.centre[self.start :], box.radius[self.start :]) for cut in self.cuts)
 
     def cuts_at(self, box: _Box) -> list[Cut]:
         """The cuts in the coordinates xi of the box."""
@@ -309,7 +301,7 @@ class _Frame:
             for i, factor in enumerate(form, start):
                 whole[i] = factor * box.radius[i]
                 value += factor * box.centre[i]
-            result.append((whole, low - value, high - value))
+            result.append(Cut(whole, low - value, high - value))
         return result
 
     def unturned(self, box: _Box) -> tuple[list[arb], list[dict[int, arb]]]:

@@ -21,11 +21,6 @@ from flint import arb, arb_mat
 from certbound.checker.balls import column, diagonal, identity, magnitude, row_sums
 from certbound.checker.report import Budget, Unproved
 
-__all__ = [
-    "Load", "Piece", "Supports", "balance", "continuous_piece", "covariances", "discrete_piece", "over_piece",
-    "supports",
-]  # fmt: skip
-
 _TERMS = 60
 _SWEEPS, _FARTHEST = 20, 300
 _SMALL = arb(2) ** -100
@@ -46,6 +41,12 @@ class Piece:
     slope: arb_mat
     size: arb_mat
     drift: arb_mat
+
+    @property
+    def curvature(self) -> arb_mat:
+        """Bound of |d^2 Phi(t, u)/dt^2| over the piece."""
+        whole = self.size + self.drift * self.length
+        return (self.drift + whole * whole) * (identity(whole.nrows()) + self.deviation)
 
 
 def _tail(older: arb, newer: arb, alpha: arb, kappa: arb, count: int) -> arb | None:
@@ -181,17 +182,8 @@ def supports(
 ) -> Supports:
     """Bounds at the nodes along ``rows[k]`` (a list of rows at node k), by the adjoint rows of every earlier piece.
 
-    Parameters
-    ----------
-    transitions : sequence of arb_mat
-        F of every piece.
-    rows : sequence
-        N + 1 lists of rows.
-    loads : sequence of Load
-        One a piece.
-    start : sequence of arb
-        Half-widths of the box of y at node 0.
-    budget : Budget
+    ``transitions`` and ``loads`` have one entry a piece, ``rows`` one more; ``start`` are the half-widths of the box of
+    y at node 0.
     """
     n = transitions[0].nrows()
     budget.hold(3 * (n + 1) * sum(map(len, rows)))
@@ -237,18 +229,13 @@ def _carried(
         if node == 0:
             break
         middle, boxes, generators = columns[node - 1]
-        centre, spread = centre + rows * middle, spread + _sizes(rows) * boxes
+        centre, spread = centre + rows * middle, spread + magnitude(rows) * boxes
         if generators is not None:
-            spread = spread + _sizes(rows * generators) * arb_mat(
+            spread = spread + magnitude(rows * generators) * arb_mat(
                 generators.ncols(), 2, [arb(0), arb(1)] * generators.ncols()
             )
         rows = rows * transitions[node - 1]
-    return centre, spread + _sizes(rows) * arb_mat(n, 2, [x for value in start for x in (arb(0), value)])
-
-
-def _sizes(matrix: arb_mat) -> arb_mat:
-    """Upper bounds of the entries' sizes."""
-    return arb_mat(matrix.nrows(), matrix.ncols(), [x.abs_upper() for x in matrix.entries()])
+    return centre, spread + magnitude(rows) * arb_mat(n, 2, [x for value in start for x in (arb(0), value)])
 
 
 def over_piece(
@@ -257,26 +244,12 @@ def over_piece(
 ) -> tuple[list[arb], list[arb], list[arb]]:
     """From a piece's start to all of it: the chord between both ends, its bulge, and what the piece adds.
 
-    Parameters
-    ----------
-    piece : Piece
-    rows : sequence of rows
-    found : Supports
-        At node k: along the unit rows, ``rows``, and ``rows`` times the transition matrix.
-    k : int
-    box : (list, list) of arb
-        Middle and radius of the remainder's box.
-    gain : list of arb, optional
-        Bound of |E (d - d0)|.
-
-    Returns
-    -------
-    low, high, reach : list of arb
+    ``found`` holds at node k bounds along the unit rows, ``rows``, and ``rows`` times the transition matrix; ``box``
+    are middle and radius of the remainder's box, ``gain`` a bound of |E (d - d0)|. Returns low, high and reach.
     """
     n, count = piece.transition.nrows(), len(rows)
     h, one = piece.length, identity(n)
-    whole = piece.size + piece.drift * h
-    bend = (piece.drift + whole * whole) * (one + piece.deviation) * (h * h / 8)
+    bend = piece.curvature * (h * h / 8)
     middle, radius = box
     sizes = [arb.max(abs(a), abs(b)) for a, b in zip(found.low[k][:n], found.high[k][:n])]
     added_r = (piece.deviation * column([abs(m) + r for m, r in zip(middle, radius)]) + column(radius)) * h

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 
-from flint import arb, arb_mat
+from flint import arb
 
 from certbound.checker.reading import Record, wholes
 from certbound.checker.report import Unproved
 from certbound.checker.statement import Model, Structure
 from certbound.errors import CertificateError
-
-__all__ = ["Shared"]
 
 MOST_PIECES = 4000
 
@@ -27,7 +24,7 @@ class Shared:
             raise CertificateError("`proof.pieces` must be the number of steps.")
         if model.continuous and model.plan is not None and self.count % len(model.plan):
             raise CertificateError("`proof.pieces` must be a multiple of the plan's rows.")
-        for name, expected in (("varying", structure.varying), ("moving", structure.moving)):
+        for name, expected in (("varying", structure.states.varying), ("moving", structure.disturbances.varying)):
             given = [tuple(wholes(item, record.at(name), 0, 10**6)) for item in record.items(name)]
             if given != expected:
                 raise Unproved(f"`proof.{name}` does not list the entries of the Jacobian that vary")
@@ -54,22 +51,3 @@ class Shared:
         if plan is None:
             return []
         return [arb(x) for x in plan[k * len(plan) // self.count if self.model.continuous else k]]
-
-    def full(self, values: Sequence[float], *, gains: bool = False) -> arb_mat:
-        """A Jacobian from its varying entries and the model's own constant ones."""
-        structure, n = self.structure, self.model.dimension
-        columns = len(self.model.disturbance) if gains else n
-        entries = [arb(0)] * (n * columns)
-        for (i, j), fixed in (structure.held if gains else structure.fixed).items():
-            entries[i * columns + j] = fixed
-        for (i, j), value in zip(structure.moving if gains else structure.varying, values):
-            entries[i * columns + j] = arb(value)
-        return arb_mat(n, columns, entries)
-
-    def drift(self, values: Sequence[float]) -> arb_mat:
-        """The slope's rate of change: constant entries have none."""
-        n = self.model.dimension
-        entries = [arb(0)] * (n * n)
-        for (i, j), value in zip(self.structure.varying, values):
-            entries[i * n + j] = arb(value)
-        return arb_mat(n, n, entries)

@@ -7,8 +7,6 @@ from typing import Any
 
 from certbound.checker.statement.tapes import canonical
 
-__all__ = ["first_difference"]
-
 _FOR_HUMANS = {"name", "label"}
 
 

@@ -12,8 +12,6 @@ from flint import arb
 
 from certbound.checker.reading import Record
 
-__all__ = ["LAWS", "Law"]
-
 Squares = list[arb]
 
 

@@ -11,8 +11,6 @@ from certbound.checker.report import Unproved
 from certbound.checker.statement.problem import Model
 from certbound.errors import CertificateError
 
-__all__ = ["cells_of"]
-
 MOST_CELLS = 4096
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from flint import arb, arb_mat
 
 from certbound.checker.balls import diagonal, is_positive_definite, matrix
-from certbound.checker.reading import Record, number, numbers, text
+from certbound.checker.reading import Record, number, text
 from certbound.checker.reading import entries as listed
 from certbound.checker.report import Budget
 from certbound.checker.statement.laws import LAWS, Law
@@ -16,8 +15,6 @@ from certbound.checker.statement.regions import Constraint, read_constraint
 from certbound.checker.statement.tapes import read_tape
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
-
-__all__ = ["Initial", "Model", "Noise", "read_model"]
 
 MOST_STATES = 400
 MOST_STEPS = 100_000
@@ -102,12 +99,8 @@ def _names(record: Record, name: str, least: int) -> tuple[str, ...]:
 def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     """The problem in a certificate.
 
-    Raises
-    ------
-    CertificateError
-        If a field is missing, has the wrong size, or makes no sense.
-    Unproved
-        If it is too large for the budget.
+    CertificateError where a field is missing, has the wrong size, or makes no sense; Unproved where it is too large for
+    the budget.
     """
     record = Record(value, path, _FIELDS)
     time = record["time"]
@@ -212,10 +205,7 @@ def _proxy(record: Record, law: Law, m: int, budget: Budget) -> arb_mat:
     if level not in law.levels:
         raise CertificateError(f"`{record.at('level')}` must be one of {', '.join(law.levels)}, got {level[:40]!r}.")
     if level == "covariance":
-        rows = record.array("values", m, m)
-        if any(rows[i][j] != rows[j][i] for i in range(m) for j in range(i)):
-            raise CertificateError(f"`{record.at('values')}` must be symmetric.")
-        return _semidefinite(matrix(rows), record.at("values"), budget)
+        return _semidefinite(matrix(record.symmetric("values", m)), record.at("values"), budget)
     values = [arb(number(item, record.at("values"), least=0.0)) for item in record.items("values", m, m)]
     if level == "variance":
         return diagonal(values)
@@ -260,13 +250,13 @@ def _initial(value: object, path: str, n: int, budget: Budget) -> Initial:
     centre = record.array("mean" if kind == "gaussian" else "center", n)
     points = [arb(x) for x in centre]
     if kind == "gaussian":
-        covariance = _semidefinite(matrix(_symmetric(record, "covariance", n)), record.at("covariance"), budget)
+        covariance = _semidefinite(matrix(record.symmetric("covariance", n)), record.at("covariance"), budget)
         return Initial(kind=kind, low=tuple(points), high=tuple(points), covariance=covariance, centre=tuple(centre))
     if kind == "ball":
         radius = record.number("radius", least=0.0)
         reach, shape = [arb(radius)] * n, None
     else:
-        rows: Any = _symmetric(record, "shape", n)
+        rows = record.symmetric("shape", n)
         if not is_positive_definite(matrix(rows), budget):
             raise CertificateError(f"`{path}.shape` must be positive definite.")
         reach, shape, radius = [arb(rows[i][i]).sqrt() for i in range(n)], matrix(rows), 0.0
@@ -274,10 +264,3 @@ def _initial(value: object, path: str, n: int, budget: Budget) -> Initial:
         kind=kind, low=tuple(p - r for p, r in zip(points, reach)), high=tuple(p + r for p, r in zip(points, reach)),
         centre=tuple(centre), radius=radius, shape=shape,
     )
-
-
-def _symmetric(record: Record, name: str, n: int) -> list[list[float]]:
-    rows: list[list[float]] = numbers(record[name], record.at(name), n, n)
-    if any(rows[i][j] != rows[j][i] for i in range(n) for j in range(i)):
-        raise CertificateError(f"`{record.at(name)}` must be symmetric.")
-    return rows

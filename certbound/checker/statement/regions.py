@@ -10,18 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from flint import arb, arb_mat
 
-from certbound.checker.balls import identity, is_positive_definite, matrix
+from certbound.checker.balls import cholesky, identity, is_positive_definite, matrix, quadratic
 from certbound.checker.reading import Record, entries, number, numbers, text, whole, wholes
 from certbound.checker.report import Budget
 from certbound.checker.statement.tapes import read_tape
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
-
-__all__ = ["POLYGON", "Constraint", "Region", "read_constraint"]
 
 POLYGON = 24
 
@@ -61,11 +58,14 @@ class Region:
         return full
 
     def image(self, dimension: int) -> tuple[arb_mat, arb]:
-        """W over all states and a bound with the region equal to {|W (x - center)| <= bound} (round ones)."""
+        """W over all states and a bound with the region equal to {|W (x - center)| <= bound} (round ones).
+
+        Of an ellipsoid {y^T shape^-1 y <= 1} it is the inverse of the Cholesky factor of its shape.
+        """
         k = len(self.coordinates)
         square, bound = identity(k), arb(self.radius)
         if self.shape is not None:
-            square, bound = _inverse_root(self.shape), arb(1)
+            square, bound = cholesky(self.shape).inv(), arb(1)
         rows = [self.lift([square[i, j] for j in range(k)], dimension) for i in range(k)]
         return matrix(rows), bound
 
@@ -75,8 +75,7 @@ class Region:
             square = sum((x * x for x in row), arb(0))
             return arb(self.radius) * square.upper().sqrt()
         flat = arb_mat(1, len(row), list(row))
-        square = (flat * self.shape * flat.transpose())[0, 0]
-        return square.upper().sqrt()
+        return quadratic(flat, self.shape, flat).upper().sqrt()
 
     def inscribed(self) -> list[tuple[Row, arb]]:
         """Rows a and bounds b of a polyhedron {a . y <= b} inside the round region at the origin."""
@@ -91,19 +90,8 @@ class Region:
             scale = 1 / arb(k).sqrt()
         if self.shape is None:
             return [(row, scale * arb(self.radius)) for row in unit]
-        factor = _inverse_root(self.shape)
+        factor = cholesky(self.shape).inv()
         return [((arb_mat(1, k, row) * factor).entries(), scale) for row in unit]
-
-
-def _inverse_root(shape: arb_mat) -> arb_mat:
-    """L^-1 of the Cholesky factor L: {y : y^T shape^-1 y <= 1} = {|L^-1 y| <= 1}."""
-    n = shape.nrows()
-    low = [[arb(0)] * n for _ in range(n)]
-    for j in range(n):
-        for i in range(j, n):
-            rest = shape[i, j] - sum((low[i][k] * low[j][k] for k in range(j)), arb(0))
-            low[i][j] = rest.sqrt() if i == j else rest / low[j][j]
-    return matrix(low).inv()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -179,13 +167,7 @@ def _sides(low: list[float | None], high: list[float | None]) -> tuple[list[list
 
 
 def read_constraint(value: object, path: str, dimension: int, horizon: float, budget: Budget) -> Constraint:
-    """One constraint of a certificate.
-
-    Raises
-    ------
-    CertificateError
-        If it is malformed.
-    """
+    """One constraint of a certificate."""
     record = Record(value, path, ("kind", "region", "during", "label"))
     if record["kind"] not in ("inside", "outside"):
         raise CertificateError(f"`{path}.kind` must be \"inside\" or \"outside\".")
@@ -244,10 +226,9 @@ def _region(value: object, path: str, dimension: int, budget: Budget) -> Region:
     if kind == "ball":
         radius = record.number("radius", least=0.0)
         return Region(kind=kind, coordinates=coordinates, center=center, faces=[], bounds=[], radius=radius)
-    rows: Any = record.array("shape", k, k)
-    shape = matrix(rows)
-    if any(rows[i][j] != rows[j][i] for i in range(k) for j in range(i)) or not is_positive_definite(shape, budget):
-        raise CertificateError(f"`{path}.shape` must be symmetric and positive definite.")
+    shape = matrix(record.symmetric("shape", k))
+    if not is_positive_definite(shape, budget):
+        raise CertificateError(f"`{path}.shape` must be positive definite.")
     return Region(kind=kind, coordinates=coordinates, center=center, faces=[], bounds=[], shape=shape)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 from flint import arb, arb_mat
 
@@ -14,8 +15,6 @@ from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint, Region
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
-
-__all__ = ["Demand", "Grid", "RoundDemand", "demands", "round_demands"]
 
 _STRICT = arb(2) ** -300
 
@@ -59,11 +58,6 @@ def demands(
     model: Model, grid: Grid, separations: list[object], path: str, budget: Budget, *, polygons: bool = True
 ) -> list[Demand]:
     """Every constraint of the model as demands along a nominal curve (without ``polygons``: but for round safe sets).
-
-    Raises
-    ------
-    CertificateError
-        If the directions that keep obstacles off are malformed.
     """
     if len(separations) != len(model.constraints):
         raise CertificateError(f"`{path}` must have {len(model.constraints)} entries, got {len(separations)}.")
@@ -109,7 +103,7 @@ def _demand(
             row, bound = family[k]
             offset = bound + _dot(row, centres[k])
             rooms = [offset - _dot(demand.rows[k], point) for point in points]
-            demand.rooms.append(min_of(rooms).lower() if rooms else None)
+            demand.rooms.append(reduce(arb.min, rooms).lower() if rooms else None)
     return found
 
 
@@ -154,17 +148,9 @@ def round_demands(model: Model, grid: Grid, budget: Budget) -> list[RoundDemand]
             for point in grid.points(k, constraint.during):
                 offset = (image * column([a - b for a, b in zip(point, moved)])).entries()
                 sizes.append(sum((x * x for x in offset), arb(0)).upper().sqrt())
-            rooms.append((bound + min_of([-size for size in sizes])).lower())
+            rooms.append((bound + reduce(arb.min, [-size for size in sizes])).lower())
         result.append(RoundDemand(label=constraint.label, image=image, rooms=rooms))
     return result
-
-
-def min_of(values: Sequence[arb]) -> arb:
-    """Ball of the least value."""
-    least = values[0]
-    for value in values[1:]:
-        least = arb.min(least, value)
-    return least
 
 
 def _dot(row: Sequence[arb], point: Sequence[arb]) -> arb:

@@ -12,14 +12,12 @@ from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint
 from certbound.problem.model import Tape
 
-__all__ = ["Part", "SafeSet"]
-
 _MOST_BOXES = 20_000
 _DEEPEST = 40
 
 Side = tuple[arb, arb]
 Form = list[tuple[int, arb]]
-Skip = Callable[[list[arb], list[arb]], bool]
+Skip = Callable[[Sequence[arb], Sequence[arb]], bool]
 
 
 def _over(form: Form, offset: arb, centre: Sequence[arb], radius: Sequence[arb]) -> tuple[arb, arb]:
@@ -72,14 +70,7 @@ class Part:
 class SafeSet:
     """The constraints of a model at rest.
 
-    Parameters
-    ----------
-    model : Model
-
-    Raises
-    ------
-    Unproved
-        If a constraint has a window or moves, or nothing bounds a state.
+    One that has a window or moves, or a state that nothing bounds, is `Unproved`.
     """
 
     def __init__(self, model: Model) -> None:
@@ -180,7 +171,7 @@ class SafeSet:
             for number, form in enumerate(shape.forms if shape.bound is None else shape.forms[:1]):
                 flat = self._flat(shape, number) if shape.bound is None and len(form) == 1 else self.hull
                 if flat is not None:
-                    parts.append(Part(box=flat, skip=self._beside(shape, number), exact=flat is not self.hull))
+                    parts.append(Part(box=flat, skip=self._misses(shape, number), exact=flat is not self.hull))
         return parts
 
     def _flat(self, shape: _Shape, number: int) -> list[Side] | None:
@@ -192,11 +183,11 @@ class SafeSet:
             return None
         return [*self.hull[:j], (value.lower(), value.upper()), *self.hull[j + 1 :]]
 
-    def _beside(self, shape: _Shape, number: int) -> Skip:
-        """Rules out boxes beside the face, and outside of the set."""
+    def _misses(self, shape: _Shape, number: int) -> Skip:
+        """Rules out boxes that do not meet the face, and those outside of the set."""
         form, offset = shape.forms[number], shape.offsets[number]
 
-        def skip(centre: list[arb], radius: list[arb]) -> bool:
+        def skip(centre: Sequence[arb], radius: Sequence[arb]) -> bool:
             low, high = shape.over(centre, radius)
             if low > 0 or high < 0 or self.excludes(centre, radius):
                 return True

@@ -7,43 +7,50 @@ not depend on that state through that entry, whatever the floats of the certific
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from flint import arb
+from flint import arb, arb_mat
 
 from certbound.checker.expressions import Graph, Program, Undecided, is_partial
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.problem.model import JUMPS
 
-__all__ = ["Structure", "structure_of"]
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Entries:
+    """A Jacobian of f, of a ``shape``: nodes[i, j] of the graph, absent where the entry is exactly 0.
+
+    ``varying`` lists those that depend on an input, row by row, ``fixed`` holds the values of the others.
+    """
+
+    shape: tuple[int, int]
+    nodes: dict[tuple[int, int], int]
+    varying: list[tuple[int, int]]
+    fixed: dict[tuple[int, int], arb]
+
+    def active(self, output: int) -> list[int]:
+        """Inputs on which the remainder of an output may depend."""
+        return [j for i, j in self.varying if i == output]
+
+    def matrix(self, values: Sequence[float], *, constants: bool = True) -> arb_mat:
+        """The matrix whose varying entries are given; the constant ones are the model's own, or 0."""
+        rows, columns = self.shape
+        entries = [arb(0)] * (rows * columns)
+        for (i, j), value in [*(self.fixed.items() if constants else ()), *zip(self.varying, map(arb, values))]:
+            entries[i * columns + j] = value
+        return arb_mat(rows, columns, entries)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Structure:
-    """Entries of the Jacobians of f by state and by disturbance.
-
-    ``state_nodes[i, j]`` and ``disturbance_nodes[i, l]`` are the derivative's nodes in ``graph`` (absent where it is
-    exactly 0); ``varying`` and ``moving`` list those that depend on an input, row by row, and ``fixed`` and ``held``
-    hold the values of the others.
-    """
+    """The Jacobians of f (``outputs`` of ``graph``) by the states and by the disturbances."""
 
     graph: Graph
     outputs: list[int]
-    state_nodes: dict[tuple[int, int], int]
-    disturbance_nodes: dict[tuple[int, int], int]
-    varying: list[tuple[int, int]]
-    moving: list[tuple[int, int]]
-    fixed: dict[tuple[int, int], arb]
-    held: dict[tuple[int, int], arb]
-
-    def active_states(self, output: int) -> list[int]:
-        """States on which the remainder of an output may depend."""
-        return [j for i, j in self.varying if i == output]
-
-    def active_disturbances(self, output: int) -> list[int]:
-        """Disturbances on which the remainder of an output may depend."""
-        return [j for i, j in self.moving if i == output]
+    states: Entries
+    disturbances: Entries
 
     def hidden(self, model: Model, output: int) -> list[int]:
         """Inputs that decide a jump of an output, or whether it is defined, and are none of its remainder's."""
@@ -51,8 +58,8 @@ class Structure:
         count, n = len(model.dynamics.inputs), model.dimension
         first = count - len(model.disturbance)
         asked = sum(1 << slot for slot in [*range(1, n + 1), *range(first, count)])
-        asked &= ~sum(1 << 1 + j for j in self.active_states(output))
-        asked &= ~sum(1 << first + j for j in self.active_disturbances(output))
+        asked &= ~sum(1 << 1 + j for j in self.states.active(output))
+        asked &= ~sum(1 << first + j for j in self.disturbances.active(output))
         deciding = 0
         for index in self.graph.reachable([self.outputs[output]]):
             deciding |= _deciding(self.graph, index)
@@ -67,13 +74,10 @@ def structure_of(model: Model, budget: Budget) -> Structure:
     nodes = graph.include(model.dynamics, slots)
     outputs = [nodes[output] for output in model.dynamics.outputs]
     first = len(slots) - q
-    by_state = _derivatives(graph, outputs, range(1, n + 1), budget)
-    by_disturbance = _derivatives(graph, outputs, range(first, first + q), budget)
-    varying = sorted(entry for entry, node in by_state.items() if graph.masks[node])
-    moving = sorted(entry for entry, node in by_disturbance.items() if graph.masks[node])
+    states = _entries(graph, outputs, range(1, n + 1), budget)
     return Structure(
-        graph=graph, outputs=outputs, state_nodes=by_state, disturbance_nodes=by_disturbance, varying=varying,
-        moving=moving, fixed=_values(graph, by_state), held=_values(graph, by_disturbance),
+        graph=graph, outputs=outputs, states=states,
+        disturbances=_entries(graph, outputs, range(first, first + q), budget),
     )  # fmt: skip
 
 
@@ -89,7 +93,7 @@ def _deciding(graph: Graph, index: int) -> int:
     return graph.masks[index] if op in JUMPS or is_partial(op) else 0
 
 
-def _derivatives(graph: Graph, outputs: list[int], slots: range, budget: Budget) -> dict[tuple[int, int], int]:
+def _entries(graph: Graph, outputs: list[int], slots: range, budget: Budget) -> Entries:
     found = {}
     for i, output in enumerate(outputs):
         for j, slot in enumerate(slots):
@@ -98,7 +102,8 @@ def _derivatives(graph: Graph, outputs: list[int], slots: range, budget: Budget)
                 node = graph.derivative(output, slot)
                 if not graph.is_const(node, 0.0):
                     found[i, j] = node
-    return found
+    varying = sorted(entry for entry, node in found.items() if graph.masks[node])
+    return Entries(shape=(len(outputs), len(slots)), nodes=found, varying=varying, fixed=_values(graph, found))
 
 
 def _values(graph: Graph, nodes: dict[tuple[int, int], int]) -> dict[tuple[int, int], arb]:

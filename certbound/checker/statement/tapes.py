@@ -11,16 +11,11 @@ from certbound.checker.reading import entries as listed
 from certbound.errors import CertificateError
 from certbound.problem.model import Node, Tape
 
-__all__ = ["canonical", "read_tape"]
-
 
 def read_tape(value: object, path: str, inputs: tuple[str, ...], shape: tuple[int, ...]) -> Tape:
     """A tape over the given inputs: {"nodes": [[op, ...arguments]], "outputs": [...]}.
 
-    Raises
-    ------
-    CertificateError
-        If it is no straight-line program over known operations, or has another number of outputs.
+    CertificateError where it is no straight-line program over known operations, or has another number of outputs.
     """
     record = Record(value, path, ("nodes", "outputs"))
     nodes = []

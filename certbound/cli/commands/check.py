@@ -12,14 +12,12 @@ import typer
 from certbound.cli.describe import attributes
 from certbound.cli.messages import InputError
 from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, examples, load_problem, option
-from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.errors import CertificateError, EngineError, contained
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.safety.verification import Verdict
-
-__all__ = ["EXAMPLES", "check", "proved_certificate"]
 
 EXAMPLES = examples(
     "certbound check unicycle.json --problem unicycle",
@@ -66,10 +64,7 @@ def check(
         "outcome": report.outcome,
         "assumptions": list(report.assumptions),
     }
-    if as_json:
-        print_json(result)
-    else:
-        _print(result)
+    show(result, as_json, lambda: _print(result))
     raise typer.Exit(0 if report.valid else 1)
 
 
@@ -90,12 +85,8 @@ def proved_certificate(problem: Problem, verdict: Verdict) -> str:
     """The text of a verdict's certificate, which the checker has proved again; it claims what was proved.
 
     Assumptions of the verdict are assumptions of the certificate, which names them. Where the checker proves no
-    certificate of one engine, at any effort, the other engines' are tried.
-
-    Raises
-    ------
-    CertificateError
-        If the verdict bounds no probability, or the checker did not prove what was written.
+    certificate of one engine, at any effort, the other engines' are tried. CertificateError where the verdict bounds no
+    probability, or the checker did not prove what was written.
     """
     left, reasons = dict(verdict.answers), list[str]()
     while left:
@@ -118,10 +109,7 @@ def proved_certificate(problem: Problem, verdict: Verdict) -> str:
 def _proved(problem: Problem, verdict: Verdict) -> tuple[str | None, str, str]:
     """A certificate that the checker has proved (None: it proved none), its engine, and what stood in the way.
 
-    Raises
-    ------
-    EngineError
-        If no certificate could be written.
+    EngineError where no certificate could be written.
     """
     from certbound.checker import check_data, parse
     from certbound.safety.certificate import problem_data, restated

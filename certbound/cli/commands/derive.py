@@ -13,7 +13,7 @@ from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
 from certbound.cli.describe import describe_constants
 from certbound.cli.messages import computing
 from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, examples, load_problem
-from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.display import log10_text, name_text
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
 
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from certbound.problem.problem import Problem
     from certbound.tubes.constants import Constants
-
-__all__ = ["EXAMPLES", "derive"]
 
 EXAMPLES = examples("certbound derive chain --json", "certbound derive unicycle --time-limit 20")
 _log = logging.getLogger(__name__)
@@ -52,10 +50,7 @@ def derive(
         ],
         "seconds": seconds,
     }
-    if as_json:
-        print_json(result)
-    else:
-        _print(constants, result)
+    show(result, as_json, lambda: _print(constants, result))
 
 
 def _bound(subject: Problem, clock: Clock) -> tuple[Constants, list[Constants], str]:

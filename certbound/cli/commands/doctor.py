@@ -13,9 +13,7 @@ import typer
 
 from certbound.cli.messages import FAILED
 from certbound.cli.options import JsonOption, examples
-from certbound.cli.output import SETTINGS, console, print_json, spinner
-
-__all__ = ["EXAMPLES", "doctor"]
+from certbound.cli.output import SETTINGS, console, show, spinner
 
 EXAMPLES = examples("certbound doctor", "certbound doctor --json")
 EXTRAS = {"cluster": ["dask", "distributed"], "learn": ["sklearn"]}
@@ -25,12 +23,7 @@ def doctor(as_json: JsonOption = False) -> None:
     """Check Python, every dependency, the rigorous arithmetic, a solver, and one whole verdict."""
     checks: list[tuple[str, Callable[[], str]]] = [("python", _python)]
     checks += [(name, _version_of(name)) for name in _requirements()]
-    checks += [
-        ("rounding", _rounding),
-        ("ball arithmetic", _balls),
-        ("tracing", _tracing),
-        ("solver", _solver),
-    ]
+    checks += [("rounding", _rounding), ("ball arithmetic", _balls), ("tracing", _tracing), ("solver", _solver)]
     checks += [("verdict", _verdict)]
     rows = []
     with spinner("checking the installation"):
@@ -43,10 +36,7 @@ def doctor(as_json: JsonOption = False) -> None:
             seconds = round(time.perf_counter() - started, 3)
             rows.append({"name": name, "ok": passed, "detail": detail, "seconds": seconds})
     healthy = all(row["ok"] for row in rows)
-    if as_json:
-        print_json({"ok": healthy, "checks": rows, "extras": _extras()})
-    else:
-        _print(rows, healthy)
+    show({"ok": healthy, "checks": rows, "extras": _extras()}, as_json, lambda: _print(rows, healthy))
     raise typer.Exit(0 if healthy else FAILED)
 
 

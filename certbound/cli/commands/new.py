@@ -10,9 +10,7 @@ import typer
 
 from certbound.cli.messages import InputError
 from certbound.cli.options import JsonOption, check_writable, examples
-from certbound.cli.output import SETTINGS, console, print_json, write_file
-
-__all__ = ["EXAMPLES", "TEMPLATE", "new"]
+from certbound.cli.output import SETTINGS, console, show, write_file
 
 EXAMPLES = examples("certbound new my_system && certbound verify my_system.toml")
 TEMPLATE = """\
@@ -69,8 +67,5 @@ def new(
         raise InputError(f"`{path}` exists already", "choose another name, or remove the file first")
     check_writable(path)
     write_file(path, TEMPLATE.format(name=path.stem.replace("_", " "), file=path))
-    if as_json:
-        print_json({"path": str(path)})
-    else:
-        following = "" if SETTINGS.quiet else f"\nnext: edit it, then run  certbound verify {path}"
-        console().print(f"wrote {path}{following}", markup=False)
+    following = "" if SETTINGS.quiet else f"\nnext: edit it, then run  certbound verify {path}"
+    show({"path": str(path)}, as_json, lambda: console().print(f"wrote {path}{following}", markup=False))

@@ -6,9 +6,7 @@ import inspect
 from typing import Any
 
 from certbound.cli.options import JsonOption, examples
-from certbound.cli.output import SETTINGS, console, print_json
-
-__all__ = ["EXAMPLES", "problems"]
+from certbound.cli.output import SETTINGS, console, show
 
 EXAMPLES = examples("certbound problems", "certbound problems --quiet")
 
@@ -16,11 +14,12 @@ EXAMPLES = examples("certbound problems", "certbound problems --quiet")
 def problems(as_json: JsonOption = False) -> None:
     """List the bundled problems with their parameters."""
     rows = _rows()
-    if as_json:
-        print_json({"problems": rows})
-        return
+    show({"problems": rows}, as_json, lambda: _print(rows))
+
+
+def _print(rows: list[dict[str, Any]]) -> None:
     if SETTINGS.quiet:
-        print_names(rows)
+        console().print("\n".join(row["name"] for row in rows))
         return
     from rich.table import Table
 
@@ -33,23 +32,14 @@ def problems(as_json: JsonOption = False) -> None:
     console().print(table)
 
 
-def print_names(rows: list[dict[str, Any]]) -> None:
-    """One name a line."""
-    console().print("\n".join(row["name"] for row in rows))
-
-
 def _rows() -> list[dict[str, Any]]:
     from certbound.problem.library import DEFAULTS, MODELS
 
+    texts = {name: inspect.getdoc(builder) or "" for name, builder in MODELS.items()}
     return [
-        {"name": name, "summary": _summary(builder), "parameters": dict(DEFAULTS[name])}
-        for name, builder in MODELS.items()
+        {"name": name, "summary": text.partition("\n")[0], "parameters": dict(DEFAULTS[name])}
+        for name, text in texts.items()
     ]
-
-
-def _summary(builder: Any) -> str:
-    lines = (inspect.getdoc(builder) or "").strip().splitlines()
-    return lines[0] if lines else ""
 
 
 def _short(value: Any) -> str:

@@ -28,14 +28,12 @@ from certbound.cli.options import (
     number,
     option,
 )
-from certbound.cli.output import SETTINGS, animated, console, print_json
+from certbound.cli.output import SETTINGS, animated, console, show
 from certbound.display import one_line, rounded
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.simulation.executors import Progress
-
-__all__ = ["EXAMPLES", "simulate"]
 
 EXAMPLES = examples(
     "certbound simulate ou --paths 1e6 --seed 1",
@@ -91,10 +89,7 @@ def simulate(
     if claim is not None:
         contradicted = result["lower"] > 10.0**claim
         result["against"] = {"certificate": str(against), "log10_delta": claim, "contradicted": contradicted}
-    if as_json:
-        print_json(result)
-    else:
-        _print(result)
+    show(result, as_json, lambda: _print(result))
     raise typer.Exit(1 if claim is not None and result["against"]["contradicted"] else 0)
 
 

@@ -26,15 +26,13 @@ from certbound.cli.options import (
     number,
     option,
 )
-from certbound.cli.output import SETTINGS, console, print_json, print_status, spinner, write_file
+from certbound.cli.output import SETTINGS, console, print_status, show, spinner, write_file
 from certbound.cli.pictures import check_picture, scene_of, write_picture
 from certbound.display import log10_text, name_text, one_line, plain
 
 if TYPE_CHECKING:
     from certbound.synthesis.controllers import ClosedLoop
     from certbound.synthesis.plans import Synthesis
-
-__all__ = ["EXAMPLES", "synthesize"]
 
 EXAMPLES = examples("certbound synthesize chain --closed-loop 3000 --plan plan.json")
 RUNS = (
@@ -96,10 +94,7 @@ def synthesize(
     if plot is not None:
         _draw(result, plot)
     answer = _answer(result, runs)
-    if as_json:
-        print_json(answer)
-    else:
-        _print(result, answer)
+    show(answer, as_json, lambda: _print(result, answer))
     raise typer.Exit(0 if result.feasible and result.status == "SAFE" else 1)
 
 

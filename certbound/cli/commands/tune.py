@@ -25,7 +25,7 @@ from certbound.cli.options import (
     examples,
     load_problem,
 )
-from certbound.cli.output import SETTINGS, console, print_json, spinner
+from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.cli.pictures import check_picture, sampled, write_picture
 from certbound.display import name_text
 from certbound.errors import SolverError
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.tubes.constants import Constants
     from certbound.tubes.tube import Tube
-
-__all__ = ["EXAMPLES", "tune"]
 
 SAMPLES = 513
 EXAMPLES = examples(
@@ -78,10 +76,8 @@ def tune(
     best = min(valid, key=lambda row: row["maximum"])["method"]
     if plot is not None:
         _draw(subject, tubes, best, plot)
-    if as_json:
-        print_json({"method": best, "rows": rows})
-    else:
-        _print(best, rows, "" if constants.metric is None else " (radii in the norm of the certified metric)")
+    norm = "" if constants.metric is None else " (radii in the norm of the certified metric)"
+    show({"method": best, "rows": rows}, as_json, lambda: _print(best, rows, norm))
 
 
 def _draw(problem: Problem, tubes: dict[str, Tube], best: str, path: Path) -> None:
@@ -136,8 +132,8 @@ def _print(best: str, rows: list[dict[str, Any]], norm: str) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
-    table.add_column("method")
-    table.add_column("level")
+    for heading in ("method", "level"):
+        table.add_column(heading)
     for heading in ("largest", "final", "mean"):
         table.add_column(heading, justify="right")
     table.add_column("parameters", overflow="fold")

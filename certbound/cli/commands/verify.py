@@ -29,7 +29,7 @@ from certbound.cli.options import (
     load_problem,
     option,
 )
-from certbound.cli.output import SETTINGS, console, print_json, print_status, spinner, write_file
+from certbound.cli.output import SETTINGS, console, print_status, show, spinner, write_file
 from certbound.cli.pictures import check_picture, scene_of, write_picture
 from certbound.display import at_least_text, log10_text, name_text, one_line, rounded
 from certbound.errors import CertificateError, EngineError, contained
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.safety.answers import EngineAnswer
     from certbound.safety.verification import Verdict
-
-__all__ = ["EXAMPLES", "verify"]
 
 EXAMPLES = examples(
     "certbound verify unicycle --horizon 2 --plot tube.png",
@@ -102,8 +100,7 @@ def verify(
     if certificate is not None:
         proof, result["certificate"] = _certify(subject, verdict, certificate)
     _write(subject, verdict, proof, report=report, plot=plot)
-    if as_json:
-        print_json(result)
+    show(result, as_json, lambda: None)
     raise typer.Exit(0 if verdict.status == "SAFE" else 1)
 
 

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from certbound.rigor.intervals import Interval
 
-__all__ = ["Supremum", "bound_supremum", "random_points", "split_boxes"]
-
 Array = NDArray[np.float64]
 
 ROUND = 2048
@@ -24,22 +22,9 @@ FEWEST = 64
 class Supremum:
     """Result of a branch and bound.
 
-    Parameters
-    ----------
-    upper : float
-        Certified: no value over the box exceeds it.
-    sampled : float
-        Largest value that was found (floating point).
-    point : ndarray, shape (k,)
-        Where.
-    boxes : int
-        Boxes evaluated.
-    worst : Interval, shape (k,)
-        A box on which the upper bound is attained, to explain it.
-    settled : float
-        Bound over all boxes that need no further splitting.
-    rest : Interval, shape (N, k)
-        Boxes that could be split further, to go on from.
+    No value over the box exceeds ``upper``; the largest one that was found, in floating point, is ``sampled``, at
+    ``point``; ``boxes`` were evaluated; ``worst`` is one on which the upper bound is attained, to explain it. To go on
+    from: ``rest``, shape (N, k), are boxes that could be split further, ``settled`` bounds all the others.
     """
 
     upper: float
@@ -64,28 +49,16 @@ def bound_supremum(
 ) -> Supremum:
     """Bound sup value over a box, best boxes first.
 
-    Proves: value(z) <= result.upper for every z in the box, provided that ``bound`` is rigorous: the upper
-    bounds of all boxes that are not split any further are kept.
+    Proves: value(z) <= result.upper for every z in the box, provided that ``bound`` is rigorous: the upper bounds of
+    all boxes that are not split any further are kept.
 
-    Parameters
-    ----------
-    bound : callable
-        Boxes (N, k) and a threshold, to rigorous upper bounds (N,), which need not be sharp below the
-        threshold, and to the coordinates' weights (N, k), the largest of which says what to halve next.
-    value : callable
-        Points (N, k) to values (N,) in floating point; NaN where undefined.
-    box : Interval, shape (k,)
-        Infinite ends are legal.
-    tolerance : float
-        Stop once upper - sampled is at most this.
-    budget : int
-        Stop after about so many boxes; the result is certified all the same.
-    ceiling : float
-        An upper bound known beforehand.
-    starts : Interval, shape (N, k), optional
-        Boxes that together hold the supremum; the box itself when omitted.
-    earlier : Supremum, optional
-        A search of the same supremum that ran out of its budget, to go on from.
+    ``bound`` takes boxes (N, k) and a threshold to rigorous upper bounds (N,), which need not be sharp below the
+    threshold, and to the coordinates' weights (N, k), the largest of which says what to halve next; ``value`` takes
+    points (N, k) to values (N,) in floating point, NaN where undefined. Infinite ends of the box are legal.
+
+    The search stops once upper - sampled is at most ``tolerance``, or after about ``budget`` boxes. ``ceiling`` is an
+    upper bound known beforehand, ``starts`` boxes that together hold the supremum, ``earlier`` a search of the same
+    supremum that ran out of its budget, to go on from.
     """
     if not tolerance > 0:
         raise ValueError(f"`tolerance` must be positive, got {tolerance}.")

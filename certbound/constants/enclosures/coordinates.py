@@ -17,11 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.rigor.definite import eigenvalue_upper, perron_upper
+from certbound.rigor.definite import eigenvalue_upper, finite_part, perron_upper
 from certbound.rigor.intervals import Interval, matmul
 from certbound.rigor.rounding import TINY, lower, product_error, quiet, upper
-
-__all__ = ["Metric", "Spread"]
 
 Array = NDArray[np.float64]
 
@@ -34,19 +32,9 @@ class Spread(NamedTuple):
 
 
 class Metric:
-    """A norm sqrt(x^T P x) and the bounds in it.
+    """A norm sqrt(x^T P x) and the bounds in it; P = ``matrix``, shape (n, n), the identity when omitted.
 
-    Parameters
-    ----------
-    matrix : array_like, shape (n, n), optional
-        P, symmetric positive definite; the identity when omitted.
-    dimension : int
-        n.
-
-    Raises
-    ------
-    ValueError
-        If P is not square of order n, not finite, not symmetric or not positive definite.
+    Raises ------ ValueError If P is not square of order n, not finite, not symmetric or not positive definite.
     """
 
     def __init__(self, matrix: ArrayLike | None, dimension: int) -> None:
@@ -92,26 +80,15 @@ class Metric:
 
     @quiet
     def measure(self, jacobians: Interval, spread: Spread | None = None) -> Array:
-        """Upper bounds of mu_P(J) over batches of Jacobians.
+        """Upper bounds of mu_P(J) over batches of Jacobians (N, n, n), with linear terms ``spread`` around them.
 
-        Proves: J^T P + P J <= 2 c P for every J in the member of the batch.
-
-        Parameters
-        ----------
-        jacobians : Interval, shape (N, n, n)
-        spread : Spread, optional
-            Linear terms around them.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            +inf where the Jacobian is unbounded.
+        Proves: J^T P + P J <= 2 c P for every J in the member of the batch; +inf where the Jacobian is unbounded.
         """
         if self.matrix is None:  # symmetrise first: it cancels skew parts exactly
             jacobians = _half_sum(jacobians)
             if spread is None:
                 return eigenvalue_upper(jacobians)
-        centre, finite = _bounded(jacobians)
+        centre, finite = finite_part(jacobians)
         m = self.transform(centre.mid)
         vectors = np.linalg.eigh(_tame(m / 2 + np.swapaxes(m, -1, -2) / 2))[1]
         right = self.frame @ vectors if self.matrix is not None else vectors
@@ -136,7 +113,7 @@ class Metric:
 
         Proves: J^T P J <= L^2 P for every J in the member of the batch. Parameters and result as `measure`.
         """
-        centre, finite = _bounded(jacobians)
+        centre, finite = finite_part(jacobians)
         u, _, vt = np.linalg.svd(_tame(self.transform(centre.mid)))
         first, right = self.frame @ u, self.frame @ np.swapaxes(vt, -1, -2)
         left, right_covector = self._covector(first), self._covector(right)
@@ -168,8 +145,7 @@ class Metric:
         """Upper bounds of |B^T P B - I| in the spectral norm."""
         gram = (matmul(covector, vectors) - np.eye(self.dimension)).mag
         gamma, _ = product_error(self.dimension)
-        result: Array = np.max(upper(np.sum(gram, axis=-1) * (1 + gamma)), axis=-1)
-        return result
+        return np.asarray(np.max(upper(np.sum(gram, axis=-1) * (1 + gamma)), axis=-1))
 
 
 def _half_sum(x: Interval) -> Interval:
@@ -181,13 +157,6 @@ def _half_sum(x: Interval) -> Interval:
     index = np.arange(x.shape[-1])
     lo[..., index, index], hi[..., index, index] = x.lo[..., index, index], x.hi[..., index, index]
     return Interval._raw(lo, hi)
-
-
-def _bounded(x: Interval) -> tuple[Interval, NDArray[np.bool_]]:
-    """Matrices with unbounded ones replaced by 0, and the mask of the bounded ones."""
-    finite = np.asarray(np.isfinite(x.lo).all(axis=(-1, -2)) & np.isfinite(x.hi).all(axis=(-1, -2)))
-    keep = finite[..., None, None]
-    return Interval._raw(np.where(keep, x.lo, 0.0), np.where(keep, x.hi, 0.0)), finite
 
 
 def _tame(matrices: Array) -> Array:
@@ -206,7 +175,7 @@ def _tame(matrices: Array) -> Array:
 
 
 def _bounded_spread(spread: Spread) -> tuple[Interval, Array, NDArray[np.bool_]]:
-    slopes, finite = _bounded(spread.slopes)
+    slopes, finite = finite_part(spread.slopes)
     usable = np.isfinite(spread.reach)
     return slopes, np.where(usable, spread.reach, 0.0), np.asarray((finite & usable).all(axis=-1))
 

@@ -18,8 +18,6 @@ from certbound.errors import EnclosureError
 from certbound.problem.model import OPERATIONS, Node, Tape, enclosed, undefined_where
 from certbound.rigor.intervals import Interval
 
-__all__ = ["enclose"]
-
 Mask = NDArray[np.bool_]
 CHUNK = 8192
 """Boxes evaluated at a time: the intermediate results stay in the processor's cache."""
@@ -35,29 +33,11 @@ class Refusal(NamedTuple):
 def enclose(tape: Tape, inputs: Sequence[Interval], *, undefined: Literal["raise", "infinite"] = "raise") -> Interval:
     """Enclose the range of a traced function over boxes.
 
-    Proves: the result contains f(z) for every z with z_i in inputs[i], member by member of the batch.
-
-    Parameters
-    ----------
-    tape : Tape
-        The function, or a Jacobian (whose nodes include those of the function, so that its jumps are seen).
-    inputs : sequence of Interval
-        One per input slot, shapes broadcastable to a common batch shape.
-    undefined : {"raise", "infinite"}
-        What to do where the function is undefined or jumps: raise, or return [-inf, inf] in all outputs of
-        that member.
-
-    Returns
-    -------
-    Interval, shape (*batch, *tape.shape)
-
-    Raises
-    ------
-    EnclosureError
-        Undefined or jumping somewhere, and ``undefined="raise"``; the message names the expression and the
-        box.
-    ValueError
-        If the number of inputs is wrong.
+    Proves: the result, of shape (*batch, *tape.shape), contains f(z) for every z with z_i in inputs[i], one interval
+    per input slot, broadcast to a common batch shape, member by member of the batch. The tape may be a Jacobian, whose
+    nodes include those of the function, so that its jumps are seen. Where the function is undefined or jumps,
+    ``undefined`` says what to do: "raise" an EnclosureError that names the expression and the box, or return [-inf,
+    inf] in all outputs of that member ("infinite").
 
     Examples
     --------

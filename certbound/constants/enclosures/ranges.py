@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.constants.enclosures.enclosure import enclose
-from certbound.problem.model import Node, Tape
+from certbound.problem.model import Graph, Node, Tape
 from certbound.rigor.intervals import Interval
-
-__all__ = ["bound_ranges", "extract"]
 
 Array = NDArray[np.float64]
 
@@ -32,23 +30,10 @@ def bound_ranges(
     tolerance: float = 1e-3,
     boxes: int = _BOXES,
 ) -> list[tuple[float, float]]:
-    """Enclosures of the ranges of some nodes.
+    """Enclosures of the ranges of some nodes, over a box of one scalar interval per input slot.
 
-    Parameters
-    ----------
-    tape : Tape
-    nodes : sequence of int
-        Indices of nodes.
-    inputs : sequence of scalar Interval
-        The box, one interval per input slot.
-    tolerance : float
-        Bisection stops once an outer end is within this share of the range's size from a sampled value.
-    boxes : int
-        Limit on the boxes evaluated per end.
-
-    Returns
-    -------
-    list of (float, float)
+    Bisection stops once an outer end is within ``tolerance``, as a share of the range's size, from a sampled value, or
+    after so many ``boxes`` per end.
     """
     if not nodes:
         return []
@@ -69,22 +54,7 @@ def bound_ranges(
 
 def extract(tape: Tape, node: int) -> Tape:
     """The scalar function that a node computes, as a tape of its own over the same inputs."""
-    needed: set[int] = set()
-    stack = [node]
-    while stack:
-        index = stack.pop()
-        if index not in needed:
-            needed.add(index)
-            if tape.nodes[index].op != "input":
-                stack.extend(tape.nodes[index].args)
-    order = sorted(needed)
-    place = {index: position for position, index in enumerate(order)}
-    kept = []
-    for index in order:
-        old = tape.nodes[index]
-        args = old.args if old.op == "input" else tuple(place[arg] for arg in old.args)
-        kept.append(Node(old.op, args, old.value))
-    return Tape(inputs=tape.inputs, nodes=tuple(kept), outputs=(place[node],), shape=(1,))
+    return Graph.starting_with(tape).tape([node], (1,))
 
 
 def _negated(tape: Tape) -> Tape:

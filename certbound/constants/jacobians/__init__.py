@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from certbound.constants.jacobians.affine import AffineForm, AffineSet, SectorSet
-from certbound.constants.jacobians.arguments import frozen, square_matrix
+from certbound.constants.jacobians.arguments import square_matrix
 from certbound.constants.jacobians.jacobian_sets import IntervalMatrixSet, JacobianSet, UnionSet, VertexPolytope, as_set
 from certbound.constants.jacobians.measures import diagonal_weights, induced_norm, matrix_measure
-from certbound.constants.jacobians.structure import affine_set, jacobian_set
+from certbound.constants.jacobians.structure import affine_set
 
 __all__ = [
     "affine_set",
@@ -14,10 +14,8 @@ __all__ = [
     "AffineSet",
     "as_set",
     "diagonal_weights",
-    "frozen",
     "induced_norm",
     "IntervalMatrixSet",
-    "jacobian_set",
     "JacobianSet",
     "matrix_measure",
     "SectorSet",

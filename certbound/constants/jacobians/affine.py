@@ -7,19 +7,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.checks import assign, frozen
 from certbound.constants.jacobians.arguments import (
     UNIT,
     factor,
     finite_array,
-    frozen,
     is_near,
     matrix_batch,
     metric_roots,
     parameter_range,
     square_matrix,
 )
-
-__all__ = ["AffineForm", "AffineSet", "SectorSet"]
 
 Array = NDArray[np.float64]
 
@@ -64,8 +62,7 @@ class AffineSet:
         slack = np.zeros((n, n)) if self.slack is None else square_matrix("slack", self.slack)
         if slack.shape != center.shape or np.any(slack < 0):
             raise ValueError(f"`slack` must be a non-negative {n} x {n} matrix, got shape {slack.shape}.")
-        for name, value in (("J0", center), ("M", terms), ("box", box), ("error", slack)):
-            object.__setattr__(self, name, frozen(value))
+        assign(self, J0=frozen(center), M=frozen(terms), box=frozen(box), error=frozen(slack))
 
     @property
     def dimension(self) -> int:
@@ -217,10 +214,7 @@ class SectorSet(AffineForm):
             raise ValueError("`groups` must join entries of equal range only.")
         terms = np.einsum("gk,ik,kj->gij", member, b, c)
         affine = AffineSet(center=a, terms=terms, low=box[0, first], high=box[1, first], slack=self.slack)
-        for name, value in (("left", b), ("right", c)):
-            object.__setattr__(self, name, frozen(value))
-        object.__setattr__(self, "groups", groups)
-        object.__setattr__(self, "affine", affine)
+        assign(self, left=frozen(b), right=frozen(c), groups=groups, affine=affine)
 
     @property
     def box(self) -> Array:

@@ -5,17 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "factor",
-    "finite_array",
-    "frozen",
-    "is_near",
-    "matrix_batch",
-    "metric_roots",
-    "parameter_range",
-    "square_matrix",
-]
-
 Array = NDArray[np.float64]
 
 UNIT = float(np.finfo(float).eps)
@@ -103,9 +92,3 @@ def matrix_batch(matrices: ArrayLike, dimension: int) -> Array:
     if batch.ndim < 2 or batch.shape[-2:] != (dimension, dimension):
         raise ValueError(f"matrices must have shape (..., {dimension}, {dimension}), got {batch.shape}.")
     return batch
-
-
-def frozen(array: Array) -> Array:
-    array = np.array(array, dtype=float)
-    array.setflags(write=False)
-    return array

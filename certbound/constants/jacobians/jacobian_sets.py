@@ -16,17 +16,15 @@ from typing import Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.checks import frozen
 from certbound.constants.jacobians.affine import AffineForm, AffineSet
 from certbound.constants.jacobians.arguments import (
     finite_array,
-    frozen,
     is_near,
     matrix_batch,
     metric_roots,
     square_matrix,
 )
-
-__all__ = ["IntervalMatrixSet", "JacobianSet", "UnionSet", "VertexPolytope", "as_set"]
 
 Array = NDArray[np.float64]
 
@@ -38,32 +36,25 @@ class JacobianSet(Protocol):
     @property
     def dimension(self) -> int:
         """State dimension n."""
-        ...
 
     @property
     def vertex_count(self) -> int:
         """Number of matrices that ``vertices`` returns."""
-        ...
 
     def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> NDArray[np.bool_]:
         """Whether each matrix of a batch (..., n, n) lies in the set, up to ``tolerance`` entrywise."""
-        ...
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """``count`` random members, shape (count, n, n)."""
-        ...
 
     def support(self, directions: ArrayLike) -> Array:
         """Largest sum(direction * J) over the set, for a batch of directions (..., n, n)."""
-        ...
 
     def vertices(self) -> Array:
         """Matrices (v, n, n) whose convex hull is the set (``slack`` left out)."""
-        ...
 
     def in_metric(self, metric: ArrayLike) -> Self:
         """The set of P^{1/2} J P^{-1/2}: the same Jacobians in coordinates where the P-norm is Euclidean."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

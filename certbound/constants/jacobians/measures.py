@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.constants.jacobians.arguments import finite_array, metric_roots
 from certbound.constants.jacobians.jacobian_sets import JacobianSet, as_set
 
-__all__ = ["diagonal_weights", "induced_norm", "matrix_measure"]
-
 Array = NDArray[np.float64]
 Order = Literal[1, 2] | float
 

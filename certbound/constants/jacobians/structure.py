@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +21,8 @@ from numpy.typing import NDArray
 from certbound.constants.enclosures import bound_ranges, enclose
 from certbound.constants.jacobians.affine import AffineSet
 from certbound.errors import EnclosureError
-from certbound.problem.model import Node, Tape, jacobian
-from certbound.problem.problem import Problem
-from certbound.problem.sets import Box
-from certbound.problem.systems import System
+from certbound.problem.model import Node, Tape
 from certbound.rigor.intervals import Interval
-
-__all__ = ["affine_set", "domain_inputs", "jacobian_set"]
 
 Array = NDArray[np.float64]
 
@@ -57,79 +51,12 @@ class _Form:
         return _Form().plus(self, factor) if factor else _Form()
 
 
-def jacobian_set(source: Problem | System, domain: Box | None = None, *, tolerance: float = 1e-3) -> AffineSet:
-    """The Jacobian D_x f of a model over a domain, as an affine set.
-
-    Proves: D_x f(t, x, u, d) lies in the set for every time, state of the domain, input and disturbance.
-
-    Parameters
-    ----------
-    source : Problem, ContinuousSystem or DiscreteSystem
-        A problem's closed loop, or a system over all inputs that it allows.
-    domain : Box, optional
-        States; the problem's domain, or all of R^n, when omitted.
-    tolerance : float
-        Wanted distance between a range and its sampled part, relative to the range's size.
-
-    Raises
-    ------
-    EnclosureError
-        If the Jacobian is unbounded, undefined or jumping on the domain.
-    """
-    system, tape = _system(source)
-    columns = [tape.inputs.index(name) for name in system.states]
-    return affine_set(jacobian(tape, columns), domain_inputs(source, domain), tolerance=tolerance)
-
-
-def domain_inputs(source: Problem | System, domain: Box | None = None) -> list[Interval]:
-    """Range of every input slot of a model's tape: time, states, inputs, disturbances."""
-    problem = source if isinstance(source, Problem) else None
-    system, tape = _system(source)
-    end = math.inf if problem is None else float(problem.horizon)
-    ranges: dict[str, tuple[float, float]] = {"t": (0.0, end)}
-    box = domain if domain is not None or problem is None else problem.domain
-    n = system.dimension
-    if box is not None and box.dimension != n:
-        raise ValueError(f"`domain` must have {n} coordinates, got {box.dimension}.")
-    low, high = (np.full(n, -np.inf), np.full(n, np.inf)) if box is None else (box.low, box.high)
-    ranges |= _named(system.states, low, high)
-    rows = None if problem is None else problem.input_sequence
-    if rows is not None:
-        ranges |= _named(system.input_names, rows.min(axis=0), rows.max(axis=0))
-    elif system.inputs is not None:
-        ranges |= _named(system.input_names, system.inputs.low, system.inputs.high)
-    if system.disturbance is not None:
-        ranges |= _named(system.disturbance_names, system.disturbance.low, system.disturbance.high)
-    return [Interval(np.array(ranges[name][0]), np.array(ranges[name][1])) for name in tape.inputs]
-
-
-def _system(source: Problem | System) -> tuple[System, Tape]:
-    if isinstance(source, Problem):
-        return source.system, source.closed_loop
-    return source, source.dynamics
-
-
-def _named(names: Sequence[str], low: Any, high: Any) -> dict[str, tuple[float, float]]:
-    return {name: (float(a), float(b)) for name, a, b in zip(names, low, high)}
-
-
 def affine_set(tape: Tape, inputs: Sequence[Interval], *, tolerance: float = 1e-3) -> AffineSet:
     """The values of a square matrix-valued tape over a box, as J0 + sum theta_k M_k with theta in a box.
 
-    Proves: the set contains the matrix at every point of the box.
-
-    Parameters
-    ----------
-    tape : Tape, shape (n, n)
-    inputs : sequence of scalar Interval
-        One per slot; infinite ends are allowed.
-    tolerance : float
-        As for ``jacobian_set``.
-
-    Raises
-    ------
-    EnclosureError
-        If a parameter has no finite range.
+    Proves: the set contains the matrix at every point of the box, of one scalar interval per slot (infinite ends are
+    allowed). ``tolerance`` is the wanted distance between a range and its sampled part, relative to the range's size. A
+    parameter without a finite range is an EnclosureError.
     """
     if len(tape.shape) != 2 or tape.shape[0] != tape.shape[1]:
         raise ValueError(f"`tape` must be square, got shape {tape.shape}.")

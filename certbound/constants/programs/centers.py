@@ -19,10 +19,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from certbound.constants.jacobians import JacobianSet, frozen
+from certbound.checks import frozen
+from certbound.constants.jacobians import JacobianSet
 from certbound.constants.programs.sectors import Sector, contraction_value, lmi_blocks, transformed
-
-__all__ = ["Center", "center_metric", "center_multipliers", "lyapunov_metric", "reachable_value", "starting_metric"]
 
 Array = NDArray[np.float64]
 
@@ -126,20 +125,11 @@ def center_metric(
     tolerance: float = 1e-6,
     max_steps: int = 150,
 ) -> Center:
-    """P and diagonal multipliers that nearly minimise c or L^2 over the blocks.
+    """P and diagonal multipliers that nearly minimise c (continuous time) or L^2 (discrete time) over the blocks.
 
-    Parameters
-    ----------
-    blocks : sequence of ndarray or Sector
-    continuous : bool
-        The value is c (continuous time) or L^2 (discrete time).
-    lower : float
-        A known lower bound of the value (spectral), which lets the search stop.
-    tolerance : float
-        The search stops once the value is this close to ``lower``, or once the gains from one centre to the
-        next, extrapolated, have less than this to go.
-    max_steps : int
-        Limit on Newton steps.
+    The search stops once the value is within ``tolerance`` of ``lower``, a known (spectral) lower bound, or once the
+    gains from one centre to the next, extrapolated, have less than that to go; at the latest after ``max_steps`` Newton
+    steps.
     """
     root = np.asarray(np.linalg.cholesky(starting_metric(blocks, continuous=continuous)).T)
     inverse = np.asarray(np.linalg.inv(root), dtype=float)
@@ -148,7 +138,7 @@ def center_metric(
     P = np.eye(n) / 2
     multipliers = [_first_multipliers(block, P) for block in work]
     value = max(block.smallest_value(P, lam) for block, lam in zip(work, multipliers))
-    center = _descend(work, P, multipliers, value, lower, tolerance, max_steps, _Pairs(n))
+    center = _Centring(work, _Pairs(n), max_steps).descend(P, multipliers, value, lower, tolerance)
     return replace(center, metric=frozen(root.T @ center.metric @ root))
 
 
@@ -176,10 +166,8 @@ def starting_metric(blocks: Sequence[Array | Sector], *, continuous: bool) -> Ar
 def lyapunov_metric(matrix: Array, share: float, *, continuous: bool) -> Array:
     """P of largest eigenvalue 1 in which one Jacobian contracts, with a margin of ``share`` of its decay.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the equation is singular in floating point (a Jordan block on the stability limit, very unlike units).
+    numpy.linalg.LinAlgError where the equation is singular in floating point (a Jordan block on the stability limit,
+    very unlike units).
     """
     from scipy.linalg import LinAlgWarning, solve_continuous_lyapunov, solve_discrete_lyapunov
 
@@ -214,7 +202,7 @@ def center_multipliers(
     value = work.smallest_value(P, first)
     if not len(first):
         return Center(metric=frozen(P), multipliers=(frozen(first),), value=value, steps=0)
-    return _descend([work], P, [first], value, -np.inf, tolerance, max_steps, None)
+    return _Centring([work], None, max_steps).descend(P, [first], value, -np.inf, tolerance)
 
 
 def reachable_value(metric: Array, jacobians: JacobianSet, *, continuous: bool) -> float:
@@ -235,147 +223,125 @@ def _first_multipliers(block: _Block, P: Array) -> Array:
     return np.full(block.k, 2 * float(size) + 1e-6)
 
 
-def _descend(
-    blocks: Sequence[_Block],
-    P: Array,
-    multipliers: list[Array],
-    value: float,
-    lower: float,
-    tolerance: float,
-    max_steps: int,
-    pairs: _Pairs | None,
-) -> Center:
-    """Shrink the target towards the value reached, and centre again, until it no longer pays."""
-    best = P, multipliers, value
-    steps, target, before, last = 0, value + max(1e-3, 0.1 * abs(value)), np.inf, np.inf
-    while steps < max_steps:
-        P, multipliers, used = _recenter(blocks, P, multipliers, target, max_steps - steps, pairs)
-        steps += used
-        reached = max(block.smallest_value(P, lam) for block, lam in zip(blocks, multipliers))
-        if reached < best[2]:
-            best = P, multipliers, reached
-        gain = before - reached
-        # gains shrink geometrically: what is left to gain is about gain * ratio / (1 - ratio)
-        left = gain * gain / (last - gain) if 0 <= gain < last < np.inf else np.inf
-        if best[2] <= lower + tolerance or left <= tolerance or gain <= 1e-3 * tolerance:
-            break
-        before, last = reached, gain
-        target = reached + _SHRINK * (target - reached)
-    P, multipliers, value = best
-    frozen_multipliers = tuple(frozen(lam) for lam in multipliers)
-    return Center(metric=frozen(P), multipliers=frozen_multipliers, value=value, steps=steps)
+class _Centring:
+    """The method of centres over some inequalities; without ``pairs`` P is fixed, and the multipliers are sought."""
 
+    def __init__(self, blocks: Sequence[_Block], pairs: _Pairs | None, max_steps: int) -> None:
+        self.blocks, self.pairs, self.max_steps = blocks, pairs, max_steps
 
-def _recenter(
-    blocks: Sequence[_Block],
-    P: Array,
-    multipliers: list[Array],
-    value: float,
-    budget: int,
-    pairs: _Pairs | None,
-) -> tuple[Array, list[Array], int]:
-    """Damped Newton steps to the analytic centre of {F > 0, floor < P < I} at a fixed value."""
-    from scipy.linalg import cho_factor, cho_solve
+    def descend(self, P: Array, multipliers: list[Array], value: float, lower: float, tolerance: float) -> Center:
+        """Shrink the target towards the value reached, and centre again, until it no longer pays."""
+        best = P, multipliers, value
+        steps, target, before, last = 0, value + max(1e-3, 0.1 * abs(value)), np.inf, np.inf
+        while steps < self.max_steps:
+            P, multipliers, used = self._recenter(P, multipliers, target, self.max_steps - steps)
+            steps += used
+            reached = max(block.smallest_value(P, lam) for block, lam in zip(self.blocks, multipliers))
+            if reached < best[2]:
+                best = P, multipliers, reached
+            gain = before - reached
+            # gains shrink geometrically: what is left to gain is about gain * ratio / (1 - ratio)
+            left = gain * gain / (last - gain) if 0 <= gain < last < np.inf else np.inf
+            if best[2] <= lower + tolerance or left <= tolerance or gain <= 1e-3 * tolerance:
+                break
+            before, last = reached, gain
+            target = reached + _SHRINK * (target - reached)
+        P, multipliers, value = best
+        return Center(
+            metric=frozen(P), multipliers=tuple(frozen(lam) for lam in multipliers), value=value, steps=steps
+        )
 
-    for step in range(1, min(budget, 30) + 1):
-        try:
-            gradient, hessian = _derivatives(blocks, P, multipliers, value, pairs)
-            direction = -cho_solve(cho_factor(hessian + 1e-14 * np.diag(np.diag(hessian))), gradient)
-        except np.linalg.LinAlgError:
-            return P, multipliers, step
-        decrement = float(np.sqrt(max(-float(gradient @ direction), 0.0)))
-        length = 1.0 if decrement < 0.25 else 1 / (1 + decrement)
-        if decrement >= 0.25:  # a longer step where it stays feasible and descends
-            length = _search(blocks, P, multipliers, value, pairs, direction, length, gradient)
-        P, multipliers = _moved(P, multipliers, pairs, direction, length)
-        if decrement < 0.1:
-            return P, multipliers, step
-    return P, multipliers, step
+    def _recenter(
+        self, P: Array, multipliers: list[Array], value: float, budget: int
+    ) -> tuple[Array, list[Array], int]:
+        """Damped Newton steps to the analytic centre of {F > 0, floor < P < I} at a fixed value."""
+        from scipy.linalg import cho_factor, cho_solve
 
+        for step in range(1, min(budget, 30) + 1):
+            try:
+                gradient, hessian = self._derivatives(P, multipliers, value)
+                direction = -cho_solve(cho_factor(hessian + 1e-14 * np.diag(np.diag(hessian))), gradient)
+            except np.linalg.LinAlgError:
+                return P, multipliers, step
+            decrement = float(np.sqrt(max(-float(gradient @ direction), 0.0)))
+            length = 1.0 if decrement < 0.25 else 1 / (1 + decrement)
+            if decrement >= 0.25:  # a longer step where it stays feasible and descends
+                length = self._search(P, multipliers, value, direction, length, float(gradient @ direction))
+            P, multipliers = self._moved(P, multipliers, direction, length)
+            if decrement < 0.1:
+                return P, multipliers, step
+        return P, multipliers, step
 
-def _moved(
-    P: Array, multipliers: list[Array], pairs: _Pairs | None, direction: Array, length: float
-) -> tuple[Array, list[Array]]:
-    offset = 0
-    if pairs is not None:
-        offset = pairs.size
-        P = P + length * pairs.matrix(direction[:offset])
-    moved = []
-    for lam in multipliers:
-        moved.append(lam + length * direction[offset : offset + len(lam)])
-        offset += len(lam)
-    return P, moved
+    def _moved(
+        self, P: Array, multipliers: list[Array], direction: Array, length: float
+    ) -> tuple[Array, list[Array]]:
+        offset = 0
+        if self.pairs is not None:
+            offset = self.pairs.size
+            P = P + length * self.pairs.matrix(direction[:offset])
+        moved = []
+        for lam in multipliers:
+            moved.append(lam + length * direction[offset : offset + len(lam)])
+            offset += len(lam)
+        return P, moved
 
-
-def _barrier(blocks: Sequence[_Block], P: Array, multipliers: list[Array], value: float) -> float:
-    matrices = [block.matrix(value, P, lam) for block, lam in zip(blocks, multipliers)]
-    total = 0.0
-    identity = np.eye(len(P))
-    for matrix in (P - _FLOOR * identity, identity - P, *matrices):
-        try:
-            total -= 2 * float(np.log(np.diagonal(np.linalg.cholesky(matrix))).sum())
-        except np.linalg.LinAlgError:
-            return float(np.inf)
-    return total
-
-
-def _search(
-    blocks: Sequence[_Block],
-    P: Array,
-    multipliers: list[Array],
-    value: float,
-    pairs: _Pairs | None,
-    direction: Array,
-    safe: float,
-    gradient: Array,
-) -> float:
-    """Backtracking from 1 down to the step that self-concordance guarantees."""
-    here = _barrier(blocks, P, multipliers, value)
-    slope = float(gradient @ direction)
-    length = 1.0
-    while length > safe:
-        if _barrier(blocks, *_moved(P, multipliers, pairs, direction, length), value) <= here + 0.1 * length * slope:
-            return length
-        length *= 0.6
-    return safe
-
-
-def _derivatives(
-    blocks: Sequence[_Block], P: Array, multipliers: list[Array], value: float, pairs: _Pairs | None
-) -> tuple[Array, Array]:
-    size = 0 if pairs is None else pairs.size
-    total = size + sum(len(lam) for lam in multipliers)
-    gradient, hessian = np.zeros(total), np.zeros((total, total))
-    if pairs is not None:
+    def _barrier(self, P: Array, multipliers: list[Array], value: float) -> float:
+        matrices = [block.matrix(value, P, lam) for block, lam in zip(self.blocks, multipliers)]
+        total = 0.0
         identity = np.eye(len(P))
-        for sign, matrix in ((1.0, P - _FLOOR * identity), (-1.0, identity - P)):
-            inverse = _inverse(matrix)
-            gradient[:size] -= sign * pairs.gradient(inverse)
-            hessian[:size, :size] += pairs.hessian(inverse, inverse)
-    offset = size
-    for block, lam in zip(blocks, multipliers):
-        W = _inverse(block.matrix(value, P, lam))
-        terms = block.terms(value)
-        here = slice(offset, offset + block.k)
-        WC, WQ = W @ block.Chat.T, W @ block.Qhat.T
-        cc, cq, qq = block.Chat @ WC, block.Chat @ WQ, block.Qhat @ WQ
-        gradient[here] -= np.diag(qq) - np.diag(cc)
-        hessian[here, here] += cc**2 - cq**2 - cq.T**2 + qq**2
+        for matrix in (P - _FLOOR * identity, identity - P, *matrices):
+            try:
+                total -= 2 * float(np.log(np.diagonal(np.linalg.cholesky(matrix))).sum())
+            except np.linalg.LinAlgError:
+                return float(np.inf)
+        return total
+
+    def _search(
+        self, P: Array, multipliers: list[Array], value: float, direction: Array, safe: float, slope: float
+    ) -> float:
+        """Backtracking from 1 down to the step that self-concordance guarantees."""
+        here, length = self._barrier(P, multipliers, value), 1.0
+        while length > safe:
+            if self._barrier(*self._moved(P, multipliers, direction, length), value) <= here + 0.1 * length * slope:
+                return length
+            length *= 0.6
+        return safe
+
+    def _derivatives(self, P: Array, multipliers: list[Array], value: float) -> tuple[Array, Array]:
+        pairs = self.pairs
+        size = 0 if pairs is None else pairs.size
+        total = size + sum(len(lam) for lam in multipliers)
+        gradient, hessian = np.zeros(total), np.zeros((total, total))
         if pairs is not None:
-            for a, (c, X, Y) in enumerate(terms):
-                gradient[:size] -= c * pairs.gradient(Y @ W @ X.T)
-                for b in range(a + 1):
-                    d, U, V = terms[b]
-                    part = pairs.hessian(V @ W @ X.T, Y @ W @ U.T)
-                    part *= c * d
-                    hessian[:size, :size] += part if a == b else part + part.T
-                for sign, factor in ((1.0, WQ), (-1.0, WC)):
-                    left, right = X @ factor, Y @ factor
-                    cross = left[pairs.i] * right[pairs.j] + left[pairs.j] * right[pairs.i]
-                    hessian[:size, here] += sign * c * pairs.scale[:, None] * cross
-        offset += block.k
-    hessian[size:, :size] = hessian[:size, size:].T
-    return gradient, hessian
+            identity = np.eye(len(P))
+            for sign, matrix in ((1.0, P - _FLOOR * identity), (-1.0, identity - P)):
+                inverse = _inverse(matrix)
+                gradient[:size] -= sign * pairs.gradient(inverse)
+                hessian[:size, :size] += pairs.hessian(inverse, inverse)
+        offset = size
+        for block, lam in zip(self.blocks, multipliers):
+            W = _inverse(block.matrix(value, P, lam))
+            terms = block.terms(value)
+            here = slice(offset, offset + block.k)
+            WC, WQ = W @ block.Chat.T, W @ block.Qhat.T
+            cc, cq, qq = block.Chat @ WC, block.Chat @ WQ, block.Qhat @ WQ
+            gradient[here] -= np.diag(qq) - np.diag(cc)
+            hessian[here, here] += cc**2 - cq**2 - cq.T**2 + qq**2
+            if pairs is not None:
+                for a, (c, X, Y) in enumerate(terms):
+                    gradient[:size] -= c * pairs.gradient(Y @ W @ X.T)
+                    for b in range(a + 1):
+                        d, U, V = terms[b]
+                        part = pairs.hessian(V @ W @ X.T, Y @ W @ U.T)
+                        part *= c * d
+                        hessian[:size, :size] += part if a == b else part + part.T
+                    for sign, factor in ((1.0, WQ), (-1.0, WC)):
+                        left, right = X @ factor, Y @ factor
+                        cross = left[pairs.i] * right[pairs.j] + left[pairs.j] * right[pairs.i]
+                        hessian[:size, here] += sign * c * pairs.scale[:, None] * cross
+            offset += block.k
+        hessian[size:, :size] = hessian[:size, size:].T
+        return gradient, hessian
 
 
 def _inverse(matrix: Array) -> Array:

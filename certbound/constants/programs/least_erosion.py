@@ -25,8 +25,6 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.excess import log_excess, log_phi
 from certbound.tubes.schedule import make_schedule
 
-__all__ = ["RadiusModel", "Rooms", "TightMetric", "erosion_factors", "noise_numbers", "tighten"]
-
 Array = NDArray[np.float64]
 
 _ROUNDS = 2
@@ -42,14 +40,9 @@ _LEAST_SQUARE = 1e-24  # stands for L^2 = 0
 class Rooms:
     """Directions of erosion, and the room along each over time.
 
-    Parameters
-    ----------
-    directions : tuple of ndarray, each (n, r)
-        The erosion is r_t sqrt(lambda_max(a^T P^-1 a)).
-    times : ndarray, shape (K,)
-        Rising, positive, the last one the horizon.
-    rooms : ndarray, shape (len(directions), K)
-        Smallest room on (times[k-1], times[k]]; positive, inf where the constraint does not hold.
+    ``directions`` are matrices a (n, r): the erosion is r_t sqrt(lambda_max(a^T P^-1 a)). ``times``, shape (K,), rise
+    and are positive, the last one is the horizon. ``rooms``, shape (len(directions), K), are the smallest on
+    (times[k-1], times[k]]: positive, inf where the constraint does not hold.
     """
 
     directions: tuple[Array, ...]
@@ -57,13 +50,15 @@ class Rooms:
     rooms: Array
 
     def coarse(self, count: int = _NODES) -> Rooms:
-        """At most ``count`` of the times, dense after the start, the tightest one of each group."""
+        """``count`` of the times, dense after the start: the tightest of each group, and of each direction missed."""
         if len(self.times) <= count:
             return self
         ends = np.unique(np.round(len(self.times) * np.linspace(0, 1, count + 1) ** 2).astype(int))
         smallest = np.min(self.rooms, axis=1, keepdims=True)
         tightness = np.min(self.rooms / smallest, axis=0)
         keep = [a + int(np.argmin(tightness[a:b])) for a, b in pairwise(ends)]
+        missed = ~np.any(np.isfinite(self.rooms[:, keep]), axis=1)  # a short window beside a tighter direction
+        keep = sorted({*keep, *np.argmin(self.rooms[missed], axis=1).tolist()})
         return Rooms(directions=self.directions, times=self.times[keep], rooms=self.rooms[:, keep])
 
     @property
@@ -89,13 +84,7 @@ class Fit(NamedTuple):
 class RadiusModel:
     """The Kummer tube (Thm K1) at sigma = 1 in floating point, its two parameters fitted to the room.
 
-    Parameters
-    ----------
-    continuous : bool
-    dimension : int
-    horizon, delta : float
-    gaussian : bool
-        Whether every Kummer parameter is allowed with nu < n in discrete time.
+    ``gaussian``: every Kummer parameter is allowed with nu < n in discrete time.
     """
 
     continuous: bool
@@ -107,13 +96,8 @@ class RadiusModel:
     def fit(self, value: float, nu: float, times: Array, room: Array, near: Fit | None = None) -> Fit:
         """The best tube for a room over time, at c (continuous time) or L^2 (discrete time).
 
-        Parameters
-        ----------
-        value, nu : float
-        times, room : ndarray, shape (K,)
-            Positive times; room in units of sigma.
-        near : Fit, optional
-            Start from its parameters instead of a coarse grid.
+        ``times`` are positive, ``room``, shape (K,), is in units of sigma; the search starts from the parameters of
+        ``near`` where that is given, and from a coarse grid otherwise.
         """
         here = min(max(nu, 0.05), float(self.dimension))
         level = 1 / max(-2 * value if self.continuous else 1 - value, 1 / self.horizon)
@@ -141,8 +125,7 @@ class RadiusModel:
         rate = 2 * value if self.continuous else float(np.log(max(value, _LEAST)))
         growth = np.expm1(rate * times) if abs(rate) > 1e-12 else times
         scale = 1.0 if abs(rate) <= 1e-12 else (rate if self.continuous else float(np.expm1(rate)))
-        result: Array = np.asarray(growth / scale)
-        return result
+        return np.asarray(growth / scale)
 
     def _squares(self, value: float, nu: float, times: Array, room: Array, a: Array, v0: Array) -> Array:
         """max_t r_t^2 / room_t^2 for each (a, v0): Newton's method on the probability of Thm K2, log in log."""
@@ -173,8 +156,7 @@ class RadiusModel:
                 x = x + step
                 if not np.any(np.abs(step) >= 1e-4):  # nan: out of range, and counted as endless below
                     break
-            result: Array = np.nan_to_num(np.exp(x), nan=np.inf)
-        return result
+            return np.asarray(np.nan_to_num(np.exp(x), nan=np.inf))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -211,10 +193,7 @@ class _Search:
     def weights(self, value: float, steepness: float) -> Array:
         """Rooms that a radius growing like a power of the standard deviation leaves.
 
-        Raises
-        ------
-        SolverError
-            If the standard deviation overflows within the horizon.
+        SolverError where the standard deviation overflows within the horizon.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             spread = self.model.variances(value, self.targets.times)
@@ -264,22 +243,10 @@ def tighten(
     *,
     form: str = "auto",
 ) -> TightMetric:
-    """The metric of least max_t,j erosion_j(t) / room_j(t), searched from a metric of nearly least c or L.
+    """The metric of least max_t,j erosion_j(t) / room_j(t), searched from a metric ``start`` of nearly least c or L.
 
-    Parameters
-    ----------
-    jacobians : JacobianSet
-    targets : Rooms
-    noise : sequence of ndarray, each (n, m)
-        Noise matrices at unit proxy.
-    model : RadiusModel
-    start : ndarray, shape (n, n)
-    form : {"auto", "vertices", "sector"}
-
-    Raises
-    ------
-    SolverError
-        If no value could be solved for.
+    ``noise`` are the noise matrices (n, m) at unit proxy, ``form`` is that of `lmi_blocks`. SolverError where no value
+    could be solved for.
     """
     search = _Search(jacobians, targets.coarse(), noise, model, start, form)
     least = _reached(start, jacobians, model)

@@ -21,11 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.constants.jacobians import JacobianSet, frozen
+from certbound.checks import frozen
+from certbound.constants.jacobians import JacobianSet
 from certbound.constants.programs.sectors import Sector, contraction_value, lmi_blocks, transformed
 from certbound.errors import InfeasibleError, SolverError
-
-__all__ = ["ErosionProgram", "FeedbackDesign", "RateProgram", "design_feedback", "solve"]
 
 Array = NDArray[np.float64]
 
@@ -33,10 +32,7 @@ Array = NDArray[np.float64]
 def solve(problem: Any) -> str:
     """Solve a cvxpy problem and return its status; a second setting and a second solver are tried on a stall.
 
-    Raises
-    ------
-    SolverError
-        If no attempt ends with values for the variables.
+    SolverError where no attempt ends with values for the variables.
     """
     cp = _cvxpy()
 
@@ -132,18 +128,10 @@ def _multipliers(groups: tuple[int, ...], *, full: bool) -> tuple[Any, Any, Any,
 class RateProgram:
     """max margin over P with I <= max_condition^{1/2} P <= max_condition I: positive where the value is reached.
 
-    Parameters
-    ----------
-    jacobians : JacobianSet
-    continuous : bool
-        Meaning of the value: c (continuous time) or L^2 (discrete time).
-    max_condition : float
-        Bound on the condition number of P, in the coordinates of ``start``.
-    form : {"auto", "vertices", "sector"}
-    full : bool
-        Full-block instead of diagonal multipliers in the sector form (at most 10 parameters).
-    start : array_like, shape (n, n), optional
-        A metric of the right order of magnitude, in whose coordinates the program is solved.
+    The value is c (continuous time) or L^2 (discrete time). ``max_condition`` bounds the condition number of P in the
+    coordinates of ``start``, a metric of the right order of magnitude in whose coordinates the program is solved.
+    ``form`` is that of `lmi_blocks`; ``full``: full-block instead of diagonal multipliers in the sector form (at most
+    10 parameters).
     """
 
     def __init__(
@@ -185,19 +173,12 @@ class RateProgram:
 class ErosionProgram:
     """min w over P: the contraction value fixed, the noise normalised, the erosions weighted (Sec. 6, 7.17).
 
-    The noise is normalised by alpha t + beta tr(G^T P G) <= 1, G^T P G <= t I: with alpha = g - g' nu and
-    beta = g' this majorises sigma^2 g(nu), g the squared radius at unit sigma, which is concave in nu.
+    The noise is normalised by alpha t + beta tr(G^T P G) <= 1, G^T P G <= t I: with alpha = g - g' nu and beta = g'
+    this majorises sigma^2 g(nu), g the squared radius at unit sigma, which is concave in nu.
 
-    Parameters
-    ----------
-    jacobians : JacobianSet
-    directions : sequence of array_like
-        One (n,) normal or (n, r) matrix per constraint; the erosion is r sqrt(lambda_max(a^T P^-1 a)).
-    noise : sequence of array_like
-        Noise matrices G (n, m), all of which the metric must serve.
-    start : array_like, shape (n, n)
-        A metric of the right order of magnitude: the program is solved in its coordinates, where P is near I.
-    continuous : bool
+    ``directions`` are one (n,) normal or (n, r) matrix per constraint: the erosion is r sqrt(lambda_max(a^T P^-1 a)).
+    ``noise`` are matrices G (n, m), all of which the metric must serve. ``start`` is a metric of the right order of
+    magnitude: the program is solved in its coordinates, where P is near I.
     """
 
     def __init__(

@@ -15,8 +15,6 @@ from certbound.constants.programs.lmi import RateProgram
 from certbound.constants.programs.sectors import VERTEX_LIMIT, lmi_blocks
 from certbound.errors import SolverError
 
-__all__ = ["Proposal", "erosion_proposals", "rate_proposals", "sampled_polytope", "smallest_value", "spectral_bound"]
-
 Array = NDArray[np.float64]
 
 _FEW_BLOCKS = 4
@@ -129,22 +127,9 @@ def smallest_value(
 ) -> tuple[Array, float]:
     """Bisection: a metric of nearly least c or L^2, and the value that it reaches in floating point.
 
-    Parameters
-    ----------
-    program : RateProgram
-        The program of ``jacobians``.
-    jacobians : JacobianSet
-    continuous : bool
-    lower : float
-        A lower bound of the value: the spectral abscissa, or the squared spectral radius, of a member.
-    tolerance : float
-        Width at which the bisection stops.
-    max_solves : int
-
-    Raises
-    ------
-    SolverError
-        From the first solve; a later one ends the search at the best metric so far.
+    ``program`` is that of ``jacobians``, ``lower`` a lower bound of the value (the spectral abscissa, or the squared
+    spectral radius, of a member), ``tolerance`` the width at which the bisection stops. SolverError where the first
+    solve fails; a later failure ends the search at the best metric so far.
     """
     metric = np.eye(jacobians.dimension)
     upper = reachable_value(metric, jacobians, continuous=continuous)

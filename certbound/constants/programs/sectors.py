@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from certbound.constants.jacobians import AffineSet, IntervalMatrixSet, JacobianSet, SectorSet, UnionSet, VertexPolytope
 
-__all__ = ["VERTEX_LIMIT", "Sector", "centred", "contraction_value", "lmi_blocks", "transformed", "varying"]
-
 Array = NDArray[np.float64]
 
 VERTEX_LIMIT = 32
@@ -31,11 +29,7 @@ class Sector:
 def lmi_blocks(jacobians: JacobianSet, *, form: str = "auto") -> list[Array | Sector]:
     """The pieces that a program imposes one inequality each for: vertices, or centred sectors.
 
-    Parameters
-    ----------
-    jacobians : JacobianSet
-    form : {"auto", "vertices", "sector"}
-        ``auto`` keeps vertices up to ``VERTEX_LIMIT`` of them.
+    ``form`` is "vertices", "sector", or "auto", which keeps vertices up to ``VERTEX_LIMIT`` of them.
     """
     if form not in ("auto", "vertices", "sector"):
         raise ValueError(f'`form` must be "auto", "vertices" or "sector", got {form!r}.')

@@ -18,8 +18,6 @@ from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside
 
-__all__ = ["Target", "constraint_targets", "cut_rooms", "nominal_paths", "rooms_of", "stated_rooms"]
-
 Array = NDArray[np.float64]
 
 _STEPS = 400
@@ -29,16 +27,10 @@ _SMALLEST_SHARE = 0.02
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Target:
-    """A direction of erosion.
+    """A direction of erosion of the constraint ``problem.constraints[constraint]``, and the room along it.
 
-    Parameters
-    ----------
-    direction : ndarray, shape (n, r)
-        a (r = 1) or the coordinates of a round constraint: the erosion is r_t sqrt(lambda_max(a^T P^-1 a)).
-    rooms : ndarray, shape (K,)
-        Room along it at the times behind the start; inf outside the constraint's window.
-    constraint : int
-        Index into ``problem.constraints``.
+    ``direction``, shape (n, r), is a (r = 1) or the coordinates of a round constraint: the erosion is r_t
+    sqrt(lambda_max(a^T P^-1 a)). ``rooms``, shape (K,), are at the times behind the start; inf outside the window.
     """
 
     direction: Array
@@ -49,12 +41,8 @@ class Target:
 def constraint_targets(problem: Problem) -> tuple[Array, list[Target]]:
     """Times (K,) behind the start, and one target per half-space, ball, ellipsoid or obstacle.
 
-    Parallel half-spaces of one constraint (the two sides of a box) share a target.
-
-    Raises
-    ------
-    ValueError
-        If no constraint bounds anything.
+    Parallel half-spaces of one constraint (the two sides of a box) share a target. A problem of which no constraint
+    bounds anything is a ValueError.
     """
     times, paths = nominal_paths(problem)
     found: list[Target] = []

@@ -187,7 +187,7 @@ class ClockEvents:
         if not steady:
             return self.windows.along(rows)
         row = np.array(rows[0])
-        if row[np.flatnonzero(row)[:1]] < 0:  # w . Z and -w . Z have the same law
+        if np.any(row[np.flatnonzero(row)[:1]] < 0):  # w . Z and -w . Z have the same law; a row may be zero
             row, rows = 0.0 - row, 0.0 - rows
         known, beaten = self.memory.setdefault(("known", row.tobytes()), ({}, set()))
         return SteadyEvent(self.windows.along(rows), row, self, known, beaten)

@@ -8,8 +8,6 @@ from typing import Any
 
 from certbound.problem.model import OPERATIONS, Graph, Tape
 
-__all__ = ["casadi_module", "from_casadi", "to_casadi"]
-
 
 def casadi_module() -> Any:
     """The casadi module, with its NumPy mode chosen (legacy, silent) unless the user chose one before."""
@@ -24,12 +22,7 @@ def casadi_module() -> Any:
 def to_casadi(tape: Tape, inputs: Sequence[Any]) -> Any:
     """The CasADi expression of a tape, of shape ``tape.shape``.
 
-    Parameters
-    ----------
-    tape : Tape
-        The function.
-    inputs : sequence of casadi.SX or casadi.MX
-        One scalar expression per input slot, or vectors whose entries make up the slots in order.
+    ``inputs`` are one scalar expression (SX or MX) per input slot, or vectors whose entries make up the slots in order.
     """
     ca = casadi_module()
     scalars = [entry for value in inputs for entry in _entries(ca, value)]
@@ -71,24 +64,11 @@ def _refused(op: str) -> Callable[..., Any]:
 
 
 def from_casadi(expression: Any, inputs: Sequence[Any], names: Sequence[str], shape: tuple[int, ...]) -> Tape:
-    """The tape of a CasADi SX expression.
+    """The tape of a CasADi SX expression, whose entries are read row by row.
 
-    Parameters
-    ----------
-    expression : casadi.SX
-        Expression whose entries, read row by row, are the outputs.
-    inputs : sequence of casadi.SX
-        Symbols (scalars or vectors) that the expression depends on.
-    names : sequence of str
-        Name of each scalar input, in order.
-    shape : tuple of int
-        Shape of the tape's output.
-
-    Raises
-    ------
-    ValueError
-        If the expression uses an operation that a tape cannot hold (erf, calls of other functions), or the
-        sizes disagree.
+    ``inputs`` are the symbols (scalars or vectors) that it depends on, ``names`` the names of their scalar entries in
+    order, ``shape`` is that of the tape's output. An operation that a tape cannot hold (erf, calls of other functions),
+    or sizes that disagree, are a ValueError.
     """
     ca = casadi_module()
     columns = ca.densify(ca.vec(ca.SX(expression).T))

@@ -11,20 +11,10 @@ import numpy as np
 
 from certbound.problem.sets import Box
 
-__all__ = ["Imported", "import_control", "is_control_system"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Imported:
-    """A python-control model in this package's terms.
-
-    Parameters
-    ----------
-    function : callable
-        f(t, x) or f(t, x, u).
-    states, inputs : tuple of str
-        Names.
-    """
+    """A python-control model in this package's terms: f(t, x) or f(t, x, u), and the signals' names."""
 
     function: Callable[..., Any]
     states: tuple[str, ...]
@@ -51,10 +41,7 @@ def is_control_system(value: Any) -> bool:
 def import_control(system: Any, time: str) -> Imported:
     """Read a ``StateSpace`` or ``NonlinearIOSystem``.
 
-    Raises
-    ------
-    ValueError
-        If the model's time base is not ``time``, or it has no states.
+    One whose time base is not ``time``, or that has no states, is a ValueError.
     """
     discrete = bool(system.isdtime(strict=True))
     if discrete != (time == "discrete"):

@@ -11,8 +11,6 @@ from certbound.problem.adapters.casadi import casadi_module, from_casadi
 from certbound.problem.adapters.sympy import from_sympy
 from certbound.problem.model import Tape, trace
 
-__all__ = ["is_symbolic", "read_model", "symbol_names", "symbolic_tape"]
-
 _CASADI = ("SX", "MX", "Function")
 
 
@@ -42,25 +40,12 @@ def read_model(f: Any, arguments: Mapping[str, Sequence[str]], *, matrix: bool =
 
 
 def symbolic_tape(f: Any, arguments: Mapping[str, Sequence[str]], *, matrix: bool = False) -> Tape:
-    """The tape of a model given as expressions.
+    """The tape of a model given as expressions: the right-hand side (n,), or a matrix.
 
-    Symbols are recognised by their names: those in ``arguments`` (``t``, states, inputs, disturbances). In CasADi,
-    ``x = SX.sym("x", n)`` stands for all states at once, and so do ``u`` and ``d``; a ``casadi.Function`` takes its
-    inputs by the names t, x, u, d.
-
-    Parameters
-    ----------
-    f : SymPy or CasADi expression, matrix, list of expressions, or casadi.Function
-        The right-hand side (n,), or a matrix.
-    arguments : mapping
-        Argument name (t, x, u, d) to the names of its scalar entries, as for ``trace``.
-    matrix : bool
-        Whether a column keeps its two dimensions, (n, 1).
-
-    Raises
-    ------
-    ValueError
-        If a symbol is none of the arguments, or an operation cannot be held by a tape.
+    Symbols are recognised by their names: those in ``arguments`` (argument name to the names of its scalar entries, as
+    for ``trace``). In CasADi, ``x = SX.sym("x", n)`` stands for all states at once, and so do ``u`` and ``d``; a
+    ``casadi.Function`` takes its inputs by the names t, x, u, d. ``matrix``: a column keeps its two dimensions, (n, 1).
+    A symbol that is none of the arguments, or an operation that a tape cannot hold, is a ValueError.
     """
     names = [name for entries in arguments.values() for name in entries]
     if _package(f) == "sympy":

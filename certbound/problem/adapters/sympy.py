@@ -8,8 +8,6 @@ from typing import Any
 
 from certbound.problem.model import ARITY, Graph, Tape
 
-__all__ = ["from_sympy"]
-
 _RENAMED = {"Abs": "abs", "Not": "not"}
 _FOLDED = {"Max": "max", "Min": "min", "And": "and", "Or": "or"}
 _COMPARISONS = {
@@ -22,21 +20,9 @@ def from_sympy(expression: Any, names: Sequence[str], *, matrix: bool = False) -
     """The tape of a SymPy expression, matrix, or list of expressions.
 
     Rational numbers stay exact quotients; pi and E become the nearest floats, as in problem files. A function of time
-    such as ``angle(t)`` counts as the symbol of its name.
-
-    Parameters
-    ----------
-    expression : sympy.Expr, sympy.Matrix, or list of expressions
-        Column vectors give shape (n,), other matrices (rows, columns).
-    names : sequence of str
-        Names of the inputs; every free symbol must be one of them.
-    matrix : bool
-        Whether a column keeps its two dimensions, (n, 1).
-
-    Raises
-    ------
-    ValueError
-        If a symbol has another name, or a function has no counterpart on a tape.
+    such as ``angle(t)`` counts as the symbol of its name. Column vectors give shape (n,) unless ``matrix``, other
+    matrices (rows, columns). A symbol that is none of ``names``, or a function without a counterpart on a tape, is a
+    ValueError.
     """
     import sympy
 

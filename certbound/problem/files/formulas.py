@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from certbound.problem.files.parser import is_function
 from certbound.problem.model import Tape
 
-__all__ = ["formulas"]
-
 _INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2)}
 _DEEPEST = 12
 _ATOM = 5
@@ -17,23 +15,9 @@ _ATOM = 5
 def formulas(tape: Tape, names: Iterator[str]) -> tuple[dict[str, str], list[str]]:
     """Expressions that give the tape's outputs, with definitions for what is used twice or nested deeply.
 
-    Parameters
-    ----------
-    tape : Tape
-        The function.
-    names : iterator of str
-        Fresh names for definitions.
-
-    Returns
-    -------
-    (dict, list)
-        Definitions in order, and one expression per output. Read again, they give the same operations on the
-        same numbers.
-
-    Raises
-    ------
-    ValueError
-        If the tape uses an operation that problem files do not have (where, sign, floor, comparisons).
+    Returns the definitions in order, their fresh names taken from ``names``, and one expression per output: read again,
+    they give the same operations on the same numbers. An operation that problem files do not have (where, sign, floor,
+    comparisons) is a ValueError.
     """
     uses = [0] * len(tape.nodes)
     for node in tape.nodes:

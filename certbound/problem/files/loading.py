@@ -16,8 +16,6 @@ from certbound.problem.files.plans import write_plan
 from certbound.problem.files.toml import toml_text
 from certbound.problem.problem import Problem
 
-__all__ = ["load", "loads", "save"]
-
 _LARGEST = 20_000_000
 
 
@@ -66,10 +64,7 @@ def load(source: str | Path, **parameters: Any) -> Problem:
 def loads(text: str, *, folder: Path | None = None, **parameters: Any) -> Problem:
     """A problem from the text of a problem file; ``plan.file`` is read from ``folder`` only.
 
-    Raises
-    ------
-    ValueError, TypeError
-        As for ``load``.
+    Errors are those of ``load``.
     """
     from pydantic import ValidationError
 

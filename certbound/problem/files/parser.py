@@ -14,8 +14,6 @@ from typing import NamedTuple
 from certbound.checks import nearest
 from certbound.problem.model import ARITY, OPERATIONS, Graph, arithmetic
 
-__all__ = ["CONSTANTS", "constant", "is_function", "parse"]
-
 CONSTANTS: Mapping[str, float] = {"pi": math.pi}
 
 _LONGEST, _DEEPEST = 20_000, 60
@@ -43,29 +41,11 @@ class _Token(NamedTuple):
 
 
 def parse(text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str) -> int:
-    """Read an expression into a graph.
+    """Read an expression into a graph; the node of its value.
 
-    Parameters
-    ----------
-    text : str
-        The expression.
-    graph : Graph
-        Where its operations go.
-    names : mapping
-        Name to a node of the graph, or to a function that makes the node when the name is first used.
-    where : str
-        What the expression belongs to, for messages.
-
-    Returns
-    -------
-    int
-        Node of the value.
-
-    Raises
-    ------
-    ValueError
-        If the text is no expression, or uses an unknown name or function; the message names the nearest known
-        one.
+    ``names`` maps a name to a node of the graph, or to a function that makes the node when the name is first used;
+    ``where`` is what the expression belongs to, for messages. A text that is no expression, or uses an unknown name or
+    function, is a ValueError that names the nearest known one.
 
     Examples
     --------

@@ -9,22 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["read_plan", "write_plan"]
-
 Array = NDArray[np.float64]
 
 
 def write_plan(path: str | Path, plan: ArrayLike, inputs: tuple[str, ...], **notes: Any) -> None:
     """Write a plan: ``{"inputs": [names], "plan": [[one row a step], ...]}`` and any notes.
 
-    Parameters
-    ----------
-    path : str or Path
-        File to write.
-    plan : array_like, shape (K, m)
-        Rows of inputs.
-    inputs : tuple of str
-        Names of the m inputs.
+    ``plan`` has shape (K, m), with one column for each of the m names of ``inputs``.
     """
     content = {"inputs": list(inputs), "plan": np.asarray(plan, dtype=float).tolist()} | notes
     Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -33,10 +24,7 @@ def write_plan(path: str | Path, plan: ArrayLike, inputs: tuple[str, ...], **not
 def read_plan(path: str | Path, inputs: tuple[str, ...]) -> Array:
     """Read a plan, with its columns in the order of ``inputs``.
 
-    Raises
-    ------
-    ValueError
-        If the file does not exist or does not hold such a plan.
+    A file that does not exist or does not hold such a plan is a ValueError.
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))

@@ -21,8 +21,6 @@ from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
 
-__all__ = ["RESERVED", "read_problem"]
-
 Array = NDArray[np.float64]
 
 RESERVED = frozenset({"t", *filter(is_function, OPERATIONS), *CONSTANTS})
@@ -36,21 +34,10 @@ class _ForbiddenError(ValueError):
 def read_problem(
     spec: Specification, folder: Path | None, source: Mapping[str, Any] | None = None
 ) -> Problem:
-    """Build the problem that a specification describes.
+    """Build the problem that a validated specification describes; ``source``, the raw content, is kept for saving.
 
-    Parameters
-    ----------
-    spec : Specification
-        Validated content of a file.
-    folder : Path or None
-        Folder of the file, from which ``plan.file`` is read; None forbids it.
-    source : mapping, optional
-        The raw content, kept for saving.
-
-    Raises
-    ------
-    ValueError, TypeError
-        Naming the key, the rule and the value.
+    ``plan.file`` is read from ``folder``; None forbids it. Errors (ValueError, TypeError) name the key, the rule and
+    the value.
     """
     return _Reader(spec, folder).problem(source)
 

@@ -14,8 +14,6 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from certbound.checks import nearest
 from certbound.problem.noise import LAWS
 
-__all__ = ["Constraint", "Noise", "Specification", "Start", "explain"]
-
 
 def _no_boolean(value: Any) -> Any:
     if isinstance(value, bool):

@@ -17,17 +17,9 @@ from certbound.problem.noise import check_law
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 
-__all__ = ["content_of", "describe_problem"]
-
 
 def content_of(problem: Problem, plan_file: str) -> dict[str, Any]:
-    """Content of a problem's file: as it was in its own file, or with the traced model as expressions.
-
-    Raises
-    ------
-    ValueError
-        As for ``describe_problem``.
-    """
+    """Content of a problem's file: as it was in its own file, or with the traced model as expressions."""
     if problem.source is None:
         return describe_problem(problem, plan_file)
     content = copy.deepcopy(dict(problem.source))
@@ -39,17 +31,8 @@ def content_of(problem: Problem, plan_file: str) -> dict[str, Any]:
 def describe_problem(problem: Problem, plan_file: str) -> dict[str, Any]:
     """Content of the problem file of any problem, with its model as expressions.
 
-    Parameters
-    ----------
-    problem : Problem
-        What to describe.
-    plan_file : str
-        Name to put under ``plan.file`` where the plan is an array (the caller writes it).
-
-    Raises
-    ------
-    ValueError
-        If the model uses what problem files do not have (np.where, np.sign, ...).
+    ``plan_file`` is the name to put under ``plan.file`` where the plan is an array (the caller writes it). A model that
+    uses what problem files do not have (np.where, np.sign, ...) is a ValueError.
     """
     content = _Writer(problem, plan_file).content()
     return {key: value for key, value in content.items() if value not in ({}, [], None)}

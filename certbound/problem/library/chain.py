@@ -18,8 +18,6 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, HalfSpace, Inside
 from certbound.problem.systems import DiscreteSystem
 
-__all__ = ["DEFAULTS", "chain", "chain_rest"]
-
 Array = NDArray[np.float64]
 
 DEFAULTS = {

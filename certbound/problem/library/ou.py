@@ -9,8 +9,6 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Inside
 from certbound.problem.systems import ContinuousSystem
 
-__all__ = ["DEFAULTS", "ou"]
-
 DEFAULTS = {"rate": -0.5, "sigma": 0.1**0.5, "radius": 1.5, "dimension": 1.0}
 
 

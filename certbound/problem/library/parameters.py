@@ -7,16 +7,12 @@ from typing import Any
 
 from certbound.checks import nearest, number
 
-__all__ = ["merged", "whole"]
-
 
 def merged(model: str, defaults: Mapping[str, float], given: Mapping[str, Any]) -> dict[str, float]:
     """The defaults with the given values in their place.
 
-    Raises
-    ------
-    ValueError
-        If a name is not a parameter of the model (the message names the nearest), or a value is not finite.
+    A name that is not a parameter of the model (the message names the nearest), or a value that is not finite, is a
+    ValueError.
     """
     for name in given:
         if name not in defaults:

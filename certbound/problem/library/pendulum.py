@@ -9,8 +9,6 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside
 from certbound.problem.systems import ContinuousSystem
 
-__all__ = ["DEFAULTS", "pendulum"]
-
 DEFAULTS = {"gravity": 9.81, "length": 1.0, "damping": 0.5, "sigma": 0.05}
 
 

@@ -17,8 +17,6 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Ball, Box, Outside
 from certbound.problem.systems import ContinuousSystem
 
-__all__ = ["DEFAULTS", "unicycle"]
-
 DEFAULTS = {
     "gamma": 0.5,
     "k": 1.0,

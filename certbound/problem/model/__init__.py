@@ -5,9 +5,9 @@ Each name is loaded when it is first used, so that the checker reads a tape with
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from certbound.lazy import load_name
+from certbound.lazy import lazily
 
 if TYPE_CHECKING:
     from certbound.problem.model.analysis import (
@@ -63,10 +63,4 @@ __all__ = [
     "watched",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    return load_name(__name__, _HOME, name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazily(__name__, _HOME, __all__)

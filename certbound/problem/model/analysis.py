@@ -5,8 +5,6 @@ from __future__ import annotations
 from certbound.problem.model.operations import OPERATIONS
 from certbound.problem.model.tape import JUMPS, Node, Tape, needed
 
-__all__ = ["adds_plainly", "deciding", "edged", "is_zero", "selected", "sources", "varying_outputs", "watched"]
-
 
 def selected(tape: Tape, outputs: list[int], function: Tape | None) -> Tape:
     """Some outputs of a derivative of ``function``: its own nodes, those that are needed, and no node twice.

@@ -9,36 +9,19 @@ from certbound.problem.model.graph import Graph
 from certbound.problem.model.operations import OPERATIONS, operands
 from certbound.problem.model.tape import Tape
 
-__all__ = ["jacobian"]
-
 
 def jacobian(tape: Tape, columns: Sequence[int] | None = None) -> Tape:
-    """Derivative of every output with respect to the given inputs.
+    """Derivative of every output with respect to the given inputs (``columns``: slots; all when omitted).
 
-    The derivative is exact: where a constant of it is no floating-point number, the tape holds the operations
-    that define it. Kinks (abs, min, max) get their generalised derivative, the operation ``kink``; jumps get
-    the derivative that holds beside the jump.
+    The derivative is exact: where a constant of it is no floating-point number, the tape holds the operations that
+    define it. Kinks (abs, min, max) get their generalised derivative, the operation ``kink``; jumps get the derivative
+    that holds beside the jump. Differentiating a derivative turns its kinks into jumps (operation ``sign``), since the
+    slope of |x| jumps at 0.
 
-    Parameters
-    ----------
-    tape : Tape
-        Any function; outputs of a matrix-valued one are taken in row-major order.
-    columns : sequence of int, optional
-        Input slots to differentiate with respect to; all of them when omitted.
-
-    Returns
-    -------
-    Tape
-        Shape ``(len(tape.outputs), len(columns))``, over the same inputs. **Its nodes begin with the nodes of
-        the function itself, index for index**, whether the derivative needs them or not: a reader that
-        refuses undecided jumps sees those of the function too (x' = sign(x) has derivative 0 beside its
-        jump). Differentiating a derivative turns its kinks into jumps (operation ``sign``), since the slope
-        of |x| jumps at 0.
-
-    Raises
-    ------
-    ValueError
-        If a column is not an input slot.
+    The tape has shape ``(len(tape.outputs), len(columns))``, outputs of a matrix-valued function in row-major order,
+    over the same inputs. **Its nodes begin with the nodes of the function itself, index for index**, whether the
+    derivative needs them or not: a reader that refuses undecided jumps sees those of the function too (x' = sign(x) has
+    derivative 0 beside its jump).
     """
     slots = tuple(range(len(tape.inputs))) if columns is None else tuple(int(column) for column in columns)
     if any(not 0 <= slot < len(tape.inputs) for slot in slots):

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.problem.model.operations import OPERATIONS
 from certbound.problem.model.tape import Tape
 
-__all__ = ["compile_numpy", "compile_scalar"]
-
 Array = NDArray[np.float64]
 
 
@@ -21,16 +19,8 @@ Array = NDArray[np.float64]
 def compile_numpy(tape: Tape) -> Callable[..., Array]:
     """A function that evaluates ``tape`` on arrays, in plain floating point (nothing is certified).
 
-    Parameters
-    ----------
-    tape : Tape
-        Function of ``len(tape.inputs)`` scalars with output shape ``tape.shape``.
-
-    Returns
-    -------
-    callable
-        ``evaluate(*inputs)`` with one number or array per input slot, broadcast against each other to a shape
-        ``batch``; returns an array of shape ``(*batch, *tape.shape)``. Undefined operations give nan or inf.
+    ``evaluate(*inputs)`` takes one number or array per input slot, broadcast against each other to a shape ``batch``,
+    and returns an array of shape ``(*batch, *tape.shape)``. Undefined operations give nan or inf.
 
     Examples
     --------

@@ -16,8 +16,6 @@ from typing import Any
 from certbound.problem.model.operations import OPERATIONS
 from certbound.problem.model.tape import ARITY, Node, Tape, needed
 
-__all__ = ["Graph", "substitute"]
-
 _COMPARE: dict[str, Callable[[float, float], bool]] = {
     "lt": lambda a, b: a < b,
     "le": lambda a, b: a <= b,
@@ -30,13 +28,7 @@ _COMMUTATIVE = frozenset(["add", "mul", "min", "max", "hypot", "eq", "ne", "and"
 
 
 class Graph:
-    """Nodes over named inputs; every method returns the index of a node.
-
-    Parameters
-    ----------
-    inputs : sequence of str
-        Names of the scalar inputs, in slot order.
-    """
+    """Nodes over named scalar inputs, in slot order; every method returns the index of a node."""
 
     def __init__(self, inputs: Sequence[str]) -> None:
         self.inputs = tuple(inputs)
@@ -233,14 +225,8 @@ def substitute(
 ) -> Tape:
     """The tape over new ``inputs`` in which some old inputs are replaced by functions or numbers.
 
-    Parameters
-    ----------
-    tape : Tape
-        The function to rewrite.
-    inputs : sequence of str
-        Names of the new inputs; every old input that is not replaced must be among them.
-    replacements : mapping
-        Old input name to a number, or to (tape, k): the k-th output of a tape over (a subset of) ``inputs``.
+    ``replacements`` maps an old input's name to a number, or to (tape, k): the k-th output of a tape over (a subset of)
+    ``inputs``. Every old input that is not replaced must be among the new ones.
     """
     graph = Graph(inputs)
     arithmetic = graph.arithmetic()

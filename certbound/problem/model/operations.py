@@ -19,8 +19,6 @@ from certbound.rigor import elementary as iv
 from certbound.rigor import series as ts
 from certbound.rigor.arithmetic import Interval
 
-__all__ = ["OPERATIONS", "Operation", "arithmetic", "enclosed", "undefined_where"]
-
 Mask = NDArray[np.bool_]
 
 

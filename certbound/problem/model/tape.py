@@ -11,8 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
-__all__ = ["ARITY", "JUMPS", "Node", "Tape", "needed"]
-
 T = TypeVar("T")
 
 ARITY: dict[str, int] = {

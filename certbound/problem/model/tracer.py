@@ -17,8 +17,6 @@ import numpy as np
 from certbound.problem.model.graph import Graph
 from certbound.problem.model.operations import OPERATIONS
 
-__all__ = ["FUNCTIONS", "Scalar", "Traced", "UntraceableError"]
-
 
 class UntraceableError(TypeError):
     """Raised inside a traced function; ``trace`` adds the place."""

@@ -14,8 +14,6 @@ from certbound.problem.model.graph import Graph
 from certbound.problem.model.tape import Tape
 from certbound.problem.model.tracer import Scalar, Traced, UntraceableError
 
-__all__ = ["trace"]
-
 
 def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) -> Tape:
     """Record a NumPy-style function as a tape.

@@ -9,17 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.checks import positive_definite, vector
+from certbound.checks import assign, positive_definite, vector
 from certbound.problem.sets.forms import Region
 
-__all__ = ["GaussianStart", "Inside", "Outside"]
-
 Array = NDArray[np.float64]
-
-
-def _set(instance: object, **values: Any) -> None:
-    for name, value in values.items():
-        object.__setattr__(instance, name, value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +47,7 @@ class Inside:
             window = (float(ends[0]), float(ends[1]))
             if not 0 <= window[0] <= window[1]:
                 raise ValueError(f"`during` must be [a, b] with 0 <= a <= b, got {list(window)}.")
-        _set(self, during=window)
+        assign(self, during=window)
 
     def named(self, states: tuple[str, ...]) -> Any:
         """The same constraint, its label made from the states' names unless the user gave one."""
@@ -100,7 +93,7 @@ class GaussianStart:
     def __post_init__(self) -> None:
         mean = vector("mean", self.mean)
         covariance = positive_definite("covariance", self.covariance, len(mean), strict=False)
-        _set(self, mean=mean, covariance=covariance)
+        assign(self, mean=mean, covariance=covariance)
 
     @property
     def dimension(self) -> int:

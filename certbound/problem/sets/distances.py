@@ -12,21 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.problem.sets.constraints import Inside
 from certbound.problem.sets.forms import Faces, Quadratic, Region
 
-__all__ = ["clearance", "face_erosion", "round_erosion"]
-
 Array = NDArray[np.float64]
 
 
 def face_erosion(normals: ArrayLike, inverse_metric: ArrayLike | None = None) -> Array:
-    """sqrt(a' P^-1 a) for rows a: what a unit tube takes from {a.x <= b}.
-
-    Parameters
-    ----------
-    normals : array_like, shape (..., n)
-        Directions a.
-    inverse_metric : array_like, shape (n, n), optional
-        P^-1; the identity when omitted.
-    """
+    """sqrt(a' P^-1 a) for rows a, shape (..., n): what a unit tube takes from {a.x <= b}."""
     a = np.asarray(normals, dtype=float)
     spread = a if inverse_metric is None else a @ np.asarray(inverse_metric, dtype=float)
     return np.asarray(np.sqrt(np.maximum(np.sum(a * spread, axis=-1), 0.0)))

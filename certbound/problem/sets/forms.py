@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from certbound.problem.model import Tape, arithmetic, compile_numpy
 from certbound.rigor.intervals import Interval, sqrt, stack
 
-__all__ = ["Faces", "Form", "Quadratic", "Region", "linear_maximum"]
-
 Array = NDArray[np.float64]
 
 

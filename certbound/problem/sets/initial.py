@@ -12,21 +12,13 @@ from certbound.problem.sets.constraints import GaussianStart, Inside
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
 
-__all__ = ["check_start"]
-
 Array = NDArray[np.float64]
 _ROUNDING, _SLACK = 1e-12, 1e-9
 """Shares of a state's size by which the start's centre, and its farthest part, may miss a constraint."""
 
 
 def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside]) -> None:
-    """Refuse a start that violates a constraint, wholly or (where that is easily decided) in part.
-
-    Raises
-    ------
-    ValueError
-        Naming the constraint and how the start violates it.
-    """
+    """Refuse a start that violates a constraint that is due at time 0, with a ValueError that names it."""
     center = initial.middle
     for constraint in constraints:
         if constraint.during is not None and constraint.during[0] > 0:

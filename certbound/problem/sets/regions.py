@@ -14,11 +14,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certbound.checks import frozen, matrix, number, pick, positive_definite, vector
+from certbound.checks import assign, frozen, matrix, number, pick, positive_definite, vector
 from certbound.problem.model import Tape, compile_numpy, trace
 from certbound.problem.sets.forms import Faces, Quadratic, Region, linear_maximum
-
-__all__ = ["Ball", "Box", "Ellipsoid", "HalfSpace", "Polytope"]
 
 Array = NDArray[np.float64]
 Center = Array | Tape
@@ -36,11 +34,6 @@ def _center(name: str, value: Any, length: int | None) -> Center:
     if all(node.op != "input" for node in tape.nodes):
         return frozen(compile_numpy(tape)(0.0))
     return tape
-
-
-def _set(instance: object, **values: Any) -> None:
-    for name, value in values.items():
-        object.__setattr__(instance, name, value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +75,7 @@ class Box(Region):
             )
         if np.any(low == np.inf) or np.any(high == -np.inf):
             raise ValueError("`low` must be below inf and `high` above -inf.")
-        _set(self, low=low, high=high, center=center, coordinates=pick(self.coordinates, len(low)))
+        assign(self, low=low, high=high, center=center, coordinates=pick(self.coordinates, len(low)))
 
     @cached_property
     def form(self) -> Faces:
@@ -163,7 +156,7 @@ class Ball(Region):
         if radius < 0:
             raise ValueError(f"`radius` must not be negative, got {radius:g}.")
         size = center.shape[0]
-        _set(self, center=center, radius=radius, coordinates=pick(self.coordinates, size))
+        assign(self, center=center, radius=radius, coordinates=pick(self.coordinates, size))
 
     @cached_property
     def form(self) -> Quadratic:
@@ -199,7 +192,7 @@ class Ellipsoid(Region):
     def __post_init__(self) -> None:
         shape = positive_definite("shape", self.shape)
         center = _center("center", self.center, len(shape))
-        _set(self, center=center, shape=shape, coordinates=pick(self.coordinates, len(shape)))
+        assign(self, center=center, shape=shape, coordinates=pick(self.coordinates, len(shape)))
 
     @cached_property
     def form(self) -> Quadratic:
@@ -230,7 +223,7 @@ class HalfSpace(Region):
         normal, bound = vector("normal", self.normal), number("bound", self.bound)
         if not np.any(normal):
             raise ValueError("`normal` must not be all 0.")
-        _set(self, normal=normal, bound=bound)
+        assign(self, normal=normal, bound=bound)
 
     @cached_property
     def form(self) -> Faces:
@@ -278,7 +271,7 @@ class Polytope(Region):
         faces = matrix("A", self.A)
         if not np.all(np.any(faces != 0, axis=1)):
             raise ValueError("`A` must not have a row that is all 0.")
-        _set(self, A=faces, b=vector("b", self.b, len(faces)))
+        assign(self, A=faces, b=vector("b", self.b, len(faces)))
         if linear_maximum(faces, self.b, np.zeros(faces.shape[1])) is None:
             raise ValueError("`A`, `b` must describe a set with a point in it, got an empty one.")
 

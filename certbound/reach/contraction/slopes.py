@@ -69,7 +69,8 @@ class LocalSlopes:
         bounds = values
         for _ in range(ROUNDS if active else 0):
             np.maximum.at(floor, owners, self._sampled(boxes))
-            open_ = values > floor[owners] + TOLERANCE * (1e-2 + np.abs(floor[owners]))
+            least = np.where(np.isfinite(floor), floor, np.inf)[owners]  # undefined in the middle: so are halves
+            open_ = values > least + TOLERANCE * (1e-2 + np.abs(least))
             open_ &= np.any(boxes.lo < boxes.hi, axis=1)
             np.maximum.at(settled, owners[~open_], values[~open_])
             if not open_.any() or np.count_nonzero(open_) > LARGEST_BATCH:

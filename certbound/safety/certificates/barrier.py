@@ -11,8 +11,6 @@ from certbound.problem.problem import Problem
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.engines import Barrier
 
-__all__ = ["barrier_proof"]
-
 _SLACK = 0.01
 _MORE = (1.0, 5.0, 25.0)
 _LEAST = 1e-6
@@ -22,10 +20,7 @@ _LOG10 = math.log(10.0)
 def barrier_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
     """The proof's data, the claimed log10 of the probability, and no assumptions.
 
-    Raises
-    ------
-    CertificateError
-        If no barrier was found, or it bounds nothing once its levels have been rounded for the checker.
+    CertificateError where no barrier was found, or it bounds nothing once its levels have been rounded for the checker.
     """
     barrier: Barrier | None = answer.details
     if barrier is None:

@@ -21,13 +21,11 @@ from certbound.reach.nominal import Curve, Flow, initial_cells
 from certbound.reach.sets import ReachTube, polyhedral_weights, round_directions
 from certbound.rigor.norms import Norm
 from certbound.safety.answers import EngineAnswer, Proof, exact
-from certbound.safety.certificates.parts import needs_direction
+from certbound.safety.certificates.parts import separations
 from certbound.safety.engines import Erosion, erode, joined
 from certbound.tubes.constants import Constants
 from certbound.tubes.kummer import Search, exit_level, moderate_parameters
 from certbound.tubes.question import Question, Start
-
-__all__ = ["STATED", "constants_proof"]
 
 STATED = "the stated constants hold"
 """The assumption as a certificate names it; the checker derives which constants those are."""
@@ -42,10 +40,7 @@ _SLACK = 0.005
 def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
     """The proof's data, the claimed log10 of the probability, and the assumptions it rests on.
 
-    Raises
-    ------
-    CertificateError
-        If the constants are local, or leave no room once they have been rounded for the checker.
+    CertificateError where the constants are local, or leave no room once they have been rounded for the checker.
     """
     given = answer.constants
     if given is None:
@@ -76,7 +71,8 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
     rooms = np.where(np.isfinite(erosion.least), erosion.least * (1 - 10 * slack), np.inf)
     if np.any(rooms[0 if flow.continuous else 1 :] <= 0):
         raise CertificateError("the reach tube leaves no room once its numbers have been rounded for the checker.")
-    log10, kummer = _search(constants, _with_rooms(erosion, rooms), flow.horizon, start)
+    stated = replace(erosion, labels=("all",), radius=rooms[None], factor=np.ones((1, len(rooms))))
+    log10, kummer = _search(constants, stated, flow.horizon, start)
     log10 += _SLACK * (1 + 0.1 * abs(log10))
     data = {
         "engine": "constants",
@@ -99,12 +95,12 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
 
 def _cell(problem: Problem, tube: ReachTube, eta: Array, cell: int) -> dict[str, Any]:
     """What is stated of one cell."""
-    curve = tube.curve
+    curve, points = tube.curve, tube.curve.coefficients[cell, :, 0]
     return {
         "nominal": exact(curve.coefficients[cell]),
         "eta": exact(eta[cell] if curve.continuous else eta[cell][: curve.pieces - 1]),
         "radius": exact(tube.radius[cell]),
-        "separations": _separations(problem, curve, tube.norm, cell),
+        "separations": separations(problem, lambda _, constraint: _separation(constraint, points, curve, tube.norm)),
     }
 
 
@@ -149,10 +145,6 @@ def _edges(low: Array, high: Array) -> list[list[float]]:
     return result
 
 
-def _with_rooms(erosion: Erosion, rooms: Array) -> Erosion:
-    return replace(erosion, labels=("all",), radius=rooms[None], factor=np.ones((1, len(rooms))))
-
-
 def _search(constants: Constants, erosion: Erosion, horizon: float, start: Start) -> tuple[float, dict[str, Any]]:
     """log10 of Thm K2's bound at the best parameters found, and these parameters."""
     profile = joined(erosion.profile(random_start=start != Start()), 1e-9)
@@ -181,17 +173,8 @@ def _candidates(question: Question) -> Iterator[tuple[bool, float, float]]:
     yield from ((False, a, v0) for a, v0 in moderate_parameters(cut))
 
 
-def _separations(problem: Problem, curve: Curve, norm: Norm, cell: int) -> list[Any]:
-    """For every obstacle the direction with the most room in the metric; null for other constraints."""
-    points = curve.coefficients[cell, :, 0]
-    found = [
-        _separation(constraint, points, curve, norm) if needs_direction(constraint) else None
-        for constraint in problem.safe
-    ]
-    return found if problem.domain is None else [*found, None]
-
-
 def _separation(constraint: Inside, points: Array, curve: Curve, norm: Norm) -> Any:
+    """The direction with the most room in the metric, piece by piece."""
     region = constraint.region
     states = region.places(points.shape[1])
     centres = np.array([region.center_at(float(t)) for t in curve.middles])

@@ -29,8 +29,6 @@ from certbound.safety.certificates.linear import (
     widened,
 )
 
-__all__ = ["diffusion_proof", "response_proof"]
-
 Array = NDArray[np.float64]
 
 _ROUNDS = 10
@@ -43,13 +41,7 @@ _ALL = 1e3
 
 
 def response_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
-    """The linear response as data: `diffusion_proof` where the noise depends on the state, else `linear_proof`.
-
-    Raises
-    ------
-    CertificateError
-        If the remainder feeds itself once its boxes are widened.
-    """
+    """The linear response as data: `diffusion_proof` where the noise depends on the state, else `linear_proof`."""
     write = diffusion_proof if depends_on_state(problem) else linear_proof
     return write(problem, answer, attempt)
 
@@ -57,10 +49,7 @@ def response_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> 
 def diffusion_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
     """The proof's data, the claimed log10 of the probability, and no assumptions beyond the checker's own.
 
-    Raises
-    ------
-    CertificateError
-        If the remainder feeds itself once its boxes are widened.
+    CertificateError where the state leaves every set over which its noise was bounded.
     """
     effort = min(attempt, EFFORTS - 1)
     found = answer.details

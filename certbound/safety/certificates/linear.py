@@ -25,9 +25,7 @@ from certbound.problem.sets import Inside, Quadratic
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear import Linearisation, LinearRun, Share, correlated
 from certbound.safety.answers import EngineAnswer, Proof, exact
-from certbound.safety.certificates.parts import needs_direction
-
-__all__ = ["EFFORTS", "PADS", "SLACK", "Stated", "engine_of", "grids", "linear_proof", "proof_data", "widened"]
+from certbound.safety.certificates.parts import separations
 
 Array = NDArray[np.float64]
 Events = StepEvents | WindowEvents
@@ -47,10 +45,7 @@ _LOG10 = math.log(10.0)
 def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
     """The proof's data, the claimed log10 of the probability, and no assumptions.
 
-    Raises
-    ------
-    CertificateError
-        If the remainder feeds itself once its boxes are widened.
+    CertificateError where the remainder feeds itself once its boxes are widened.
     """
     effort = min(attempt, EFFORTS - 1)
     found = answer.details
@@ -76,13 +71,7 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
 
 
 def engine_of(answer: EngineAnswer) -> Linearisation:
-    """The linearisation that an answer rests on.
-
-    Raises
-    ------
-    CertificateError
-        If it bounds nothing.
-    """
+    """The linearisation that an answer rests on; CertificateError where it bounds nothing."""
     found = answer.details
     engine: Linearisation = found.run.engine
     if not engine.pieces or found.outcome.bounds is None:
@@ -281,12 +270,7 @@ def proof_data(problem: Problem, run: LinearRun, stated: Stated) -> dict[str, An
 
 
 def _cell(
-    problem: Problem,
-    run: LinearRun,
-    stated: Stated,
-    cell: int,
-    *,
-    varying: list[tuple[int, int]],
+    problem: Problem, run: LinearRun, stated: Stated, cell: int, *, varying: list[tuple[int, int]],
     moving: list[tuple[int, int]],
 ) -> dict[str, Any]:
     engine = run.engine
@@ -294,7 +278,7 @@ def _cell(
     events = stated.events[cell]
     active = engine.model.active
     extra = run.rows[cell][:, len(active) :][..., active]
-
+    asked = {requirement.constraint: requirement.rows for requirement in reversed(run.requirements[cell])}
     windows = events.coordinate_levels if isinstance(events, WindowEvents) else None
     if stated.window_levels is not None:
         windows = stated.window_levels[cell]
@@ -313,7 +297,7 @@ def _cell(
         "levels": exact((stated.levels if stated.gaussian is None else stated.gaussian)[cell]),
         "window_levels": None if windows is None else exact(windows),
         "frames": _frames(problem, run, stated, cell, varying),
-        "separations": _separations(problem, run, cell),
+        "separations": separations(problem, lambda number, constraint: _separation(constraint, asked[number])),
         **({} if stated.stopped is None else {"stopped": stated.stopped[cell]}),
     }
 
@@ -380,16 +364,8 @@ def _hessians(problem: Problem, engine: Linearisation, cell: int, active: list[i
     return np.nan_to_num(values.reshape(len(x), engine.n, len(active), len(active)))
 
 
-def _separations(problem: Problem, run: LinearRun, cell: int) -> list[Any]:
-    """For every obstacle the direction that keeps it off on each piece; null for other constraints."""
-    found: list[Any] = []
-    for number, constraint in enumerate(problem.safe):
-        rows = [r.rows for r in run.requirements[cell] if r.constraint == number]
-        found.append(_separation(constraint, rows[0]) if needs_direction(constraint) else None)
-    return found if problem.domain is None else [*found, None]
-
-
 def _separation(constraint: Inside, rows: Array) -> Any:
+    """The direction that keeps an obstacle off on each piece, as the rows of its requirement have it."""
     region = constraint.region
     own = rows[:, region.places(rows.shape[1])]
     if isinstance(region.form, Quadratic):

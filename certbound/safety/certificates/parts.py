@@ -1,12 +1,18 @@
-"""What writers of a proof share: which constraints ask for a direction."""
+"""What writers of a proof share: a direction for every obstacle that asks for one."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
+from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside
 
-__all__ = ["needs_direction"]
 
-
-def needs_direction(constraint: Inside) -> bool:
-    """Whether the proof names a direction that keeps the obstacle off, piece by piece."""
-    return constraint.outside and constraint.region.kind != "halfspace"
+def separations(problem: Problem, stated: Callable[[int, Inside], Any]) -> list[Any]:
+    """What is stated of every obstacle to keep it off, piece by piece, by its number; null for other constraints."""
+    found = [
+        stated(number, constraint) if constraint.outside and constraint.region.kind != "halfspace" else None
+        for number, constraint in enumerate(problem.safe)
+    ]
+    return found if problem.domain is None else [*found, None]

@@ -34,8 +34,6 @@ from certbound.rigor.intervals import Interval
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
 
-__all__ = ["Barrier", "barrier_engine"]
-
 Array = NDArray[np.float64]
 
 _MOST_STATES = 3
@@ -53,18 +51,9 @@ _LOG10 = math.log(10.0)
 class Barrier:
     """A polynomial V and what was proved of it.
 
-    Parameters
-    ----------
-    exponents : ndarray of int, shape (K, n)
-    coefficients : ndarray, shape (K,)
-        V(x) = sum_k coefficients[k] prod_i ((x_i - center_i)/scale_i)**exponents[k, i].
-    center, scale : ndarray, shape (n,)
-    start : float
-        Upper bound of V over the initial set.
-    boundary : float
-        Lower bound of V where a constraint is about to be broken.
-    growth : float
-        Upper bound kappa of the generator's expression.
+    V(x) = sum_k coefficients[k] prod_i ((x_i - center_i)/scale_i)**exponents[k, i]; shapes: exponents (K, n),
+    coefficients (K,), center and scale (n,). ``start`` is an upper bound of V over the initial set, ``boundary`` a
+    lower one where a constraint is about to be broken, ``growth`` an upper bound kappa of the generator's expression.
     """
 
     exponents: NDArray[np.int64]

@@ -54,8 +54,6 @@ from certbound.tubes.question import Start
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
-__all__ = ["ONE_TIME", "constants_engine"]
-
 Array = NDArray[np.float64]
 
 ONE_TIME = ("prop1", "prop1_cosh", "prop2", "markov", "chebyshev")
@@ -77,16 +75,9 @@ def constants_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     """The best answer from constants: global ones, or local ones along the reach tube where none are global.
 
     It covers the disturbances that do not see coming noise. Where it is asked to be quick, proposed metrics and local
-    constants are left out.
-
-    Raises
-    ------
-    ValueError
-        If stated constants contradict the problem's own noise.
-    EnclosureError
-        If the Jacobian is unbounded or undefined on the domain that the user gave.
-    EngineError
-        If the nominal is lost before the horizon.
+    constants are left out. ValueError where stated constants contradict the problem's own noise, EnclosureError where
+    the Jacobian is unbounded or undefined on the domain that the user gave, EngineError where the nominal is lost
+    before the horizon.
     """
     method, constants, quick = asked.method, asked.constants, asked.quick
     if constants is not None:
@@ -133,10 +124,7 @@ def _proposals(problem: Problem, *, quick: bool) -> Iterator[Constants]:
 
 
 def _better(first: EngineAnswer, second: EngineAnswer) -> EngineAnswer:
-    if second.log10_delta != first.log10_delta:
-        return second if second.log10_delta < first.log10_delta else first
-    margins = (-math.inf if a.margin is None else a.margin for a in (first, second))
-    return first if next(margins) >= next(margins) else second
+    return min(first, second, key=lambda a: (a.log10_delta, math.inf if a.margin is None else -a.margin))
 
 
 class _Work:
@@ -172,12 +160,7 @@ class _Work:
         While no constraint is broken the state is in the domain, so that all constants hold up to the first event.
         """
         count = len(self.problem.constraints)
-        if (
-            self.method != "auto"
-            or count < 2
-            or not common.applicable
-            or self.problem.initial.random
-        ):
+        if self.method != "auto" or count < 2 or not common.applicable or self.problem.initial.random:
             return common
         if common.tube is not None and common.reach is not None:
             erosion = erode(common.reach, self.problem, common.reach.norm)

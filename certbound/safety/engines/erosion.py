@@ -20,8 +20,6 @@ from certbound.problem.sets import Inside
 from certbound.reach.sets import ReachTube, constraint_clearance
 from certbound.rigor.norms import Norm
 
-__all__ = ["Erosion", "Tightest", "erode"]
-
 Array = NDArray[np.float64]
 
 
@@ -46,17 +44,9 @@ class Tightest:
 class Erosion:
     """Rooms of all constraints (J of them) over the pieces (K) of a reach tube, in one metric.
 
-    Parameters
-    ----------
-    labels : tuple of str
-        The constraints in words, the model's domain last where there is one.
-    continuous : bool
-    starts, ends : ndarray, shape (K,)
-        The pieces; in discrete time steps, starts = ends.
-    radius : ndarray, shape (J, K)
-        Proved r; inf where the constraint is not asked.
-    factor : ndarray, shape (J, K)
-        Euclidean distance per unit of r (for people).
+    ``labels`` are the constraints in words, the model's domain last where there is one. ``starts`` and ``ends``, shape
+    (K,), are the pieces; in discrete time steps, starts = ends. ``radius``, shape (J, K), is the proved r, inf where
+    the constraint is not asked; ``factor``, shape (J, K), the Euclidean distance per unit of r (for people).
     """
 
     labels: tuple[str, ...]

@@ -12,8 +12,6 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Quadratic
 from certbound.rigor.intervals import Interval, sq
 
-__all__ = ["Gap", "gaps_of", "hull_of", "lies_inside"]
-
 Array = NDArray[np.float64]
 
 _CUTS = 12  # halvings of every side of a set

@@ -9,8 +9,6 @@ from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state
 from certbound.reach.remainder import hidden_jump
 from certbound.safety.answers import AS_IT_IS, Deviation, EngineAnswer, Request
 
-__all__ = ["linear_engine"]
-
 
 def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     """Smallest probability that Thm K7' proves for the problem, with one cell unless ``asked`` for more.

@@ -22,15 +22,6 @@ from certbound.tubes.question import Question, Start
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import least_exit_level
 
-__all__ = [
-    "BELOW",
-    "deviation_pieces",
-    "joined",
-    "log10_sum",
-    "room_level",
-    "smallest_level",
-]
-
 Array = NDArray[np.float64]
 Profile = tuple[Array, Array]
 
@@ -70,18 +61,9 @@ def smallest_level(
 ) -> float:
     """log10 of about the smallest delta at which a named tube fits; 0 if it fits at none.
 
-    Parameters
-    ----------
-    tube_at : callable
-        delta to tube.
-    fits : callable
-        Whether a tube fits into the rooms (rigorous).
-    target : float
-        The delta that was asked for.
-    fitting : Tube or None
-        The tube at that delta, if it fits.
-    closely : bool
-        False: only the target and 1/2 are tried.
+    ``tube_at`` takes a delta to its tube; ``fits`` says, rigorously, whether a tube fits into the rooms; ``target`` is
+    the delta that was asked for, ``fitting`` the tube at it, if it fits. Not ``closely``: only the target and 1/2 are
+    tried.
     """
 
     def proved(log10: float) -> float | None:

@@ -7,56 +7,34 @@ import math
 from certbound.display import rounded
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Region
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.values.continuous import ExitBounds, bound_exits
 from certbound.values.discrete import FailureBounds, bound_failure
 
-__all__ = ["values_engine"]
-
-_SECONDS = 20.0
+_SECONDS = 20.0  # about what may be spent
 _FLOOR = -300.0
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 
 
-def values_engine(
-    problem: Problem,
-    asked: Request = AS_IT_IS,
-    *,
-    target: Region | None = None,
-    ratio: float = 1.05,
-    seconds: float = _SECONDS,
-) -> EngineAnswer:
+def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     """Certified bounds of the probability of failing, on finer and finer grids; nothing where another has answered.
 
     Proves: log10_lower <= log10 of the largest probability of failing over starts and disturbances <= log10_delta.
-
-    Parameters
-    ----------
-    problem : Problem
-    asked : Request
-    target : Region, optional
-        Set that ends the danger; never to enter it counts as failing.
-    ratio : float
-        Refine until the upper bound is at most that many times the lower one.
-    seconds : float
-        About what may be spent; a quarter of it unless ``asked`` is thorough.
     """
     if asked.quick:
         return EngineAnswer(applicable=False, method="values", reason="left out, since another engine has answered.")
-    limit = seconds if asked.thorough else seconds / 4
+    limit = _SECONDS if asked.thorough else _SECONDS / 4
     try:
         if not isinstance(problem.system, DiscreteSystem):
-            return _continuous(problem, target=target, seconds=limit)
-        found = bound_failure(problem, target=target, ratio=ratio, seconds=limit, delta=problem.delta)
+            return _continuous(bound_exits(problem, seconds=limit))
+        found = bound_failure(problem, seconds=limit, delta=problem.delta)
     except (InfeasibleError, EnclosureError) as error:
         return EngineAnswer(applicable=False, method="values", reason=str(error))
     return _answer(problem, found)
 
 
-def _continuous(problem: Problem, *, target: Region | None, seconds: float) -> EngineAnswer:
-    found: ExitBounds = bound_exits(problem, target=target, seconds=seconds)
+def _continuous(found: ExitBounds) -> EngineAnswer:
     close = found.lower is not None and found.upper <= found.lower + math.log10(_CLOSE)
     return EngineAnswer(
         log10_delta=found.upper,

@@ -117,29 +117,52 @@ def load_kernel(source: str) -> Callable[..., Any]:
     with _LOCK:
         if digest not in _LOADED:
             folder = cache_directory()
-            text = source.replace("@CACHE@", str(folder is not None))
-            module = ModuleType(f"certbound_kernel_{digest}")
-            sys.modules[module.__name__] = module  # numba looks it up when it loads the compiled form
-            path = None if folder is None else folder / f"kernel_{digest}.py"
-            if path is not None:
-                _store(path, text.encode())
-                _drop_damaged(path)
-            # The text was written by this package a moment ago, from a validated tape.
-            exec(compile(text, str(path or f"<kernel {digest}>"), "exec"), module.__dict__)  # noqa: S102
-            if path is not None:
-                _seal(path)
-            _LOADED[digest] = module.run
+            try:
+                _LOADED[digest] = _run(digest, source, folder)
+            except (FileNotFoundError, RuntimeError) as error:  # another process drops the oldest kernels too
+                if isinstance(error, RuntimeError) and (folder is None or _source(folder, digest).exists()):
+                    raise
+                logger.info("kernel %s is not cached: %s", digest, error)
+                _LOADED[digest] = _run(digest, source, None)
         return _LOADED[digest]
+
+
+def _run(digest: str, source: str, folder: Path | None) -> Callable[..., Any]:
+    """The function ``run`` of a module, by the compiled form in ``folder`` if there is one."""
+    text = source.replace("@CACHE@", str(folder is not None))
+    module = ModuleType(f"certbound_kernel_{digest}")
+    sys.modules[module.__name__] = module  # numba looks it up when it loads the compiled form
+    path = None if folder is None else _source(folder, digest)
+    if path is not None:
+        _store(path, text.encode())
+        _drop_damaged(path)
+    # The text was written by this package a moment ago, from a validated tape.
+    exec(compile(text, str(path or f"<kernel {digest}>"), "exec"), module.__dict__)  # noqa: S102
+    if path is not None:
+        _seal(path)
+    run: Callable[..., Any] = module.run
+    return run
+
+
+def _source(folder: Path, digest: str) -> Path:
+    return folder / f"kernel_{digest}.py"
 
 
 def _store(path: Path, content: bytes) -> None:
     """Keep the source beside its compiled form (numba compares time and size); drop the oldest ones."""
     if not path.exists() or path.read_bytes() != content:
         write_atomically(path, content)
-        sources = sorted(path.parent.glob("kernel_*.py"), key=lambda file: file.stat().st_mtime)
-        for old in sources[:-_KEPT]:
+        for old in sorted(path.parent.glob("kernel_*.py"), key=_written)[:-_KEPT]:
             for file in [old, _manifest(old), *_compiled(old)]:
                 file.unlink(missing_ok=True)
+
+
+def _written(file: Path) -> float:
+    """When a file was written; long ago where another process has just dropped it."""
+    try:
+        return file.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
 
 
 def _manifest(path: Path) -> Path:

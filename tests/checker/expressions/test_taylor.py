@@ -12,7 +12,7 @@ from certbound.checker.expressions.arithmetic import Undecided, power
 from certbound.checker.expressions.expansion import Expansion
 from certbound.checker.expressions.graph import Graph
 from certbound.checker.expressions.operations import OPERATIONS
-from certbound.checker.expressions.quadratic import Quadratic
+from certbound.checker.expressions.quadratic import Cut, Quadratic
 
 
 def form(graph: Graph, node: int, centre: list[float], radius: list[float]) -> Quadratic:
@@ -116,7 +116,7 @@ def test_a_polynomial_stays_within_its_range_and_within_no_less() -> None:
 
 
 def test_cuts_count_and_points_beyond_them_do_not() -> None:
-    cut = ([arb(1), arb(1)], arb(-1), arb(1))  # |x + y| <= 1
+    cut = Cut([arb(1), arb(1)], arb(-1), arb(1))  # |x + y| <= 1
     assert polynomial().stays(arb(-0.3), arb(1.0), [cut]) is True
     assert polynomial().stays(arb(-0.1), arb(0.1), [cut]) is False
     assert polynomial(bend=-1.0).stays(arb(-1), arb(0.01), [cut]) is not True  # x y - ... = -(x - y)^2/2 goes to -2

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 import certbound as cb
 from certbound.constants.jacobians.affine import AffineSet, SectorSet
 from certbound.constants.jacobians.jacobian_sets import IntervalMatrixSet, UnionSet, VertexPolytope, as_set
-from certbound.constants.jacobians.structure import affine_set, jacobian_set
+from certbound.constants.jacobians.structure import affine_set
+from certbound.constants.metrics import jacobian_set
 from certbound.errors import EnclosureError
 from certbound.problem.model.derivative import jacobian
 from certbound.problem.model.evaluation import compile_numpy

@@ -61,6 +61,14 @@ def test_the_sharper_bounds_stay_above_the_simulated_probability(state: int, kin
         assert bound <= 2.2 * share + 3 * np.sqrt(share / len(top))
 
 
+def test_a_row_of_zeros_never_moves() -> None:
+    found = events(MATRIX, DIFFUSION, 4.0)
+    pieces = found.windows.response.pieces
+    event = found.along(np.zeros((pieces, 2)))
+    assert event.profile.max() < 1e-100
+    assert event.log_exceedance(np.full(pieces, 1e-3)) < np.log(1e-5)
+
+
 def test_a_clock_beats_the_windows_and_never_loses_to_them() -> None:
     found = events(np.array([[-0.5]]), np.array([[0.1**0.5]]), 5.0)
     pieces = found.windows.response.pieces

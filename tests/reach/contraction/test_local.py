@@ -86,6 +86,15 @@ def test_rates_grow_with_the_ball():
     assert np.all(np.isinf(slopes.bound(curve, np.full((1, curve.pieces), np.inf))))
 
 
+def test_a_jump_in_the_middle_of_a_ball_leaves_it_unbounded_and_the_others_as_they_were():
+    system = DiscreteSystem(lambda x: [np.arctan2(x[0], x[1]), 0.5 * x[1] + 1], states=2, noise=Gaussian(std=0.1))
+    flow = Flow(Problem(system, initial=Box([0.0, 0.0], [0.0, 0.0]), safe=[], horizon=3))
+    curve = nominal_curve(flow, [0.0, 0.0])
+    bounds = LocalSlopes(flow, Norm(2)).bound(curve, np.full((1, curve.pieces), 0.01))[0]
+    assert bounds[0] == np.inf
+    assert np.all(bounds[1:] < 2.0)
+
+
 def test_a_point_keeps_to_its_trajectory():
     tube = local_contraction_tube(cubic(0.0))
     assert tube.end == 2.0

@@ -117,6 +117,28 @@ def test_the_oldest_kernels_are_dropped(private, monkeypatch):
     assert len(files(private, "*.nbc")) == 2
 
 
+@posix
+def test_a_kernel_that_another_process_drops_while_the_oldest_are_sought_is_passed_over(private, monkeypatch):
+    monkeypatch.setattr(cache, "_KEPT", 1)
+    cache_directory()
+    (private / "kernel_gone.py").symlink_to(private / "nothing")  # listed, and not there when it is looked at
+    assert load_kernel(SOURCE.format(number=20))(1) == 21
+    assert [file.name for file in files(private, "kernel_*.py")] != ["kernel_gone.py"]
+    assert len(files(private, "kernel_*.py")) == 1
+
+
+@pytest.mark.parametrize("step", ["_drop_damaged", "_seal"])
+def test_a_kernel_that_another_process_drops_while_it_is_compiled_runs_all_the_same(private, monkeypatch, step):
+    there = getattr(cache, step)
+
+    def drop(path):
+        path.unlink()
+        there(path)
+
+    monkeypatch.setattr(cache, step, drop)
+    assert load_kernel(SOURCE.format(number=22))(1) == 23
+
+
 def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):
     target = tmp_path / "file"
     write_atomically(target, b"old")
