@@ -17,7 +17,7 @@ PACKAGE = ROOT / "certbound"
 
 # What a line names may import the lines above it: rooms, sub-rooms, and single modules that stand between these.
 ORDER = """
-errors lazy _version
+errors lazy arrays _version
 checks
 display
 rigor
@@ -81,7 +81,7 @@ LEVEL |= {
     f"checker.{unit}": level for level, line in enumerate(CHECKER_ORDER.split("\n")) for unit in line.split()
 } | {"checker": 99}
 
-GROUND = {"errors", "_version", "checks", "display", "rigor"}
+GROUND = {"errors", "arrays", "_version", "checks", "display", "rigor"}
 KNOWS_ONLY = {  # rooms that may be taken out and used elsewhere
     "tubes": GROUND,
     "gaussian": GROUND | {"problem"},
@@ -101,7 +101,7 @@ MANY_DOORS = {
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (23, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),
-    "reach.linear": (15, "certificates state the records of the search: its linearisation, shares, levels, references"),
+    "reach.linear": (14, "certificates state the records of the search: its linearisation, shares, levels, references"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
     "constants.programs": (15, "one program each for rate, gain and erosion, with what it is asked"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),

@@ -5,14 +5,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from certbound.lazy import lazily
 
 __all__ = ["bound_reach"]
 
+_HOME = {"dispatch": "bound_reach"}
 
-def __getattr__(name: str) -> Any:
-    if name == "bound_reach":
-        from certbound.reach.dispatch import bound_reach
-
-        return bound_reach
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazily(__name__, _HOME, __all__)

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.arrays import Array
+
 __all__ = ["BLOCK", "MEMORY_LIMIT", "Tally", "Work", "check_count", "entropy_of", "run_blocks"]
 
-Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 BLOCK = 1024
@@ -61,53 +62,31 @@ class Tally:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Work:
-    """Everything that a worker needs to run any block; it can be pickled.
+    """Everything that a worker needs to run any block; it can be pickled."""
 
-    Parameters
-    ----------
-    source : str
-        The kernel's source.
-    p : ndarray
-        Its parameters.
-    sample_start : callable
-        ``sample_start(rng, count)`` -> starts of shape (count, n).
-    low, high : ndarray, shape (q,)
-        Box of the disturbance that each path draws.
-    inputs, moving, nominal : ndarray
-        Tables over the steps.
-    windows : ndarray of int, shape (constraints, 2)
-        First and last step of each constraint.
-    profile, marks : ndarray
-        Divisor of deviations, steps to look at.
-    steps : int
-    interval : float
-        Time of a step.
-    counts_shape, marginals_shape : tuple of int
-    paths : int
-    entropy : int
-    block : int
-        Paths per block.
-    """
-
-    source: str
-    p: Array
+    source: str  # the kernel's source
+    p: Array  # its parameters
+    # ``sample_start(rng, count)`` -> starts of shape (count, n)
     sample_start: Callable[[np.random.Generator, int], Array]
+    # (q,): box of the disturbance that each path draws
     low: Array
     high: Array
+    # tables over the steps
     inputs: Array
     moving: Array
     nominal: Array
-    windows: Counts
+    windows: Counts  # (constraints, 2): first and last step of each constraint
+    # divisor of deviations, steps to look at
     profile: Array
     marks: Counts
     steps: int
-    interval: float
+    interval: float  # time of a step
     dimension: int
     counts_shape: tuple[int, int]
     marginals_shape: tuple[int, int, int, int] = (2, 0, 1, 1)
     paths: int
     entropy: int
-    block: int = BLOCK
+    block: int = BLOCK  # paths per block
 
     @property
     def blocks(self) -> int:

@@ -17,6 +17,8 @@ from certbound.simulation.compiled import write_atomically
 __all__ = ["Checkpoint", "seed_of"]
 
 _VERSION = 1
+_KEYS = ("version", "problem", "number of paths", "seed", "chunk size")
+_ARRAYS = ("done", "counts", "marginals", "steps", "finished")
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -72,13 +74,8 @@ class Checkpoint:
 
     def _keys(self) -> dict[str, str]:
         work = self.work
-        return {
-            "version": str(_VERSION),
-            "problem": work.digest(),
-            "number of paths": str(work.paths),
-            "seed": str(work.entropy),
-            "chunk size": str(self.chunk),
-        }
+        values = (_VERSION, work.digest(), work.paths, work.entropy, self.chunk)
+        return dict(zip(_KEYS, map(str, values), strict=True))
 
     def missing(self) -> list[int]:
         """Numbers of the chunks still to do."""
@@ -93,13 +90,10 @@ class Checkpoint:
         """Write the file, all of it or nothing."""
         if self.path is None:
             return
+        tally = self.tally
+        values = (np.packbits(self.done), tally.counts, tally.marginals, np.array(tally.steps), np.array(tally.paths))
         arrays = {name: np.array(value) for name, value in self._keys().items()}
-        arrays |= {
-            "done": np.packbits(self.done),
-            "counts": self.tally.counts,
-            "marginals": self.tally.marginals,
-        }
-        arrays |= {"steps": np.array(self.tally.steps), "finished": np.array(self.tally.paths)}
+        arrays |= dict(zip(_ARRAYS, values, strict=True))
         buffer = io.BytesIO()
         np.savez_compressed(buffer, allow_pickle=False, **arrays)
         write_atomically(self.path, buffer.getvalue())
@@ -117,19 +111,7 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
         raise ValueError(
             f"`checkpoint` {path} is not a checkpoint of certbound ({error}); choose another file."
         ) from error
-    needed = {
-        "version",
-        "problem",
-        "number of paths",
-        "seed",
-        "chunk size",
-        "done",
-        "counts",
-        "marginals",
-        "steps",
-        "finished",
-    }
-    if not needed <= set(stored):
+    if not {*_KEYS, *_ARRAYS} <= set(stored):
         raise ValueError(f"`checkpoint` {path} is not a checkpoint of certbound; choose another file.")
     return stored
 

@@ -69,7 +69,6 @@ def run_work(
 
     Parameters
     ----------
-    work : Work
     executor : concurrent.futures.Executor or dask Client, optional
         Threads of this process when omitted. The answer is the same on any.
     checkpoint : path, optional

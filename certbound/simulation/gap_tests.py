@@ -14,14 +14,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.sets import Faces, Quadratic
 from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 
-__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "tables_of", "window_test"]
-
-Array = NDArray[np.float64]
+__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "starts_at_once", "tables_of", "window_test"]
 
 EXPONENT = 40.0
 """A bridge is looked at only where it exits with probability above exp(-40)."""
@@ -29,34 +27,17 @@ EXPONENT = 40.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Barrier:
-    """One constraint on the steps ``first`` .. ``last``.
+    """One constraint on the steps ``first`` .. ``last``."""
 
-    Parameters
-    ----------
-    label : str
-        Text for humans.
-    stay : bool
-        True: inside the region; False: outside it.
-    round : bool
-        True: the region is {‖matrix x - offset‖ <= radius}; False: it is {matrix x <= offset}.
-    matrix : ndarray, shape (rows, n)
-    offset : ndarray, shape (rows,) or (steps + 1, rows)
-        The second shape: one row per step, for a region that moves.
-    radius : float
-    first, last : int
-    always : bool
-        Whether these are all steps: then the kernel asks no further.
-    """
-
-    label: str
-    stay: bool
-    round: bool
-    matrix: Array
-    offset: Array
+    label: str  # text for humans
+    stay: bool  # True: inside the region; False: outside it
+    round: bool  # True: the region is {‖matrix x - offset‖ <= radius}; False: it is {matrix x <= offset}
+    matrix: Array  # (rows, n)
+    offset: Array  # (rows,) or (steps + 1, rows): the second shape: one row per step, for a region that moves
     radius: float = 0.0
     first: int
     last: int
-    always: bool = False
+    always: bool = False  # whether these are all steps: then the kernel asks no further
 
     @property
     def moving(self) -> bool:
@@ -179,7 +160,8 @@ def if_all(*conditions: str, word: str = "if") -> str:
     return f"{word} {' and '.join(condition for condition in conditions if condition) or 'True'}:"
 
 
-def _starts(number: int, barrier: Barrier) -> str:
+def starts_at_once(number: int, barrier: Barrier) -> str:
+    """Condition for a constraint to hold at the start; none if it always does."""
     return "" if barrier.always else f"windows[{number}, 0] == 0"
 
 
@@ -210,7 +192,7 @@ def _faces(
     def out(names: list[str]) -> str:
         return (" or " if barrier.stay else " and ").join(f"{name} < 0.0" for name in names)
 
-    start = [*gaps(old, "x", "0"), if_all(_starts(number, barrier), f"({out(old)})"), f"    left = {number}"]
+    start = [*gaps(old, "x", "0"), if_all(starts_at_once(number, barrier), f"({out(old)})"), f"    left = {number}"]
     step = [
         *gaps(new, "y", "k + 1"),
         if_all(f"({out(new)})", *window_test(number, barrier, "k + 1")),
@@ -273,7 +255,7 @@ def _round(
 
     beyond = f"{'>' if barrier.stay else '<'} {radius} * {radius}"
     start = distance(old, "x", "0")
-    start += [if_all(_starts(number, barrier), f"{old} {beyond}"), f"    left = {number}"]
+    start += [if_all(starts_at_once(number, barrier), f"{old} {beyond}"), f"    left = {number}"]
     step = distance(new, "y", "k + 1")
     step += [if_all(f"{new} {beyond}", *window_test(number, barrier, "k + 1")), f"    left = {number}"]
     end = [f"{old} = {new}"]

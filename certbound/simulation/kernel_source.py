@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from certbound.problem.model import Tape
+from certbound.arrays import Array
+from certbound.problem.model import Tape, is_zero
 from certbound.simulation.gap_tests import Bridge
 from certbound.simulation.stepping import StepModel
 from certbound.simulation.tape_text import Parameters, function_source, indent, linear_form, vector
@@ -31,8 +31,6 @@ __all__ = [
     "open_noise",
     "step_lines",
 ]
-
-Array = NDArray[np.float64]
 
 _WORDS = "word_0, word_1, word_2, word_3"  # the state of the noise's stream
 _STORED = "stream[4], stream[5], stream[6], stream[7]"
@@ -203,12 +201,9 @@ def _noise(model: StepModel, p: Parameters) -> tuple[list[str], list[str], Bridg
 def _entries(tape: Tape) -> list[list[str]]:
     """Names of a diffusion's entries, "0.0" for those that are constant zero."""
     rows, columns = tape.shape
-    names = []
-    for place, output in enumerate(tape.outputs):
-        node = tape.nodes[output]
-        zero = node.op == "const" and node.value == 0.0
-        names.append("0.0" if zero else f"s_{place // columns}_{place % columns}")
-    return [names[row * columns : (row + 1) * columns] for row in range(rows)]
+    return [
+        ["0.0" if is_zero(tape, i * columns + j) else f"s_{i}_{j}" for j in range(columns)] for i in range(rows)
+    ]
 
 
 def _disturbance(model: StepModel, p: Parameters) -> list[str]:

@@ -7,16 +7,15 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from certbound.problem.model import Node, Tape, compile_numpy, edged, jacobian, trace
+from certbound.arrays import Array
+from certbound.problem.model import Node, Tape, compile_numpy, edged, is_zero, jacobian, trace
 from certbound.problem.noise import Law, check_law
 from certbound.simulation.tape_text import live_nodes
 from certbound.simulation.transition import exact_transition
 
 __all__ = ["Scenario", "StepModel", "step_model"]
-
-Array = NDArray[np.float64]
 
 _LARGEST_EXACT = 16
 
@@ -65,61 +64,33 @@ class Scenario:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepModel:
-    """One step of a system, as numbers and tapes.
+    """One step of a system, as numbers and tapes."""
 
-    Parameters
-    ----------
-    drift : Tape
-        Inputs (t, states, inputs, disturbances). With ``step`` > 0 the state moves by ``step`` times it;
-        otherwise it is the next state.
-    dimension, input_count, disturbance_count : int
-        n, and the numbers of inputs and disturbances among the tape's inputs.
-    step : float
-        Step h of Euler's scheme in seconds; 0 when ``drift`` gives the next state.
-    interval : float
-        Time between two states (h, or 1 in discrete time).
-    variate : str
-        Law of the m independent variates v: ``normal``, ``uniform`` on (-1, 1), ``sign``.
-    unit : Tape, optional
-        z as a function of v, entry by entry; without it z = v.
-    noise : ndarray, shape (n, m), or Tape
-        What multiplies z. A tape (inputs t, states; shape (n, m)) is multiplied by sqrt(step) too.
-    correction : Tape, optional
-        Diagonal of d g_ii/d x_i, for Milstein's scheme.
-    spread : ndarray, shape (n, m), optional
-        g sqrt(h) of the bridge between two steps; None in discrete time, and where ``noise`` is a tape.
-    bridge : bool
-        Whether exits between steps are looked for.
-    signal : Tape, optional
-        Disturbance as a function of (t, states).
-    low, high : ndarray, shape (disturbance_count,)
-        The disturbance's box.
-    switching : float
-        Mean number of steps between two jumps of a switching disturbance; 0: constant.
-    table : ndarray, shape (steps, input_count + disturbances given as an array)
-        Inputs that all paths share, one row a step.
-    scheme : str
-        What was chosen: ``exact``, ``milstein``, ``euler`` or ``discrete``.
-    """
-
+    # inputs (t, states, inputs, disturbances). With ``step`` > 0 the state moves by ``step`` times it; otherwise
+    # it is the next state
     drift: Tape
+    # n, and the numbers of inputs and disturbances among the tape's inputs
     dimension: int
     input_count: int = 0
     disturbance_count: int = 0
-    step: float = 0.0
-    interval: float = 1.0
-    variate: str = "normal"
-    unit: Tape | None = None
+    step: float = 0.0  # step h of Euler's scheme in seconds; 0 when ``drift`` gives the next state
+    interval: float = 1.0  # time between two states (h, or 1 in discrete time)
+    variate: str = "normal"  # law of the m independent variates v: ``normal``, ``uniform`` on (-1, 1), ``sign``
+    unit: Tape | None = None  # z as a function of v, entry by entry; without it z = v
+    # (n, m): what multiplies z. A tape (inputs t, states; shape (n, m)) is multiplied by sqrt(step) too.
     noise: Array | Tape
-    correction: Tape | None = None
+    correction: Tape | None = None  # diagonal of d g_ii/d x_i, for Milstein's scheme
+    # (n, m): g sqrt(h) of the bridge between two steps; None in discrete time, and where ``noise`` is a tape
     spread: Array | None = None
-    bridge: bool = False
-    signal: Tape | None = None
+    bridge: bool = False  # whether exits between steps are looked for
+    signal: Tape | None = None  # disturbance as a function of (t, states)
+    # (disturbance_count,): the disturbance's box
     low: Array = field(default_factory=lambda: np.zeros(0))
     high: Array = field(default_factory=lambda: np.zeros(0))
-    switching: float = 0.0
+    switching: float = 0.0  # mean number of steps between two jumps of a switching disturbance; 0: constant
+    # (steps, input_count + disturbances given as an array): inputs that all paths share, one row a step
     table: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    scheme: str = "discrete"
+    scheme: str = "discrete"  # what was chosen: ``exact``, ``milstein``, ``euler`` or ``discrete``
 
     @property
     def noise_count(self) -> int:
@@ -276,14 +247,9 @@ def _milstein(diffusion: Tape, n: int) -> Tape | None:
     if diffusion.shape != (n, n):
         return None
     derivative = jacobian(diffusion, tuple(range(1, n + 1)))
-    zero = [derivative.nodes[o].op == "const" and derivative.nodes[o].value == 0.0 for o in derivative.outputs]
-    entry = np.array(zero).reshape(n, n, n)
     for i in range(n):
-        for j in range(n):
-            node = diffusion.nodes[diffusion.outputs[i * n + j]]
-            if i != j and not (node.op == "const" and node.value == 0.0):
-                return None
-        if not all(entry[i, i, k] for k in range(n) if k != i):
+        others = [k for k in range(n) if k != i]
+        if not all(is_zero(diffusion, i * n + k) and is_zero(derivative, (i * n + i) * n + k) for k in others):
             return None
     outputs = tuple(derivative.outputs[(i * n + i) * n + i] for i in range(n))
     return Tape(inputs=derivative.inputs, nodes=derivative.nodes, outputs=outputs, shape=(n,))

@@ -53,16 +53,7 @@ def live_nodes(tape: Tape) -> list[int]:
 def function_source(name: str, tape: Tape, arguments: Sequence[str], parameters: Parameters) -> list[str]:
     """Source lines of ``name(p, *arguments)``, which returns the tape's outputs as a tuple.
 
-    Parameters
-    ----------
-    name : str
-        Name of the function.
-    tape : Tape
-        Function of ``len(arguments)`` scalars.
-    arguments : sequence of str
-        Variable name of each input slot, in the generated source.
-    parameters : Parameters
-        Receives the tape's numbers.
+    ``arguments`` name the input slots in the generated source; ``parameters`` receives the numbers of the tape.
 
     Examples
     --------

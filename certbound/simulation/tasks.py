@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, barrier_source
 from certbound.simulation.tape_text import Parameters, indent, linear_form
 
 __all__ = ["LOWEST", "Lines", "Task", "task_source"]
 
-Array = NDArray[np.float64]
 Lines = tuple[list[str], list[str], list[str], list[str]]
 
 LOWEST = -40
@@ -27,37 +26,20 @@ LOWEST = -40
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Task:
-    """What a kernel does with the paths.
+    """What a kernel does with the paths."""
 
-    Parameters
-    ----------
-    kind : str
-        ``exits`` (stop at the first exit, count it by constraint and time), ``deviation`` (histograms of the
-        largest distance to the associated noise-free path) or ``record`` (store states).
-    barriers : sequence of Barrier
-        Constraints of an ``exits`` task.
-    norm : ndarray, shape (rows, n), optional
-        The deviation s is measured by ‖norm s‖ ...
-    directions : ndarray, shape (rows, n), optional
-        ... or by the value of each directions . s (with one histogram each).
-    own_nominal : bool
-        Whether each path has a noise-free path of its own (which shares its start and disturbance); otherwise
-        all share one. In a ``record`` task: whether to store the deviation instead of the state.
-    smallest_scale : float
-        Smallest value of the profile that deviations are divided by; 0: no profile.
-    marked : bool
-        Whether histograms are also taken at marked steps.
-    densities : tuple of float
-        Bins per factor of two of the histograms of suprema, and of those at the marked times.
-    """
-
+    # ``exits`` (stop at the first exit, count it by constraint and time), ``deviation`` (histograms of the
+    # largest distance to the associated noise-free path) or ``record`` (store states)
     kind: Literal["exits", "deviation", "record"]
-    barriers: Sequence[Barrier] = ()
-    norm: Array | None = None
-    directions: Array | None = None
+    barriers: Sequence[Barrier] = ()  # constraints of an ``exits`` task
+    norm: Array | None = None  # (rows, n): the deviation s is measured by ‖norm s‖ ...
+    directions: Array | None = None  # (rows, n): ... or by the value of each directions . s (with one histogram each)
+    # whether each path has a noise-free path of its own (which shares its start and disturbance); otherwise all
+    # share one. In a ``record`` task: whether to store the deviation instead of the state.
     own_nominal: bool = True
-    smallest_scale: float = 0.0
-    marked: bool = False
+    smallest_scale: float = 0.0  # smallest value of the profile that deviations are divided by; 0: no profile
+    marked: bool = False  # whether histograms are also taken at marked steps
+    # bins per factor of two of the histograms of suprema, and of those at the marked times
     densities: tuple[float, float] = (1.0, 1.0)
 
 

@@ -5,31 +5,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+
+from certbound.arrays import Array
 
 __all__ = ["exact_transition"]
-
-Array = NDArray[np.float64]
 
 
 def exact_transition(matrix: Array, offset: Array, diffusion: Array, step: float) -> tuple[Array, Array, Array]:
     """The law of x(h) for dx = (A x + B v + b) dt + G dW with v constant: N(F x + E v + e, L L').
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (n, n + k)
-        [A, B].
-    offset : ndarray, shape (n,)
-        b.
-    diffusion : ndarray, shape (n, m)
-        G.
-    step : float
-        h in seconds.
-
-    Returns
-    -------
-    tuple of ndarray
-        [F, E] of shape (n, n + k), e of shape (n,), and L of shape (n, r) with r the rank of the covariance.
+    ``matrix`` (n, n + k) is [A, B], ``offset`` (n,) b, ``diffusion`` (n, m) G and ``step`` h in seconds. Returned are
+    [F, E] (n, n + k), e (n,) and L (n, r), r the rank of the covariance.
 
     Notes
     -----

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.adapters import to_casadi
 from certbound.problem.model import Tape, compile_numpy, trace
 from certbound.problem.problem import Problem
@@ -16,25 +16,14 @@ from certbound.synthesis.plant import Grid
 
 __all__ = ["Cost", "cost_of"]
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cost:
-    """Sum over the pieces of step * stage(t, z, u), and an end cost (z - c)' end (z - c).
+    """Sum over the pieces of step * stage(t, z, u), and an end cost (z - c)' end (z - c)."""
 
-    Parameters
-    ----------
-    stage : (Q, R) or Tape
-        Quadratic weights, or a function over ("t", *states, *inputs) of shape (1,).
-    end : ndarray, shape (n, n)
-    center : ndarray, shape (n,)
-        c.
-    """
-
-    stage: tuple[Array, Array] | Tape
-    end: Array
-    center: Array
+    stage: tuple[Array, Array] | Tape  # quadratic weights, or a function over ("t", *states, *inputs) of shape (1,)
+    end: Array  # (n, n)
+    center: Array  # (n,): c
 
     def symbolic(self, ca: Any, time: Any, state: Any, inputs: Any) -> Any:
         """Stage cost as a CasADi expression."""

@@ -19,46 +19,29 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array, Mask
 from certbound.problem.adapters import to_casadi
-from certbound.problem.model import Tape
+from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 
 __all__ = ["Face", "Facets", "Plane", "Round", "faces_of", "with_parts"]
-
-Array = NDArray[np.float64]
 
 _ANGLES = 24
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Face:
-    """What every face offers.
+    """What every face offers."""
 
-    Parameters
-    ----------
-    label : str
-        Of its constraint, for humans.
-    constraint : int
-        Index into ``problem.constraints``.
-    during : (float, float) or None
-        When it is asked.
-    dimension : int
-        Of the state.
-    coordinates : tuple of int
-        State indices that the set lives in.
-    center : Tape or ndarray
-        Where the set's origin is.
-    """
-
-    label: str
-    constraint: int
-    during: tuple[float, float] | None
-    dimension: int
-    coordinates: tuple[int, ...]
-    center: Any
+    label: str  # of its constraint, for humans
+    constraint: int  # index into ``problem.constraints``
+    during: tuple[float, float] | None  # when it is asked
+    dimension: int  # of the state
+    coordinates: tuple[int, ...]  # state indices that the set lives in
+    center: Any  # where the set's origin is
 
     @property
     def weights(self) -> int:
@@ -70,7 +53,7 @@ class Face:
         """Number of erosions that the face takes."""
         return 1
 
-    def asked(self, times: Array) -> NDArray[np.bool_]:
+    def asked(self, times: Array) -> Mask:
         """Whether the constraint is asked at each time."""
         if self.during is None:
             return np.ones(len(times), dtype=bool)
@@ -97,8 +80,6 @@ class Face:
         """Coordinates relative to the centre, shape (K, q)."""
         chosen = states[:, list(self.coordinates)]
         if isinstance(self.center, Tape):
-            from certbound.problem.model import compile_numpy
-
             return np.asarray(chosen - compile_numpy(self.center)(times))
         return np.asarray(chosen - self.center)
 
@@ -108,6 +89,10 @@ class Face:
         if isinstance(self.center, Tape):
             return chosen - to_casadi(self.center, [time])
         return chosen - ca.DM(np.asarray(self.center))
+
+    def _taken(self, states: Array, erosion: ArrayLike) -> Array:
+        """Erosions (K, parts)."""
+        return np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), self.parts))
 
     def _embedded(self, rows: Array) -> Array:
         """Rows over the set's coordinates as rows over the whole state."""
@@ -123,12 +108,16 @@ class Plane(Face):
     normal: Array
     bound: float
 
+    @property
+    def row(self) -> Array:
+        """The normal over the whole state."""
+        return self._embedded(self.normal)
+
     def rows(self, states: Array, times: Array) -> Array:
-        return np.broadcast_to(self._embedded(self.normal[None]), (len(states), 1, self.dimension))
+        return np.broadcast_to(self.row, (len(states), 1, self.dimension))
 
     def room(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
-        taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), 1))[:, 0]
-        return np.asarray(self.bound - self.local(states, times) @ self.normal - taken)
+        return np.asarray(self.bound - self.local(states, times) @ self.normal - self._taken(states, erosion)[:, 0])
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:
         return self.bound - ca.dot(ca.DM(self.normal), self.relative(ca, state, time)) - erosion[0]
@@ -165,9 +154,8 @@ class Round(Face):
         return np.asarray(extents.max(axis=1, keepdims=True) * factor)
 
     def room(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
-        taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), 1))[:, 0]
         value = np.linalg.norm(self.local(states, times) @ self.matrix.T, axis=1) - self.size
-        return np.asarray((value if self.outside else -value) - taken)
+        return np.asarray((value if self.outside else -value) - self._taken(states, erosion)[:, 0])
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:
         image = ca.DM(self.matrix) @ self.relative(ca, state, time)
@@ -197,14 +185,15 @@ class Facets(Face):
         return np.broadcast_to(full, (len(states), *full.shape))
 
     def room(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
-        taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), self.parts))
-        return np.asarray(np.max(self.local(states, times) @ self.normals.T - self.bounds - taken, axis=1))
+        return np.asarray(np.max(self.values(states, times, erosion), axis=1))
+
+    def values(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
+        """By how much every facet is passed, (K, facets)."""
+        return self.local(states, times) @ self.normals.T - self.bounds - self._taken(states, erosion)
 
     def best(self, states: Array, times: Array, erosion: ArrayLike = 0.0) -> Array:
         """Weights (K, facets) that choose the facet with the most room."""
-        taken = np.broadcast_to(np.asarray(erosion, dtype=float), (len(states), self.parts))
-        value = self.local(states, times) @ self.normals.T - self.bounds - taken
-        return np.asarray(np.eye(self.parts)[np.argmax(value, axis=1)])
+        return np.asarray(np.eye(self.parts)[np.argmax(self.values(states, times, erosion), axis=1)])
 
     def gap(self, ca: Any, state: Any, time: Any, erosion: Any, weights: Any) -> Any:
         value = ca.DM(self.normals) @ self.relative(ca, state, time) - ca.DM(self.bounds) - erosion

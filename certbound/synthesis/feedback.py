@@ -7,24 +7,24 @@ bounds during piece k, which the verdict proves like every other constraint.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.checks import matrix
 from certbound.constants.metrics import jacobian_set
 from certbound.constants.programs import design_feedback
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
-from certbound.problem.model import Tape, jacobian, substitute, trace
+from certbound.problem.model import Tape, jacobian, needed, substitute, trace
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside, Polytope
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 from certbound.synthesis.terminal import linearise, riccati
 
 __all__ = ["close_loop", "constrain_inputs", "depends_on", "resolve_feedback"]
-
-Array = NDArray[np.float64]
 
 _MOST_VERTICES = 64
 LARGER = 2.0
@@ -35,7 +35,6 @@ def resolve_feedback(problem: Problem, feedback: str | ArrayLike, start: Array) 
 
     Parameters
     ----------
-    problem : Problem
     feedback : {"riccati", "lmi"} or array_like of shape (m, n)
         "riccati": the linear-quadratic regulator of the linearisation at ``start``; "lmi": K and a metric together,
         with the smallest c or L over all Jacobians.
@@ -96,30 +95,14 @@ def _designed(problem: Problem, start: Array) -> Array:
         raise ValueError(f"`feedback` 'lmi' found no gain: {error}") from error
 
 
-def depends_on(tape: Tape, slots: Any) -> bool:
+def depends_on(tape: Tape, slots: Container[int]) -> bool:
     """Whether the outputs of a tape depend on any of the input slots."""
-    wanted, needed = set(slots), set(tape.outputs)
-    for index in range(len(tape.nodes) - 1, -1, -1):
-        if index not in needed:
-            continue
-        node = tape.nodes[index]
-        if node.op == "input":
-            if node.args[0] in wanted:
-                return True
-        else:
-            needed.update(node.args)
-    return False
+    live = needed(tape.nodes, tape.outputs)
+    return any(use and node.op == "input" and node.args[0] in slots for use, node in zip(live, tape.nodes, strict=True))
 
 
 def close_loop(system: System, gain: Array) -> System:
-    """The system x+ = f(t, x, w + K x, d) (or dx = ...) with inputs w without bounds.
-
-    Parameters
-    ----------
-    system : ContinuousSystem or DiscreteSystem
-    gain : ndarray, shape (m, n)
-        K.
-    """
+    """The system x+ = f(t, x, w + K x, d) (or dx = ...), K = ``gain`` (m, n), with inputs w without bounds."""
     names = system.input_names
 
     def law(x: Any, u: Any) -> Any:
@@ -144,13 +127,8 @@ def constrain_inputs(problem: Problem, gain: Array, plan: Array, used: Array) ->
     Neighbouring pieces share one constraint, with the tightest of their bounds, where that leaves each of them at least
     half of its own room: fewer constraints are verified sooner.
 
-    Parameters
-    ----------
-    problem : Problem
-    gain : ndarray, shape (m, n)
-    plan : ndarray, shape (N, m)
-    used : ndarray, shape (N, 2 m)
-        Largest K z + e and -K z + e on each piece, e what the tube takes: bounds less this is the room of a piece.
+    K = ``gain`` (m, n); ``used`` (N, 2 m) are the largest K z + e and -K z + e on each piece, e what the tube takes:
+    bounds less this is the room of a piece.
     """
     box = problem.system.inputs
     assert box is not None

@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.bounds import bound_constants
 from certbound.errors import InfeasibleError
 from certbound.problem.model import jacobian
@@ -39,14 +40,12 @@ from certbound.synthesis.tightening import (
     spread_tube,
     tighten,
 )
-from certbound.synthesis.transcription import Solution, Transcription
+from certbound.synthesis.transcription import Mode, Solution, Transcription
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
 __all__ = ["Path", "Planner", "Tightened", "check_tube"]
-
-Array = NDArray[np.float64]
 
 PIECES = 40
 ROUNDING = 1e-7
@@ -66,20 +65,11 @@ def check_tube(problem: Problem, tube: Tube) -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tightened:
-    """A tube along a plan and what it takes.
+    """A tube along a plan and what it takes."""
 
-    Parameters
-    ----------
-    erosion : ndarray, shape (points, parts)
-    inputs : ndarray, shape (points + 1, m)
-        Taken from the input bounds by the feedback.
-    tube : Tube or None
-        Where it comes from constants.
-    """
-
-    erosion: Array
-    inputs: Array
-    tube: Tube | None = None
+    erosion: Array  # (points, parts)
+    inputs: Array  # (points + 1, m): taken from the input bounds by the feedback
+    tube: Tube | None = None  # where it comes from constants
 
     def more(self, factor: float, extra: Array) -> Tightened:
         """Everything larger by a factor, and the erosions by ``extra`` (parts,) on top."""
@@ -198,7 +188,7 @@ class Planner:
             if not np.all(np.isfinite(states)) or np.abs(states).max() > 1e6:
                 states = np.tile(self.start, (self.grid.points + 1, 1))
             shape = self.tightened(spread_tube(self.problem, self.plant, self.grid, states, guess), states)
-            found = self.program.solve("scale", self.start, shape.erosion, guess, tightening=shape.inputs)
+            found = self.plan("scale", shape, guess)
             if not np.all(np.isfinite(found.states)):
                 break
             best = found
@@ -229,12 +219,7 @@ class Planner:
     def constants(self, plan: Array, *, metric: Any = None) -> Constants:
         """Certified constants in the one common metric, for every input that the problem allows.
 
-        Parameters
-        ----------
-        plan : ndarray, shape (N, m)
-            Around which the metric is chosen.
-        metric : "euclidean" or ndarray, shape (n, n), optional
-            The metric instead.
+        The metric is chosen around ``plan`` (N, m), unless ``metric`` names one: "euclidean", or a matrix (n, n).
 
         Raises
         ------
@@ -333,17 +318,9 @@ class Planner:
             assert self.terminal is not None
             check_terminal(self.terminal, self.faces, last, horizon)
 
-    def widest(self, tightened: Tightened, guess: Array) -> Solution:
-        """The plan with the largest s such that s times the erosion fits."""
-        return self.program.solve("scale", self.start, tightened.erosion, guess, tightening=tightened.inputs)
-
-    def cheapest(self, tightened: Tightened, guess: Array) -> Solution:
-        """The plan of least cost in the tightened constraints."""
-        return self.program.solve("cost", self.start, tightened.erosion, guess, tightening=tightened.inputs)
-
-    def softest(self, tightened: Tightened, guess: Array) -> Solution:
-        """The plan that misses the tightened constraints least."""
-        return self.program.solve("soft", self.start, tightened.erosion, guess, tightening=tightened.inputs)
+    def plan(self, mode: Mode, tightened: Tightened, guess: Array) -> Solution:
+        """The best plan in the tightened constraints, by a mode of `certbound.synthesis.transcription`."""
+        return self.program.solve(mode, self.start, tightened.erosion, guess, tightening=tightened.inputs)
 
 
 def _grid(problem: Problem, steps: int | None) -> Grid:

@@ -8,16 +8,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.adapters import to_casadi
 from certbound.problem.export import runge_kutta
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.sets import Box
 
 __all__ = ["Grid", "Plant", "middle_of"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -44,27 +42,17 @@ class Grid:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plant:
-    """Noise-free dynamics with a fixed disturbance and inputs in a box, and input rows that depend on the state.
+    """Noise-free dynamics with a fixed disturbance and inputs in a box, and input rows that depend on the state."""
 
-    Parameters
-    ----------
-    dynamics : Tape
-        Over ("t", *states, *inputs, *disturbances).
-    disturbance : ndarray, shape (q,)
-        Its middle.
-    low, high : ndarray, shape (m,)
-        Box of the decision u; infinite where there is none.
-    feedback : ndarray, shape (m, n), optional
-        The plant's own input is u + feedback z; ``input_low`` and ``input_high`` bound it.
-    input_low, input_high : ndarray, shape (m,), optional
-    """
-
-    dynamics: Tape
+    dynamics: Tape  # over ("t", *states, *inputs, *disturbances)
     dimension: int
-    disturbance: Array
+    disturbance: Array  # (q,): its middle
+    # (m,): box of the decision u; infinite where there is none
     low: Array
     high: Array
+    # (m, n): the plant's own input is u + feedback z; ``input_low`` and ``input_high`` bound it
     feedback: Array | None = None
+    # (m,)
     input_low: Array | None = None
     input_high: Array | None = None
 

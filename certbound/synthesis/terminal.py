@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Ellipsoid, Quadratic, Region
@@ -27,8 +28,6 @@ from certbound.synthesis.plant import middle_of
 from certbound.tubes.constants import Constants
 
 __all__ = ["TerminalSet", "check_terminal", "contraction_terminal", "linearise", "riccati", "riccati_terminal"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,15 +79,7 @@ class TerminalSet:
 
 
 def check_terminal(terminal: TerminalSet, faces: Sequence[Face], erosion: Array, time: float) -> None:
-    """Refuse a terminal set that sticks out of the tightened constraints at the last time.
-
-    Parameters
-    ----------
-    terminal : TerminalSet
-    faces : sequence of Face
-    erosion : ndarray, shape (parts,)
-        At that time.
-    time : float
+    """Refuse a terminal set that sticks out of the constraints as ``erosion`` (parts,) tightens them at the last time.
 
     Raises
     ------
@@ -114,8 +105,7 @@ def _room_of_region(region: Region, face: Face, erosion: Array, time: float) -> 
     room = face.room(middle, np.array([time]), erosion[None])
     if isinstance(face, Facets):
         spread = np.array([float(region.support(a)) - float(a @ middle[0]) for a in rows])
-        local = face.local(middle, np.array([time])) @ face.normals.T - face.bounds - erosion
-        return float(np.max(local[0] - spread))
+        return float(np.max(face.values(middle, np.array([time]), erosion)[0] - spread))
     reach = max(float(region.support(a)) - float(a @ middle[0]) for a in rows)
     if isinstance(face, Round) and not face.outside:
         reach *= 1.0 if rows.shape[0] == 2 else float(np.sqrt(len(face.coordinates)))
@@ -141,14 +131,11 @@ def linearise(problem: Problem, state: ArrayLike, inputs: ArrayLike) -> tuple[Ar
 
 
 def riccati(problem: Problem, state: ArrayLike | None = None) -> tuple[Array, Array, Array]:
-    """S, K and the closed loop's matrix of the linear-quadratic regulator at a state without inputs (python-control).
+    """S (n, n), K (m, n) with u = K z, and A + B K of the linear-quadratic regulator at a state without inputs.
 
     Without a cost of the problem, Q = I and R = I.
 
-    Returns
-    -------
-    (ndarray, ndarray, ndarray)
-        S (n, n), the cost-to-go matrix; K (m, n) with u = K z; A + B K.
+    S is the cost-to-go matrix (python-control).
 
     Raises
     ------
@@ -174,13 +161,7 @@ def contraction_terminal(
 ) -> TerminalSet:
     """The largest ball of the contraction metric that fits into the tightened constraints, with its cost.
 
-    Parameters
-    ----------
-    problem : Problem
-    constants : Constants
-        With a gain below 1 (rate below 0).
-    faces, erosion, time
-        The tightened constraints at the last time.
+    The constants must contract (a gain below 1, a rate below 0); the erosion is that of the last time.
 
     Raises
     ------
@@ -252,8 +233,7 @@ def _largest_level(metric: Array, center: Array, faces: Sequence[Face], erosion:
         rows = face.rows(center[None], np.array([time]))[0]
         reach = np.sqrt(np.einsum("ij,jk,ik->i", rows, inverse, rows))
         if isinstance(face, Facets):
-            local = (face.local(center[None], np.array([time])) @ face.normals.T - face.bounds - own)[0]
-            level = float(np.max(local / reach))
+            level = float(np.max(face.values(center[None], np.array([time]), own)[0] / reach))
         else:
             taken = face.erosion(reach[None])[0, 0] if isinstance(face, Round) else float(np.max(reach))
             level = float(face.room(center[None], np.array([time]), own[None])[0]) / float(taken)

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.gaussian.response import StepEvents, level_scale
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Quadratic
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
-from certbound.reach.linear import Events, Linearisation, LinearRun, Share, Supports
+from certbound.reach.linear import Events, Linearisation, LinearRun, Share
 from certbound.reach.nominal import initial_cells
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm
@@ -41,7 +41,6 @@ __all__ = [
     "tighten",
 ]
 
-Array = NDArray[np.float64]
 Rows = Callable[[Array, Array], Array]
 
 CORNERS = 8
@@ -105,10 +104,7 @@ class LinearTube(Tightening):
         at = engine.times if not engine.continuous else (engine.times[:-1] + engine.times[1:]) / 2
         middle = nodes if not engine.continuous else (nodes[:-1] + nodes[1:]) / 2
         a = np.ascontiguousarray(rows(middle, at))
-        radii = engine.radii[0]
-        support = Supports(
-            engine.response, engine.gathering.of_cell(0), 0, a, np.diag(radii)[radii > 0], continuous=engine.continuous
-        )
+        support = engine.supports(0, a)
         _, high, _ = support.remainder(self.bounds[0][0], self.bounds[1][0])
         taken = support.y + high
         taken += self._levels(a, key)

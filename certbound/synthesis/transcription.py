@@ -20,8 +20,8 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.adapters import casadi_module
 from certbound.synthesis.costs import Cost
 from certbound.synthesis.faces import Face, Facets, with_parts
@@ -30,7 +30,6 @@ from certbound.synthesis.terminal import TerminalSet
 
 __all__ = ["Mode", "Solution", "Transcription"]
 
-Array = NDArray[np.float64]
 Mode = Literal["cost", "scale", "soft"]
 
 PENALTY = 1e4
@@ -44,36 +43,18 @@ _UNBOUNDED = 1e19  # what IPOPT takes for infinity
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """A plan that a solver proposed and a rollout measured.
+    """A plan that a solver proposed and a rollout measured."""
 
-    Parameters
-    ----------
-    inputs : ndarray, shape (N, m)
-    states : ndarray, shape (points + 1, n)
-        Rolled out from the inputs.
-    success : bool
-        The rollout meets every tightened constraint up to `TOLERANCE` (with slack in mode ``soft``: the solver
-        ended well).
-    scale : float
-        s; 1 outside mode ``scale``.
-    cost : float
-    slack : ndarray, shape (points, faces)
-        By how much each tightened constraint is missed.
-    pressure : ndarray, shape (points, faces)
-        Multipliers of the tightened constraints: where they hold the plan back.
-    status : str
-        The solver's word.
-    seconds : float
-    """
-
-    inputs: Array
-    states: Array
+    inputs: Array  # (N, m)
+    states: Array  # (points + 1, n): rolled out from the inputs
+    # the rollout meets every tightened constraint up to `TOLERANCE` (with slack in mode ``soft``: the solver
+    # ended well)
     success: bool
-    scale: float
+    scale: float  # s; 1 outside mode ``scale``
     cost: float
-    slack: Array
-    pressure: Array
-    status: str
+    slack: Array  # (points, faces): by how much each tightened constraint is missed
+    pressure: Array  # (points, faces): multipliers of the tightened constraints: where they hold the plan back
+    status: str  # the solver's word
     seconds: float
     iterations: int
 
@@ -81,16 +62,7 @@ class Solution:
 class Transcription:
     """One family of optimal control problems: grid, plant, faces and cost are fixed, start and erosions vary.
 
-    Parameters
-    ----------
-    plant : Plant
-    grid : Grid
-    faces : sequence of Face
-    cost : Cost
-    terminal : TerminalSet, optional
-        Where the last state must lie.
-    options : dict, optional
-        For IPOPT.
+    ``terminal`` is where the last state must lie; ``warm``: a solve begins at the multipliers of the last one.
     """
 
     def __init__(

@@ -20,21 +20,11 @@ def integral(rate: arb, length: arb) -> arb:
 
 @dataclass(frozen=True, eq=False)
 class BallPath:
-    """v_t (in units of ``unit``^2) and I_t as balls, for one start v_0.
+    """v_t (in units of ``unit``^2) and I_t as balls, for one start v_0."""
 
-    Parameters
-    ----------
-    schedule : Schedule
-        The data.
-    start : arb
-        v_0 in units of ``schedule.unit``^2.
-    bessel : bool
-        v' = 2 c v (Bessel form) instead of v' = 2 c v + sigma^2.
-    """
-
-    schedule: Schedule
-    start: arb
-    bessel: bool = False
+    schedule: Schedule  # the data
+    start: arb  # v_0 in units of ``schedule.unit``^2
+    bessel: bool = False  # v' = 2 c v (Bessel form) instead of v' = 2 c v + sigma^2
 
     @cached_property
     def pieces(self) -> list[tuple[arb, arb]]:

@@ -9,39 +9,24 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.display import Shown, plain, span_text
 from certbound.rigor.norms import Norm
 
 __all__ = ["Constants", "Proof", "check_delta"]
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Proof:
-    """What the rigorous recheck established; built by ``certbound.constants`` alone, never by a user.
+    """What the rigorous recheck established; built by ``certbound.constants`` alone, never by a user."""
 
-    Parameters
-    ----------
-    sampled : float
-        Largest value of the bounded quantity that sampling found: no valid constant lies below it.
-    boxes : int
-        Number of boxes that the branch and bound proved.
-    status : str
-        What proposed the metric: ``closed form`` or the status of the solver.
-    domain : str
-        Where the constants hold, in words.
-    fingerprint : str
-        ``Constants.fingerprint`` of what was proved: altered constants are no longer certified.
-    """
-
-    sampled: float
-    boxes: int
-    status: str
-    domain: str
-    fingerprint: str
+    sampled: float  # largest value of the bounded quantity that sampling found: no valid constant lies below it
+    boxes: int  # number of boxes that the branch and bound proved
+    status: str  # what proposed the metric: ``closed form`` or the status of the solver
+    domain: str  # where the constants hold, in words
+    fingerprint: str  # ``Constants.fingerprint`` of what was proved: altered constants are no longer certified
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -116,13 +101,13 @@ class Constants(Shown):
         if times is not None:
             if times.ndim != 1 or len(times) < 2 or times[0] != 0 or np.any(np.diff(times) <= 0):
                 raise ValueError("`times` must rise strictly from 0 and have at least two entries.")
-            object.__setattr__(self, "times", _frozen(times))
+            object.__setattr__(self, "times", _read_only(times))
         nu = float(self.dimension) if self.effective_dimension is None else float(self.effective_dimension)
         if not 0 < nu <= self.dimension:
             raise ValueError(f"`effective_dimension` must lie in (0, {self.dimension}], got {nu}.")
         object.__setattr__(self, "effective_dimension", nu)
         if self.metric is not None:
-            object.__setattr__(self, "metric", _frozen(_checked_metric(self.metric, self.dimension)))
+            object.__setattr__(self, "metric", _read_only(_checked_metric(self.metric, self.dimension)))
         if self.isotropic:
             object.__setattr__(self, "gaussian", True)
             if nu != self.dimension:
@@ -268,7 +253,6 @@ class Constants(Shown):
             return None
         return self.worst_slope - self.proof.sampled
 
-
 _PROVED = (
     "rate",
     "gain",
@@ -283,7 +267,7 @@ _PROVED = (
 )
 
 
-def _frozen(array: Array) -> Array:
+def _read_only(array: Array) -> Array:
     copy: Array = np.array(array, dtype=float)
     copy.setflags(write=False)
     return copy
@@ -298,7 +282,7 @@ def _values(name: str, value: ArrayLike | None, times: Array | None) -> float | 
     if times is None or array.ndim != 1 or len(array) != len(times) - 1:
         expected = "a number, or an array together with `times`" if times is None else f"{len(times) - 1} values"
         raise ValueError(f"`{name}` must be {expected}, got shape {array.shape}.")
-    return _frozen(array)
+    return _read_only(array)
 
 
 def _checked_metric(metric: ArrayLike, dimension: int) -> Array:

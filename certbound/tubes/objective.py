@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.tubes.schedule import Schedule
 
-__all__ = ["Clearance", "Objective", "make_objective", "read_clearance"]
-
-Array = NDArray[np.float64]
+__all__ = ["Clearance", "Objective", "make_objective", "mean_over_time", "read_clearance"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +111,7 @@ class Objective:
         with np.errstate(over="ignore", invalid="ignore"):
             if self.kind == "mean":
                 fine = schedule.graded(64)
-                return np.array([_mean(fine, root(fine))]), np.ones(1)
+                return np.array([mean_over_time(fine, root(fine))]), np.ones(1)
             if self.kind == "final":  # e^C sqrt(W_T) is sqrt(V_T) there
                 return np.sqrt(schedule.nodes[1][-1:]), np.ones(1)
             if self.clearance is None:
@@ -145,7 +143,8 @@ class Objective:
         return np.minimum(right, self.clearance.at(schedule.times, side="left"))
 
 
-def _mean(schedule: Schedule, values: Array) -> float:
+def mean_over_time(schedule: Schedule, values: Array) -> float:
+    """Mean of a function with these values at the nodes, in DT over the steps from 1 on."""
     times = schedule.times
     if schedule.continuous:
         return float(np.trapezoid(values, times) / times[-1])

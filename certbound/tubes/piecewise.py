@@ -8,15 +8,13 @@ from typing import Any
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.rigor.balls import precision, upper
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.tube import monotone
 
 __all__ = ["MonotoneProfile", "PiecewiseProfile"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -32,24 +32,12 @@ class Start:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Question:
-    """All but the probability delta, which is asked for, or found: made once by :meth:`of`, which checks it.
+    """All but the probability delta, which is asked for, or found: made once by :meth:`of`, which checks it."""
 
-    Parameters
-    ----------
-    constants : Constants
-        As stated or proved.
-    schedule : Schedule
-        The constants cut to the horizon.
-    goal : Objective
-        What is minimised; its clearance is what an exit probability is bounded for.
-    start : Start
-        Deviation at time 0.
-    """
-
-    constants: Constants
-    schedule: Schedule
-    goal: Objective
-    start: Start
+    constants: Constants  # as stated or proved
+    schedule: Schedule  # the constants cut to the horizon
+    goal: Objective  # what is minimised; its clearance is what an exit probability is bounded for
+    start: Start  # deviation at time 0
 
     @classmethod
     def of(

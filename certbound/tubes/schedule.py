@@ -15,13 +15,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.tubes.constants import Constants
 
 __all__ = ["Schedule", "make_schedule", "spread"]
-
-Array = NDArray[np.float64]
 
 
 def integral(rate: Array, length: Array) -> Array:
@@ -33,33 +31,15 @@ def integral(rate: Array, length: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Schedule:
-    """Constants cut to a horizon: K pieces, values constant on [times[k], times[k+1]).
+    """Constants cut to a horizon: K pieces, values constant on [times[k], times[k+1])."""
 
-    Parameters
-    ----------
-    continuous : bool
-        CT or DT.
-    times : ndarray (K + 1,)
-        From 0 to the horizon; whole numbers in DT.
-    slopes : ndarray (K,)
-        rate (CT) or gain (DT) per piece, as stated.
-    sigmas : ndarray (K,)
-        Noise level per piece, as stated.
-    nu : float
-        Effective dimension.
-    any_power : bool
-        Whether every Kummer parameter a > 0 is valid (CT, Gaussian noise or isotropic proxy; Thm K1).
-    scale : float, optional
-        Unit of length; the largest sigma when omitted.
-    """
-
-    continuous: bool
-    times: Array
-    slopes: Array
-    sigmas: Array
-    nu: float
-    any_power: bool
-    scale: float | None = None
+    continuous: bool  # CT or DT
+    times: Array  # (K + 1,): from 0 to the horizon; whole numbers in DT
+    slopes: Array  # (K,): rate (CT) or gain (DT) per piece, as stated
+    sigmas: Array  # (K,): noise level per piece, as stated
+    nu: float  # effective dimension
+    any_power: bool  # whether every Kummer parameter a > 0 is valid (CT, Gaussian noise or isotropic proxy; Thm K1)
+    scale: float | None = None  # unit of length; the largest sigma when omitted
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
@@ -153,7 +133,7 @@ class Schedule:
         extra = (self.times[:-1, None] + self.lengths[:, None] * fraction).ravel()
         return self.refined(extra if self.continuous else np.append(np.ceil(extra), 1.0))
 
-    def locate(self, t: Array) -> NDArray[np.intp]:
+    def locate(self, t: Array) -> Index:
         """Piece that holds each time."""
         last = len(self.lengths) - 1
         return np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, last)

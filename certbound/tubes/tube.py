@@ -11,15 +11,14 @@ from typing import Any, Protocol
 
 import numpy as np
 from flint import arb, arb_mat
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.display import Shown, log10_text, rounded
 from certbound.rigor.balls import lower, precision, upper
 from certbound.tubes.constants import Constants
 
 __all__ = ["Profile", "Tube", "log10_upper", "metric_factor"]
-
-Array = NDArray[np.float64]
 
 
 class Profile(Protocol):

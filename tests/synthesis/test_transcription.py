@@ -43,7 +43,7 @@ def test_the_rollout_of_continuous_time_is_the_solution() -> None:
 
 def test_the_cheapest_plan_keeps_the_tightened_constraints_and_touches_them() -> None:
     planner = Planner(cart())
-    free, held = (planner.cheapest(tight(planner, e), planner.guess()) for e in (0.0, 0.3))
+    free, held = (planner.plan("cost", tight(planner, e), planner.guess()) for e in (0.0, 0.3))
     assert free.success
     assert held.success
     assert held.states[:, 1].min() == pytest.approx(-0.5, abs=1e-5)
@@ -53,31 +53,31 @@ def test_the_cheapest_plan_keeps_the_tightened_constraints_and_touches_them() ->
 
 def test_the_scale_is_that_at_which_the_program_stops_having_a_point() -> None:
     planner = Planner(cart())
-    widest = planner.widest(tight(planner, 0.1), planner.guess())
+    widest = planner.plan("scale", tight(planner, 0.1), planner.guess())
     assert widest.success
-    assert planner.cheapest(tight(planner, 0.1 * widest.scale * 0.999), widest.inputs).success
-    assert not planner.cheapest(tight(planner, 0.1 * widest.scale * 1.01), widest.inputs).success
+    assert planner.plan("cost", tight(planner, 0.1 * widest.scale * 0.999), widest.inputs).success
+    assert not planner.plan("cost", tight(planner, 0.1 * widest.scale * 1.01), widest.inputs).success
 
 
 def test_the_soft_plan_keeps_the_constraints_themselves_and_reports_the_rest() -> None:
     planner = Planner(cart())
-    soft = planner.softest(tight(planner, 0.7), planner.guess())
+    soft = planner.plan("soft", tight(planner, 0.7), planner.guess())
     assert soft.success
     assert 0 < soft.slack.max() <= 0.7 + 1e-6
     assert np.all(np.abs(soft.states[:, 1]) <= 0.8 + 1e-6)
-    assert not planner.cheapest(tight(planner, 0.7), planner.guess()).success
+    assert not planner.plan("cost", tight(planner, 0.7), planner.guess()).success
 
 
 def test_the_measured_cost_is_the_sum_of_its_stages() -> None:
     planner = Planner(cart())
-    found = planner.cheapest(tight(planner, 0.0), planner.guess())
+    found = planner.plan("cost", tight(planner, 0.0), planner.guess())
     by_hand = np.sum(found.states**2) + 0.01 * np.sum(found.inputs**2)
     assert found.cost == pytest.approx(by_hand, rel=1e-12)
 
 
 def test_a_users_stage_cost_is_minimised() -> None:
     planner = Planner(cart(), stage_cost=lambda t, x, u: (x[0] - 0.5) ** 2 + 1e-4 * u[0] ** 2)
-    found = planner.cheapest(tight(planner, 0.0), planner.guess())
+    found = planner.plan("cost", tight(planner, 0.0), planner.guess())
     assert found.success
     assert found.states[-2, 0] == pytest.approx(0.5, abs=0.02)
 

@@ -21,7 +21,7 @@ from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.payment import BIN, Levels, Patched, pay_lower, pay_upper, repay
 from certbound.values.continuous.polynomials import basis_at, interpolation, node_product, nodes_of, to_bernstein
-from certbound.values.continuous.proposal import sketch
+from certbound.values.continuous.proposal import Splines, sketch, through
 from certbound.values.continuous.residual import bound_ranges
 from certbound.values.continuous.room import safe_room, starts_of
 from certbound.values.continuous.shapes import propose_lower, propose_upper, sealed
@@ -436,3 +436,12 @@ def test_a_disturbance_that_counts_between_the_ends_of_its_range_only_is_seen() 
     )
     safe = [cb.Inside(cb.Box([-1], [1]))]
     assert bound_exits(cb.Problem(system, initial=[0.0], safe=safe, horizon=0.5), seconds=0.5).upper == 0.0
+
+
+def test_nodes_are_bent_to_a_start_and_stay_where_a_start_lies_on_an_end():
+    nodes = np.linspace(1.0, 2.0, 41)
+    assert 1.513 in through(nodes, (1.513, 1.513))
+    end = float(np.nextafter(2.0, 0.0))
+    kept = through(nodes, (end, end))
+    assert np.array_equal(kept, nodes)
+    assert np.linalg.cond(Splines(kept).dense[0]) < 1e6

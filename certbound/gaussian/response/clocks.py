@@ -15,19 +15,17 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.response.decorrelation import decorrelation
 from certbound.gaussian.response.events import WindowEvent, WindowEvents
 from certbound.gaussian.response.linear_response import LinearResponse, continuous_response
-from certbound.gaussian.response.martingale_windows import logsumexp
+from certbound.gaussian.response.martingale_windows import logsumexp, remembered
 from certbound.gaussian.response.moments import smooth_moments
 from certbound.gaussian.scalar import Clock, clock_crossing, crossing_rate, node_clock
 from certbound.rigor.intervals import Interval
 
 __all__ = ["ClockBound", "ClockEvents", "RateBound", "SteadyEvent"]
-
-Array = NDArray[np.float64]
 
 _PART, _FEWEST_PARTS = 0.05, 100  # ||J|| times the length of a part; parts of the horizon
 _LIMITS = (0.35, 3.0)  # of -log corr in a block: short blocks have a slower clock, long ones add fewer probabilities
@@ -157,18 +155,11 @@ class SteadyEvent:
 
 @dataclass(frozen=True, eq=False)
 class ClockEvents:
-    """Windows for every row, clocks or crossing rates for the rows that stay the same.
-
-    Parameters
-    ----------
-    windows : WindowEvents
-    diffusion : ndarray, shape (n, m), or (N, n, m) where it differs from piece to piece
-    memory : dict
-        What was computed for this cell's response before; shared by events with other levels.
-    """
+    """Windows for every row, clocks or crossing rates for the rows that stay the same."""
 
     windows: WindowEvents
-    diffusion: Array
+    diffusion: Array  # (n, m), or (N, n, m) where it differs from piece to piece
+    # what was computed for this cell's response before; shared by events with other levels
     memory: dict[Any, Any] = field(default_factory=dict)
 
     @property
@@ -194,12 +185,8 @@ class ClockEvents:
 
     def bound(self, row: Array) -> ClockBound | RateBound | None:
         """The sharper bound along ``row``; None where none is proved."""
-        key = row.tobytes()
-        if key not in self.memory:
-            smooth = not np.any(np.abs(row) @ np.abs(self.diffusion))
-            self.memory[key] = self._rate(row) if smooth else self._clock(row)
-        found: ClockBound | RateBound | None = self.memory[key]
-        return found
+        smooth = not np.any(np.abs(row) @ np.abs(self.diffusion))
+        return remembered(self.memory, row.tobytes(), lambda: self._rate(row) if smooth else self._clock(row))
 
     @cached_property
     def parts(self) -> int:
@@ -221,10 +208,7 @@ class ClockEvents:
     @property
     def fine(self) -> LinearResponse:
         """The same response on the parts."""
-        if b"fine" not in self.memory:
-            self.memory[b"fine"] = self._refined()
-        found: LinearResponse = self.memory[b"fine"]
-        return found
+        return remembered(self.memory, b"fine", self._refined)
 
     def _refined(self) -> LinearResponse:
         response, parts = self.windows.response, self.parts

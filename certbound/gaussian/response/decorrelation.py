@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers, Mask
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.response.moments import UP, RowMoments, apply
 from certbound.gaussian.scalar import EPS
@@ -23,10 +23,6 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 
 __all__ = ["Decorrelation", "decorrelation"]
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 _BATCH = 2_000_000
 
@@ -41,13 +37,12 @@ class Decorrelation:
     variance: Interval
 
 
-def _ratio(x: Interval, y: Interval, usable: Flags) -> Interval:
+def _ratio(x: Interval, y: Interval, usable: Mask) -> Interval:
     """x / y where y > 0 (``usable``), anything elsewhere."""
-    result: Interval = x / Interval(np.where(usable, y.lo, 1.0), np.where(usable, y.hi, 1.0))
-    return result
+    return x / Interval(np.where(usable, y.lo, 1.0), np.where(usable, y.hi, 1.0))
 
 
-def _of(own: Interval, index: Index) -> Interval:
+def _of(own: Interval, index: Integers) -> Interval:
     return Interval(own.lo[index], own.hi[index])
 
 
@@ -55,8 +50,8 @@ def _of(own: Interval, index: Index) -> Interval:
 class _Pairs:
     """Phi(t_b, t_a) for pairs of nodes a < b in floats, with an entrywise error bound of each."""
 
-    a: Index
-    b: Index
+    a: Integers
+    b: Integers
     matrix: Array
     error: Array
 
@@ -144,7 +139,7 @@ def _at_nodes(row: RowMoments, w: Array, pairs: _Pairs) -> Array:
 
 
 def _derivatives(
-    row: RowMoments, rows: tuple[Array, Array], i: Index, j: Index, matrix: Array, error: Array
+    row: RowMoments, rows: tuple[Array, Array], i: Integers, j: Integers, matrix: Array, error: Array
 ) -> dict[str, Interval]:
     """D differentiated by t and s over the cells of parts i < j; ``matrix`` = Phi(t_j, t_{i+1})."""
     n, (middles, radii) = matrix.shape[-1], rows
@@ -169,20 +164,18 @@ def _product(middle: Array, radius: Array, other: Array, width: Array) -> Interv
     return Interval(np.where(known, centre - spread, -np.inf), np.where(known, centre + spread, np.inf))
 
 
-def _second(d: dict[str, Interval], usable: Flags, own: Interval, twice: str, once: str) -> Interval:
+def _second(d: dict[str, Interval], usable: Mask, own: Interval, second: str, first: str) -> Interval:
     """psi differentiated twice by t or by s: -D''/D + (D'/D)^2 + ``own``."""
-    result: Interval = _ratio(d[once], d["00"], usable) ** 2 - _ratio(d[twice], d["00"], usable) + own
-    return result
+    return _ratio(d[first], d["00"], usable) ** 2 - _ratio(d[second], d["00"], usable) + own
 
 
-def _mixed(d: dict[str, Interval], usable: Flags) -> Interval:
+def _mixed(d: dict[str, Interval], usable: Mask) -> Interval:
     """psi differentiated by s and t."""
     product = _ratio(d["10"], d["00"], usable) * _ratio(d["01"], d["00"], usable)
-    result: Interval = product - _ratio(d["11"], d["00"], usable)
-    return result
+    return product - _ratio(d["11"], d["00"], usable)
 
 
-def _slope_at_middles(row: RowMoments, part: Index) -> Array:
+def _slope_at_middles(row: RowMoments, part: Integers) -> Array:
     """Upper bounds of d psi/dt with s at the middle of the part before and t at that of ``part``."""
     column = row.at_middle[2]
     over, under = (

@@ -15,8 +15,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.response.martingale_windows import (  # fmt: skip
     ROUND,
@@ -25,8 +25,8 @@ from certbound.gaussian.response.martingale_windows import (  # fmt: skip
     inverse_of,
     logsumexp,
     longer,
-    numbers,
     one_cell,
+    remembered,
     size_of,
     spread_of,
 )
@@ -34,58 +34,36 @@ from certbound.gaussian.scalar import log_tail
 
 __all__ = ["WindowEvent", "WindowEvents"]
 
-Array = NDArray[np.float64]
-Nodes = NDArray[np.int64]
-
 
 @dataclass(frozen=True, eq=False)
 class WindowEvents:
-    """Continuous time: reflection in windows of ``length`` pieces.
-
-    Parameters
-    ----------
-    response : LinearResponse
-    cell : int
-    length : int
-        Pieces per window.
-    shared_log : float
-        Log probability granted to the event that some coordinate of M leaves its level in some window.
-    memory : dict
-        What does not depend on ``shared_log``; events with other shares may share it.
-    """
+    """Continuous time: reflection in windows of ``length`` pieces."""
 
     response: LinearResponse
     cell: int
-    length: int
-    shared_log: float
+    length: int  # pieces per window
+    shared_log: float  # log probability granted to the event that some coordinate of M leaves its level in some window
+    # what does not depend on ``shared_log``; events with other shares may share it
     memory: dict[Any, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "response", one_cell(self.response, self.cell))
 
     @cached_property
-    def bounds(self) -> Nodes:
+    def bounds(self) -> Integers:
         """Window borders: node numbers from 0 to N."""
         return np.append(np.arange(0, self.response.pieces, self.length, dtype=np.int64), self.response.pieces)
 
     @property
     def back(self) -> tuple[Array, Array]:
         """Phi(t_{k+1}, t_e)^{-1 of the forward map}: G_k of the row b = w G_k, and an entrywise error bound."""
-        if "back" not in self.memory:
-            self.memory["back"] = self._back()
-        found: tuple[Array, Array] = self.memory["back"]
-        return found
+        return remembered(self.memory, "back", self._back)
 
     def _back(self) -> tuple[Array, Array]:
-        """See `back`.
-
-        G_k approximates Phi(t_e, t_{k+1})^{-1}; the error also covers the motion inside piece k.
-        """
-        n = self.response.slope.shape[-1]
-        pieces = self.response.pieces
+        """G_k approximates Phi(t_e, t_{k+1})^{-1}; the error also covers the motion inside piece k."""
         f, phi = self.response.transition[0], self.response.transition_error[0]
-        g = np.zeros((pieces, n, n))
-        error = np.zeros((pieces, n, n))
+        n = f.shape[-1]
+        g, error = np.zeros(f.shape), np.zeros(f.shape)
         for start, end in zip(self.bounds[:-1], self.bounds[1:], strict=True):
             forward, slack = np.eye(n), 0.0
             for k in range(end - 1, start - 1, -1):
@@ -102,13 +80,10 @@ class WindowEvents:
 
         Proves: at every t of the piece b_t lies between w G at its start and at its end, up to |w| E, entry by entry.
         """
-        if "chords" not in self.memory:
-            self.memory["chords"] = self._chords()
-        found: tuple[Array, Array, Array] = self.memory["chords"]
-        return found
+        return remembered(self.memory, "chords", self._chords)
 
     def _chords(self) -> tuple[Array, Array, Array]:
-        """See `chords`. G_t = Phi(t_e, t)^{-1} obeys G'' = (K + Jhat^2) G: it leaves its chord by h^2/8 sup |G''|."""
+        """G_t = Phi(t_e, t)^{-1} obeys G'' = (K + Jhat^2) G: it leaves its chord by h^2/8 sup |G''|."""
         response, h = self.response, self.response.step * ROUND
         n, f, phi = response.slope.shape[-1], response.transition[0], response.transition_error[0]
         drift = np.abs(response.drift[0])
@@ -128,13 +103,9 @@ class WindowEvents:
     @property
     def starts(self) -> tuple[Array, Array]:
         """Phi(t_e, t_a) of every window in floats, and an entrywise error bound (one number a window)."""
-        if "starts" not in self.memory:
-            self.memory["starts"] = self._starts()
-        found: tuple[Array, Array] = self.memory["starts"]
-        return found
+        return remembered(self.memory, "starts", self._starts)
 
     def _starts(self) -> tuple[Array, Array]:
-        """See `starts`."""
         f, phi = self.response.transition[0], self.response.transition_error[0]
         n = f.shape[-1]
         result, errors = [], []
@@ -149,14 +120,13 @@ class WindowEvents:
     @property
     def coordinates(self) -> tuple[Array, list[Windows]]:
         """Upper bounds of the standard deviations of M at the windows' ends (W, n), and the windows of each M_i."""
-        if "coordinates" not in self.memory:
-            n, count = self.response.slope.shape[-1], len(self.bounds) - 1
-            rows = [np.broadcast_to(row, (count, n)) for row in np.eye(n)]
-            variance = np.stack([self.response.variance(r[None], self.bounds[1:])[1][0] for r in rows], axis=1)
-            sd = np.sqrt(np.maximum(variance, 0.0)) * ROUND
-            self.memory["coordinates"] = sd, [self._windows(r) for r in rows]
-        found: tuple[Array, list[Windows]] = self.memory["coordinates"]
-        return found
+        return remembered(self.memory, "coordinates", self._coordinates)
+
+    def _coordinates(self) -> tuple[Array, list[Windows]]:
+        n, count = self.response.slope.shape[-1], len(self.bounds) - 1
+        rows = [np.broadcast_to(row, (count, n)) for row in np.eye(n)]
+        variance = np.stack([self.response.variance(r[None], self.bounds[1:])[1][0] for r in rows], axis=1)
+        return np.sqrt(np.maximum(variance, 0.0)) * ROUND, [self._windows(r) for r in rows]
 
     @cached_property
     def coordinate_levels(self) -> Array:
@@ -183,10 +153,8 @@ class WindowEvents:
 
     def along(self, rows: Array) -> WindowEvent:
         """The event along ``rows`` (pieces, n)."""
-        key = "along", rows.tobytes()
-        if key not in self.memory:
-            self.memory[key] = self._course(rows)
-        return WindowEvent(course=self.memory[key], owner=self)
+        course = remembered(self.memory, ("along", rows.tobytes()), lambda: self._course(rows))
+        return WindowEvent(course=course, owner=self)
 
     def _course(self, rows: Array) -> Course:
         """What the event along ``rows`` needs, whatever the share."""
@@ -197,8 +165,8 @@ class WindowEvents:
         slack += 1e-14 * np.einsum("ki,kij->kj", np.abs(rows), np.maximum(np.abs(first), np.abs(last)))
         starts = self.bounds[:-1]
         directions = (np.maximum.reduceat(high, starts) + np.minimum.reduceat(low, starts)) / 2
-        window = np.repeat(numbers(len(starts)), np.diff(self.bounds))
-        nodes = numbers(self.response.pieces)
+        window = np.repeat(np.arange(len(starts)), np.diff(self.bounds))
+        nodes = np.arange(self.response.pieces)
         sizes = [self.response.variance(rows[None], nodes + shift)[1][0] for shift in (0, 1)]
         deviation = np.sqrt(np.maximum(np.maximum(*sizes), 0.0))
         early = max(1, len(rows) // 5)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.response.clocks import SteadyEvent
 from certbound.gaussian.response.events import WindowEvent
 from certbound.gaussian.response.martingales import SplitEvent
@@ -12,7 +12,6 @@ from certbound.gaussian.response.step_events import StepEvent
 
 __all__ = ["level_along", "level_scale"]
 
-Array = NDArray[np.float64]
 Event = StepEvent | WindowEvent | SteadyEvent | SplitEvent
 
 _TRIES = 12

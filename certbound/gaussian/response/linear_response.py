@@ -14,14 +14,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 
 __all__ = ["LinearResponse", "RowResponse", "discrete_response", "continuous_response"]
-
-Array = NDArray[np.float64]
-Nodes = NDArray[np.int64]
 
 _UNIT = 2.0**-53
 _TINY = 1e-300
@@ -50,45 +47,31 @@ def _norm(a: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearResponse:
-    """Linear data of a batch of nominal curves (axis 0: cells of X0; axis 1: pieces or steps).
+    """Linear data of a batch of nominal curves (axis 0: cells of X0; axis 1: pieces or steps)."""
 
-    Parameters
-    ----------
-    step : float
-        Length h of a piece (1 in discrete time); the exact length is h up to one rounding.
-    slope, drift : ndarray, shape (B, N, n, n)
-        A and K of Jhat(tau) = A + tau K.
-    transition : ndarray, shape (B, N, n, n)
-        F; the exact transition matrix differs by at most ``transition_error`` in every entry.
-    transition_error : ndarray, shape (B, N)
-    deviation : ndarray, shape (B, N, n, n)
-        Entrywise bound of |Phi(t, s) - I| for s <= t in one piece (0 in discrete time).
-    covariance, covariance_error : ndarray, shape (B, N + 1, n, n)
-        V and W with -W <= V_exact - V <= W as quadratic forms.
-    slope_error : float
-        Entrywise bound of the exact slope minus its floats.
-    """
-
-    step: float
+    step: float  # length h of a piece (1 in discrete time); the exact length is h up to one rounding
+    # (B, N, n, n): A and K of Jhat(tau) = A + tau K
     slope: Array
     drift: Array
+    # (B, N, n, n): F; the exact transition matrix differs by at most ``transition_error`` in every entry
     transition: Array
-    transition_error: Array
-    deviation: Array
+    transition_error: Array  # (B, N)
+    deviation: Array  # (B, N, n, n): entrywise bound of |Phi(t, s) - I| for s <= t in one piece (0 in discrete time)
+    # (B, N + 1, n, n): V and W with -W <= V_exact - V <= W as quadratic forms
     covariance: Array
     covariance_error: Array
-    slope_error: float = 0.0
+    slope_error: float = 0.0  # entrywise bound of the exact slope minus its floats
 
     @property
     def pieces(self) -> int:
         """Number of pieces N."""
         return int(self.slope.shape[1])
 
-    def variance(self, rows: Array, nodes: Nodes) -> tuple[Array, Array]:
+    def variance(self, rows: Array, nodes: Integers) -> tuple[Array, Array]:
         """Lower and upper bounds of the variances r V r^T of ``rows`` (B, M, n) at ``nodes`` (M,)."""
         return self.covariance_of(rows, rows, nodes)
 
-    def covariance_of(self, first: Array, second: Array, nodes: Nodes) -> tuple[Array, Array]:
+    def covariance_of(self, first: Array, second: Array, nodes: Integers) -> tuple[Array, Array]:
         """Bounds of cov(first Z, second Z) at ``nodes``; rows (B, M, n)."""
         n = first.shape[-1]
         used = np.flatnonzero((first != 0).any(axis=(0, 1)) | (second != 0).any(axis=(0, 1)))
@@ -238,15 +221,13 @@ class RowResponse:
 
     Parameters
     ----------
-    response : LinearResponse
-    cell : int
     rows : ndarray, shape (M, D, n)
         Rows at nodes 0 .. M - 1 (M <= N + 1).
     columns : ndarray of int, optional
         States that b_j is expected to move; what it does to the others is bounded coarsely (all when omitted).
     """
 
-    def __init__(self, response: LinearResponse, cell: int, rows: Array, columns: Nodes | None = None) -> None:
+    def __init__(self, response: LinearResponse, cell: int, rows: Array, columns: Integers | None = None) -> None:
         self.nodes, asked, self.dimension = rows.shape
         n = self.dimension
         places: dict[bytes, int] = {}

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.scalar import log_below_above, log_tail
 
 __all__ = [
-    "ROUND", "Course", "Windows", "inverse_of", "logsumexp", "longer", "numbers", "one_cell", "ratio_down", "ratio_up",
-    "size_of", "spread_of",
+    "ROUND", "Course", "Windows", "inverse_of", "logsumexp", "longer", "one_cell", "ratio_down", "ratio_up",
+    "remembered", "size_of", "spread_of",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
-Nodes = NDArray[np.int64]
+Found = TypeVar("Found")
 
 ROUND = 1 + 1e-14
 
@@ -129,18 +130,21 @@ class Course:
     """
 
     windows: Windows
-    starts: Nodes
-    window: Nodes
+    starts: Integers
+    window: Integers
     off: Array
     profile: Array
 
 
-def numbers(count: int) -> Nodes:
-    """0, 1, ..., count - 1."""
-    return np.arange(count, dtype=np.int64)
+def remembered(memory: dict[Any, Any], key: object, compute: Callable[[], Found]) -> Found:
+    """What ``compute`` returns, for all who share ``memory``."""
+    if key not in memory:
+        memory[key] = compute()
+    found: Found = memory[key]
+    return found
 
 
-def size_of(response: LinearResponse, nodes: Nodes) -> Array:
+def size_of(response: LinearResponse, nodes: Integers) -> Array:
     """Bound of the standard deviation along any row with entries in [-1, 1], at ``nodes``."""
     total = np.abs(response.covariance[0, nodes]).sum(axis=(1, 2)) + np.abs(
         response.covariance_error[0, nodes]).sum(axis=(1, 2))
@@ -149,10 +153,6 @@ def size_of(response: LinearResponse, nodes: Nodes) -> Array:
 
 def one_cell(response: LinearResponse, cell: int) -> LinearResponse:
     """The response of a single cell."""
-    chosen = slice(cell, cell + 1)
-    return LinearResponse(
-        step=response.step, slope=response.slope[chosen], drift=response.drift[chosen],
-        transition=response.transition[chosen], transition_error=response.transition_error[chosen],
-        deviation=response.deviation[chosen], covariance=response.covariance[chosen],
-        covariance_error=response.covariance_error[chosen], slope_error=response.slope_error,
-    )
+    batches = {name: value for name, value in vars(response).items() if isinstance(value, np.ndarray)}
+    alone: dict[str, Any] = {name: value[cell : cell + 1] for name, value in batches.items()}
+    return replace(response, **alone)

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index, Integers
 from certbound.gaussian.response.clocks import ClockEvents, SteadyEvent
 from certbound.gaussian.response.events import WindowEvent, WindowEvents
 from certbound.gaussian.response.linear_response import LinearResponse
@@ -30,8 +30,6 @@ from certbound.gaussian.scalar import log_tail
 from certbound.rigor.intervals import Interval
 
 __all__ = ["MartingaleEvent", "Martingales", "SplitEvent", "SplitEvents"]
-
-Array = NDArray[np.float64]
 
 _ROUND = 1 + 1e-12
 _UNIT = 2.0**-53
@@ -57,16 +55,8 @@ def quantile(log_probability: float) -> float:
 class Martingales:
     """The part of the noise that depends on the state, for one cell of the initial set.
 
-    Parameters
-    ----------
-    response : LinearResponse
-    cell : int
-    excess : Interval, shape (N, n, m)
-        g - ghat over the tube, piece by piece.
-    shared_log : float
-        Log probability granted to the event that some coordinate of M leaves its level in some window.
-    frame : Windowed, optional
-        What `Windowed` found for this response and cell before.
+    ``excess`` (N, n, m) is g - ghat over the tube, piece by piece; ``shared_log`` the log probability granted to the
+    event that some coordinate of M leaves its level in some window; ``frame`` what `Windowed` found before.
     """
 
     def __init__(
@@ -202,8 +192,8 @@ class MartingaleEvent:
     """One family of rows: kappa of every window, and what a level loses to coordinates and rounding on every piece."""
 
     kappa: Array
-    window: NDArray[np.intp]
-    starts: NDArray[np.int64]
+    window: Index
+    starts: Integers
     cost: Array
 
     @property

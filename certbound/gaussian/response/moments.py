@@ -10,16 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.scalar import EPS
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 
 __all__ = ["UP", "RowMoments", "SmoothMoments", "apply", "smooth_moments"]
-
-Array = NDArray[np.float64]
 
 UP = 1 + 1e-12
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.response.martingale_windows import logsumexp
 from certbound.gaussian.scalar import log_rectangle
@@ -21,8 +21,6 @@ from certbound.problem.sets import Inside
 from certbound.rigor.intervals import Interval
 
 __all__ = ["log_occupancy"]
-
-Array = NDArray[np.float64]
 
 _SIDES, _STEPS = 3, 200  # sides looked at, most steps
 _PARTS, _MOST = (1, 16, 16, 4), 4000  # cells of y along each side, by their number; cells and steps in all
@@ -39,8 +37,6 @@ def log_occupancy(
     ----------
     constraint : Outside
         Of a box that does not move; anything else is answered by 0.
-    response : LinearResponse
-    cell : int
     nominal : ndarray, shape (T + 1, n)
         p_t.
     moved, remainder : ndarray, shape (T + 1, n)

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.response.martingale_windows import logsumexp
 from certbound.gaussian.response.step_events import StepEvents
@@ -24,9 +24,6 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 
 __all__ = ["log_any_exceedance"]
-
-Array = NDArray[np.float64]
-Nodes = NDArray[np.int64]
 
 _MOST = 4000  # pairs of (step, row) looked at; where there are more, the rows' own events are added
 _WORTH = 1e-3  # share of its fair part of the whole that an overlap must promise
@@ -37,12 +34,7 @@ _UNIT = 2.0**-53
 def log_any_exceedance(events: StepEvents, rows: Sequence[Array], levels: Sequence[Array]) -> float:
     """Upper bound of log P(exists t and j: rows[j][t] . Z_t > levels[j][t]), for Gaussian noise.
 
-    Parameters
-    ----------
-    events : StepEvents
-    rows : sequence of ndarray, shape (nodes, n)
-    levels : sequence of ndarray, shape (nodes,)
-        +inf where nothing is asked.
+    Every row has the shape (nodes, n), its levels (nodes,), with +inf where nothing is asked.
     """
     if any(np.any(z < 0) for z in levels):
         return 0.0
@@ -63,18 +55,18 @@ def log_any_exceedance(events: StepEvents, rows: Sequence[Array], levels: Sequen
     t, j, i, lag = chosen.t, chosen.j, chosen.i, chosen.lag
     s = t - lag
 
-    def between(first: Nodes, node: Nodes, second: Nodes, past: Nodes) -> Interval:
+    def between(first: Integers, node: Integers, second: Integers, past: Integers) -> Interval:
         """cov(row ``first`` at ``node``, row ``second`` at ``past``), the later one first."""
         late = past > node
         return carried.covariance(np.where(late, second, first), np.maximum(node, past),
                                   np.where(late, first, second), np.minimum(node, past))
 
     own = tuple((variance[0][a, b].clip(0.0), variance[1][a, b].clip(0.0)) for a, b in ((t - 1, j), (t, j), (s, i)))
-    twice = triple_below(
+    counted = triple_below(
         z[t - 1, j], z[t, j], z[s, i], (own[0], own[1], own[2]),
         (between(j, t, j, t - 1), between(j, t - 1, i, s), between(j, t, i, s)),
     )
-    total = np.exp(whole) * (1 + 1e-14) - float(np.sum(twice)) * (1 - 1e-12)
+    total = np.exp(whole) * (1 + 1e-14) - float(np.sum(counted)) * (1 - 1e-12)
     return min(float(np.log(max(total, 1e-300))) + 1e-14, whole, 0.0)
 
 
@@ -82,10 +74,10 @@ def log_any_exceedance(events: StepEvents, rows: Sequence[Array], levels: Sequen
 class _Choice:
     """For row j at t: the row i at t - lag whose overlap is subtracted."""
 
-    t: Nodes
-    j: Nodes
-    i: Nodes
-    lag: Nodes
+    t: Integers
+    j: Integers
+    i: Integers
+    lag: Integers
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +112,7 @@ class _Carried:
         seen = self.rows[lag, lag:] @ self.response.covariance[0, : count - lag]
         return np.asarray(seen @ np.swapaxes(self.rows[0, : count - lag], -1, -2))
 
-    def covariance(self, first: Nodes, node: Nodes, second: Nodes, past: Nodes) -> Interval:
+    def covariance(self, first: Integers, node: Integers, second: Integers, past: Integers) -> Interval:
         """cov(row ``first`` at ``node``, row ``second`` at ``past``), past <= node."""
         lag = node - past
         row, other = self.rows[lag, node, first], self.rows[0, past, second]

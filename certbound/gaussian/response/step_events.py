@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.response.martingale_windows import (
     ROUND,
     logsumexp,
-    numbers,
     one_cell,
     ratio_down,
     ratio_up,
@@ -21,8 +20,6 @@ from certbound.gaussian.response.martingale_windows import (
 from certbound.gaussian.scalar import log_below_above, log_tail
 
 __all__ = ["StepEvent", "StepEvents"]
-
-Array = NDArray[np.float64]
 
 _KEPT = 16  # bounds that an event remembers
 
@@ -52,10 +49,10 @@ class StepEvents:
     @cached_property
     def sizes(self) -> Array:
         """Bounds of the standard deviation along any row with entries in [-1, 1], at all nodes."""
-        return size_of(self.response, numbers(self.response.pieces + 1))
+        return size_of(self.response, np.arange(self.response.pieces + 1))
 
     def _along(self, rows: Array) -> StepEvent:
-        nodes = numbers(len(rows))
+        nodes = np.arange(len(rows))
         variances = [v[0] for v in self.response.variance(rows[None], nodes)]
         if not self.gaussian:
             return StepEvent(variances[0], variances[1], None)

@@ -11,15 +11,14 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.rigor.rounding import quiet
 
 __all__ = [
     "gauss_rule", "lift", "log_below_above", "log_between", "log_tail", "log_tail_below", "mills", "mills_deficit",
 ]  # fmt: skip
-
-Array = NDArray[np.float64]
 
 EPS = 2.0**-52
 MILLS_ERROR = 2.0**-48

@@ -11,8 +11,9 @@ probability that a Brownian motion started a below the line meets it (Bachelier-
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.gaussian.scalar.normal import (
     EPS,
     LOG_ROOT_2PI,
@@ -26,8 +27,6 @@ from certbound.gaussian.scalar.normal import (
 from certbound.rigor.rounding import quiet
 
 __all__ = ["log_line_crossing", "log_polygon_crossing"]
-
-Array = NDArray[np.float64]
 
 _EDGES, _NODES = np.array([0.0, 0.2, 0.5, 1.0]), 16  # panels, as parts of the range; nodes in each
 _ELLIPSES = np.array([1.3, 1.7, 2.2, 3.0, 4.5, 7.0])

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.scalar.normal import lift, log_between
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 
 __all__ = ["log_rectangle"]
-
-Array = NDArray[np.float64]
 
 _CELLS = (1, 32, 14, 8)  # along every side but the last, by the number of sides
 _FAR = 9.0  # deviations beyond which the outermost cells are infinite

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.gaussian.scalar.normal import EPS, LOG_ROOT_2PI, lift, log_tail, mills_deficit
 from certbound.gaussian.scalar.pairs import Bounds, ends, levels_of, standard_levels, total
 from certbound.rigor.rounding import down, quiet, up
 
 __all__ = ["crossing_rate"]
-
-Array = NDArray[np.float64]
 
 
 @quiet
@@ -89,17 +88,21 @@ def crossing_rate(
     near = log_density + _log_positive_part(mean, up(np.sqrt(rest)))
     far = _vanishing(low, v_hi, up(np.sqrt(e_hi)), fall)
     rates = np.fmin(np.where(np.isnan(near), np.inf, near), far) + np.log(h)
+    initial = np.broadcast_to(initial, rates.shape[:-1])[..., None]
+    jumps = np.broadcast_to(_log_jumps(left, right, v_lo, v_hi), (*rates.shape[:-1], len(h) - 1))
+    logs = np.concatenate([initial, rates, jumps], axis=-1)
+    return total(lift(logs, 64), axis=-1)
+
+
+def _log_jumps(left: Array, right: Array, v_lo: Array, v_hi: Array) -> Array:
+    """Logs of what a level adds where it jumps down, P(z+ < xi <= z-), at every node between two pieces."""
     drop = right[..., :-1] - left[..., 1:]
     drop = np.where(drop > 0, up(drop), 0.0)
     node = (np.maximum(v_lo[..., :-1], v_lo[..., 1:]), np.minimum(v_hi[..., :-1], v_hi[..., 1:]))
     node = (np.minimum(*node), node[1])
     after, upper = left[..., 1:], np.maximum(left[..., 1:], right[..., :-1])
     jumps = np.where(drop > 0, np.log(drop) + _largest_density(after, upper, *node), -np.inf)
-    jumps = np.fmin(jumps, np.where(drop > 0, log_tail(standard_levels(after, *node)[0]), -np.inf))
-    initial = np.broadcast_to(initial, rates.shape[:-1])[..., None]
-    jumps = np.broadcast_to(jumps, (*rates.shape[:-1], len(h) - 1))
-    logs = np.concatenate([initial, rates, jumps], axis=-1)
-    return total(lift(logs, 64), axis=-1)
+    return np.fmin(jumps, np.where(drop > 0, log_tail(standard_levels(after, *node)[0]), -np.inf))
 
 
 def _line_ends(levels: Array, count: int) -> tuple[Array, Array]:

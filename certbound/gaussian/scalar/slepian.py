@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array, Index
 from certbound.checks import frozen
 from certbound.gaussian.scalar.normal import EPS
 from certbound.gaussian.scalar.ornstein_uhlenbeck import log_polygon_crossing
@@ -20,9 +21,6 @@ from certbound.gaussian.scalar.pairs import total
 from certbound.rigor.rounding import quiet
 
 __all__ = ["Clock", "Windows", "clock_crossing", "group_windows", "node_clock"]
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _WEIGHT = 2.0  # window clock times the square of the least level: near the optimum for levels of 3 to 6
 _MOST_WINDOWS = 2000
@@ -33,18 +31,10 @@ _FAR_ABOVE = 20.0  # levels with (z/s)^2 this much above the least do not matter
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Clock:
-    """A clock on K pieces, linear in time on each: clock(t) - clock(s) >= -log corr within every block.
+    """A clock on K pieces, linear in time on each: clock(t) - clock(s) >= -log corr within every block."""
 
-    Parameters
-    ----------
-    increments : ndarray, shape (K,)
-        Clock of each piece.
-    starts : ndarray of int
-        First piece of each block, beginning with 0.
-    """
-
-    increments: Array
-    starts: Index
+    increments: Array  # (K,): clock of each piece
+    starts: Index  # first piece of each block, beginning with 0
 
 
 def node_clock(durations: ArrayLike, near: ArrayLike, needs: ArrayLike, *, limit: float = 0.35) -> Clock:
@@ -100,7 +90,6 @@ def node_clock(durations: ArrayLike, near: ArrayLike, needs: ArrayLike, *, limit
         increments[j] = max(increments[j], ahead + 8 * EPS * (1 + abs(clock[j])))
         clock[j + 1] = clock[j] + increments[j]
     return Clock(increments=frozen(increments), starts=np.asarray(starts, dtype=np.intp))
-
 
 NO_CUTS: Index = np.zeros(1, dtype=np.intp)
 

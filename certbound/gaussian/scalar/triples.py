@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.gaussian.scalar.normal import log_tail, log_tail_below
 from certbound.gaussian.scalar.pairs import Bounds, ends, levels_of, log_pair, standard_levels
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 
 __all__ = ["triple_below"]
-
-Array = NDArray[np.float64]
 
 _KNOTS = np.array([0.0, 0.1, 0.2, 0.3, 0.42, 0.56, 0.72, 0.9, 1.1, 1.35, 1.65, 2.05, 2.6, 3.4, 4.8])
 _CUTS = np.interp(np.arange(29) / 2, np.arange(15), _KNOTS)  # edges of the cells of W, in units of its mean excess

@@ -11,11 +11,11 @@ Source: Thms K4, K5 (theory).
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.bounds import constants_along
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
@@ -40,14 +40,13 @@ __all__ = [
     "random_start",
 ]
 
-Array = NDArray[np.float64]
-
 BLOCK = 16
 ITERATIONS = 12
 INFLATION = 1.03
 GUESSES = 12
 TUBE_INFLATION = 1.1
 SEGMENTS = 48
+REFINE = 16  # sub-boxes per piece
 SUPREMUM_GAP = 2e-3
 _FARTHEST = 1e150  # radius beyond which nothing is looked for: its square must be finite
 
@@ -67,7 +66,6 @@ def local_contraction_tube(
 
     Parameters
     ----------
-    problem : Problem or Flow
     metric : array_like, shape (n, n), optional
         P; the identity when omitted.
     cells : int, optional
@@ -147,19 +145,16 @@ class _March:
 
 
 def local_constants(
-    problem: Problem, reach: ReachTube, extra: ArrayLike = 0.0, *, refine: int = 16, segments: int = SEGMENTS
+    problem: Problem, reach: ReachTube, extra: ArrayLike = 0.0, *, segments: int = SEGMENTS
 ) -> Constants:
     """Constants per piece that hold on reach + {||y||_P <= extra}, in the metric of ``reach`` (Thm K4).
 
     Parameters
     ----------
-    problem : Problem
     reach : ReachTube
         Noise-free tube over the whole horizon.
     extra : array_like, shape (K,) or ()
         Room for the stochastic deviation on each piece.
-    refine : int
-        Sub-boxes per piece.
     segments : int
         Neighbouring pieces are joined, at their largest values, until so many are left (continuous time).
 
@@ -175,19 +170,11 @@ def local_constants(
         times = np.append(curve.starts, curve.ends[-1])
     else:
         times, boxes = curve.starts, boxes[:-1]
-    along = constants_along(problem, times, boxes, metric=reach.metric, refine=refine)
+    along = constants_along(problem, times, boxes, metric=reach.metric, refine=REFINE)
     return along.with_fewer_pieces(segments) if curve.continuous else along
 
 
-def local_tube(
-    problem: Problem,
-    reach: ReachTube,
-    *,
-    delta: float,
-    method: str = "auto",
-    objective: Any = "max",
-    segments: int = SEGMENTS,
-) -> tuple[Tube, Array]:
+def local_tube(problem: Problem, reach: ReachTube, *, delta: float, method: str = "auto") -> tuple[Tube, Array]:
     """A tube whose constants hold on reach + tube only, and its radius over each piece of ``reach`` (Thm K4).
 
     Proves: P(||X_t - x_t||_P <= radius over the piece of t, for all t) >= 1 - delta for every associated trajectory
@@ -208,13 +195,13 @@ def local_tube(
     guess = np.zeros(reach.curve.pieces)
     for _ in range(GUESSES):
         try:
-            constants = local_constants(problem, reach, guess, segments=segments)
+            constants = local_constants(problem, reach, guess)
         except (ValueError, EnclosureError) as error:
             raise InfeasibleError(
                 f"no local tube at delta = {delta:g}: with {np.max(guess):.3g} of room, {error} "
                 "Use more cells, less noise, or a larger delta."
             ) from error
-        tube = tune_tube(constants, horizon=reach.end, delta=delta, method=method, objective=objective)
+        tube = tune_tube(constants, horizon=reach.end, delta=delta, method=method)
         if tube.level != "trajectory":
             raise ValueError(f"`method` must be of trajectory level with local constants, got {method!r}.")
         radius = radius_over_pieces(tube, reach.curve)

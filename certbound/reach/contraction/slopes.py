@@ -7,8 +7,8 @@ are rigorous at every stage (`certbound.constants.enclosures.coordinates`), so t
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.constants.enclosures import Metric, split_boxes
 from certbound.constants.state_jacobian import StateJacobian
 from certbound.reach.nominal import Curve, Flow
@@ -17,22 +17,13 @@ from certbound.rigor.norms import Norm
 
 __all__ = ["LocalSlopes"]
 
-Array = NDArray[np.float64]
-
 ROUNDS = 5
 TOLERANCE = 0.03
 LARGEST_BATCH = 8_000
 
 
 class LocalSlopes:
-    """Bounds of mu_P(D_x f) (CT) or ||D_x f||_P (DT) around pieces of a curve.
-
-    Parameters
-    ----------
-    flow : Flow
-    norm : Norm
-        The metric P.
-    """
+    """Bounds of mu_P(D_x f) (CT) or ||D_x f||_P (DT) around pieces of a curve, P the metric of ``norm``."""
 
     def __init__(self, flow: Flow, norm: Norm) -> None:
         self.flow, self.norm = flow, norm
@@ -90,7 +81,7 @@ class LocalSlopes:
         np.maximum.at(settled, owners, values)
         return settled
 
-    def _near(self, boxes: Interval, slots: Interval, centres: Interval, radius: Array) -> NDArray[np.bool_]:
+    def _near(self, boxes: Interval, slots: Interval, centres: Interval, radius: Array) -> Mask:
         """False only where no point of the box is within ``radius`` of the centre: a . y <= ||a||_P* ||y||_P."""
         low, high = slots.lo.copy(), slots.hi.copy()
         low[:, list(self.jacobian.active)], high[:, list(self.jacobian.active)] = boxes.lo, boxes.hi

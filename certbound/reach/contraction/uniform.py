@@ -17,8 +17,8 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import EnclosureError
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import Curve, Flow, bound_defect, bound_disturbance_slope, initial_cells, nominal_curve
@@ -38,8 +38,6 @@ __all__ = [
     "values_on_pieces",
 ]
 
-Array = NDArray[np.float64]
-
 CORNER_LIMIT = 6
 
 
@@ -49,7 +47,6 @@ def contraction_tube(
     *,
     cells: int | None = None,
     curve: Curve | None = None,
-    forcing: Array | None = None,
 ) -> ReachTube:
     """Noise-free reach tube in the constants' metric (Thm K5).
 
@@ -59,15 +56,12 @@ def contraction_tube(
 
     Parameters
     ----------
-    problem : Problem or Flow
     constants : Constants
         rate (continuous time) or gain (discrete time) in its metric; sigma is not used.
     cells : int, optional
         Parts along each side of the initial set, one curve each.
     curve : Curve, optional
         The curves, when they are known already; they must start one in each cell.
-    forcing : ndarray, shape (B, K), optional
-        `bound_forcing` in the same metric, when it is known already.
 
     Returns
     -------
@@ -89,10 +83,9 @@ def contraction_tube(
     if curve is None:
         curve = nominal_curve(flow, parts.centres)
     norm = constants.norm
-    eta = bound_forcing(flow, curve, norm) if forcing is None else forcing
     slopes = values_on_pieces(constants.slope, constants.times, curve)
     rho = parts.radii(norm, curve.initial())
-    radius, _ = integrate_radius(curve, jump_sizes(curve, norm), rho, slopes, eta)
+    radius, _ = integrate_radius(curve, jump_sizes(curve, norm), rho, slopes, bound_forcing(flow, curve, norm))
     proved = first_infinite(radius)
     if proved == 0:
         raise EnclosureError(
@@ -153,16 +146,9 @@ def _largest_image(norm: Norm, slope: Interval, width: Interval) -> Array:
 def integrate_radius(curve: Curve, gaps: Array, rho: Array, slopes: Array, eta: Array) -> tuple[Array, Array]:
     """rho over each piece, shape (B, K), and after the last one, shape (B,), rounded up.
 
-    Parameters
-    ----------
-    curve : Curve
-        Of K pieces (or steps).
-    gaps : ndarray, shape (B, K)
-        Size of the curve's jump after each piece, see `jump_sizes`.
-    rho : ndarray, shape (B,)
-        Radius at the start of the first piece.
-    slopes, eta : ndarray, shapes broadcastable to (B, K)
-        c (CT) or L (DT), and the forcing. Once a radius is infinite it stays so.
+    ``gaps`` (B, K) are the jumps of the curve after each of its K pieces (see `jump_sizes`), ``rho`` (B,) the radius at
+    the start of the first one; ``slopes`` and ``eta``, broadcastable to (B, K), are c (CT) or L (DT), and the forcing.
+    Once a radius is infinite it stays so.
     """
     slopes = np.broadcast_to(slopes, eta.shape)
     radius = np.empty(eta.shape)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from certbound.reach.linear.answer import LinearAnswer, linear_answer, linear_reach, refusal
 from certbound.reach.linear.deviation_tube import DeviationTube
 from certbound.reach.linear.diffusion import Accepted, DiffusionRun, Reference, depends_on_state
-from certbound.reach.linear.inclusion import Supports
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import Events, LinearRun, correlated
 from certbound.reach.linear.shares import Share
@@ -25,5 +24,4 @@ __all__ = [
     "Reference",
     "refusal",
     "Share",
-    "Supports",
 ]

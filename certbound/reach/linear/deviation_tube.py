@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from certbound.arrays import Array, Index
 
 __all__ = ["DeviationTube"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -47,7 +47,7 @@ class DeviationTube:
         """Euclidean bound of the deviation on each piece."""
         return np.asarray(np.linalg.norm(self.half_widths, axis=1) * (1 + 1e-14))
 
-    def _piece(self, t: ArrayLike) -> NDArray[np.intp]:
+    def _piece(self, t: ArrayLike) -> Index:
         index = np.searchsorted(self.times, np.asarray(t, dtype=float), side="right") - 1
         return np.clip(index, 0, len(self.half_widths) - 1)
 

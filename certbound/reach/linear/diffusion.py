@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.gaussian.response import (
     ClockEvents,
@@ -37,8 +37,6 @@ from certbound.reach.sets import Requirement
 from certbound.rigor.intervals import Interval
 
 __all__ = ["DiffusionRun", "depends_on_state"]
-
-Array = NDArray[np.float64]
 
 _ROUNDS = 12
 _SETTLE = 6
@@ -82,15 +80,15 @@ class DiffusionRun(LinearRun):
         assert isinstance(engine.system, ContinuousSystem)
         assert isinstance(engine.system.diffusion, Tape)
         self.tape = engine.system.diffusion
-        cells, pieces, n = len(engine.centres), engine.pieces, engine.n
+        cells, pieces, n = engine.shape
         slope, drift, _ = engine.slopes
         silent = np.zeros((cells, pieces, n, self.tape.shape[1]))
-        still = continuous_response(
+        without = continuous_response(
             slope, drift, engine.step, np.zeros((n, 1)), engine.start_covariance, slope_error=engine.slope_error
         )
         self.references = [
             Reference(response=engine.response, value=engine.diffusion, gaussian=True),
-            Reference(response=still, value=silent, gaussian=bool(engine.start_covariance.any())),
+            Reference(response=without, value=silent, gaussian=bool(engine.start_covariance.any())),
         ]
         self.frames = [Windowed(engine.response, cell) for cell in range(cells)]
         self.outcomes: dict[Share, Outcome] = {}
@@ -203,9 +201,8 @@ class DiffusionRun(LinearRun):
         """
         engine = self.engine
         count = len(engine.model.active)
-        shape = (len(engine.centres), engine.pieces, engine.n)
-        low = high = np.zeros((shape[0] * shape[1], count))
-        bounds: tuple[Array, Array] = (np.zeros(shape), np.zeros(shape))
+        low = high = np.zeros((engine.cells * engine.pieces, count))
+        bounds = self.nothing
         fresh = False
         for _ in range(_ROUNDS):
             for _ in range(_SETTLE):

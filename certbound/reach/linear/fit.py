@@ -8,16 +8,14 @@ later. Everything here proposes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
+from certbound.reach.linear.fixed_point import Inclusion
 from certbound.reach.linear.linearisation import Linearisation
-from certbound.reach.linear.run import LinearRun
 from certbound.reach.linear.shares import Share
 from certbound.reach.remainder import fitted_slopes
 
 __all__ = ["fitted"]
-
-Array = NDArray[np.float64]
 
 _PICARD = 10
 _CLOSE = 0.02
@@ -33,7 +31,7 @@ def fitted(engine: Linearisation, nonlinear: Share) -> Linearisation:
     """
     if not len(engine.model.active):
         return engine
-    run = LinearRun(engine, asked=False)
+    run = Inclusion(engine)
     for _ in range(2):
         tube = _tube(run, nonlinear)
         if tube is None:
@@ -48,20 +46,17 @@ def fitted(engine: Linearisation, nonlinear: Share) -> Linearisation:
         engine = other
         if grown < _LARGEST / 4:
             break
-        run = LinearRun(engine, asked=False)
+        run = Inclusion(engine)
     return engine
 
 
-def _tube(run: LinearRun, nonlinear: Share) -> tuple[Array, Array, float] | None:
+def _tube(run: Inclusion, nonlinear: Share) -> tuple[Array, Array, float] | None:
     """Rough bounds of the deviation along the inner rows (B N, D), and the remainder's share of them.
 
     None where the deviation without any remainder is beyond all use already.
     """
-    engine = run.engine
     levels = _levels(run, nonlinear)
-    shape = (len(engine.centres), engine.pieces, engine.n)
-    low, high = np.zeros(shape), np.zeros(shape)
-    base = run.deviations(levels, low, high)
+    base = run.deviations(levels, *run.nothing)
     if base is None:
         return None
     grown = 0.0
@@ -70,8 +65,7 @@ def _tube(run: LinearRun, nonlinear: Share) -> tuple[Array, Array, float] | None
         sample = run.sampled(tube)
         if not (np.isfinite(sample[0]).all() and np.isfinite(sample[1]).all()):
             return *base, np.inf
-        low, high = sample
-        found = run.deviations(levels, low, high)
+        found = run.deviations(levels, *sample)
         if found is None:
             return *tube, np.inf
         size = _LARGEST * (base[1] - base[0])
@@ -84,7 +78,7 @@ def _tube(run: LinearRun, nonlinear: Share) -> tuple[Array, Array, float] | None
     return *tube, grown
 
 
-def _levels(run: LinearRun, nonlinear: Share) -> Array:
+def _levels(run: Inclusion, nonlinear: Share) -> Array:
     """Levels of |Z| along the inner rows from their standard deviations alone."""
     v = run.engine.response.covariance
     variance = [np.einsum("bkdi,bkij,bkdj->bkd", run.rows, ends, run.rows) for ends in (v[:, :-1], v[:, 1:])]
@@ -97,8 +91,7 @@ def _levels(run: LinearRun, nonlinear: Share) -> Array:
 
 def _at_nodes(engine: Linearisation, found: Array) -> Array:
     """Corrections at the nodes from those of the pieces, on top of the ones that the engine has."""
-    shape = (len(engine.centres), engine.pieces, engine.n, engine.n)
-    pieces = found.reshape(shape)
+    pieces = found.reshape(*engine.shape, engine.n)
     if engine.continuous:
         ends = np.concatenate([pieces[:, :1], (pieces[:, 1:] + pieces[:, :-1]) / 2, pieces[:, -1:]], axis=1)
     else:

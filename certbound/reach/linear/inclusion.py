@@ -9,14 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.gaussian.response import LinearResponse, RowResponse
 
 __all__ = ["Gathering", "Supports"]
-
-Array = NDArray[np.float64]
-Nodes = NDArray[np.int64]
 
 _ROUND = 1 + 1e-13
 _UNIT = 2.0**-53
@@ -49,22 +46,19 @@ class Supports:
 
     Parameters
     ----------
-    response : LinearResponse
     gathering : Gathering
         Of this cell.
-    cell : int
     rows : ndarray, shape (N, D, n)
         In discrete time N + 1 rows, one a node.
     generators : ndarray, shape (G, n)
         Zonotope of the initial set about the nominal start.
-    continuous : bool
     outputs : ndarray of int, optional
         States that the remainder or the disturbance moves by more than a rounding error (discrete time).
     """
 
     def __init__(
         self, response: LinearResponse, gathering: Gathering, cell: int, rows: Array, generators: Array,
-        *, continuous: bool, outputs: Nodes | None = None,
+        *, continuous: bool, outputs: Integers | None = None,
     ) -> None:
         self.gathering, self.continuous, self.step = gathering, continuous, response.step
         self.rows = rows

@@ -7,22 +7,20 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 from certbound.gaussian.response import LinearResponse, continuous_response, discrete_response
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
-from certbound.reach.linear.inclusion import Gathering
+from certbound.reach.linear.inclusion import Gathering, Supports
 from certbound.reach.nominal import initial_cells
 from certbound.reach.remainder import Frame, Remainder
 from certbound.reach.sets import NominalPieces
 from certbound.rigor.intervals import Interval
 
 __all__ = ["WINDOW", "Linearisation"]
-
-Array = NDArray[np.float64]
 
 _FEWEST_PIECES, _MOST_PIECES = 50, 2000
 _STEP, _OWN_STEP, _SERIES = 0.1, 0.03, 2.0
@@ -102,6 +100,16 @@ class Linearisation:
         return trial if alike else cls(problem, cells=cells, pieces=pieces, noise=noise)
 
     # ---- nominal data ------------------------------------------------------------------------------------
+
+    @property
+    def cells(self) -> int:
+        """Number B of cells of the initial set."""
+        return len(self.centres)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Cells, pieces and states: (B, N, n)."""
+        return self.cells, self.pieces, self.n
 
     @cached_property
     def inputs(self) -> Array:
@@ -228,8 +236,7 @@ class Linearisation:
     @cached_property
     def tangents(self) -> tuple[Array, Array, Array]:
         """The same without the correction: derivatives along the nominal curve."""
-        cells = len(self.centres)
-        x = self.nodes
+        cells, x = self.cells, self.nodes
         inputs = np.broadcast_to(self.inputs, (cells, *self.inputs.shape))
 
         def at(nodes: Array, times: Array) -> Array:
@@ -261,7 +268,7 @@ class Linearisation:
         assert isinstance(self.system, ContinuousSystem)
         g = self.system.diffusion
         if isinstance(g, Tape):
-            shape = (len(self.centres), self.pieces, *g.shape)
+            shape = (self.cells, self.pieces, *g.shape)
             middle = (self.nodes[:, :-1] + self.nodes[:, 1:]) / 2
             time = np.broadcast_to((self.times[:-1] + self.times[1:]) / 2, shape[:2])
             with np.errstate(all="ignore"):
@@ -292,7 +299,7 @@ class Linearisation:
     def frame(self) -> Frame:
         """Enclosures of the nominal data, cells and pieces in one batch (piece index fastest)."""
         slope, drift, gain = self.slopes
-        cells, pieces, n = len(self.centres), self.pieces, self.n
+        cells, pieces, n = self.shape
 
         def flat(a: Array) -> Array:
             return a.reshape(cells * pieces, *a.shape[2:])
@@ -373,15 +380,24 @@ class Linearisation:
         box = (h * h / 4 * np.abs(slope) + h * second) @ size_e[..., None]
         generators = h * (middle @ gain) * self.d_radius
         rounding = 16 * (n + 4) * 2.0**-53 * h * (np.abs(middle) @ size_e[..., None])
-        bend = np.abs(response.drift) + _square(np.abs(slope) + h * np.abs(response.drift))
+        size = np.abs(slope) + h * np.abs(response.drift)
+        bend = np.abs(response.drift) + size @ size * _ROUND
         return Gathering(
             centre=h * middle, second=h * second, first=response.deviation,
             curve=h * h / 8 * (bend @ (identity + response.deviation)) * _ROUND,
             generators=np.swapaxes(generators, -1, -2), box=(box + rounding)[..., 0] * _ROUND, size=size_e * _ROUND,
         )
 
+    def supports(self, cell: int, rows: Array, outputs: Integers | None = None) -> Supports:
+        """Bounds of y and R of one cell along ``rows``; see `Supports`."""
+        radii = self.radii[cell]
+        return Supports(
+            self.response, self.gathering.of_cell(cell), cell, rows, np.diag(radii)[radii > 0],
+            continuous=self.continuous, outputs=outputs,
+        )
+
     @cached_property
-    def moved(self) -> NDArray[np.int64] | None:
+    def moved(self) -> Integers | None:
         """States that the remainder or a disturbance moves by more than a rounding error; None for all."""
         if self.continuous or self.n < _LARGE:
             return None
@@ -396,7 +412,3 @@ def balanced(slopes: Array) -> Array:
     largest = np.abs(slopes).reshape(-1, *slopes.shape[-2:]).max(axis=0)
     units = matrix_balance(largest, permute=False, separate=True)[1][0]
     return np.asarray(slopes / units[:, None] * units)
-
-
-def _square(a: Array) -> Array:
-    return np.asarray(a @ a * (1 + 1e-13))

@@ -6,18 +6,16 @@ Any rows are valid; these bound what the Hessians see, and move so that bounds a
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.reach.linear.linearisation import Linearisation
 
 __all__ = ["inner_rows"]
 
-Array = NDArray[np.float64]
-
 
 def inner_rows(engine: Linearisation) -> tuple[Array, Array]:
     """All rows (B, N, D, n), the active coordinates first, and the others over the active coordinates alone."""
-    active, cells = engine.model.active, len(engine.centres)
+    active, cells = engine.model.active, engine.cells
     unit = np.zeros((len(active), engine.n))
     unit[np.arange(len(active)), active] = 1.0
     rows = np.broadcast_to(unit, (cells, engine.pieces, *unit.shape))
@@ -29,7 +27,7 @@ def inner_rows(engine: Linearisation) -> tuple[Array, Array]:
 
 def _curved(engine: Linearisation) -> Array:
     """Extreme eigen-directions of the Hessians in the metric of the deviation's spread."""
-    active, cells, blocks = engine.model.active, len(engine.centres), engine.model.blocks
+    active, cells, blocks = engine.model.active, engine.cells, engine.model.blocks
     count = len(active)
     nothing = np.zeros((cells, engine.pieces, 0, count))
     if not 2 <= count <= 6 or len(blocks) != 1 or len(blocks[0]) != 1:

@@ -2,19 +2,18 @@
 
 X = p + y + Z + R: y answers the initial set and the disturbance linearly, Z is Gaussian, and R gathers what the
 linearisation leaves over. The event that Z stays within levels along the coordinates that enter nonlinearly costs
-delta_N; on it R obeys an inclusion that `LinearRun.include` guesses and proves. What each constraint then leaves
+delta_N; on it R obeys an inclusion that `Inclusion.include` guesses and proves. What each constraint then leaves
 to Z is a scalar event, so that P(unsafe) <= delta_N + sum_j P_j (Thm K7').
 """
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.gaussian.response import (
     ClockEvents,
     SplitEvents,
@@ -29,26 +28,15 @@ from certbound.gaussian.response import (
 )
 from certbound.gaussian.scalar import log_tail_below
 from certbound.problem.systems import ContinuousSystem
-from certbound.reach.linear.inclusion import Supports
+from certbound.reach.linear.fixed_point import PADS, Inclusion
 from certbound.reach.linear.linearisation import Linearisation
-from certbound.reach.linear.rows import inner_rows
 from certbound.reach.linear.shares import Share
-from certbound.reach.remainder import sampled_range
 from certbound.reach.sets import Requirement, requirements
 
 __all__ = ["Events", "LinearRun", "Outcome", "correlated"]
 
-Array = NDArray[np.float64]
 Events = StepEvents | ClockEvents | SplitEvents
-_LOG = logging.getLogger(__name__)
 
-_GUESSES = 30
-_PICARD = 12
-_HUGE = 1e6  # times what a row sees of the nominal states, the initial set and the noise: beyond all use
-_ROUNDING = 1e-12  # share of a typical remainder that its guess is widened by, so that it may be 0
-_PADS = (0.15, 0.1, 0.06, 0.04)  # how much wider than the sampled range the first guess is, by effort
-_REPAIRS, _REPAIRED = 4, 0.03  # times that pieces are tried again, each with so much more room
-_WIDER = 0.05  # of the remainder's share in a polytope
 _MARGIN = 2.0  # times that width is what a proof is expected to need
 _OVERLAPPING = -8.0  # from which on constraints that are broken together are counted once
 _LIKELY = -4.0  # log of a probability from which on a product is worth more than a sum
@@ -56,207 +44,25 @@ _LIKELY = -4.0  # log of a probability from which on a product is worth more tha
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Outcome:
-    """What one run proved.
+    """What one run proved."""
 
-    Parameters
-    ----------
-    log_probability : float
-        Natural logarithm of a bound on P(unsafe); 0 when nothing was proved.
-    nonlinear : Share
-        delta_N.
-    bounds : (ndarray, ndarray), shape (B, N, n), or None
-        The proved enclosure of the remainder beta, None when it fed itself.
-    cell : int
-        The worst cell.
-    logs : tuple of float
-        What every requirement costs there.
-    """
-
-    log_probability: float
-    nonlinear: Share
-    bounds: tuple[Array, Array] | None
-    cell: int = 0
-    logs: tuple[float, ...] = ()
+    log_probability: float  # natural logarithm of a bound on P(unsafe); 0 when nothing was proved
+    nonlinear: Share  # delta_N
+    bounds: tuple[Array, Array] | None  # (B, N, n): the proved enclosure of the remainder beta, None when it fed itself
+    cell: int = 0  # the worst cell
+    logs: tuple[float, ...] = ()  # what every requirement costs there
 
 
-class LinearRun:
-    """One evaluation of the engine: supports of all cells, the inclusion for the remainder, the events.
+class LinearRun(Inclusion):
+    """One evaluation of the engine: the inclusion for the remainder, the events, and their room."""
 
-    Parameters
-    ----------
-    engine : Linearisation
-    asked : bool
-        Whether the constraints' rows are wanted.
-    """
-
-    def __init__(self, engine: Linearisation, *, asked: bool = True) -> None:
-        self.engine = engine
-        self.rows, self.extra = inner_rows(engine)
-        cells = range(len(engine.centres))
-        self.requirements = [requirements(engine.problem, engine.nominal(cell)) if asked else [] for cell in cells]
-        self.supports: list[Supports] = []
-        for cell in cells:
-            nothing = np.zeros((engine.nodes.shape[1] - engine.continuous, 0, engine.n))
-            outer = np.concatenate([nothing, *(r.rows[:, None] for r in self.requirements[cell])], axis=1)
-            inner = self.rows[cell]
-            if not engine.continuous:
-                inner = np.concatenate([inner, np.zeros((1, *inner.shape[1:]))])
-            self.supports.append(Supports(
-                engine.response, engine.gathering.of_cell(cell), cell, np.concatenate([inner, outer], axis=1),
-                np.diag(engine.radii[cell])[engine.radii[cell] > 0], continuous=engine.continuous, outputs=engine.moved,
-            ))
-        self.inner = self.rows.shape[2]
+    def __init__(self, engine: Linearisation) -> None:
+        self.requirements = [requirements(engine.problem, engine.nominal(cell)) for cell in range(engine.cells)]
+        super().__init__(engine, [[asked.rows for asked in cell] for cell in self.requirements])
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
         self.kept: dict[Share, tuple[Array, list[Events]]] = {}
         self.spent: dict[Share, tuple[Array, Array] | None] = {}
-        self.failed_at = 0
-
-    @property
-    def curved(self) -> bool:
-        """Whether the model leaves a remainder at all."""
-        return bool(len(self.engine.model.active))
-
-    def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-        """Bounds of s = y + Z + R along the inner rows over all pieces: (B N, D)."""
-        n = self.engine.pieces
-        lows, highs = [], []
-        for support, level, (r_lo, r_hi) in zip(self.supports, levels, remainder, strict=True):
-            y = support.y[:n, : self.inner]
-            lows.append(-y - level + r_lo[:n, : self.inner])
-            highs.append(y + level + r_hi[:n, : self.inner])
-        low, high = np.concatenate(lows), np.concatenate(highs)
-        slack = 4e-16 * (np.abs(low) + np.abs(high))
-        return low - slack, high + slack
-
-    def include(self, levels: Array, effort: int) -> tuple[Array, Array] | None:
-        """beta's bounds (B, N, n) that prove themselves, or None (``failed_at`` then names a piece)."""
-        engine = self.engine
-        shape = (len(engine.centres), engine.pieces, engine.n)
-        self.failed_at = engine.pieces - 1
-        # what the proof needs beyond the sampled range
-        least = _ROUNDING * engine.remainder_sizes
-        below = above = engine.model.defect(engine.frame).reshape(shape) * 1.05 + least
-        low, high = np.zeros(shape), np.zeros(shape)
-        for attempt in range(_PICARD):
-            guess = self.guess(levels, (low, high), (below, above), _PADS[effort] if attempt == 0 else 0.02)
-            if guess is None:
-                return None
-            low, high = guess
-            implied = self.deviations(levels, low, high)
-            if implied is None:
-                return None
-            polytope = self._wider(levels, implied)
-            found = self._closed(levels, polytope, guess, effort)
-            if found is None:
-                return None
-            closed, b_low, b_high = found
-            if closed:
-                return b_low, b_high
-            _LOG.debug("inclusion %d: widths %s, beyond the guess by %.3g", attempt, (b_high - b_low).max(
-                axis=(0, 2))[:: max(1, engine.pieces // 8)].round(4), max(np.max(low - b_low), np.max(b_high - high)))
-            sample = self.sampled(polytope)
-            below = np.maximum(1.02 * (sample[0] - b_low), 0.0) + least
-            above = np.maximum(1.02 * (b_high - sample[1]), 0.0) + least
-        return None
-
-    def _closed(
-        self, levels: Array, polytope: tuple[Array, Array], hoped: tuple[Array, Array], effort: int
-    ) -> tuple[bool, Array, Array] | None:
-        """Bounds of beta over a polytope, and whether what they imply lies in it: then they prove themselves.
-
-        Pieces on which it does not are tried again over a larger part. None where a bound is infinite.
-        """
-        engine, shape = self.engine, hoped[0].shape
-        (p_low, p_high), target = polytope, [b.reshape(-1, engine.n) for b in hoped]
-        low, high = (np.zeros(shape).reshape(-1, engine.n) for _ in range(2))
-        again = np.arange(len(p_low))
-        for _ in range(_REPAIRS):
-            found = engine.model.bound(
-                engine.frame, p_low, p_high, self.flat_extra, effort, (target[0], target[1]), again)
-            low[again], high[again] = found[0][again], found[1][again]
-            b_low, b_high = low.reshape(shape), high.reshape(shape)
-            implied = self.deviations(levels, b_low, b_high) if self._all_finite(b_low, b_high) else None
-            if implied is None:
-                return None
-            again = np.flatnonzero(((implied[0] < p_low) | (implied[1] > p_high)).any(axis=1))
-            if not len(again):
-                return True, b_low, b_high
-            if 2 * len(again) > len(p_low):
-                break
-            wider = self._wider(levels, implied)
-            p_low, p_high = p_low.copy(), p_high.copy()
-            p_low[again], p_high[again] = wider[0][again], wider[1][again]
-            room = _REPAIRED * (high - low)
-            target = [low - room, high + room]
-        return False, b_low, b_high
-
-    def _wider(self, levels: Array, implied: tuple[Array, Array]) -> tuple[Array, Array]:
-        """A polytope with the remainder's share enlarged a little: room for bounds that differ a little."""
-        nothing = np.zeros((len(self.supports), self.engine.pieces, self.engine.n))
-        base = self.deviations(levels, nothing, nothing)
-        if base is None:
-            return implied
-        return implied[0] - _WIDER * np.abs(implied[0] - base[0]), implied[1] + _WIDER * np.abs(implied[1] - base[1])
-
-    def guess(
-        self, levels: Array, start: tuple[Array, Array], widening: tuple[Array, Array], share: float
-    ) -> tuple[Array, Array] | None:
-        """The fixed point of the sampled range of beta, widened by ``share`` of itself and by what a proof needed."""
-        low, high = start
-        for _ in range(_GUESSES):
-            polytope = self.deviations(levels, low, high)
-            if polytope is None:
-                return None
-            old = low, high
-            sample = self.sampled(polytope)
-            pad = share * (sample[1] - sample[0])
-            low, high = sample[0] - widening[0] - pad, sample[1] + widening[1] + pad
-            if not self._all_finite(low, high):
-                return None
-            change = max(float(np.max(old[0] - low)), float(np.max(high - old[1])))
-            if change <= 1e-3 * float(np.max(high - low)):
-                break
-        return low, high
-
-    @property
-    def flat_extra(self) -> Array:
-        """The extra rows over the active coordinates, cells and pieces in one batch."""
-        return self.extra.reshape(self.extra.shape[0] * self.extra.shape[1], *self.extra.shape[2:])
-
-    def sampled(self, polytope: tuple[Array, Array]) -> list[Array]:
-        """Range of beta over sample points: two arrays (B, N, n)."""
-        engine = self.engine
-        found = sampled_range(engine.model, engine.frame, *polytope, self.flat_extra)
-        return [b.reshape(len(engine.centres), engine.pieces, engine.n) for b in found]
-
-    def _all_finite(self, low: Array, high: Array) -> bool:
-        """Whether all bounds are finite; if not, ``failed_at`` names the first piece."""
-        finite = np.isfinite(low) & np.isfinite(high)
-        if not finite.all():
-            self.failed_at = int(np.argmax((~finite).any(axis=(0, 2))))
-        return bool(finite.all())
-
-    def deviations(self, levels: Array, low: Array, high: Array) -> tuple[Array, Array] | None:
-        """The polytope that bounds on beta imply, or None where it is beyond all use."""
-        reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(self.supports, low, high, strict=True)]
-        p_low, p_high = self.polytope(levels, reach)
-        with np.errstate(invalid="ignore"):
-            beyond = ~(np.isfinite(p_low) & np.isfinite(p_high)) | (p_high - p_low > self._limit(levels))
-        if beyond.any():
-            self.failed_at = int(np.argmax(beyond.any(axis=1).reshape(len(low), -1).any(axis=0)))
-            return None
-        return p_low, p_high
-
-    def _limit(self, levels: Array) -> Array:
-        """The widest polytope that is of any use, in the units of every row: (B N, D)."""
-        count = self.engine.pieces
-        moved = np.stack([2 * support.y[:count, : self.inner] for support in self.supports]) + 2 * levels
-        size = np.abs(self.rows) @ self.engine.sizes + moved
-        widest = np.broadcast_to(size.max(axis=(0, 1), initial=0.0), (size.shape[0] * count, self.inner))
-        return np.where(widest > 0, _HUGE * widest, np.inf)
-
-    # ---- probabilities -----------------------------------------------------------------------------------
 
     def events(self, cell: int, shared: Share) -> Events:
         """Scalar events of one cell; ``shared`` is what they may cost in common."""
@@ -306,8 +112,7 @@ class LinearRun:
             v = self.engine.response.covariance[:, 1:]
             variance = np.einsum("bkdi,bkij,bkdj->bkd", self.rows, v, self.rows)
             levels = 0.99 * q * np.sqrt(np.maximum(variance, 0.0))
-            nothing = np.zeros((len(levels), self.engine.pieces, self.engine.n))
-            self.spent[nonlinear] = self.guess(levels, (nothing, nothing), (nothing, nothing), 0.0)
+            self.spent[nonlinear] = self.guess(levels, self.nothing, self.nothing, 0.0)
         return self.spent[nonlinear]
 
     def _one_time(self, nonlinear: Share) -> float:
@@ -330,15 +135,13 @@ class LinearRun:
 
         A value beyond ``limit`` says no more than that: the cells that come after such a one are left out.
         """
-        shape = (len(self.engine.centres), self.engine.pieces, self.engine.n)
         if self.hopeless(nonlinear):
             return 0.0
         least = self._one_time(nonlinear)
         if least > limit:
             return least
         levels, events = self.levels(nonlinear)
-        nothing = np.zeros(shape), np.zeros(shape)
-        guess = self.guess(levels, nothing, nothing, _MARGIN * _PADS[effort])
+        guess = self.guess(levels, self.nothing, self.nothing, _MARGIN * PADS[effort])
         if guess is None:
             return 0.0
         worst = -np.inf
@@ -350,13 +153,11 @@ class LinearRun:
 
     def probability(self, nonlinear: Share, effort: int = 2) -> Outcome:
         """Thm K7' with delta_N = exp(nonlinear.log): the outcome of the worst cell."""
-        if self.hopeless(nonlinear):
-            return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=None)
-        levels, events = self.levels(nonlinear)
-        bounds = self.include(levels, effort)
-        if bounds is None:
-            return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=None)
-        if not events:  # the noise-free reachable set alone
+        bounds = None
+        if not self.hopeless(nonlinear):
+            levels, events = self.levels(nonlinear)
+            bounds = self.include(levels, effort)
+        if bounds is None or not events:  # without events the noise-free reachable set alone
             return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=bounds)
         outcomes = [self._cell(cell, bounds, events[cell], nonlinear) for cell in range(len(self.supports))]
         return max(outcomes, key=lambda outcome: outcome.log_probability)

@@ -6,8 +6,8 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Quadratic
 from certbound.rigor import intervals as iv
@@ -16,8 +16,6 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm, ball_root, largest_over_box
 
 __all__ = ["Cells", "initial_cells"]
-
-Array = NDArray[np.float64]
 
 MOST_CELLS = 4096
 

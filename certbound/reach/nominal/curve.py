@@ -11,29 +11,18 @@ from dataclasses import dataclass
 from math import comb
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.reach.nominal.series import Series, polynomial_range
 from certbound.rigor.intervals import Interval, stack
 
 __all__ = ["Curve"]
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Curve:
     """A batch of piecewise polynomial curves on common time pieces.
-
-    Parameters
-    ----------
-    continuous : bool
-        False: discrete time, the pieces are the steps 0, 1, ..., K - 1.
-    starts, ends : ndarray, shape (K,)
-        Piece k is [starts[k], ends[k]], and starts[k + 1] = ends[k] in continuous time; in discrete time
-        starts = ends = the steps.
-    coefficients : ndarray, shape (B, K, degree + 1, n)
-        One curve per cell of the initial set.
 
     Examples
     --------
@@ -42,10 +31,12 @@ class Curve:
     array([[1.5]])
     """
 
-    continuous: bool
+    continuous: bool  # False: discrete time, the pieces are the steps 0, 1, ..., K - 1
+    # (K,): piece k is [starts[k], ends[k]], and starts[k + 1] = ends[k] in continuous time; in discrete time
+    # starts = ends = the steps
     starts: Array
     ends: Array
-    coefficients: Array
+    coefficients: Array  # (B, K, degree + 1, n): one curve per cell of the initial set
 
     def __post_init__(self) -> None:
         for name in ("starts", "ends", "coefficients"):

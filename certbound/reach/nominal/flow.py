@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
@@ -22,19 +23,10 @@ from certbound.rigor.intervals import Interval, stack
 
 __all__ = ["Flow"]
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class Flow:
     """The map f(t, x, d) of a problem's closed loop.
-
-    Parameters
-    ----------
-    problem : Problem
-        With a plan if its system has inputs.
-    only : array_like, shape (q,), optional
-        Study this one constant disturbance instead of the whole set D.
 
     Raises
     ------
@@ -42,8 +34,8 @@ class Flow:
         If the system has inputs and the problem has no plan.
     """
 
-    problem: Problem
-    only: ArrayLike | None = None
+    problem: Problem  # with a plan if its system has inputs
+    only: ArrayLike | None = None  # (q,): study this one constant disturbance instead of the whole set D
     tape: Tape = field(init=False)
     dimension: int = field(init=False)
 

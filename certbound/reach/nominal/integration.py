@@ -15,8 +15,9 @@ import itertools
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.errors import EngineError
 from certbound.problem.problem import Problem
 from certbound.reach.nominal.curve import Curve
@@ -26,9 +27,8 @@ from certbound.rigor.intervals import Interval, stack
 
 __all__ = ["bound_defect", "bound_disturbance_slope", "defect_series", "nominal_curve", "time_grid"]
 
-Array = NDArray[np.float64]
-
 ORDER = 6
+PIECES = 128  # at least, where the grid is chosen
 ROUNDS = 5
 LARGEST_GRID = 4096
 MOST_EVALUATIONS = 400_000
@@ -36,27 +36,18 @@ PATIENCE, LEAST_PROGRESS = 5000, 1e-4
 """Evaluations within which the solver must advance, and by which share of the time."""
 
 
-def nominal_curve(
-    problem: Problem | Flow,
-    points: ArrayLike,
-    *,
-    times: ArrayLike | None = None,
-    pieces: int = 128,
-) -> Curve:
+def nominal_curve(problem: Problem | Flow, points: ArrayLike, *, times: ArrayLike | None = None) -> Curve:
     """Curves through ``points`` at time 0 that follow the noise-free closed loop closely.
 
     Nothing is proved about them here; see `bound_defect`.
 
     Parameters
     ----------
-    problem : Problem or Flow
     points : array_like, shape (B, n) or (n,)
         States at time 0, one per cell.
     times : array_like, optional
         Nodes of the pieces in continuous time, from 0 to the horizon; chosen so that the defect is small when
-        omitted (at least ``pieces``; the plan's and the constraints' times are nodes).
-    pieces : int
-        Least number of pieces when ``times`` is omitted.
+        omitted (at least 128 pieces; the plan's and the constraints' times are nodes).
 
     Raises
     ------
@@ -69,7 +60,7 @@ def nominal_curve(
         return _iterate(flow, states)
     if times is not None:
         return _through(flow, np.asarray(times, dtype=float), states)
-    grid = time_grid(flow, pieces)
+    grid = time_grid(flow, PIECES)
     for _ in range(ROUNDS):
         curve = _through(flow, grid, states)
         coarse = _estimate_defect(flow, curve) > _tolerance(curve)
@@ -94,7 +85,7 @@ def time_grid(flow: Flow, pieces: int) -> Array:
     return np.unique(np.concatenate(nodes))
 
 
-def bound_defect(flow: Flow, curve: Curve, order: int = ORDER) -> Interval:
+def bound_defect(flow: Flow, curve: Curve) -> Interval:
     """Enclosure of p' - f(p, d0, t) over every piece, shape (B, K, n); DT: p_{t+1} - f(p_t, d0, t), (B, K -
     1, n).
 
@@ -107,7 +98,7 @@ def bound_defect(flow: Flow, curve: Curve, order: int = ORDER) -> Interval:
         points = curve.range()
         image = flow.bounds(flow.tape, curve.times[:-1], points[:, :-1], rows[:-1], d0)
         return points[:, 1:] - image
-    centre, piece = defect_series(flow, curve, order)
+    centre, piece = defect_series(flow, curve)
     span = curve.span
     plain = _derivative_range(curve) - flow.bounds(flow.tape, curve.times, curve.range(), rows, d0)
     undefined = np.any(~np.isfinite(plain.mag), axis=-1)

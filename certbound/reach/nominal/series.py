@@ -21,15 +21,7 @@ from certbound.rigor.series import ZERO, Series
 __all__ = ["Series", "expand", "polynomial_range", "taylor_bounds"]
 
 def expand(tape: Tape, inputs: Sequence[Series], order: int) -> list[Series]:
-    """Series of every output of ``tape``, padded to ``order + 1`` coefficients.
-
-    Parameters
-    ----------
-    tape : Tape
-    inputs : sequence of Series
-        One series per input slot.
-    order : int
-        Highest coefficient.
+    """Series of every output of ``tape``, padded to ``order + 1`` coefficients, from one series per input slot.
 
     Examples
     --------
@@ -60,12 +52,7 @@ def taylor_bounds(centre: Series, piece: Series, span: Interval) -> list[Interva
     Proves: x(s) lies in sum_{j < r} centre_j s^j + piece_r s^r for s in ``span``, for every r; a caller may
     intersect them.
 
-    Parameters
-    ----------
-    centre : Series
-        Coefficients at s = 0.
-    piece : Series
-        Coefficients valid at every s of the convex hull of 0 and ``span``.
+    ``centre`` are the coefficients at s = 0, ``piece`` those valid at every s of the convex hull of 0 and ``span``.
     """
     powers = [span**power for power in range(1, len(piece))]
     bounds = [piece[0]]

@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import adds_plainly, selected
 from certbound.reach.remainder.derivatives import Derivatives
@@ -28,8 +28,6 @@ from certbound.rigor.intervals import Interval
 
 __all__ = ["Remainder"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Target = tuple[Array, Array]
 
 _GRID = {1: 16, 2: 6, 3: 4}
@@ -47,9 +45,9 @@ class _Asked:
     rounds: int
     tolerance: float
     target: Target | None
-    only: Indices | None
+    only: Index | None
 
-    def excess(self, lo: Array, hi: Array, inner_lo: Array, inner_hi: Array, items: Indices) -> Array:
+    def excess(self, lo: Array, hi: Array, inner_lo: Array, inner_hi: Array, items: Index) -> Array:
         """By how much bounds over boxes exceed what is hoped for, or their own range: in its units, (Q, n)."""
         low, high = (inner_lo, inner_hi) if self.target is None else self.target
         found = np.maximum(hi - high[items], low[items] - lo) / np.maximum(high - low, 1e-300)[items]
@@ -65,7 +63,7 @@ class Remainder(Derivatives):
 
     def bound(
         self, frame: Frame, low: Array, high: Array, rows: Array, effort: int = 2, target: Target | None = None,
-        only: Indices | None = None,
+        only: Index | None = None,
     ) -> tuple[Array, Array]:
         """Enclosure of beta over every piece of ``frame``.
 
@@ -196,7 +194,7 @@ class Remainder(Derivatives):
         return boxes if asked.only is None else boxes[np.isin(items, asked.only)]
 
 
-def _costliest(expansion: Expansion, parts: Parts, radius: Array, excess: Array) -> Indices:
+def _costliest(expansion: Expansion, parts: Parts, radius: Array, excess: Array) -> Index:
     """The coordinate of every box whose width costs most in the output that exceeds most."""
     worst = np.argmax(excess, axis=1)
     number = np.arange(len(radius))

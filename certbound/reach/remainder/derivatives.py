@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import (
     JUMPS,
@@ -25,45 +25,24 @@ from certbound.rigor.intervals import Interval
 
 __all__ = ["Derivatives"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
-    """Derivatives of the dynamics of a problem's closed loop.
-
-    Attributes
-    ----------
-    active : ndarray
-        States whose column of the Jacobian is not constant.
-    constant_slope : Interval, shape (n, n)
-        Constant entries of the Jacobian (up to rounding), 0 where the entry varies.
-    blocks : list of groups of lists of int
-        Positions in ``active`` that second derivatives couple, in groups whose outputs do not meet.
-    entries : list of (int, int)
-        Output and state of every entry of the Jacobian that varies.
-    second_index : list of (int, int)
-        Entry and state (-1: time) of every second derivative kept; of a mixed pair only one.
-    sources : list of lists of int
-        States that every such entry depends on.
-    kinked : bool
-        Whether abs, min or max let the Jacobian jump.
-    timed : list of int
-        Outputs that depend on time explicitly.
-    value, varying, second, time, time2, gain : Tape
-        f, its varying entries, their derivatives, derivatives by time, and the one by the disturbance.
-    """
+    """Derivatives of the dynamics of a problem's closed loop."""
 
     problem: Problem
-    active: Indices = field(init=False)
+    active: Index = field(init=False)  # states whose column of the Jacobian is not constant
+    # (n, n): constant entries of the Jacobian (up to rounding), 0 where the entry varies
     constant_slope: Interval = field(init=False)
+    # positions in ``active`` that second derivatives couple, in groups whose outputs do not meet
     blocks: list[list[list[int]]] = field(init=False)
-    entries: list[tuple[int, int]] = field(init=False)
+    entries: list[tuple[int, int]] = field(init=False)  # output and state of every entry of the Jacobian that varies
+    # entry and state (-1: time) of every second derivative kept; of a mixed pair only one
     second_index: list[tuple[int, int]] = field(init=False)
-    sources: list[list[int]] = field(init=False)
-    kinked: bool = field(init=False)
-    timed: list[int] = field(init=False)
+    sources: list[list[int]] = field(init=False)  # states that every such entry depends on
+    kinked: bool = field(init=False)  # whether abs, min or max let the Jacobian jump
+    timed: list[int] = field(init=False)  # outputs that depend on time explicitly
+    # f, its varying entries, their derivatives, derivatives by time, and the one by the disturbance
     value: Tape = field(init=False)
     varying: Tape = field(init=False)
     second: Tape = field(init=False)
@@ -181,9 +160,7 @@ class Derivatives:
         slots = self.slots(Interval.point(time), Interval.point(state), inputs, disturbance)
         result = np.broadcast_to(self.constant_slope.mid, (len(state), n, n)).copy()
         if self.entries:
-            values = enclose(self.varying, slots, undefined="infinite")
-            finite = np.isfinite(values.lo) & np.isfinite(values.hi)
-            mid = np.where(finite, values.mid, 0.0)
+            mid = _middle(enclose(self.varying, slots, undefined="infinite"))
             for column, (i, j) in enumerate(self.entries):
                 result[:, i, j] = mid[:, column]
         return result
@@ -194,8 +171,7 @@ class Derivatives:
         if self.gain is None:
             return np.zeros((len(state), n, q))
         slots = self.slots(Interval.point(time), Interval.point(state), inputs, disturbance)
-        values = enclose(self.gain, slots, undefined="infinite").broadcast_to((len(state), n, q))
-        return np.asarray(np.where(np.isfinite(values.lo) & np.isfinite(values.hi), values.mid, 0.0))
+        return _middle(enclose(self.gain, slots, undefined="infinite").broadcast_to((len(state), n, q)))
 
     def reference_hessians(self, frame: Frame) -> Array:
         """Float Hessians over the active coordinates, of every output that has one: (M, outputs, active, active)."""
@@ -205,8 +181,7 @@ class Derivatives:
         result = np.zeros((len(frame), len(outputs), len(self.active), len(self.active)))
         if outputs:
             slots = self.slots(frame.middle_time, frame.middle, frame.inputs, frame.disturbance_middle)
-            values = enclose(self.second, slots, undefined="infinite")
-            middle = np.where(np.isfinite(values.lo) & np.isfinite(values.hi), values.mid, 0.0)
+            middle = _middle(enclose(self.second, slots, undefined="infinite"))
             for column, (entry, state) in enumerate(index):
                 if state >= 0:
                     i, j = entries[entry]
@@ -226,3 +201,8 @@ class Derivatives:
             low, high = (value, value) if widths is None else (widths[0][i], widths[1][i])
             slots.append(Interval(np.full(len(state), low), np.full(len(state), high)))
         return slots
+
+
+def _middle(values: Interval) -> Array:
+    """The middles of enclosures; 0 where there is none."""
+    return np.asarray(np.where(np.isfinite(values.lo) & np.isfinite(values.hi), values.mid, 0.0))

@@ -14,20 +14,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index, Mask
 from certbound.constants.enclosures import enclose
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.frame import Frame
-from certbound.reach.remainder.nominal_defect import Still
+from certbound.reach.remainder.nominal_defect import NominalDefect, product
 from certbound.reach.remainder.polytope import Boxes, Polytope, linear_range
 from certbound.rigor.intervals import Interval
 
 __all__ = ["Expansion", "Parts"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 _UNIT = 2.0**-53
 _WIDE = 1 + 1e-11  # covers the rounding errors of every sum of radii
@@ -94,7 +90,7 @@ class Expansion:
             i, a = self.entries[entry]
             b = -1 if state < 0 else position[state]
             self.second.append((column, entry, b, number.get((i, b), -1) if model.folded(entry, state) else -1))
-        self.still = Still(model, frame) if frame.half else None
+        self.nominal = NominalDefect(model, frame) if frame.half else None
 
     def parts(self, boxes: Boxes) -> Parts:
         """The expansions on boxes; to first order, with the Jacobian over the whole box, where it may jump."""
@@ -164,7 +160,7 @@ class Expansion:
         """The motion over the piece, by the rate of beta over the whole box and piece: of beta, of its slopes."""
         f, model, half, items = self.frame, self.model, self.frame.half, held.boxes.items
         velocity, drift = f.velocity[items], self.drift[items]
-        rate = _product(model.constant_slope, velocity) - f.acceleration[items]
+        rate = product(model.constant_slope, velocity) - f.acceleration[items]
         box = (Interval(-held.boxes.radius, held.boxes.radius) + held.boxes.centre)[:, self.columns] * drift
         rates = [rate[:, i] for i in range(rate.shape[1])]
         for p, i in enumerate(self.gather.argmax(axis=1)):
@@ -173,17 +169,17 @@ class Expansion:
             assert held.first is not None
             rates[i] = rates[i] + held.first[:, entry] * velocity[:, self.active[a]]
         if model.timed:
-            once = enclose(model.time, held.wide, undefined="infinite").broadcast_to((len(items), len(model.timed)))
+            by_time = enclose(model.time, held.wide, undefined="infinite").broadcast_to((len(items), len(model.timed)))
             for column, i in enumerate(model.timed):
-                rates[i] = rates[i] + once[:, column]
+                rates[i] = rates[i] + by_time[:, column]
         motion = np.stack([half * rate.mag * _WIDE + _LEAST for rate in rates], axis=1)
         return motion, half * np.abs(drift[:, self.chosen])
 
-    def _base(self, items: Indices, order: int) -> tuple[Interval, Interval | None]:
+    def _base(self, items: Index, order: int) -> tuple[Interval, Interval | None]:
         """What beta is counted from at the middle of a piece, and beta itself there over the piece."""
-        if self.still is None or order == 1:
+        if self.nominal is None or order == 1:
             return self.frame.middle_velocity[items], None
-        return self.still.value[items], self.still.defect[items]
+        return self.nominal.value[items], self.nominal.defect[items]
 
     def _values(
         self, boxes: Boxes, value: Interval, base: Interval, rest: Interval | None
@@ -201,7 +197,7 @@ class Expansion:
         total = Interval(lower, upper) + rest
         return total.lo, total.hi, middle
 
-    def _gradients(self, items: Indices, first: Interval | None) -> tuple[Array, Array]:
+    def _gradients(self, items: Index, first: Interval | None) -> tuple[Array, Array]:
         """J(t_m, c) - J_m entry by entry: floats and radii."""
         if first is None:
             nothing = np.zeros((len(items), 0))
@@ -243,16 +239,16 @@ class Expansion:
         # dJ/dt: floats, radii; |J - J(c)|
         turn, blurred, swell = (np.zeros((len(items), len(self.entries))) for _ in range(3))
         bend = np.zeros(held.reach.shape)
-        assert self.still is not None
-        beside = self.still.second[items]
+        assert self.nominal is not None
+        nominal = self.nominal.second[items]
         for column, entry, b, other in self.second:
             assert held.second is not None
             lo, hi = held.second.lo[:, column], held.second.hi[:, column]
             size = np.maximum(-lo, hi)
             i, a = self.entries[entry]
             centre, radius = (lo + hi) / 2, (hi - lo) / 2 + 4 * _UNIT * size
-            change = np.maximum(hi - beside.lo[:, column], beside.hi[:, column] - lo)
-            change = change + 4 * _UNIT * (size + np.maximum(-beside.lo[:, column], beside.hi[:, column]))
+            change = np.maximum(hi - nominal.lo[:, column], nominal.hi[:, column] - lo)
+            change = change + 4 * _UNIT * (size + np.maximum(-nominal.lo[:, column], nominal.hi[:, column]))
             for target, along in [(entry, b)] if other < 0 else [(entry, b), (other, a)]:
                 if along < 0:
                     turn[:, target] += centre
@@ -275,18 +271,18 @@ class Expansion:
 
         gamma is beta less what it is at s = 0.
         """
-        f, half, still, items, first = self.frame, self.frame.half, self.still, held.boxes.items, held.first
-        assert still is not None
-        rate = still.rate[items]
+        f, half, nominal, items, first = self.frame, self.frame.half, self.nominal, held.boxes.items, held.first
+        assert nominal is not None
+        rate = nominal.rate[items]
         turned = self.drift[items] * held.boxes.centre[:, self.columns]
         value, error = -rate.mid - turned @ self.gather, rate.rad
         size = np.abs(rate.mid) + np.abs(turned) @ self.gather
-        curve = still.curve[items] + bend
+        curve = nominal.curve[items] + bend
         if first is not None:
             speed, acceleration = f.middle_velocity[items], f.acceleration[items].mag
             middle, radius = first.mid, first.rad
-            beside = still.first_over[items]
-            change = np.maximum(first.hi - beside.lo, beside.hi - first.lo) + 4 * _UNIT * (first.mag + beside.mag)
+            along = nominal.first_over[items]
+            change = np.maximum(first.hi - along.lo, along.hi - first.lo) + 4 * _UNIT * (first.mag + along.mag)
             for entry, (i, a) in enumerate(self.entries):
                 j = self.active[a]
                 v, r = speed.lo[:, j] / 2 + speed.hi[:, j] / 2, (speed.hi[:, j] - speed.lo[:, j]) / 2
@@ -299,12 +295,12 @@ class Expansion:
 
     def _explicit_time(self, held: _Enclosed) -> Array:
         """What the derivatives by explicit time add to the motion, less what they are at s = 0: (Q, timed)."""
-        model, half, still, items = self.model, self.frame.half, self.still, held.boxes.items
-        assert still is not None
+        model, half, nominal, items = self.model, self.frame.half, self.nominal, held.boxes.items
+        assert nominal is not None
         shape = (len(items), len(model.timed))
-        once = enclose(model.time, held.slots, undefined="infinite").broadcast_to(shape) - still.once[items]
-        twice = enclose(model.time2, held.wide, undefined="infinite").reshape(shape) - still.twice[items]
-        return (half * once.mag + half * half / 2 * twice.mag) * _WIDE
+        first = enclose(model.time, held.slots, undefined="infinite").broadcast_to(shape) - nominal.by_time[items]
+        second = enclose(model.time2, held.wide, undefined="infinite").reshape(shape) - nominal.by_time_twice[items]
+        return (half * first.mag + half * half / 2 * second.mag) * _WIDE
 
     def plain_range(self, parts: Parts, boxes: Boxes) -> tuple[Array, Array]:
         """Bounds of beta over whole boxes: (Q, n); infinite where beta is not defined."""
@@ -344,8 +340,3 @@ def _closed(parts: Parts, below: Array, above: Array) -> tuple[Array, Array]:
 
 def _infinite(x: Interval) -> Mask:
     return np.asarray(~(np.isfinite(x.lo) & np.isfinite(x.hi)).all(axis=1))
-
-
-def _product(matrix: Interval, vector: Interval) -> Interval:
-    """``matrix`` (n, n) times a batch of interval vectors (M, n)."""
-    return (matrix[None, :, :] * vector[:, None, :]).sum(axis=-1)

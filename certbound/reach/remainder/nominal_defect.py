@@ -10,8 +10,8 @@ from __future__ import annotations
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import Tape
 from certbound.reach.nominal import Series, expand, polynomial_range, taylor_bounds
@@ -19,14 +19,12 @@ from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.frame import Frame
 from certbound.rigor.intervals import Interval, stack
 
-__all__ = ["Still", "bound_defect_over_pieces"]
-
-Array = NDArray[np.float64]
+__all__ = ["NominalDefect", "bound_defect_over_pieces", "product"]
 
 _ORDER = 4
 
 
-class Still:
+class NominalDefect:
     """What `Expansion` subtracts at s = 0, piece by piece (axis 0), so that beta = defect + gamma.
 
     Where the dynamics or its derivatives are not enclosed along a whole piece, phi = p' takes the place of f(p): the
@@ -41,8 +39,8 @@ class Still:
         Varying entries of the Jacobian along the curve at the middle, and over the piece.
     second : Interval, shape (M, columns)
         Second derivatives over the piece.
-    once, twice : Interval, shape (M, timed)
-        Derivatives by explicit time, at the middle and over the piece.
+    by_time, by_time_twice : Interval, shape (M, timed)
+        First derivatives by explicit time at the middle, and second ones over the piece.
     defect : Interval, shape (M, n)
         delta over the piece.
     curve : ndarray, shape (M, n)
@@ -60,23 +58,21 @@ class Still:
         value = along(model.value, thin)
         first, first_over = along(model.varying, thin), along(model.varying, wide)
         second = along(model.second, wide)
-        once, twice = (along(model.time, thin), along(model.time2, wide)) if model.timed else (first[:, :0],) * 2
-        defect = bound_defect_over_pieces(model, frame)
-        parts = (value, first, first_over, second, once, twice, defect)
-        known = np.all([np.isfinite(part.mag).all(axis=1) for part in parts], axis=0)[:, None]
+        times = (along(model.time, thin), along(model.time2, wide)) if model.timed else (first[:, :0],) * 2
+        parts = (first, first_over, second, *times, bound_defect_over_pieces(model, frame))
+        known = np.all([np.isfinite(part.mag).all(axis=1) for part in (value, *parts)], axis=0)[:, None]
         velocity = frame.middle_velocity
         rates = [Interval.point(np.zeros(count))] * n
         for entry, (i, j) in enumerate(model.entries):
             rates[i] = rates[i] + first[:, entry] * velocity[:, j]
         constant = model.constant_slope
-        other = frame.middle_acceleration - _product(constant, velocity)
+        other = frame.middle_acceleration - product(constant, velocity)
         self.value = _where(known, value, velocity)
         self.rate = _where(known, stack(rates, axis=-1), other)
-        self.first, self.first_over, self.second, self.once, self.twice, self.defect = (
-            _where(known, part, Interval.point(np.zeros(part.shape)))
-            for part in (first, first_over, second, once, twice, defect)
+        self.first, self.first_over, self.second, self.by_time, self.by_time_twice, self.defect = (
+            _where(known, part, Interval.point(np.zeros(part.shape))) for part in parts
         )
-        self.curve = np.where(known, 0.0, (_product(constant, frame.acceleration) - frame.jerk).mag)
+        self.curve = np.where(known, 0.0, (product(constant, frame.acceleration) - frame.jerk).mag)
 
 
 def bound_defect_over_pieces(model: Derivatives, frame: Frame) -> Interval:
@@ -117,6 +113,6 @@ def _where(mask: Array, first: Interval, second: Interval) -> Interval:
     return Interval(np.where(mask, first.lo, second.lo), np.where(mask, first.hi, second.hi))
 
 
-def _product(matrix: Interval, vector: Interval) -> Interval:
+def product(matrix: Interval, vector: Interval) -> Interval:
     """``matrix`` (n, n) times a batch of interval vectors (M, n)."""
     return (matrix[None, :, :] * vector[:, None, :]).sum(axis=-1)

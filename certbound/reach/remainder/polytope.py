@@ -6,13 +6,10 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from certbound.arrays import Array, Index, Mask
 
 __all__ = ["Boxes", "Polytope", "grid", "linear_range"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 _WIDE = 1 + 1e-11
 _LEAST = 1e-290
@@ -22,17 +19,17 @@ _LEAST = 1e-290
 class Boxes:
     """Boxes centre + [-radius, radius], shape (Q, active) each, of the pieces ``items`` (Q,)."""
 
-    items: Indices
+    items: Index
     centre: Array
     radius: Array
 
     def __len__(self) -> int:
         return len(self.items)
 
-    def __getitem__(self, chosen: Indices | Mask) -> Boxes:
+    def __getitem__(self, chosen: Index | Mask) -> Boxes:
         return Boxes(self.items[chosen], self.centre[chosen], self.radius[chosen])
 
-    def halved(self, along: Indices) -> Boxes:
+    def halved(self, along: Index) -> Boxes:
         """Every box cut in two along its coordinate ``along``."""
         number = np.arange(len(self))
         half, old = self.radius[number, along] / 2, self.centre[number, along]
@@ -67,18 +64,8 @@ def linear_range(matrix: Array, radius: Array, normals: Array, room: Array) -> A
 
     For alpha >= 0, g . d <= |g - alpha w| . e + alpha room: the least value over the kinks alpha = g_j / w_j counts.
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (Q, n, a)
-        Rows g.
-    radius : ndarray, shape (Q, a)
-    normals : ndarray, shape (Q, D, a)
-    room : ndarray, shape (Q, D)
-
-    Returns
-    -------
-    ndarray, shape (Q, n)
-        Rounded up.
+    ``matrix`` (Q, n, a) holds the rows g, ``radius`` (Q, a) is e, ``normals`` (Q, D, a) and ``room`` (Q, D) are the
+    faces. The bounds (Q, n) are rounded up.
 
     Examples
     --------

@@ -9,15 +9,13 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.frame import Frame
 
 __all__ = ["fitted_slopes", "sampled_range"]
-
-Array = NDArray[np.float64]
 
 _POINTS = {1: 17, 2: 9, 3: 7, 4: 3, 5: 3, 6: 3}
 _DIRECTIONS = 64
@@ -28,13 +26,7 @@ _ROUNDING = 1e-13  # of the nominal state
 def sampled_range(model: Derivatives, frame: Frame, low: Array, high: Array, rows: Array) -> tuple[Array, Array]:
     """Range of beta at the middle of every piece over the points: two arrays (M, n).
 
-    Parameters
-    ----------
-    model : Derivatives
-    frame : Frame
-    low, high : ndarray, shape (M, D)
-        Bounds of s along the active coordinates (first) and along ``rows``.
-    rows : ndarray, shape (M, D - active, active)
+    ``low`` and ``high`` (M, D) bound s along the active coordinates (first) and along ``rows`` (M, D - active, active).
     """
     base = _remainder(model, frame, np.zeros((len(frame), 1, len(model.active))))[:, 0]
     lower, upper = base.copy(), base.copy()

@@ -19,13 +19,13 @@ Carlo methods" (2020), whose Monte Carlo method takes one box at one time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import Curve, Flow
 from certbound.reach.sets import ReachTube
@@ -33,8 +33,6 @@ from certbound.rigor.intervals import Interval
 from certbound.simulation.estimates import sample_paths
 
 __all__ = ["SampledTube", "estimate_reach", "noise_free_states", "scenario_count"]
-
-Array = NDArray[np.float64]
 
 _PIECES = 25
 _STEPS = 200  # of the noise-free integration over the horizon, at least
@@ -83,12 +81,7 @@ class SampledTube(ReachTube):
 def scenario_count(constraints: int, epsilon: float, confidence: float) -> int:
     """The least N with P(Binomial(N, epsilon) <= constraints - 1) <= 1 - confidence.
 
-    Parameters
-    ----------
-    constraints : int
-        Bound of the number of samples that decide the set (support constraints).
-    epsilon, confidence : float
-        In (0, 1).
+    ``constraints`` bounds the number of samples that decide the set (support constraints); the others lie in (0, 1).
 
     Raises
     ------
@@ -166,7 +159,7 @@ def estimate_reach(
     flow = Flow(problem)
     grid = time_grid(flow, pieces)
     count = scenario_count(2 * flow.dimension * (len(grid) - flow.continuous), epsilon, confidence)
-    low, high = _boxes(flow, grid, count, noise, np.random.default_rng(rng))
+    low, high, *_ = (_noisy_boxes if noise else noise_free_boxes)(flow, grid, count, np.random.default_rng(rng))
     return boxes_tube(flow, grid, low, high, noise=noise, epsilon=epsilon, confidence=confidence, samples=count)
 
 
@@ -202,7 +195,6 @@ def noise_free_states(
 
     Parameters
     ----------
-    flow : Flow
     grid : ndarray
         Ends of the pieces; time may run backwards (a falling grid).
     starts : ndarray, shape (count, n)
@@ -246,30 +238,40 @@ def noise_free_states(
             yield piece, end, x
 
 
-def _boxes(flow: Flow, grid: Array, count: int, noise: bool, rng: np.random.Generator) -> tuple[Array, Array]:
+def _noisy_boxes(flow: Flow, grid: Array, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Least and largest states on every piece (every step in discrete time) over ``count`` trajectories."""
     pieces = len(grid) - flow.continuous
     low = np.full((pieces, flow.dimension), np.inf)
     high = -low
-    if noise:
-        inner = math.ceil(_NOISY_STEPS / pieces) if flow.continuous else 1
-        steps = inner * pieces if flow.continuous else pieces - 1
-        chunk = max(1, _CHUNK // ((steps + 1) * flow.dimension))
-        for first in range(0, count, chunk):
-            paths = sample_paths(
-                flow.problem, paths=min(chunk, count - first), rng=rng, steps=steps if flow.continuous else None
-            )
-            for k in range(pieces):
-                own = paths[:, k * inner : (k + 1) * inner + 1] if flow.continuous else paths[:, k : k + 1]
-                low[k], high[k] = np.minimum(low[k], own.min(axis=(0, 1))), np.maximum(high[k], own.max(axis=(0, 1)))
-        return low, high
+    inner = math.ceil(_NOISY_STEPS / pieces) if flow.continuous else 1
+    steps = inner * pieces if flow.continuous else pieces - 1
+    chunk = max(1, _CHUNK // ((steps + 1) * flow.dimension))
+    for first in range(0, count, chunk):
+        paths = sample_paths(
+            flow.problem, paths=min(chunk, count - first), rng=rng, steps=steps if flow.continuous else None
+        )
+        for k in range(pieces):
+            own = paths[:, k * inner : (k + 1) * inner + 1] if flow.continuous else paths[:, k : k + 1]
+            low[k], high[k] = np.minimum(low[k], own.min(axis=(0, 1))), np.maximum(high[k], own.max(axis=(0, 1)))
+    return low, high
+
+
+def noise_free_boxes(
+    flow: Flow, grid: Array, count: int, rng: np.random.Generator, wanted: Container[float] = ()
+) -> tuple[Array, Array, dict[float, Array]]:
+    """The same without noise, and the states (count, n) at those times of the grid that are wanted."""
+    pieces, kept = len(grid) - flow.continuous, {}
+    low = np.full((pieces, flow.dimension), np.inf)
+    high = -low
     for piece, t, x in noise_free_states(flow, grid, *draw(flow, rng, count)):
         touched = {piece} if flow.continuous else {int(t)}
         if flow.continuous and piece + 1 < pieces and t == grid[piece + 1]:
             touched.add(piece + 1)
         for k in touched:
             low[k], high[k] = np.minimum(low[k], x.min(axis=0)), np.maximum(high[k], x.max(axis=0))
-    return low, high
+        if t in wanted:
+            kept[t] = x.copy()
+    return low, high, kept
 
 
 def boxes_tube(flow: Flow, grid: Array, low: Array, high: Array, **statement: Any) -> SampledTube:

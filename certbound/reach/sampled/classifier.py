@@ -23,14 +23,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import Flow
-from certbound.reach.sampled.boxes import SampledTube, boxes_tube, draw, noise_free_states, scenario_count, time_grid
+from certbound.reach.sampled.boxes import (
+    SampledTube,
+    boxes_tube,
+    noise_free_boxes,
+    noise_free_states,
+    scenario_count,
+    time_grid,
+)
 
 __all__ = ["LearnedTube", "estimate_reach_by_classifier"]
-
-Array = NDArray[np.float64]
-Truth = NDArray[np.bool_]
 
 _TIMES = 8
 _FIRST = 500
@@ -158,16 +163,9 @@ def _forward(
     flow: Flow, grid: Array, chosen: NDArray[Any], rng: np.random.Generator, count: int
 ) -> tuple[list[Array], Array, Array]:
     """States at the chosen grid times of ``count`` new trajectories, and the boxes around them on every piece."""
-    pieces = len(grid) - 1
-    low, high = np.full((pieces, flow.dimension), np.inf), np.full((pieces, flow.dimension), -np.inf)
-    kept: dict[float, Array] = {}
-    wanted = {float(grid[k]) for k in chosen}
-    for piece, t, x in noise_free_states(flow, grid, *draw(flow, rng, count)):
-        for k in {piece, piece + 1} if piece + 1 < pieces and t == grid[piece + 1] else {piece}:
-            low[k], high[k] = np.minimum(low[k], x.min(axis=0)), np.maximum(high[k], x.max(axis=0))
-        if t in wanted:
-            kept[t] = x.copy()
-    return [kept[float(grid[k])] for k in chosen], low, high
+    wanted = [float(grid[k]) for k in chosen]
+    low, high, kept = noise_free_boxes(flow, grid, count, rng, wanted)
+    return [kept[t] for t in wanted], low, high
 
 
 def _disturbances(flow: Flow, rng: np.random.Generator) -> Array:
@@ -181,7 +179,7 @@ def _disturbances(flow: Flow, rng: np.random.Generator) -> Array:
     return np.concatenate([*tried, rng.uniform(box.low, box.high, (_FEW, len(ends)))])
 
 
-def _labels(flow: Flow, grid: Array, states: Array, inside: Any, disturbances: Array) -> Truth:
+def _labels(flow: Flow, grid: Array, states: Array, inside: Any, disturbances: Array) -> Mask:
     """Whether states at the grid's end come from the initial set, for some of the disturbances."""
     count, tried = len(states), len(disturbances)
     both = np.tile(states, (tried, 1)), np.repeat(disturbances, count, axis=0)
@@ -209,7 +207,7 @@ def _learn(
     reach = np.abs(whitened(positive)).max(axis=0) * (1 + _MARGIN)
     disturbances = _disturbances(flow, rng)
 
-    def asked(z: Array) -> Truth:
+    def asked(z: Array) -> Mask:
         return _labels(flow, grid, middle + z @ factor.T, inside, disturbances)
 
     own = whitened(positive[: points // 4])
@@ -228,7 +226,7 @@ def _learn(
         where = whitened(x)
         # without a model nothing around the samples is unreachable
         found = np.ones(len(where)) if model is None else np.asarray(model.predict_proba(where)[:, 1])
-        near: Truth = (np.abs(where) <= reach).all(axis=1)
+        near: Mask = (np.abs(where) <= reach).all(axis=1)
         return np.asarray(np.where(near, found, 0.0), dtype=float)
 
     return score

@@ -16,12 +16,13 @@ Source: set erosion, Thm 1 and Prop 4 (paper), with the nominal piece enclosed a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.problem.model import Tape
 from certbound.problem.sets import Faces, Inside, Quadratic, Region
 from certbound.reach.nominal import Curve, Series, expand, polynomial_range
@@ -32,8 +33,6 @@ from certbound.rigor.norms import Norm, ball_root
 from certbound.rigor.series import product
 
 __all__ = ["Clearance", "constraint_clearance"]
-
-Array = NDArray[np.float64]
 
 
 class Sets(Protocol):
@@ -65,18 +64,10 @@ class Sets(Protocol):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Clearance:
-    """Room of one constraint over the time pieces.
+    """Room of one constraint over the time pieces."""
 
-    Parameters
-    ----------
-    radius : ndarray, shape (K,)
-        Proved r per piece; inf where the constraint is not asked, -inf where nothing could be proved.
-    factor : ndarray, shape (K,)
-        Euclidean distance per unit of r along the binding direction (for people; not rounded).
-    """
-
-    radius: Array
-    factor: Array
+    radius: Array  # (K,): proved r per piece; inf where the constraint is not asked, -inf where nothing could be proved
+    factor: Array  # (K,): Euclidean distance per unit of r along the binding direction (for people; not rounded)
 
 
 def constraint_clearance(tube: Sets, constraint: Inside, norm: Norm) -> Clearance:
@@ -92,7 +83,7 @@ def constraint_clearance(tube: Sets, constraint: Inside, norm: Norm) -> Clearanc
     return Clearance(radius=np.where(asked, radius, np.inf), factor=room.factor)
 
 
-def _window(curve: Curve, constraint: Inside) -> tuple[NDArray[np.bool_], Interval]:
+def _window(curve: Curve, constraint: Inside) -> tuple[Mask, Interval]:
     """Pieces on which the constraint is asked, and the offsets s at which it is, shape (K,)."""
     if constraint.during is None:
         return np.ones(curve.pieces, dtype=bool), curve.span
@@ -128,15 +119,7 @@ def _relative(curve: Curve, region: Region, span: Interval) -> list[Series]:
 
 def _functional(relative: list[Series], direction: Interval, span: Interval) -> Interval:
     """Range of a . (C p - o) over the piece; ``direction`` of shape (..., q) -> (B, K)."""
-    length = max(len(series) for series in relative)
-    total: Series = []
-    for j in range(length):
-        terms = [series[j] * direction[..., i] for i, series in enumerate(relative) if j < len(series)]
-        value = terms[0]
-        for term in terms[1:]:
-            value = value + term
-        total.append(value)
-    return polynomial_range(total, span)
+    return polynomial_range(_combined(relative, [direction[..., i] for i in range(len(relative))]), span)
 
 
 def _lift(direction: Interval, region: Region, dimension: int) -> Interval:
@@ -189,10 +172,11 @@ def _inside_round(
     scale = np.eye(form.dimension) if form.even else ball_root(form.shape).T
     squared: Series = []
     for row in scale:
-        series = _combine(relative, row)
+        kept = np.flatnonzero(row)
+        series = _combined([relative[i] for i in kept], row[kept].tolist())
         squared = _added(squared, product(series, series))
     ranges = polynomial_range(squared, span)
-    largest = iv.sqrt(Interval(np.maximum(ranges.lo, 0.0), np.maximum(ranges.hi, 0.0)))
+    largest = iv.sqrt(_nonnegative(ranges))
     rows = region.lifted(scale, tube.curve.dimension)
     spread = Interval.point(tube.radius) * tube.norm.section(rows)
     lifted = Interval.point(rows)
@@ -214,11 +198,11 @@ def _nonnegative(x: Interval) -> Interval:
     return Interval(np.maximum(x.lo, 0.0), np.maximum(x.hi, 0.0))
 
 
-def _combine(relative: list[Series], row: Array) -> Series:
+def _combined(relative: list[Series], weights: Sequence[Interval | float]) -> Series:
+    """The sum of the series times their weights."""
     total: Series = []
-    for value, series in zip(row, relative):
-        if value:
-            total = _added(total, [coefficient * float(value) for coefficient in series])
+    for weight, series in zip(weights, relative, strict=True):
+        total = _added(total, [coefficient * weight for coefficient in series])
     return total
 
 

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
@@ -23,31 +23,19 @@ from certbound.rigor.intervals import Interval
 
 __all__ = ["NominalPieces", "Requirement", "requirements"]
 
-Array = NDArray[np.float64]
-
 _POLYGON = 24
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NominalPieces:
-    """A nominal curve, piece by piece: every p_t of a piece lies in the convex hull of its control points.
+    """A nominal curve, piece by piece: every p_t of a piece lies in the convex hull of its control points."""
 
-    Parameters
-    ----------
-    times : ndarray, shape (N + 1,) in continuous time, (N,) steps in discrete time
-    controls : ndarray, shape (N, C, n)
-    continuous : bool
-    covariance : ndarray, shape (N, n, n), optional
-        About that of the deviation: where an obstacle is a corner, it decides how its faces are mixed.
-    extent : ndarray, shape (N, n), optional
-        About how far the state lies from the curve without noise.
-    """
-
-    times: Array
-    controls: Array
+    times: Array  # (N + 1,) in continuous time, (N,) steps in discrete time
+    controls: Array  # (N, C, n)
     continuous: bool
+    # (N, n, n): about that of the deviation: where an obstacle is a corner, it decides how its faces are mixed
     covariance: Array | None = None
-    extent: Array | None = None
+    extent: Array | None = None  # (N, n): about how far the state lies from the curve without noise
 
     @property
     def pieces(self) -> int:
@@ -61,7 +49,7 @@ class NominalPieces:
             return Interval(self.times[:-1] - slip, self.times[1:] + slip)
         return Interval.point(self.times)
 
-    def required(self, during: tuple[float, float] | None) -> NDArray[np.bool_]:
+    def required(self, during: tuple[float, float] | None) -> Mask:
         """Pieces that meet the time window ``during``."""
         span = self.span()
         if during is None:
@@ -87,17 +75,11 @@ class Requirement:
 def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
     """Every constraint of the problem (its domain last, numbered -1) as requirements along ``curve``."""
     found = []
-    for number, constraint in enumerate(problem.safe):
-        needed = curve.required(constraint.during)
+    for number, constraint in enumerate(problem.constraints):
+        own, needed = number if number < len(problem.safe) else -1, curve.required(constraint.during)
         for label, rows, room in _constraint(constraint, curve):
-            found.append(Requirement(
-                label=label, constraint=number, rows=rows, room=np.where(needed, room, np.inf)
-            ))
-    if problem.domain is not None:
-        for label, rows, room in _constraint(Inside(problem.domain, label="the model's domain"), curve):
-            found.append(Requirement(label=label, constraint=-1, rows=rows, room=room))
+            found.append(Requirement(label=label, constraint=own, rows=rows, room=np.where(needed, room, np.inf)))
     return found
-
 
 Rows = Iterator[tuple[str, Array, Array]]
 

@@ -15,8 +15,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.display import Shown, log10_text
 from certbound.problem.sets import Inside
 from certbound.reach.nominal import Curve, polynomial_range
@@ -25,8 +26,6 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm
 
 __all__ = ["Piece", "ReachTube"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -8,11 +8,10 @@ obstacle's support function; it is Q^-1 (q - y) for the obstacle's point y neare
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from certbound.arrays import Array
 
 __all__ = ["polyhedral_weights", "round_directions"]
-
-Array = NDArray[np.float64]
 
 SWEEPS = 60
 

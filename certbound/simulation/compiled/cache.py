@@ -107,11 +107,7 @@ def _fingerprint() -> str:
 def load_kernel(source: str) -> Callable[..., Any]:
     """The function ``run`` of a generated module, compiled or loaded from the cache.
 
-    Parameters
-    ----------
-    source : str
-        Text of a module written by `certbound.simulation.kernel_source`; ``@CACHE@`` in it stands for the cache
-        switch.
+    ``@CACHE@`` stands for the cache switch in what `certbound.simulation.kernel_source` writes.
     """
     digest = hashlib.sha256(f"{_fingerprint()}\n{source}".encode()).hexdigest()[:32]
     with _LOCK:

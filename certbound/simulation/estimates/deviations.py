@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.checks import positive_definite
 from certbound.simulation.blocks import MEMORY_LIMIT, Counts, check_count
 from certbound.simulation.checkpoint import seed_of
@@ -21,8 +22,6 @@ from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import LOWEST, Task
 
 __all__ = ["Deviations", "Measure", "Quantile", "sup_deviation"]
-
-Array = NDArray[np.float64]
 
 _OCTAVES = 64  # histograms reach from 2**LOWEST to 2**(LOWEST + 64)
 _FINE, _COARSE = 2000, 100  # bins per octave: 0.035 % and 0.7 %
@@ -178,25 +177,16 @@ def sup_deviation(
     """
     paths = check_count("paths", paths)
     setting = prepare(problem, steps, scenario)
-    points = check_count("points", points) if points else 0
-    if points > setting.steps:
-        raise ValueError(f"`points` must be at most the number of steps, {setting.steps}, got {points}.")
-    measure = measure or Measure()
-    task, profile = _task(setting, measure, points > 0)
-    rows = 1 if task.directions is None else len(task.directions)
-    bins = _OCTAVES * _COARSE + 2
-    if 16 * points * rows * bins > MEMORY_LIMIT:
-        raise ValueError(f"`points` must be at most {MEMORY_LIMIT // (16 * rows * bins)}, got {points}.")
-    marks = np.round(np.arange(1, points + 1) * setting.steps / max(points, 1)).astype(np.int64)
-    source, p = kernel_source(setting.model, task)
+    task, profile = _task(setting, measure or Measure(), points != 0)
+    rows, bins = 1 if task.directions is None else len(task.directions), _OCTAVES * _COARSE + 2
+    marks = _marks(points, setting.steps, rows * bins)
     work = setting.work(
-        source=source,
-        p=p,
+        kernel_source(setting.model, task),
         nominal=setting.nominal(),
         profile=profile,
         marks=marks,
         counts_shape=(rows, _OCTAVES * _FINE + 2),
-        marginals_shape=(2, points, rows, bins),
+        marginals_shape=(2, len(marks), rows, bins),
         paths=paths,
         entropy=seed_of(rng, checkpoint),
     )
@@ -214,6 +204,16 @@ def sup_deviation(
         seconds=outcome.seconds,
         path_steps_per_second=outcome.rate,
     )
+
+
+def _marks(points: int, steps: int, bins: int) -> Counts:
+    """Steps at equal distances, the last one included, where histograms of ``bins`` counts are taken."""
+    count = check_count("points", points) if points else 0
+    if count > steps:
+        raise ValueError(f"`points` must be at most the number of steps, {steps}, got {count}.")
+    if 16 * count * bins > MEMORY_LIMIT:
+        raise ValueError(f"`points` must be at most {MEMORY_LIMIT // (16 * bins)}, got {count}.")
+    return np.round(np.arange(1, count + 1) * steps / max(count, 1)).astype(np.int64)
 
 
 def _task(setting: Setting, measure: Measure, marked: bool) -> tuple[Task, Array]:

@@ -8,21 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from certbound.simulation.blocks import Counts, Work, check_count
+from certbound.arrays import Array
+from certbound.simulation.blocks import Counts, check_count
 from certbound.simulation.checkpoint import seed_of
 from certbound.simulation.estimates.preparation import Setting, prepare
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
 from certbound.simulation.executors import Progress, run_work
-from certbound.simulation.gap_tests import Barrier, barriers_of, tables_of
+from certbound.simulation.gap_tests import barriers_of, tables_of
 from certbound.simulation.kernel_source import kernel_source
 from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
 
 __all__ = ["ExitCounts", "simulate_exits"]
-
-Array = NDArray[np.float64]
 
 _TIME_BINS = 200
 
@@ -134,7 +132,13 @@ def simulate_exits(
     paths, confidence = check_count("paths", paths), check_confidence(confidence)
     setting = prepare(problem, steps, scenario)
     barriers = barriers_of(problem, setting.times)
-    work = _exit_work(setting, barriers, paths, seed_of(rng, checkpoint))
+    work = setting.work(
+        kernel_source(setting.model, Task(kind="exits", barriers=barriers)),
+        **tables_of(barriers),
+        counts_shape=(len(barriers), 1 + min(setting.steps, _TIME_BINS)),
+        paths=paths,
+        entropy=seed_of(rng, checkpoint),
+    )
     outcome = run_work(work, executor, checkpoint, progress)
     counts = outcome.tally.counts
     exits = int(counts.sum())
@@ -156,18 +160,6 @@ def simulate_exits(
         scheme=setting.model.scheme,
         seconds=outcome.seconds,
         path_steps_per_second=outcome.rate,
-    )
-
-
-def _exit_work(setting: Setting, barriers: list[Barrier], paths: int, entropy: int) -> Work:
-    source, p = kernel_source(setting.model, Task(kind="exits", barriers=barriers))
-    return setting.work(
-        source=source,
-        p=p,
-        **tables_of(barriers),
-        counts_shape=(len(barriers), 1 + min(setting.steps, _TIME_BINS)),
-        paths=paths,
-        entropy=entropy,
     )
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.simulation.blocks import BLOCK, MEMORY_LIMIT, check_count, entropy_of
 from certbound.simulation.estimates.preparation import prepare
 from certbound.simulation.kernel_source import kernel_source
@@ -14,8 +14,6 @@ from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
 
 __all__ = ["sample_paths"]
-
-Array = NDArray[np.float64]
 
 
 def sample_paths(
@@ -74,9 +72,9 @@ def sample_paths(
             f"`paths` must be at most {MEMORY_LIMIT // per_path} with {points + 1} stored times of {n} "
             f"states ({MEMORY_LIMIT // 2**20} MiB), got {paths}; lower `paths` or `points`."
         )
-    source, p = kernel_source(setting.model, Task(kind="record", own_nominal=deviation))
+    kernel = kernel_source(setting.model, Task(kind="record", own_nominal=deviation))
     marks = np.arange(points + 1, dtype=np.int64) * (setting.steps // points)
-    work = setting.work(source=source, p=p, marks=marks, counts_shape=(1, 1), paths=paths, entropy=entropy_of(rng))
+    work = setting.work(kernel, marks=marks, counts_shape=(1, 1), paths=paths, entropy=entropy_of(rng))
     out = np.empty((paths, points + 1, n))
     for block in range(work.blocks):
         work.run_block(block, work.tally(), out[block * BLOCK : (block + 1) * BLOCK])

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.model import compile_scalar
 from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
 from certbound.simulation.stepping import Scenario, StepModel, step_model
 
 __all__ = ["FixedStart", "Setting", "prepare"]
-
-Array = NDArray[np.float64]
 
 _DEFAULT_STEPS = 1000
 _LONGEST_NOMINAL = 20_000  # steps; longer paths are advanced by the kernel
@@ -33,24 +31,13 @@ class FixedStart:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Setting:
-    """Grid, step and starts of a simulation.
-
-    Parameters
-    ----------
-    model : StepModel
-    steps : int
-    times : ndarray, shape (steps + 1,)
-    start : callable
-        ``start(rng, count)`` draws starts.
-    fixed : ndarray, shape (n,), or None
-        The start, if all paths share one.
-    """
+    """Grid, step and starts of a simulation."""
 
     model: StepModel
     steps: int
-    times: Array
-    start: Callable[[np.random.Generator, int], Array]
-    fixed: Array | None
+    times: Array  # (steps + 1,)
+    start: Callable[[np.random.Generator, int], Array]  # ``start(rng, count)`` draws starts
+    fixed: Array | None  # (n,): the start, if all paths share one
 
     @property
     def shared_nominal(self) -> bool:
@@ -71,12 +58,14 @@ class Setting:
                 path.append([x + model.step * v for x, v in zip(path[k], value)] if model.step > 0.0 else value)
         return np.array(path, dtype=float)
 
-    def work(self, kind: type[Work] = Work, **fields: Any) -> Work:
-        """A piece of work on this setting; ``fields`` are those that differ from task to task."""
-        model = self.model
+    def work(self, kernel: tuple[str, Array], kind: type[Work] = Work, **fields: Any) -> Work:
+        """A piece of work on this setting, by a kernel's source and parameters; ``fields`` differ from task to task."""
+        model, (source, p) = self.model, kernel
         drawn = model.signal is None and model.switching == 0.0
         none = np.zeros(0)
         defaults: dict[str, Any] = {
+            "source": source,
+            "p": p,
             "sample_start": self.start,
             "low": model.low if drawn and model.disturbance_count else np.zeros(model.disturbance_count),
             "high": model.high if drawn and model.disturbance_count else np.zeros(model.disturbance_count),

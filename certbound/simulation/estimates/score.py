@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, if_all, window_test
+from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, if_all, starts_at_once, window_test
 from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 
 __all__ = ["score_source"]
@@ -33,9 +33,8 @@ def score_source(
         units = 1 if barrier.round or not barrier.stay else len(barrier.matrix)
         old, new, free = (vector(f"{letter}_{number}", units) for letter in "gnc")
         begin += _gaps(barrier, old, "x", "first", column, p)
-        due = "" if barrier.always else f"windows[{number}, 0] == 0"
         for g in old:
-            begin += [if_all("first == 0", due, f"{g} < 0.0"), "    top = 2.0"]
+            begin += [if_all("first == 0", starts_at_once(number, barrier), f"{g} < 0.0"), "    top = 2.0"]
         within += _gaps(barrier, free, "b", "k + 1", column, p) + _gaps(barrier, new, "y", "k + 1", column, p)
         active = " and ".join(window_test(number, barrier, "k + 1"))
         bridged = " and ".join(window_test(number, barrier, "k"))

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.simulation.blocks import MEMORY_LIMIT, Tally, Work, check_count
 from certbound.simulation.checkpoint import seed_of
-from certbound.simulation.estimates.preparation import prepare
+from certbound.simulation.estimates.preparation import Setting, prepare
 from certbound.simulation.estimates.score import score_source
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
 from certbound.simulation.executors import Progress, run_work
@@ -38,8 +38,6 @@ from certbound.simulation.stepping import Scenario, StepModel
 from certbound.simulation.tape_text import Parameters, indent
 
 __all__ = ["RareExits", "simulate_rare_exits"]
-
-Array = NDArray[np.float64]
 
 _PARTICLES = 500
 _DISCARDED = 0.1
@@ -140,18 +138,11 @@ def simulate_rare_exits(
     if model.switching > 0.0:
         raise ValueError("`disturbance` must not be 'switching' for rare exits; give a constant, an array or d(t, x).")
     own = not setting.shared_nominal
-    size = 8 * (setting.steps + 1) * (1 + model.dimension * (2 if own else 1))
-    if particles * size > MEMORY_LIMIT // 4:
-        raise ValueError(
-            f"`particles` must be at most {MEMORY_LIMIT // 4 // size} with {setting.steps} steps of {model.dimension} "
-            f"states, got {particles}; lower `particles` or `steps`."
-        )
+    _check_memory(setting, particles, own)
     barriers = barriers_of(problem, setting.times)
-    source, p = _kernel_source(model, barriers, own)
     work = setting.work(
+        _kernel_source(model, barriers, own),
         RareWork,
-        source=source,
-        p=p,
         nominal=setting.nominal(),
         **tables_of(barriers),
         counts_shape=(replicas, 2),
@@ -179,6 +170,17 @@ def simulate_rare_exits(
     )
 
 
+def _check_memory(setting: Setting, particles: int, own: bool) -> None:
+    """Refuse more particles than their stored paths may take; ``own`` noise-free paths are stored too."""
+    n = setting.model.dimension
+    size = 8 * (setting.steps + 1) * (1 + n * (2 if own else 1))
+    if particles * size > MEMORY_LIMIT // 4:
+        raise ValueError(
+            f"`particles` must be at most {MEMORY_LIMIT // 4 // size} with {setting.steps} steps of {n} "
+            f"states, got {particles}; lower `particles` or `steps`."
+        )
+
+
 def _summary(estimates: Array, paths: int, confidence: float) -> tuple[float, float, float, float]:
     """Mean, its standard error, and an interval."""
     from scipy.special import stdtrit
@@ -204,7 +206,6 @@ class RareWork(Work):
         tally.counts[block, 0] = result[0, 0].view(np.int64)[0]
         tally.counts[block, 1] = int(result[0, 0, 1])
         return done
-
 
 _FOLLOW = """
 @njit(nogil=True, error_model="numpy")

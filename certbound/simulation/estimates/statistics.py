@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from certbound.arrays import Array
 
 __all__ = ["bound_binomial", "check_confidence", "order_ranks"]
-
-Array = NDArray[np.float64]
 
 
 def check_confidence(confidence: Any) -> float:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.problem.problem import Problem
 from certbound.simulation.blocks import MEMORY_LIMIT
 from certbound.simulation.estimates import bound_binomial, sample_paths, simulate_exits
@@ -17,8 +17,6 @@ from certbound.synthesis.costs import Cost, cost_of
 from certbound.synthesis.plans import Synthesis
 
 __all__ = ["ClosedLoop", "simulate_closed_loop"]
-
-Array = NDArray[np.float64]
 
 CONFIDENCE = 0.99
 
@@ -139,7 +137,7 @@ def _costs(cost: Cost, times: Array, paths: Array, inputs: Array) -> Array:
     return np.concatenate([running, last], axis=1)
 
 
-def _broken(problem: Problem, paths: Array, counts: dict[str, int]) -> NDArray[np.bool_]:
+def _broken(problem: Problem, paths: Array, counts: dict[str, int]) -> Mask:
     """Which runs break a constraint at some step; counted by constraint."""
     broken = np.zeros(len(paths), dtype=bool)
     for constraint in problem.constraints:

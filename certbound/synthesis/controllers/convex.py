@@ -17,20 +17,19 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.errors import SolverError
 from certbound.problem.adapters import casadi_module
 from certbound.problem.model import Tape, edged, jacobian
 from certbound.problem.problem import Problem
 from certbound.synthesis.costs import cost_of
-from certbound.synthesis.faces import Face, Facets, Round, with_parts
+from certbound.synthesis.faces import Face, Facets, Plane, Round, with_parts
 from certbound.synthesis.feedback import depends_on
 from certbound.synthesis.planning import Planner
 
 __all__ = ["ConvexPlan", "ConvexPlanner"]
-
-Array = NDArray[np.float64]
 
 PENALTY = 1e4
 KEPT = 1e-6
@@ -244,9 +243,9 @@ class _Program:
             rows = cp.Parameter((steps, face.dimension))
             self.moving[index] = (rows, room)
             return [cp.sum(cp.multiply(rows, ahead), axis=1) <= room + slack]
-        row = face.rows(np.zeros((1, face.dimension)), np.zeros(1))[0, 0]
-        self.fixed[index] = (room, row)
-        return [ahead @ row <= room + slack]
+        assert isinstance(face, Plane)
+        self.fixed[index] = (room, face.row)
+        return [ahead @ face.row <= room + slack]
 
     def _objective(self) -> Any:
         cp, owner = self.cp, self.owner

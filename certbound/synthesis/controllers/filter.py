@@ -25,8 +25,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.matching import check_constants
 from certbound.errors import CertboundError
 from certbound.problem.adapters import casadi_module
@@ -41,8 +42,6 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 
 __all__ = ["FilterReport", "SafetyFilter"]
-
-Array = NDArray[np.float64]
 
 KEPT = 1e-10
 """Room that must be left: more than the rounding of the noise-free state."""

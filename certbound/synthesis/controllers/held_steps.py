@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.errors import EnclosureError
 from certbound.problem.problem import Problem
 from certbound.reach.contraction import bound_forcing, integrate_radius, jump_sizes, values_on_pieces
@@ -27,8 +28,6 @@ from certbound.rigor.norms import Norm
 from certbound.tubes.tube import Tube
 
 __all__ = ["SPARE", "HeldSteps", "Link", "ProvedStep"]
-
-Array = NDArray[np.float64]
 
 CHARGE = 1e-4
 """Share of the tube that the integrator's error may take in one step before more pieces are tried."""
@@ -47,25 +46,14 @@ class Link:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProvedStep:
-    """What one step leaves.
+    """What one step leaves."""
 
-    Parameters
-    ----------
-    state : ndarray, shape (n,)
-        Noise-free state to go on from.
-    link : Link
-        At the end of the step.
-    room : ndarray, shape (constraints,)
-        Room of every constraint over the step, in the metric, beyond what this step and the beginning of the next one
-        take; inf where it is not asked.
-    proved : bool
-        This step keeps every constraint.
-    """
-
-    state: Array
-    link: Link
+    state: Array  # (n,): noise-free state to go on from
+    link: Link  # at the end of the step
+    # (constraints,): room of every constraint over the step, in the metric, beyond what this step and the
+    # beginning of the next one take; inf where it is not asked
     room: Array
-    proved: bool
+    proved: bool  # this step keeps every constraint
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,21 +74,11 @@ class _Held(Flow):
 
 @dataclass(eq=False, kw_only=True)
 class HeldSteps:
-    """The steps of one problem around one tube.
+    """The steps of one problem around one tube."""
 
-    Parameters
-    ----------
-    problem : Problem
-        With an array plan, which is not used, and without a disturbance.
-    tube : Tube
-        Its constants hold for every input.
-    times : ndarray, shape (steps + 1,)
-        Ends of the steps, from 0 to the horizon.
-    """
-
-    problem: Problem
-    tube: Tube
-    times: Array
+    problem: Problem  # with an array plan, which is not used, and without a disturbance
+    tube: Tube  # its constants hold for every input
+    times: Array  # (steps + 1,): ends of the steps, from 0 to the horizon
     _norm: Norm = field(init=False)
     _radii: dict[int, float] = field(init=False, default_factory=dict)
     _pieces: int = field(init=False, default=1)

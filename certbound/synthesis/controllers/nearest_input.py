@@ -6,13 +6,11 @@ import importlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import SolverError
 
 __all__ = ["NearestInput"]
-
-Array = NDArray[np.float64]
 
 SLACK_WEIGHT = 1e6
 

@@ -21,8 +21,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.matching import check_constants
 from certbound.problem.problem import Problem
 from certbound.safety.verification import Verdict, verify_safety
@@ -33,8 +34,6 @@ from certbound.synthesis.terminal import TerminalSet, check_terminal, contractio
 from certbound.synthesis.transcription import Solution, Transcription
 
 __all__ = ["PredictiveController", "StepReport"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

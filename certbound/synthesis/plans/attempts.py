@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import CertboundError
 from certbound.safety.verification import Verdict, verify_safety
 from certbound.synthesis.planning import FITTED, Planner, Tightened
@@ -23,7 +23,6 @@ from certbound.tubes.tube import Tube
 
 __all__ = ["Attempts"]
 
-Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
 WIDENING = 6
@@ -120,7 +119,7 @@ class Attempts:
         for _ in range(turns):
             tube = self._tube(name, constants, solution, self.delta if delta is None else delta)
             tightened = self.planner.around(tube, solution)
-            found = self.planner.widest(tightened, solution.inputs)
+            found = self.planner.plan("scale", tightened, solution.inputs)
             gain = math.inf if best is None else found.scale / max(best[0].scale, 1e-9)
             if best is None or (found.success and found.scale > best[0].scale):
                 best = found, tightened
@@ -139,7 +138,7 @@ class Attempts:
             tightened = self.planner.response(solution, self.delta if delta is None else delta)
             if tightened is None:
                 break
-            found = self.planner.widest(tightened, solution.inputs)
+            found = self.planner.plan("scale", tightened, solution.inputs)
             grown = best[1] is None or found.scale > best[0].scale * (ENOUGH if best[0].scale >= 1 else 1.001)
             if best[1] is None or (found.success and found.scale > best[0].scale):
                 best = found, tightened
@@ -201,7 +200,7 @@ class Attempts:
         solution, used = widest, tightened
         best: tuple[Solution, Tightened] | None = None
         for _ in range(turns):
-            found = planner.cheapest(used.more(factor, extra), solution.inputs)
+            found = planner.plan("cost", used.more(factor, extra), solution.inputs)
             if not found.success:
                 return best
             if name == "linear":
@@ -238,7 +237,7 @@ class Attempts:
     ) -> Synthesis:
         """The soft plan, with the obstacle to a better one; `explained` adds the rest."""
         self.tell(f"tube {name}: the plan that misses least")
-        soft = self.planner.softest(tightened, widest.inputs)
+        soft = self.planner.plan("soft", tightened, widest.inputs)
         solution = soft if np.all(np.isfinite(soft.states)) else widest
         verdict = self._verified(name, constants, solution, tightened)
         self.refused[name] = constants, widest

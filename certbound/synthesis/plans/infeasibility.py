@@ -64,12 +64,7 @@ class Infeasibility:
 def smallest_delta(feasible: Callable[[float], bool], delta: float) -> float | None:
     """The smallest delta that ``feasible`` accepts, within 0.25 %, from the side where it does; None if none does.
 
-    Parameters
-    ----------
-    feasible : callable
-        Monotone in delta.
-    delta : float
-        Where to begin.
+    ``feasible`` is monotone in delta; the search begins at ``delta``.
     """
     start = math.log10(delta)
     if feasible(delta):

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from certbound.arrays import Array
 from certbound.problem.problem import Problem
 from certbound.safety.verification import Verdict
 from certbound.synthesis.plans.infeasibility import Infeasibility
 from certbound.tubes.constants import Constants
 
 __all__ = ["Synthesis"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

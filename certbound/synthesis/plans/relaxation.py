@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 from flint import arb, arb_mat, fmpq
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.constants.enclosures import enclose
 from certbound.errors import EnclosureError
 from certbound.problem.model import Node, Tape
@@ -32,7 +32,6 @@ from certbound.synthesis.plant import Grid, middle_of
 
 __all__ = ["bound_scale", "empty_at_once"]
 
-Array = NDArray[np.float64]
 Form = dict[int, Fraction]
 
 _BITS = 256
@@ -74,14 +73,7 @@ def bound_scale(problem: Problem, grid: Grid, faces: tuple[Face, ...], erosion: 
     Proves: for every input sequence within the bounds, some plane constraint a_j . z_k + s e_jk <= b_j is broken for
     every s above the bound. Discrete time, bounded inputs, a point start (or the middle of the initial set).
 
-    Parameters
-    ----------
-    problem : Problem
-    grid : Grid
-    faces : tuple of Face
-        Other faces than fixed planes are left out.
-    erosion : ndarray, shape (points, parts)
-        Taken as exact.
+    Faces other than fixed planes are left out; ``erosion`` (points, parts) is taken as exact.
     """
     box = problem.system.inputs
     if grid.continuous or box is None or not box.bounded:
@@ -119,11 +111,9 @@ class _Relaxed:
 
     def floats(self) -> tuple[Array, Array, Array, Array]:
         """A, B, C, c as floats."""
-        parts = [np.array([[float(v) for v in row] for row in m]).reshape(len(m), -1) for m in self._matrices()]
+        matrices = (self.state, self.inputs, self.free)
+        parts = [np.array([[float(v) for v in row] for row in m]).reshape(len(m), -1) for m in matrices]
         return parts[0], parts[1], parts[2], np.array([float(v) for v in self.offset])
-
-    def _matrices(self) -> list[list[list[Fraction]]]:
-        return [self.state, self.inputs, self.free]
 
 
 def _relaxed(problem: Problem) -> _Relaxed:
@@ -147,7 +137,7 @@ def _relaxed(problem: Problem) -> _Relaxed:
         lows, highs = np.asarray(values.lo).reshape(-1), np.asarray(values.hi).reshape(-1)
     if not (np.all(np.isfinite(lows)) and np.all(np.isfinite(highs))):
         raise EnclosureError("a nonlinear term of the dynamics is unbounded.")
-    slot = {k: tape.nodes[k].args[0] for k in nodes if k not in free}
+    place = {k: tape.nodes[k].args[0] - 1 for k in nodes if k not in free}
     state = [[Fraction(0)] * n for _ in range(n)]
     inputs = [[Fraction(0)] * m for _ in range(n)]
     unknown = [[Fraction(0)] * len(free) for _ in range(n)]
@@ -156,14 +146,12 @@ def _relaxed(problem: Problem) -> _Relaxed:
         constant, terms = forms[output]
         offset.append(constant)
         for k, value in terms.items():
-            if k in slot:
-                place = slot[k] - 1
-                if place < n:
-                    state[row][place] += value
-                else:
-                    inputs[row][place - n] += value
-            else:
+            if k not in place:
                 unknown[row][free.index(k)] += value
+            elif place[k] < n:
+                state[row][place[k]] += value
+            else:
+                inputs[row][place[k] - n] += value
     return _Relaxed(state=state, inputs=inputs, free=unknown, offset=offset, low=lows, high=highs)
 
 
@@ -203,7 +191,7 @@ def _forms(tape: Tape, first_disturbance: int, middle: Array) -> list[tuple[Frac
 
 
 def _propose(
-    model: _Relaxed, problem: Problem, planes: list[Plane], taken: Array, asked: NDArray[np.bool_]
+    model: _Relaxed, problem: Problem, planes: list[Plane], taken: Array, asked: Mask
 ) -> Array | None:
     """Multipliers (points, planes) of the linear program, in floating point; None where the solver has no optimum."""
     optimize: Any = importlib.import_module("scipy.optimize")
@@ -217,7 +205,6 @@ def _propose(
     rows = int(asked.sum())
     less, most = lil_matrix((rows, size)), np.zeros(rows)
     start = problem.initial.middle
-    normals = [_full(plane) for plane in planes]
     row = 0
     for k in range(steps):
         base = k * width  # u_k, q_k, z_{k+1}
@@ -230,7 +217,7 @@ def _propose(
         else:
             right[block] += a @ start
         for j in np.flatnonzero(asked[k]):
-            less[row, base + m + q : base + width] = normals[j]
+            less[row, base + m + q : base + width] = planes[j].row
             less[row, size - 1] = taken[k, j]
             most[row] = _bound(planes[j])
             row += 1
@@ -258,7 +245,7 @@ def _dual_bound(model: _Relaxed, problem: Problem, planes: list[Plane], taken: A
         weight = sum((arb(float(x)) * arb(float(e)) for x, e in zip(multipliers.ravel(), taken.ravel())), arb(0))
         total = arb(0)
         adjoint = arb_mat(1, n)
-        normals = [arb_mat([[arb(float(v)) for v in _full(plane)]]) for plane in planes]
+        normals = [arb_mat([[arb(float(v)) for v in plane.row]]) for plane in planes]
         for k in range(steps - 1, -1, -1):
             for j, plane in enumerate(planes):
                 value = float(multipliers[k, j])
@@ -294,12 +281,6 @@ def _ball(value: Fraction) -> arb:
 def _balls(matrix: list[list[Fraction]]) -> arb_mat:
     rows = [[_ball(value) for value in row] for row in matrix]
     return arb_mat(rows) if rows and rows[0] else arb_mat(len(rows), 0)
-
-
-def _full(plane: Plane) -> Array:
-    full = np.zeros(plane.dimension)
-    full[list(plane.coordinates)] = plane.normal
-    return full
 
 
 def _bound(plane: Plane) -> float:

@@ -9,34 +9,21 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.rigor.balls import precision
 from certbound.tubes.piecewise import MonotoneProfile
 
 __all__ = ["AlmostSureProfile"]
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AlmostSureProfile(MonotoneProfile):
-    """b_t from b_0 = ``start``.
+    """b_t from b_0 = ``start``."""
 
-    Parameters
-    ----------
-    schedule : Schedule
-        Gains.
-    bounds : ndarray (K,)
-        h per piece.
-    start : float
-        Bound of ||S_0||.
-    """
-
-    bounds: Array
-    start: float = 0.0
+    bounds: Array  # (K,): h per piece
+    start: float = 0.0  # bound of ||S_0||
 
     def to_dict(self) -> dict[str, Any]:
         """Parameters as plain data."""

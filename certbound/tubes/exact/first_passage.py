@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.rigor.balls import lower, precision
 from certbound.tubes.ballpath import integral
@@ -31,8 +31,6 @@ from certbound.tubes.schedule import Schedule, make_schedule
 from certbound.tubes.tube import Tube
 
 __all__ = ["ConstantProfile", "bound_exact_exit", "bound_worst_exit", "chain_of", "first_passage_tube"]
-
-Array = NDArray[np.float64]
 
 _LARGEST_CHAIN = 2.0e10
 _MOST_KERNELS = 12
@@ -70,6 +68,11 @@ class ConstantProfile:
         return {"kind": "constant", "radius": self.value}
 
 
+def _backwards(schedule: Schedule) -> list[tuple[float, float, float]]:
+    """(rate, noise, length) of every piece, the last one first."""
+    return list(zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist()))[::-1]
+
+
 def _exact_pieces(schedule: Schedule, square: float) -> tuple[tuple[float, float], ...]:
     """(duration, kappa) per piece along a boundary y_b <= R^2 with y_b(T) = R^2; pieces without noise are left out.
 
@@ -79,8 +82,7 @@ def _exact_pieces(schedule: Schedule, square: float) -> tuple[tuple[float, float
     pieces: list[tuple[float, float]] = []
     with precision():
         y = arb(square)
-        path = zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist())
-        for rate, noise, length in reversed(list(path)):
+        for rate, noise, length in _backwards(schedule):
             if noise == 0 and rate > 0:
                 raise InfeasibleError("`method` 'exact' needs noise wherever the rate is positive; use 'worst_case'.")
             if noise == 0:
@@ -111,8 +113,7 @@ def _worst_pieces(schedule: Schedule, dimension: int, square: float) -> tuple[tu
     pieces: list[tuple[float, float]] = []
     with precision():
         y = arb(square)
-        path = zip(schedule.rates.tolist(), schedule.noise.tolist(), schedule.lengths.tolist())
-        for rate, noise, length in reversed(list(path)):
+        for rate, noise, length in _backwards(schedule):
             if 2 * arb(rate) * y + arb(kappa) * arb(noise) > 0:
                 y, duration = _moved(y, rate, noise, length, kappa)
                 if math.isnan(duration):
@@ -161,14 +162,7 @@ def chain_of(constants: Constants, schedule: Schedule, radius: float) -> Recursi
 def bound_exact_exit(constants: Constants, *, horizon: float, radius: float, target: float = 1e-3) -> float:
     """Upper bound of P(exists t <= T: ||S_t||_P > radius) for noise that is exactly isotropic.
 
-    Parameters
-    ----------
-    constants : Constants
-        With ``isotropic=True``.
-    horizon, radius : float
-        T, and the constant radius.
-    target : float
-        Expected size of the probability: it sets the mesh.
+    ``target`` is the expected size of the probability: it sets the mesh.
 
     Raises
     ------
@@ -218,16 +212,8 @@ def _check_continuous(constants: Constants) -> None:
 def first_passage_tube(question: Question, delta: float, *, worst: bool, above: float) -> Tube:
     """The tube of least constant radius: P(||S_t|| <= R for all t <= T) >= 1 - delta.
 
-    Parameters
-    ----------
-    question : Question
-        ``isotropic=True`` for the exact law (``worst=False``); continuous time for the worst case.
-    delta : float
-        The level.
-    worst : bool
-        Which law.
-    above : float
-        A radius that is known to be large enough (the search starts below it).
+    The exact law needs ``isotropic=True``, the worst case continuous time; ``above`` is a radius that is known to be
+    large enough: the search starts below it.
 
     Raises
     ------

@@ -17,14 +17,12 @@ from functools import cache, cached_property
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.rigor.balls import bessel_excess, precision, upper
 from certbound.rigor.rounding import LIBRARY_ULPS, UNIT
 
 __all__ = ["Recursion", "legendre_rule"]
-
-Array = NDArray[np.float64]
 
 _POINTS = 14
 _TINY = 1e-290  # more than what entries below the smallest float add up to
@@ -33,25 +31,14 @@ _TABLE_RATIO = 2e-3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recursion:
-    """Exit from the ball of radius R at one of the steps 1, ..., T.
+    """Exit from the ball of radius R at one of the steps 1, ..., T."""
 
-    Parameters
-    ----------
-    gains, sigmas : ndarray (K,)
-        L and sigma per group of steps, in the order of time.
-    counts : ndarray (K,)
-        Steps per group.
-    dimension : int
-        n.
-    radius : float
-        R, in the unit of sigma.
-    """
-
+    # (K,): L and sigma per group of steps, in the order of time
     gains: Array
     sigmas: Array
-    counts: NDArray[np.intp]
-    dimension: int
-    radius: float
+    counts: Index  # (K,): steps per group
+    dimension: int  # n
+    radius: float  # R, in the unit of sigma
 
     @cached_property
     def size(self) -> int:

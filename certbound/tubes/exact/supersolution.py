@@ -25,13 +25,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.tubes.line_search import golden
 
 __all__ = ["Supersolution"]
-
-Array = NDArray[np.float64]
 
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) * math.sqrt(3) / 6
 _ROUNDING = 128 * 2.0**-53
@@ -45,34 +43,17 @@ the durations, which come from at most 12 rounded operations, each of them withi
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Supersolution:
-    """The problem on xi in [0, 1].
+    """The problem on xi in [0, 1]."""
 
-    Parameters
-    ----------
-    pieces : tuple of (float, float)
-        (duration in theta, kappa), in the order of time.
-    dimension : int
-        n.
-    nu : float
-        Effective dimension (read for ``worst`` only).
-    worst : bool
-        Any noise below sigma (True) or exactly sigma (False).
-    target : float
-        Probability of interest: it sets the mesh and what small corrections may cost.
-    inflation : float
-        Relative room left in H, which widens the radius for a given probability by about as much; for probabilities
-        below 1e-3 it grows with the square of their logarithm.
-    coarseness : float
-        Factor on the mesh widths and steps.
-    """
-
-    pieces: tuple[tuple[float, float], ...]
-    dimension: int
-    nu: float
-    worst: bool
-    target: float
+    pieces: tuple[tuple[float, float], ...]  # (duration in theta, kappa), in the order of time
+    dimension: int  # n
+    nu: float  # effective dimension (read for ``worst`` only)
+    worst: bool  # any noise below sigma (True) or exactly sigma (False)
+    target: float  # probability of interest: it sets the mesh and what small corrections may cost
+    # relative room left in H, which widens the radius for a given probability by about as much; for probabilities
+    # below 1e-3 it grows with the square of their logarithm
     inflation: float = 3e-4
-    coarseness: float = 1.0
+    coarseness: float = 1.0  # factor on the mesh widths and steps
 
     @cached_property
     def controls(self) -> list[tuple[float, float]]:
@@ -320,14 +301,12 @@ class _Bernstein:
         left, right = m[:, :-1], m[:, 1:]
         chord = 3 * (u[:, 1:] - u[:, :-1]) / h
         value = np.stack([chord - 2 * left - right, 2 * right + left - chord]) * (2 / h)
-        size = np.stack([np.abs(chord) + 2 * np.abs(left) + np.abs(right)] * 2) * (2 / h)
-        size[1] = (np.abs(chord) + np.abs(left) + 2 * np.abs(right)) * (2 / h)
-        return _Bernstein(value, size)
+        ends = np.abs(chord) + 2 * np.abs(left) + np.abs(right), np.abs(chord) + np.abs(left) + 2 * np.abs(right)
+        return _Bernstein(value, np.stack(ends) * (2 / h))
 
     def times(self, y: Array) -> _Bernstein:
         """Product with y, whose coefficients on a cell are its ends."""
-        degree = len(self.value) - 1
-        return _Bernstein(_by_line(self.value, y, degree), _by_line(self.size, y, degree))
+        return _Bernstein(_by_line(self.value, y), _by_line(self.size, y))
 
     def raised(self, degree: int) -> _Bernstein:
         """The same polynomial with more coefficients."""
@@ -337,8 +316,9 @@ class _Bernstein:
         return _Bernstein(value, size)
 
 
-def _by_line(c: Array, y: Array, degree: int) -> Array:
-    low, high = y[:-1], y[1:]
+def _by_line(c: Array, y: Array) -> Array:
+    """Coefficients of the product with lines that have the values ``y`` at the ends of the cells."""
+    degree, low, high = len(c) - 1, y[:-1], y[1:]
     result = np.zeros((degree + 2, *c.shape[1:]))
     for k in range(degree + 1):
         result[k] += c[k] * low * ((degree + 1 - k) / (degree + 1))
@@ -347,12 +327,8 @@ def _by_line(c: Array, y: Array, degree: int) -> Array:
 
 
 def _raise(c: Array) -> Array:
-    degree = len(c) - 1
-    result = np.zeros((degree + 2, *c.shape[1:]))
-    for k in range(degree + 1):
-        result[k] += c[k] * ((degree + 1 - k) / (degree + 1))
-        result[k + 1] += c[k] * ((k + 1) / (degree + 1))
-    return result
+    """The same polynomials with one coefficient more."""
+    return _by_line(c, np.ones(2))
 
 
 def _local(u: Array, m: Array) -> Array:

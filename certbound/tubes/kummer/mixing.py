@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.errors import InfeasibleError
 from certbound.rigor.balls import precision, upper
 from certbound.tubes.kummer.mixture import Component, MixtureProfile, MixtureProgram
@@ -19,7 +19,6 @@ from certbound.tubes.tube import Tube
 
 __all__ = ["mixture_level", "mixture_tube"]
 
-Array = NDArray[np.float64]
 Pair = tuple[float, float, bool]
 
 _ALL_STEPS = 400
@@ -37,7 +36,7 @@ def _radii(data: Schedule, clearance: Clearance) -> Array:
     return clearance.at(data.times[:-1]) if data.continuous else clearance.at(data.times[1:])
 
 
-def _dictionary(data: Schedule, best: list[Pair]) -> tuple[list[Pair], NDArray[np.intp]]:
+def _dictionary(data: Schedule, best: list[Pair]) -> tuple[list[Pair], Index]:
     """Pairs around the best single ones and on a grid, and the candidate ends."""
     count = len(data.lengths)
     cap = math.inf if data.any_power else data.nu / 2

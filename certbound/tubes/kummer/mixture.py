@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index, Mask
 from certbound.errors import SolverError
 from certbound.rigor.balls import lower, precision, upper
 from certbound.tubes.ballpath import BallPath, ball_path
@@ -30,7 +30,6 @@ from certbound.tubes.schedule import Schedule
 
 __all__ = ["Component", "MixtureProfile", "MixtureProgram"]
 
-Array = NDArray[np.float64]
 Pair = tuple[float, float, bool]
 
 
@@ -47,21 +46,11 @@ class Component:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MixtureProgram:
-    """The linear program for one schedule whose pieces are the intervals of time to cover.
+    """The linear program for one schedule whose pieces are the intervals of time to cover."""
 
-    Parameters
-    ----------
-    schedule : Schedule
-        Refined data: one row per piece.
-    clearance : ndarray (K,)
-        r_t on each piece (infinite where nothing is asked).
-    ends : ndarray
-        Candidate end times, among the schedule's times.
-    """
-
-    schedule: Schedule
-    clearance: Array
-    ends: NDArray[np.intp]
+    schedule: Schedule  # refined data: one row per piece
+    clearance: Array  # (K,): r_t on each piece (infinite where nothing is asked)
+    ends: Index  # candidate end times, among the schedule's times
 
     @cached_property
     def _squares(self) -> Array:
@@ -172,7 +161,7 @@ class MixtureProgram:
         u[kept] = np.asarray(result.x) * math.exp(-unit)
         return float(u.sum()), u, -np.asarray(result.ineqlin.marginals) * math.exp(-unit)
 
-    def _improve(self, pair: Pair, dual: Array, scale: float, asked: NDArray[np.bool_]) -> Pair | None:
+    def _improve(self, pair: Pair, dual: Array, scale: float, asked: Mask) -> Pair | None:
         """A pair near ``pair`` with a smaller reduced cost 1 - sum_j dual_j g_j/X, over all ends."""
         a, v0, bessel = pair
         cap = 1e4 if self.schedule.any_power else self.schedule.nu / 2 * (1 - 1e-9)
@@ -311,13 +300,13 @@ class MixtureProfile(PiecewiseProfile):
             radius = np.where(flat == 0, 0.0, radius)
         return np.asarray(radius.reshape(np.shape(t)))
 
-    def _piece(self, t: Array) -> NDArray[np.intp]:
+    def _piece(self, t: Array) -> Index:
         """In DT a step belongs to the piece that ends there or holds it inside."""
         times = self.schedule.times
         after = np.searchsorted(times, t, side="right") if self.schedule.continuous else np.searchsorted(times, t)
         return np.clip(after - 1, 0, len(times) - 2)
 
-    def _solve(self, piece: NDArray[np.intp], t: Array, start: Array) -> Array:
+    def _solve(self, piece: Index, t: Array, start: Array) -> Array:
         """Radius in units with gain 1, in floating point, by bisection on its logarithm and Newton steps."""
         rows = []
         for component in self.components:

@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.rigor.balls import bessel_excess, excess_floor, kummer_excess, lower, precision, solve_upward, upper
 from certbound.tubes.ballpath import BallPath, ball_path
 from certbound.tubes.constants import Constants, check_delta
@@ -34,8 +34,6 @@ from certbound.tubes.schedule import Schedule
 from certbound.tubes.tube import Tube
 
 __all__ = ["KummerProfile", "kummer_tube", "log_initial", "log_target"]
-
-Array = NDArray[np.float64]
 
 _LARGEST_EXPONENT = 1e8
 
@@ -153,6 +151,8 @@ class KummerProfile(PiecewiseProfile):
         a = arb(self.a)
         spent = phi_ball(a, info)
         target = (self.initial / arb(self.delta) - spent) * (-a * info).exp()
+        if target.is_zero():  # no noise, and a start at 0: E_a(0) = 0
+            return arb(0)
         if not (target > 0):
             return arb.pos_inf()
         known = self._known.get(key)

@@ -12,16 +12,16 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.tubes.excess import log_excess_value, log_excess_values, log_phi, log_phi_one, solve_excess
 from certbound.tubes.kummer.profile import log_initial, log_target
+from certbound.tubes.objective import mean_over_time
 from certbound.tubes.question import Question, Start
 from certbound.tubes.schedule import Schedule
 
 __all__ = ["Search", "log_gain", "moderate_parameters", "simplex"]
 
-Array = NDArray[np.float64]
 Point = tuple[float, ...]
 
 _POWERS = np.array([0.1, 1.5, 20.0])
@@ -36,30 +36,14 @@ _OVERFLOWING = 1e300  # variance beyond which nothing is looked for
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Search:
-    """One tuning problem on the nodes of a (graded) schedule.
+    """One tuning problem on the nodes of a (graded) schedule."""
 
-    Parameters
-    ----------
-    schedule : Schedule
-        Data; its piece ends are the nodes.
-    kind : str
-        ``"scale"`` (least s with r_t <= s clearance_t), ``"final"``, ``"mean"``, or ``"probability"`` (Thm K2).
-    weights : ndarray (K + 1,)
-        Clearance at the nodes (infinite where nothing is asked); ones for the largest radius.
-    log_delta : float
-        Level of the tube (unused for ``"probability"``).
-    bessel : bool
-        Search the Bessel form.
-    start : Start
-        Deviation at time 0.
-    """
-
-    schedule: Schedule
-    kind: str
-    weights: Array
-    log_delta: float = 0.0
-    bessel: bool = False
-    start: Start = field(default_factory=Start)
+    schedule: Schedule  # data; its piece ends are the nodes
+    kind: str  # ``"scale"`` (least s with r_t <= s clearance_t), ``"final"``, ``"mean"``, or ``"probability"`` (Thm K2)
+    weights: Array  # (K + 1,): clearance at the nodes (infinite where nothing is asked); ones for the largest radius
+    log_delta: float = 0.0  # level of the tube (unused for ``"probability"``)
+    bessel: bool = False  # search the Bessel form
+    start: Start = field(default_factory=Start)  # deviation at time 0
 
     @classmethod
     def of(
@@ -270,13 +254,9 @@ class Search:
             return math.inf
         with np.errstate(over="ignore", invalid="ignore"):
             z = solve_excess(np.asarray(a), self.half, log_target(a, info, log_x, self.log_delta), bessel=self.bessel)
-            radius = np.sqrt(2 * v * z) * self.schedule.unit
-        times = self.schedule.times
-        if self.schedule.continuous:
-            return float(np.trapezoid(radius, times) / times[-1])
-        return float(np.mean(np.interp(np.arange(1.0, times[-1] + 1), times, radius)))
+            return mean_over_time(self.schedule, np.sqrt(2 * v * z) * self.schedule.unit)
 
-    def _active(self, v: Array) -> NDArray[np.intp]:
+    def _active(self, v: Array) -> Index:
         """Nodes that no later node dominates: z_t rises in t, so only records of v/clearance^2 from the end count."""
         if self.kind == "final":
             return np.array([len(v) - 1])

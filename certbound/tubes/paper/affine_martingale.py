@@ -15,14 +15,13 @@ from functools import cached_property
 
 import numpy as np
 from flint import arb
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.rigor.balls import lower, precision, upper
 from certbound.tubes.ballpath import integral
 
 __all__ = ["AffineMartingale", "estimate_affine_excess"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

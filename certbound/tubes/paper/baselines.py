@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from certbound.tubes.paper.radii import RootProfile, Tail, best_epsilon, best_growth, growth, sharp_tail
 from certbound.tubes.paper.windows import WindowProfile, event_count, window_scale
@@ -18,36 +17,17 @@ from certbound.tubes.tube import Profile, Tube
 
 __all__ = ["BASELINES", "Baseline", "baseline_tube", "check_method"]
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline:
-    """One named formula.
+    """One named formula."""
 
-    Parameters
-    ----------
-    time : str
-        ``"continuous"``, ``"discrete"`` or ``"both"``.
-    kind : str
-        Roots of :class:`certbound.tubes.paper.radii.RootProfile`, or ``"windows"``.
-    level : str
-        ``"trajectory"`` or ``"one time"``.
-    tail : str
-        Kind of B.
-    printed : bool
-        A variant that keeps an error of the paper: never certified, never chosen.
-    title : str
-        Its source.
-    """
-
-    time: str
-    kind: str
-    level: str
-    title: str
-    tail: str = "growth"
-    printed: bool = False
-
+    time: str  # ``"continuous"``, ``"discrete"`` or ``"both"``
+    kind: str  # roots of :class:`certbound.tubes.paper.radii.RootProfile`, or ``"windows"``
+    level: str  # ``"trajectory"`` or ``"one time"``
+    title: str  # its source
+    tail: str = "growth"  # kind of B
+    printed: bool = False  # a variant that keeps an error of the paper: never certified, never chosen
 
 _CT, _DT, _ONE, _ALL = "continuous", "discrete", "one time", "trajectory"
 _MOST_WINDOWS = 512
@@ -212,9 +192,8 @@ class _Builder:
             scale = self._closed_scale() if self._plain else self._sum_scale
             return scale(step) if step is not None else rough_scale(data, scale, self._most)
         roots, weights = self.question.goal.roots(data, scaled=row.kind == "scaled")
-        count = data.horizon if self.method.startswith("prop3") else 1.0
         with np.errstate(over="ignore", invalid="ignore"):
-            scale_value = float(np.max(roots / weights)) * math.sqrt(self.size(count)) * data.unit
+            scale_value = float(np.max(roots / weights)) * math.sqrt(self.size(self._steps)) * data.unit
         return scale_value if scale_value == scale_value else math.inf
 
     @property
@@ -228,23 +207,24 @@ class _Builder:
 
     def roots(self) -> tuple[Profile, dict[str, Any]]:
         """One-root formulas."""
-        count = self.schedule.horizon if self.method.startswith("prop3") else 1.0
-        tail = self.tail(count)
-        profile = RootProfile(schedule=self.schedule, tail=tail, kind=self.row.kind)
-        return profile, _parameters(tail)
+        tail = self.tail(self._steps)
+        return RootProfile(schedule=self.schedule, tail=tail, kind=self.row.kind), _parameters(tail)
+
+    @property
+    def _steps(self) -> float:
+        """Number of events of a one-root formula: Prop 3 adds the steps up."""
+        return self.schedule.horizon if self.method.startswith("prop3") else 1.0
 
     def windows(self, step: float | None) -> tuple[Profile, dict[str, Any]]:
         """Thms 3 and 5."""
         data = self.schedule
         if step is None:
             step = best_step(data, self._closed_scale() if self._plain else self._sum_scale, self._most)
+        tail = self.tail(self._events(step))
+        profile: Profile = WindowProfile(schedule=data, tail=tail, step=step)
         if self._plain:
             windows = _window_count(data.horizon, step)
-            tail = self.tail(self._events(step))
-            profile: Profile = RootProfile(schedule=data, tail=tail, kind="windows", step=step, count=windows)
-        else:
-            tail = self.tail(self._events(step))
-            profile = WindowProfile(schedule=data, tail=tail, step=step)
+            profile = RootProfile(schedule=data, tail=tail, kind="windows", step=step, count=windows)
         return profile, {**_parameters(tail), "step": step}
 
     def _events(self, step: float) -> float:

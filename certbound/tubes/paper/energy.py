@@ -9,13 +9,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from certbound.tubes.excess import log_excess
 
 __all__ = ["log_energy"]
-
-Array = NDArray[np.float64]
 
 
 def log_energy(x: ArrayLike, rate: float) -> Any:

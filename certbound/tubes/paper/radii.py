@@ -19,9 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
 from certbound.rigor.balls import bessel_excess, precision, solve_upward
 from certbound.tubes.ballpath import BallPath, ball_path, integral
@@ -30,8 +28,6 @@ from certbound.tubes.line_search import golden
 from certbound.tubes.piecewise import MonotoneProfile
 
 __all__ = ["RootProfile", "Tail", "best_epsilon", "best_growth", "growth", "growth_ball", "sharp_tail"]
-
-Array = NDArray[np.float64]
 
 
 def growth(epsilon: float, dimension: float, level: float) -> float:
@@ -72,27 +68,15 @@ def best_epsilon(dimension: float, level: float) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Tail:
-    """The factor B of a radius.
+    """The factor B of a radius."""
 
-    Parameters
-    ----------
-    kind : str
-        ``"growth"`` (eq. (7) with ``epsilon``), ``"cosh"`` (n = 1), ``"moment"`` (``weight``/delta) or ``"sharp"``
-        (``power`` k).
-    delta : float
-        Level.
-    count : float
-        Number of events that share delta: ell = log(count/delta).
-    dimension : float
-        n (nu for the sharp tail).
-    epsilon, weight, power : float
-        As ``kind`` asks.
-    """
-
+    # ``"growth"`` (eq. (7) with ``epsilon``), ``"cosh"`` (n = 1), ``"moment"`` (``weight``/delta) or ``"sharp"``
+    # (``power`` k)
     kind: str
-    delta: float
-    dimension: float
-    count: float = 1.0
+    delta: float  # level
+    dimension: float  # n (nu for the sharp tail)
+    count: float = 1.0  # number of events that share delta: ell = log(count/delta)
+    # as ``kind`` asks
     epsilon: float = 0.0
     weight: float = 0.0
     power: float = 0.0
@@ -131,26 +115,12 @@ def sharp_tail(*, delta: float, dimension: float, count: float = 1.0) -> Tail:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RootProfile(MonotoneProfile):
-    """sqrt(B) times the roots named by ``kind``.
+    """sqrt(B) times the roots named by ``kind``."""
 
-    Parameters
-    ----------
-    schedule : Schedule
-        Data.
-    tail : Tail
-        B.
-    kind : str
-        ``"variance"``, ``"scaled"``, ``"printed"`` (Thm 4 as printed) or ``"windows"`` (constant data).
-    step : float
-        Window length of ``"windows"``.
-    count : int
-        N = ceil(T/step) of ``"windows"``; the length is at least T/N whatever the rounding of ``step``.
-    """
-
-    tail: Tail
-    kind: str
-    step: float = 0.0
-    count: int = 1
+    tail: Tail  # B
+    kind: str  # ``"variance"``, ``"scaled"``, ``"printed"`` (Thm 4 as printed) or ``"windows"`` (constant data)
+    step: float = 0.0  # window length of ``"windows"``
+    count: int = 1  # N = ceil(T/step) of ``"windows"``; the length is at least T/N whatever the rounding of ``step``
 
     def to_dict(self) -> dict[str, Any]:
         """Parameters as plain data."""

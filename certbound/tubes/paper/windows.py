@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.rigor.balls import precision
 from certbound.tubes.ballpath import BallPath, ball_path, integral
 from certbound.tubes.paper.radii import Tail
@@ -29,8 +29,6 @@ from certbound.tubes.schedule import Schedule
 from certbound.tubes.schedule import integral as integral_float
 
 __all__ = ["WindowProfile", "event_count", "window_scale"]
-
-Array = NDArray[np.float64]
 
 
 def event_count(horizon: float, step: float, *, continuous: bool) -> int:
@@ -60,20 +58,10 @@ class _Piece:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WindowProfile(MonotoneProfile):
-    """Radius of the module's formula.
+    """Radius of the module's formula; ``schedule`` is not refined."""
 
-    Parameters
-    ----------
-    schedule : Schedule
-        Data, not refined.
-    tail : Tail
-        B with the number of events.
-    step : float
-        Window length.
-    """
-
-    tail: Tail
-    step: float
+    tail: Tail  # B with the number of events
+    step: float  # window length
 
     @cached_property
     def grid(self) -> Schedule:

@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 
 _DEGREE = 5
 _BAND = 5
+_THINNEST = 1e-6  # share of a cell that a bent one keeps
 _GAMMA = 1 - 0.5**0.5  # the L-stable two-stage method of order 2
 
 
@@ -117,7 +118,10 @@ def graded(line: Line, cells: int, layers: list[float]) -> Array:
 
 
 def through(nodes: Array, points: tuple[float, float]) -> Array:
-    """Nodes bent a little so that the inner ones nearest to the points lie on them; as they were where that fails."""
+    """Nodes bent a little so that the inner ones nearest to the points lie on them; as they were where that fails.
+
+    It fails where a cell would all but vanish, as beside a point on an end: collocation is singular there.
+    """
     places = [1 + int(np.argmin(np.abs(nodes[1:-1] - point))) for point in points]
     if places[0] == places[1] and points[0] != points[1]:
         return nodes
@@ -126,7 +130,7 @@ def through(nodes: Array, points: tuple[float, float]) -> Array:
     moved = nodes + np.interp(np.arange(len(nodes)), order, [known[k] for k in order])
     moved[[0, -1]] = nodes[[0, -1]]
     moved[places] = points
-    return moved if np.all(np.diff(moved) > 0) else nodes
+    return moved if np.all(np.diff(moved) > _THINNEST * np.diff(nodes)) else nodes
 
 
 class Splines:

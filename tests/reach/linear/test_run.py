@@ -204,7 +204,7 @@ def test_a_direction_alone_needs_a_proof() -> None:
 
 @pytest.mark.parametrize("effort", [0, 1, 2])
 def test_bounds_of_the_remainder_prove_themselves(effort: int) -> None:
-    run = LinearRun(Linearisation.of(cb.load("unicycle").replace(horizon=1.0)), asked=False)
+    run = LinearRun(Linearisation.of(cb.load("unicycle").replace(horizon=1.0)))
     levels, _ = run.levels(Share.of(1e-4))
     bounds = run.include(levels, effort)
     assert bounds is not None
@@ -221,7 +221,7 @@ def test_bounds_of_the_remainder_prove_themselves(effort: int) -> None:
 
 
 def test_a_piece_that_needs_more_is_tried_again_alone() -> None:
-    run = LinearRun(Linearisation.of(cb.load("unicycle").replace(horizon=1.0)), asked=False)
+    run = LinearRun(Linearisation.of(cb.load("unicycle").replace(horizon=1.0)))
     levels, _ = run.levels(Share.of(1e-4))
     bounds = run.include(levels, 1)
     assert bounds is not None
@@ -310,7 +310,7 @@ def test_units_of_time_change_no_bound() -> None:
 
 
 def test_a_reach_tube_that_nothing_bounds_names_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("certbound.reach.linear.answer.level_scale", lambda *_: np.inf)
+    monkeypatch.setattr("certbound.reach.linear.answer_tubes.level_scale", lambda *_: np.inf)
     system = cb.linear_system([[-0.5]], diffusion=[[0.1]])
     problem = cb.Problem(system, initial=[1.0], safe=[], horizon=2, delta=1e-2)
     with pytest.raises(ArithmeticError, match=r"no bound of the deviation of x1 was found .*method='contraction'"):

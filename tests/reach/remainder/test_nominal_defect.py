@@ -10,7 +10,7 @@ import certbound as cb
 from certbound.reach.linear.answer import linear_reach
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.nominal.flow import Flow
-from certbound.reach.remainder.nominal_defect import Still, bound_defect_over_pieces
+from certbound.reach.remainder.nominal_defect import NominalDefect, bound_defect_over_pieces
 
 
 def swinging() -> cb.Problem:
@@ -61,14 +61,14 @@ def test_the_defect_falls_with_the_third_power_of_the_step() -> None:
 
 def test_where_a_kink_is_crossed_the_derivative_of_the_curve_takes_the_place_of_the_dynamics() -> None:
     engine = Linearisation(creased(), pieces=10)
-    still, frame = Still(engine.model, engine.frame), engine.frame
-    crossed = np.flatnonzero(still.curve.max(axis=1) > 0)
+    found, frame = NominalDefect(engine.model, engine.frame), engine.frame
+    crossed = np.flatnonzero(found.curve.max(axis=1) > 0)
     assert set(crossed) <= {4, 5}
     assert len(crossed)
-    assert np.all(still.defect.mag[crossed] == 0)
-    assert np.array_equal(still.value.lo[crossed], frame.middle_velocity.lo[crossed])
+    assert np.all(found.defect.mag[crossed] == 0)
+    assert np.array_equal(found.value.lo[crossed], frame.middle_velocity.lo[crossed])
     smooth = np.setdiff1d(np.arange(10), crossed)
-    assert np.all(still.defect.mag[smooth] < 1e-3)
+    assert np.all(found.defect.mag[smooth] < 1e-3)
 
 
 def test_a_trajectory_without_noise_is_enclosed_closely() -> None:

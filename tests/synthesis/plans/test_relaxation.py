@@ -15,7 +15,7 @@ from tests.synthesis.conftest import cart
 def test_the_bound_is_the_solvers_value_on_a_linear_system() -> None:
     planner = Planner(cart())
     erosion = np.full((20, 4), 0.1) * np.linspace(0.5, 1.5, 20)[:, None]
-    found = planner.widest(Tightened(erosion=erosion, inputs=np.zeros((21, 1))), planner.guess())
+    found = planner.plan("scale", Tightened(erosion=erosion, inputs=np.zeros((21, 1))), planner.guess())
     bound = bound_scale(planner.problem, planner.grid, planner.faces, erosion)
     assert found.scale <= bound * (1 + 1e-6)  # the solver ends within its tolerance
     assert bound == pytest.approx(found.scale, rel=1e-5)
@@ -29,7 +29,7 @@ def test_the_bound_lies_above_every_plan_of_a_nonlinear_system() -> None:
     problem = cb.Problem(system, initial=[0.9, 0.3], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=15)
     planner = Planner(problem)
     erosion = np.full((15, 4), 0.05)
-    found = planner.widest(Tightened(erosion=erosion, inputs=np.zeros((16, 1))), planner.guess())
+    found = planner.plan("scale", Tightened(erosion=erosion, inputs=np.zeros((16, 1))), planner.guess())
     bound = bound_scale(problem, planner.grid, planner.faces, erosion)
     assert np.isfinite(bound)
     assert found.scale <= bound

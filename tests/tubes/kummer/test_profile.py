@@ -36,6 +36,15 @@ def test_at_a_equal_nu_half_the_tube_is_that_of_the_exponential():
     assert got == pytest.approx(math.sqrt(2 * 0.1 * math.log1p(math.expm1(10.0) / 1e-3)), rel=1e-12)
 
 
+@pytest.mark.parametrize("changes", [{}, {"bessel": True}, {"a": 0.0}])
+@pytest.mark.parametrize("known", [{"rate": -0.5}, {"rate": 0.2}, {"gain": 0.9}])
+def test_without_noise_the_bound_is_the_radius_and_both_are_zero(known, changes):
+    silent = tube(Constants(**known, sigma=0.0, dimension=2), **changes)
+    assert silent.radius(3.0) == silent.bound(0.0, 5.0) == silent.maximum == 0.0
+    moved = tube(Constants(**known, sigma=0.0, dimension=2), start=Start(offset=0.1), **changes)
+    assert 0 < moved.maximum < np.inf
+
+
 def test_the_bessel_form_in_one_dimension_is_the_hyperbolic_cosine():
     walk = Constants(rate=0.0, sigma=1.0, dimension=1)
     rate, horizon, delta = 2.5, 2.0, 1e-3
