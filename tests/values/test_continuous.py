@@ -15,11 +15,12 @@ import certbound as cb
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model.tracing import trace
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous import exits, hypotheses
+from certbound.values.continuous import exits, hypotheses, two_states
 from certbound.values.continuous.coefficients import Cells, Reader, enclose, squared_diffusion
 from certbound.values.continuous.exits import bound_exits
-from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
+from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper, sampled_residual
 from certbound.values.continuous.payment import BIN, Levels, Patched, pay_lower, pay_upper, repay
+from certbound.values.continuous.plane_proposal import Plan, Source, propose_plane
 from certbound.values.continuous.polynomials import basis_at, interpolation, node_product, nodes_of, to_bernstein
 from certbound.values.continuous.proposal import Splines, sketch, through
 from certbound.values.continuous.residual import bound_ranges
@@ -368,14 +369,54 @@ def test_the_start_counts_with_its_worst_point_above_and_its_best_below() -> Non
     assert extreme_over(lower, [(0.9, 1.1)], upper=False) >= inside.max()
 
 
-def test_two_states_without_coupling_are_as_safe_as_each_alone() -> None:
+def two_free_states() -> cb.Problem:
     system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.5 * np.eye(2))
-    problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
-    found = bound_exits(problem, seconds=0.1)
-    one = exit_probability(lambda t, x: -x, lambda t, x: 0.5 + 0 * x, -1, 1, 1, 0.0)
-    truth = math.log10(1 - (1 - one) ** 2)
-    assert truth <= found.upper < truth + 0.2
+    return cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
+
+
+TWO_FREE_STATES = math.log10(1 - (1 - exit_probability(lambda t, x: -x, lambda t, x: 0.5 + 0 * x, -1, 1, 1, 0.0)) ** 2)
+
+
+def test_two_states_without_coupling_are_as_safe_as_each_alone() -> None:
+    found = bound_exits(two_free_states(), seconds=0.1)
+    assert TWO_FREE_STATES <= found.upper < TWO_FREE_STATES + 0.06
     assert found.lower is None
+
+
+def test_a_source_of_any_size_never_takes_a_bound_below_the_truth() -> None:
+    problem = two_free_states()
+    model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
+    plane = two_states._plane(problem, model, room.inner_low, room.inner_high, starts)
+    plan = Plan(cells=16, growth=0.5, lead=0.02, floor=-8.0)
+    first = propose_plane(plane, plan)
+    assert first is not None
+    needed = two_states._source(first, *sampled_residual(first, model))
+    bounds = {}
+    for size in (-1.0, 0.0, 1.0, 3.0):
+        source = dataclasses.replace(needed, values=size * needed.values)
+        surface = propose_plane(plane, plan, source)
+        if surface is not None:
+            bounds[size] = prove_upper(surface, model, starts).log / math.log(10)
+    assert min(bounds.values()) >= TWO_FREE_STATES
+    assert bounds[1.0] < bounds[0.0] - 0.01  # what it is for
+    assert bounds[1.0] < TWO_FREE_STATES + 0.3
+
+
+def test_a_source_is_at_least_what_is_needed_on_every_patch() -> None:
+    problem = two_free_states()
+    model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
+    plane = two_states._plane(problem, model, room.inner_low, room.inner_high, starts)
+    surface = propose_plane(plane, Plan(cells=8, growth=0.8, lead=0.1, floor=-5.0))
+    assert surface is not None
+    needed = np.random.default_rng(0).uniform(0.0, 1.0, (surface.slabs, *surface.cells))
+    source = Source.above(surface, needed)
+    points = [np.linspace(axis[0], axis[-1], 57)[1:-1] for axis in surface.axes]
+    at_ends = source.at(points)
+    cells = [np.searchsorted(axis, place) - 1 for axis, place in zip(surface.axes, points)]
+    for slab in range(surface.slabs):
+        wanted = needed[slab][np.ix_(*cells)]
+        assert np.all(at_ends[slab] >= wanted - 1e-12)
+        assert np.all(at_ends[slab + 1] >= wanted - 1e-12)
 
 
 # what is refused

@@ -72,7 +72,7 @@ def _extreme(table: Array, low: Array, high: Array) -> None:
                     high[s] = max(high[s], table[i, j, k, s])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def extremes_in_plane(
     coefficients: Array, step: Array, width_x: Array, width_y: Array, place: Index, drift: Array, square: Array,
     bases: tuple[Array, ...], inverses: tuple[Array, ...], wanted: float, out: Array,
@@ -86,7 +86,7 @@ def extremes_in_plane(
     t0, t1, x0, x1, x2, y0, y1, y2 = bases
     nt, nx, ny = t0.shape[0], x0.shape[0], y0.shape[0]
     shape = (nt, nx, ny, BLOCK)
-    one, two = np.empty((nt, max(nx, 6), ny, BLOCK)), np.empty(shape)
+    one, two = np.empty((max(nt, 4), max(nx, 6), max(ny, 6), BLOCK)), np.empty((max(nt, 4), nx, ny, BLOCK))
     vt, vx, vy, xx, yy, xy = (np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape),
                               np.empty(shape))  # fmt: skip
     rest, energy, result = np.empty(shape), np.empty(shape), np.empty(shape)

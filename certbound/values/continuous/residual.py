@@ -23,7 +23,7 @@ from certbound.rigor.rounding import UNIT
 from certbound.values.continuous.coefficients import Interpolant
 from certbound.values.continuous.polynomials import basis_at, nodes_of, norm, to_bernstein
 
-__all__ = ["Patches", "Ranges", "bound_ranges", "coarse_size", "value_range"]
+__all__ = ["Patches", "Ranges", "bound_ranges", "coarse_size", "sample_in_plane", "value_range"]
 
 Array = NDArray[np.float64]
 
@@ -146,20 +146,36 @@ def _in_plane(
     counts: Sequence[int], wanted: float,
 ) -> Extremes:
     """The same in two states, compiled."""
+    out = _run_plane(patches, drifts, squares, place, counts, tuple(np.array(to_bernstein(k)) for k in counts), wanted)
+    return out[:, :, 0].T, out[:, :, 1].T, out[:, :, 2].min(axis=1)
+
+
+def sample_in_plane(
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp],
+    counts: Sequence[int],
+) -> Array:
+    """The largest sample of R over each patch and all branches, two states: a sketch, no bound."""
+    same = tuple(np.eye(count) for count in counts)
+    return np.asarray(_run_plane(patches, drifts, squares, place, counts, same, np.inf)[:, :, 1].max(axis=1))
+
+
+def _run_plane(
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp],
+    counts: Sequence[int], inverses: tuple[Array, ...], wanted: float,
+) -> Array:
     from certbound.values.continuous.kernel import extremes_in_plane
 
     time, x, y = (
         _derivatives(count, degree, orders) for count, degree, orders in zip(counts, (TIME, SPACE, SPACE), (2, 3, 3))
     )
-    inverses = [np.array(to_bernstein(count)) for count in counts]
     out = np.empty((len(patches.size), len(drifts), 3))
     width_x, width_y = patches.widths
     extremes_in_plane(
         np.ascontiguousarray(patches.coefficients), patches.step, width_x, width_y, place,
         np.ascontiguousarray([drift.samples for drift in drifts]), np.ascontiguousarray(squares.samples),
-        (*time, *x, *y), tuple(inverses), wanted, out,
+        (*time, *x, *y), inverses, wanted, out,
     )  # fmt: skip
-    return out[:, :, 0].T, out[:, :, 1].T, out[:, :, 2].min(axis=1)
+    return out
 
 
 def _derivatives(count: int, degree: int, orders: int) -> list[Array]:
