@@ -10,8 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.certification import certify, record, relative_widths, slope_weights
 from certbound.constants.enclosures import Metric, split_boxes
 from certbound.constants.metrics import check_objective, improve
@@ -21,8 +22,6 @@ from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import EnclosureError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants
-
-Array = NDArray[np.float64]
 
 
 def bound_constants(

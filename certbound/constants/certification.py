@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import Metric, Supremum, bound_supremum, random_points
 from certbound.constants.jacobians import affine_set
 from certbound.constants.model_data import Model
@@ -18,8 +19,6 @@ from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants, Proof
-
-Array = NDArray[np.float64]
 
 FIRST_BUDGET = 4000
 """Boxes before the affine structure of the Jacobian is looked for."""

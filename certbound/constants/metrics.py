@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.certification import certify
 from certbound.constants.enclosures import random_points
 from certbound.constants.jacobians import AffineSet, JacobianSet, affine_set, as_set
@@ -37,8 +38,6 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 from certbound.tubes.constants import Constants
-
-Array = NDArray[np.float64]
 
 _GAIN = 1e-3
 """Smallest decrease of c or L for which another metric than the identity is worth its name."""

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System, from_control
 from certbound.rigor.intervals import Interval
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -7,8 +7,8 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.constants.enclosures import Metric, bound_supremum, enclose
 from certbound.constants.model_data import Model
 from certbound.errors import EnclosureError, InfeasibleError
@@ -17,8 +17,6 @@ from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.rigor.definite import eigenvalue_upper
 from certbound.rigor.intervals import Interval, matmul
 from certbound.rigor.rounding import TINY, lower, quiet, upper
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -131,7 +129,7 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
     return NoiseBound(sigma=sigma, effective_dimension=nu, isotropic=False, gaussian=True)
 
 
-def _widths(boxes: Interval, whole: Interval, used: NDArray[np.bool_]) -> Array:
+def _widths(boxes: Interval, whole: Interval, used: Mask) -> Array:
     """Widths as shares of the whole range, whatever its units; 0 for what the diffusion does not read."""
     with np.errstate(all="ignore"):
         share = (boxes.hi - boxes.lo) / (whole.hi - whole.lo)

@@ -13,8 +13,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.jacobians import (
     AffineSet,
     IntervalMatrixSet,
@@ -28,8 +29,6 @@ from certbound.constants.programs import center_multipliers, centred, varying
 from certbound.errors import EnclosureError
 from certbound.rigor.definite import eigenvalue_lower, eigenvalue_upper, is_positive_definite
 from certbound.rigor.intervals import Interval, down, matmul, up
-
-Array = NDArray[np.float64]
 
 VERTEX_WORK = 2e7
 """Largest count * n^3 for which a parametric set is proved vertex by vertex."""

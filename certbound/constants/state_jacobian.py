@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import Spread, enclose
 from certbound.problem.model import OPERATIONS, Node, Tape, compile_numpy, jacobian, sources
 from certbound.rigor.intervals import Interval
 
-Array = NDArray[np.float64]
 PERIOD = 6.283185307179588
 """A float above 2 pi."""
 SLOPE_LIMIT = 20_000

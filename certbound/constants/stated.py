@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.bounds import bound_constants
 from certbound.constants.matching import implies
 from certbound.display import rounded
@@ -15,8 +15,6 @@ from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.tubes.constants import Constants
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9  # what floating-point evaluations of the problem's own numbers may be wrong by, and more
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.plotting.plane import supports
 from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene
 from certbound.problem.sets import Inside, Quadratic, clearance
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from certbound.problem.problem import Problem
     from certbound.reach.sets import ReachTube
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

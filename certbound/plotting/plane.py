@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.plotting.scene import GREY, INK, RIM, VERMILION, YELLOW, Scene
 from certbound.problem.sets import Inside, Quadratic, Region
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.reach.sets import ReachTube
 
-Array = NDArray[np.float64]
 Plane = tuple[int, int]
 
 DIRECTIONS = 32

@@ -6,7 +6,6 @@ from functools import singledispatch
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from certbound.plotting.panels import draw_panel, panels_of
 from certbound.plotting.plane import draw_plane, plane_of
@@ -20,8 +19,6 @@ from certbound.tubes.tube import Tube
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-Array = NDArray[np.float64]
 
 
 @singledispatch

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from certbound.arrays import Array
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.reach.sets import ReachTube
     from certbound.safety.verification import Verdict
-
-Array = NDArray[np.float64]
 
 INK, GREY, BLUE, VERMILION, YELLOW = "#000000", "#8c8c8c", "#0072B2", "#D55E00", "#F0E442"
 INNER, OUTER, RIM = "#86B9DD", "#C3E0F2", "#7a3500"

@@ -18,10 +18,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.checks import frozen, positive_definite, vector
 from certbound.rigor.intervals import Interval, sq
-
-Array = NDArray[np.float64]
 
 LAWS: dict[str, type[Law]] = {}
 """Every law that has a name, by its name; a class enters when it is defined."""

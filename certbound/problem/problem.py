@@ -8,15 +8,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.checks import assign, frozen, nearest, number, positive_definite, vector
 from certbound.display import Shown, ask_later_room, name_text
 from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.sets import Box, GaussianStart, Inside, Outside, Region, check_start
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.checks import assign, frozen, matrix, names, number, vector
 from certbound.problem.adapters import import_control, is_control_system, is_symbolic, read_model, symbol_names
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.noise import Gaussian, Law, known_laws
 from certbound.problem.sets import Box
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, init=False)

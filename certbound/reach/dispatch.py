@@ -21,8 +21,6 @@ from certbound.reach.sets import ReachTube
 from certbound.tubes.question import Start
 from certbound.tubes.tuning import tune_tube
 
-__all__ = ["bound_reach"]
-
 _ENGINES = ("linear", "contraction")
 """Names of the engines, in the order in which "auto" tries them."""
 

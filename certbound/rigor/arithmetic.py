@@ -10,11 +10,10 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array, Mask
 from certbound.rigor.rounding import LARGEST, TINY, lower, product_error, quiet, upper
-
-Array = NDArray[np.float64]
 
 
 class Interval:
@@ -160,7 +159,7 @@ class Interval:
         hi = hi + np.sum(np.abs(self.hi), axis=axis) * (gamma * (1 + 1e-9)) if terms > 1 else hi
         return Interval._raw(np.where(np.isnan(lo), -np.inf, lo), np.where(np.isnan(hi), np.inf, hi))
 
-    def contains(self, value: ArrayLike | Interval) -> NDArray[np.bool_]:
+    def contains(self, value: ArrayLike | Interval) -> Mask:
         """Elementwise: does the interval contain the number (or the other interval)?"""
         lo, hi = (value.lo, value.hi) if isinstance(value, Interval) else (np.asarray(value),) * 2
         return np.asarray((self.lo <= lo) & (hi <= self.hi))

@@ -10,12 +10,10 @@ The bounds are exact up to rounding for point matrices and to first order in the
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.rigor.arithmetic import Interval, IntervalLike, matmul
 from certbound.rigor.rounding import STEP, TINY, lower, product_error, quiet, upper
-
-Array = NDArray[np.float64]
 
 
 def _matrices(name: str, matrix: IntervalLike) -> Interval:
@@ -76,7 +74,7 @@ def eigenvalue_lower(A: IntervalLike) -> Array:
 
 
 @quiet
-def is_positive_definite(A: IntervalLike) -> NDArray[np.bool_]:
+def is_positive_definite(A: IntervalLike) -> Mask:
     """True only where every symmetric matrix in A is proved positive definite.
 
     A is scaled to a unit diagonal by powers of two (which is exact) before its eigenvalues are bounded, so
@@ -105,7 +103,7 @@ def is_positive_definite(A: IntervalLike) -> NDArray[np.bool_]:
     return np.asarray(possible & (eigenvalue_lower(scaled) > 0))
 
 
-def finite_part(x: Interval) -> tuple[Interval, NDArray[np.bool_]]:
+def finite_part(x: Interval) -> tuple[Interval, Mask]:
     """Matrices with those that hold an unbounded entry replaced by 0, and the mask of the bounded ones."""
     finite = np.asarray(np.isfinite(x.lo).all(axis=(-1, -2)) & np.isfinite(x.hi).all(axis=(-1, -2)))
     keep = finite[..., None, None]

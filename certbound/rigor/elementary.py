@@ -11,13 +11,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.rigor.arithmetic import Interval, power
 from certbound.rigor.rounding import LIBRARY_ULPS, STEP, TINY, lower, quiet, upper
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Function = Callable[[Any], Any]
 
 MARGIN = LIBRARY_ULPS * STEP

@@ -10,14 +10,13 @@ import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.errors import SolverError
 from certbound.rigor import intervals as iv
 from certbound.rigor.definite import eigenvalue_lower, eigenvalue_upper
 from certbound.rigor.intervals import Interval
-
-Array = NDArray[np.float64]
 
 CORNERS = 10
 """Boxes with at most so many wide sides are bounded through their corners."""

@@ -11,9 +11,9 @@ arithmetic.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from certbound.arrays import Array
 
 UNIT = 2.0**-53
 """Unit roundoff u of float64: |fl(a op b) - (a op b)| <= u |a op b| barring underflow."""

@@ -9,16 +9,14 @@ from typing import Any, Protocol
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.display import Shown, rounded
 from certbound.errors import CertificateError
 from certbound.reach.sets import ReachTube
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
-
-Array = NDArray[np.float64]
 
 Proof = tuple[dict[str, Any], float, list[str]]
 """The proof's data, the claimed log10 of the probability, and what is assumed."""

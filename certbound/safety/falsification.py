@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import CertboundError
 from certbound.problem.model import compile_numpy, edged, varying_outputs
 from certbound.problem.problem import Problem
@@ -18,8 +18,6 @@ from certbound.problem.sets import Inside, Outside, clearance
 from certbound.reach.nominal import Flow
 from certbound.reach.sets import ReachTube, constraint_clearance
 from certbound.rigor.norms import Norm
-
-Array = NDArray[np.float64]
 
 PATHS = 64
 STEPS = 400

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from certbound.arrays import Array
 
-__all__ = ["BLOCK", "MEMORY_LIMIT", "Tally", "Work", "check_count", "entropy_of", "run_blocks"]
-
 Counts = NDArray[np.int64]
 
 BLOCK = 1024

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from certbound.simulation.blocks import Tally, Work, entropy_of
 from certbound.simulation.compiled import write_atomically
 
-__all__ = ["Checkpoint", "seed_of"]
-
 _VERSION = 1
 _KEYS = ("version", "problem", "number of paths", "seed", "chunk size")
 _ARRAYS = ("done", "counts", "marginals", "steps", "finished")

@@ -23,8 +23,6 @@ from certbound.errors import SolverError
 from certbound.simulation.blocks import Tally, Work, run_blocks
 from certbound.simulation.checkpoint import Checkpoint
 
-__all__ = ["Outcome", "Progress", "connect", "run_work"]
-
 _STEPS_PER_CHUNK = 4e7  # about a quarter of a second
 _FEWEST_CHUNKS = 64
 _SAVE_EVERY = 2.0  # seconds between two checkpoints

@@ -19,8 +19,6 @@ from certbound.arrays import Array
 from certbound.problem.sets import Faces, Quadratic
 from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 
-__all__ = ["Barrier", "Bridge", "barrier_source", "barriers_of", "if_all", "starts_at_once", "tables_of", "window_test"]
-
 EXPONENT = 40.0
 """A bridge is looked at only where it exits with probability above exp(-40)."""
 

@@ -21,17 +21,6 @@ from certbound.simulation.stepping import StepModel
 from certbound.simulation.tape_text import Parameters, function_source, indent, linear_form, vector
 from certbound.simulation.tasks import LOWEST, Task, task_source
 
-__all__ = [
-    "SIGNATURE",
-    "close_noise",
-    "kernel_source",
-    "load_lines",
-    "module_head",
-    "nominal_lines",
-    "open_noise",
-    "step_lines",
-]
-
 _WORDS = "word_0, word_1, word_2, word_3"  # the state of the noise's stream
 _STORED = "stream[4], stream[5], stream[6], stream[7]"
 

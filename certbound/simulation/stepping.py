@@ -15,8 +15,6 @@ from certbound.problem.noise import Law, check_law
 from certbound.simulation.tape_text import live_nodes
 from certbound.simulation.transition import exact_transition
 
-__all__ = ["Scenario", "StepModel", "step_model"]
-
 _LARGEST_EXACT = 16
 
 

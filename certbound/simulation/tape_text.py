@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 from certbound.problem.model import OPERATIONS, Node, Tape, needed
 
-__all__ = ["Parameters", "function_source", "indent", "linear_form", "live_nodes", "vector"]
 
 @dataclass(eq=False, slots=True)
 class Parameters:

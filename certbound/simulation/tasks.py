@@ -16,8 +16,6 @@ from certbound.arrays import Array
 from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, barrier_source
 from certbound.simulation.tape_text import Parameters, indent, linear_form
 
-__all__ = ["LOWEST", "Lines", "Task", "task_source"]
-
 Lines = tuple[list[str], list[str], list[str], list[str]]
 
 LOWEST = -40

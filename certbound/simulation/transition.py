@@ -8,8 +8,6 @@ import numpy as np
 
 from certbound.arrays import Array
 
-__all__ = ["exact_transition"]
-
 
 def exact_transition(matrix: Array, offset: Array, diffusion: Array, step: float) -> tuple[Array, Array, Array]:
     """The law of x(h) for dx = (A x + B v + b) dt + G dW with v constant: N(F x + E v + e, L L').

@@ -14,8 +14,6 @@ from certbound.problem.model import Tape, compile_numpy, trace
 from certbound.problem.problem import Problem
 from certbound.synthesis.plant import Grid
 
-__all__ = ["Cost", "cost_of"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cost:

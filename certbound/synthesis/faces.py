@@ -27,8 +27,6 @@ from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 
-__all__ = ["Face", "Facets", "Plane", "Round", "faces_of", "with_parts"]
-
 _ANGLES = 24
 
 

@@ -24,8 +24,6 @@ from certbound.problem.sets import Box, Inside, Polytope
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 from certbound.synthesis.terminal import linearise, riccati
 
-__all__ = ["close_loop", "constrain_inputs", "depends_on", "resolve_feedback"]
-
 _MOST_VERTICES = 64
 LARGER = 2.0
 

@@ -45,8 +45,6 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
-__all__ = ["Path", "Planner", "Tightened", "check_tube"]
-
 PIECES = 40
 ROUNDING = 1e-7
 """Taken from the input bounds at step 0, where nothing else is: a proof needs some room."""

@@ -15,8 +15,6 @@ from certbound.problem.export import runge_kutta
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.sets import Box
 
-__all__ = ["Grid", "Plant", "middle_of"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Grid:

@@ -27,8 +27,6 @@ from certbound.synthesis.faces import Face, Facets, Round, with_parts
 from certbound.synthesis.plant import middle_of
 from certbound.tubes.constants import Constants
 
-__all__ = ["TerminalSet", "check_terminal", "contraction_terminal", "linearise", "riccati", "riccati_terminal"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TerminalSet:

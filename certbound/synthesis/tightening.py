@@ -29,18 +29,6 @@ from certbound.synthesis.plant import Grid, Plant
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 
-__all__ = [
-    "BallTube",
-    "LinearTube",
-    "ScaledTube",
-    "Tightening",
-    "ball_tube",
-    "linear_tube",
-    "nominal_spread",
-    "spread_tube",
-    "tighten",
-]
-
 Rows = Callable[[Array, Array], Array]
 
 CORNERS = 8

@@ -28,8 +28,6 @@ from certbound.synthesis.faces import Face, Facets, with_parts
 from certbound.synthesis.plant import Grid, Plant
 from certbound.synthesis.terminal import TerminalSet
 
-__all__ = ["Mode", "Solution", "Transcription"]
-
 Mode = Literal["cost", "scale", "soft"]
 
 PENALTY = 1e4

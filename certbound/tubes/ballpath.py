@@ -10,8 +10,6 @@ from flint import arb
 from certbound.rigor.balls import precision
 from certbound.tubes.schedule import Schedule
 
-__all__ = ["BallPath", "integral"]
-
 
 def integral(rate: arb, length: arb) -> arb:
     """Ball of int_0^length e^{rate s} ds; ``rate`` is exactly 0 or a ball without 0."""

@@ -15,8 +15,6 @@ from certbound.arrays import Array
 from certbound.display import Shown, plain, span_text
 from certbound.rigor.norms import Norm
 
-__all__ = ["Constants", "Proof", "check_delta"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Proof:
@@ -252,6 +250,7 @@ class Constants(Shown):
         if self.proof is None or not self.certified:
             return None
         return self.worst_slope - self.proof.sampled
+
 
 _PROVED = (
     "rate",

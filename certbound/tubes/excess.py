@@ -14,11 +14,6 @@ import numpy as np
 
 from certbound.arrays import Array
 
-__all__ = [
-    "log_excess", "log_excess_one", "log_excess_value", "log_excess_values", "log_phi", "log_phi_one", "solve_excess",
-    "solve_excess_one",
-]  # fmt: skip
-
 _DIRECT = 1200
 _LARGEST = 700.0  # logarithm of the largest argument that is tried
 _CHUNK = 1 << 21

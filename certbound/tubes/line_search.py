@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-__all__ = ["golden"]
-
 
 def golden(function: Callable[[float], float], low: float, high: float, width: float) -> float:
     """Place of the least value of a unimodal function on [low, high]."""

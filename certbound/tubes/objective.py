@@ -10,8 +10,6 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.tubes.schedule import Schedule
 
-__all__ = ["Clearance", "Objective", "make_objective", "mean_over_time", "read_clearance"]
-
 
 @dataclass(frozen=True, eq=False)
 class Clearance:

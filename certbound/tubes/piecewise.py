@@ -14,8 +14,6 @@ from certbound.rigor.balls import precision, upper
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.tube import monotone
 
-__all__ = ["MonotoneProfile", "PiecewiseProfile"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PiecewiseProfile:

@@ -13,8 +13,6 @@ from certbound.tubes.objective import Clearance, Objective, make_objective, read
 from certbound.tubes.schedule import Schedule, make_schedule
 from certbound.tubes.tube import Profile, Tube
 
-__all__ = ["Question", "Start"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Start:

@@ -19,8 +19,6 @@ import numpy as np
 from certbound.arrays import Array, Index
 from certbound.tubes.constants import Constants
 
-__all__ = ["Schedule", "make_schedule", "spread"]
-
 
 def integral(rate: Array, length: Array) -> Array:
     """int_0^length e^{rate s} ds, without cancellation at rate -> 0."""

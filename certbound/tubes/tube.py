@@ -18,8 +18,6 @@ from certbound.display import Shown, log10_text, rounded
 from certbound.rigor.balls import lower, precision, upper
 from certbound.tubes.constants import Constants
 
-__all__ = ["Profile", "Tube", "log10_upper", "metric_factor"]
-
 
 class Profile(Protocol):
     """A radius as a function of time; one implementation per family of formulas."""

@@ -28,8 +28,6 @@ from certbound.tubes.question import Question, Start
 from certbound.tubes.schedule import Schedule, spread
 from certbound.tubes.tube import Tube, log10_upper, supremum
 
-__all__ = ["METHODS", "applicable_methods", "bound_exit_probability", "least_exit_level", "tube_objective", "tune_tube"]
-
 METHODS = ("auto", "kummer", "bessel", "mixture", "exact", "worst_case", *BASELINES)
 """Every name that ``method`` takes."""
 

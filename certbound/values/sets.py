@@ -5,15 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.problem.sets import Faces, Inside, Quadratic, Region
 from certbound.rigor.intervals import Interval, sq, stack
-
-__all__ = ["active_at", "box_around", "contains", "respected"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def active_at(constraints: Sequence[Inside], step: int) -> list[Inside]:

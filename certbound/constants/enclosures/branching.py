@@ -6,11 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.rigor.intervals import Interval
-
-Array = NDArray[np.float64]
 
 ROUND = 2048
 """Boxes split at a time."""
@@ -131,9 +129,9 @@ def _parts(boxes: Interval, weights: Array, uppers: Array) -> tuple[Interval, Ar
         weights = np.concatenate([weights, weights])
 
 
-def _heaviest(boxes: Interval, weights: Array) -> NDArray[np.intp]:
+def _heaviest(boxes: Interval, weights: Array) -> Index:
     wide = boxes.lo < boxes.hi
-    side: NDArray[np.intp] = np.argmax(np.where(wide, np.where(np.isnan(weights), np.inf, weights), -1.0), axis=1)
+    side: Index = np.argmax(np.where(wide, np.where(np.isnan(weights), np.inf, weights), -1.0), axis=1)
     return side
 
 

@@ -15,13 +15,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array, Mask
 from certbound.rigor.definite import eigenvalue_upper, finite_part, perron_upper
 from certbound.rigor.intervals import Interval, matmul
 from certbound.rigor.rounding import TINY, lower, product_error, quiet, upper
-
-Array = NDArray[np.float64]
 
 
 class Spread(NamedTuple):
@@ -174,7 +173,7 @@ def _tame(matrices: Array) -> Array:
     return np.where(wild, np.where(usable & np.isfinite(scaled), scaled, 0.0), matrices)
 
 
-def _bounded_spread(spread: Spread) -> tuple[Interval, Array, NDArray[np.bool_]]:
+def _bounded_spread(spread: Spread) -> tuple[Interval, Array, Mask]:
     slopes, finite = finite_part(spread.slopes)
     usable = np.isfinite(spread.reach)
     return slopes, np.where(usable, spread.reach, 0.0), np.asarray((finite & usable).all(axis=-1))

@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.enclosures.enclosure import enclose
 from certbound.problem.model import Graph, Node, Tape
 from certbound.rigor.intervals import Interval
-
-Array = NDArray[np.float64]
 
 _BOXES = 4000
 _ROUNDS = 60

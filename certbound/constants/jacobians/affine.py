@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array, Mask
 from certbound.checks import assign, frozen
 from certbound.constants.jacobians.arguments import (
     UNIT,
@@ -18,8 +19,6 @@ from certbound.constants.jacobians.arguments import (
     parameter_range,
     square_matrix,
 )
-
-Array = NDArray[np.float64]
 
 _VERTEX_LIMIT = 1 << 16
 
@@ -72,7 +71,7 @@ class AffineSet:
     def vertex_count(self) -> int:
         return 1 << int(np.count_nonzero(self.box[1] > self.box[0]))
 
-    def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> NDArray[np.bool_]:
+    def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> Mask:
         batch = matrix_batch(matrices, self.dimension)
         columns = self.M.reshape(len(self.M), -1).T
         bounds = list(zip(*self.box))
@@ -157,7 +156,7 @@ class AffineForm:
     def vertex_count(self) -> int:
         return self.affine.vertex_count
 
-    def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> NDArray[np.bool_]:
+    def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> Mask:
         return self.affine.contains(matrices, tolerance)
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:

@@ -14,8 +14,9 @@ from functools import cached_property
 from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array, Mask
 from certbound.checks import frozen
 from certbound.constants.jacobians.affine import AffineForm, AffineSet
 from certbound.constants.jacobians.arguments import (
@@ -25,8 +26,6 @@ from certbound.constants.jacobians.arguments import (
     metric_roots,
     square_matrix,
 )
-
-Array = NDArray[np.float64]
 
 
 @runtime_checkable
@@ -41,7 +40,7 @@ class JacobianSet(Protocol):
     def vertex_count(self) -> int:
         """Number of matrices that ``vertices`` returns."""
 
-    def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> NDArray[np.bool_]:
+    def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> Mask:
         """Whether each matrix of a batch (..., n, n) lies in the set, up to ``tolerance`` entrywise."""
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
@@ -91,7 +90,7 @@ class VertexPolytope:
     def vertex_count(self) -> int:
         return len(self._stack)
 
-    def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> NDArray[np.bool_]:
+    def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> Mask:
         batch = matrix_batch(matrices, self.dimension)
         columns = self._stack.reshape(len(self._stack), -1).T
         one = np.ones((1, columns.shape[1]))
@@ -179,7 +178,7 @@ class UnionSet:
     def vertex_count(self) -> int:
         return sum(member.vertex_count for member in self.members)
 
-    def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> NDArray[np.bool_]:
+    def contains(self, matrices: ArrayLike, tolerance: float = 1e-9) -> Mask:
         return np.asarray(np.any([member.contains(matrices, tolerance) for member in self.members], axis=0))
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:

@@ -10,12 +10,12 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.jacobians.arguments import finite_array, metric_roots
 from certbound.constants.jacobians.jacobian_sets import JacobianSet, as_set
 
-Array = NDArray[np.float64]
 Order = Literal[1, 2] | float
 
 

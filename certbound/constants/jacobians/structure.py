@@ -16,15 +16,12 @@ from fractions import Fraction
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from certbound.constants.enclosures import bound_ranges, enclose
 from certbound.constants.jacobians.affine import AffineSet
 from certbound.errors import EnclosureError
 from certbound.problem.model import Node, Tape
 from certbound.rigor.intervals import Interval
-
-Array = NDArray[np.float64]
 
 _NARROW = 1e-13
 """A parameter narrower than this share of its size is a constant with slack."""

@@ -17,13 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.checks import frozen
 from certbound.constants.jacobians import JacobianSet
 from certbound.constants.programs.sectors import Sector, contraction_value, lmi_blocks, transformed
-
-Array = NDArray[np.float64]
 
 _SHRINK = 0.1
 """Share of the distance to the current value that the next target keeps."""

@@ -15,8 +15,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.jacobians import JacobianSet
 from certbound.constants.programs.centers import reachable_value
 from certbound.constants.programs.lmi import ErosionProgram
@@ -24,8 +24,6 @@ from certbound.errors import SolverError
 from certbound.tubes.constants import Constants
 from certbound.tubes.excess import log_excess, log_phi
 from certbound.tubes.schedule import make_schedule
-
-Array = NDArray[np.float64]
 
 _ROUNDS = 2
 _LEAST = 1e-24  # L^2 of a map that forgets its state

@@ -19,14 +19,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.checks import frozen
 from certbound.constants.jacobians import JacobianSet
 from certbound.constants.programs.sectors import Sector, contraction_value, lmi_blocks, transformed
 from certbound.errors import InfeasibleError, SolverError
-
-Array = NDArray[np.float64]
 
 
 def solve(problem: Any) -> str:

@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.jacobians import AffineForm, AffineSet, JacobianSet, VertexPolytope
 from certbound.constants.programs.centers import center_metric, reachable_value, starting_metric
 from certbound.constants.programs.least_erosion import RadiusModel, Rooms, tighten
 from certbound.constants.programs.lmi import RateProgram
 from certbound.constants.programs.sectors import VERTEX_LIMIT, lmi_blocks
 from certbound.errors import SolverError
-
-Array = NDArray[np.float64]
 
 _FEW_BLOCKS = 4
 """Up to so many inequalities the method of centres is used; beyond, a semidefinite solver."""

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.constants.jacobians import AffineSet, IntervalMatrixSet, JacobianSet, SectorSet, UnionSet, VertexPolytope
-
-Array = NDArray[np.float64]
 
 VERTEX_LIMIT = 32
 """Above this number of vertices a set that has a sector form is used in it."""
@@ -47,7 +45,7 @@ def lmi_blocks(jacobians: JacobianSet, *, form: str = "auto") -> list[Array | Se
     return [centred(jacobians)]
 
 
-def varying(sector: SectorSet) -> NDArray[np.intp]:
+def varying(sector: SectorSet) -> Index:
     """Entries of Delta that have a range and reach the matrix."""
     low, high = sector.box
     reaches = sector.left.any(axis=0) & sector.right.any(axis=1)

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.constants.programs.least_erosion import Rooms
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside
-
-Array = NDArray[np.float64]
 
 _STEPS = 400
 _PATHS = 33

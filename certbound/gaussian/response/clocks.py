@@ -25,8 +25,6 @@ from certbound.gaussian.response.moments import smooth_moments
 from certbound.gaussian.scalar import Clock, clock_crossing, crossing_rate, node_clock
 from certbound.rigor.intervals import Interval
 
-__all__ = ["ClockBound", "ClockEvents", "RateBound", "SteadyEvent"]
-
 _PART, _FEWEST_PARTS = 0.05, 100  # ||J|| times the length of a part; parts of the horizon
 _LIMITS = (0.35, 3.0)  # of -log corr in a block: short blocks have a slower clock, long ones add fewer probabilities
 _MOST_PARTS = 1200

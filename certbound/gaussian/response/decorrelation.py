@@ -22,8 +22,6 @@ from certbound.gaussian.scalar import EPS
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 
-__all__ = ["Decorrelation", "decorrelation"]
-
 _BATCH = 2_000_000
 
 

@@ -32,8 +32,6 @@ from certbound.gaussian.response.martingale_windows import (  # fmt: skip
 )
 from certbound.gaussian.scalar import log_tail
 
-__all__ = ["WindowEvent", "WindowEvents"]
-
 
 @dataclass(frozen=True, eq=False)
 class WindowEvents:

@@ -10,8 +10,6 @@ from certbound.gaussian.response.events import WindowEvent
 from certbound.gaussian.response.martingales import SplitEvent
 from certbound.gaussian.response.step_events import StepEvent
 
-__all__ = ["level_along", "level_scale"]
-
 Event = StepEvent | WindowEvent | SteadyEvent | SplitEvent
 
 _TRIES = 12

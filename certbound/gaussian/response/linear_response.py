@@ -18,8 +18,6 @@ import numpy as np
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 
-__all__ = ["LinearResponse", "RowResponse", "discrete_response", "continuous_response"]
-
 _UNIT = 2.0**-53
 _TINY = 1e-300
 _TERMS = 24

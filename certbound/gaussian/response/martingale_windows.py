@@ -13,11 +13,6 @@ from certbound.errors import EngineError
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.scalar import log_below_above, log_tail
 
-__all__ = [
-    "ROUND", "Course", "Windows", "inverse_of", "logsumexp", "longer", "one_cell", "ratio_down", "ratio_up",
-    "remembered", "size_of", "spread_of",
-]  # fmt: skip
-
 Found = TypeVar("Found")
 
 ROUND = 1 + 1e-14

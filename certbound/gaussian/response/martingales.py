@@ -29,8 +29,6 @@ from certbound.gaussian.response.martingale_windows import logsumexp
 from certbound.gaussian.scalar import log_tail
 from certbound.rigor.intervals import Interval
 
-__all__ = ["MartingaleEvent", "Martingales", "SplitEvent", "SplitEvents"]
-
 _ROUND = 1 + 1e-12
 _UNIT = 2.0**-53
 _TINY = 1e-290

@@ -17,8 +17,6 @@ from certbound.gaussian.scalar import EPS
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 
-__all__ = ["UP", "RowMoments", "SmoothMoments", "apply", "smooth_moments"]
-
 UP = 1 + 1e-12
 
 

@@ -20,8 +20,6 @@ from certbound.gaussian.scalar import log_rectangle
 from certbound.problem.sets import Inside
 from certbound.rigor.intervals import Interval
 
-__all__ = ["log_occupancy"]
-
 _SIDES, _STEPS = 3, 200  # sides looked at, most steps
 _PARTS, _MOST = (1, 16, 16, 4), 4000  # cells of y along each side, by their number; cells and steps in all
 _ROUND = 1e-14

@@ -23,8 +23,6 @@ from certbound.gaussian.scalar import log_below_above, triple_below
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 
-__all__ = ["log_any_exceedance"]
-
 _MOST = 4000  # pairs of (step, row) looked at; where there are more, the rows' own events are added
 _WORTH = 1e-3  # share of its fair part of the whole that an overlap must promise
 _UNIT = 2.0**-53

@@ -19,8 +19,6 @@ from certbound.gaussian.response.martingale_windows import (
 )
 from certbound.gaussian.scalar import log_below_above, log_tail
 
-__all__ = ["StepEvent", "StepEvents"]
-
 _KEPT = 16  # bounds that an event remembers
 
 

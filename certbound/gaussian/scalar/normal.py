@@ -16,10 +16,6 @@ from numpy.typing import ArrayLike
 from certbound.arrays import Array
 from certbound.rigor.rounding import quiet
 
-__all__ = [
-    "gauss_rule", "lift", "log_below_above", "log_between", "log_tail", "log_tail_below", "mills", "mills_deficit",
-]  # fmt: skip
-
 EPS = 2.0**-52
 MILLS_ERROR = 2.0**-48
 LOG_ROOT_2PI = 0.9189385332046727  # within eps of log sqrt(2 pi)

@@ -26,8 +26,6 @@ from certbound.gaussian.scalar.normal import (
 )
 from certbound.rigor.rounding import quiet
 
-__all__ = ["log_line_crossing", "log_polygon_crossing"]
-
 _EDGES, _NODES = np.array([0.0, 0.2, 0.5, 1.0]), 16  # panels, as parts of the range; nodes in each
 _ELLIPSES = np.array([1.3, 1.7, 2.2, 3.0, 4.5, 7.0])
 _DROP = 26.0

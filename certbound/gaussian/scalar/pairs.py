@@ -11,8 +11,6 @@ from certbound.arrays import Array
 from certbound.gaussian.scalar.normal import EPS, lift, log_below_above, log_tail
 from certbound.rigor.rounding import down, quiet, up
 
-__all__ = ["Bounds", "ends", "levels_of", "log_pair", "standard_levels", "total", "union"]
-
 Bounds = Any
 """A pair (lo, hi) of array_likes, an object with attributes ``lo`` and ``hi``, or one array_like for both."""
 

@@ -9,8 +9,6 @@ from certbound.gaussian.scalar.normal import lift, log_between
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 
-__all__ = ["log_rectangle"]
-
 _CELLS = (1, 32, 14, 8)  # along every side but the last, by the number of sides
 _FAR = 9.0  # deviations beyond which the outermost cells are infinite
 _ROUND = 1e-12

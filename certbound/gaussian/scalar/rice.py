@@ -12,8 +12,6 @@ from certbound.gaussian.scalar.normal import EPS, LOG_ROOT_2PI, lift, log_tail, 
 from certbound.gaussian.scalar.pairs import Bounds, ends, levels_of, standard_levels, total
 from certbound.rigor.rounding import down, quiet, up
 
-__all__ = ["crossing_rate"]
-
 
 @quiet
 def crossing_rate(

@@ -20,8 +20,6 @@ from certbound.gaussian.scalar.ornstein_uhlenbeck import log_polygon_crossing
 from certbound.gaussian.scalar.pairs import total
 from certbound.rigor.rounding import quiet
 
-__all__ = ["Clock", "Windows", "clock_crossing", "group_windows", "node_clock"]
-
 _WEIGHT = 2.0  # window clock times the square of the least level: near the optimum for levels of 3 to 6
 _MOST_WINDOWS = 2000
 _LEAST_CLOCK = 1e-9  # a piece of less clock is given this much
@@ -90,6 +88,7 @@ def node_clock(durations: ArrayLike, near: ArrayLike, needs: ArrayLike, *, limit
         increments[j] = max(increments[j], ahead + 8 * EPS * (1 + abs(clock[j])))
         clock[j + 1] = clock[j] + increments[j]
     return Clock(increments=frozen(increments), starts=np.asarray(starts, dtype=np.intp))
+
 
 NO_CUTS: Index = np.zeros(1, dtype=np.intp)
 

@@ -11,8 +11,6 @@ from certbound.gaussian.scalar.pairs import Bounds, ends, levels_of, log_pair, s
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 
-__all__ = ["triple_below"]
-
 _KNOTS = np.array([0.0, 0.1, 0.2, 0.3, 0.42, 0.56, 0.72, 0.9, 1.1, 1.35, 1.65, 2.05, 2.6, 3.4, 4.8])
 _CUTS = np.interp(np.arange(29) / 2, np.arange(15), _KNOTS)  # edges of the cells of W, in units of its mean excess
 _ROUND = 1e-12

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from certbound.arrays import Array
 
 
 def write_plan(path: str | Path, plan: ArrayLike, inputs: tuple[str, ...], **notes: Any) -> None:

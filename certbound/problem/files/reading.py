@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.checks import names as checked_names
 from certbound.checks import nearest
 from certbound.problem import sets
@@ -20,8 +20,6 @@ from certbound.problem.model import OPERATIONS, Graph, Tape
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
-
-Array = NDArray[np.float64]
 
 RESERVED = frozenset({"t", *filter(is_function, OPERATIONS), *CONSTANTS})
 """Names that no state, input, disturbance, parameter or definition may have."""

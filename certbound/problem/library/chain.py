@@ -10,15 +10,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.library.parameters import merged, whole
 from certbound.problem.noise import Gaussian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, HalfSpace, Inside
 from certbound.problem.systems import DiscreteSystem
-
-Array = NDArray[np.float64]
 
 DEFAULTS = {
     "masses": 3.0,

@@ -7,12 +7,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.problem.model.operations import OPERATIONS
 from certbound.problem.model.tape import Tape
-
-Array = NDArray[np.float64]
 
 
 @lru_cache(maxsize=256)

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array, Mask
 from certbound.checks import assign, positive_definite, vector
 from certbound.problem.sets.forms import Region
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +52,7 @@ class Inside:
         """The same constraint, its label made from the states' names unless the user gave one."""
         return self if self.label is not None else replace(self, label=self.region.describe(states, self.word))
 
-    def satisfied(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
+    def satisfied(self, x: ArrayLike, t: float = 0.0) -> Mask:
         """Whether states, shape (..., n), satisfy the constraint at time t (its window aside)."""
         return np.asarray(self.region.contains(x, t) != self.outside)
 

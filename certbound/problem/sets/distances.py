@@ -7,12 +7,11 @@ What a verdict needs is proved elsewhere, with outward rounding.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array
 from certbound.problem.sets.constraints import Inside
 from certbound.problem.sets.forms import Faces, Quadratic, Region
-
-Array = NDArray[np.float64]
 
 
 def face_erosion(normals: ArrayLike, inverse_metric: ArrayLike | None = None) -> Array:

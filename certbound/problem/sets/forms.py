@@ -12,12 +12,11 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array, Mask
 from certbound.problem.model import Tape, arithmetic, compile_numpy
 from certbound.rigor.intervals import Interval, sqrt, stack
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,11 +213,11 @@ class Region:
 
     # ---- points and directions ---------------------------------------------------------------------------------
 
-    def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
+    def contains(self, x: ArrayLike, t: float = 0.0) -> Mask:
         """Whether states, shape (..., n), lie in the closed set at time t."""
         return self._holds(self.local(x) - self.center_at(t))
 
-    def _holds(self, y: Array) -> NDArray[np.bool_]:
+    def _holds(self, y: Array) -> Mask:
         match self.form:
             case Quadratic() as form:
                 return np.asarray(np.linalg.norm(y @ form.root.T, axis=-1) <= form.radius)

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.sets.constraints import GaussianStart, Inside
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
 
-Array = NDArray[np.float64]
 _ROUNDING, _SLACK = 1e-12, 1e-9
 """Shares of a state's size by which the start's centre, and its farthest part, may miss a constraint."""
 

@@ -12,13 +12,13 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from certbound.arrays import Array, Mask
 from certbound.checks import assign, frozen, matrix, number, pick, positive_definite, vector
 from certbound.problem.model import Tape, compile_numpy, trace
 from certbound.problem.sets.forms import Faces, Quadratic, Region, linear_maximum
 
-Array = NDArray[np.float64]
 Center = Array | Tape
 
 
@@ -97,7 +97,7 @@ class Box(Region):
         """True when every side is finite."""
         return bool(np.all(np.isfinite([self.low, self.high])))
 
-    def contains(self, x: ArrayLike, t: float = 0.0) -> NDArray[np.bool_]:
+    def contains(self, x: ArrayLike, t: float = 0.0) -> Mask:
         y = self.local(x) - self.center_at(t)
         return np.asarray(np.all((self.low <= y) & (y <= self.high), axis=-1))
 

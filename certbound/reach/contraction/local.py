@@ -31,15 +31,6 @@ from certbound.tubes.question import Start
 from certbound.tubes.tube import Tube, supremum
 from certbound.tubes.tuning import tune_tube
 
-__all__ = [
-    "local_constants",
-    "local_contraction_tube",
-    "local_tube",
-    "needed_radius",
-    "radius_over_pieces",
-    "random_start",
-]
-
 BLOCK = 16
 ITERATIONS = 12
 INFLATION = 1.03

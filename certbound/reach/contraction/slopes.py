@@ -15,8 +15,6 @@ from certbound.reach.nominal import Curve, Flow
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm
 
-__all__ = ["LocalSlopes"]
-
 ROUNDS = 5
 TOLERANCE = 0.03
 LARGEST_BATCH = 8_000

@@ -28,16 +28,6 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm, largest_over_box
 from certbound.tubes.constants import Constants
 
-__all__ = [
-    "bound_forcing",
-    "contraction_tube",
-    "first_infinite",
-    "growth",
-    "integrate_radius",
-    "jump_sizes",
-    "values_on_pieces",
-]
-
 CORNER_LIMIT = 6
 
 

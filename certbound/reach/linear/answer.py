@@ -21,8 +21,6 @@ from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share
 from certbound.reach.sets import ReachTube, Requirement
 
-__all__ = ["LinearAnswer", "linear_answer", "linear_reach", "refusal"]
-
 _REFINEMENTS = 3
 _MANY = 20  # nonlinear coordinates beyond which a probability below the target is not refined
 _NOTHING = -0.1  # log of a probability that says nothing

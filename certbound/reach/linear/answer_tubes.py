@@ -15,8 +15,6 @@ from certbound.reach.nominal import Curve
 from certbound.reach.sets import ReachTube
 from certbound.rigor.intervals import Interval
 
-__all__ = ["LEAST", "deviation_along", "deviation_tube", "levels_of_coordinates", "reach_tube"]
-
 _FEW = 20  # states up to which each has an event of its own in the deviation tube
 LEAST = -1e12  # log10 of the smallest probability that is told apart from 0
 

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike
 
 from certbound.arrays import Array, Index
 
-__all__ = ["DeviationTube"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DeviationTube:

@@ -36,8 +36,6 @@ from certbound.reach.linear.shares import Share
 from certbound.reach.sets import Requirement
 from certbound.rigor.intervals import Interval
 
-__all__ = ["DiffusionRun", "depends_on_state"]
-
 _ROUNDS = 12
 _SETTLE = 6
 _GROWTH = 0.03

@@ -15,8 +15,6 @@ from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.shares import Share
 from certbound.reach.remainder import fitted_slopes
 
-__all__ = ["fitted"]
-
 _PICARD = 10
 _CLOSE = 0.02
 _LARGEST = 1.0  # remainder, at most so many times what it came from

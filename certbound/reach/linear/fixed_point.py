@@ -17,8 +17,6 @@ from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.rows import inner_rows
 from certbound.reach.remainder import sampled_range
 
-__all__ = ["PADS", "Inclusion"]
-
 _LOG = logging.getLogger(__name__)
 
 _GUESSES = 30

@@ -13,8 +13,6 @@ import numpy as np
 from certbound.arrays import Array, Integers
 from certbound.gaussian.response import LinearResponse, RowResponse
 
-__all__ = ["Gathering", "Supports"]
-
 _ROUND = 1 + 1e-13
 _UNIT = 2.0**-53
 

@@ -20,8 +20,6 @@ from certbound.reach.remainder import Frame, Remainder
 from certbound.reach.sets import NominalPieces
 from certbound.rigor.intervals import Interval
 
-__all__ = ["WINDOW", "Linearisation"]
-
 _FEWEST_PIECES, _MOST_PIECES = 50, 2000
 _STEP, _OWN_STEP, _SERIES = 0.1, 0.03, 2.0
 """||J|| h of a piece: in the states' own units; in those that balance J, where fewer pieces do; and, in the states' own

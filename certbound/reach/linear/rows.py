@@ -10,8 +10,6 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.reach.linear.linearisation import Linearisation
 
-__all__ = ["inner_rows"]
-
 
 def inner_rows(engine: Linearisation) -> tuple[Array, Array]:
     """All rows (B, N, D, n), the active coordinates first, and the others over the active coordinates alone."""

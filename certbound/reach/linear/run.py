@@ -33,8 +33,6 @@ from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.shares import Share
 from certbound.reach.sets import Requirement, requirements
 
-__all__ = ["Events", "LinearRun", "Outcome", "correlated"]
-
 Events = StepEvents | ClockEvents | SplitEvents
 
 _MARGIN = 2.0  # times that width is what a proof is expected to need

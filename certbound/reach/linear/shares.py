@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Share"]
-
 HOPED = ((0.1, 1), (0.3, 2), (0.8, 3))
 """Parts of the target that delta_N is proved at, each with the effort."""
 HOPED_LINEAR = ((0.02, 1), (0.2, 1))

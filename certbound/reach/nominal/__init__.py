@@ -6,7 +6,8 @@ from certbound.reach.nominal.cells import initial_cells
 from certbound.reach.nominal.curve import Curve
 from certbound.reach.nominal.flow import Flow
 from certbound.reach.nominal.integration import bound_defect, bound_disturbance_slope, nominal_curve
-from certbound.reach.nominal.series import Series, expand, polynomial_range, taylor_bounds
+from certbound.reach.nominal.series import expand, polynomial_range, taylor_bounds
+from certbound.rigor.series import Series
 
 __all__ = [
     "bound_defect",

@@ -15,8 +15,6 @@ from certbound.rigor.definite import eigenvalue_upper, is_positive_definite
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm, ball_root, largest_over_box
 
-__all__ = ["Cells", "initial_cells"]
-
 MOST_CELLS = 4096
 
 

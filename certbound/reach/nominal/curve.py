@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
-from certbound.reach.nominal.series import Series, polynomial_range
+from certbound.reach.nominal.series import polynomial_range
 from certbound.rigor.intervals import Interval, stack
-
-__all__ = ["Curve"]
+from certbound.rigor.series import Series
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -18,10 +18,9 @@ from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
-from certbound.reach.nominal.series import Series, expand
+from certbound.reach.nominal.series import expand
 from certbound.rigor.intervals import Interval, stack
-
-__all__ = ["Flow"]
+from certbound.rigor.series import Series
 
 
 @dataclass(frozen=True, eq=False)

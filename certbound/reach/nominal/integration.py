@@ -25,8 +25,6 @@ from certbound.reach.nominal.flow import Flow
 from certbound.reach.nominal.series import taylor_bounds
 from certbound.rigor.intervals import Interval, stack
 
-__all__ = ["bound_defect", "bound_disturbance_slope", "defect_series", "nominal_curve", "time_grid"]
-
 ORDER = 6
 PIECES = 128  # at least, where the grid is chosen
 ROUNDS = 5

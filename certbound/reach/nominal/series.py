@@ -18,7 +18,6 @@ from certbound.problem.model import JUMPS, OPERATIONS, Tape
 from certbound.rigor.arithmetic import Interval
 from certbound.rigor.series import ZERO, Series
 
-__all__ = ["Series", "expand", "polynomial_range", "taylor_bounds"]
 
 def expand(tape: Tape, inputs: Sequence[Series], order: int) -> list[Series]:
     """Series of every output of ``tape``, padded to ``order + 1`` coefficients, from one series per input slot.

@@ -26,8 +26,6 @@ from certbound.reach.remainder.frame import Frame
 from certbound.reach.remainder.polytope import Boxes, Polytope, grid
 from certbound.rigor.intervals import Interval
 
-__all__ = ["Remainder"]
-
 Target = tuple[Array, Array]
 
 _GRID = {1: 16, 2: 6, 3: 4}

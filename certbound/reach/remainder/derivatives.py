@@ -23,8 +23,6 @@ from certbound.problem.problem import Problem
 from certbound.reach.remainder.frame import Frame
 from certbound.rigor.intervals import Interval
 
-__all__ = ["Derivatives"]
-
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:

@@ -23,8 +23,6 @@ from certbound.reach.remainder.nominal_defect import NominalDefect, product
 from certbound.reach.remainder.polytope import Boxes, Polytope, linear_range
 from certbound.rigor.intervals import Interval
 
-__all__ = ["Expansion", "Parts"]
-
 _UNIT = 2.0**-53
 _WIDE = 1 + 1e-11  # covers the rounding errors of every sum of radii
 _LEAST = 1e-290  # and their underflow

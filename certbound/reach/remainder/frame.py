@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from certbound.arrays import Array
 from certbound.rigor.intervals import Interval
 
-__all__ = ["Frame"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Frame:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from certbound.problem.model import deciding, jacobian, varying_outputs
 from certbound.problem.problem import Problem
 
-__all__ = ["hidden_jump"]
-
 
 def hidden_jump(problem: Problem) -> str | None:
     """Why the linear response would not see a jump of the dynamics; None where it sees all there are.

@@ -19,8 +19,6 @@ from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.frame import Frame
 from certbound.rigor.intervals import Interval, stack
 
-__all__ = ["NominalDefect", "bound_defect_over_pieces", "product"]
-
 _ORDER = 4
 
 

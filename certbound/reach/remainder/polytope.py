@@ -9,8 +9,6 @@ import numpy as np
 
 from certbound.arrays import Array, Index, Mask
 
-__all__ = ["Boxes", "Polytope", "grid", "linear_range"]
-
 _WIDE = 1 + 1e-11
 _LEAST = 1e-290
 

@@ -15,8 +15,6 @@ from certbound.problem.model import compile_numpy
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.frame import Frame
 
-__all__ = ["fitted_slopes", "sampled_range"]
-
 _POINTS = {1: 17, 2: 9, 3: 7, 4: 3, 5: 3, 6: 3}
 _DIRECTIONS = 64
 _NEGLIGIBLE = 1e-9  # of the widest deviation of a state

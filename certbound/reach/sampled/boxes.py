@@ -32,8 +32,6 @@ from certbound.reach.sets import ReachTube
 from certbound.rigor.intervals import Interval
 from certbound.simulation.estimates import sample_paths
 
-__all__ = ["SampledTube", "estimate_reach", "noise_free_states", "scenario_count"]
-
 _PIECES = 25
 _STEPS = 200  # of the noise-free integration over the horizon, at least
 _NOISY_STEPS = 1000

@@ -35,8 +35,6 @@ from certbound.reach.sampled.boxes import (
     time_grid,
 )
 
-__all__ = ["LearnedTube", "estimate_reach_by_classifier"]
-
 _TIMES = 8
 _FIRST = 500
 _POOL = 2000

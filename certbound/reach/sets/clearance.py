@@ -32,8 +32,6 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm, ball_root
 from certbound.rigor.series import product
 
-__all__ = ["Clearance", "constraint_clearance"]
-
 
 class Sets(Protocol):
     """What is read of a reach tube: its curve, and the sets about it (see `ReachTube`)."""

@@ -21,8 +21,6 @@ from certbound.reach.sets.separation import polyhedral_weights
 from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
 
-__all__ = ["NominalPieces", "Requirement", "requirements"]
-
 _POLYGON = 24
 
 
@@ -80,6 +78,7 @@ def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
         for label, rows, room in _constraint(constraint, curve):
             found.append(Requirement(label=label, constraint=own, rows=rows, room=np.where(needed, room, np.inf)))
     return found
+
 
 Rows = Iterator[tuple[str, Array, Array]]
 

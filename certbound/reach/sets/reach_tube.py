@@ -25,8 +25,6 @@ from certbound.reach.sets.clearance import constraint_clearance
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm
 
-__all__ = ["Piece", "ReachTube"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Piece:

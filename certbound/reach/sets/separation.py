@@ -11,8 +11,6 @@ import numpy as np
 
 from certbound.arrays import Array
 
-__all__ = ["polyhedral_weights", "round_directions"]
-
 SWEEPS = 60
 
 

@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
@@ -29,8 +29,6 @@ from certbound.tubes.question import Question, Start
 
 STATED = "the stated constants hold"
 """The assumption as a certificate names it; the checker derives which constants those are."""
-
-Array = NDArray[np.float64]
 
 _TINY = (1e-7, 1e-5, 1e-3)
 _ROOM = (1e-3, 0.1, 3.0)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import CertificateError
 from certbound.gaussian.response import MartingaleEvent, SplitEvents, WindowEvents, logsumexp
 from certbound.problem.problem import Problem
@@ -28,8 +28,6 @@ from certbound.safety.certificates.linear import (
     proof_data,
     widened,
 )
-
-Array = NDArray[np.float64]
 
 _ROUNDS = 10
 _WIDER = 0.03  # H beyond what it must hold, the first time

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import CertificateError
 from certbound.gaussian.response import StepEvents, WindowEvents, level_scale, logsumexp
 from certbound.problem.model import Tape, compile_numpy, jacobian, varying_outputs
@@ -27,7 +27,6 @@ from certbound.reach.linear import Linearisation, LinearRun, Share, correlated
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.parts import separations
 
-Array = NDArray[np.float64]
 Events = StepEvents | WindowEvents
 
 _STEPS = (0.25, 0.12, 0.06)

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers, Mask
 from certbound.constants.enclosures import bound_supremum, enclose
 from certbound.errors import EngineError
 from certbound.problem.model import Tape, compile_numpy, jacobian, substitute, trace
@@ -33,8 +33,6 @@ from certbound.reach.nominal import initial_cells
 from certbound.rigor.intervals import Interval
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
-
-Array = NDArray[np.float64]
 
 _MOST_STATES = 3
 _DEGREES = {1: (4, 6), 2: (4, 6), 3: (4,)}
@@ -56,7 +54,7 @@ class Barrier:
     lower one where a constraint is about to be broken, ``growth`` an upper bound kappa of the generator's expression.
     """
 
-    exponents: NDArray[np.int64]
+    exponents: Integers
     coefficients: Array
     center: Array
     scale: Array
@@ -213,7 +211,7 @@ class _Work:
         return np.asarray(np.max([gap.over(Interval.point(states)).mid for gap in self.gaps], axis=0))
 
     def _program(
-        self, exponents: NDArray[np.int64], inner: Array, initial: Array, boundary: Array
+        self, exponents: Integers, inner: Array, initial: Array, boundary: Array
     ) -> tuple[Array | None, float]:
         """Coefficients (the constant last) that minimise the exponent on the points, and log10 of that bound."""
         import cvxpy
@@ -247,7 +245,7 @@ class _Work:
             return None, 0.0
         return np.append(np.asarray(c.value, dtype=float), float(constant.value)), float(program.value) / _LOG10
 
-    def _monomials(self, exponents: NDArray[np.int64], states: Array, along: tuple[int, ...]) -> Array:
+    def _monomials(self, exponents: Integers, states: Array, along: tuple[int, ...]) -> Array:
         """Monomials in the scaled states, differentiated along the given states: (points, K)."""
         y = (states - self.center) / self.scale
         powers, factor = exponents.copy(), np.ones(len(exponents))
@@ -260,7 +258,7 @@ class _Work:
     # ---- the proof -------------------------------------------------------------------------------------------
 
     def _certified(
-        self, exponents: NDArray[np.int64], coefficients: Array
+        self, exponents: Integers, coefficients: Array
     ) -> tuple[Barrier | None, tuple[Array, Array, Array]]:
         """What holds for the polynomial, and the points where its three bounds are tight."""
         names = list(self.system.states)
@@ -322,7 +320,7 @@ class _Work:
         return substitute(trace(expression, names), self.problem.closed_loop.inputs, replaced)
 
     def _supremum(
-        self, tape: Tape, box: Interval, first: int, keep: Callable[[Interval], NDArray[np.bool_]], tolerance: float
+        self, tape: Tape, box: Interval, first: int, keep: Callable[[Interval], Mask], tolerance: float
     ) -> Any:
         """Bound a function over the part of a box that ``keep`` does not rule out; states begin at ``first``."""
         slope, function = jacobian(tape), compile_numpy(tape)
@@ -349,18 +347,18 @@ class _Work:
 
         return bound_supremum(bound, value, box, tolerance=tolerance, budget=_BUDGET)
 
-    def _safe(self, boxes: Interval) -> NDArray[np.bool_]:
+    def _safe(self, boxes: Interval) -> Mask:
         """Boxes that may meet the safe set."""
         return np.asarray(np.all([gap.over(boxes).lo <= 0 for gap in self.gaps], axis=0))
 
-    def _leaving(self, boxes: Interval) -> NDArray[np.bool_]:
+    def _leaving(self, boxes: Interval) -> Mask:
         """Boxes that may meet the safe set where some constraint is about to be broken."""
         gaps = [gap.over(boxes) for gap in self.gaps]
         near = np.any([gap.hi >= 0 for gap in gaps], axis=0)
         return np.asarray(np.all([gap.lo <= 0 for gap in gaps], axis=0) & near)
 
 
-def _anywhere(boxes: Interval) -> NDArray[np.bool_]:
+def _anywhere(boxes: Interval) -> Mask:
     return np.ones(len(boxes), dtype=bool)
 
 

@@ -21,8 +21,8 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.bounds import bound_constants
 from certbound.constants.metrics import bound_metrics
 from certbound.constants.stated import proved_or_stated, refuse_contradiction
@@ -53,8 +53,6 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.question import Start
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
-
-Array = NDArray[np.float64]
 
 ONE_TIME = ("prop1", "prop1_cosh", "prop2", "markov", "chebyshev")
 """Methods that bound one time at a time: never SAFE."""

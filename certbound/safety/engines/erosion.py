@@ -13,14 +13,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside
 from certbound.reach.sets import ReachTube, constraint_clearance
 from certbound.rigor.norms import Norm
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

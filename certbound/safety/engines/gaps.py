@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.constants.enclosures import split_boxes
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Quadratic
 from certbound.rigor.intervals import Interval, sq
-
-Array = NDArray[np.float64]
 
 _CUTS = 12  # halvings of every side of a set
 

@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.reach.nominal import Curve
 from certbound.rigor.balls import precision, upper
 from certbound.tubes.constants import Constants
@@ -22,7 +22,6 @@ from certbound.tubes.question import Question, Start
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import least_exit_level
 
-Array = NDArray[np.float64]
 Profile = tuple[Array, Array]
 
 SMALLEST_LOG10 = -290.0

@@ -25,8 +25,6 @@ from typing import Any
 
 from certbound._version import __version__
 
-__all__ = ["cache_directory", "is_private", "load_kernel", "write_atomically"]
-
 logger = logging.getLogger(__name__)
 
 _KEPT = 256

@@ -14,8 +14,6 @@ import math
 
 from numba import int64, njit
 
-__all__ = ["atan2", "sincos", "tanh"]
-
 _MAGIC = 6755399441055744.0  # 1.5 * 2**52: adding and subtracting it rounds to the nearest whole number
 _PI_2 = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21)
 _SIN = (

@@ -19,8 +19,6 @@ import numpy as np
 from numba import int64, njit, uint64
 from numpy.typing import NDArray
 
-__all__ = ["draw_normal", "draw_sign", "draw_uniform", "next_word", "seed_stream", "start_generator", "uniform"]
-
 _TAIL = 3.6541528853610088  # where the tail of 256 layers of equal area begins
 
 

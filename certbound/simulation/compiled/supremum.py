@@ -16,8 +16,6 @@ from numba import njit
 
 from certbound.simulation.compiled.streams import uniform
 
-__all__ = ["STRETCH", "raise_top"]
-
 STRETCH = 1024
 """Steps kept."""
 

@@ -21,8 +21,6 @@ from certbound.simulation.kernel_source import kernel_source
 from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import LOWEST, Task
 
-__all__ = ["Deviations", "Measure", "Quantile", "sup_deviation"]
-
 _OCTAVES = 64  # histograms reach from 2**LOWEST to 2**(LOWEST + 64)
 _FINE, _COARSE = 2000, 100  # bins per octave: 0.035 % and 0.7 %
 

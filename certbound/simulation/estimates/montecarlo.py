@@ -20,8 +20,6 @@ from certbound.simulation.kernel_source import kernel_source
 from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
 
-__all__ = ["ExitCounts", "simulate_exits"]
-
 _TIME_BINS = 200
 
 

@@ -13,8 +13,6 @@ from certbound.simulation.kernel_source import kernel_source
 from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
 
-__all__ = ["sample_paths"]
-
 
 def sample_paths(
     problem: Any,

@@ -13,8 +13,6 @@ from certbound.problem.model import compile_scalar
 from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
 from certbound.simulation.stepping import Scenario, StepModel, step_model
 
-__all__ = ["FixedStart", "Setting", "prepare"]
-
 _DEFAULT_STEPS = 1000
 _LONGEST_NOMINAL = 20_000  # steps; longer paths are advanced by the kernel
 

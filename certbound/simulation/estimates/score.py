@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, if_all, starts_at_once, window_test
 from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 
-__all__ = ["score_source"]
-
 _ALMOST = 1.0 - 1e-9  # score of a path beyond a constraint that does not hold yet
 
 

@@ -37,8 +37,6 @@ from certbound.simulation.kernel_source import (
 from certbound.simulation.stepping import Scenario, StepModel
 from certbound.simulation.tape_text import Parameters, indent
 
-__all__ = ["RareExits", "simulate_rare_exits"]
-
 _PARTICLES = 500
 _DISCARDED = 0.1
 
@@ -206,6 +204,7 @@ class RareWork(Work):
         tally.counts[block, 0] = result[0, 0].view(np.int64)[0]
         tally.counts[block, 1] = int(result[0, 0, 1])
         return done
+
 
 _FOLLOW = """
 @njit(nogil=True, error_model="numpy")

@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
 
-__all__ = ["bound_binomial", "check_confidence", "order_ranks"]
-
 
 def check_confidence(confidence: Any) -> float:
     """A number in (0, 1)."""

@@ -16,8 +16,6 @@ from certbound.simulation.estimates import bound_binomial, sample_paths, simulat
 from certbound.synthesis.costs import Cost, cost_of
 from certbound.synthesis.plans import Synthesis
 
-__all__ = ["ClosedLoop", "simulate_closed_loop"]
-
 CONFIDENCE = 0.99
 
 

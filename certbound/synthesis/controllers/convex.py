@@ -29,8 +29,6 @@ from certbound.synthesis.faces import Face, Facets, Plane, Round, with_parts
 from certbound.synthesis.feedback import depends_on
 from certbound.synthesis.planning import Planner
 
-__all__ = ["ConvexPlan", "ConvexPlanner"]
-
 PENALTY = 1e4
 KEPT = 1e-6
 SOLVERS = ("CLARABEL", "OSQP")

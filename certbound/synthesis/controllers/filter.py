@@ -41,8 +41,6 @@ from certbound.synthesis.planning import Planner, check_tube
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 
-__all__ = ["FilterReport", "SafetyFilter"]
-
 KEPT = 1e-10
 """Room that must be left: more than the rounding of the noise-free state."""
 AIM = 1e-7

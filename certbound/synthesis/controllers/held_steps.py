@@ -27,8 +27,6 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm
 from certbound.tubes.tube import Tube
 
-__all__ = ["SPARE", "HeldSteps", "Link", "ProvedStep"]
-
 CHARGE = 1e-4
 """Share of the tube that the integrator's error may take in one step before more pieces are tried."""
 SPARE = 1.0005

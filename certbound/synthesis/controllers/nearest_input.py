@@ -10,8 +10,6 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.errors import SolverError
 
-__all__ = ["NearestInput"]
-
 SLACK_WEIGHT = 1e6
 
 

@@ -33,8 +33,6 @@ from certbound.synthesis.plans import Synthesis, synthesize_plan
 from certbound.synthesis.terminal import TerminalSet, check_terminal, contraction_terminal, riccati_terminal
 from certbound.synthesis.transcription import Solution, Transcription
 
-__all__ = ["PredictiveController", "StepReport"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepReport:

@@ -21,8 +21,6 @@ from certbound.synthesis.transcription import Solution
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 
-__all__ = ["Attempts"]
-
 _LOG = logging.getLogger(__name__)
 
 WIDENING = 6

@@ -6,8 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-__all__ = ["Infeasibility", "smallest_delta"]
-
 _LOG_TOLERANCE = 1e-3
 _LARGEST = math.log10(0.999)
 

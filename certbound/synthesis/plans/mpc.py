@@ -28,8 +28,6 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import METHODS
 
-__all__ = ["synthesize_plan"]
-
 _LOG = logging.getLogger(__name__)
 
 

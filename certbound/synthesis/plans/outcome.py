@@ -10,8 +10,6 @@ from certbound.safety.verification import Verdict
 from certbound.synthesis.plans.infeasibility import Infeasibility
 from certbound.tubes.constants import Constants
 
-__all__ = ["Synthesis"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Synthesis:

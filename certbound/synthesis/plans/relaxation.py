@@ -30,8 +30,6 @@ from certbound.rigor.intervals import Interval
 from certbound.synthesis.faces import Face, Plane, Round, with_parts
 from certbound.synthesis.plant import Grid, middle_of
 
-__all__ = ["bound_scale", "empty_at_once"]
-
 Form = dict[int, Fraction]
 
 _BITS = 256

@@ -15,8 +15,6 @@ from certbound.arrays import Array
 from certbound.rigor.balls import precision
 from certbound.tubes.piecewise import MonotoneProfile
 
-__all__ = ["AlmostSureProfile"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AlmostSureProfile(MonotoneProfile):

@@ -30,8 +30,6 @@ from certbound.tubes.question import Question
 from certbound.tubes.schedule import Schedule, make_schedule
 from certbound.tubes.tube import Tube
 
-__all__ = ["ConstantProfile", "bound_exact_exit", "bound_worst_exit", "chain_of", "first_passage_tube"]
-
 _LARGEST_CHAIN = 2.0e10
 _MOST_KERNELS = 12
 _MOST_ENTRIES = 5.0e7  # of one kernel: it and what it is made of take some two gigabytes

@@ -22,8 +22,6 @@ from certbound.arrays import Array, Index
 from certbound.rigor.balls import bessel_excess, precision, upper
 from certbound.rigor.rounding import LIBRARY_ULPS, UNIT
 
-__all__ = ["Recursion", "legendre_rule"]
-
 _POINTS = 14
 _TINY = 1e-290  # more than what entries below the smallest float add up to
 _TABLE_RATIO = 2e-3

@@ -29,8 +29,6 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.tubes.line_search import golden
 
-__all__ = ["Supersolution"]
-
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) * math.sqrt(3) / 6
 _ROUNDING = 128 * 2.0**-53
 """Bound of the relative rounding of each term of a defect: a product of at most 40 rounded factors and sums.

@@ -19,8 +19,6 @@ from certbound.tubes.objective import Clearance
 from certbound.tubes.question import Start
 from certbound.tubes.schedule import Schedule
 
-__all__ = ["Tangents", "exit_level", "union_level", "union_may_help"]
-
 _MOST_UNIONS = 128
 _LOSS = 1e-3  # of a logarithm, from a tangent instead of the function
 

@@ -17,8 +17,6 @@ from certbound.tubes.question import Question
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.tube import Tube
 
-__all__ = ["mixture_level", "mixture_tube"]
-
 Pair = tuple[float, float, bool]
 
 _ALL_STEPS = 400

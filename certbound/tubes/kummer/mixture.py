@@ -28,8 +28,6 @@ from certbound.tubes.kummer.search import simplex
 from certbound.tubes.piecewise import PiecewiseProfile
 from certbound.tubes.schedule import Schedule
 
-__all__ = ["Component", "MixtureProfile", "MixtureProgram"]
-
 Pair = tuple[float, float, bool]
 
 

@@ -33,8 +33,6 @@ from certbound.tubes.question import Question, Start
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.tube import Tube
 
-__all__ = ["KummerProfile", "kummer_tube", "log_initial", "log_target"]
-
 _LARGEST_EXPONENT = 1e8
 
 

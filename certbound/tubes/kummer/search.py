@@ -20,8 +20,6 @@ from certbound.tubes.objective import mean_over_time
 from certbound.tubes.question import Question, Start
 from certbound.tubes.schedule import Schedule
 
-__all__ = ["Search", "log_gain", "moderate_parameters", "simplex"]
-
 Point = tuple[float, ...]
 
 _POWERS = np.array([0.1, 1.5, 20.0])

@@ -21,8 +21,6 @@ from certbound.arrays import Array
 from certbound.rigor.balls import lower, precision, upper
 from certbound.tubes.ballpath import integral
 
-__all__ = ["AffineMartingale", "estimate_affine_excess"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AffineMartingale:

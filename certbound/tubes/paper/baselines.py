@@ -15,8 +15,6 @@ from certbound.tubes.question import Question
 from certbound.tubes.schedule import Schedule, integral
 from certbound.tubes.tube import Profile, Tube
 
-__all__ = ["BASELINES", "Baseline", "baseline_tube", "check_method"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline:

@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike
 
 from certbound.tubes.excess import log_excess
 
-__all__ = ["log_energy"]
-
 
 def log_energy(x: ArrayLike, rate: float) -> Any:
     """log Phi_{n,lam}(x) for vectors x and lam = ``rate``, at any size, in floating point.

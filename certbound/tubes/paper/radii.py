@@ -27,8 +27,6 @@ from certbound.tubes.excess import log_phi_one, solve_excess_one
 from certbound.tubes.line_search import golden
 from certbound.tubes.piecewise import MonotoneProfile
 
-__all__ = ["RootProfile", "Tail", "best_epsilon", "best_growth", "growth", "growth_ball", "sharp_tail"]
-
 
 def growth(epsilon: float, dimension: float, level: float) -> float:
     """B(e, n, ell) = eps1 n + eps2 ell of eq. (7) of the paper, in floating point.

@@ -28,8 +28,6 @@ from certbound.tubes.piecewise import MonotoneProfile
 from certbound.tubes.schedule import Schedule
 from certbound.tubes.schedule import integral as integral_float
 
-__all__ = ["WindowProfile", "event_count", "window_scale"]
-
 
 def event_count(horizon: float, step: float, *, continuous: bool) -> int:
     """Events that share delta: 2N - 1 in CT; one-time bounds and windows with an inside in DT."""

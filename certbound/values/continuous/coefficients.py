@@ -18,17 +18,12 @@ from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.errors import EnclosureError
 from certbound.problem.model import OPERATIONS, Graph, Node, Tape, edged, enclosed, jacobian, undefined_where
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.polynomials import interpolation, node_product, nodes_of, norm
-
-__all__ = ["Cells", "Interpolant", "Reader", "enclose", "squared_diffusion"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _HIGHEST = 6  # polynomials up to this degree are represented exactly
 _SMOOTH = 4  # degree of the interpolant of any other smooth function

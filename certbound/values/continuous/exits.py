@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Node, Tape, compile_numpy, edged, jacobian
 from certbound.problem.problem import Problem
@@ -23,9 +23,6 @@ from certbound.values.continuous.proposal import Line, sketch
 from certbound.values.continuous.room import Room, safe_room, starts_of
 from certbound.values.continuous.shapes import propose_lower, propose_upper, sealed
 
-__all__ = ["ExitBounds", "bound_exits"]
-
-Array = NDArray[np.float64]
 Starts = list[tuple[float, float]]
 
 _LN10 = math.log(10)

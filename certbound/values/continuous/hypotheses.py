@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Cells, Interpolant, Reader
 from certbound.values.continuous.payment import Patched, Payment, pay_lower, pay_upper
@@ -38,12 +38,6 @@ from certbound.values.continuous.residual import (
 )  # fmt: skip
 from certbound.values.continuous.surface import Surface
 
-__all__ = [
-    "Model", "Need", "Proof", "covers", "examine", "examine_upper", "extreme_over", "prove_lower",
-    "prove_upper", "sampled_residual",
-]  # fmt: skip
-
-Array = NDArray[np.float64]
 Found = TypeVar("Found")
 
 _LIFTS = (0.0, 0.003, 0.02, 0.1)
@@ -85,8 +79,8 @@ class Proof:
     """
 
     ranges: Ranges
-    slab: NDArray[np.intp]
-    cell: NDArray[np.intp]
+    slab: Index
+    cell: Index
 
     def spread(self, values: Array, surface: Surface, rest: float) -> Array:
         """One value a patch, shape (slabs, *cells), ``rest`` where nothing was looked at."""
@@ -114,7 +108,7 @@ def examine(surface: Surface, model: Model, need: Need) -> Proof:
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
 
-    def look(ends: tuple[int, int]) -> tuple[NDArray[np.intp], Ranges] | None:
+    def look(ends: tuple[int, int]) -> tuple[Index, Ranges] | None:
         patches = surface.patches(*ends)
         place = np.arange(len(patches.size)) % (per if fixed else len(patches.size))
         drifts, squares = fixed or interpolants(surface, model, *ends, counts)
@@ -275,7 +269,7 @@ def extreme_over(surface: Surface, starts: Sequence[tuple[float, float]], *, upp
     return max(at_nodes, float(low[touched].max()))
 
 
-def _touched(axis: Array, low: float, high: float) -> NDArray[np.intp]:
+def _touched(axis: Array, low: float, high: float) -> Index:
     if low == high:
         return np.flatnonzero((axis[:-1] <= low) & (axis[1:] >= high))
     return np.flatnonzero((axis[:-1] < high) & (axis[1:] > low))

@@ -8,13 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-__all__ = ["extremes_in_plane"]
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-
+from certbound.arrays import Array, Index
 
 BLOCK = 8
 """Patches that are worked on together, side by side in the last axis: the processor's vectors run along it."""

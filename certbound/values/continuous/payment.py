@@ -25,14 +25,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.rigor.intervals import Interval, exp, log
-
-__all__ = ["Levels", "Patched", "Payment", "pay_lower", "pay_upper"]
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 BIN = 0.125
 _UP = 1 + 1e-13

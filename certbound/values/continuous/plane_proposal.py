@@ -16,14 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.values.continuous.proposal import Splines, through
 from certbound.values.continuous.surface import Surface
 
-__all__ = ["Plan", "Plane", "Source", "propose_plane"]
-
-Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 _GAMMA = 0.5

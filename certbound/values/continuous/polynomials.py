@@ -12,14 +12,9 @@ from functools import lru_cache
 from math import comb, cos, pi
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = [
-    "HERMITE", "TIME_HERMITE", "basis_at", "interpolation", "node_product", "nodes_of",
-    "norm", "to_bernstein",
-]  # fmt: skip
+from certbound.arrays import Array
 
-Array = NDArray[np.float64]
 Rows = list[list[Fraction]]
 
 HERMITE = np.array([

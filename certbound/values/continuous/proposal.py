@@ -15,16 +15,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import solve_banded
 from scipy.linalg.lapack import dgbtrf, dgbtrs
 
+from certbound.arrays import Array
 from certbound.values.continuous.surface import Surface
-
-__all__ = ["Boundary", "Line", "Sketch", "Splines", "graded", "propose", "sketch", "through"]
-
-Array = NDArray[np.float64]
 
 _DEGREE = 5
 _BAND = 5

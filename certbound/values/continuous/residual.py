@@ -17,15 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Index
 from certbound.rigor.rounding import UNIT
 from certbound.values.continuous.coefficients import Interpolant
 from certbound.values.continuous.polynomials import basis_at, nodes_of, norm, to_bernstein
-
-__all__ = ["Patches", "Ranges", "bound_ranges", "coarse_size", "sample_in_plane", "value_range"]
-
-Array = NDArray[np.float64]
 
 SPACE, TIME = 5, 3
 _ROUNDOFFS = 500 * UNIT
@@ -51,7 +47,7 @@ class Patches:
     step: Array
     widths: tuple[Array, ...]
 
-    def take(self, place: NDArray[np.intp]) -> Patches:
+    def take(self, place: Index) -> Patches:
         """Some of the patches."""
         return Patches(
             coefficients=self.coefficients[place], reference=self.reference[place], size=self.size[place],
@@ -76,7 +72,7 @@ def along(matrix: Array, array: Array, axis: int) -> Array:
 
 
 def bound_ranges(
-    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp],
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
     counts: Sequence[int], *, wanted: float = 0.0,
 ) -> Ranges:
     """Ranges of R (its maximum over the drifts), V and Q2; see the module.
@@ -122,7 +118,7 @@ Extremes = tuple[Array, Array, Array]
 
 
 def _on_line(
-    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp],
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
     counts: Sequence[int], wanted: float,
 ) -> Extremes:
     """Least and largest Bernstein coefficients of R, one row a branch, and the least of Q2: one state."""
@@ -142,7 +138,7 @@ def _on_line(
 
 
 def _in_plane(
-    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp],
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
     counts: Sequence[int], wanted: float,
 ) -> Extremes:
     """The same in two states, compiled."""
@@ -151,7 +147,7 @@ def _in_plane(
 
 
 def sample_in_plane(
-    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp],
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
     counts: Sequence[int],
 ) -> Array:
     """The largest sample of R over each patch and all branches, two states: a sketch, no bound."""
@@ -160,7 +156,7 @@ def sample_in_plane(
 
 
 def _run_plane(
-    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp],
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
     counts: Sequence[int], inverses: tuple[Array, ...], wanted: float,
 ) -> Array:
     from certbound.values.continuous.kernel import extremes_in_plane
@@ -188,7 +184,7 @@ def _derivatives(count: int, degree: int, orders: int) -> list[Array]:
 
 
 def coarse_size(
-    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: NDArray[np.intp]
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index
 ) -> Array:
     """An upper bound of |R| over each patch from the sizes of its terms: good where V hardly moves."""
     n = len(patches.widths)

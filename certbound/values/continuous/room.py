@@ -10,8 +10,6 @@ from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic, Region
 
-__all__ = ["Room", "safe_room", "starts_of"]
-
 Ends = tuple[float, float]
 
 

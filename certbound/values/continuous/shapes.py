@@ -5,14 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.values.continuous.proposal import Boundary, Line, graded, propose
 from certbound.values.continuous.surface import Surface
-
-__all__ = ["propose_lower", "propose_upper", "sealed"]
-
-Array = NDArray[np.float64]
 
 _SPARE = 8.0
 

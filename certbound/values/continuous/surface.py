@@ -13,14 +13,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.values.continuous.polynomials import HERMITE, TIME_HERMITE
 from certbound.values.continuous.residual import Patches, along, value_range
-
-__all__ = ["Surface"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -12,8 +12,8 @@ import time
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.continuous.hypotheses import (
@@ -26,10 +26,6 @@ from certbound.values.continuous.hypotheses import (
 from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane
 from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
-
-__all__ = ["two_states"]
-
-Array = NDArray[np.float64]
 
 _FACTOR = 1.12
 _TOP = -0.02  # where V is above, the proof may lift it over 0 instead

@@ -16,8 +16,6 @@ import numpy as np
 
 from certbound.rigor.intervals import Interval, abs_, exp, sq
 
-__all__ = ["KAPPA", "dominance", "density_tail", "quadrature_error", "tail"]
-
 KAPPA = 1.3
 """Ratio of the standard deviations of the dominating density and of the noise."""
 _STEPS = 128

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside, Region
 from certbound.problem.systems import DiscreteSystem
@@ -32,10 +32,6 @@ from certbound.values.discrete.transitions import Transition
 from certbound.values.discrete.uniform_noise import UniformTables, UniformTransition
 from certbound.values.grids import Grid, corners
 from certbound.values.sets import active_at, box_around, contains, respected
-
-__all__ = ["FailureBounds", "bound_failure"]
-
-Array = NDArray[np.float64]
 
 MOST_STATES = 3
 _SHARES = {
@@ -310,7 +306,7 @@ class _Work:
         values = values.ravel()[inside]
         return upper, float(values.max()) if len(values) else 0.0
 
-    def _highest(self, transition: AnyTransition, above: ValueFunction, meets: NDArray[np.bool_]) -> float:
+    def _highest(self, transition: AnyTransition, above: ValueFunction, meets: Mask) -> float:
         nodal, bend, known = values_above(transition, above)
         top = np.maximum.reduce(corners(nodal))
         for i in range(self.n):

@@ -17,18 +17,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.rigor.rounding import product_error
 from certbound.values.discrete.dominance import density_tail, dominance
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.kernels import REACH, AxisKernel, axis_kernel
 from certbound.values.discrete.shocks import Inapplicable, Shocks
 from certbound.values.grids import Grid, corners
-
-__all__ = ["Field", "Mesh", "POINTS", "Tables", "orders_up_to"]
-
-Array = NDArray[np.float64]
 
 POINTS = 8
 """Points of the interpolation between the mesh's nodes."""

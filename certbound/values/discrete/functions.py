@@ -13,13 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.values.grids import Grid, over_corners
-
-__all__ = ["ValueFunction"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -42,7 +38,7 @@ class ValueFunction:
     grid: Grid
     nodal: Array
     bend: Array
-    fixed: NDArray[np.bool_] | None
+    fixed: Mask | None
     level: Array
 
     def size(self) -> Array:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.problem.sets import Inside, Region
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.transitions import Transition
@@ -23,10 +23,6 @@ from certbound.values.discrete.uniform_noise import UniformTransition
 from certbound.values.grids import Grid, around_nodes, corners
 from certbound.values.sets import contains, respected
 
-__all__ = ["AnyTransition", "Zones", "back_above", "back_below", "final", "values_above", "zones_of"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 AnyTransition = Transition | UniformTransition
 
 _STEEPEST = 0.5

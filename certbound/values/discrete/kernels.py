@@ -14,14 +14,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from flint import arb
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.rigor.balls import precision
 from certbound.values.discrete.dominance import KAPPA, dominance, quadrature_error
-
-__all__ = ["ORDERS", "REACH", "AxisKernel", "axis_kernel"]
-
-Array = NDArray[np.float64]
 
 REACH = 10.0
 """Standard deviations up to which every interval is integrated that comes so near."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside, Outside, Quadratic, Region
@@ -17,10 +17,6 @@ from certbound.values.discrete.shocks import Inapplicable, Shocks
 from certbound.values.discrete.steps import Dynamics
 from certbound.values.grids import Grid, graded_axis
 from certbound.values.sets import active_at, box_around
-
-__all__ = ["Boxes", "boxes_of", "grid_of", "widths_of"]
-
-Array = NDArray[np.float64]
 
 _COARSE = {1: 256, 2: 32, 3: 12}  # cells along each side when the reach of a step is bounded
 

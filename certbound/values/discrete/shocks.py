@@ -6,15 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.noise import Law
 from certbound.rigor.intervals import Interval, sq, sqrt
-
-__all__ = ["Inapplicable", "Shocks", "gaussian_shocks", "shocks_of"]
-
-Array = NDArray[np.float64]
 
 
 class Inapplicable(InfeasibleError):

@@ -6,17 +6,12 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Mask
 from certbound.problem.model import OPERATIONS, Tape, enclosed, jacobian, undefined_where
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
 from certbound.values.grids import Grid
-
-__all__ = ["CellImages", "Dynamics", "Step"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _CHUNK = 16384
 

@@ -13,19 +13,14 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array, Integers, Mask
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import dominance
 from certbound.values.discrete.fields import POINTS, Field, Tables
 from certbound.values.discrete.steps import CellImages, Step
 from certbound.values.grids import over_corners
 
-__all__ = ["Forms", "Places", "Transition", "Windows"]
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 Alpha = tuple[int, ...]
 
 
@@ -54,7 +49,7 @@ class Places:
         self.radius = np.where(usable[:, None], image.rad, np.inf)
         self.usable = usable & np.all(self.radius <= mesh.step / 2, axis=1)
         self.points = points
-        self.base: list[Index] = []
+        self.base: list[Integers] = []
         self.weights: list[list[Array]] = []
         for i in range(n):
             place = np.clip((middle[:, i] - mesh.start[i]) / mesh.step[i], 0, mesh.count[i] - 1)
@@ -63,9 +58,9 @@ class Places:
             self.base.append(base)
             self.weights.append(_weights(theta, points))
 
-    def flat(self, count: tuple[int, ...], shift: tuple[int, ...]) -> Index:
+    def flat(self, count: tuple[int, ...], shift: tuple[int, ...]) -> Integers:
         """Flat index of the stencils' nodes ``shift``."""
-        total: Index = np.zeros(len(self.base[0]), dtype=np.int64)
+        total: Integers = np.zeros(len(self.base[0]), dtype=np.int64)
         for base, size, more in zip(self.base, count, shift):
             total = total * size + base + more
         return total
@@ -77,7 +72,7 @@ class Places:
         strides = [int(np.prod(table.shape[i + 1 :])) for i in range(n)]
         start = self.flat(table.shape, (0,) * n)
 
-        def along(axis: int, index: Index) -> Array:
+        def along(axis: int, index: Integers) -> Array:
             total = np.zeros(len(index))
             for k in range(self.points):
                 moved = index + k * strides[axis]
@@ -116,12 +111,12 @@ class Windows:
         scale = np.max(length / typical, axis=1)
         levels = [1.0, 1.34, 1.67, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 32.0, 64.0, 1e9]
         group = np.searchsorted(levels, scale - 1e-9)
-        self.groups: list[tuple[tuple[int, ...], Index, Index]] = []
+        self.groups: list[tuple[tuple[int, ...], Integers, Integers]] = []
         for g in np.unique(group):
             members = np.flatnonzero(group == g)
             size = np.minimum(length[members].max(axis=0), last + 1)
             start = np.minimum(first[members], last + 1 - size)
-            flat: Index = np.zeros(len(members), dtype=np.int64)
+            flat: Integers = np.zeros(len(members), dtype=np.int64)
             for i in range(n):
                 flat = flat * (mesh.count[i] - 1) + start[:, i]
             self.groups.append((tuple(int(s) for s in size), members, flat))

@@ -14,8 +14,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Array
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import product_error
 from certbound.values.discrete.fields import Mesh, Tables
@@ -26,9 +26,6 @@ from certbound.values.discrete.steps import Step
 from certbound.values.discrete.transitions import Places, Transition
 from certbound.values.grids import Grid
 
-__all__ = ["UniformField", "UniformTables", "UniformTransition"]
-
-Array = NDArray[np.float64]
 _UNIT = 2.0**-53
 _MOST_WEIGHTS = 8_000_000
 """Of a kernel along one axis, which holds every pair of a point and a node, a dozen times over: about a gigabyte."""
