@@ -40,7 +40,7 @@ def two_states(
     inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
     level = _rough_level(inner)
     upper, done = 0.0, []
-    for plan in _plans(inner, level):
+    for plan in _plans(inner, level, 36 if deadline - time.perf_counter() < 15 else 50):
         begin = time.perf_counter()
         for found in _uppers(inner, model, starts, plan):
             upper = min(upper, found)
@@ -54,8 +54,8 @@ def two_states(
     return upper, None, words
 
 
-def _plans(plane: Plane, level: float) -> Iterator[Plan]:
-    cells, growth, lead = 36, 0.28, 0.01
+def _plans(plane: Plane, level: float, cells: int) -> Iterator[Plan]:
+    growth, lead = 0.28 * (36 / cells) ** 0.6, 0.36 / cells
     for _ in range(5):
         yield Plan(cells=cells, growth=growth, lead=lead * plane.horizon, floor=level - 5)
         cells, growth, lead = int(1.35 * cells), growth / 1.2, lead * 0.8
