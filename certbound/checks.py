@@ -8,9 +8,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from certbound.arrays import Array
+
 _SLACK, _ROUNDING = 1e-12, 1e-14
 """How far a semidefinite matrix with a diagonal of 1 may miss it, and how far its computed eigenvalues may."""
 

@@ -15,9 +15,9 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from certbound._version import __version__
+from certbound.arrays import Array
 from certbound.display import name_text, rounded
 from certbound.plotting.panels import Panel, least_distance, panels_of, stairs
 from certbound.plotting.plane import outlines, plane_of, supports
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from certbound.reach.sets import ReachTube
     from certbound.safety.verification import Verdict
 
-Array = NDArray[np.float64]
 Trace = dict[str, Any]
 
 DIGITS = 5

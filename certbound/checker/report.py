@@ -25,37 +25,19 @@ class Unproved(CertboundError):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Report:
-    """The answer about one certificate.
+    """The answer about one certificate."""
 
-    Parameters
-    ----------
-    valid : bool
-        Whether the claim may be relied on: every inequality was proved again, and nothing had to be assumed, unless
-        whoever asked allows assumptions.
-    claim : str
-        What the certificate claims, in words: for which disturbances, and under which assumptions.
-    reason : str
-        What was proved, or the first thing that could not be.
-    seconds : float
-        Time taken.
-    log10_delta : float
-        The claimed bound on log10 of the probability.
-    log10_proved : float or None
-        The bound that the checker itself arrived at (None where it did not).
-    assumptions : tuple of str
-        What the proof takes for granted, derived from the proof itself, and what the file says besides.
-    proved : bool
-        Whether every inequality was proved again but for the assumptions.
-    """
-
+    # whether the claim may be relied on: every inequality was proved again, and nothing had to be assumed, unless
+    # whoever asked allows assumptions
     valid: bool
-    claim: str
-    reason: str
-    seconds: float
-    log10_delta: float
-    log10_proved: float | None = None
+    claim: str  # what the certificate claims, in words: for which disturbances, and under which assumptions
+    reason: str  # what was proved, or the first thing that could not be
+    seconds: float  # time taken
+    log10_delta: float  # the claimed bound on log10 of the probability
+    log10_proved: float | None = None  # the bound that the checker itself arrived at (None where it did not)
+    # what the proof takes for granted, derived from the proof itself, and what the file says besides
     assumptions: tuple[str, ...] = ()
-    proved: bool = False
+    proved: bool = False  # whether every inequality was proved again but for the assumptions
 
     @property
     def outcome(self) -> str:

@@ -52,11 +52,6 @@ def ball_root(matrix: Array) -> Array:
 class Norm:
     """The weighted Euclidean norm of a metric P (the identity when None).
 
-    Parameters
-    ----------
-    dimension : int
-    metric : array_like, shape (n, n), optional
-
     Examples
     --------
     >>> norm = Norm(2, [[4.0, 0.0], [0.0, 1.0]])
@@ -65,7 +60,7 @@ class Norm:
     """
 
     dimension: int
-    metric: ArrayLike | None = None
+    metric: ArrayLike | None = None  # (n, n)
     matrix: Array | None = field(init=False, repr=False)
     root: Array | None = field(init=False, repr=False)
 

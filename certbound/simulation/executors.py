@@ -30,22 +30,13 @@ _SAVE_EVERY = 2.0  # seconds between two checkpoints
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Progress:
-    """Where a run stands.
+    """Where a run stands."""
 
-    Parameters
-    ----------
-    paths, total : int
-        Paths done, and asked for.
-    rate : float
-        Path-steps per second, of this run.
-    remaining : float
-        Estimated seconds left.
-    """
-
+    # paths done, and asked for
     paths: int
     total: int
-    rate: float
-    remaining: float
+    rate: float  # path-steps per second, of this run
+    remaining: float  # estimated seconds left
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -22,32 +22,22 @@ _LARGEST_EXACT = 16
 class Scenario:
     """How paths are drawn: what the problem leaves open.
 
-    Parameters
-    ----------
-    scheme : {"auto", "exact", "milstein", "euler"}
-        Continuous time only. ``auto`` takes the exact transition of a linear system of up to 16 states,
-        Milstein's scheme where the diffusion is diagonal and entry i depends on state i alone, and
-        Euler-Maruyama otherwise.
-    bridge : bool
-        Continuous time only: look for exits between two steps with a Brownian bridge.
-    initial : array_like, shape (n,), optional
-        One start for all paths; otherwise X_0 is uniform in the problem's initial set (or drawn from its
-        law).
-    disturbance : {"constant", "switching"}, array_like or callable
-        ``constant``: each path draws one value, uniform in the box. ``switching``: jumps between vertices of
-        the box at random times (ten times per horizon on average). An array of shape (q,) or (pieces, q): the
-        same signal for all paths, constant on equal pieces of the horizon. A function d(t, x) reacts to the
-        state of the path (and is cut off at the box).
-
     Examples
     --------
     >>> Scenario(scheme="euler", disturbance=[0.1]).bridge
     True
     """
 
+    # Continuous time only. ``auto`` takes the exact transition of a linear system of up to 16 states, Milstein's scheme
+    # where the diffusion is diagonal and entry i depends on state i alone, and Euler-Maruyama otherwise.
     scheme: Literal["auto", "exact", "milstein", "euler"] = "auto"
-    bridge: bool = True
+    bridge: bool = True  # continuous time only: look for exits between two steps with a Brownian bridge
+    # (n,): one start for all paths; otherwise X_0 is uniform in the problem's initial set (or drawn from its law)
     initial: ArrayLike | None = None
+    # ``constant``: each path draws one value, uniform in the box. ``switching``: jumps between vertices of the box at
+    # random times (ten times per horizon on average). An array of shape (q,) or (pieces, q): the same signal for all
+    # paths, constant on equal pieces of the horizon. A function d(t, x) reacts to the state of the path (and is cut off
+    # at the box).
     disturbance: str | ArrayLike | Callable[..., Any] = "constant"
 
     def __post_init__(self) -> None:

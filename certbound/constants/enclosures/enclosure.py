@@ -12,13 +12,12 @@ from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Mask
 from certbound.errors import EnclosureError
 from certbound.problem.model import OPERATIONS, Node, Tape, enclosed, undefined_where
 from certbound.rigor.intervals import Interval
 
-Mask = NDArray[np.bool_]
 CHUNK = 8192
 """Boxes evaluated at a time: the intermediate results stay in the processor's cache."""
 

@@ -25,24 +25,14 @@ _VERTEX_LIMIT = 1 << 16
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AffineSet:
-    """{J0 + sum_k theta_k M_k + E : low <= theta <= high, |E| <= slack entrywise}.
+    """{J0 + sum_k theta_k M_k + E : low <= theta <= high, |E| <= slack entrywise}."""
 
-    Parameters
-    ----------
-    center : array_like, shape (n, n)
-        J0.
-    terms : array_like, shape (k, n, n)
-        M_k; entries that share a parameter stay correlated.
-    low, high : array_like, shape (k,)
-        Finite range of each parameter.
-    slack : array_like, shape (n, n), optional
-        Entrywise error, which carries the rounding of J0 and M_k; zero when omitted.
-    """
-
-    center: ArrayLike
-    terms: ArrayLike
+    center: ArrayLike  # (n, n): J0
+    terms: ArrayLike  # (k, n, n): M_k; entries that share a parameter stay correlated
+    # (k,): finite range of each parameter
     low: ArrayLike
     high: ArrayLike
+    # (n, n): entrywise error, which carries the rounding of J0 and M_k; zero when omitted
     slack: ArrayLike | None = None
     J0: Array = field(init=False, repr=False)
     M: Array = field(init=False, repr=False)
@@ -171,28 +161,16 @@ class AffineForm:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SectorSet(AffineForm):
-    """{A + B Delta C + E : Delta = diag(delta), low <= delta <= high, |E| <= slack entrywise}.
+    """{A + B Delta C + E : Delta = diag(delta), low <= delta <= high, |E| <= slack entrywise}."""
 
-    Parameters
-    ----------
-    A : array_like, shape (n, n)
-    B : array_like, shape (n, k)
-    C : array_like, shape (k, n)
-    low, high : array_like, shape (k,)
-        Range of each slope.
-    slack : array_like, shape (n, n), optional
-        Entrywise error; zero when omitted.
-    groups : tuple of int, optional
-        Entries of Delta with the same number are equal; all differ when omitted.
-    """
-
-    A: ArrayLike
-    B: ArrayLike
-    C: ArrayLike
+    A: ArrayLike  # (n, n)
+    B: ArrayLike  # (n, k)
+    C: ArrayLike  # (k, n)
+    # (k,): range of each slope
     low: ArrayLike
     high: ArrayLike
-    slack: ArrayLike | None = None
-    groups: tuple[int, ...] | None = None
+    slack: ArrayLike | None = None  # (n, n): entrywise error; zero when omitted
+    groups: tuple[int, ...] | None = None  # entries of Delta with the same number are equal; all differ when omitted
     left: Array = field(init=False, repr=False)
     right: Array = field(init=False, repr=False)
     affine: AffineSet = field(init=False, repr=False)

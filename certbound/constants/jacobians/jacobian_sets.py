@@ -60,18 +60,13 @@ class JacobianSet(Protocol):
 class VertexPolytope:
     """Convex hull of finitely many matrices.
 
-    Parameters
-    ----------
-    matrices : array_like, shape (v, n, n)
-        The vertices; a single matrix (n, n) is a point (a linear time-invariant system).
-
     Examples
     --------
     >>> VertexPolytope(matrices=[[[0.0, 1.0], [-1.0, -1.0]], [[0.0, 1.0], [-2.0, -1.0]]]).vertex_count
     2
     """
 
-    matrices: ArrayLike
+    matrices: ArrayLike  # (v, n, n): the vertices; a single matrix (n, n) is a point (a linear time-invariant system)
     _stack: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -117,15 +112,10 @@ class VertexPolytope:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class IntervalMatrixSet(AffineForm):
-    """{J : low <= J <= high entrywise}; entries vary independently of each other.
+    """{J : low <= J <= high entrywise}; entries vary independently of each other."""
 
-    Parameters
-    ----------
-    low, high : array_like, shape (n, n)
-    """
-
-    low: ArrayLike
-    high: ArrayLike
+    low: ArrayLike  # (n, n)
+    high: ArrayLike  # (n, n)
     box: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -155,12 +145,7 @@ class IntervalMatrixSet(AffineForm):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UnionSet:
-    """Union of Jacobian sets, one per sub-box; bounds hold for each member, hence for the union.
-
-    Parameters
-    ----------
-    members : sequence of Jacobian sets of one dimension
-    """
+    """Union of Jacobian sets, one per sub-box; bounds hold for each member, hence for the union."""
 
     members: Sequence[JacobianSet]
 

@@ -228,21 +228,11 @@ class ErosionProgram:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FeedbackDesign:
-    """A feedback u = K x and a metric P proposed together; the value is the solver's, to be certified.
+    """A feedback u = K x and a metric P proposed together; the value is the solver's, to be certified."""
 
-    Parameters
-    ----------
-    feedback : ndarray, shape (m, n)
-        K.
-    metric : ndarray, shape (n, n)
-        P.
-    value : float
-        c (continuous time) or L (discrete time) of J + B K in the metric, in floating point.
-    """
-
-    feedback: Array
-    metric: Array
-    value: float
+    feedback: Array  # (m, n): K
+    metric: Array  # (n, n): P
+    value: float  # c (continuous time) or L (discrete time) of J + B K in the metric, in floating point
 
 
 def design_feedback(

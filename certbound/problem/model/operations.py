@@ -11,15 +11,14 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from certbound.arrays import Mask
 from certbound.problem.model.tape import Node
 from certbound.rigor import arithmetic as ia
 from certbound.rigor import elementary as iv
 from certbound.rigor import series as ts
 from certbound.rigor.arithmetic import Interval
 
-Mask = NDArray[np.bool_]
 
 
 class Builder(Protocol):

@@ -47,25 +47,13 @@ class Node(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Tape:
-    """A vector- or matrix-valued function of named scalars.
+    """A vector- or matrix-valued function of named scalars."""
 
-    Parameters
-    ----------
-    inputs : tuple of str
-        Names of the scalar inputs, in slot order; for a system's dynamics: ``t``, states, inputs,
-        disturbances.
-    nodes : tuple of Node
-        Operations in topological order.
-    outputs : tuple of int
-        Node of each output, in row-major order.
-    shape : tuple of int
-        Shape of the output, ``(n,)`` or ``(rows, columns)``.
-    """
-
+    # names of the scalar inputs, in slot order; for a system's dynamics: ``t``, states, inputs, disturbances
     inputs: tuple[str, ...]
-    nodes: tuple[Node, ...]
-    outputs: tuple[int, ...]
-    shape: tuple[int, ...]
+    nodes: tuple[Node, ...]  # operations in topological order
+    outputs: tuple[int, ...]  # node of each output, in row-major order
+    shape: tuple[int, ...]  # shape of the output, ``(n,)`` or ``(rows, columns)``
 
     def __post_init__(self) -> None:
         for index, node in enumerate(self.nodes):

@@ -21,21 +21,12 @@ from certbound.rigor.intervals import Interval, sqrt, stack
 
 @dataclass(frozen=True, eq=False)
 class Faces:
-    """{normals y <= bounds} of y = x - center, in the set's coordinates.
+    """{normals y <= bounds} of y = x - center, in the set's coordinates."""
 
-    Parameters
-    ----------
-    normals : ndarray, shape (m, k)
-        No row all 0; m = 0 is the whole space.
-    bounds : ndarray, shape (m,)
-        Finite.
-    axial : bool
-        Whether every face bounds one coordinate, by an entry of 1 or -1, and no two faces have the same row: then
-        comparisons are exact, and a row tells the weights of the faces it is made of.
-    """
-
-    normals: Array
-    bounds: Array
+    normals: Array  # (m, k): no row all 0; m = 0 is the whole space
+    bounds: Array  # (m,): finite
+    # whether every face bounds one coordinate, by an entry of 1 or -1, and no two faces have the same row: then
+    # comparisons are exact, and a row tells the weights of the faces it is made of
     axial: bool = False
 
     round: ClassVar[bool] = False
@@ -78,18 +69,10 @@ class Faces:
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """{y' shape^-1 y <= radius^2} of y = x - center, in the set's coordinates.
+    """{y' shape^-1 y <= radius^2} of y = x - center, in the set's coordinates."""
 
-    Parameters
-    ----------
-    shape : ndarray, shape (k, k)
-        Positive definite; the identity for a ball.
-    radius : float
-        Not negative.
-    """
-
-    shape: Array
-    radius: float
+    shape: Array  # (k, k): positive definite; the identity for a ball
+    radius: float  # not negative
 
     round: ClassVar[bool] = True
     axial: ClassVar[bool] = False

@@ -35,24 +35,13 @@ class Quantile(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Measure:
-    """What is measured of the deviation s = X_t - x_t.
+    """What is measured of the deviation s = X_t - x_t."""
 
-    Parameters
-    ----------
-    metric : array_like, shape (n, n), optional
-        P of sqrt(s' P s); the identity when omitted.
-    coordinates : sequence of int, optional
-        Measure the Euclidean norm of these states only (instead of ``metric``).
-    directions : array_like, shape (q, n), optional
-        Measure each directions[j] . s, with its sign (instead of a norm).
-    profile : array_like, shape (steps + 1,), or callable, optional
-        Divide by this positive function of time (or its values on the steps): the quantiles then tell by
-        which factor a tube with this radius would have to be scaled.
-    """
-
-    metric: ArrayLike | None = None
-    coordinates: Sequence[int] | None = None
-    directions: ArrayLike | None = None
+    metric: ArrayLike | None = None  # (n, n): P of sqrt(s' P s); the identity when omitted
+    coordinates: Sequence[int] | None = None  # measure the Euclidean norm of these states only (instead of ``metric``)
+    directions: ArrayLike | None = None  # (q, n): measure each directions[j] . s, with its sign (instead of a norm)
+    # (steps + 1,), or callable: divide by this positive function of time (or its values on the steps): the quantiles
+    # then tell by which factor a tube with this radius would have to be scaled
     profile: ArrayLike | Callable[[Array], ArrayLike] | None = None
 
     def __post_init__(self) -> None:
@@ -63,37 +52,21 @@ class Measure:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Deviations:
-    """Histograms of deviations; rows belong to the directions (one row for a norm).
-
-    Parameters
-    ----------
-    paths : int
-    counts : ndarray of int, shape (rows, bins)
-        Largest deviation over the horizon. Bin 0 holds all up to ``edges[0]``, bin k those up to
-        ``edges[k]``.
-    edges : ndarray, shape (bins,)
-        Upper ends of the bins; neighbours differ by 0.035 %.
-    times : ndarray, shape (points,)
-        Where the two histograms below were taken.
-    marginal_counts, running_counts : ndarray of int, shape (points, rows, marginal bins)
-        Deviation at that time, and the largest one until then.
-    marginal_edges : ndarray, shape (marginal bins,)
-        Upper ends of their bins; neighbours differ by 0.7 %.
-    steps : int
-    scheme : str
-    seconds, path_steps_per_second : float
-        Compilation left out.
-    """
+    """Histograms of deviations; rows belong to the directions (one row for a norm)."""
 
     paths: int
+    # (rows, bins): largest deviation over the horizon. Bin 0 holds all up to ``edges[0]``, bin k those up to
+    # ``edges[k]``.
     counts: Counts = field(repr=False)
-    edges: Array = field(repr=False)
-    times: Array = field(repr=False)
+    edges: Array = field(repr=False)  # (bins,): upper ends of the bins; neighbours differ by 0.035 %
+    times: Array = field(repr=False)  # (points,): where the two histograms below were taken
+    # (points, rows, marginal bins): deviation at that time, and the largest one until then
     marginal_counts: Counts = field(repr=False)
     running_counts: Counts = field(repr=False)
-    marginal_edges: Array = field(repr=False)
+    marginal_edges: Array = field(repr=False)  # (marginal bins,): upper ends of their bins; neighbours differ by 0.7 %
     steps: int
     scheme: str
+    # compilation left out
     seconds: float
     path_steps_per_second: float
 

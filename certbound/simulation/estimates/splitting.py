@@ -43,43 +43,22 @@ _DISCARDED = 0.1
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class RareExits:
-    """An exit probability from importance splitting.
+    """An exit probability from importance splitting."""
 
-    Parameters
-    ----------
-    probability : float
-        Mean of the replicas' estimates: unbiased for the time-discretised model.
-    standard_error : float
-        Of the mean, from the scatter of the replicas.
-    lower, upper : float
-        Student interval of the mean, cut off at 0 (approximate, unlike Clopper-Pearson limits). If no
-        particle of any replica left, ``lower`` is 0 and ``upper`` the Clopper-Pearson limit of the first
-        generation alone.
-    confidence : float
-    paths : int
-        Particles in all replicas.
-    exits : int
-        Particles that had left in the end, in all replicas.
-    replicas : int
-    steps : int
-    scheme : str
-    path_steps : int
-        Path-steps done, copies included.
-    seconds, path_steps_per_second : float
-        Compilation left out.
-    """
-
-    probability: float
-    standard_error: float
+    probability: float  # mean of the replicas' estimates: unbiased for the time-discretised model
+    standard_error: float  # of the mean, from the scatter of the replicas
+    # Student interval of the mean, cut off at 0 (approximate, unlike Clopper-Pearson limits). If no particle of any
+    # replica left, ``lower`` is 0 and ``upper`` the Clopper-Pearson limit of the first generation alone.
     lower: float
     upper: float
     confidence: float
-    paths: int
-    exits: int
+    paths: int  # particles in all replicas
+    exits: int  # particles that had left in the end, in all replicas
     replicas: int
     steps: int
     scheme: str
-    path_steps: int
+    path_steps: int  # path-steps done, copies included
+    # compilation left out
     seconds: float
     path_steps_per_second: float
 

@@ -21,35 +21,19 @@ CONFIDENCE = 0.99
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClosedLoop:
-    """What stochastic runs of a plan did.
+    """What stochastic runs of a plan did."""
 
-    Parameters
-    ----------
-    runs, violations : int
-        Runs, and those that broke a constraint (input bounds under a feedback included).
-    lower, upper : float
-        Clopper-Pearson limits of the probability of breaking one, at 99 %.
-    max_input : float
-        Largest |u| over all runs.
-    times : ndarray, shape (N + 1,)
-    mean_cost : ndarray, shape (N + 1,)
-        Mean stage cost at each time; at the last one of the state alone.
-    mean_final_cost : float
-        Its last entry.
-    by_constraint : dict
-        Label to the number of runs that broke it (in continuous time: first).
-    seconds : float
-    """
-
+    # runs, and those that broke a constraint (input bounds under a feedback included)
     runs: int
     violations: int
+    # Clopper-Pearson limits of the probability of breaking one, at 99 %
     lower: float
     upper: float
-    max_input: float
-    times: Array
-    mean_cost: Array
-    mean_final_cost: float
-    by_constraint: dict[str, int]
+    max_input: float  # largest |u| over all runs
+    times: Array  # (N + 1,)
+    mean_cost: Array  # (N + 1,): mean stage cost at each time; at the last one of the state alone
+    mean_final_cost: float  # its last entry
+    by_constraint: dict[str, int]  # label to the number of runs that broke it (in continuous time: first)
     seconds: float
 
 

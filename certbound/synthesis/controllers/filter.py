@@ -59,28 +59,15 @@ MOST_SUBSTEPS = 16
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FilterReport:
-    """One step of the filter.
-
-    Parameters
-    ----------
-    time : float
-    input : ndarray, shape (m,)
-        What to apply.
-    changed : float
-        Largest change of an input.
-    feasible : bool
-        The step is proved: everything within the tube around the noise-free path keeps the constraints up to the next
-        sample. Otherwise they are missed by as little as the program found.
-    room : float
-        Least H over the faces at the next noise-free state, in floating point.
-    seconds : float
-    """
+    """One step of the filter."""
 
     time: float
-    input: Array
-    changed: float
+    input: Array  # (m,): what to apply
+    changed: float  # largest change of an input
+    # The step is proved: everything within the tube around the noise-free path keeps the constraints up to the next
+    # sample. Otherwise they are missed by as little as the program found.
     feasible: bool
-    room: float
+    room: float  # least H over the faces at the next noise-free state, in floating point
     seconds: float
 
 

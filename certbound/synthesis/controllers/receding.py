@@ -36,37 +36,18 @@ from certbound.synthesis.transcription import Solution, Transcription
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepReport:
-    """One step of the controller.
+    """One step of the controller."""
 
-    Parameters
-    ----------
-    time : float
-        When (steps in discrete time).
-    input : ndarray, shape (m,)
-        What to apply until the next step.
-    state : ndarray, shape (n,)
-        Noise-free state that it was planned from.
-    feasible : bool
-        The tightened problem had a point; otherwise the input comes from the soft one.
-    softened : float
-        Largest miss of a tightened constraint over the prediction; 0 also where the terminal set alone is missed.
-    cost : float
-        Of the prediction.
-    seconds : float
-    iterations : int
-    status : str
-        The solver's word.
-    """
-
-    time: float
-    input: Array
-    state: Array
-    feasible: bool
+    time: float  # when (steps in discrete time)
+    input: Array  # (m,): what to apply until the next step
+    state: Array  # (n,): noise-free state that it was planned from
+    feasible: bool  # the tightened problem had a point; otherwise the input comes from the soft one
+    # largest miss of a tightened constraint over the prediction; 0 also where the terminal set alone is missed
     softened: float
-    cost: float
+    cost: float  # of the prediction
     seconds: float
     iterations: int
-    status: str
+    status: str  # the solver's word
 
 
 class PredictiveController:

@@ -12,31 +12,15 @@ _LARGEST = math.log10(0.999)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Infeasibility:
-    """What stands between a problem and a plan.
+    """What stands between a problem and a plan."""
 
-    Parameters
-    ----------
-    proved : bool
-        Whether it is proved that no inputs keep the noise-free state in the eroded set.
-    kind : str
-        "eroded set empty" (proved), "no noise-free trajectory" (proved) or "solver found no point".
-    constraint : str
-        Where the plan with the most room is held back most.
-    time : float
-    scale : float
-        How much of the tube fits: the largest s found such that s times the erosion does.
-    scale_bound : float
-        Proved upper bound of s; inf where nothing was proved.
-    smallest_delta : float or None
-        Smallest delta for which a plan was found (bisection); None where there is none below 1.
-    """
-
-    proved: bool
-    kind: str
-    constraint: str
+    proved: bool  # whether it is proved that no inputs keep the noise-free state in the eroded set
+    kind: str  # "eroded set empty" (proved), "no noise-free trajectory" (proved) or "solver found no point"
+    constraint: str  # where the plan with the most room is held back most
     time: float
-    scale: float
-    scale_bound: float
+    scale: float  # how much of the tube fits: the largest s found such that s times the erosion does
+    scale_bound: float  # proved upper bound of s; inf where nothing was proved
+    # smallest delta for which a plan was found (bisection); None where there is none below 1
     smallest_delta: float | None
 
     def describe(self, unit: str) -> str:
