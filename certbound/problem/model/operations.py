@@ -20,7 +20,6 @@ from certbound.rigor import series as ts
 from certbound.rigor.arithmetic import Interval
 
 
-
 class Builder(Protocol):
     """What derivatives are made with: ``graph.Graph``."""
 
