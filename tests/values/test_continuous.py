@@ -486,3 +486,18 @@ def test_nodes_are_bent_to_a_start_and_stay_where_a_start_lies_on_an_end():
     kept = through(nodes, (end, end))
     assert np.array_equal(kept, nodes)
     assert np.linalg.cond(Splines(kept).dense[0]) < 1e6
+
+
+def test_a_proposal_of_two_states_that_does_not_span_the_horizon_proves_nothing(monkeypatch) -> None:
+    problem = two_free_states()
+    model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
+    plane = two_states._plane(problem, model, room.inner_low, room.inner_high, starts)
+    plan, real = Plan(cells=8, growth=0.8, lead=0.1, floor=-5.0), two_states.propose_plane
+
+    def short(plane, plan, source=None):
+        surface = real(plane, plan, source)
+        return surface if source is None else dataclasses.replace(surface, times=0.5 * surface.times)
+
+    assert len(list(two_states._uppers(plane, model, starts, plan))) == 2
+    monkeypatch.setattr(two_states, "propose_plane", short)
+    assert list(two_states._uppers(plane, model, starts, plan)) == []

@@ -78,17 +78,20 @@ def _rough_level(plane: Plane) -> float:
 def _uppers(plane: Plane, model: Model, starts: list[Pair], plan: Plan) -> Iterator[float]:
     """Proved upper bounds, one after another."""
     surface = propose_plane(plane, plan)
-    if surface is None or not covers(surface, plane.horizon, plane.low, plane.high, within=True):
+    if surface is None:
         return
     source = _source(surface, *sampled_residual(surface, model))
     for attempt in range(2):
         better = propose_plane(plane, plan, source)
-        if better is None:
-            if attempt == 0:
-                yield examine_upper(surface, model, starts)[0].log
+        if better is None and attempt:
             return
-        payment, excess, low = examine_upper(better, model, starts)
+        candidate = better or surface  # without a better one the first one is proved as it is
+        if not covers(candidate, plane.horizon, plane.low, plane.high, within=True):
+            return
+        payment, excess, low = examine_upper(candidate, model, starts)
         yield payment.log
+        if better is None:
+            return
         source = source.plus(_source(better, excess, low))
 
 
