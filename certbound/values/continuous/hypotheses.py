@@ -41,6 +41,7 @@ from certbound.values.continuous.surface import Surface
 Found = TypeVar("Found")
 
 _LIFTS = (0.0, 0.003, 0.02, 0.1)
+_NEAR = 40.0  # units of NEGLIGIBLE
 NEGLIGIBLE = 5e-4
 """lam and eps (in units of the bound), summed over the horizon, that are granted without being looked at."""
 
@@ -102,9 +103,10 @@ class Need:
         return self.spare * (1 + np.exp(np.minimum(self.start - high, 700.0)) * (1 - 1e-13)) * (1 - 1e-13)
 
 
-def examine(surface: Surface, model: Model, need: Need) -> Proof:
-    """Enclose R, V and Q2 on every patch of a surface that needs it."""
+def examine(surface: Surface, model: Model, need: Need, *, upper: bool) -> Proof:
+    """Enclose R (closely on one side), V and Q2 on every patch of a surface that needs it."""
     counts = model.counts()
+    near = (math.inf, _NEAR * need.spare) if upper else (_NEAR * need.spare, math.inf)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
 
@@ -117,7 +119,7 @@ def examine(surface: Surface, model: Model, need: Need) -> Proof:
         kept = np.flatnonzero(~(low >= need.top) & ~(size <= need.free(high)))  # what is no number is looked at
         if not len(kept):
             return None
-        ranges = bound_ranges(patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare)
+        ranges = bound_ranges(patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare, near=near)
         return ends[0] * per + kept, ranges
 
     found = [one for one in _side_by_side(look, list(surface.chunks())) if one is not None]
@@ -201,7 +203,7 @@ def examine_upper(
         surface = surface.raised(1e-12 * (1 + lift))
     start = _up(extreme_over(surface, starts, upper=True))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
-    proof = examine(surface, model, need)
+    proof = examine(surface, model, need, upper=True)
     floor = float(surface.range_at(-1)[0].min())
     best: Payment | None = None
     for lift in _LIFTS:  # V + lift has the same residual, and nothing is due where it is positive
@@ -224,7 +226,7 @@ def prove_lower(surface: Surface, model: Model, starts: Sequence[tuple[float, fl
         surface = surface.raised(-highest - 1e-12 * (1 + highest))
     start = -_up(-extreme_over(surface, starts, upper=False))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=np.inf)
-    proof = examine(surface, model, need)
+    proof = examine(surface, model, need, upper=False)
     if np.any(proof.ranges.high > 0):
         return None
     patched = _patched(proof, -proof.ranges.residual_low, need, surface.steps)
