@@ -40,8 +40,8 @@ from certbound.values.continuous.surface import Surface
 
 Found = TypeVar("Found")
 
-_LIFTS = (0.0, 0.003, 0.02, 0.1)
-_NEAR = 40.0  # units of NEGLIGIBLE
+LIFTS = (0.0, 0.003, 0.01, 0.02, 0.035, 0.06, 0.1)
+_NEAR = 40.0  # in units of what is granted without being looked at
 NEGLIGIBLE = 5e-4
 """lam and eps (in units of the bound), summed over the horizon, that are granted without being looked at."""
 
@@ -83,12 +83,6 @@ class Proof:
     slab: Index
     cell: Index
 
-    def spread(self, values: Array, surface: Surface, rest: float) -> Array:
-        """One value a patch, shape (slabs, *cells), ``rest`` where nothing was looked at."""
-        table = np.full((surface.slabs, int(np.prod(surface.cells))), rest)
-        table[self.slab, self.cell] = values
-        return table.reshape(surface.slabs, *surface.cells)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Need:
@@ -106,9 +100,9 @@ class Need:
 def examine(surface: Surface, model: Model, need: Need, *, upper: bool) -> Proof:
     """Enclose R (closely on one side), V and Q2 on every patch of a surface that needs it."""
     counts = model.counts()
-    near = (math.inf, _NEAR * need.spare) if upper else (_NEAR * need.spare, math.inf)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
+    share = _NEAR * (0.5 + 0.5 * surface.times[-1] / (surface.slabs * surface.steps))
 
     def look(ends: tuple[int, int]) -> tuple[Index, Ranges] | None:
         patches = surface.patches(*ends)
@@ -119,7 +113,10 @@ def examine(surface: Surface, model: Model, need: Need, *, upper: bool) -> Proof
         kept = np.flatnonzero(~(low >= need.top) & ~(size <= need.free(high)))  # what is no number is looked at
         if not len(kept):
             return None
-        ranges = bound_ranges(patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare, near=near)
+        ranges = bound_ranges(
+            patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare,
+            near=share[ends[0] + kept // per] * need.free(high[kept]), upper=upper,
+        )  # fmt: skip
         return ends[0] * per + kept, ranges
 
     found = [one for one in _side_by_side(look, list(surface.chunks())) if one is not None]
@@ -190,13 +187,6 @@ def covers(surface: Surface, horizon: float, low: Sequence[float], high: Sequenc
 
 def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment:
     """An upper bound of log P(leaving the box of the surface by its last time), whatever the surface is."""
-    return examine_upper(surface, model, starts)[0]
-
-
-def examine_upper(
-    surface: Surface, model: Model, starts: Sequence[tuple[float, float]]
-) -> tuple[Payment, Array, Array]:
-    """`prove_upper`, and for every patch an upper bound of R and a lower one of V (-inf and inf where none is due)."""
     lift = max(0.0, -min(surface.face_range(axis, side)[0] for axis in range(len(surface.axes)) for side in (0, 1)))
     surface = surface.raised(_up(lift)) if lift else surface
     if any(surface.face_range(axis, side)[0] < 0 for axis in range(len(surface.axes)) for side in (0, 1)):
@@ -206,15 +196,14 @@ def examine_upper(
     proof = examine(surface, model, need, upper=True)
     floor = float(surface.range_at(-1)[0].min())
     best: Payment | None = None
-    for lift in _LIFTS:  # V + lift has the same residual, and nothing is due where it is positive
+    for lift in LIFTS:  # V + lift has the same residual, and nothing is due where it is positive
         if best is not None and start + lift >= best.log:
             break
         patched = _patched(proof, proof.ranges.residual_high, need, surface.steps, lift)
         payment = pay_upper(patched, _up(start + lift), floor + lift - 1e-15 * (1 + abs(floor)))
         best = payment if best is None or payment.log < best.log else best
     assert best is not None
-    high = proof.spread(proof.ranges.residual_high, surface, -np.inf)
-    return best, high, proof.spread(proof.ranges.low, surface, np.inf)
+    return best
 
 
 def prove_lower(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment | None:

@@ -59,20 +59,16 @@ def to_bernstein(count: int) -> Array:
     return _rounded(_inverse(_bernstein_rows(nodes_of(count), count - 1)))
 
 
-@lru_cache(maxsize=32)
-def to_parts(count: int, halvings: int) -> Array:
-    """`to_bernstein` for each part of [0, 1] alone: halves, then quarters, ..., one matrix a part.
+@lru_cache(maxsize=64)
+def to_parts(count: int, parts: int) -> Array:
+    """`to_bernstein` for each of ``parts`` equal parts of [0, 1], a power of 2, alone: shape (parts, count, count).
 
     The coefficients on a part are averages of those on the whole, so that no matrix is larger than `to_bernstein`.
     """
     nodes = [Fraction(node) for node in nodes_of(count)]
     inverse = _inverse(_bernstein_rows(nodes_of(count), count - 1))
-    found = []
-    for parts in (2**level for level in range(1, halvings + 1)):
-        for part in range(parts):
-            rows = _rows_at([(part + node) / parts for node in nodes], count - 1)
-            found.append(_rounded(_product(inverse, _product(rows, inverse))))
-    return np.array(found)
+    there = [_rows_at([(part + node) / parts for node in nodes], count - 1) for part in range(parts)]
+    return np.array([_rounded(_product(inverse, _product(rows, inverse))) for rows in there])
 
 
 @lru_cache(maxsize=128)
@@ -100,7 +96,7 @@ def lebesgue(count: int) -> float:
     parts = max(256, 2 ** (2 * (count - 1) ** 2 - 1).bit_length())
     finer = tuple(k / parts for k in range(parts + 1))
     # between the points it changes by at most 2 degree^2 per unit (Markov) times its norm
-    return norm(interpolation(count, finer)) / (1 - (count - 1) ** 2 / parts)
+    return float(norm(interpolation(count, finer)) / (1 - (count - 1) ** 2 / parts))
 
 
 def norm(matrix: Array) -> float:

@@ -77,7 +77,7 @@ def along(matrix: Array, array: Array, axis: int) -> Array:
 
 def bound_ranges(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], *, wanted: float = 0.0, near: tuple[float, float] = (math.inf, math.inf),
+    counts: Sequence[int], *, wanted: float = 0.0, near: Array | float = math.inf, upper: bool = True,
 ) -> Ranges:
     """Ranges of R (its maximum over the drifts), V and Q2; see the module.
 
@@ -93,8 +93,8 @@ def bound_ranges(
         Samples in time and in each state; at least the degree of R plus 1.
     wanted : float
         Where |R| <= ``wanted`` the bound of Q2 may be 0, which saves its evaluation.
-    near : (float, float)
-        How far below the least and above the largest sample of R its bounds may lie before the halves and quarters of
+    near : float or ndarray, shape (B,)
+        How far from the samples of R its bound, the upper or the lower one, may lie before the halves and quarters of
         a patch are looked at; two states.
 
     Notes
@@ -104,7 +104,7 @@ def bound_ranges(
     """
     n = len(patches.widths)
     extremes = _in_plane if n == 2 else _on_line
-    least, most, floor, largest = extremes(patches, drifts, squares, place, counts, wanted, near)
+    least, most, floor, largest = extremes(patches, drifts, squares, place, counts, wanted, near, upper)
     error, sizes = _errors(patches, squares.size[:, place], n)
     loss = _diffusive_loss(patches, squares.remainder[:, place], n)
     sampled = float(np.prod([lebesgue(count) for count in counts])) * _ROUNDOFFS
@@ -127,7 +127,7 @@ Extremes = tuple[Array, Array, Array, Array]
 
 def _on_line(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], wanted: float, near: tuple[float, float],
+    counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
 ) -> Extremes:
     """Least and largest Bernstein coefficients of R, one row a branch, the least of Q2, and the sizes of the samples.
 
@@ -152,12 +152,18 @@ def _on_line(
 
 def _in_plane(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], wanted: float, near: tuple[float, float],
+    counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
 ) -> Extremes:
-    """The same in two states, compiled."""
-    whole = tuple(np.array(to_bernstein(count)) for count in counts)
-    out = _run_plane(patches, drifts, squares, place, counts, whole, wanted, near)
-    sizes = np.vstack([out[:, :, 3].T, out[:, :, 4].max(axis=1)])
+    """The same in two states, compiled; halves and quarters are looked at where the coefficients lie far off."""
+    out = _run_plane(patches, drifts, squares, place, counts, 1, wanted)
+    near = np.broadcast_to(near, len(out))
+    for parts in (2, 4):
+        far = out[:, :, 1] - np.maximum(out[:, :, 4], 0) if upper else np.minimum(out[:, :, 3], 0) - out[:, :, 0]
+        beyond = np.maximum(out[:, :, 4] if upper else -out[:, :, 3], 0)
+        bad = np.flatnonzero(np.any(far > near[:, None] + 0.05 * beyond, axis=1))
+        if len(bad):
+            out[bad] = _run_plane(patches.take(bad), drifts, squares, place[bad], counts, parts, wanted)
+    sizes = np.vstack([np.maximum(-out[:, :, 3], out[:, :, 4]).T, out[:, :, 5].max(axis=1)])
     return out[:, :, 0].T, out[:, :, 1].T, out[:, :, 2].min(axis=1), sizes
 
 
@@ -166,26 +172,26 @@ def sample_in_plane(
     counts: Sequence[int],
 ) -> Array:
     """The largest sample of R over each patch and all branches, two states: a sketch, no bound."""
-    same = tuple(np.eye(count) for count in counts)
-    return np.asarray(_run_plane(patches, drifts, squares, place, counts, same, np.inf, (np.inf, np.inf))[:, :, 1].max(axis=1))
+    return np.asarray(_run_plane(patches, drifts, squares, place, counts, 0, np.inf)[:, :, 4].max(axis=1))
 
 
 def _run_plane(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], inverses: tuple[Array, ...], wanted: float, near: tuple[float, float],
+    counts: Sequence[int], parts: int, wanted: float,
 ) -> Array:
+    """What the kernel finds with this many parts along each axis; samples alone for 0."""
     from certbound.values.continuous.kernel import extremes_in_plane
 
     time, x, y = (
         _derivatives(count, degree, orders) for count, degree, orders in zip(counts, (TIME, SPACE, SPACE), (2, 3, 3))
     )
-    parts = tuple(to_parts(count, 2) for count in counts)
-    out = np.empty((len(patches.size), len(drifts), 5))
+    changes = tuple(to_parts(count, parts) if parts else np.empty((0, count, count)) for count in counts)
+    out = np.empty((len(patches.size), len(drifts), 6))
     width_x, width_y = patches.widths
     extremes_in_plane(
         np.ascontiguousarray(patches.coefficients), patches.step, width_x, width_y, place,
         np.ascontiguousarray([drift.samples for drift in drifts]), np.ascontiguousarray(squares.samples),
-        (*time, *x, *y), inverses, parts, wanted, near, out,
+        (*time, *x, *y), changes, wanted, out,
     )  # fmt: skip
     return out
 
