@@ -293,7 +293,7 @@ def spoilt(surface: Surface, rng: np.random.Generator, size: float) -> Surface:
     noisy = {}
     for name in ("values", "start_rates", "end_rates"):
         data = getattr(surface, name)
-        noisy[name] = data + size * np.abs(data).mean() * rng.normal(size=data.shape)
+        noisy[name] = data * (1 + size * rng.normal(size=data.shape))
     return dataclasses.replace(surface, **noisy)
 
 
@@ -307,8 +307,8 @@ def proposals():
     line = exits._line(problem, model, room.inner_low[0], room.inner_high[0])
     rough = sketch(line)
     short, far = sealed(line, rough.level)
-    upper = propose_upper(short, rough.level, 0.05, share=0.01, cells=90, tolerance=5e-4)
-    lower = propose_lower(line, rough.level, 0.1, far, share=0.1, cells=90, tolerance=2e-4)
+    upper = propose_upper(short, rough, 0.07, fineness=2.5, tolerance=3e-4)
+    lower = propose_lower(line, rough, 0.14, far, fineness=2.5, tolerance=2e-4)
     return model, starts_of(problem), upper, lower
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import time
@@ -19,15 +20,21 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Reader, enclose, squared_diffusion
 from certbound.values.continuous.hypotheses import Model, covers, extreme_over, prove_lower, prove_upper
-from certbound.values.continuous.proposal import Line, sketch
+from certbound.values.continuous.proposal import Line, Sketch, sketch
 from certbound.values.continuous.room import Room, safe_room, starts_of
 from certbound.values.continuous.shapes import propose_lower, propose_upper, sealed
+from certbound.values.continuous.surface import Surface
 
 Starts = list[tuple[float, float]]
 
 _LN10 = math.log(10)
-_LEAD = 0.012
-_SHARES = (0.003, 0.1)
+_LADDER = ((4.0, 1e-4, 0.008), (4.5, 3e-5, 0.005), (6.0, 1e-5, 0.003), (8.0, 3e-6, 0.002))
+"""Cells a bend, error a step, and lead (a share of the horizon, by d log P / d log T): one attempt after another."""
+_DEARER = 2.0  # what the next attempt costs, in units of the last one
+_SMALL_GAIN = 0.005
+_RATE = 80_000.0
+"""Patches of 63 samples that are taken for a second: measured once, so that a grant of seconds is one of work."""
+_USUAL_SAMPLES = 63.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -63,7 +70,8 @@ def bound_exits(
     target : region, optional
         Not served yet.
     seconds : float
-        When to stop refining; the first attempt is finished in any case.
+        How long to refine; the first attempt is finished in any case. In one state seconds stand for so many
+        patches of work, so that the bounds do not depend on the machine or its load.
     lower : bool
         Whether to look for a lower bound too (one state; there is none in two).
 
@@ -93,7 +101,7 @@ def bound_exits(
     model = _model(problem)
     _check_noise(model, room, problem)
     if problem.system.dimension == 1:
-        upper, least, words = _one_state(problem, model, room, begin + seconds, lower)
+        upper, least, words = _one_state(problem, model, room, seconds * _RATE, lower)
     else:
         from certbound.values.continuous.two_states import two_states
 
@@ -186,50 +194,48 @@ def _line(problem: Problem, model: Model, low: float, high: float) -> Line:
 
 
 def _one_state(
-    problem: Problem, model: Model, room: Room, deadline: float, lower: bool
+    problem: Problem, model: Model, room: Room, budget: float, lower: bool
 ) -> tuple[float, float | None, str]:
-    """Refine both sides until the time is spent or a refinement gains less than half a per cent."""
+    """Refine both sides until the work is spent or a refinement gains less than half a per cent."""
     starts = starts_of(problem)
     inner = _line(problem, model, room.inner_low[0], room.inner_high[0])
     outer = _line(problem, model, room.outer_low[0], room.outer_high[0])
-    rough = sketch(inner)
-    found = _Found(level=rough.level)
-    effort, tolerance, lead = 60.0, 1.5e-4, _LEAD
-    for attempt in range(5):
-        begin = time.perf_counter()
-        cells = int(effort * (1 + 0.2 * min(-found.level, 80)))
-        span = inner.horizon * lead / max(rough.growth, 1.0)
-        gain = _raise_upper(found, inner, model, starts, span, cells, tolerance)
+    found = _Found(rough=sketch(inner))
+    for fineness, tolerance, lead in _LADDER:
+        before = found.work
+        span = inner.horizon * lead / max(found.rough.growth, 1.0)
+        gain = _raise_upper(found, inner, model, starts, span, fineness, tolerance)
         if lower:
-            gain = max(gain, _raise_lower(found, outer, model, starts, 3 * span, cells, tolerance))
-        spent = time.perf_counter() - begin
-        if (gain < 0.005 and attempt > 0) or time.perf_counter() + 2.5 * spent > deadline:
+            gain = max(gain, _raise_lower(found, outer, model, starts, span, fineness, tolerance))
+        if gain < _SMALL_GAIN or found.work + _DEARER * (found.work - before) > budget:
             break
-        effort, tolerance, lead = effort * 1.4, tolerance / 3, lead * 0.6
     words = f"value function in one state, cells x slabs of time: {', '.join(found.done) or 'none came to an end'}"
     return found.upper, found.lower, words
 
 
 @dataclass(slots=True)
 class _Found:
-    """The best bounds so far (natural logarithms), and log P as far as it is known."""
+    """The best bounds so far (natural logarithms), log P as far as it is known, and the patches that were proved."""
 
-    level: float
+    rough: Sketch
     upper: float = 0.0
     lower: float | None = None
     done: list[str] = field(default_factory=list)
+    work: float = 0.0
 
 
 def _raise_upper(
-    found: _Found, line: Line, model: Model, starts: Starts, span: float, cells: int, tolerance: float
+    found: _Found, line: Line, model: Model, starts: Starts, span: float, fineness: float, tolerance: float
 ) -> float:
     """One attempt at the upper bound; what it gained."""
-    short, _ = sealed(line, found.level)
-    surface = propose_upper(short, found.level, span, share=_SHARES[0], cells=cells, tolerance=tolerance)
+    short, _ = sealed(line, found.rough.level)
+    surface = propose_upper(short, found.rough, span, fineness=fineness, tolerance=tolerance)
     if surface is None or not covers(surface, line.horizon, [line.low], [line.high], within=True):
         return 0.0
-    found.done.append(f"{cells} x {surface.slabs}")
-    found.level = min(found.level, extreme_over(surface, starts, upper=True))
+    found.done.append(f"{surface.cells[0]} x {surface.slabs}")
+    found.work += _patches_in(surface, model)
+    level = min(found.rough.level, extreme_over(surface, starts, upper=True))
+    found.rough = dataclasses.replace(found.rough, level=level)
     value = prove_upper(surface, model, starts).log
     gain = found.upper - value
     found.upper = min(found.upper, value)
@@ -237,16 +243,22 @@ def _raise_upper(
 
 
 def _raise_lower(
-    found: _Found, line: Line, model: Model, starts: Starts, span: float, cells: int, tolerance: float
+    found: _Found, line: Line, model: Model, starts: Starts, span: float, fineness: float, tolerance: float
 ) -> float:
     """One attempt at the lower bound; what it gained."""
-    _, far = sealed(line, found.level)
-    surface = propose_lower(line, found.level, span, far, share=_SHARES[1], cells=cells, tolerance=0.3 * tolerance)
+    _, far = sealed(line, found.rough.level)
+    surface = propose_lower(line, found.rough, 2 * span, far, fineness=fineness, tolerance=0.5 * tolerance)
     if surface is None or not covers(surface, line.horizon, [line.low], [line.high], within=False):
         return 0.0
+    found.work += _patches_in(surface, model)
     payment = prove_lower(surface, model, starts)
     if payment is None:
         return 0.0
     gain = math.inf if found.lower is None else payment.log - found.lower
     found.lower = payment.log if found.lower is None else max(found.lower, payment.log)
     return gain
+
+
+def _patches_in(surface: Surface, model: Model) -> float:
+    """Patches of a surface, each worth as many as its samples and branches make of it."""
+    return surface.slabs * surface.cells[0] * math.prod(model.counts()) * len(model.branches) / _USUAL_SAMPLES

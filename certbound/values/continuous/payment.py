@@ -175,7 +175,7 @@ def _proposals(patched: Patched, start: float, *, upper: bool) -> Iterator[Level
         edges = -BIN * np.arange(count, -1, -1.0)
         if count:
             first, last = lowest + count, np.minimum(highest, -1) + count
-            need = (patched.excess - base / horizon) / np.maximum(patched.energy, 1e-300)
+            need = (patched.excess - base / horizon) / np.maximum(patched.energy, 1e-200)
             here = np.flatnonzero((last >= 0) & (need > 0) & (need <= cap))
             need, first, last = need[here], np.maximum(first[here], 0), last[here]
             for offset in range(int(np.max(last - first, initial=-1)) + 1):
@@ -222,7 +222,7 @@ def _rates(patched: Patched, levels: Levels, start: float) -> tuple[Array, Array
     top = np.zeros(slabs)
     np.maximum.at(top, patched.slab, excess)
     best, eps = top.copy(), np.zeros(slabs)
-    ratio, peak = excess / np.maximum(reach, 1e-300), top[patched.slab] / np.maximum(reach, 1e-300)
+    ratio, peak = excess / np.maximum(reach, 1e-200), top[patched.slab] / np.maximum(reach, 1e-200)
     for share in (0.0, *np.geomspace(3e-4, 0.9, 12)):
         extra = np.zeros(slabs)
         np.maximum.at(extra, patched.slab, ratio - share * peak)
