@@ -56,11 +56,16 @@ class Sketch:
     growth: float
 
 
-def sketch(line: Line, *, cells: int = 400, steps: int = 240) -> Sketch:
-    """A rough solution, accurate to some per cent at any size of u (monotone rates, an L-stable step of order 2)."""
+def sketch(
+    line: Line, *, cells: int = 400, steps: int = 240, begin: Callable[[Array], Array] | None = None
+) -> Sketch:
+    """A rough solution, accurate to some per cent at any size of u (monotone rates, an L-stable step of order 2).
+
+    u is 0 at the horizon unless ``begin`` says what it is.
+    """
     x = graded(line, cells, [0.002 * (line.high - line.low)] * 2)
     left, right = np.diff(x)[:-1], np.diff(x)[1:]
-    u = np.zeros(len(x))
+    u = np.zeros(len(x)) if begin is None else begin(x)
     u[0] = u[-1] = 1.0
     tau = line.horizon * np.concatenate([[0.0], np.geomspace(1e-5, 1.0, steps)])
     rates = _rates(line, 0.0, x, u, left, right)

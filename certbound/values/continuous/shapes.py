@@ -17,7 +17,7 @@ from certbound.values.continuous.proposal import Boundary, Line, Sketch, propose
 from certbound.values.continuous.surface import Surface
 
 _SPARE = 8.0
-_SHARE = 0.005
+LOWER_SHARE = 0.005
 """What a lower bound starts from at the horizon, as a share of P; it is subtracted at last."""
 _ROOM = 6.0  # how far below the answer V is to be known, as a logarithm
 _BACKGROUND = 0.3  # share of the cells that is spread evenly
@@ -65,15 +65,15 @@ def propose_upper(line: Line, rough: Sketch, lead: float, *, fineness: float, to
     fineness : float
         Cells for each length over which V bends.
     """
-    layers = [_layer(line, side, lead) for side in (0, 1)]
+    layers = [layer(line, side, lead) for side in (0, 1)]
 
     def profile(x: Array) -> Array:
         far = [rate * _distance(line, x, side) for side, (rate, _) in enumerate(layers)]
-        return _either(*(np.log1p(bend * away) - away for away, (_, bend) in zip(far, layers)))
+        return either(*(np.log1p(bend * away) - away for away, (_, bend) in zip(far, layers)))
 
     zero = np.zeros(2)
     boundary = Boundary(profile=profile, faces=lambda tau: (zero, zero), step=0.02 * lead)
-    nodes = spread(line, [rate for rate, _ in layers], rough, fineness)
+    nodes = spread(line, [(line.low, layers[0][0]), (line.high, layers[1][0])], rough, fineness)
     return propose(line, nodes, boundary, tolerance=tolerance, level=rough.level)
 
 
@@ -81,7 +81,7 @@ def propose_lower(
     line: Line, rough: Sketch, lead: float, far: tuple[bool, bool], *, fineness: float, tolerance: float
 ) -> Surface | None:
     """V small at T; on the faces it rises to 0 within ``lead``, save on those that no path reaches: V' = 0 there."""
-    top = rough.level + float(np.log(_SHARE))
+    top = rough.level + float(np.log(LOWER_SHARE))
 
     def faces(tau: float) -> tuple[Array, Array]:
         s = min(tau / lead, 1.0)
@@ -89,18 +89,19 @@ def propose_lower(
         rate = -top * 30 * (s * (1 - s)) ** 2 / lead
         return np.full(2, value), np.full(2, rate)
 
-    rates = [_rise(line, side, -2 * top / lead) for side in (0, 1)]
+    rates = [rise(line, side, -2 * top / lead) for side in (0, 1)]
 
     def profile(x: Array) -> Array:
         rows = [np.full(len(x), -np.inf) if far[k] else -rates[k] * _distance(line, x, k) for k in (0, 1)]
-        return top + (_either(*rows) if not all(far) else 0 * x)
+        return top + (either(*rows) if not all(far) else 0 * x)
 
     boundary = Boundary(profile=profile, faces=faces, step=0.02 * lead, free=far)
-    nodes = spread(line, [None if far[k] else rates[k] for k in (0, 1)], rough, fineness)
+    marks = [(end, rate) for end, rate, out in zip((line.low, line.high), rates, far) if not out]
+    nodes = spread(line, marks, rough, fineness)
     return propose(line, nodes, boundary, tolerance=tolerance, level=rough.level)
 
 
-def _either(first: Array, second: Array) -> Array:
+def either(first: Array, second: Array) -> Array:
     """log(1 - (1 - e^first)(1 - e^second)): 0 exactly wherever one of them is."""
     most, least = np.maximum(first, second), np.minimum(first, second)
     return np.asarray(most + np.log1p(np.exp(least - most) - np.exp(least)))
@@ -117,7 +118,7 @@ def _at_face(line: Line, side: int) -> tuple[float, float]:
     return max(float(line.square(line.horizon, x)[0]), 1e-300), inward
 
 
-def _layer(line: Line, side: int, lead: float) -> tuple[float, float]:
+def layer(line: Line, side: int, lead: float) -> tuple[float, float]:
     """Rate k and bend c of the layer (1 + c k d) exp(-k d), whose u'' a / 2 + f u' is 0 at the face."""
     a, inward = _at_face(line, side)
     rate = 1.3 * float(np.sqrt(2 / (a * lead))) + 4 * max(inward, 0.0) / a
@@ -125,28 +126,33 @@ def _layer(line: Line, side: int, lead: float) -> tuple[float, float]:
     return rate, float(np.clip(bend, 0.0, 0.9))
 
 
-def _rise(line: Line, side: int, speed: float) -> float:
+def rise(line: Line, side: int, speed: float) -> float:
     """The slope k at which V = -k d follows a face whose value rises at that speed: a k^2 / 2 - f k = speed."""
     a, inward = _at_face(line, side)
     return (inward + float(np.sqrt(max(inward, 0.0) ** 2 + 2 * a * max(speed, 1e-9)))) / a
 
 
-def spread(line: Line, rates: Sequence[float | None], rough: Sketch, fineness: float) -> Array:
+def spread(line: Line, marks: Sequence[tuple[float, float]], rough: Sketch, fineness: float) -> Array:
     """Nodes in proportion to the lengths over which V bends, 1/sqrt(a V''), wherever it is not far below the answer.
 
-    Near a face V is a line of slope k that turns into a parabola at the distance a k tau: sqrt(k / d) bends a length;
-    and where the parabola is above log P - 6, at most sqrt(2 L) / d, L = 6 - log P. At t = 0 the sketch knows V''.
+    Beside a mark (place, k) V is a line of slope k that turns into a parabola at the distance a k tau: sqrt(k / d)
+    bends a length; and where the parabola is above log P - 6, at most sqrt(2 L) / d, L = 6 - log P. At t = 0 the sketch
+    knows V''.
     """
-    fine = np.linspace(line.low, line.high, 8001)
+    even = np.linspace(line.low, line.high, 8001)
+    away = np.geomspace(0.02, 200.0, 400)
+    close = [place + np.concatenate([-away, away]) / rate for place, rate in marks]
+    fine = np.unique(np.concatenate([even, *close]))
+    fine = fine[(fine >= line.low) & (fine <= line.high)]
     scale = 1 / np.sqrt(np.maximum(line.square(0.5 * line.horizon, fine), 1e-300))
     way = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(fine))])
     depth = max(-rough.level, 1.0) + _ROOM
     density = _bends(rough, fine) / scale
-    for rate, distance, unit in zip(rates, (way, way[-1] - way), scale[[0, -1]]):
-        if rate is not None:
-            slope = rate / unit
-            near, later = np.sqrt(slope / (distance + 1 / slope)), np.sqrt(2 * depth) / np.maximum(distance, 1e-12)
-            density = density + np.minimum(near, later)
+    for place, rate in marks:
+        slope = rate / float(np.interp(place, fine, scale))
+        distance = np.abs(way - np.interp(place, fine, way))
+        near, later = np.sqrt(slope / (distance + 1 / slope)), np.sqrt(2 * depth) / np.maximum(distance, 1e-12)
+        density = density + np.minimum(near, later)
     density = density + (_BACKGROUND * np.trapezoid(density, way) + 4) / way[-1]
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(way))])
     nodes = np.interp(np.linspace(0, total[-1], int(np.ceil(fineness * total[-1])) + 1), total, fine)
