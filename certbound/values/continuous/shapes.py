@@ -1,4 +1,4 @@
-"""What proposals in one state start from: end profiles, faces, grids, and cut ends (plain floats).
+"""What proposals in one state are made of: layers at faces, grids, and cut ends (plain floats).
 
 No floor is put under V: at the horizon it falls from each face as a straight line, V = -k d, and evolves from there
 into the parabola -d^2 / (2 a tau) by a smooth tangent, with no corner that travels through the grid. Where V is far
@@ -13,12 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.values.continuous.proposal import Boundary, Line, Sketch, propose, through
-from certbound.values.continuous.surface import Surface
+from certbound.values.continuous.proposal import Line, Sketch, through
 
 _SPARE = 8.0
-LOWER_SHARE = 0.005
-"""What a lower bound starts from at the horizon, as a share of P; it is subtracted at last."""
 _ROOM = 6.0  # how far below the answer V is to be known, as a logarithm
 _BACKGROUND = 0.3  # share of the cells that is spread evenly
 
@@ -51,54 +48,6 @@ def _cut(line: Line, side: int, barrier: float) -> float | None:
     if not height[-1] > 1.3 * barrier:
         return None
     return float(x[int(np.argmax(height > barrier))])
-
-
-def propose_upper(line: Line, rough: Sketch, lead: float, *, fineness: float, tolerance: float) -> Surface | None:
-    """V = 0 on both faces; at T a layer at each face, evolved for about ``lead``.
-
-    Parameters
-    ----------
-    rough : Sketch
-        Its ``level`` is an estimate of log P.
-    lead : float
-        Time by which the end profile is ahead: the relative cost is that of a longer horizon.
-    fineness : float
-        Cells for each length over which V bends.
-    """
-    layers = [layer(line, side, lead) for side in (0, 1)]
-
-    def profile(x: Array) -> Array:
-        far = [rate * _distance(line, x, side) for side, (rate, _) in enumerate(layers)]
-        return either(*(np.log1p(bend * away) - away for away, (_, bend) in zip(far, layers)))
-
-    zero = np.zeros(2)
-    boundary = Boundary(profile=profile, faces=lambda tau: (zero, zero), step=0.02 * lead)
-    nodes = spread(line, [(line.low, layers[0][0]), (line.high, layers[1][0])], rough, fineness)
-    return propose(line, nodes, boundary, tolerance=tolerance, level=rough.level)
-
-
-def propose_lower(
-    line: Line, rough: Sketch, lead: float, far: tuple[bool, bool], *, fineness: float, tolerance: float
-) -> Surface | None:
-    """V small at T; on the faces it rises to 0 within ``lead``, save on those that no path reaches: V' = 0 there."""
-    top = rough.level + float(np.log(LOWER_SHARE))
-
-    def faces(tau: float) -> tuple[Array, Array]:
-        s = min(tau / lead, 1.0)
-        value = top * (1 - s**3 * (10 - 15 * s + 6 * s * s))
-        rate = -top * 30 * (s * (1 - s)) ** 2 / lead
-        return np.full(2, value), np.full(2, rate)
-
-    rates = [rise(line, side, -2 * top / lead) for side in (0, 1)]
-
-    def profile(x: Array) -> Array:
-        rows = [np.full(len(x), -np.inf) if far[k] else -rates[k] * _distance(line, x, k) for k in (0, 1)]
-        return top + (either(*rows) if not all(far) else 0 * x)
-
-    boundary = Boundary(profile=profile, faces=faces, step=0.02 * lead, free=far)
-    marks = [(end, rate) for end, rate, out in zip((line.low, line.high), rates, far) if not out]
-    nodes = spread(line, marks, rough, fineness)
-    return propose(line, nodes, boundary, tolerance=tolerance, level=rough.level)
 
 
 def either(first: Array, second: Array) -> Array:

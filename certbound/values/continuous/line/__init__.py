@@ -2,7 +2,7 @@
 
 From the bottom: ``phases`` (what the constraints leave, piece by piece), ``charts`` (coordinates in which moving limits
 stand still), ``profiles`` (what the proposal of a phase starts from), ``joins`` (one surface against the next),
-``chain`` (the proof over all of them), ``ladder`` (finer and finer, until the work is spent).
+``linked`` (the proof over all of them), ``ladder`` (finer and finer, until the work is spent).
 """
 
 from certbound.values.continuous.line.ladder import bound_line

@@ -14,8 +14,8 @@ from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.hypotheses import Model, check_noise
-from certbound.values.continuous.line.chain import Link, prove_above, prove_below, spans
 from certbound.values.continuous.line.charts import model_on
+from certbound.values.continuous.line.linked import Link, prove_above, prove_below, spans
 from certbound.values.continuous.line.phases import Gate, Phase, check_room, last_instant, pieces
 from certbound.values.continuous.line.profiles import End, propose_above, propose_below, shifted, values_of
 from certbound.values.continuous.line.reach import cuts_of
@@ -71,6 +71,11 @@ def bound_line(
     for phase, one in zip(outer.phases, outer.models):
         check_noise(one, (phase.start, phase.end), [(phase.low, phase.high)])
     rough = _sketches(inner)
+    leak = _leak(outer, model, cuts, start) if lower and len(outer.phases) > 1 else -math.inf
+    if leak > -math.inf:
+        outer = dataclasses.replace(
+            outer, phases=[dataclasses.replace(phase, closed=(True, True)) for phase in outer.phases]
+        )
     found = _Found()
     for fineness, tolerance, lead in _LADDER:
         before = found.work
@@ -80,6 +85,7 @@ def bound_line(
             gain = max(gain, _raise_lower(found, outer, start, rough, (share, fineness, 0.5 * tolerance, lead)))
         if gain < _SMALL_GAIN or found.work + _DEARER * (found.work - before) > seconds * _RATE:
             break
+    found.lower = _less(found.lower, leak)
     words = f"value function in one state, cells x slabs of time: {', '.join(found.done) or 'none came to an end'}"
     return found.upper, found.lower, words
 
@@ -92,6 +98,34 @@ def _room(
     models = [model_on(phase, model) for phase in phases]
     lines = [_line(phase, one, start) for phase, one in zip(phases, models)]
     return Room(phases=phases, gates=gates, models=models, lines=lines)
+
+
+def _leak(room: Room, model: Model, cuts: tuple[float, float], start: Start) -> float:
+    """log of a bound of the probability that a path passes a cut while the line is cut there; -inf without cuts.
+
+    Behind a gate V is 0 up to the face, which no small value on that face would allow: so there lower bounds count
+    paths through a cut as failing, and take this off.
+    """
+    ends = [phase.end for phase in room.phases if not all(phase.closed)]
+    if not ends:
+        return -math.inf
+    phase = Phase(start=0.0, end=max(ends), low=cuts[0], high=cuts[1], closed=(True, True))
+    alone = Room(
+        phases=[phase], gates=[Gate(time=phase.end, low=-math.inf, high=math.inf)], models=[model],
+        lines=[_line(phase, model, start)],
+    )  # fmt: skip
+    rough = _sketches(alone)
+    fineness, tolerance, lead = _LADDER[0]
+    links = _above(alone, start, rough, (lead / max(rough[0].growth, 1.0), fineness, tolerance, lead))
+    return 0.0 if links is None or not spans(links, upper=True) else prove_above(links, start).log
+
+
+def _less(lower: float | None, leak: float) -> float | None:
+    """log(e^lower - e^leak), rounded down; None where nothing is left."""
+    if lower is None or leak == -math.inf:
+        return lower
+    left = -math.expm1(min(leak - lower, 0.0))
+    return lower + math.log(left) - 1e-12 * (1 + abs(lower)) if left > 1e-9 else None
 
 
 def _line(phase: Phase, model: Model, start: Start) -> Line:
@@ -173,20 +207,8 @@ def _raise_upper(
     found: _Found, room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
 ) -> float:
     """One attempt at the upper bound; what it gained."""
-    share, fineness, tolerance, _ = effort
-    links: list[Link] = []
-    for k in reversed(range(len(room.phases))):
-        line = room.lines[k]
-        if len(room.phases) == 1 and not start.random:
-            line = sealed(line, rough[0].level)[0]
-        end = _end(room, k, links[0].surface if links else None)
-        surface = propose_above(
-            line, end, rough[k], share * line.horizon, effort[3], fineness=fineness, tolerance=tolerance
-        )
-        if surface is None:
-            return 0.0
-        links.insert(0, _link(room, k, _placed(surface, room.phases[k])))
-    if not spans(links, upper=True):
+    links = _above(room, start, rough, effort)
+    if links is None or not spans(links, upper=True):
         return 0.0
     found.done.append(" + ".join(f"{link.surface.cells[0]} x {link.surface.slabs}" for link in links))
     found.work += _patches_in(links)
@@ -200,23 +222,8 @@ def _raise_lower(
     found: _Found, room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
 ) -> float:
     """One attempt at the lower bound; what it gained."""
-    share, fineness, tolerance, _ = effort
-    links: list[Link] = []
-    for k in reversed(range(len(room.phases))):
-        line, phase = room.lines[k], room.phases[k]
-        far = (False, False)
-        if len(room.phases) == 1 and not start.random:
-            far = sealed(line, rough[0].level)[1]
-            far = (far[0] and phase.closed[0], far[1] and phase.closed[1])
-        end = _end(room, k, links[0].surface if links else None)
-        surface = propose_below(
-            line, end, rough[k], 2 * share * line.horizon, effort[3], phase.closed, far,
-            fineness=fineness, tolerance=tolerance,
-        )  # fmt: skip
-        if surface is None:
-            return 0.0
-        links.insert(0, _link(room, k, _placed(surface, phase)))
-    if not spans(links, upper=False):
+    links = _below(room, start, rough, effort)
+    if links is None or not spans(links, upper=False):
         return 0.0
     found.work += _patches_in(links)
     payment = prove_below(links, start)
@@ -225,6 +232,48 @@ def _raise_lower(
     gain = math.inf if found.lower is None else payment.log - found.lower
     found.lower = payment.log if found.lower is None else max(found.lower, payment.log)
     return gain
+
+
+def _above(
+    room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
+) -> list[Link] | None:
+    """Surfaces for the upper bound, the last phase first."""
+    share, fineness, tolerance, sharpness = effort
+    links: list[Link] = []
+    for k in reversed(range(len(room.phases))):
+        line = room.lines[k]
+        if len(room.phases) == 1 and not start.random:
+            line = sealed(line, rough[0].level)[0]
+        surface = propose_above(
+            line, _end(room, k, links[0].surface if links else None), rough[k], share * line.horizon, sharpness,
+            fineness=fineness, tolerance=tolerance,
+        )  # fmt: skip
+        if surface is None:
+            return None
+        links.insert(0, _link(room, k, _placed(surface, room.phases[k])))
+    return links
+
+
+def _below(
+    room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
+) -> list[Link] | None:
+    """Surfaces for the lower bound."""
+    share, fineness, tolerance, sharpness = effort
+    links: list[Link] = []
+    for k in reversed(range(len(room.phases))):
+        line, phase = room.lines[k], room.phases[k]
+        far = (False, False)
+        if len(room.phases) == 1 and not start.random:
+            far = sealed(line, rough[0].level)[1]
+            far = (far[0] and phase.closed[0], far[1] and phase.closed[1])
+        surface = propose_below(
+            line, _end(room, k, links[0].surface if links else None), rough[k], 2 * share * line.horizon, sharpness,
+            phase.closed, far, fineness=fineness, tolerance=tolerance,
+        )  # fmt: skip
+        if surface is None:
+            return None
+        links.insert(0, _link(room, k, _placed(surface, phase)))
+    return links
 
 
 def _link(room: Room, k: int, surface: Surface) -> Link:

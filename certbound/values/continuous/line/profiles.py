@@ -14,10 +14,11 @@ from scipy.interpolate import BPoly
 
 from certbound.arrays import Array
 from certbound.values.continuous.proposal import Boundary, Line, Sketch, propose
-from certbound.values.continuous.shapes import LOWER_SHARE, either, layer, rise, spread
+from certbound.values.continuous.shapes import either, layer, rise, spread
 from certbound.values.continuous.surface import Surface
 
 Values = Callable[[Array], Array]
+_SHARE = 0.005  # what a lower bound starts from at the horizon, as a share of P; it is subtracted at last
 _APART = 4.0  # how far beyond a gate a lower V begins to rise, in units of its slope
 _BENT = 3.0  # over which length V is bent at a gate, in units of its slope
 _SHARPER = 0.25  # what lower bounds need in addition: their V has to rise from far below
@@ -71,7 +72,7 @@ def propose_above(
         return np.asarray(np.maximum(total, -1e4))
 
     zero = np.zeros(2)
-    boundary = Boundary(profile=profile, faces=lambda tau: (zero, zero), step=0.02 * lead)
+    boundary = Boundary(profile=profile, faces=lambda tau: (zero, zero), step=_first_step(line, end, steep, lead))
     nodes = spread(line, _marks(line, end, [rate for rate, _ in layers], steep), rough, fineness)
     return propose(line, nodes, boundary, tolerance=tolerance, level=rough.level)
 
@@ -81,7 +82,7 @@ def propose_below(
     far: tuple[bool, bool], *, fineness: float, tolerance: float,
 ) -> Surface | None:
     """V <= 0; at the horizon and on cut faces a small share of P, on faces 0 after a rise, V' = 0 on far ones."""
-    top = rough.level + float(np.log(LOWER_SHARE))
+    top = rough.level + float(np.log(_SHARE))
     steep = _gate_slopes(line, rough, _SHARPER * sharpness)
     rates = [rise(line, side, -2 * top / lead) for side in (0, 1)]
     profile = _profile_below(line, end, far, top, rates, steep)
@@ -96,7 +97,7 @@ def propose_below(
         value = at_faces + gap * s**3 * (10 - 15 * s + 6 * s * s)
         return value, gap * 30 * (s * (1 - s)) ** 2 / lead
 
-    boundary = Boundary(profile=profile, faces=faces, step=0.02 * lead, free=far)
+    boundary = Boundary(profile=profile, faces=faces, step=_first_step(line, end, steep, lead), free=far)
     slopes = [None if far[k] else rates[k] for k in (0, 1)]
     nodes = spread(line, _marks(line, end, slopes, steep), rough, fineness)
     return propose(line, nodes, boundary, tolerance=tolerance, level=rough.level)
@@ -188,9 +189,23 @@ def _smooth(s: Array) -> Array:
     return np.asarray(s**3 * (10 - 15 * s + 6 * s * s))
 
 
+def _first_step(line: Line, end: End, steep: list[float], lead: float) -> float:
+    """A step that follows what happens first: a layer at a face, or V that is bent at a gate."""
+    step = 0.02 * lead
+    for side in (0, 1):
+        if _inside(line, end, side):
+            a = float(line.square(line.horizon, _mark(end, side))[0])
+            step = min(step, 0.02 / (a * steep[side] ** 2))
+    return step
+
+
 def _marks(line: Line, end: End, rates: list[float | None], steep: list[float]) -> list[tuple[float, float]]:
     """Faces and ends of the gate, each with the slope of V beside it."""
-    faces = [(place, rate) for place, rate in zip((line.low, line.high), rates) if rate is not None]
+    faces = [
+        (place, rate)
+        for side, (place, rate) in enumerate(zip((line.low, line.high), rates))
+        if rate is not None and not _inside(line, end, side)  # behind a gate V is 0 up to the face
+    ]
     return faces + [(end.gate[side], steep[side]) for side in (0, 1) if _inside(line, end, side)]
 
 

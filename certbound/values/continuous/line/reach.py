@@ -20,6 +20,7 @@ from certbound.values.continuous.line.starts import Start
 
 _PATHS, _STEPS = 400, 200
 _DEVIATIONS = 7.0
+_FARTHEST = 1e9
 
 
 def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]:
@@ -59,14 +60,13 @@ def _spread(problem: Problem, model: Model, start: Start) -> tuple[float, float]
                 f = np.array([np.broadcast_to(drift(k * step, x, *c)[..., 0], x.shape) for c in corners])
                 g = np.sqrt(np.broadcast_to(square(k * step, x)[..., 0, 0], x.shape))
                 x = x + step * sign * (sign * f).max(axis=0) + np.sqrt(step) * g * rng.standard_normal(_PATHS)
-            x = x[np.isfinite(x)]
-            if len(x) < _PATHS:
+            if not np.all(np.abs(x) < _FARTHEST):
                 raise InfeasibleError(_BEYOND)
             middle, deviation = float(np.median(x)), float(np.std(x))
             beyond = _beyond(lambda y, t=k * step: square(t, y)[..., 0, 0], middle, sign * _DEVIATIONS * deviation)
             far = sign * max(sign * far, sign * beyond, float((sign * x).max()))
         ends.append(far)
-    if not np.isfinite(ends).all() or ends[1] - ends[0] > 1e9:
+    if not max(-ends[0], ends[1]) < _FARTHEST:
         raise InfeasibleError(_BEYOND)
     return ends[0], ends[1]
 
