@@ -20,13 +20,14 @@ from certbound.values.continuous import exits, hypotheses, two_states
 from certbound.values.continuous.coefficients import Cells, Reader, enclose, squared_diffusion
 from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
+from certbound.values.continuous.line import ladder
+from certbound.values.continuous.line.starts import start_of
 from certbound.values.continuous.payment import BIN, Levels, Patched, pay_lower, pay_upper, repay
 from certbound.values.continuous.plane_proposal import Plan, Source, propose_plane
 from certbound.values.continuous.polynomials import basis_at, interpolation, node_product, nodes_of, to_bernstein
-from certbound.values.continuous.proposal import Splines, sketch, through
+from certbound.values.continuous.proposal import Splines, through
 from certbound.values.continuous.residual import bound_ranges
 from certbound.values.continuous.room import safe_room, starts_of
-from certbound.values.continuous.shapes import propose_lower, propose_upper, sealed
 from certbound.values.continuous.surface import Surface
 
 
@@ -294,7 +295,7 @@ def spoilt(surface: Surface, rng: np.random.Generator, size: float) -> Surface:
     noisy = {}
     for name in ("values", "start_rates", "end_rates"):
         data = getattr(surface, name)
-        noisy[name] = data + size * np.abs(data).mean() * rng.normal(size=data.shape)
+        noisy[name] = data * (1 + size * rng.normal(size=data.shape))
     return dataclasses.replace(surface, **noisy)
 
 
@@ -305,12 +306,13 @@ def well_truth(horizon: float, start: float) -> float:
 @functools.cache
 def proposals():
     problem = line_problem(*WELL)
-    model, room = exits._model(problem), safe_room(problem)
-    line = exits._line(problem, model, room.inner_low[0], room.inner_high[0])
-    rough = sketch(line)
-    short, far = sealed(line, rough.level)
-    upper = propose_upper(short, rough.level, 0.05, share=0.01, cells=90, tolerance=5e-4)
-    lower = propose_lower(line, rough.level, 0.1, far, share=0.1, cells=90, tolerance=2e-4)
+    model, start = exits._model(problem), start_of(problem)
+    found = []
+    for inner, propose in ((True, ladder._above), (False, ladder._below)):
+        room = ladder._room(problem, model, (-9.0, 9.0), start, inner=inner)
+        (link,) = propose(room, start, ladder._sketches(room), (0.007, 2.5, 3e-4, 0.01))
+        found.append(link.surface)
+    upper, lower = found
     return model, starts_of(problem), upper, lower
 
 
@@ -447,16 +449,15 @@ def test_a_source_is_at_least_what_is_needed_on_every_patch() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"safe": [cb.Inside(cb.HalfSpace([1.0], 1.0))]}, "x1 is unbounded below"),
-        ({"safe": [cb.Inside(cb.Box([-1], [1]), during=(0.5, 1.0))]}, "over a window"),
-        ({"safe": [cb.Inside(cb.Box([-1], [1], center=lambda t: [0.1 * t]))]}, "moving sets"),
-        ({"initial": cb.GaussianStart([0.0], [[0.01]])}, "random start"),
+        ({"safe": [cb.Inside(cb.HalfSpace([1.0, 0.0], 1.0))]}, "x1 is unbounded below"),
+        ({"safe": [cb.Inside(cb.Box([-1, -1], [1, 1]), during=(0.5, 1.0))]}, "over a window"),
+        ({"safe": [cb.Inside(cb.Box([-1, -1], [1, 1], center=lambda t: [0.1 * t, 0.0]))]}, "moving sets"),
+        ({"initial": cb.GaussianStart([0.0, 0.0], 0.01 * np.eye(2))}, "random start"),
     ],
 )
-def test_what_is_not_served_is_refused_in_words(changes, message: str) -> None:
-    problem = line_problem(lambda x: [-x[0]], 0.4, -1.0, 1.0, 1.0, (0.0, 0.0)).replace(**changes)
+def test_what_is_not_served_in_two_states_is_refused_in_words(changes, message: str) -> None:
     with pytest.raises(InfeasibleError, match=message):
-        bound_exits(problem)
+        bound_exits(two_free_states().replace(**changes))
 
 
 def test_noise_in_some_coordinates_only_is_refused() -> None:
@@ -487,8 +488,6 @@ def test_an_obstacle_bounds_the_safe_set_on_its_side() -> None:
     walls = plain.replace(safe=[cb.Inside(cb.Box([-1], [3])), cb.Outside(cb.Box([1], [2]))])
     first, second = bound_exits(plain, seconds=0.1), bound_exits(walls, seconds=0.1)
     assert first.upper == pytest.approx(second.upper, abs=1e-3)
-    room = safe_room(walls)
-    assert room.inner_high == (1.0,)
 
 
 def test_a_disturbance_that_counts_between_the_ends_of_its_range_only_is_seen() -> None:

@@ -25,8 +25,9 @@ from typing import TypeVar
 import numpy as np
 
 from certbound.arrays import Array, Index
+from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.coefficients import Cells, Interpolant, Reader
+from certbound.values.continuous.coefficients import Cells, Interpolant, Reader, enclose
 from certbound.values.continuous.payment import Patched, Payment, pay_lower, pay_upper
 from certbound.values.continuous.polynomials import nodes_of
 from certbound.values.continuous.residual import (
@@ -187,11 +188,8 @@ def covers(surface: Surface, horizon: float, low: Sequence[float], high: Sequenc
 
 def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment:
     """An upper bound of log P(leaving the box of the surface by its last time), whatever the surface is."""
-    lift = max(0.0, -min(surface.face_range(axis, side)[0] for axis in range(len(surface.axes)) for side in (0, 1)))
-    surface = surface.raised(_up(lift)) if lift else surface
-    if any(surface.face_range(axis, side)[0] < 0 for axis in range(len(surface.axes)) for side in (0, 1)):
-        surface = surface.raised(1e-12 * (1 + lift))
-    start = _up(extreme_over(surface, starts, upper=True))
+    surface = raised_above(surface)
+    start = up(extreme_over(surface, starts, upper=True))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
     proof = examine(surface, model, need, upper=True)
     floor = float(surface.range_at(-1)[0].min())
@@ -199,34 +197,74 @@ def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, fl
     for lift in LIFTS:  # V + lift has the same residual, and nothing is due where it is positive
         if best is not None and start + lift >= best.log:
             break
-        patched = _patched(proof, proof.ranges.residual_high, need, surface.steps, lift)
-        payment = pay_upper(patched, _up(start + lift), floor + lift - 1e-15 * (1 + abs(floor)))
+        patched = patched_of(proof, proof.ranges.residual_high, need, surface.steps, lift)
+        payment = pay_upper(patched, up(start + lift), floor + lift - 1e-15 * (1 + abs(floor)))
         best = payment if best is None or payment.log < best.log else best
     assert best is not None
     return best
+
+
+def check_noise(model: Model, span: tuple[float, float], ends: Sequence[tuple[float, float]]) -> None:
+    """Refuse noise that may vanish somewhere in a box over a span of time.
+
+    Where it has full rank a path that touches a face crosses it: what lower bounds rest on.
+
+    Raises
+    ------
+    InfeasibleError
+    """
+    fine = [np.linspace(low, high, 17) for low, high in ends]
+    low = np.meshgrid(*(axis[:-1] for axis in fine), indexing="ij")
+    high = np.meshgrid(*(axis[1:] for axis in fine), indexing="ij")
+    clock = [Interval(*span).broadcast_to((low[0].size,))]
+    values, _ = enclose(model.square.tape, clock + [Interval(a.ravel(), b.ravel()) for a, b in zip(low, high)])
+    smallest = values[0].lo
+    if len(fine) == 2:
+        cross = np.maximum(np.abs(values[1].lo), np.abs(values[1].hi))
+        smallest = np.minimum(np.minimum(values[0].lo, values[3].lo), values[0].lo * values[3].lo - cross**2)
+    if not np.all(smallest > 0):
+        raise InfeasibleError(
+            "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
+            "direction has none somewhere (noise in the velocities only, say): another engine's answer stands."
+        )
+
+
+def raised_above(surface: Surface) -> Surface:
+    """The surface, raised by what it misses of V >= 0 on its faces."""
+    sides = [(axis, side) for axis in range(len(surface.axes)) for side in (0, 1)]
+    lift = max(0.0, -min(surface.face_range(*side)[0] for side in sides))
+    surface = surface.raised(up(lift)) if lift else surface
+    if any(surface.face_range(*side)[0] < 0 for side in sides):
+        surface = surface.raised(1e-12 * (1 + lift))
+    return surface
+
+
+def top_of(surface: Surface) -> float:
+    """An upper bound of V over all of the surface."""
+    return max(float(value_range(surface.patches(*chunk))[1].max()) for chunk in surface.chunks())
 
 
 def prove_lower(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment | None:
     """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is."""
     if extreme_over(surface, starts, upper=False) == -math.inf:
         return None
-    highest = max(float(value_range(surface.patches(*chunk))[1].max()) for chunk in surface.chunks())
+    highest = top_of(surface)
     if highest > 0:
         surface = surface.raised(-highest - 1e-12 * (1 + highest))
-    start = -_up(-extreme_over(surface, starts, upper=False))
+    start = -up(-extreme_over(surface, starts, upper=False))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=np.inf)
     proof = examine(surface, model, need, upper=False)
     if np.any(proof.ranges.high > 0):
         return None
-    patched = _patched(proof, -proof.ranges.residual_low, need, surface.steps)
+    patched = patched_of(proof, -proof.ranges.residual_low, need, surface.steps)
     return pay_lower(patched, start, float(surface.range_at(-1)[1].max()))
 
 
-def _up(value: float) -> float:
+def up(value: float) -> float:
     return value + 1e-15 * (1 + abs(value))
 
 
-def _patched(proof: Proof, excess: Array, need: Need, steps: Array, lift: float = 0.0) -> Patched:
+def patched_of(proof: Proof, excess: Array, need: Need, steps: Array, lift: float = 0.0) -> Patched:
     """The patches that cost more than what every slab pays in any case, for V + lift."""
     ranges, slack = proof.ranges, 1e-14 if lift else 0.0
     low, high = ranges.low + lift - slack * (1 + np.abs(ranges.low)), ranges.high + lift

@@ -122,7 +122,7 @@ def _slope(low: float, high: float, m: float, upper: bool) -> float:
     return most + 1e-14 * (1 + abs(most))
 
 
-def pay_upper(patched: Patched, start: float, floor: float) -> Payment:
+def pay_upper(patched: Patched, start: float, floor: float, *, whole: bool = False) -> Payment:
     """The smallest upper bound of log P that the search finds.
 
     Parameters
@@ -133,16 +133,18 @@ def pay_upper(patched: Patched, start: float, floor: float) -> Payment:
         Upper bound of V(0, .) over the starts.
     floor : float
         Lower bound of V(T, .) over the safe set; -inf will do.
+    whole : bool
+        Whether ``start`` is the logarithm of a mean of e^V(0, .): then all of q is paid, int q over every level.
     """
     best = Payment(log=0.0, lam=0.0, eps=0.0, growth=0.0)
     if start >= 0:
         return best
     for levels in _proposals(patched, start, upper=True):
-        best = min(best, _settle_upper(patched, levels, start, floor), key=lambda payment: payment.log)
+        best = min(best, _settle_upper(patched, levels, start, floor, whole), key=lambda payment: payment.log)
     return best
 
 
-def pay_lower(patched: Patched, start: float, ceiling: float) -> Payment | None:
+def pay_lower(patched: Patched, start: float, ceiling: float, *, whole: bool = False) -> Payment | None:
     """The largest lower bound of log P that the search finds; None where none is positive.
 
     Parameters
@@ -153,10 +155,12 @@ def pay_lower(patched: Patched, start: float, ceiling: float) -> Payment | None:
         Lower bound of V(0, .) at one start.
     ceiling : float
         Upper bound of V(T, .) over the safe set.
+    whole : bool
+        As for `pay_upper`, with p.
     """
     best = None
     for levels in _proposals(patched, start, upper=False):
-        payment = _settle_lower(patched, levels, start, ceiling)
+        payment = _settle_lower(patched, levels, start, ceiling, whole)
         if payment is not None and (best is None or payment.log > best.log):
             best = payment
     return best
@@ -175,7 +179,7 @@ def _proposals(patched: Patched, start: float, *, upper: bool) -> Iterator[Level
         edges = -BIN * np.arange(count, -1, -1.0)
         if count:
             first, last = lowest + count, np.minimum(highest, -1) + count
-            need = (patched.excess - base / horizon) / np.maximum(patched.energy, 1e-300)
+            need = (patched.excess - base / horizon) / np.maximum(patched.energy, 1e-200)
             here = np.flatnonzero((last >= 0) & (need > 0) & (need <= cap))
             need, first, last = need[here], np.maximum(first[here], 0), last[here]
             for offset in range(int(np.max(last - first, initial=-1)) + 1):
@@ -222,7 +226,7 @@ def _rates(patched: Patched, levels: Levels, start: float) -> tuple[Array, Array
     top = np.zeros(slabs)
     np.maximum.at(top, patched.slab, excess)
     best, eps = top.copy(), np.zeros(slabs)
-    ratio, peak = excess / np.maximum(reach, 1e-300), top[patched.slab] / np.maximum(reach, 1e-300)
+    ratio, peak = excess / np.maximum(reach, 1e-200), top[patched.slab] / np.maximum(reach, 1e-200)
     for share in (0.0, *np.geomspace(3e-4, 0.9, 12)):
         extra = np.zeros(slabs)
         np.maximum.at(extra, patched.slab, ratio - share * peak)
@@ -233,14 +237,15 @@ def _rates(patched: Patched, levels: Levels, start: float) -> tuple[Array, Array
     return lam + patched.spare, eps + patched.spare
 
 
-def _settle_upper(patched: Patched, levels: Levels, start: float, floor: float) -> Payment:
+def _settle_upper(patched: Patched, levels: Levels, start: float, floor: float, whole: bool) -> Payment:
     lam, eps = _rates(patched, levels, start)
     worst = Payment(log=0.0, lam=0.0, eps=0.0, growth=0.0)
     paid = Interval.point(lam) * Interval(*_around(patched.steps))
     later = np.cumsum(paid.hi[::-1])[::-1] * (1 + 1e-15 * (len(lam) + 4))  # over this slab and all later ones
     if not later[0] < 50 or not np.isfinite(eps).all():
         return worst
-    growth, most = levels.above(start), levels.above(-np.inf)
+    most = levels.above(-np.inf)
+    growth = most if whole else levels.above(start)
     first = exp(Interval.point(later[0]) + growth)
     rest = (Interval.point(eps) * Interval(*_around(patched.steps)) * exp(Interval.point(later))).sum()
     # in units of exp(start): total = exp(L + growth) + exp(Q) sum eps h exp(L_k)
@@ -255,14 +260,16 @@ def _settle_upper(patched: Patched, levels: Levels, start: float, floor: float) 
     return Payment(log=value, lam=float(later[0]), eps=float(rest.hi), growth=float(growth.hi))
 
 
-def _settle_lower(patched: Patched, levels: Levels, start: float, ceiling: float) -> Payment | None:
+def _settle_lower(
+    patched: Patched, levels: Levels, start: float, ceiling: float, whole: bool
+) -> Payment | None:
     lam, eps = _rates(patched, levels, start)
     steps = Interval(*_around(patched.steps))
     paid = (Interval.point(lam) * steps).sum()
     if not paid.hi < 50 or not np.isfinite(eps).all():
         return None
     most = Interval.point(1.0 + float(levels.q.max())) if len(levels.m) else Interval.point(1.0)
-    growth = levels.above(start)
+    growth = levels.above(-np.inf if whole else start)
     first = exp(-(growth + most * paid))
     rest = most * (Interval.point(eps) * steps).sum()
     # in units of exp(start); then less W = exp(ceiling)

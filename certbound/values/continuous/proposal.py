@@ -26,6 +26,8 @@ _DEGREE = 5
 _BAND = 5
 _THINNEST = 1e-6  # share of a cell that a bent one keeps
 _GAMMA = 1 - 0.5**0.5  # the L-stable two-stage method of order 2
+_NEAR = 6.0  # below the answer, as a logarithm: what a path hardly meets on its way
+_FARTHEST = 1e-3  # weight of errors much farther below
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -54,11 +56,16 @@ class Sketch:
     growth: float
 
 
-def sketch(line: Line, *, cells: int = 400, steps: int = 240) -> Sketch:
-    """A rough solution, accurate to some per cent at any size of u (monotone rates, an L-stable step of order 2)."""
+def sketch(
+    line: Line, *, cells: int = 400, steps: int = 240, begin: Callable[[Array], Array] | None = None
+) -> Sketch:
+    """A rough solution, accurate to some per cent at any size of u (monotone rates, an L-stable step of order 2).
+
+    u is 0 at the horizon unless ``begin`` says what it is.
+    """
     x = graded(line, cells, [0.002 * (line.high - line.low)] * 2)
     left, right = np.diff(x)[:-1], np.diff(x)[1:]
-    u = np.zeros(len(x))
+    u = np.zeros(len(x)) if begin is None else begin(x)
     u[0] = u[-1] = 1.0
     tau = line.horizon * np.concatenate([[0.0], np.geomspace(1e-5, 1.0, steps)])
     rates = _rates(line, 0.0, x, u, left, right)
@@ -189,12 +196,11 @@ class Boundary:
 
 
 def propose(
-    line: Line, nodes: Array, boundary: Boundary, *, tolerance: float,
-    floor: float = -np.inf, most_steps: int = 1500,
+    line: Line, nodes: Array, boundary: Boundary, *, tolerance: float, level: float, most_steps: int = 4000
 ) -> Surface | None:
     """V on the given nodes; None where the integration breaks down.
 
-    Errors count less where V is near ``floor``.
+    Errors count little where V is far below ``level``, log P: the proof pays for those places in units of P.
     """
     system = _Collocation(line, nodes, boundary)
     coefficients, tau = system.start(), 0.0
@@ -207,7 +213,8 @@ def propose(
             new, error = system.step(tau, coefficients, step)
         except FloatingPointError:
             return None
-        weight = 0.1 + 0.9 / (1 + np.exp(np.clip(floor + 2.5 - system.value(new), -50, 50)))
+        highest = np.maximum(system.value(new), system.value(coefficients))
+        weight = _FARTHEST + 1 / (1 + np.exp(np.clip(level - _NEAR - highest, -50, 50)))
         size = float(np.max(weight * np.abs(error))) / tolerance if np.isfinite(error).all() else np.inf
         if size > 1:
             step *= max(0.2, 0.8 * size ** (-1 / 3)) if np.isfinite(size) else 0.1

@@ -1,16 +1,23 @@
-"""What proposals in one state start from: end profiles, faces, and cut ends (plain floats)."""
+"""What proposals in one state are made of: layers at faces, grids, and cut ends (plain floats).
+
+No floor is put under V: at the horizon it falls from each face as a straight line, V = -k d, and evolves from there
+into the parabola -d^2 / (2 a tau) by a smooth tangent, with no corner that travels through the grid. Where V is far
+below the answer the proof pays in units of the answer, and the grid may be coarse.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.values.continuous.proposal import Boundary, Line, graded, propose
-from certbound.values.continuous.surface import Surface
+from certbound.values.continuous.proposal import Line, Sketch, through
 
 _SPARE = 8.0
+_ROOM = 6.0  # how far below the answer V is to be known, as a logarithm
+_BACKGROUND = 0.3  # share of the cells that is spread evenly
 
 
 def sealed(line: Line, level: float) -> tuple[Line, tuple[bool, bool]]:
@@ -43,63 +50,68 @@ def _cut(line: Line, side: int, barrier: float) -> float | None:
     return float(x[int(np.argmax(height > barrier))])
 
 
-def propose_upper(
-    line: Line, level: float, lead: float, *, share: float, cells: int, tolerance: float
-) -> Surface | None:
-    """V = 0 on both faces; at T a layer at each face, evolved for about ``lead``, over a floor.
-
-    Parameters
-    ----------
-    level : float
-        Estimate of log P.
-    lead : float
-        Time by which the start profile is ahead: the relative cost is that of a longer horizon.
-    share : float
-        The floor is this share of P.
-    """
-    floor = level + float(np.log(share))
-    layers = [_layer(line, side, lead) for side in (0, 1)]
-    least = float(np.exp(floor))
-
-    def profile(x: Array) -> Array:
-        u = np.full(len(x), least)
-        for side, (rate, bend) in enumerate(layers):
-            distance = _distance(line, x, side)
-            u += (1 - least) * (1 + bend * rate * distance) * np.exp(-rate * distance)
-        return np.asarray(np.log(u))
-
-    zero = np.zeros(2)
-    boundary = Boundary(profile=profile, faces=lambda tau: (zero, zero), step=0.02 * lead)
-    nodes = graded(line, cells, [1 / rate for rate, _ in layers])
-    return propose(line, nodes, boundary, tolerance=tolerance, floor=floor)
-
-
-def propose_lower(
-    line: Line, level: float, lead: float, far: tuple[bool, bool], *, share: float, cells: int, tolerance: float
-) -> Surface | None:
-    """V constant at T; on the faces it rises to 0 within ``lead``, save on those that no path reaches: V' = 0 there."""
-    floor = level + float(np.log(share))
-
-    def faces(tau: float) -> tuple[Array, Array]:
-        s = min(tau / lead, 1.0)
-        value = floor * (1 - s**3 * (10 - 15 * s + 6 * s * s))
-        rate = -floor * 30 * (s * (1 - s)) ** 2 / lead
-        return np.full(2, value), np.full(2, rate)
-
-    boundary = Boundary(profile=lambda x: np.full(len(x), floor), faces=faces, step=0.02 * lead, free=far)
-    sizes = [0.3 * (line.high - line.low) if far[side] else 1 / _layer(line, side, lead)[0] for side in (0, 1)]
-    return propose(line, graded(line, cells, sizes), boundary, tolerance=tolerance)
+def either(first: Array, second: Array) -> Array:
+    """log(1 - (1 - e^first)(1 - e^second)): 0 exactly wherever one of them is."""
+    most, least = np.maximum(first, second), np.minimum(first, second)
+    return np.asarray(most + np.log1p(np.exp(least - most) - np.exp(least)))
 
 
 def _distance(line: Line, x: Array, side: int) -> Array:
     return x - line.low if side == 0 else line.high - x
 
 
-def _layer(line: Line, side: int, lead: float) -> tuple[float, float]:
-    """Rate k and bend c of the layer (1 + c k d) exp(-k d), whose u'' a / 2 + f u' is 0 at the face."""
+def _at_face(line: Line, side: int) -> tuple[float, float]:
+    """a at a face at the horizon, and the drift away from it."""
     x = np.array([line.low if side == 0 else line.high])
-    a = max(float(line.square(line.horizon, x)[0]), 1e-300)
     inward = float((line.drift(line.horizon, x) * (1 if side == 0 else -1)).min())
+    return max(float(line.square(line.horizon, x)[0]), 1e-300), inward
+
+
+def layer(line: Line, side: int, lead: float) -> tuple[float, float]:
+    """Rate k and bend c of the layer (1 + c k d) exp(-k d), whose u'' a / 2 + f u' is 0 at the face."""
+    a, inward = _at_face(line, side)
     rate = 1.3 * float(np.sqrt(2 / (a * lead))) + 4 * max(inward, 0.0) / a
     bend = (rate * a / 2 - inward) / (rate * a - inward)
     return rate, float(np.clip(bend, 0.0, 0.9))
+
+
+def rise(line: Line, side: int, speed: float) -> float:
+    """The slope k at which V = -k d follows a face whose value rises at that speed: a k^2 / 2 - f k = speed."""
+    a, inward = _at_face(line, side)
+    return (inward + float(np.sqrt(max(inward, 0.0) ** 2 + 2 * a * max(speed, 1e-9)))) / a
+
+
+def spread(line: Line, marks: Sequence[tuple[float, float]], rough: Sketch, fineness: float) -> Array:
+    """Nodes in proportion to the lengths over which V bends, 1/sqrt(a V''), wherever it is not far below the answer.
+
+    Beside a mark (place, k) V is a line of slope k that turns into a parabola at the distance a k tau: sqrt(k / d)
+    bends a length; and where the parabola is above log P - 6, at most sqrt(2 L) / d, L = 6 - log P. At t = 0 the sketch
+    knows V''.
+    """
+    even = np.linspace(line.low, line.high, 8001)
+    away = np.geomspace(0.02, 200.0, 400)
+    close = [place + np.concatenate([-away, away]) / rate for place, rate in marks]
+    fine = np.unique(np.concatenate([even, *close]))
+    fine = fine[(fine >= line.low) & (fine <= line.high)]
+    scale = 1 / np.sqrt(np.maximum(line.square(0.5 * line.horizon, fine), 1e-300))
+    way = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(fine))])
+    depth = max(-rough.level, 1.0) + _ROOM
+    density = _bends(rough, fine) / scale
+    for place, rate in marks:
+        slope = rate / float(np.interp(place, fine, scale))
+        distance = np.abs(way - np.interp(place, fine, way))
+        near, later = np.sqrt(slope / (distance + 1 / slope)), np.sqrt(2 * depth) / np.maximum(distance, 1e-12)
+        density = density + np.minimum(near, later)
+    density = density + (_BACKGROUND * np.trapezoid(density, way) + 4) / way[-1]
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(way))])
+    nodes = np.interp(np.linspace(0, total[-1], int(np.ceil(fineness * total[-1])) + 1), total, fine)
+    nodes[0], nodes[-1] = line.low, line.high
+    return through(nodes, line.starts)
+
+
+def _bends(rough: Sketch, fine: Array) -> Array:
+    """sqrt |V''| at time 0 where V is not far below the answer."""
+    even = np.linspace(fine[0], fine[-1], 401)
+    values = np.interp(even, rough.nodes, rough.values)
+    curved = np.abs(np.gradient(np.gradient(values, even), even))
+    return np.interp(fine, even, np.sqrt(np.where(values > rough.level - _ROOM, curved, 0.0)))

@@ -49,6 +49,10 @@ _UNIFORM_SHARES = {
 _MOST_NODES = 3_000_000
 _NODE_SECONDS = {False: 1e-4, True: 2e-3}
 """Roughly what a node of a first grid takes, without and with a common factor in the noise; measured, for refusing."""
+_CELL_SECONDS = 5e-6  # what a cell takes for one step, both bounds; measured once
+_COMMON_FACTOR = 20.0  # how much more that is with a common factor in the noise
+_UNIFORM_FACTOR = 0.4
+_OVERHEAD = 250  # cells that every step is worth in addition
 _PATIENCE = 1.0  # seconds for which grids are refined although the question is answered
 _FLOOR = 1e-16  # where what lies beyond ten standard deviations begins to count
 
@@ -104,7 +108,7 @@ def bound_failure(
     delta : float, optional
         Stop also once upper is a hundredth of it, or lower a hundred times (or half).
     seconds : float
-        Stop before a grid that is expected to end later than this after the beginning.
+        Stop before a grid whose cells, at fixed rates, would take longer than this with all before it.
     parts : int
         Parts along each side of the set of disturbances.
 
@@ -115,9 +119,8 @@ def bound_failure(
     """
     work = _Work(problem, target, parts)
     begun = time.perf_counter()
-    upper, lower = 1.0, 0.0
+    upper, lower, spent = 1.0, 0.0, 0.0
     tried: list[tuple[float, float, float]] = []
-    spent: list[tuple[int, float]] = []
     cells: tuple[int, ...] = ()
     for share in (_UNIFORM_SHARES if work.shocks.uniform else _SHARES)[work.n]:
         layout = work.layout(share)
@@ -128,19 +131,19 @@ def bound_failure(
         finest = max((grid.shape for grid in layout), key=math.prod)
         if not tried:
             work.check_first(math.prod(finest), seconds)
-        if tried and time.perf_counter() - begun + _expected(spent, math.prod(finest)) > seconds:
+        cost = work.cost(layout)
+        if tried and spent + cost > seconds:
             break
-        start = time.perf_counter()
         try:
             found = work.bounds(layout, share)
         except Inapplicable:
             if not tried:
                 raise
             break
-        spent.append((math.prod(finest), time.perf_counter() - start))
+        spent += cost
         upper, lower, cells = min(upper, found[0]), max(lower, found[1]), finest
         tried.append((share, *found))
-        settled = time.perf_counter() - begun > _PATIENCE and _settled(upper, lower, delta)
+        settled = spent > _PATIENCE and _settled(upper, lower, delta)
         if upper <= ratio * lower or settled or upper < (_UNIFORM_FLOOR if work.shocks.uniform else _FLOOR):
             break
     return FailureBounds(
@@ -151,15 +154,6 @@ def bound_failure(
         seconds=time.perf_counter() - begun,
         tried=tuple(tried),
     )
-
-
-def _expected(spent: list[tuple[int, float]], cells: int) -> float:
-    """Seconds that so many cells will take: a straight line through the last two grids, or half in proportion."""
-    (count, last) = spent[-1]
-    if len(spent) == 1:
-        return last * (0.5 + 0.5 * cells / count)
-    before, earlier = spent[-2]
-    return last + max(last - earlier, 0.0) / max(count - before, 1) * max(cells - count, 0)
 
 
 def _settled(upper: float, lower: float, delta: float | None) -> bool:
@@ -200,6 +194,13 @@ class _Work:
                 f"{seconds:g} s may be spent: the safe set is many standard deviations of the noise wide. Use another "
                 "engine, which is at its best there."
             )
+
+    def cost(self, layout: list[Grid]) -> float:
+        """Seconds that a layout stands for, at fixed rates: bounds must not depend on the machine's load."""
+        rate = _CELL_SECONDS * (_COMMON_FACTOR if self.shocks.common else 1.0)
+        rate *= _UNIFORM_FACTOR if self.shocks.uniform else 1.0
+        boxes = float(self.dynamics.parts) ** len(self.problem.system.disturbance_names)
+        return rate * boxes * sum(_OVERHEAD + math.prod(grid.shape) for grid in layout)
 
     def _start_shocks(self) -> Shocks | None:
         initial = self.problem.initial

@@ -251,3 +251,15 @@ def test_four_states_and_too_many_nodes_are_refused() -> None:
     fine = cb.DiscreteSystem(lambda x: x, states=2, noise=cb.Gaussian(std=5e-4))
     with pytest.raises(Inapplicable, match="more than 3000000 nodes"):
         bound_failure(cb.Problem(fine, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=2))
+
+
+def test_bounds_do_not_depend_on_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = scalar(horizon=6)
+    first = bound_failure(problem, seconds=0.05, ratio=1.0001)
+    ticks = iter(range(0, 10**9, 1000))
+    monkeypatch.setattr("certbound.values.discrete.failures.time.perf_counter", lambda: float(next(ticks)))
+    second = bound_failure(problem, seconds=0.05, ratio=1.0001)
+    assert first.tried == second.tried
+    assert len(first.tried) > 1
+    longer = bound_failure(problem, seconds=5.0, ratio=1.0001)
+    assert len(longer.tried) > len(first.tried)

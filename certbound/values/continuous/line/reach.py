@@ -1,0 +1,87 @@
+"""Where a line without a limit on some side is cut, in floats: far beyond where paths get to.
+
+The cut is no hypothesis: above, leaving through it counts as failing; below, as not failing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.errors import InfeasibleError
+from certbound.problem.model import compile_numpy
+from certbound.problem.problem import Problem
+from certbound.values.continuous.hypotheses import Model
+from certbound.values.continuous.line.phases import last_instant, limits_of, value_at
+from certbound.values.continuous.line.starts import Start
+
+_PATHS, _STEPS = 400, 200
+_DEVIATIONS = 7.0
+_FARTHEST = 1e9
+
+
+def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]:
+    """A place below and one above everything; `inf` is never returned.
+
+    Raises
+    ------
+    InfeasibleError
+        Paths get beyond any bound, so that no cut helps.
+    """
+    low, high = _spread(problem, model, start)
+    for limit, _ in limits_of(problem, inner=False):
+        times = [0.0, last_instant(problem)] if limit.center is None else np.linspace(0, last_instant(problem), 9)
+        for t in times:
+            place = limit.offset + (0.0 if limit.center is None else float(value_at(limit.center, float(t)).mid))
+            low, high = min(low, place), max(high, place)
+    square = compile_numpy(model.square.tape)
+    room = 0.02 * (high - low)
+    at = [_beyond(lambda y: square(0.0, y)[..., 0, 0], place, way) for place, way in ((low, -room), (high, room))]
+    return at[0], at[1]
+
+
+def _spread(problem: Problem, model: Model, start: Start) -> tuple[float, float]:
+    """Extremes of a few paths with the worst disturbances each way, extended by so many deviations."""
+    drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
+    corners = [[float(value.mid) for value in branch] for branch in model.branches]
+    rng = np.random.default_rng(0)
+    horizon = last_instant(problem)
+    step = horizon / _STEPS
+    sigma = math.sqrt(start.variance)
+    ends = []
+    for sign, begin in ((-1.0, start.low), (1.0, start.high)):
+        x: Array = begin + sigma * rng.standard_normal(_PATHS)
+        far, middle, deviation = begin + sign * _DEVIATIONS * sigma, begin, sigma
+        for k in range(_STEPS):
+            with np.errstate(all="ignore"):
+                f = np.array([np.broadcast_to(drift(k * step, x, *c)[..., 0], x.shape) for c in corners])
+                g = np.sqrt(np.broadcast_to(square(k * step, x)[..., 0, 0], x.shape))
+                x = x + step * sign * (sign * f).max(axis=0) + np.sqrt(step) * g * rng.standard_normal(_PATHS)
+            if not np.all(np.abs(x) < _FARTHEST):
+                raise InfeasibleError(_BEYOND)
+            middle, deviation = float(np.median(x)), float(np.std(x))
+            beyond = _beyond(lambda y, t=k * step: square(t, y)[..., 0, 0], middle, sign * _DEVIATIONS * deviation)
+            far = sign * max(sign * far, sign * beyond, float((sign * x).max()))
+        ends.append(far)
+    if not max(-ends[0], ends[1]) < _FARTHEST:
+        raise InfeasibleError(_BEYOND)
+    return ends[0], ends[1]
+
+
+def _beyond(square: Callable[..., Array], middle: float, way: float) -> float:
+    """The place at a distance from the middle that is measured by the noise: multiplicative noise never reaches 0."""
+    parts, x = 64, middle
+    start = max(float(np.ravel(square(np.array([middle])))[0]), 1e-300)
+    with np.errstate(all="ignore"):
+        for _ in range(parts):
+            x += way / parts * math.sqrt(max(float(np.ravel(square(np.array([x])))[0]), 0.0) / start)
+    return x if math.isfinite(x) else middle + way
+
+
+_BEYOND = (
+    "value functions need a bounded safe set, or paths that stay in reach; here paths leave every bound: add a "
+    "`domain`, or a constraint that bounds the state."
+)
