@@ -5,7 +5,9 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,8 +19,17 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
+from certbound.values.charts import Chart, Charts
 from certbound.values.continuous.coefficients import Reader, enclose, squared_diffusion
-from certbound.values.continuous.hypotheses import Model, covers, extreme_over, prove_lower, prove_upper
+from certbound.values.continuous.hypotheses import (
+    Model,
+    chart_above,
+    chart_below,
+    covers,
+    extreme_over,
+    prove_lower,
+    prove_upper,
+)  # fmt: skip
 from certbound.values.continuous.proposal import Line, sketch
 from certbound.values.continuous.room import Room, safe_room, starts_of
 from certbound.values.continuous.shapes import propose_lower, propose_upper, sealed
@@ -102,6 +113,86 @@ def bound_exits(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin,
     )  # fmt: skip
+
+
+def chart_exits(problem: Problem, *, levels: Sequence[float], times: int = 1, seconds: float = 10.0) -> Charts:
+    """Bound P(X leaves the safe set by T | X_t = x) for every safe x, not for the initial set alone (Theorem K8-CT).
+
+    Parameters
+    ----------
+    problem : Problem
+        As `bound_exits` takes it; its initial set does not matter, but for where the grid is fine.
+    levels : sequence of float
+        log10 of probabilities at which the bounds should be sharp.
+    times : int
+        In one state: how many times t, 0 the first of them. In two states only t = 0 is charted.
+    seconds : float
+        When to stop refining (two states).
+
+    Returns
+    -------
+    Charts
+        In two states without lower bounds.
+
+    Raises
+    ------
+    InfeasibleError
+        The theorem does not apply, or nothing was proved; the message says why.
+    EnclosureError
+        The model is undefined somewhere in the safe set.
+    """
+    begin = time.perf_counter()
+    _check(problem, None, seconds)
+    room, model = safe_room(problem), _model(problem)
+    _check_noise(model, room, problem)
+    logs = sorted(_LN10 * level for level in levels)
+    if problem.system.dimension == 1:
+        charts = _chart_line(problem, model, room, logs, times)
+    else:
+        from certbound.values.continuous.two_states import chart_plane
+
+        charts = Charts(upper=tuple(chart_plane(problem, model, room, logs, begin + seconds)))
+    if not charts.upper:
+        raise InfeasibleError("no value function over the whole safe set could be proved; give `seconds` more.")
+    return charts
+
+
+def _chart_line(problem: Problem, model: Model, room: Room, levels: list[float], times: int) -> Charts:
+    inner = _line(problem, model, room.inner_low[0], room.inner_high[0])
+    outer = _line(problem, model, room.outer_low[0], room.outer_high[0])
+    rough = sketch(inner)
+    levels = sorted({max(level, float(rough.values.min())) for level in levels})
+    cells, span = int(100 * (1 + 0.2 * min(-levels[0], 80))), 0.6 * _LEAD * inner.horizon / max(rough.growth, 1.0)
+    above: list[Chart] = []
+    below: list[Chart] = []
+    lines = [inner, sealed(inner, levels[0])[0]]  # the shorter one gives smaller bounds on it, the longer one more room
+    for line in lines if lines[1] != inner else lines[:1]:
+        surface = propose_upper(line, levels[0], span, share=_SHARES[0], cells=cells, tolerance=5e-5)
+        if surface is not None and covers(surface, line.horizon, [inner.low], [inner.high], within=True):
+            found = _at_times(model, surface.times, times, -1, partial(chart_above, surface, model, levels))
+            same = len(above) == len(found) and all(a.time == b.time for a, b in zip(above, found))
+            above = [a.joined(b) for a, b in zip(above, found)] if same else found
+    far = sealed(outer, levels[0])[1]
+    surface = propose_lower(outer, levels[0], 3 * span, far, share=_SHARES[1], cells=cells, tolerance=2e-5)
+    if surface is not None and covers(surface, outer.horizon, [outer.low], [outer.high], within=False):
+        below = _at_times(model, surface.times, times, 1, partial(chart_below, surface, model, levels))
+    return Charts(upper=tuple(above), lower=tuple(below))
+
+
+def _at_times(
+    model: Model, ends: Array, count: int, side: int, chart: Callable[[list[int]], list[Chart]]
+) -> list[Chart]:
+    """Charts at ``count`` times from 0 on: at equal ones, or at ends of slabs where the model depends on time.
+
+    Where it does not, the probability falls with t: what holds at the end of a slab before t (``side`` -1: an upper
+    bound) or after it (1: a lower one) holds at t.
+    """
+    wanted = float(ends[-1]) * np.arange(count) / count
+    if not model.autonomous:
+        return chart(sorted({int(np.argmin(np.abs(ends[:-1] - time))) for time in wanted}))
+    slabs = np.searchsorted(ends, wanted) if side > 0 else np.searchsorted(ends, wanted, side="right") - 1
+    found = chart([min(int(slab), len(ends) - 2) for slab in slabs])
+    return [replace(one, time=float(time)) for one, time in zip(found, wanted) if side < 0 or one.time >= time]
 
 
 def _check(problem: Problem, target: Any, seconds: float) -> None:

@@ -16,8 +16,10 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
+from certbound.values.charts import Chart
 from certbound.values.continuous.hypotheses import (
     Model,
+    chart_above,
     covers,
     examine_upper,
     extreme_over,
@@ -52,6 +54,27 @@ def two_states(
             break
     words = f"value function in two states, cells: {', '.join(done) or 'none came to an end'}"
     return upper, None, words
+
+
+def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], deadline: float) -> list[Chart]:
+    """The last proved upper bound from every cell at t = 0, sharp at the levels of log P; none where none was proved.
+
+    The proposal is refined once for what its residual costs, as for the bound over the initial set.
+    """
+    plane = _plane(problem, model, room.inner_low, room.inner_high, starts_of(problem))
+    least = _rough_level(plane)
+    levels = sorted({max(level, least) for level in levels})
+    found: list[Chart] = []
+    for plan in _plans(plane, levels[0], 36 if deadline - time.perf_counter() < 15 else 50):
+        begin = time.perf_counter()
+        surface = propose_plane(plane, plan)
+        if surface is not None:
+            surface = propose_plane(plane, plan, _source(surface, *sampled_residual(surface, model))) or surface
+            if covers(surface, plane.horizon, plane.low, plane.high, within=True):
+                found = chart_above(surface, model, levels, [0])
+        if time.perf_counter() + 3 * (time.perf_counter() - begin) > deadline:
+            break
+    return found
 
 
 def _plans(plane: Plane, level: float, cells: int) -> Iterator[Plan]:
