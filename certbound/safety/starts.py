@@ -56,7 +56,11 @@ class SafeStarts(Shown):
     @property
     def cells(self) -> Mask:
         """Which cells belong to the set, shape (N_1, ..., N_n)."""
-        return np.asarray(self.chart.log10 <= _threshold(self.delta))
+        return self.safe(self.chart)
+
+    def safe(self, chart: Chart) -> Mask:
+        """The cells of a chart of upper bounds from which failing is proved to be at most as probable as delta."""
+        return np.asarray(chart.log10 <= _threshold(self.delta))
 
     @property
     def boxes(self) -> Array:
