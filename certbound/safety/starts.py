@@ -207,7 +207,7 @@ def bound_safe_starts(
         if pictured:
             proved = [] if answer is None else [answer.log10_delta]
             levels += [*_DECADES, *(max(level, _DEEPEST) for level in proved if level < 0)]
-        charts = chart_exits(problem, levels=levels, times=times)
+        charts = chart_exits(problem, levels=levels, times=times, lower=pictured)
     return SafeStarts(problem=problem, delta=target, charts=charts)
 
 

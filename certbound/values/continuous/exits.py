@@ -115,7 +115,9 @@ def bound_exits(
     )  # fmt: skip
 
 
-def chart_exits(problem: Problem, *, levels: Sequence[float], times: int = 1, seconds: float = 10.0) -> Charts:
+def chart_exits(
+    problem: Problem, *, levels: Sequence[float], times: int = 1, seconds: float = 10.0, lower: bool = True
+) -> Charts:
     """Bound P(X leaves the safe set by T | X_t = x) for every safe x, not for the initial set alone (Theorem K8-CT).
 
     Parameters
@@ -128,6 +130,8 @@ def chart_exits(problem: Problem, *, levels: Sequence[float], times: int = 1, se
         In one state: how many times t, 0 the first of them. In two states only t = 0 is charted.
     seconds : float
         When to stop refining (two states).
+    lower : bool
+        Whether to look for lower bounds too (one state).
 
     Returns
     -------
@@ -147,7 +151,7 @@ def chart_exits(problem: Problem, *, levels: Sequence[float], times: int = 1, se
     _check_noise(model, room, problem)
     logs = sorted(_LN10 * level for level in levels)
     if problem.system.dimension == 1:
-        charts = _chart_line(problem, model, room, logs, times)
+        charts = _chart_line(problem, model, room, logs, times, lower)
     else:
         from certbound.values.continuous.two_states import chart_plane
 
@@ -157,7 +161,9 @@ def chart_exits(problem: Problem, *, levels: Sequence[float], times: int = 1, se
     return charts
 
 
-def _chart_line(problem: Problem, model: Model, room: Room, levels: list[float], times: int) -> Charts:
+def _chart_line(
+    problem: Problem, model: Model, room: Room, levels: list[float], times: int, lower: bool
+) -> Charts:
     inner = _line(problem, model, room.inner_low[0], room.inner_high[0])
     outer = _line(problem, model, room.outer_low[0], room.outer_high[0])
     rough = sketch(inner)
@@ -172,6 +178,8 @@ def _chart_line(problem: Problem, model: Model, room: Room, levels: list[float],
             found = _at_times(model, surface.times, times, -1, partial(chart_above, surface, model, levels))
             same = len(above) == len(found) and all(a.time == b.time for a, b in zip(above, found))
             above = [a.joined(b) for a, b in zip(above, found)] if same else found
+    if not lower:
+        return Charts(upper=tuple(above))
     far = sealed(outer, levels[0])[1]
     surface = propose_lower(outer, levels[0], 3 * span, far, share=_SHARES[1], cells=cells, tolerance=2e-5)
     if surface is not None and covers(surface, outer.horizon, [outer.low], [outer.high], within=False):

@@ -241,12 +241,12 @@ def chart_above(surface: Surface, model: Model, levels: Sequence[float], slabs: 
     paid = [_cheapest(proof, need, surface, level) for level in levels]
     charts = []
     for k in slabs:
-        values = surface.range_at(k)[1]
+        axes, values = (surface.axes, surface.range_at(k)[1]) if len(surface.axes) == 1 else surface.ceiling_at(k)
         rows = [
             bound_above(payment.terms, _above(values, lift), k) for payment, lift in paid if payment.terms is not None
         ]
         best = np.minimum.reduce([np.zeros(values.shape), *rows])
-        charts.append(Chart(time=float(surface.times[k]), axes=surface.axes, log10=from_natural(best, up=True)))
+        charts.append(Chart(time=float(surface.times[k]), axes=axes, log10=from_natural(best, up=True)))
     return charts
 
 
