@@ -52,6 +52,7 @@ _MOST_NODES = 3_000_000
 _NODE_SECONDS = {False: 1e-4, True: 2e-3}
 """Roughly what a node of a first grid takes, without and with a common factor in the noise; measured, for refusing."""
 _PATIENCE = 1.0  # seconds for which grids are refined although the question is answered
+_CHARTED = 300_000  # parts of cells that a map has at most
 _FLOOR = 1e-16  # where what lies beyond ten standard deviations begins to count
 
 
@@ -304,14 +305,17 @@ class _Work:
         for t, above, below in self._backward(grids, share, 0):
             if t not in steps:
                 continue
-            active, cells, shape = active_at(self.problem.constraints, t), grids[t].cells(), grids[t].shape
-            safe, broken = (mask.reshape(shape) for mask in respected(active, cells, t))  # faces count too
-            high = np.where(safe, above.range()[1], 1.0)
-            upper.append(Chart(time=float(t), axes=grids[t].axes, log10=from_probability(high, up=True)))
+            parts = next((parts for parts in (8, 4, 2) if above.nodal.size * parts**self.n <= _CHARTED), 1)
+            active, cells = active_at(self.problem.constraints, t), grids[t].cells()
+            masks = [*respected(active, cells, t), respected(active, cells, t, interiors=True)[1]]
+            whole = [np.kron(mask.reshape(grids[t].shape), np.ones([parts] * self.n, dtype=bool)) for mask in masks]
+            safe, broken, inner = (mask > 0 for mask in whole)  # for starts, unlike later on, faces count
+            axes, _, high = above.ranges_within(parts)
+            log10 = from_probability(np.where(safe, high, 1.0), up=True)
+            upper.append(Chart(time=float(t), axes=axes, log10=log10))
             if self.boxes.leak == 0:
-                inner = respected(active, cells, t, interiors=True)[1].reshape(shape)
-                low = np.where(inner & ~broken, 0.0, below.range()[0])
-                lower.append(Chart(time=float(t), axes=grids[t].axes, log10=from_probability(low, up=False)))
+                low = np.where(inner & ~broken, 0.0, below.ranges_within(parts)[1])
+                lower.append(Chart(time=float(t), axes=axes, log10=from_probability(low, up=False)))
         return Charts(upper=tuple(upper[::-1]), lower=tuple(lower[::-1]))
 
     def _zones(self, grids: list[Grid], t: int) -> Zones:
