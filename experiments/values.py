@@ -27,7 +27,7 @@ from scipy.sparse.linalg import splu
 import certbound as cb
 from certbound.problem.model import compile_numpy
 from certbound.values.continuous.coefficients import squared_diffusion
-from certbound.values.discrete import chart_failures
+from certbound.values.discrete import bound_failure
 from experiments import values_continuous, values_discrete
 from experiments.values_continuous import line_problems, plane_problems
 
@@ -41,7 +41,7 @@ RARE = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A problem, where its truth comes from ("line", "plane", "paths", "steps") and the ratios that are aimed at."""
+    """A problem, where its truth comes from ("line", "plane" or "paths") and the ratios that are aimed at."""
 
     name: str
     problem: Callable[[], cb.Problem]
@@ -109,7 +109,7 @@ CASES: tuple[Case, ...] = (
     Case(name="cubic oscillator .5", problem=oscillator, truth="paths", upper=1.5, lower=None),
     Case(name="around a ball", problem=around_ball, truth="paths", upper=1.2, lower=1.5),
     Case(name="Lorenz-like", problem=lorenz, truth="paths", upper=5.0, lower=None),
-    *(Case(name=name, problem=make, truth="steps", upper=1.1, lower=1.1)
+    *(Case(name=name, problem=make, truth="paths", upper=1.1, lower=1.1)
       for name, make in values_discrete.PROBLEMS.items()),
 )  # fmt: skip
 
@@ -125,9 +125,6 @@ def truth_of(case: Case, problem: cb.Problem) -> tuple[float, float, float]:
     if case.truth == "plane":
         value, low, high = plane_truth(problem, 160)
         return (value, low, high) if high < 1.2 * low else _worst_of_paths(problem)  # the grid is too coarse for it
-    if case.truth == "steps":
-        low, high = values_discrete.simulated(problem, PATHS)
-        return math.sqrt(low * high) if low > 0 else high, low, high
     return _worst_of_paths(problem)
 
 
@@ -137,11 +134,11 @@ def _worst_of_paths(problem: cb.Problem) -> tuple[float, float, float]:
     best = (0.0, 0.0, 0.0)
     for point in sorted(points):
         one = problem.replace(initial=list(point))
-        found = cb.simulate_exits(one, paths=PATHS // 4, rng=np.random.default_rng(1))
+        found = cb.simulate_exits(one, paths=PATHS, rng=np.random.default_rng(1))
         if found.probability < RARE:
             from certbound.simulation.estimates import simulate_rare_exits
 
-            found = simulate_rare_exits(one, paths=PATHS // 4, rng=np.random.default_rng(1))
+            found = simulate_rare_exits(one, paths=PATHS, rng=np.random.default_rng(1))
         best = max(best, (found.probability, found.lower, found.upper))
     return best
 
@@ -217,10 +214,10 @@ def _row(case: Case, seconds: float | None) -> str:
     if words:
         return f"| {case.name} | - | - | - | - | - | - | {case.upper:g} | {words} |"
     truth, low, high = truth_of(case, problem)
-    below = f"{truth / lower:.3f}" if lower else "-"
+    above, below = f"{upper / truth:.3f}" if low > 0 else "-", f"{truth / lower:.3f}" if lower and low > 0 else "-"
     aim = f"{case.upper:g}" + ("" if case.lower is None else f", {case.lower:g}")
     return (
-        f"| {case.name} | {lower:.4g} | {upper:.4g} | {truth:.4g} | {low:.3g} ... {high:.3g} | {upper / truth:.3f} "
+        f"| {case.name} | {lower:.4g} | {upper:.4g} | {truth:.4g} | {low:.3g} ... {high:.3g} | {above} "
         f"| {below} | {aim} | {spent:.1f} |"
     )
 
@@ -234,7 +231,6 @@ def _bounds(problem: cb.Problem, seconds: float | None) -> tuple[float, float, s
             return 1.0, 0.0, verdict.reason
         return 10.0**answer.log10_delta, 0.0 if answer.log10_lower is None else 10.0**answer.log10_lower, ""
     from certbound.values.continuous import bound_exits
-    from certbound.values.discrete import bound_failure
 
     try:
         if problem.system.time == "discrete":
@@ -266,31 +262,32 @@ def engines() -> Iterator[str]:
         yield f"| {name} | " + " | ".join(cells) + " |"
 
 
-GRIDS = {1: (0.05, 0.025, 0.0125, 0.006), 2: (0.2, 0.1, 0.05, 0.03), 3: (0.6, 0.4, 0.25, 0.18)}
+GAPS = {1: (0.03, 3e-4, 3e-5, 3e-6), 2: (0.1, 0.02, 2e-3, 5e-4), 3: (0.3, 0.03, 0.01, 5e-3)}
 
 
 def growth(quick: bool) -> Iterator[str]:
-    """x+ = .9 x with noise .3 on each of n states in [-1, 1]^n, ten steps: grid, processor time, memory, ratio."""
+    """x+ = .9 x with noise .3 on each of n states in [-1, 1]^n, ten steps: what smaller and smaller gaps cost."""
     yield "| states | cells | CPU s | MB | upper/lower - 1 |"
     yield "| --- " * 5 + "|"
-    for n, shares in GRIDS.items():
-        found = []
-        for share in shares[:2] if quick else shares:
-            system = cb.DiscreteSystem(lambda x: 0.9 * x, states=n, noise=cb.Gaussian(std=0.3))
-            safe = [cb.Inside(cb.Box([-1.0] * n, [1.0] * n))]
-            problem = cb.Problem(system, initial=[0.0] * n, safe=safe, horizon=10)
+    for n, gaps in GAPS.items():
+        found: dict[int, tuple[float, float, float]] = {}
+        system = cb.DiscreteSystem(lambda x: 0.9 * x, states=n, noise=cb.Gaussian(std=0.3))
+        safe = [cb.Inside(cb.Box([-1.0] * n, [1.0] * n))]
+        problem = cb.Problem(system, initial=[0.0] * n, safe=safe, horizon=10)
+        for gap in gaps[:2] if quick else gaps:
             begin = time.process_time()
-            charts = chart_failures(problem, share=share)
+            bounds = bound_failure(problem, ratio=1 + gap, seconds=120.0)
             seconds = time.process_time() - begin
-            memory = _memory(lambda p=problem, s=share: chart_failures(p, share=s))
-            above, below = (chart.at(np.zeros((1, n)), up=up) for chart, up in
-                            ((charts.upper[0], True), (charts.lower[0], False)))  # fmt: skip
-            gap = 10.0 ** float(above[0] - below[0]) - 1
-            found.append((charts.upper[0].log10.size, seconds, memory, gap))
-            yield f"| {n} | {found[-1][0]} | {seconds:.2f} | {memory:.0f} | {gap:.2g} |"
-        cells, *rest = (np.log([row[k] for row in found]) for k in range(4))
-        laws = [float(np.polyfit(cells, values, 1)[0]) for values in rest]
-        yield f"| {n} | cells^p | p = {laws[0]:.2f} | p = {laws[1]:.2f} | p = {laws[2]:.2f} |"
+            cells = math.prod(bounds.cells)
+            if cells in found:
+                continue
+            memory = _memory(lambda p=problem, g=gap: bound_failure(p, ratio=1 + g, seconds=120.0))
+            found[cells] = (seconds, memory, bounds.upper / bounds.lower - 1)
+            yield f"| {n} | {cells} | {seconds:.2f} | {memory:.0f} | {found[cells][2]:.2g} |"
+        if len(found) > 1:
+            logs = np.log(np.array([(cells, *row) for cells, row in found.items()]))
+            laws = [float(np.polyfit(logs[:, 0], logs[:, k], 1)[0]) for k in (1, 2, 3)]
+            yield f"| {n} | cells^p | p = {laws[0]:.2f} | p = {laws[1]:.2f} | p = {laws[2]:.2f} |"
 
 
 def _memory(task: Callable[[], object]) -> float:
