@@ -12,7 +12,7 @@ import numpy as np
 from certbound.arrays import Array, Mask
 from certbound.checks import matrix
 from certbound.display import Shown, rounded
-from certbound.errors import InfeasibleError
+from certbound.errors import EngineError, InfeasibleError, contained
 from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
@@ -197,18 +197,25 @@ def bound_safe_starts(
             f"safe starts are read off a value function, and none was proved: {why}. "
             f'Ask for one: verify_safety(problem, method="{_ENGINE}").safe_starts().'
         )
+    try:
+        with contained(_ENGINE):
+            charts = _charted(problem, answer, target, pictured)
+    except EngineError as error:
+        raise InfeasibleError(f"safe starts could not be proved: {error}") from error
+    return SafeStarts(problem=problem, delta=target, charts=charts)
+
+
+def _charted(problem: Problem, answer: EngineAnswer | None, target: float, pictured: bool) -> Charts:
     times = 4 if pictured and problem.system.dimension == 1 else 1
     if isinstance(problem.system, DiscreteSystem):
         details = None if answer is None else answer.details
         found = details if isinstance(details, FailureBounds) else bound_failure(problem, delta=target)
-        charts = chart_failures(problem, share=found.share, times=times)
-    else:
-        levels = [math.log10(target)]
-        if pictured:
-            proved = [] if answer is None else [answer.log10_delta]
-            levels += [*_DECADES, *(max(level, _DEEPEST) for level in proved if level < 0)]
-        charts = chart_exits(problem, levels=levels, times=times, lower=pictured)
-    return SafeStarts(problem=problem, delta=target, charts=charts)
+        return chart_failures(problem, share=found.share, times=times)
+    levels = [math.log10(target)]
+    if pictured:
+        proved = [] if answer is None else [answer.log10_delta]
+        levels += [*_DECADES, *(max(level, _DEEPEST) for level in proved if level < 0)]
+    return chart_exits(problem, levels=levels, times=times, lower=pictured)
 
 
 def _threshold(delta: float) -> float:

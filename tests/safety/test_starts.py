@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import certbound as cb
+from certbound.cli.app import run
 from certbound.errors import InfeasibleError
 from certbound.html_report import report_page
 from certbound.plotting import draw_values
@@ -189,3 +191,15 @@ def test_the_outline_closes_around_the_chosen_cells() -> None:
     edges = outline_of((np.arange(4.0), np.arange(3.0)), np.array([[True, False], [True, True], [False, False]]))
     assert len(edges) == 8
     assert np.abs(edges[:, 1] - edges[:, 0]).sum() == 8.0
+
+
+def test_verify_draws_and_reports_the_value_function_behind_its_verdict(tmp_path: Path) -> None:
+    problem, picture, page = tmp_path / "map.toml", tmp_path / "map.png", tmp_path / "page.html"
+    problem.write_text(
+        'time = "discrete"\nhorizon = 5\nstates = ["x"]\n[dynamics]\nx = "0.9*x"\n'
+        '[noise]\nlaw = "gaussian"\nstd = 0.2\n[initial]\npoint = [0]\n[[stay]]\nbox = [[-1, 1]]\n'
+    )
+    words = ["verify", str(problem), "--method", "values", "--plot", str(picture), "--report", str(page), "--json"]
+    assert run(words) in (0, 1)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "Safe starts" in page.read_text(encoding="utf-8")
