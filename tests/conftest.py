@@ -1,7 +1,8 @@
-"""Kernels of the tests are kept between runs in pytest's own cache, not in the user's."""
+"""Kernels of the tests are kept between runs in pytest's own cache, and a test leaves balls as precise as they were."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,3 +14,12 @@ def _kernel_cache(request: pytest.FixtureRequest):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CERTBOUND_CACHE", str(folder))
         yield
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """What a test computes in balls of its own must not change what the next one sees."""
+    flint = sys.modules.get("flint")
+    if flint is not None and flint.ctx.prec != 53:
+        flint.ctx.prec = 53
+        pytest.fail(f"{item.name} leaves flint at another precision; use flint.ctx.workprec.")

@@ -31,6 +31,7 @@ def modules() -> dict[str, tuple[ast.Module, bool]]:
     return found
 
 
+@functools.cache
 def words(tree: ast.AST) -> Counter[str]:
     """Names that a piece of code reads, and with a dot before them attributes."""
     nodes = [node for node in ast.walk(tree) if isinstance(node, ast.Name | ast.Attribute)]

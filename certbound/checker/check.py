@@ -103,11 +103,12 @@ def check_data(
 
 
 def _compare(proved: arb, level: float) -> None:
-    if not (proved.is_zero() or proved.log() <= arb(level) * arb(10).log()):
-        raise Unproved(
-            f"the probability that follows is at most 10^{rounded(_log10(proved), up=True)}, which is more than the "
-            f"claimed 10^{plainly(level)}"
-        )
+    if proved.is_zero() or proved.log() <= arb(level) * arb(10).log():
+        return
+    found, claimed = _log10(proved), f"which is more than the claimed 10^{plainly(level)}"
+    if found >= 0:
+        raise Unproved(f"what follows is no bound below 1, {claimed}")
+    raise Unproved(f"the probability that follows is at most 10^{rounded(found, up=True)}, {claimed}")
 
 
 def _log10(value: arb) -> float:

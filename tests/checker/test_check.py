@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flint import arb
 
 import certbound as cb
-from certbound.checker import check_data, parse
+from certbound.checker import check, check_data, parse
+from certbound.checker.report import Unproved
 from certbound.checker.statement.comparison import first_difference
 from certbound.errors import CertificateError
 from certbound.safety.certificate import certificate_text, problem_data
@@ -240,6 +242,29 @@ def test_proved_levels_are_rounded_up(contracting) -> None:
     refused = check_data(data)
     assert not refused.valid
     assert "more than the claimed" in refused.reason
+
+
+@pytest.mark.parametrize(
+    ("proved", "level", "words"),
+    [
+        (arb(1) + arb(0, 1e-9), 0.0, r"no bound below 1, which is more than the claimed 10\^0$"),
+        (arb(1) - arb(1e-9), -1e-3, r"10\^-4\.34294e-10, which is more than the claimed 10\^-0\.001$"),
+        (arb("1e-3") * (1 + arb(1e-9)), -3.0, r"10\^-2\.99999, which is more than the claimed 10\^-3$"),
+        (arb("1e-2"), -3.0, r"10\^-(2|1\.99999), which is more than the claimed 10\^-3$"),
+    ],
+)
+def test_a_refusal_shows_by_how_much_a_claim_is_too_strong(proved: arb, level: float, words: str) -> None:
+    with pytest.raises(Unproved, match=words):
+        check._compare(proved, level)
+
+
+def test_an_angle_that_is_constant_varies_for_nobody() -> None:
+    system = cb.ContinuousSystem(
+        lambda x: [0.1 * np.arctan2(x[0], x[0]) - x[0], np.sin(x[0]) - x[1]], states=2, diffusion=0.05 * np.eye(2)
+    )
+    safe = [cb.Inside(cb.Box([0.1, -1.0], [1.0, 1.0]))]
+    _, report = checked(cb.Problem(system, initial=[0.5, 0.0], safe=safe, horizon=0.5), "linear")
+    assert report.valid, report.reason
 
 
 def test_a_nominal_curve_may_cross_a_kink_in_time() -> None:

@@ -15,9 +15,9 @@ def symmetric(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return (a + np.swapaxes(a, -1, -2)) / 2
 
 
+@flint.ctx.workprec(200)
 def exceeds(matrix: np.ndarray, bound: float) -> bool:
     """Whether lambda_max(matrix) > bound for certain: bound I - matrix is indefinite in ball arithmetic."""
-    flint.ctx.prec = 200
     n = len(matrix)
     shifted = flint.arb_mat((-matrix).tolist()) + flint.arb_mat(np.eye(n).tolist()) * flint.arb(float(bound))
     for k in range(1, n + 1):

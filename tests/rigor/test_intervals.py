@@ -68,11 +68,11 @@ def escapes(result: Interval, values: list[flint.arb]) -> int:
     return count
 
 
+@flint.ctx.workprec(128)
 def count_escapes(op: str | float, count: int = COUNT, seed: int = 0) -> int:
     rng = np.random.default_rng(seed)
     x, y = random_intervals(rng, count), random_intervals(rng, count)
     total = 0
-    flint.ctx.prec = 128
     if isinstance(op, (int, float)):
         ball = POWERS.get(op, lambda v: v ** flint.arb(op)) if op != 0.5 else (lambda v: v.sqrt())
         result = iv.pow_(x, op)
@@ -113,6 +113,7 @@ def test_a_rounding_left_out_is_noticed(op, monkeypatch):
 @pytest.mark.parametrize(
     "op", ["sin", "cos", "tan", "exp", "log", "tanh", "atan", "sinh", "cosh", "asin", "acos"]
 )
+@flint.ctx.workprec(128)
 def test_library_functions_stay_within_half_of_the_granted_margin(op):
     rng = np.random.default_rng(1)
     x = np.concatenate([rng.uniform(-1, 1, 4000), rng.uniform(-20, 20, 4000), rng.uniform(-1e5, 1e5, 4000)])
@@ -121,7 +122,6 @@ def test_library_functions_stay_within_half_of_the_granted_margin(op):
     x = x[np.abs(x) < 700] if op in ("exp", "sinh", "cosh") else x
     name = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}.get(op, op)
     found = getattr(np, name)(x)
-    flint.ctx.prec = 128
     for value, point in zip(found.tolist(), x.tolist(), strict=True):
         exact = UNARY_BALLS[op](flint.arb(point))
         granted = max(abs(value), 5e-324) * 2.0**-52 * elementary.LIBRARY_ULPS
@@ -196,11 +196,11 @@ def test_jumps_are_decided_only_where_the_box_decides_them():
     assert OPERATIONS["floor"].interval(Interval([0.2], [0.8])).hi.tolist() == [0]
 
 
+@flint.ctx.workprec(200)
 def test_matrix_product_contains_exact_products_and_unbounded_entries():
     rng = np.random.default_rng(2)
     a, b = rng.normal(size=(20, 3, 5)), rng.normal(size=(20, 5, 2)) * 10.0 ** rng.uniform(-8, 8, (20, 1, 1))
     product = iv.matmul(Interval.point(a), Interval.point(b))
-    flint.ctx.prec = 200
     for k in range(20):
         exact = flint.arb_mat(a[k].tolist()) * flint.arb_mat(b[k].tolist())
         for i in range(3):
@@ -219,21 +219,21 @@ def test_matrix_product_contains_exact_products_and_unbounded_entries():
     assert (Interval.point(np.ones(5)) @ np.ones(5)).shape == ()
 
 
+@flint.ctx.workprec(200)
 def test_matmul_error_bounds_the_rounding_error_and_is_small():
     rng = np.random.default_rng(3)
     a, b = rng.normal(size=(1, 40)) * 1e8, rng.normal(size=(40, 1))
     product, bound = iv.matmul_error(a, b)
-    flint.ctx.prec = 200
     exact = sum((flint.arb(x) * flint.arb(y) for x, y in zip(a[0].tolist(), b[:, 0].tolist())), flint.arb(0))
     assert abs(exact - flint.arb(product[0, 0])) <= flint.arb(bound[0, 0])
     assert bound[0, 0] < 1e-14 * np.abs(a).max() * 40
 
 
+@flint.ctx.workprec(200)
 def test_sum_encloses_whatever_the_order():
     rng = np.random.default_rng(4)
     values = rng.normal(size=(7, 1000)) * 10.0 ** rng.uniform(-10, 10, (7, 1000))
     total = Interval.point(values).sum(axis=1)
-    flint.ctx.prec = 200
     for row in range(7):
         exact = sum(map(flint.arb, values[row].tolist()), flint.arb(0))
         assert flint.arb(total.lo[row]) <= exact <= flint.arb(total.hi[row])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 from typing import Any
@@ -18,7 +19,7 @@ from certbound.rigor.intervals import Interval
 from certbound.values.continuous import exits, hypotheses, two_states
 from certbound.values.continuous.coefficients import Cells, Reader, enclose, squared_diffusion
 from certbound.values.continuous.exits import bound_exits
-from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper, sampled_residual
+from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.payment import BIN, Levels, Patched, pay_lower, pay_upper, repay
 from certbound.values.continuous.plane_proposal import Plan, Source, propose_plane
 from certbound.values.continuous.polynomials import basis_at, interpolation, node_product, nodes_of, to_bernstein
@@ -29,7 +30,7 @@ from certbound.values.continuous.shapes import propose_lower, propose_upper, sea
 from certbound.values.continuous.surface import Surface
 
 
-def exit_probability(f, g, low, high, horizon, start, *, target_times=None, cells=800, steps=800):
+def exit_probability(f, g, low, high, horizon, start, *, cells=400, steps=200):
     """A fine monotone solution of u_t + f u' + g^2 u'' / 2 = 0, extrapolated from two grids."""
 
     def solve(n, count):
@@ -251,7 +252,7 @@ WELL = (lambda x: [x[0] - x[0] ** 3], 0.35, 0.0, 2.5, 10.0, (0.9, 1.1))
 def test_both_bounds_are_near_the_truth(f, g, low, high, horizon, start) -> None:
     found = bound_exits(line_problem(f, g, low, high, horizon, start), seconds=3)
     drift, gain = (lambda t, x: f([x])[0]), (lambda t, x: g + 0 * x)
-    truth = math.log10(max(exit_probability(drift, gain, low, high, horizon, x, cells=1600) for x in start))
+    truth = math.log10(max(exit_probability(drift, gain, low, high, horizon, x) for x in start))
     assert truth - 1e-4 <= found.upper < truth + math.log10(1.06)
     assert found.lower is not None
     assert truth - math.log10(1.25) < found.lower <= truth + 1e-4
@@ -298,9 +299,10 @@ def spoilt(surface: Surface, rng: np.random.Generator, size: float) -> Surface:
 
 
 def well_truth(horizon: float, start: float) -> float:
-    return exit_probability(lambda t, x: x - x**3, lambda t, x: 0.35 + 0 * x, 0, 2.5, horizon, start, cells=1600)
+    return exit_probability(lambda t, x: x - x**3, lambda t, x: 0.35 + 0 * x, 0, 2.5, horizon, start)
 
 
+@functools.cache
 def proposals():
     problem = line_problem(*WELL)
     model, room = exits._model(problem), safe_room(problem)
@@ -317,13 +319,12 @@ def test_noise_on_a_proposal_never_passes_the_truth() -> None:
     truth = math.log(max(well_truth(10.0, x) for x in WELL[5]))
     rng = np.random.default_rng(0)
     seen = [prove_upper(upper, model, starts).log]
-    for size in (0.0, 1e-6, 1e-3, 0.3):
-        for shift in (-2.0, -0.3, 0.3):
-            bound = prove_upper(spoilt(upper, rng, size).raised(shift), model, starts).log
-            assert bound >= truth - 1e-3
-            payment = prove_lower(spoilt(lower, rng, size).raised(shift), model, starts)
-            assert payment is None or payment.log <= truth + 1e-3
-            seen.append(bound)
+    for size, shift in ((0.0, -2.0), (0.0, 0.3), (1e-6, -0.3), (1e-3, -0.3), (1e-3, 0.3), (0.3, -2.0)):
+        bound = prove_upper(spoilt(upper, rng, size).raised(shift), model, starts).log
+        assert bound >= truth - 1e-3
+        payment = prove_lower(spoilt(lower, rng, size).raised(shift), model, starts)
+        assert payment is None or payment.log <= truth + 1e-3
+        seen.append(bound)
     assert min(seen) < truth + 1.5  # some of these say something
 
 
@@ -332,9 +333,9 @@ def test_a_lower_bound_is_proved_of_a_function_that_is_nowhere_positive(monkeypa
     seen: list[float] = []
     examine = hypotheses.examine
 
-    def watched(surface: Surface, *rest: Any) -> Any:
+    def watched(surface: Surface, *rest: Any, **sides: bool) -> Any:
         seen.append(max(float(hypotheses.value_range(surface.patches(*chunk))[1].max()) for chunk in surface.chunks()))
-        return examine(surface, *rest)
+        return examine(surface, *rest, **sides)
 
     monkeypatch.setattr(hypotheses, "examine", watched)
     for shift in (1e-4, 0.3):
@@ -346,7 +347,7 @@ def test_a_lower_bound_is_proved_of_a_function_that_is_nowhere_positive(monkeypa
 def test_scaled_and_bent_proposals_never_pass_the_truth() -> None:
     model, starts, upper, lower = proposals()
     truth = math.log(max(well_truth(10.0, x) for x in WELL[5]))
-    for factor in (0.5, 0.9, 0.99, 1.01, 1.1, 1.5):
+    for factor in (0.5, 0.99, 1.01, 1.5):
         def scaled(surface: Surface, factor: float = factor) -> Surface:
             return dataclasses.replace(
                 surface, values=factor * surface.values, start_rates=factor * surface.start_rates,
@@ -378,8 +379,8 @@ TWO_FREE_STATES = math.log10(1 - (1 - exit_probability(lambda t, x: -x, lambda t
 
 
 def test_two_states_without_coupling_are_as_safe_as_each_alone() -> None:
-    found = bound_exits(two_free_states(), seconds=0.1)
-    assert TWO_FREE_STATES <= found.upper < TWO_FREE_STATES + 0.06
+    found = bound_exits(two_free_states(), seconds=1.6)
+    assert TWO_FREE_STATES <= found.upper < TWO_FREE_STATES + 0.09
     assert found.lower is None
 
 
@@ -390,7 +391,7 @@ def test_a_source_of_any_size_never_takes_a_bound_below_the_truth() -> None:
     plan = Plan(cells=12, growth=0.6, lead=0.03, floor=-7.0)
     first = propose_plane(plane, plan)
     assert first is not None
-    needed = two_states._source(first, *sampled_residual(first, model))
+    needed = Source.above(first, 1.1 * two_states._Sketch.of(first, model, starts).needed(-0.02))
     bounds = {}
     for size in (-1.0, 0.0, 1.0, 3.0):
         source = dataclasses.replace(needed, values=size * needed.values)
@@ -400,6 +401,27 @@ def test_a_source_of_any_size_never_takes_a_bound_below_the_truth() -> None:
     assert min(bounds.values()) >= TWO_FREE_STATES
     assert bounds[1.0] < bounds[0.0] - 0.01  # what it is for
     assert bounds[1.0] < TWO_FREE_STATES + 0.4
+
+
+def test_noise_that_grows_with_the_state_costs_no_rounding_to_speak_of() -> None:
+    """R = f.c + c'ac/2 for V = c.x: its bound lies that close although R is given by 13 x 13 coefficients."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[0] * (1 - x[1]), x[1] * (x[0] - 1)],
+        states=2, diffusion=lambda x: [[0.2 * x[0], 0], [0, 0.2 * x[1]]],
+    )  # fmt: skip
+    problem = cb.Problem(system, initial=[1, 1], safe=[cb.Inside(cb.Box([0.3, 0.3], [2.5, 2.5]))], horizon=1)
+    model, axis = exits._model(problem), np.array([0.3, 0.34, 0.4])
+    values = np.zeros((2, 3, 3, 3, 3))
+    values[:, :, 0, :, 0] = -20 * (axis[:, None] + axis)  # V = -20 (x + y)
+    values[:, :, 1, :, 0] = values[:, :, 0, :, 1] = -20.0
+    flat = np.zeros((1, 3, 3, 3, 3))
+    surface = Surface(axes=(axis, axis), times=np.array([0.0, 1.0]), values=values, start_rates=flat, end_rates=flat)
+    drifts, squares = hypotheses.interpolants(surface, model, 0, 1, model.counts())
+    found = bound_ranges(surface.patches(0, 1), drifts, squares, np.arange(4), model.counts())
+    x, y = np.meshgrid(np.linspace(0.34, 0.4, 50), np.linspace(0.34, 0.4, 50))
+    exact = -20 * (x * (1 - y) + y * (x - 1)) + 200 * 0.04 * (x**2 + y**2)
+    assert 0 <= found.residual_high[3] - exact.max() < 1e-3
+    assert 0 <= exact.min() - found.residual_low[3] < 1e-3
 
 
 def test_a_source_is_at_least_what_is_needed_on_every_patch() -> None:
@@ -498,6 +520,6 @@ def test_a_proposal_of_two_states_that_does_not_span_the_horizon_proves_nothing(
         surface = real(plane, plan, source)
         return surface if source is None else dataclasses.replace(surface, times=0.5 * surface.times)
 
-    assert len(list(two_states._uppers(plane, model, starts, plan))) == 2
+    assert two_states._upper(plane, model, starts, plan) < 0
     monkeypatch.setattr(two_states, "propose_plane", short)
-    assert list(two_states._uppers(plane, model, starts, plan)) == []
+    assert two_states._upper(plane, model, starts, plan) == 0

@@ -80,8 +80,10 @@ def mills(x: Array) -> Array:
     table = _mills_table()
     u = near - (cell + 0.5) / _CELLS
     value = table[_DEGREE].take(cell)
+    term = np.empty_like(value)
     for k in range(_DEGREE - 1, -1, -1):
-        value = value * u + table[k].take(cell)
+        value *= u
+        value += table[k].take(cell, out=term, mode="clip")
     far = x >= _FAR
     if np.any(far):
         large = x[far]

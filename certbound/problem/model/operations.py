@@ -121,6 +121,8 @@ def _arc_slope(g: Builder, numerator: float, a: int) -> int:
 
 
 def _angle_slope(g: Builder, numerator: Callable[[], int], a: int, b: int) -> int:
+    if a == b:  # the two slopes cancel: atan2(a, a) is constant on either side of 0
+        return g.const(0.0)
     squares = g.apply("add", g.apply("sq", a), g.apply("sq", b))
     return g.apply("div", numerator(), squares)
 

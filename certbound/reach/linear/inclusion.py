@@ -39,6 +39,33 @@ class Gathering:
         return Gathering(**{name: getattr(self, name)[cell] for name in self.__dataclass_fields__})
 
 
+def gathering_of(
+    response: LinearResponse, slope: Array, gain: Array, d_radius: Array, *, continuous: bool
+) -> Gathering:
+    """The gathering of slopes A (B, N, n, n), gains E (B, N, n, q) and a disturbance |d - d0| <= ``d_radius`` (q,)."""
+    h, n = response.step, slope.shape[-1]
+    size_e = np.abs(gain) @ d_radius
+    if not continuous:
+        generators = gain * d_radius
+        loss = np.abs(generators).sum(-1) * 4 * 2.0**-53
+        zero = np.zeros((*slope.shape[:2], n, n))
+        return Gathering(centre=zero + np.eye(n), second=zero, first=zero, curve=zero,
+                         generators=np.swapaxes(generators, -1, -2), box=loss, size=size_e)
+    identity = np.eye(n)
+    middle = identity + (h / 2) * slope
+    second = np.maximum(response.deviation - h * np.abs(slope), 0.0) + 4e-16 * response.deviation
+    box = (h * h / 4 * np.abs(slope) + h * second) @ size_e[..., None]
+    generators = h * (middle @ gain) * d_radius
+    rounding = 16 * (n + 4) * 2.0**-53 * h * (np.abs(middle) @ size_e[..., None])
+    size = np.abs(slope) + h * np.abs(response.drift)
+    bend = np.abs(response.drift) + size @ size * _ROUND
+    return Gathering(
+        centre=h * middle, second=h * second, first=response.deviation,
+        curve=h * h / 8 * (bend @ (identity + response.deviation)) * _ROUND,
+        generators=np.swapaxes(generators, -1, -2), box=(box + rounding)[..., 0] * _ROUND, size=size_e * _ROUND,
+    )
+
+
 class Supports:
     """Bounds of y and R of one cell along ``rows`` over every piece (and along the coordinates at every node).
 

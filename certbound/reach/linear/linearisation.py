@@ -14,7 +14,7 @@ from certbound.gaussian.response import LinearResponse, continuous_response, dis
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
-from certbound.reach.linear.inclusion import Gathering, Supports
+from certbound.reach.linear.inclusion import Gathering, Supports, gathering_of
 from certbound.reach.nominal import initial_cells
 from certbound.reach.remainder import Frame, Remainder
 from certbound.reach.sets import NominalPieces
@@ -24,7 +24,6 @@ _FEWEST_PIECES, _MOST_PIECES = 50, 2000
 _STEP, _OWN_STEP, _SERIES = 0.1, 0.03, 2.0
 """||J|| h of a piece: in the states' own units; in those that balance J, where fewer pieces do; and, in the states' own
 again, what the series of a transition matrix need."""
-_ROUND = 1 + 1e-13
 _LARGE = 40  # states
 WINDOW, WINDOW_TURN, WINDOW_SPAN = 0.02, 0.1, 8.0
 """The martingale windows that bound rows which turn: their share of the horizon; ||J|| times their time in balanced
@@ -364,27 +363,7 @@ class Linearisation:
     def gathering(self) -> Gathering:
         """How a disturbance and a remainder on one piece reach its end."""
         slope, _, gain = self.slopes
-        response, h, n = self.response, self.step, self.n
-        size_e = np.abs(gain) @ self.d_radius
-        if not self.continuous:
-            generators = gain * self.d_radius
-            loss = np.abs(generators).sum(-1) * 4 * 2.0**-53
-            zero = np.zeros((*slope.shape[:2], n, n))
-            return Gathering(centre=zero + np.eye(n), second=zero, first=zero, curve=zero,
-                             generators=np.swapaxes(generators, -1, -2), box=loss, size=size_e)
-        identity = np.eye(n)
-        middle = identity + (h / 2) * slope
-        second = np.maximum(response.deviation - h * np.abs(slope), 0.0) + 4e-16 * response.deviation
-        box = (h * h / 4 * np.abs(slope) + h * second) @ size_e[..., None]
-        generators = h * (middle @ gain) * self.d_radius
-        rounding = 16 * (n + 4) * 2.0**-53 * h * (np.abs(middle) @ size_e[..., None])
-        size = np.abs(slope) + h * np.abs(response.drift)
-        bend = np.abs(response.drift) + size @ size * _ROUND
-        return Gathering(
-            centre=h * middle, second=h * second, first=response.deviation,
-            curve=h * h / 8 * (bend @ (identity + response.deviation)) * _ROUND,
-            generators=np.swapaxes(generators, -1, -2), box=(box + rounding)[..., 0] * _ROUND, size=size_e * _ROUND,
-        )
+        return gathering_of(self.response, slope, gain, self.d_radius, continuous=self.continuous)
 
     def supports(self, cell: int, rows: Array, outputs: Integers | None = None) -> Supports:
         """Bounds of y and R of one cell along ``rows``; see `Supports`."""

@@ -23,7 +23,7 @@ from certbound.arrays import Array, Mask
 from certbound.errors import EnclosureError
 from certbound.problem.model import OPERATIONS, Graph, Node, Tape, edged, enclosed, jacobian, undefined_where
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.polynomials import interpolation, node_product, nodes_of, norm
+from certbound.values.continuous.polynomials import interpolation, lebesgue, node_product, nodes_of, norm
 
 _HIGHEST = 6  # polynomials up to this degree are represented exactly
 _SMOOTH = 4  # degree of the interpolant of any other smooth function
@@ -165,7 +165,7 @@ class Reader:
         full = [value.broadcast_to(shape) for value in values]
         mid = np.array([value.mid for value in full])
         rad = np.array([value.rad.reshape(shape[0], -1).max(axis=1) for value in full])
-        remainder = rad * np.prod([self._lebesgue(count) for count in counts]) + self._tail(cells, branch)
+        remainder = rad * np.prod([lebesgue(count) for count in counts]) + self._tail(cells, branch)
         mid, remainder = self._at_edges(cells, branch, mid, remainder)
         size = np.abs(mid).reshape(*mid.shape[:2], -1).max(axis=2)
         for axis, (count, where) in enumerate(zip(counts, points)):
@@ -173,12 +173,6 @@ class Reader:
             mid = np.moveaxis(np.tensordot(mid, matrix, axes=([axis + 2], [1])), -1, axis + 2)
             size = size * norm(matrix)
         return Interpolant(samples=mid, size=size * (1 + 1e-12), remainder=remainder * (1 + 1e-12))
-
-    @staticmethod
-    def _lebesgue(count: int) -> float:
-        finer = tuple(k / 256 for k in range(257))
-        # between the points the interpolant of values in [-1, 1] changes by at most degree^2 per unit times its norm
-        return norm(interpolation(count, finer)) / (1 - 2 * (count - 1) ** 2 / 512) if count > 1 else 1.0
 
     def _tail(self, cells: Cells, branch: Sequence[Interval]) -> Array:
         """The interpolation errors of all axes; 0 along an axis in which the function is a polynomial."""
@@ -190,7 +184,7 @@ class Reader:
                 sizes = _magnitudes(derivative, [*cells.whole(), *branch], len(width))
                 factor = node_product(count) / factorial(count) * (width * (1 + 1e-15)) ** count
                 total += weight * sizes * factor * (1 + 1e-12)
-            weight *= self._lebesgue(count)
+            weight *= lebesgue(count)
         return total
 
     def _at_edges(

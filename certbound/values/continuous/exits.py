@@ -129,7 +129,7 @@ def chart_exits(
     times : int
         In one state: how many times t, 0 the first of them. In two states only t = 0 is charted.
     seconds : float
-        When to stop refining (two states).
+        About what may be spent in two states, turned into a number of patches.
     lower : bool
         Whether to look for lower bounds too (one state).
 
@@ -145,7 +145,6 @@ def chart_exits(
     EnclosureError
         The model is undefined somewhere in the safe set.
     """
-    begin = time.perf_counter()
     _check(problem, None, seconds)
     room, model = safe_room(problem), _model(problem)
     _check_noise(model, room, problem)
@@ -155,7 +154,7 @@ def chart_exits(
     else:
         from certbound.values.continuous.two_states import chart_plane
 
-        charts = Charts(upper=tuple(chart_plane(problem, model, room, logs, begin + seconds)))
+        charts = Charts(upper=tuple(chart_plane(problem, model, room, logs, seconds)))
     if not charts.upper:
         raise InfeasibleError("no value function over the whole safe set could be proved; give `seconds` more.")
     return charts

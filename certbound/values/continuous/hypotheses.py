@@ -41,7 +41,8 @@ from certbound.values.continuous.surface import Surface
 
 Found = TypeVar("Found")
 
-_LIFTS = (0.0, 0.003, 0.02, 0.1)
+LIFTS = (0.0, 0.003, 0.01, 0.02, 0.035, 0.06, 0.1)
+_NEAR = 40.0  # in units of what is granted without being looked at
 NEGLIGIBLE = 5e-4
 """lam and eps (in units of the bound), summed over the horizon, that are granted without being looked at."""
 
@@ -83,12 +84,6 @@ class Proof:
     slab: Index
     cell: Index
 
-    def spread(self, values: Array, surface: Surface, rest: float) -> Array:
-        """One value a patch, shape (slabs, *cells), ``rest`` where nothing was looked at."""
-        table = np.full((surface.slabs, int(np.prod(surface.cells))), rest)
-        table[self.slab, self.cell] = values
-        return table.reshape(surface.slabs, *surface.cells)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Need:
@@ -103,11 +98,12 @@ class Need:
         return self.spare * (1 + np.exp(np.minimum(self.start - high, 700.0)) * (1 - 1e-13)) * (1 - 1e-13)
 
 
-def examine(surface: Surface, model: Model, need: Need) -> Proof:
-    """Enclose R, V and Q2 on every patch of a surface that needs it."""
+def examine(surface: Surface, model: Model, need: Need, *, upper: bool) -> Proof:
+    """Enclose R (closely on one side), V and Q2 on every patch of a surface that needs it."""
     counts = model.counts()
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
+    share = _NEAR * (0.5 + 0.5 * surface.times[-1] / (surface.slabs * surface.steps))
 
     def look(ends: tuple[int, int]) -> tuple[Index, Ranges] | None:
         patches = surface.patches(*ends)
@@ -118,7 +114,10 @@ def examine(surface: Surface, model: Model, need: Need) -> Proof:
         kept = np.flatnonzero(~(low >= need.top) & ~(size <= need.free(high)))  # what is no number is looked at
         if not len(kept):
             return None
-        ranges = bound_ranges(patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare)
+        ranges = bound_ranges(
+            patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare,
+            near=share[ends[0] + kept // per] * need.free(high[kept]), upper=upper,
+        )  # fmt: skip
         return ends[0] * per + kept, ranges
 
     found = [one for one in _side_by_side(look, list(surface.chunks())) if one is not None]
@@ -189,20 +188,11 @@ def covers(surface: Surface, horizon: float, low: Sequence[float], high: Sequenc
 
 def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment:
     """An upper bound of log P(leaving the box of the surface by its last time), whatever the surface is."""
-    return examine_upper(surface, model, starts)[0]
-
-
-def examine_upper(
-    surface: Surface, model: Model, starts: Sequence[tuple[float, float]]
-) -> tuple[Payment, Array, Array]:
-    """`prove_upper`, and for every patch an upper bound of R and a lower one of V (-inf and inf where none is due)."""
     surface = _grounded(surface)
     start = _up(extreme_over(surface, starts, upper=True))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
-    proof = examine(surface, model, need)
-    best = _cheapest(proof, need, surface, start)[0]
-    high = proof.spread(proof.ranges.residual_high, surface, -np.inf)
-    return best, high, proof.spread(proof.ranges.low, surface, np.inf)
+    proof = examine(surface, model, need, upper=True)
+    return _cheapest(proof, need, surface, start)[0]
 
 
 def _grounded(surface: Surface) -> Surface:
@@ -220,7 +210,7 @@ def _cheapest(proof: Proof, need: Need, surface: Surface, start: float) -> tuple
     """The payment that bounds log P best where V(0, .) = ``start``, and by how much V was lifted for it."""
     floor = float(surface.range_at(-1)[0].min())
     best: tuple[Payment, float] | None = None
-    for lift in _LIFTS:  # V + lift has the same residual, and nothing is due where it is positive
+    for lift in LIFTS:  # V + lift has the same residual, and nothing is due where it is positive
         if best is not None and start + lift >= best[0].log:
             break
         patched = _patched(proof, proof.ranges.residual_high, need, surface.steps, lift)
@@ -237,7 +227,7 @@ def chart_above(surface: Surface, model: Model, levels: Sequence[float], slabs: 
     """
     surface = _grounded(surface)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=0.0)
-    proof = examine(surface, model, need)
+    proof = examine(surface, model, need, upper=True)
     paid = [_cheapest(proof, need, surface, level) for level in levels]
     charts = []
     for k in slabs:
@@ -261,7 +251,7 @@ def prove_lower(surface: Surface, model: Model, starts: Sequence[tuple[float, fl
     surface = _sunk(surface)
     start = -_up(-extreme_over(surface, starts, upper=False))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=np.inf)
-    proof = examine(surface, model, need)
+    proof = examine(surface, model, need, upper=False)
     return _earned(proof, need, surface, start)
 
 
@@ -282,7 +272,7 @@ def chart_below(surface: Surface, model: Model, levels: Sequence[float], slabs: 
     """Lower bounds of P(leaving the box from a cell on), as `chart_above`; -inf where nothing was proved."""
     surface = _sunk(surface)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=np.inf)
-    proof = examine(surface, model, need)
+    proof = examine(surface, model, need, upper=False)
     found = [_earned(proof, need, surface, level) for level in levels]
     paid = [payment.terms for payment in found if payment is not None and payment.terms is not None]
     charts = []

@@ -67,16 +67,33 @@ def _extreme(table: Array, low: Array, high: Array) -> None:
                     high[s] = max(high[s], table[i, j, k, s])
 
 
+@njit(cache=True)
+def _extreme_parts(
+    table: Array, parts: tuple[Array, ...], one: Array, two: Array, result: Array, low: Array, high: Array
+) -> None:
+    """Least and largest coefficient of a table over all parts, which ``parts`` lead to from the samples."""
+    least, most = np.empty(BLOCK), np.empty(BLOCK)
+    low[:], high[:] = np.inf, -np.inf
+    for i in range(parts[0].shape[0]):
+        for j in range(parts[1].shape[0]):
+            for k in range(parts[2].shape[0]):
+                _change(table, parts[0][i], parts[1][j], parts[2][k], one, two, result)
+                _extreme(result, least, most)
+                for s in range(BLOCK):
+                    low[s], high[s] = min(low[s], least[s]), max(high[s], most[s])
+
+
 @njit(cache=True, nogil=True)
 def extremes_in_plane(
     coefficients: Array, step: Array, width_x: Array, width_y: Array, place: Index, drift: Array, square: Array,
-    bases: tuple[Array, ...], inverses: tuple[Array, ...], wanted: float, out: Array,
+    bases: tuple[Array, ...], parts: tuple[Array, ...], wanted: float, out: Array,
 ) -> None:
-    """Write least and largest coefficient of R for each branch, then the least of Q2, to ``out`` (B, branches, 3).
+    """Write to ``out`` (B, branches, 6): extreme coefficients of R, the least of Q2, extreme samples of R, Q2's size.
 
     ``drift`` has shape (branches, 2, cells, 1 or t, x, y), ``square`` (4, cells, 1 or t, x, y); ``place`` says which
     cell a patch is. ``bases`` are the values of the basis and of its derivatives at the samples: time 0, 1; x 0, 1, 2;
-    y 0, 1, 2. ``inverses`` lead from samples to Bernstein coefficients in time, x and y.
+    y 0, 1, 2. ``parts`` (parts, samples, samples) lead from samples to Bernstein coefficients on
+    equal parts of time, x and y.
     """
     t0, t1, x0, x1, x2, y0, y1, y2 = bases
     nt, nx, ny = t0.shape[0], x0.shape[0], y0.shape[0]
@@ -87,6 +104,7 @@ def extremes_in_plane(
     rest, energy, result = np.empty(shape), np.empty(shape), np.empty(shape)
     c = np.empty((4, 6, 6, BLOCK))
     low, high, look = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    least, most = np.empty(BLOCK), np.empty(BLOCK)
     count = coefficients.shape[0]
     for begin in range(0, count, BLOCK):
         for s in range(BLOCK):  # the last patch is repeated where the block is not full
@@ -121,15 +139,16 @@ def extremes_in_plane(
                         for k in range(ny):
                             vt[i, j, k, s] = (rest[i, j, k, s] + drift[branch, 0, cell, ia, j, k] * vx[i, j, k, s]
                                               + drift[branch, 1, cell, ia, j, k] * vy[i, j, k, s])  # fmt: skip
-            _change(vt, inverses[0], inverses[1], inverses[2], one, two, result)
-            _extreme(result, low, high)
+            _extreme_parts(vt, parts, one, two, result, low, high)
+            _extreme(vt, least, most)
             for s in range(min(BLOCK, count - begin)):
                 out[begin + s, branch, 0], out[begin + s, branch, 1] = low[s], high[s]
+                out[begin + s, branch, 3], out[begin + s, branch, 4] = least[s], most[s]
                 look[s] = max(look[s], max(-low[s], high[s]))
         if look.max() > wanted:
-            _change(energy, inverses[0], inverses[1], inverses[2], one, two, result)
-            _extreme(result, low, high)
+            _extreme_parts(energy, parts, one, two, result, low, high)
         else:
             low[:] = 0.0
+        _extreme(energy, least, most)
         for s in range(min(BLOCK, count - begin)):
-            out[begin + s, :, 2] = low[s]
+            out[begin + s, :, 2], out[begin + s, :, 5] = low[s], max(-least[s], most[s])

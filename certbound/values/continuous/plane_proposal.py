@@ -25,6 +25,7 @@ Pair = tuple[float, float]
 
 _GAMMA = 0.5
 _COURANT = 3.0
+_GATE = 0.004  # a source weakens where V is above minus this, and ends at 0
 _MOST_STEPS = 40_000
 
 
@@ -97,7 +98,7 @@ def _linear(nodes: Array, points: Array) -> Array:
 def propose_plane(plane: Plane, plan: Plan, source: Source | None = None) -> Surface | None:
     """V on a tensor grid; None where the integration breaks down or needs too many steps."""
     solver = _Solver(plane, plan, source)
-    times = _slab_times(plane.horizon, plan)
+    times = slab_times(plane.horizon, plan)
     value, taken = solver.start(), 0
     values, first, last = [value], [], []
     for begin, end in itertools.pairwise(times):
@@ -116,7 +117,8 @@ def propose_plane(plane: Plane, plan: Plan, source: Source | None = None) -> Sur
     return solver.surface(times, values, first, last)
 
 
-def _slab_times(horizon: float, plan: Plan) -> Array:
+def slab_times(horizon: float, plan: Plan) -> Array:
+    """Ends of the slabs in time to go, short at first."""
     times = [0.0]
     while times[-1] < horizon:
         times.append(times[-1] + min(plan.growth * (0.1 * plan.lead + times[-1]), horizon * plan.growth / 4))
@@ -181,15 +183,16 @@ class _Solver:
         if np.any(a[0, 1]):
             bends = bends + 2 * a[0, 1] * (vx @ self.slope[1].T)
         energy = a[0, 0] * vx * vx + 2 * a[0, 1] * vx * vy + a[1, 1] * vy * vy
-        rate = force[0] * vx + force[1] * vy + 0.5 * (bends + energy) + self._source(tau)
+        rate = force[0] * vx + force[1] * vy + 0.5 * (bends + energy)
+        rate = rate + self._source(tau) * np.clip(-value / _GATE, 0.0, 1.0)
         rate[self.edge] = 0.0
         speed_x = force[0] + a[0, 0] * vx + a[0, 1] * vy
         speed_y = force[1] + a[1, 1] * vy + a[0, 1] * vx
         return rate, speed_x, speed_y, a
 
-    def _source(self, tau: float) -> Array | float:
+    def _source(self, tau: float) -> Array:
         if self.source is None:
-            return 0.0
+            return np.zeros(self.x.shape)
         times, values = self.source
         t = self.plane.horizon - tau
         left = min(max(int(np.searchsorted(times, t)) - 1, 0), len(times) - 2)
@@ -205,8 +208,9 @@ class _Solver:
         fastest = max(float(np.max(np.abs(v) / w)) for v, w in zip((speed_x, speed_y), self.widths))
         return max(4, math.ceil(min(span * fastest / _COURANT, 1e6)) if math.isfinite(fastest) else 4)
 
-    def _divided(self, right: Array, speeds: tuple[Array, Array], a: Array, step: float) -> Array:
-        """(I - g h J_x)^-1 (I - g h J_y)^-1 applied."""
+    def _divided(self, right: Array, speeds: tuple[Array, Array], a: Array, step: float, fed: Array) -> Array:
+        """(I - g h J_x)^-1 (I - g h J_y)^-1 (I - g h J_s)^-1 applied, J_s = -``fed`` being the source's part."""
+        right = right / (1 + _GAMMA * step * fed)
         for axis in (1, 0):
             own = self.splines[axis]
             line = np.ascontiguousarray(right if axis == 0 else right.T)
@@ -219,9 +223,10 @@ class _Solver:
 
     def step(self, tau: float, value: Array, h: float) -> Array:
         rate, speed_x, speed_y, a = self._right(tau, value)
-        k1 = self._divided(rate, (speed_x, speed_y), a, h)
+        fed = np.where((value < 0) & (value > -_GATE), self._source(tau) / _GATE, 0.0)
+        k1 = self._divided(rate, (speed_x, speed_y), a, h, fed)
         again = self._right(tau + h, value + h * k1)[0]
-        k2 = self._divided(again - 2 * k1, (speed_x, speed_y), a, h)
+        k2 = self._divided(again - 2 * k1, (speed_x, speed_y), a, h, fed)
         return value + 1.5 * h * k1 + 0.5 * h * k2
 
     def surface(self, times: Array, values: list[Array], first: list[Array], last: list[Array]) -> Surface:
@@ -246,7 +251,8 @@ class _Solver:
 def _grid(plane: Plane, plan: Plan, axis: int) -> Array:
     low, high = plane.low[axis], plane.high[axis]
     fine = np.linspace(low, high, 4001)
-    density = np.full(len(fine), 1.0 / (high - low))
+    density = 1 / _mean_deviation(plane, axis, fine)
+    density = density / np.trapezoid(density, fine)
     for side, distance in ((0, fine - low), (1, high - fine)):
         weight = 1 / (distance + 1 / _layer_rate(plane, plan, axis, side))
         density += 0.5 * weight / np.trapezoid(weight, fine)
@@ -254,6 +260,15 @@ def _grid(plane: Plane, plan: Plan, axis: int) -> Array:
     nodes = np.interp(np.linspace(0, total[-1], plan.cells + 1), total, fine)
     nodes[0], nodes[-1] = low, high
     return through(nodes, plane.starts[axis])
+
+
+def _mean_deviation(plane: Plane, axis: int, places: Array) -> Array:
+    """The root of a's diagonal along an axis, averaged over the other one, and kept from being too small."""
+    others = np.linspace(plane.low[1 - axis], plane.high[1 - axis], 17)
+    x, y = np.meshgrid(places, others, indexing="ij") if axis == 0 else np.meshgrid(others, places, indexing="ij")
+    square = plane.square(plane.horizon, x, y)[axis, axis] * np.ones(x.shape)
+    root = np.sqrt(np.maximum(square, 0.0)).mean(axis=1 - axis)
+    return np.asarray(np.maximum(root, 0.2 * root.max()))
 
 
 def _layer_rate(plane: Plane, plan: Plan, axis: int, side: int) -> float:

@@ -7,6 +7,7 @@ of its n + 1 Bernstein coefficients on [0, 1]; that is what every bound of this 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from functools import lru_cache
 from math import comb, cos, pi
@@ -43,7 +44,10 @@ def nodes_of(count: int) -> tuple[float, ...]:
 
 
 def _bernstein_rows(points: tuple[float, ...], degree: int) -> Rows:
-    exact = [Fraction(point) for point in points]
+    return _rows_at([Fraction(point) for point in points], degree)
+
+
+def _rows_at(exact: Sequence[Fraction], degree: int) -> Rows:
     return [[comb(degree, j) * s**j * (1 - s) ** (degree - j) for j in range(degree + 1)] for s in exact]
 
 
@@ -57,6 +61,18 @@ def basis_at(points: tuple[float, ...], degree: int) -> Array:
 def to_bernstein(count: int) -> Array:
     """From values at ``nodes_of(count)`` to the Bernstein coefficients of the polynomial through them."""
     return _rounded(_inverse(_bernstein_rows(nodes_of(count), count - 1)))
+
+
+@lru_cache(maxsize=64)
+def to_parts(count: int, parts: int) -> Array:
+    """`to_bernstein` for each of ``parts`` equal parts of [0, 1], a power of 2, alone: shape (parts, count, count).
+
+    The coefficients on a part are averages of those on the whole, so that no matrix is larger than `to_bernstein`.
+    """
+    nodes = [Fraction(node) for node in nodes_of(count)]
+    inverse = _inverse(_bernstein_rows(nodes_of(count), count - 1))
+    there = [_rows_at([(part + node) / parts for node in nodes], count - 1) for part in range(parts)]
+    return np.array([_rounded(_product(inverse, _product(rows, inverse))) for rows in there])
 
 
 @lru_cache(maxsize=128)
@@ -74,6 +90,17 @@ def node_product(count: int) -> float:
     values = [_absolute_product(Fraction(point), nodes) for point in finer]
     # |derivative| <= count on [0, 1], each factor being at most 1 in size: half a spacing to the nearest point
     return float(max(values)) + count / 2048
+
+
+@lru_cache(maxsize=32)
+def lebesgue(count: int) -> float:
+    """An upper bound of sup |p| over [0, 1] where a polynomial is at most 1 in size at ``nodes_of(count)``."""
+    if count == 1:
+        return 1.0
+    parts = max(256, 2 ** (2 * (count - 1) ** 2 - 1).bit_length())
+    finer = tuple(k / parts for k in range(parts + 1))
+    # between the points it changes by at most 2 degree^2 per unit (Markov) times its norm
+    return float(norm(interpolation(count, finer)) / (1 - (count - 1) ** 2 / parts))
 
 
 def norm(matrix: Array) -> float:

@@ -8,11 +8,14 @@ diffusion that are polynomials up to a remainder (`coefficients`), the residual
 is a polynomial up to a remainder. It is evaluated at as many nodes as it has coefficients and turned into Bernstein
 form. Rounding: with Z the size of V's coefficients on the cell (reference value subtracted), |V_t| <= 6 Z / dt,
 |V_i| <= 10 Z / h_i, |V_ij| <= 100 Z / (h_i h_j), and each is evaluated with at most 200 roundoffs of that size (three
-changes of basis with at most 8 terms each, differences included; `_ROUNDOFFS` doubles what the count gives).
+changes of basis with at most 8 terms each, differences included; `_ROUNDOFFS` doubles what the count gives). The
+polynomial through the computed samples is off by as much times Lebesgue's constants; its own Bernstein coefficients
+are off by `_CHANGE` units of its largest sample times the norms of the matrices that lead to them.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,10 +24,11 @@ import numpy as np
 from certbound.arrays import Array, Index
 from certbound.rigor.rounding import UNIT
 from certbound.values.continuous.coefficients import Interpolant
-from certbound.values.continuous.polynomials import basis_at, nodes_of, norm, to_bernstein
+from certbound.values.continuous.polynomials import basis_at, lebesgue, nodes_of, norm, to_bernstein, to_parts
 
 SPACE, TIME = 5, 3
 _ROUNDOFFS = 500 * UNIT
+_CHANGE = 600 * UNIT  # dot products of at most 17 terms along each axis, or of 17^2 where two axes are one product
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -73,7 +77,7 @@ def along(matrix: Array, array: Array, axis: int) -> Array:
 
 def bound_ranges(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], *, wanted: float = 0.0,
+    counts: Sequence[int], *, wanted: float = 0.0, near: Array | float = math.inf, upper: bool = True,
 ) -> Ranges:
     """Ranges of R (its maximum over the drifts), V and Q2; see the module.
 
@@ -89,6 +93,9 @@ def bound_ranges(
         Samples in time and in each state; at least the degree of R plus 1.
     wanted : float
         Where |R| <= ``wanted`` the bound of Q2 may be 0, which saves its evaluation.
+    near : float or ndarray, shape (B,)
+        How far from the samples of R its bound, the upper or the lower one, may lie before the halves and quarters of
+        a patch are looked at; two states.
 
     Notes
     -----
@@ -97,53 +104,67 @@ def bound_ranges(
     """
     n = len(patches.widths)
     extremes = _in_plane if n == 2 else _on_line
-    least, most, floor = extremes(patches, drifts, squares, place, counts, wanted)
+    least, most, floor, largest = extremes(patches, drifts, squares, place, counts, wanted, near, upper)
     error, sizes = _errors(patches, squares.size[:, place], n)
     loss = _diffusive_loss(patches, squares.remainder[:, place], n)
-    amplification = float(np.prod([norm(to_bernstein(count)) for count in counts]))
+    sampled = float(np.prod([lebesgue(count) for count in counts])) * _ROUNDOFFS
+    changed = float(np.prod([norm(to_bernstein(count)) for count in counts])) * _CHANGE
     high, low = np.full(len(error), -np.inf), np.full(len(error), -np.inf)
     for branch, drift in enumerate(drifts):
         own, slack = error, loss
         for i in range(n):
             own = own + drift.size[i, place] * sizes[i]
             slack = slack + drift.remainder[i, place] * _steepest(patches, i)
-        slack = (amplification * _ROUNDOFFS * own + slack) * (1 + 1e-9)
+        slack = (sampled * own + changed * largest[branch] + slack) * (1 + 1e-9)
         high, low = np.maximum(high, most[branch] + slack), np.maximum(low, least[branch] - slack)
-    floor = np.maximum(floor - (amplification * _ROUNDOFFS * error + loss) * (1 + 1e-9), 0.0)
+    floor = np.maximum(floor - (sampled * error + changed * largest[-1] + loss) * (1 + 1e-9), 0.0)
     v_low, v_high = value_range(patches)
     return Ranges(residual_low=low, residual_high=high, low=v_low, high=v_high, energy=floor)
 
 
-Extremes = tuple[Array, Array, Array]
+Extremes = tuple[Array, Array, Array, Array]
 
 
 def _on_line(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], wanted: float,
+    counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
 ) -> Extremes:
-    """Least and largest Bernstein coefficients of R, one row a branch, and the least of Q2: one state."""
+    """Least and largest Bernstein coefficients of R, one row a branch, the least of Q2, and the sizes of the samples.
+
+    The sizes have one row a branch, then one of Q2. One state.
+    """
     first = _derived(patches.coefficients, 2, patches.widths[0])
     slope = _at_samples(first, counts)
     half = 0.5 * squares.samples[0, place]
     energy = half * slope * slope
     rest = _at_samples(_derived(patches.coefficients, 1, patches.step), counts) + energy
     rest += half * _at_samples(_derived(first, 2, patches.widths[0]), counts)
-    found = [_extremes(rest + drift.samples[0, place] * slope, counts) for drift in drifts]
+    tables = [rest + drift.samples[0, place] * slope for drift in drifts]
+    sizes = np.array([np.abs(table).max(axis=(1, 2)) for table in (*tables, energy)])
+    found = [_extremes(table, counts) for table in tables]
     least, most = np.array([pair[0] for pair in found]), np.array([pair[1] for pair in found])
     floor = np.zeros(len(rest))
     looked = np.flatnonzero((least.min(axis=0) < -wanted) | (most.max(axis=0) > wanted))
     if len(looked):
         floor[looked] = _extremes(energy[looked], counts)[0]
-    return least, most, floor
+    return least, most, floor, sizes
 
 
 def _in_plane(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], wanted: float,
+    counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
 ) -> Extremes:
-    """The same in two states, compiled."""
-    out = _run_plane(patches, drifts, squares, place, counts, tuple(np.array(to_bernstein(k)) for k in counts), wanted)
-    return out[:, :, 0].T, out[:, :, 1].T, out[:, :, 2].min(axis=1)
+    """The same in two states, compiled; halves and quarters are looked at where the coefficients lie far off."""
+    out = _run_plane(patches, drifts, squares, place, counts, 1, wanted)
+    near = np.broadcast_to(near, len(out))
+    for parts in (2, 4):
+        far = out[:, :, 1] - np.maximum(out[:, :, 4], 0) if upper else np.minimum(out[:, :, 3], 0) - out[:, :, 0]
+        beyond = np.maximum(out[:, :, 4] if upper else -out[:, :, 3], 0)
+        bad = np.flatnonzero(np.any(far > near[:, None] + 0.05 * beyond, axis=1))
+        if len(bad):
+            out[bad] = _run_plane(patches.take(bad), drifts, squares, place[bad], counts, parts, wanted)
+    sizes = np.vstack([np.maximum(-out[:, :, 3], out[:, :, 4]).T, out[:, :, 5].max(axis=1)])
+    return out[:, :, 0].T, out[:, :, 1].T, out[:, :, 2].min(axis=1), sizes
 
 
 def sample_in_plane(
@@ -151,25 +172,26 @@ def sample_in_plane(
     counts: Sequence[int],
 ) -> Array:
     """The largest sample of R over each patch and all branches, two states: a sketch, no bound."""
-    same = tuple(np.eye(count) for count in counts)
-    return np.asarray(_run_plane(patches, drifts, squares, place, counts, same, np.inf)[:, :, 1].max(axis=1))
+    return np.asarray(_run_plane(patches, drifts, squares, place, counts, 0, np.inf)[:, :, 4].max(axis=1))
 
 
 def _run_plane(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], inverses: tuple[Array, ...], wanted: float,
+    counts: Sequence[int], parts: int, wanted: float,
 ) -> Array:
+    """What the kernel finds with this many parts along each axis; samples alone for 0."""
     from certbound.values.continuous.kernel import extremes_in_plane
 
     time, x, y = (
         _derivatives(count, degree, orders) for count, degree, orders in zip(counts, (TIME, SPACE, SPACE), (2, 3, 3))
     )
-    out = np.empty((len(patches.size), len(drifts), 3))
+    changes = tuple(to_parts(count, parts) if parts else np.empty((0, count, count)) for count in counts)
+    out = np.empty((len(patches.size), len(drifts), 6))
     width_x, width_y = patches.widths
     extremes_in_plane(
         np.ascontiguousarray(patches.coefficients), patches.step, width_x, width_y, place,
         np.ascontiguousarray([drift.samples for drift in drifts]), np.ascontiguousarray(squares.samples),
-        (*time, *x, *y), inverses, wanted, out,
+        (*time, *x, *y), changes, wanted, out,
     )  # fmt: skip
     return out
 

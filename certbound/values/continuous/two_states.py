@@ -1,15 +1,16 @@
-"""Two states: propose V, prove it, and hand what the proof had to pay back to the proposal as a source.
+"""Two states: propose V, hand what a proof would have to pay back to the proposal as a source, and prove it.
 
-R, the residual, is bounded on every patch. Where it is positive the theorem pays for the worst patch of each slab all
+R, the residual, is sampled on every patch. Where it is positive the theorem pays for the worst patch of each slab all
 over the plane, which is far too much where the worst ones lie in corners that hardly a path visits. With s >= R as a
 source of V's equation the residual of the next proposal is about R - s <= 0, and u grows only by what a path meets on
-its way out. The residual is sampled first and bounded later: all this is proposal, the proof is that of `hypotheses`.
+its way out. All this is proposal, the proof is that of `hypotheses`.
 """
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,70 +19,55 @@ from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.charts import Chart
 from certbound.values.continuous.hypotheses import (
+    LIFTS,
     Model,
     chart_above,
     covers,
-    examine_upper,
     extreme_over,
+    prove_upper,
     sampled_residual,
 )  # fmt: skip
-from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane
+from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane, slab_times
 from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
 
 _FACTOR = 1.12
-_TOP = -0.02  # where V is above, the proof may lift it over 0 instead
+_TOPS = (-0.02, -0.1)  # where V is above, the proof may lift it over 0 instead
 _CAP = 50.0
+_GRANTED = 0.005  # eps that the proof may pay, in units of the bound, summed over the horizon
+_RATE = 10_000  # patches that are proposed and proved in a second
+_PASSES = 2
+_CLOSE = 0.15
+_VARIED = 1.0  # about how much V varies on a patch
+_SHARES = (0.12, 0.8)  # of the patches, for one grid after the other
 
 
 def two_states(
     problem: Problem, model: Model, room: Room, deadline: float
 ) -> tuple[float, None, str]:
-    """Refine the upper bound until the time is spent; lower bounds in two states are not looked for."""
+    """The upper bound on one grid after another; lower bounds in two states are not looked for.
+
+    The seconds until the deadline are turned into a number of patches, so that the bound does not depend on the clock.
+    """
     starts = starts_of(problem)
     inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
+    patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     level = _rough_level(inner)
     upper, done = 0.0, []
-    for plan in _plans(inner, level, 36 if deadline - time.perf_counter() < 15 else 50):
-        begin = time.perf_counter()
-        for found in _uppers(inner, model, starts, plan):
-            upper = min(upper, found)
-            if time.perf_counter() > deadline:
-                break
+    for share in _SHARES:
+        plan = _plan(inner, level, share * patches)
+        upper = min(upper, _upper(inner, model, starts, plan))
         done.append(f"{plan.cells}^2")
-        spent = time.perf_counter() - begin
-        if time.perf_counter() + 2 * spent > deadline:
+    return upper, None, f"value function in two states, cells: {', '.join(done)}"
+
+
+def _plan(plane: Plane, level: float, patches: float) -> Plan:
+    """The finest grid with about so many patches; slabs grow fewer as fast as cells do."""
+    for cells in itertools.count(16):
+        plan = Plan(cells=cells, growth=min(6 / cells, 0.3), lead=0.32 / cells * plane.horizon, floor=level - 5)
+        if cells**2 * len(slab_times(plane.horizon, plan)) > patches:
             break
-    words = f"value function in two states, cells: {', '.join(done) or 'none came to an end'}"
-    return upper, None, words
-
-
-def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], deadline: float) -> list[Chart]:
-    """The last proved upper bound from every cell at t = 0, sharp at the levels of log P; none where none was proved.
-
-    The proposal is refined once for what its residual costs, as for the bound over the initial set.
-    """
-    plane = _plane(problem, model, room.inner_low, room.inner_high, starts_of(problem))
-    least = _rough_level(plane)
-    levels = sorted({max(level, least) for level in levels})
-    found: list[Chart] = []
-    for plan in _plans(plane, levels[0], 36 if deadline - time.perf_counter() < 15 else 50):
-        begin = time.perf_counter()
-        surface = propose_plane(plane, plan)
-        if surface is not None:
-            surface = propose_plane(plane, plan, _source(surface, *sampled_residual(surface, model))) or surface
-            if covers(surface, plane.horizon, plane.low, plane.high, within=True):
-                found = chart_above(surface, model, levels, [0])
-        if time.perf_counter() + 3 * (time.perf_counter() - begin) > deadline:
-            break
-    return found
-
-
-def _plans(plane: Plane, level: float, cells: int) -> Iterator[Plan]:
-    growth, lead = 0.28 * (36 / cells) ** 0.6, 0.36 / cells
-    for _ in range(5):
-        yield Plan(cells=cells, growth=growth, lead=lead * plane.horizon, floor=level - 5)
-        cells, growth, lead = int(1.35 * cells), growth / 1.2, lead * 0.8
+    return plan
 
 
 def _rough_level(plane: Plane) -> float:
@@ -98,29 +84,67 @@ def _rough_level(plane: Plane) -> float:
     return level
 
 
-def _uppers(plane: Plane, model: Model, starts: list[Pair], plan: Plan) -> Iterator[float]:
-    """Proved upper bounds, one after another."""
+def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], seconds: float) -> list[Chart]:
+    """Upper bounds from every cell at t = 0, sharp at the levels of log P; none where no proposal comes to an end."""
+    plane = _plane(problem, model, room.inner_low, room.inner_high, starts_of(problem))
+    least = _rough_level(plane)
+    levels = sorted({max(level, least) for level in levels})
+    plan = _plan(plane, levels[0], _SHARES[0] * _RATE * seconds)
+    surface = _promising(plane, model, plan, levels[-1])
+    return [] if surface is None else chart_above(surface, model, levels, [0])
+
+
+def _upper(plane: Plane, model: Model, starts: list[Pair], plan: Plan) -> float:
+    """A proved upper bound of log P from the most promising proposal; 0 where none comes to an end."""
+    surface = _promising(plane, model, plan)
+    return 0.0 if surface is None else prove_upper(surface, model, starts).log
+
+
+def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = None) -> Surface | None:
+    """The proposal whose bound will be the smallest where V is the ``level``, or over the starts."""
     surface = propose_plane(plane, plan)
     if surface is None:
-        return
-    source = _source(surface, *sampled_residual(surface, model))
-    for attempt in range(2):
-        better = propose_plane(plane, plan, source)
-        if better is None and attempt:
-            return
-        candidate = better or surface  # without a better one the first one is proved as it is
-        if not covers(candidate, plane.horizon, plane.low, plane.high, within=True):
-            return
-        payment, excess, low = examine_upper(candidate, model, starts)
-        yield payment.log
-        if better is None:
-            return
-        source = source.plus(_source(better, excess, low))
+        return None
+    first = best = _Sketch.of(surface, model, plane.starts, level)
+    for top in _TOPS:
+        sketch, source = first, None
+        for _ in range(_PASSES):
+            more = Source.above(sketch.surface, _FACTOR * sketch.needed(top))
+            source = more if source is None else source.plus(more)
+            surface = propose_plane(plane, plan, source)
+            if surface is None:
+                break
+            sketch = _Sketch.of(surface, model, plane.starts, level)
+            best = min(best, sketch, key=lambda one: one.estimate())
+        if best.estimate() < best.start + _CLOSE:
+            break
+    return best.surface if covers(best.surface, plane.horizon, plane.low, plane.high, within=True) else None
 
 
-def _source(surface: Surface, excess: Array, low: Array) -> Source:
-    needed = np.where(low < _TOP, np.clip(excess, 0.0, _CAP), 0.0)
-    return Source.above(surface, _FACTOR * needed)
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Sketch:
+    """A proposal with samples of what its proof would pay for: R, but for what eps pays, and V's least values."""
+
+    surface: Surface
+    start: float
+    excess: Array
+    low: Array
+
+    @classmethod
+    def of(cls, surface: Surface, model: Model, starts: list[Pair], level: float | None = None) -> _Sketch:
+        start = extreme_over(surface, starts, upper=True) if level is None else level
+        highest, low = sampled_residual(surface, model)
+        paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - low - _VARIED, 50.0))
+        return cls(surface=surface, start=start, excess=np.maximum(highest - paid, 0.0), low=low)
+
+    def needed(self, top: float) -> Array:
+        """The source that would do where V is below ``top``."""
+        return np.where(self.low < top, np.minimum(self.excess, _CAP), 0.0)
+
+    def estimate(self) -> float:
+        """About what the proof will find."""
+        worst = [np.where(self.low < -lift, self.excess, 0.0).max(axis=(1, 2)) for lift in LIFTS]
+        return self.start + min(lift + float(rate @ self.surface.steps) for lift, rate in zip(LIFTS, worst))
 
 
 def _plane(

@@ -29,9 +29,9 @@ def is_indefinite(matrix: flint.arb_mat) -> bool:
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
+@flint.ctx.workprec(300)
 def test_the_inequalities_hold_in_ball_arithmetic_and_fail_just_below(n):
     rng = np.random.default_rng(n)
-    flint.ctx.prec = 300
     jacobians = rng.normal(size=(6, n, n)) * 10.0 ** rng.uniform(-3, 3, (6, 1, 1))
     for matrix in metrics(rng, n):
         norm = Metric(matrix, n)

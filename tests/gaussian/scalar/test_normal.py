@@ -32,9 +32,9 @@ def tail(x):
     return (flint.arb(float(x)) / flint.arb(2).sqrt()).erfc() / 2
 
 
+@flint.ctx.workprec(120)
 def log_pair_exact(a, b, rho, scale):
     """log P(X <= a, Y > b) by adaptive integration of phi(x) Q((b - rho x)/s), scaled by exp(-scale)."""
-    flint.ctx.prec = 120
     a, b, rho = (flint.acb(float(v)) for v in (a, b, rho))
     s = (1 - rho * rho).sqrt()
     shift = flint.acb(float(scale))

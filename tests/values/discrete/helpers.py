@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import multivariate_normal
 
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.grids import Grid
@@ -34,11 +33,13 @@ def mean_after_noise(value: ValueFunction, points: np.ndarray, covariance: np.nd
         weights.append((width * weight / 2).ravel())
     y = np.stack([part.ravel() for part in np.meshgrid(*places, indexing="ij")], axis=1)
     w = np.prod([part.ravel() for part in np.meshgrid(*weights, indexing="ij")], axis=0)
-    law = multivariate_normal(np.zeros(len(covariance)), covariance)
+    white = np.linalg.inv(np.linalg.cholesky(covariance))
+    w = w * np.linalg.det(white) / np.sqrt(2 * np.pi) ** len(covariance)
+    places = white @ y.T
     share = value.values(y)
     found = []
-    for point in points:
-        density = law.pdf(y - point) * w
+    for point in points @ white.T:
+        density = np.exp(-0.5 * np.sum((places - point[:, None]) ** 2, axis=0)) * w
         found.append(np.sum(density * share) + 1 - np.sum(density))
     return np.array(found)
 
