@@ -22,15 +22,14 @@ from certbound.display import name_text, rounded
 from certbound.plotting.panels import Panel, least_distance, panels_of, stairs
 from certbound.plotting.plane import outlines, plane_of, supports
 from certbound.plotting.scene import BLUE, GREY, INK, VERMILION, Scene
-from certbound.problem.sets import Quadratic
+from certbound.plotting.value_traces import Trace, broken, circles, numbers, stroke, value_figures
+from certbound.safety.starts import SafeStarts
 
 if TYPE_CHECKING:
+    from certbound.problem.problem import Problem
     from certbound.reach.sets import ReachTube
     from certbound.safety.verification import Verdict
 
-Trace = dict[str, Any]
-
-DIGITS = 5
 SENTENCES = {
     "SAFE": "Safe: with the constraints as stated, the probability of leaving the safe set at any time up to the "
     "horizon is proved to be at most the number below.",
@@ -42,21 +41,24 @@ PACKAGES = ("numpy", "scipy", "casadi", "cvxpy", "clarabel", "python-flint", "nu
 
 
 def report_page(
-    scene: Scene, verdict: Verdict, *, command: str = "", probability: str = "", certificate: str = ""
+    shown: Scene | SafeStarts, verdict: Verdict, *, command: str = "", probability: str = "", certificate: str = ""
 ) -> str:
-    """The page as one string: a problem, tubes and sample paths (``scene``) and what was proved (``verdict``).
+    """The page as one string: what was proved (``verdict``), and pictures of what is ``shown``.
+
+    These are tubes with sample paths (a scene), or a value function with its safe starts.
 
     ``command`` gives the verdict again; ``probability`` is the certified bound in words, such as ``3.7e-4``; of the
     text of a ``certificate`` that was written the page shows the hash, as ``sha256sum`` prints it.
     """
     from plotly.offline import get_plotlyjs
 
-    figures = list(_figures(scene))
-    problem = scene.problem
+    figures = list(value_figures(shown) if isinstance(shown, SafeStarts) else _figures(shown))
+    problem = shown.problem
     parts = [
         _head(f"{name_text(problem.name)}: {verdict.status}", get_plotlyjs()),
-        _verdict_section(scene, verdict, probability),
+        _verdict_section(problem, verdict, probability),
         *(_figure_section(*figure) for figure in figures),
+        _starts_section(shown) if isinstance(shown, SafeStarts) else "",
         _engine_section(verdict),
         _constants_section(verdict),
         _origin_section(command, certificate),
@@ -77,8 +79,7 @@ def _head(title: str, script: str) -> str:
     )
 
 
-def _verdict_section(scene: Scene, verdict: Verdict, probability: str) -> str:
-    problem = scene.problem
+def _verdict_section(problem: Problem, verdict: Verdict, probability: str) -> str:
     unit = "s" if problem.system.time == "continuous" else "steps"
     bound = probability or f"10^{rounded(verdict.log10_delta, up=True, digits=4)}"
     rows = [
@@ -95,6 +96,12 @@ def _verdict_section(scene: Scene, verdict: Verdict, probability: str) -> str:
         f'<section id="verdict" class="{verdict.status}"><h2>Verdict</h2><p class="status">{verdict.status}</p>'
         f"<p>{_text(SENTENCES[verdict.status])}</p>{_table(None, rows)}</section>"
     )
+
+
+def _starts_section(starts: SafeStarts) -> str:
+    words = f"From each of these starts the probability of leaving is proved to be at most {starts.delta!r}."
+    rows = [("size", starts.summary().split(",")[0]), *starts.rows()]
+    return f"<section><h2>Safe starts</h2><p>{_text(words)}</p>{_table(None, rows)}</section>"
 
 
 def _engine_section(verdict: Verdict) -> str:
@@ -202,25 +209,18 @@ def _plane_figure(scene: Scene, plane: tuple[int, int]) -> tuple[str, str, list[
     traces: list[Trace] = []
     for tube, color in scene.tubes:
         shape = outlines(tube, plane)[:: max(1, len(outlines(tube, plane)) // 60)]
-        x, y = (_broken(np.concatenate([shape[..., i], shape[:, :1, i]], axis=1)) for i in (0, 1))
+        x, y = (broken(np.concatenate([shape[..., i], shape[:, :1, i]], axis=1)) for i in (0, 1))
         label = "with noise" if tube.noise else "noise-free"
         style = {"mode": "lines", "fill": "toself", "fillcolor": color, "line": {"width": 0}, "hoverinfo": "skip"}
         traces.append({"x": x, "y": y, "name": label, **style})
     if scene.paths is not None:
         shown = scene.paths[:25, :: max(1, scene.paths.shape[1] // 200)]
-        x, y = _broken(shown[..., plane[0]]), _broken(shown[..., plane[1]])
-        traces.append({"x": x, "y": y, "name": "sample paths", **_line(GREY, 0.7), "opacity": 0.6})
+        x, y = broken(shown[..., plane[0]]), broken(shown[..., plane[1]])
+        traces.append({"x": x, "y": y, "name": "sample paths", **stroke(GREY, 0.7), "opacity": 0.6})
     _, centre = scene.nominal(200)
-    nominal = {"x": _list(centre[:, plane[0]]), "y": _list(centre[:, plane[1]])}
-    traces.append({**nominal, "name": "nominal", **_line(INK, 2)})
-    shapes = []
-    for constraint in scene.problem.safe:
-        region = constraint.region
-        form = region.form
-        if constraint.outside and isinstance(form, Quadratic) and form.even and form.dimension == 2:
-            (x0, y0), r = region.center_at(0.0), form.radius
-            ends = {"x0": x0 - r, "x1": x0 + r, "y0": y0 - r, "y1": y0 + r}
-            shapes.append({"type": "circle", **ends, "fillcolor": VERMILION, "line": {"color": "#7a3500", "width": 1}})
+    nominal = {"x": numbers(centre[:, plane[0]]), "y": numbers(centre[:, plane[1]])}
+    traces.append({**nominal, "name": "nominal", **stroke(INK, 2)})
+    shapes = circles(scene.problem, plane)
     layout: Trace = {"xaxis": {"title": {"text": names[plane[0]]}}, "yaxis": {"title": {"text": names[plane[1]]}}}
     if shapes:
         layout["shapes"] = shapes
@@ -238,22 +238,22 @@ def _panel_figure(scene: Scene, panel: Panel) -> tuple[str, str, list[Trace], Tr
             x, high = stairs(tube, supports(tube, row))
             _, low = stairs(tube, -supports(tube, -row))
             ends = np.concatenate([low, high[::-1]])
-            area = {"fill": "toself", "fillcolor": color, "hoverinfo": "skip", **_line(color, 0)}
+            area = {"fill": "toself", "fillcolor": color, "hoverinfo": "skip", **stroke(color, 0)}
             label = "with noise" if tube.noise else "noise-free"
-            traces.append({"x": _list(np.concatenate([x, x[::-1]])), "y": _list(ends), "name": label, **area})
+            traces.append({"x": numbers(np.concatenate([x, x[::-1]])), "y": numbers(ends), "name": label, **area})
     else:
         bound = None if scene.tube is None else least_distance(scene.tube, panel.constraint)
         if bound is not None and scene.tube is not None:
             x, y = stairs(scene.tube, bound)
-            traces.append({"x": _list(x), "y": _list(y), "name": "certified least distance", **_line(BLUE, 2)})
+            traces.append({"x": numbers(x), "y": numbers(y), "name": "certified least distance", **stroke(BLUE, 2)})
     if scene.paths is not None and scene.times is not None:
         every = max(1, len(scene.times) // 200)
         times = scene.times[::every]
         values = panel.values(scene.paths[:25, ::every], times)
-        repeated = _broken(np.broadcast_to(times, values.shape))
-        traces.append({"x": repeated, "y": _broken(values), "name": "sample paths", **_line(GREY, 0.7), "opacity": 0.6})
+        repeated = broken(np.broadcast_to(times, values.shape))
+        traces.append({"x": repeated, "y": broken(values), "name": "sample paths", **stroke(GREY, 0.7), "opacity": 0.6})
     nominal, limits = panel.values(centre, t), panel.limits
-    traces.append({"x": _list(t), "y": _list(nominal), "name": "nominal", **_line(INK, 2)})
+    traces.append({"x": numbers(t), "y": numbers(nominal), "name": "nominal", **stroke(INK, 2)})
     start, end = panel.during or (0.0, float(scene.problem.horizon))
     for limit in limits:
         line = {"color": VERMILION, "width": 2, "dash": "dash"}
@@ -278,7 +278,7 @@ def _margins_figure(scene: Scene, panels: list[Panel]) -> tuple[str, str, list[T
         asked = (x >= start) & (x <= end)
         if np.any(asked):
             name = panel.label if len(panel.label) < 30 else f"{panel.label[:27]}..."
-            traces.append({"x": _list(x[asked]), "y": _list(y[asked]), "name": name, "mode": "lines"})
+            traces.append({"x": numbers(x[asked]), "y": numbers(y[asked]), "name": name, "mode": "lines"})
             smallest.append(f"{panel.label}: at least {np.min(y[asked]):.4g}")
     if not traces:
         return None
@@ -292,22 +292,6 @@ def _room(tube: ReachTube, panel: Panel) -> Array | None:
         return least_distance(tube, panel.constraint)
     above = panel.high - supports(tube, panel.direction)
     return np.minimum(above, -panel.low - supports(tube, -panel.direction))
-
-
-def _line(color: str, width: float) -> Trace:
-    return {"mode": "lines", "line": {"color": color, "width": width}}
-
-
-def _list(values: Array) -> list[float]:
-    return [float(f"{value:.{DIGITS}g}") for value in np.asarray(values, dtype=float)]
-
-
-def _broken(rows: Array) -> list[float | None]:
-    """Several polylines as one trace, separated by gaps."""
-    result: list[float | None] = []
-    for row in rows:
-        result += [*_list(row), None]
-    return result
 
 
 LAYOUT: Trace = {

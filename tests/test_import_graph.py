@@ -53,7 +53,7 @@ reach.sets reach.remainder
 reach.contraction reach.linear reach.sampled
 reach
 safety.answers
-safety.engines
+safety.engines safety.starts
 safety.certificates
 safety.portfolio
 safety.certificate

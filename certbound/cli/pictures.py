@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from certbound.cli.messages import InputError
 from certbound.cli.output import write_file
+from certbound.errors import EngineError, contained
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from certbound.plotting import Scene
     from certbound.problem.problem import Problem
     from certbound.reach.sets import ReachTube
+    from certbound.safety.starts import SafeStarts
     from certbound.safety.verification import Verdict
 
 PATHS = 60
@@ -52,6 +54,18 @@ def sampled(problem: Problem, *, deviation: bool = False) -> Any:
         return sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0), deviation=deviation)
     except ValueError as error:
         _log.info("no sample paths are drawn: %s", error)
+        return None
+
+
+def values_of(problem: Problem, verdict: Verdict) -> SafeStarts | None:
+    """The value function behind a verdict, with its safe starts; None where there is none to draw."""
+    from certbound.safety.starts import bound_safe_starts
+
+    try:
+        with contained("values"):
+            return bound_safe_starts(problem, verdict.answers, pictured=True) if verdict.answers else None
+    except EngineError as error:
+        _log.info("no value function is drawn: %s", error)
         return None
 
 

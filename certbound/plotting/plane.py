@@ -46,11 +46,11 @@ def draw_plane(axes: Axes, scene: Scene, plane: Plane) -> None:
     axes.autoscale_view()
     limits = _limits(scene.problem, plane, (*axes.get_xlim(), *axes.get_ylim()))
     for constraint in scene.problem.safe:
-        if _lives_in(constraint.region, plane):
-            _draw_set(axes, constraint, plane, limits, _band(scene, constraint, plane))
+        if lives_in(constraint.region, plane):
+            draw_set(axes, constraint, plane, limits, _band(scene, constraint, plane))
     names = scene.problem.system.states
     axes.set(xlim=limits[:2], ylim=limits[2:], xlabel=names[plane[0]], ylabel=names[plane[1]])
-    if any(c.region.form.even and _lives_in(c.region, plane) for c in scene.problem.safe):
+    if any(c.region.form.even and lives_in(c.region, plane) for c in scene.problem.safe):
         axes.set_aspect("equal", adjustable="box")
 
 
@@ -83,7 +83,7 @@ def _row(tube: ReachTube, plane: Plane, angle: float) -> Array:
     return row
 
 
-def _lives_in(region: Region, plane: Plane) -> bool:
+def lives_in(region: Region, plane: Plane) -> bool:
     coordinates = set(region.places(region.dimension))
     return coordinates == set(plane) or (region.form.axial and bool(coordinates & set(plane)))
 
@@ -93,7 +93,7 @@ def _limits(problem: Problem, plane: Plane, limits: tuple[float, ...]) -> tuple[
     left, right, bottom, top = limits
     for constraint in problem.safe:
         region = constraint.region
-        if constraint.outside and isinstance(region.form, Quadratic) and region.form.even and _lives_in(region, plane):
+        if constraint.outside and isinstance(region.form, Quadratic) and region.form.even and lives_in(region, plane):
             x, y = region.center_at(0.0)
             grown = 1.25 * region.form.radius
             left, right = min(left, x - grown), max(right, x + grown)
@@ -101,7 +101,7 @@ def _limits(problem: Problem, plane: Plane, limits: tuple[float, ...]) -> tuple[
     return left, right, bottom, top
 
 
-def _draw_set(axes: Axes, constraint: Inside, plane: Plane, limits: tuple[float, ...], band: float) -> None:
+def draw_set(axes: Axes, constraint: Inside, plane: Plane, limits: tuple[float, ...], band: float) -> None:
     """An obstacle with the band that the noise adds to it, or the border of where the state must stay."""
     from matplotlib.patches import Circle, Polygon
 

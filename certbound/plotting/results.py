@@ -10,9 +10,11 @@ import numpy as np
 from certbound.plotting.panels import draw_panel, panels_of
 from certbound.plotting.plane import draw_plane, plane_of
 from certbound.plotting.scene import BLUE, INK, OUTER, Scene, noisy_reach
+from certbound.plotting.value_maps import draw_curves, draw_map, slices_of
 from certbound.problem.problem import Problem
 from certbound.reach.sets import ReachTube
 from certbound.safety.answers import Deviation
+from certbound.safety.starts import SafeStarts
 from certbound.safety.verification import Verdict
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
@@ -80,6 +82,16 @@ def _verdict(result: Verdict, axes: Axes) -> None:
         tightest = [c.label for c in result.problem.safe].index(result.constraint) if _named(result) else 0
         draw_panel(axes, scene, panels[min(tightest, len(panels) - 1)])
         axes.set_xlabel(_time(result.reach.curve.continuous))
+    axes.set_title(result.summary(), fontsize="small")
+
+
+@draw.register(SafeStarts)
+def _starts(result: SafeStarts, axes: Axes) -> None:
+    slices = list(slices_of(result))
+    if slices:
+        draw_map(axes, result, slices[0][0], slices[0][2])
+    else:
+        draw_curves(axes, result)
     axes.set_title(result.summary(), fontsize="small")
 
 

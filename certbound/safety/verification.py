@@ -20,6 +20,7 @@ from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.portfolio import ENGINES, engine_named
 
 if TYPE_CHECKING:
+    from certbound.safety.starts import SafeStarts
     from certbound.tubes.constants import Constants
 
 _log = logging.getLogger(__name__)
@@ -103,6 +104,33 @@ class Verdict(Shown):
         from certbound.safety.certificate import certificate_text
 
         return certificate_text(problem, self, attempt=attempt)
+
+    def safe_starts(self, delta: float | None = None) -> SafeStarts:
+        """The largest set of starts that a value function proves safe: P(a constraint is broken) <= delta from each.
+
+        Parameters
+        ----------
+        delta : float, optional
+            The problem's own where it is left out.
+
+        Returns
+        -------
+        SafeStarts
+            With ``contains``, ``bound``, ``measure``, ``boxes``. The proof over the whole safe set is made now, in
+            about the time of the verdict.
+
+        Raises
+        ------
+        InfeasibleError
+            If the verdict rests on no value function (``method="values"`` gives one), or none applies.
+        ValueError
+            If ``delta`` does not lie in (0, 1), or the verdict has no problem.
+        """
+        from certbound.safety.starts import bound_safe_starts
+
+        if self.problem is None:
+            raise ValueError("`problem` must be set for safe starts; verify_safety sets it.")
+        return bound_safe_starts(self.problem, self.answers, delta)
 
     def summary(self) -> str:
         """The verdict in one line."""

@@ -21,7 +21,7 @@ from certbound.values.continuous.coefficients import Cells, Reader, enclose, squ
 from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.line import ladder
-from certbound.values.continuous.line.starts import start_of
+from certbound.values.continuous.line.initial_law import start_of
 from certbound.values.continuous.payment import BIN, Levels, Patched, pay_lower, pay_upper, repay
 from certbound.values.continuous.plane_proposal import Plan, Source, propose_plane
 from certbound.values.continuous.polynomials import basis_at, interpolation, node_product, nodes_of, to_bernstein
@@ -308,9 +308,9 @@ def proposals():
     problem = line_problem(*WELL)
     model, start = exits._model(problem), start_of(problem)
     found = []
-    for inner, propose in ((True, ladder._above), (False, ladder._below)):
-        room = ladder._room(problem, model, (-9.0, 9.0), start, inner=inner)
-        (link,) = propose(room, start, ladder._sketches(room), (0.007, 2.5, 3e-4, 0.01))
+    for inner, propose in ((True, ladder.surfaces_above), (False, ladder.surfaces_below)):
+        room = ladder.room_of(problem, model, (-9.0, 9.0), start, inner=inner)
+        (link,) = propose(room, start, ladder.sketches(room), (0.007, 2.5, 3e-4, 0.01))
         found.append(link.surface)
     upper, lower = found
     return model, starts_of(problem), upper, lower

@@ -16,10 +16,10 @@ from certbound.rigor.intervals import Interval
 from certbound.values.continuous import exits
 from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.line import ladder
+from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.joins import Profile, missing_lower, missing_upper
 from certbound.values.continuous.line.linked import prove_above, prove_below, spans
 from certbound.values.continuous.line.phases import Gate, Phase, pieces
-from certbound.values.continuous.line.starts import Start, start_of
 from certbound.values.continuous.surface import Surface
 from tests.values.line_truth import bracket
 from tests.values.random_problems import check
@@ -85,9 +85,9 @@ def test_three_hundred_random_problems_lie_between_the_bounds(kind: str, seed: i
 def chain_of(asked: cb.Problem, *, inner: bool) -> tuple[list[Any], Start]:
     """The first proposal of one side, with its phases."""
     model, start = exits._model(asked), start_of(asked)
-    room = ladder._room(asked, model, ladder.cuts_of(asked, model, start), start, inner=inner)
-    rough = ladder._sketches(room)
-    links = (ladder._above if inner else ladder._below)(room, start, rough, (0.01, 2.5, 5e-4, 0.02))
+    room = ladder.room_of(asked, model, ladder.cuts_of(asked, model, start), start, inner=inner)
+    rough = ladder.sketches(room)
+    links = (ladder.surfaces_above if inner else ladder.surfaces_below)(room, start, rough, (0.01, 2.5, 5e-4, 0.02))
     assert links is not None
     return links, start
 

@@ -30,7 +30,7 @@ from certbound.cli.options import (
     option,
 )
 from certbound.cli.output import SETTINGS, console, print_status, show, spinner, write_file
-from certbound.cli.pictures import check_picture, scene_of, write_picture
+from certbound.cli.pictures import check_picture, scene_of, values_of, write_picture
 from certbound.display import at_least_text, log10_text, name_text, one_line, rounded
 from certbound.errors import CertificateError, EngineError, contained
 
@@ -182,23 +182,28 @@ def _limits(verdict: Verdict, cells: int | None, clock: Clock) -> dict[str, Any]
 def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | None, plot: Path | None) -> None:
     if plot is None and report is None:
         return
-    if verdict.reach is None:
+    title = f"{name_text(problem.name)}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
+    with spinner("looking for what can be drawn"):
+        shown = (
+            values_of(problem, verdict)
+            if verdict.reach is None
+            else scene_of(problem, verdict, verdict.reach, title)
+        )
+    if shown is None:
         sys.stderr.write("certbound: nothing was drawn or reported: no set was proved that could be\n")
         return
-    title = f"{name_text(problem.name)}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
-    scene = scene_of(problem, verdict, verdict.reach, title)
     if plot is not None:
-        from certbound.plotting import draw_scene
+        from certbound.plotting import Scene, draw_scene, draw_values
 
         with spinner("drawing"):
-            write_picture(plot, draw_scene(scene))
+            write_picture(plot, draw_scene(shown) if isinstance(shown, Scene) else draw_values(shown, title))
     if report is not None:
         from certbound.html_report import report_page
 
         with spinner("writing the report"):
             command = shlex.join(["certbound", *(word for word in sys.argv[1:])])
             probability = log10_text(verdict.log10_delta)
-            write_file(report, report_page(scene, verdict, command=command, probability=probability, certificate=proof))
+            write_file(report, report_page(shown, verdict, command=command, probability=probability, certificate=proof))
 
 
 def _certify(problem: Problem, verdict: Verdict, path: Path) -> tuple[str, dict[str, Any]]:

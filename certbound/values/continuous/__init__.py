@@ -3,6 +3,6 @@
 ``hypotheses`` says which function proves which hypothesis.
 """
 
-from certbound.values.continuous.exits import ExitBounds, bound_exits
+from certbound.values.continuous.exits import ExitBounds, bound_exits, chart_exits
 
-__all__ = ["ExitBounds", "bound_exits"]
+__all__ = ["ExitBounds", "bound_exits", "chart_exits"]

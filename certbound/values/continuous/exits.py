@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
+from certbound.values.charts import Charts
 from certbound.values.continuous.coefficients import Reader, squared_diffusion
 from certbound.values.continuous.hypotheses import Model, check_noise
 from certbound.values.continuous.room import safe_room
@@ -101,6 +103,54 @@ def bound_exits(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin,
     )  # fmt: skip
+
+
+def chart_exits(
+    problem: Problem, *, levels: Sequence[float], times: int = 1, seconds: float = 10.0, lower: bool = True
+) -> Charts:
+    """Bound P(X leaves the safe set by T | X_t = x) for every safe x, not for the initial set alone (Theorem K8-CT).
+
+    Parameters
+    ----------
+    problem : Problem
+        As `bound_exits` takes it; its initial set does not matter, but for where the grid is fine.
+    levels : sequence of float
+        log10 of probabilities at which the bounds should be sharp.
+    times : int
+        In one state: how many times t, 0 the first of them. In two states only t = 0 is charted.
+    seconds : float
+        About what may be spent in two states, turned into a number of patches.
+    lower : bool
+        Whether to look for lower bounds too (one state).
+
+    Returns
+    -------
+    Charts
+        In two states without lower bounds.
+
+    Raises
+    ------
+    InfeasibleError
+        The theorem does not apply, or nothing was proved; the message says why.
+    EnclosureError
+        The model is undefined somewhere in the safe set.
+    """
+    _check(problem, None, seconds)
+    model = _model(problem)
+    logs = sorted(_LN10 * level for level in levels)
+    if problem.system.dimension == 1:
+        from certbound.values.continuous.line import chart_line
+
+        charts = chart_line(problem, model, logs, times, lower)
+    else:
+        from certbound.values.continuous.two_states import chart_plane
+
+        room = safe_room(problem)
+        check_noise(model, (0.0, float(problem.horizon)), list(zip(room.inner_low, room.inner_high)))
+        charts = Charts(upper=tuple(chart_plane(problem, model, room, logs, seconds)))
+    if not charts.upper:
+        raise InfeasibleError("no value function over the whole safe set could be proved; give `seconds` more.")
+    return charts
 
 
 def _check(problem: Problem, target: Any, seconds: float) -> None:

@@ -27,8 +27,9 @@ import numpy as np
 from certbound.arrays import Array, Index
 from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval
+from certbound.values.charts import Chart, from_natural
 from certbound.values.continuous.coefficients import Cells, Interpolant, Reader, enclose
-from certbound.values.continuous.payment import Patched, Payment, pay_lower, pay_upper
+from certbound.values.continuous.payment import Patched, Payment, bound_above, bound_below, pay_lower, pay_upper
 from certbound.values.continuous.polynomials import nodes_of
 from certbound.values.continuous.residual import (
     Ranges,
@@ -192,14 +193,19 @@ def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, fl
     start = up(extreme_over(surface, starts, upper=True))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
     proof = examine(surface, model, need, upper=True)
+    return _cheapest(proof, need, surface, start)[0]
+
+
+def _cheapest(proof: Proof, need: Need, surface: Surface, start: float) -> tuple[Payment, float]:
+    """The payment that bounds log P best where V(0, .) = ``start``, and by how much V was lifted for it."""
     floor = float(surface.range_at(-1)[0].min())
-    best: Payment | None = None
+    best: tuple[Payment, float] | None = None
     for lift in LIFTS:  # V + lift has the same residual, and nothing is due where it is positive
-        if best is not None and start + lift >= best.log:
+        if best is not None and start + lift >= best[0].log:
             break
         patched = patched_of(proof, proof.ranges.residual_high, need, surface.steps, lift)
         payment = pay_upper(patched, up(start + lift), floor + lift - 1e-15 * (1 + abs(floor)))
-        best = payment if best is None or payment.log < best.log else best
+        best = (payment, lift) if best is None or payment.log < best[0].log else best
     assert best is not None
     return best
 
@@ -244,20 +250,67 @@ def top_of(surface: Surface) -> float:
     return max(float(value_range(surface.patches(*chunk))[1].max()) for chunk in surface.chunks())
 
 
+def chart_above(surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int]) -> list[Chart]:
+    """Upper bounds of P(leaving the box from a cell on), at the start of each of the ``slabs``.
+
+    One payment is made for each of the ``levels`` (of log P), at which it is then sharp; every cell takes the best.
+    """
+    surface = raised_above(surface)
+    need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=0.0)
+    proof = examine(surface, model, need, upper=True)
+    paid = [_cheapest(proof, need, surface, level) for level in levels]
+    charts = []
+    for k in slabs:
+        axes, values = (surface.axes, surface.range_at(k)[1]) if len(surface.axes) == 1 else surface.ceiling_at(k)
+        rows = [
+            bound_above(payment.terms, _above(values, lift), k) for payment, lift in paid if payment.terms is not None
+        ]
+        best = np.minimum.reduce([np.zeros(values.shape), *rows])
+        charts.append(Chart(time=float(surface.times[k]), axes=axes, log10=from_natural(best, up=True)))
+    return charts
+
+
+def _above(values: Array, lift: float) -> Array:
+    return np.asarray(values + lift + 1e-15 * (np.abs(values) + lift))
+
+
 def prove_lower(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment | None:
     """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is."""
     if extreme_over(surface, starts, upper=False) == -math.inf:
         return None
-    highest = top_of(surface)
-    if highest > 0:
-        surface = surface.raised(-highest - 1e-12 * (1 + highest))
+    surface = _sunk(surface)
     start = -up(-extreme_over(surface, starts, upper=False))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=np.inf)
     proof = examine(surface, model, need, upper=False)
+    return _earned(proof, need, surface, start)
+
+
+def _sunk(surface: Surface) -> Surface:
+    """The surface, lowered until V <= 0 everywhere."""
+    highest = top_of(surface)
+    return surface.raised(-highest - 1e-12 * (1 + highest)) if highest > 0 else surface
+
+
+def _earned(proof: Proof, need: Need, surface: Surface, start: float) -> Payment | None:
     if np.any(proof.ranges.high > 0):
         return None
     patched = patched_of(proof, -proof.ranges.residual_low, need, surface.steps)
     return pay_lower(patched, start, float(surface.range_at(-1)[1].max()))
+
+
+def chart_below(surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int]) -> list[Chart]:
+    """Lower bounds of P(leaving the box from a cell on), as `chart_above`; -inf where nothing was proved."""
+    surface = _sunk(surface)
+    need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=np.inf)
+    proof = examine(surface, model, need, upper=False)
+    found = [_earned(proof, need, surface, level) for level in levels]
+    paid = [payment.terms for payment in found if payment is not None and payment.terms is not None]
+    charts = []
+    for k in slabs:
+        values = surface.range_at(k)[0]
+        best = np.maximum.reduce([np.full(values.shape, -np.inf), *(bound_below(terms, values, k) for terms in paid)])
+        charts.append(Chart(time=float(surface.times[k]), axes=surface.axes, log10=from_natural(best, up=False)))
+    return charts
 
 
 def up(value: float) -> float:

@@ -63,29 +63,51 @@ class Levels:
     q: Array
     edges: Array
 
-    def above(self, level: float) -> Interval:
-        """int of q from ``level`` to 0 (q is piecewise linear, and 0 below the lowest edge)."""
-        if not len(self.m) or level >= 0:
-            return Interval.point(0.0)
+    def above(self, level: Array | float) -> Interval:
+        """int of q from each ``level`` to 0 (q is piecewise linear, and 0 below the lowest edge)."""
+        level = np.asarray(level, dtype=float)
+        if not len(self.m):
+            return Interval.point(np.zeros(level.shape))
         left, right = self.edges[:-1], self.edges[1:]
-        start = np.clip(level, left, right)
+        start = np.clip(level[..., None], left, right)
         share = (Interval.point(right) - Interval.point(start)) * Interval.point(1 / BIN)
         end = Interval.point(self.q[1:])
         begin = end - share * (end - Interval.point(self.q[:-1]))
-        return ((begin + end) * share * Interval.point(BIN / 2)).sum()
+        found = ((begin + end) * share * Interval.point(BIN / 2)).sum(axis=-1)
+        return Interval(np.where(level >= 0, 0.0, found.lo), np.where(level >= 0, 0.0, found.hi))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Terms:
+    """What was paid, slab by slab: with it a bound at any place and from any slab on follows from V there.
+
+    ``lam`` and ``eps`` (in units of exp(``start``)) hold on every slab; ``end`` is a lower bound of V(T, .) on the
+    upper side, an upper one on the lower side. Where ``whole``, V stands for the logarithm of a mean of e^V: then all
+    of q (or p) is paid, its integral over every level.
+    """
+
+    levels: Levels
+    lam: Array
+    eps: Array
+    steps: Array
+    start: float
+    end: float
+    whole: bool = False
+
+    def growth(self, values: Array) -> Interval:
+        """theta(V) - V (upper side) or V - theta(V) (lower side)."""
+        return self.levels.above(np.full(values.shape, -np.inf) if self.whole else values)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Payment:
     """A bound of the probability as a natural logarithm, and what it was paid with.
 
-    ``lam`` and ``eps`` (in units of exp(v0)) are summed over time; ``growth`` is the size of theta(v0) - v0.
+    ``terms`` holds what each slab paid; None where nothing was proved.
     """
 
     log: float
-    lam: float
-    eps: float
-    growth: float
+    terms: Terms | None = None
 
 
 def repay(m: Array, *, upper: bool) -> Array | None:
@@ -136,7 +158,7 @@ def pay_upper(patched: Patched, start: float, floor: float, *, whole: bool = Fal
     whole : bool
         Whether ``start`` is the logarithm of a mean of e^V(0, .): then all of q is paid, int q over every level.
     """
-    best = Payment(log=0.0, lam=0.0, eps=0.0, growth=0.0)
+    best = Payment(log=0.0)
     if start >= 0:
         return best
     for levels in _proposals(patched, start, upper=True):
@@ -239,46 +261,57 @@ def _rates(patched: Patched, levels: Levels, start: float) -> tuple[Array, Array
 
 def _settle_upper(patched: Patched, levels: Levels, start: float, floor: float, whole: bool) -> Payment:
     lam, eps = _rates(patched, levels, start)
-    worst = Payment(log=0.0, lam=0.0, eps=0.0, growth=0.0)
-    paid = Interval.point(lam) * Interval(*_around(patched.steps))
-    later = np.cumsum(paid.hi[::-1])[::-1] * (1 + 1e-15 * (len(lam) + 4))  # over this slab and all later ones
-    if not later[0] < 50 or not np.isfinite(eps).all():
-        return worst
-    most = levels.above(-np.inf)
-    growth = most if whole else levels.above(start)
-    first = exp(Interval.point(later[0]) + growth)
-    rest = (Interval.point(eps) * Interval(*_around(patched.steps)) * exp(Interval.point(later))).sum()
-    # in units of exp(start): total = exp(L + growth) + exp(Q) sum eps h exp(L_k)
-    total = (first + exp(most) * rest).hi
-    level = Interval.point(start) + log(Interval.point(total))
-    if level.hi >= 0:
-        return worst
-    if floor > -np.inf:  # (exp(level) - w) / (1 - w), w = exp(floor)
-        kept = Interval.point(1.0) - exp(Interval.point(floor) - level)
-        level = level + log(kept) - log(Interval.point(1.0) - exp(Interval.point(floor)))
-    value = min(float(level.hi), 0.0)
-    return Payment(log=value, lam=float(later[0]), eps=float(rest.hi), growth=float(growth.hi))
+    terms = Terms(levels=levels, lam=lam, eps=eps, steps=patched.steps, start=start, end=floor, whole=whole)
+    return Payment(log=float(bound_above(terms, np.array(start))), terms=terms)
+
+
+def bound_above(terms: Terms, values: Array, first: int = 0) -> Array:
+    """Upper bounds of log P(failing from the start of slab ``first`` on) from where V is at most ``values`` then."""
+    steps = Interval(*_around(terms.steps[first:]))
+    paid = Interval.point(terms.lam[first:]) * steps
+    later = np.cumsum(paid.hi[::-1])[::-1] * (1 + 1e-15 * (len(terms.lam) + 4))  # over a slab and all later ones
+    if not later[0] < 50 or not np.isfinite(terms.eps).all():
+        return np.zeros(values.shape)
+    growth, most = terms.growth(values), terms.levels.above(-np.inf)
+    rest = (Interval.point(terms.eps[first:]) * steps * exp(Interval.point(later))).sum()
+    # in units of exp(start): total = exp(L + theta(v) - start) + exp(Q) sum eps h exp(L_k)
+    here = exp(Interval.point(later[0]) + (Interval.point(values) - Interval.point(terms.start)) + growth)
+    total = (here + exp(most) * rest).hi
+    level = Interval.point(terms.start) + log(Interval.point(total))
+    found = level.hi
+    if terms.end > -np.inf:  # (exp(level) - w) / (1 - w), w = exp(floor)
+        kept = (Interval.point(1.0) - exp(Interval.point(terms.end) - level)).hi
+        less = level + log(Interval.point(np.maximum(kept, 1e-300)))
+        less = less - log(Interval.point(1.0) - exp(Interval.point(terms.end)))
+        found = np.where(kept > 0, less.hi, found)
+    return np.asarray(np.where((values < 0) & (level.hi < 0), np.minimum(found, 0.0), 0.0))
 
 
 def _settle_lower(
     patched: Patched, levels: Levels, start: float, ceiling: float, whole: bool
 ) -> Payment | None:
     lam, eps = _rates(patched, levels, start)
-    steps = Interval(*_around(patched.steps))
-    paid = (Interval.point(lam) * steps).sum()
-    if not paid.hi < 50 or not np.isfinite(eps).all():
-        return None
+    terms = Terms(levels=levels, lam=lam, eps=eps, steps=patched.steps, start=start, end=ceiling, whole=whole)
+    value = float(bound_below(terms, np.array(start)))
+    return None if value == -np.inf else Payment(log=value, terms=terms)
+
+
+def bound_below(terms: Terms, values: Array, first: int = 0) -> Array:
+    """Lower bounds of log P(failing from the start of slab ``first`` on) from where V is at least ``values`` then."""
+    steps = Interval(*_around(terms.steps[first:]))
+    paid = (Interval.point(terms.lam[first:]) * steps).sum()
+    if not paid.hi < 50 or not np.isfinite(terms.eps).all():
+        return np.full(values.shape, -np.inf)
+    levels = terms.levels
     most = Interval.point(1.0 + float(levels.q.max())) if len(levels.m) else Interval.point(1.0)
-    growth = levels.above(-np.inf if whole else start)
-    first = exp(-(growth + most * paid))
-    rest = most * (Interval.point(eps) * steps).sum()
+    away = Interval.point(values) - Interval.point(terms.start)
+    rest = most * (Interval.point(terms.eps[first:]) * steps).sum()
     # in units of exp(start); then less W = exp(ceiling)
-    left = first - rest - exp(Interval.point(ceiling) - Interval.point(start))
-    if not left.lo > 0:
-        return None
-    kept = log(Interval.point(1.0) - exp(Interval.point(ceiling)))
-    level = Interval.point(start) + log(Interval.point(left.lo)) - kept
-    return Payment(log=float(level.lo), lam=float(paid.hi), eps=float(rest.hi), growth=float(growth.hi))
+    left = exp(away - (terms.growth(values) + most * paid)) - rest
+    least = (left - exp(Interval.point(terms.end) - Interval.point(terms.start))).lo
+    kept = log(Interval.point(1.0) - exp(Interval.point(terms.end)))
+    found = Interval.point(terms.start) + log(Interval.point(np.maximum(least, 1e-300))) - kept
+    return np.asarray(np.where(least > 0, found.lo, -np.inf))
 
 
 def _around(steps: Array) -> tuple[Array, Array]:

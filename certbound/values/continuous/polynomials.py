@@ -29,6 +29,10 @@ HERMITE = np.array([
 """Bernstein coefficients of degree 5 from (v, h v', h^2 v'') at the left and at the right end."""
 TIME_HERMITE = np.array([[1, 0, 0, 0], [1, 1 / 3, 0, 0], [0, 0, 1, -1 / 3], [0, 0, 1, 0]])
 """Bernstein coefficients of degree 3 from (v, h v') at the left and at the right end."""
+_LEFT = np.array([[comb(i, k) / 2**i if k <= i else 0.0 for k in range(6)] for i in range(6)])
+_HALVES = (_LEFT, _LEFT[::-1, ::-1])
+QUARTERS = np.array([second @ first for first in _HALVES for second in _HALVES])
+"""De Casteljau: Bernstein coefficients of degree 5 on each quarter of [0, 1], from those on all of it; exact."""
 
 
 @lru_cache(maxsize=32)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.values.continuous.polynomials import HERMITE, TIME_HERMITE
+from certbound.values.continuous.polynomials import HERMITE, QUARTERS, TIME_HERMITE
 from certbound.values.continuous.residual import Patches, along, value_range
 
 
@@ -93,6 +93,25 @@ class Surface:
         data[:, 1] = data[:, 3] = 0.0
         low, high = value_range(self._patches(data, np.ones(1)))
         return low.reshape(self.cells), high.reshape(self.cells)
+
+    def ceiling_at(self, index: int) -> tuple[tuple[Array, ...], Array]:
+        """Nodes of cells cut in four along both of two states, and upper bounds of V over them at one end of a slab.
+
+        A node in floats lies within two roundoffs of |x| of where the polynomial is cut, and |V_i| <= 10 Z / h_i; the
+        products are convex combinations of at most Z, of six terms each.
+        """
+        data = self.values[index][None, None] * np.ones((1, 4, *([1] * (2 * len(self.axes)))))
+        data[:, 1] = data[:, 3] = 0.0
+        patches = self._patches(data, np.ones(1))
+        cut = np.einsum("pia,bac,qjc->bpqij", QUARTERS, patches.coefficients[:, 0], QUARTERS, optimize=True)
+        off = sum(np.max(np.abs(axis)) / width for axis, width in zip(self.axes, patches.widths))
+        slack = 2.0**-53 * (1000 + 40 * off) * (patches.size + np.abs(patches.reference))
+        high = (patches.reference + slack)[:, None, None] + cut.max(axis=(3, 4))
+        rows, columns = self.cells
+        high = high.reshape(rows, columns, 4, 4).swapaxes(1, 2).reshape(4 * rows, 4 * columns)
+        share = np.arange(4) / 4
+        nodes = [(axis[:-1, None] + np.diff(axis)[:, None] * share).ravel() for axis in self.axes]
+        return tuple(np.append(node, axis[-1]) for node, axis in zip(nodes, self.axes)), high
 
     def face_range(self, axis: int, side: int) -> tuple[float, float]:
         """Bounds of V on one face of the grid over all times."""

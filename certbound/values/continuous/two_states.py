@@ -17,9 +17,11 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
+from certbound.values.charts import Chart
 from certbound.values.continuous.hypotheses import (
     LIFTS,
     Model,
+    chart_above,
     covers,
     extreme_over,
     prove_upper,
@@ -82,12 +84,28 @@ def _rough_level(plane: Plane) -> float:
     return level
 
 
+def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], seconds: float) -> list[Chart]:
+    """Upper bounds from every cell at t = 0, sharp at the levels of log P; none where no proposal comes to an end."""
+    plane = _plane(problem, model, room.inner_low, room.inner_high, starts_of(problem))
+    least = _rough_level(plane)
+    levels = sorted({max(level, least) for level in levels})
+    plan = _plan(plane, levels[0], _SHARES[0] * _RATE * seconds)
+    surface = _promising(plane, model, plan, levels[-1])
+    return [] if surface is None else chart_above(surface, model, levels, [0])
+
+
 def _upper(plane: Plane, model: Model, starts: list[Pair], plan: Plan) -> float:
     """A proved upper bound of log P from the most promising proposal; 0 where none comes to an end."""
+    surface = _promising(plane, model, plan)
+    return 0.0 if surface is None else prove_upper(surface, model, starts).log
+
+
+def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = None) -> Surface | None:
+    """The proposal whose bound will be the smallest where V is the ``level``, or over the starts."""
     surface = propose_plane(plane, plan)
     if surface is None:
-        return 0.0
-    first = best = _Sketch.of(surface, model, starts)
+        return None
+    first = best = _Sketch.of(surface, model, plane.starts, level)
     for top in _TOPS:
         sketch, source = first, None
         for _ in range(_PASSES):
@@ -96,13 +114,11 @@ def _upper(plane: Plane, model: Model, starts: list[Pair], plan: Plan) -> float:
             surface = propose_plane(plane, plan, source)
             if surface is None:
                 break
-            sketch = _Sketch.of(surface, model, starts)
+            sketch = _Sketch.of(surface, model, plane.starts, level)
             best = min(best, sketch, key=lambda one: one.estimate())
         if best.estimate() < best.start + _CLOSE:
             break
-    if not covers(best.surface, plane.horizon, plane.low, plane.high, within=True):
-        return 0.0
-    return prove_upper(best.surface, model, starts).log
+    return best.surface if covers(best.surface, plane.horizon, plane.low, plane.high, within=True) else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -115,8 +131,8 @@ class _Sketch:
     low: Array
 
     @classmethod
-    def of(cls, surface: Surface, model: Model, starts: list[Pair]) -> _Sketch:
-        start = extreme_over(surface, starts, upper=True)
+    def of(cls, surface: Surface, model: Model, starts: list[Pair], level: float | None = None) -> _Sketch:
+        start = extreme_over(surface, starts, upper=True) if level is None else level
         highest, low = sampled_residual(surface, model)
         paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - low - _VARIED, 50.0))
         return cls(surface=surface, start=start, excess=np.maximum(highest - paid, 0.0), low=low)

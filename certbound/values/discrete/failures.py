@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside, Region
 from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
+from certbound.values.charts import Chart, Charts, from_probability
 from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import (
@@ -54,6 +56,7 @@ _COMMON_FACTOR = 20.0  # how much more that is with a common factor in the noise
 _UNIFORM_FACTOR = 0.4
 _OVERHEAD = 250  # cells that every step is worth in addition
 _PATIENCE = 1.0  # seconds for which grids are refined although the question is answered
+_CHARTED = 300_000  # parts of cells that a map has at most
 _FLOOR = 1e-16  # where what lies beyond ten standard deviations begins to count
 
 
@@ -156,6 +159,29 @@ def bound_failure(
     )
 
 
+def chart_failures(problem: Problem, *, share: float, times: int = 1, parts: int = 4) -> Charts:
+    """Bound the probability of failing from every safe state, not from the initial set alone.
+
+    Parameters
+    ----------
+    problem : Problem
+        As `bound_failure` takes it; where constraints do not bound a state, as far as paths from its initial set get.
+    share : float
+        Of the cells, as `FailureBounds` has it.
+    times : int
+        How many steps are charted, step 0 the first of them.
+    parts : int
+        Parts along each side of the set of disturbances.
+
+    Raises
+    ------
+    Inapplicable
+        If value functions do not fit the problem; the message says why.
+    """
+    work = _Work(problem, None, parts)
+    return work.charts(share, sorted({work.horizon * k // times for k in range(times)}))
+
+
 def _settled(upper: float, lower: float, delta: float | None) -> bool:
     """Whether the question is answered with room to spare."""
     return delta is not None and (upper <= delta / 100 or lower >= min(100 * delta, 0.5))
@@ -247,21 +273,51 @@ class _Work:
 
     def bounds(self, grids: list[Grid], share: float) -> tuple[float, float]:
         """(upper, lower) from the grids."""
+        end = 0 if self.random else 1
+        *_, (_, above, below) = self._backward(grids, share, end)
+        upper, lower = self._at_random(above, below) if self.random else self._over_start(above, below, share)
+        leak = self.boxes.leak * (1 + 1e-9)
+        return min(max(upper, 0.0), 1.0), max(lower - leak, 0.0)
+
+    def _backward(
+        self, grids: list[Grid], share: float, end: int
+    ) -> Iterator[tuple[int, ValueFunction, ValueFunction]]:
+        """(step, function above, function below), from the horizon back to step ``end``."""
         last = self.horizon
         zones = [self._zones(grids, t) for t in range(last + 1)]
         above = final(grids[last], zones[last], above=True)
         below = final(grids[last], zones[last], above=False)
+        yield last, above, below
         kept: tuple[object, AnyTransition] | None = None
-        end = 0 if self.random else 1
         for t in range(last - 1, end - 1, -1):
             key = (id(grids[t]), id(grids[t + 1])) if self.dynamics.steady else t
             if kept is None or kept[0] != key:
                 kept = (key, self._transition(t, grids[t], grids[t + 1], share))
             above = back_above(kept[1], above, zones[t])
             below = back_below(kept[1], below, zones[t])
-        upper, lower = self._at_random(above, below) if self.random else self._over_start(above, below, share)
-        leak = self.boxes.leak * (1 + 1e-9)
-        return min(max(upper, 0.0), 1.0), max(lower - leak, 0.0)
+            yield t, above, below
+
+    def charts(self, share: float, steps: Sequence[int]) -> Charts:
+        """Both bounds on all cells at some steps; lower ones only where constraints bound every state."""
+        grids = self.layout(share)
+        if grids is None:
+            raise Inapplicable(self.too_large)
+        upper, lower = [], []
+        for t, above, below in self._backward(grids, share, 0):
+            if t not in steps:
+                continue
+            parts = next((parts for parts in (8, 4, 2) if above.nodal.size * parts**self.n <= _CHARTED), 1)
+            active, cells = active_at(self.problem.constraints, t), grids[t].cells()
+            masks = [*respected(active, cells, t), respected(active, cells, t, interiors=True)[1]]
+            whole = [np.kron(mask.reshape(grids[t].shape), np.ones([parts] * self.n, dtype=bool)) for mask in masks]
+            safe, broken, inner = (mask > 0 for mask in whole)  # for starts, unlike later on, faces count
+            axes, _, high = above.ranges_within(parts)
+            log10 = from_probability(np.where(safe, high, 1.0), up=True)
+            upper.append(Chart(time=float(t), axes=axes, log10=log10))
+            if self.boxes.leak == 0:
+                low = np.where(inner & ~broken, 0.0, below.ranges_within(parts)[1])
+                lower.append(Chart(time=float(t), axes=axes, log10=from_probability(low, up=False)))
+        return Charts(upper=tuple(upper[::-1]), lower=tuple(lower[::-1]))
 
     def _zones(self, grids: list[Grid], t: int) -> Zones:
         return zones_of(grids[t], active_at(self.problem.constraints, t), self.target, t)

@@ -62,6 +62,45 @@ class ValueFunction:
             low, high = np.where(self.fixed, self.level, low), np.where(self.fixed, self.level, high)
         return low - slack, high + slack
 
+    def ranges_within(self, parts: int) -> tuple[tuple[Array, ...], Array, Array]:
+        """Nodes of the cells cut in ``parts`` along each axis, and bounds of the function on them.
+
+        On a part U is again the multilinear function of its corners less parabolas with the same bends. A node in
+        floats lies within a roundoff of |x| of where the cell is cut, and |d_i U| is at most 6 size / D_i.
+        """
+        n, shares = self.grid.dimension, np.arange(parts + 1) / parts
+        table = self.nodal
+        for axis in range(n):  # every cell gets values of its own: bends differ across a face
+            moved = np.moveaxis(table, axis, 0)
+            cut = moved[:-1, ..., None] * (1 - shares) + moved[1:, ..., None] * shares
+            table = np.moveaxis(cut, 0, axis)
+        bulge = np.zeros((2, *self.grid.shape))
+        off = np.zeros(self.grid.shape)
+        for i, axis_nodes in enumerate(self.grid.axes):
+            width, bend = self.grid.widths(i), self.bend[i]
+            arch = np.reshape(shares * (1 - shares) / 2, [-1 if k == n + i else 1 for k in range(2 * n)])
+            table = table - np.reshape(bend * width**2, (*self.grid.shape, *[1] * n)) * arch
+            bulge += np.maximum([bend, -bend], 0.0) * (width / parts) ** 2 / 8 * (1 + 1e-12)
+            off = off + 12 * np.abs(axis_nodes).max() / width
+        low, high = table, table
+        for i in range(n):
+            low, high = (np.moveaxis(end, n + i, 0) for end in (low, high))
+            low, high = np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
+            low, high = (np.moveaxis(end, 0, n + i) for end in (low, high))
+        wide = (*self.grid.shape, *[1] * n)
+        slack = self.size() * (1e-12 + 2.0**-53 * off)
+        least, most = (np.reshape(end, wide) for end in self.range())
+        low = np.maximum(low - np.reshape(bulge[0] + slack, wide), least)
+        high = np.minimum(high + np.reshape(bulge[1] + slack, wide), most)
+        if self.fixed is not None:
+            fixed, level = np.reshape(self.fixed, wide), np.reshape(self.level, wide)
+            low, high = np.where(fixed, level, low), np.where(fixed, level, high)
+        order = [axis for i in range(n) for axis in (i, n + i)]
+        shape = [size * parts for size in self.grid.shape]
+        low, high = (end.transpose(order).reshape(shape) for end in (low, high))
+        nodes = [(axis[:-1, None] + np.diff(axis)[:, None] * shares[:-1]).ravel() for axis in self.grid.axes]
+        return tuple(np.append(node, axis[-1]) for node, axis in zip(nodes, self.grid.axes)), low, high
+
     def values(self, points: Array) -> Array:
         """At points (P, n), in plain floats; 1 outside."""
         places, shares = [], []

@@ -14,17 +14,17 @@ from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.hypotheses import Model, check_noise
-from certbound.values.continuous.line.charts import model_on
+from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import Link, prove_above, prove_below, spans
+from certbound.values.continuous.line.moved_model import model_on
 from certbound.values.continuous.line.phases import Gate, Phase, check_room, last_instant, pieces
 from certbound.values.continuous.line.profiles import End, propose_above, propose_below, shifted, values_of
 from certbound.values.continuous.line.reach import cuts_of
-from certbound.values.continuous.line.starts import Start, start_of
 from certbound.values.continuous.proposal import Line, Sketch, sketch
 from certbound.values.continuous.shapes import sealed
 from certbound.values.continuous.surface import Surface
 
-_LADDER = ((4.0, 1e-4, 0.008), (4.5, 3e-5, 0.005), (6.0, 1e-5, 0.003), (8.0, 3e-6, 0.002))
+LADDER = ((4.0, 1e-4, 0.008), (4.5, 3e-5, 0.005), (6.0, 1e-5, 0.003), (8.0, 3e-6, 0.002))
 """Cells a bend, error a step, and lead (a share of the horizon, by d log P / d log T): one attempt after another."""
 _DEARER = 2.0  # what the next attempt costs, in units of the last one
 _SMALL_GAIN = 0.005
@@ -67,17 +67,17 @@ def bound_line(
     if not last_instant(problem) > 0 or (start.random and any(c.during == (0.0, 0.0) for c in problem.constraints)):
         raise InfeasibleError("value functions do not serve constraints at time 0 alone.")
     cuts = cuts_of(problem, model, start)
-    inner, outer = (_room(problem, model, cuts, start, inner=side) for side in (True, False))
+    inner, outer = (room_of(problem, model, cuts, start, inner=side) for side in (True, False))
     for phase, one in zip(outer.phases, outer.models):
         check_noise(one, (phase.start, phase.end), [(phase.low, phase.high)])
-    rough = _sketches(inner)
+    rough = sketches(inner)
     leak = _leak(outer, model, cuts, start) if lower and len(outer.phases) > 1 else -math.inf
     if leak > -math.inf:
         outer = dataclasses.replace(
             outer, phases=[dataclasses.replace(phase, closed=(True, True)) for phase in outer.phases]
         )
     found = _Found()
-    for fineness, tolerance, lead in _LADDER:
+    for fineness, tolerance, lead in LADDER:
         before = found.work
         share = lead / max(rough[0].growth, 1.0)
         gain = _raise_upper(found, inner, start, rough, (share, fineness, tolerance, lead))
@@ -90,7 +90,7 @@ def bound_line(
     return found.upper, found.lower, words
 
 
-def _room(
+def room_of(
     problem: Problem, model: Model, cuts: tuple[float, float], start: Start, *, inner: bool
 ) -> Room:
     phases, gates = pieces(problem, cuts, inner=inner)
@@ -114,9 +114,9 @@ def _leak(room: Room, model: Model, cuts: tuple[float, float], start: Start) -> 
         phases=[phase], gates=[Gate(time=phase.end, low=-math.inf, high=math.inf)], models=[model],
         lines=[_line(phase, model, start)],
     )  # fmt: skip
-    rough = _sketches(alone)
-    fineness, tolerance, lead = _LADDER[0]
-    links = _above(alone, start, rough, (lead / max(rough[0].growth, 1.0), fineness, tolerance, lead))
+    rough = sketches(alone)
+    fineness, tolerance, lead = LADDER[0]
+    links = surfaces_above(alone, start, rough, (lead / max(rough[0].growth, 1.0), fineness, tolerance, lead))
     return 0.0 if links is None or not spans(links, upper=True) else prove_above(links, start).log
 
 
@@ -146,12 +146,12 @@ def _line(phase: Phase, model: Model, start: Start) -> Line:
     return shifted(line, phase.start)
 
 
-def _sketches(room: Room) -> list[Sketch]:
+def sketches(room: Room) -> list[Sketch]:
     """Rough solutions of all phases, the last one first; the level is that of the start."""
     found: list[Sketch] = []
     for k in reversed(range(len(room.phases))):
         begin = None
-        if found or _gated(room, k):
+        if found or is_gated(room, k):
             later = found[0] if found else None
 
             def begin(y: Array, k: int = k, later: Sketch | None = later) -> Array:
@@ -167,7 +167,7 @@ def _sketches(room: Room) -> list[Sketch]:
     return [dataclasses.replace(one, level=found[0].level) for one in found]
 
 
-def _gated(room: Room, k: int) -> bool:
+def is_gated(room: Room, k: int) -> bool:
     gate, phase = room.gates[k], room.phases[k]
     ends = _y_of(phase, np.array([gate.low, gate.high]), gate.time)
     slack = 1e-9 * (phase.high - phase.low)
@@ -207,7 +207,7 @@ def _raise_upper(
     found: _Found, room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
 ) -> float:
     """One attempt at the upper bound; what it gained."""
-    links = _above(room, start, rough, effort)
+    links = surfaces_above(room, start, rough, effort)
     if links is None or not spans(links, upper=True):
         return 0.0
     found.done.append(" + ".join(f"{link.surface.cells[0]} x {link.surface.slabs}" for link in links))
@@ -222,7 +222,7 @@ def _raise_lower(
     found: _Found, room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
 ) -> float:
     """One attempt at the lower bound; what it gained."""
-    links = _below(room, start, rough, effort)
+    links = surfaces_below(room, start, rough, effort)
     if links is None or not spans(links, upper=False):
         return 0.0
     found.work += _patches_in(links)
@@ -234,7 +234,7 @@ def _raise_lower(
     return gain
 
 
-def _above(
+def surfaces_above(
     room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
 ) -> list[Link] | None:
     """Surfaces for the upper bound, the last phase first."""
@@ -254,7 +254,7 @@ def _above(
     return links
 
 
-def _below(
+def surfaces_below(
     room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
 ) -> list[Link] | None:
     """Surfaces for the lower bound."""

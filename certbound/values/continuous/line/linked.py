@@ -26,9 +26,9 @@ from certbound.values.continuous.hypotheses import (
     top_of,
     up,
 )  # fmt: skip
+from certbound.values.continuous.line.initial_law import Start
 from certbound.values.continuous.line.joins import highest_inside, missing_lower, missing_upper
 from certbound.values.continuous.line.phases import Gate, Phase
-from certbound.values.continuous.line.starts import Start
 from certbound.values.continuous.payment import Patched, Payment, pay_lower, pay_upper
 from certbound.values.continuous.surface import Surface
 
@@ -66,14 +66,14 @@ def prove_above(links: Sequence[Link], start: Start) -> Payment:
         surface = raised_above(link.surface)
         missing = missing_upper(surface, link.phase, link.gate, (after.surface, after.phase) if after else None)
         if not math.isfinite(missing):
-            return Payment(log=0.0, lam=0.0, eps=0.0, growth=0.0)
+            return Payment(log=0.0)
         ready.insert(0, replace(link, surface=surface.raised(up(missing)) if missing else surface))
     level = up(start.highest(ready[0].surface, ready[0].phase))
     need = Need(spare=NEGLIGIBLE / (links[-1].phase.end - links[0].phase.start), start=level, top=0.0)
     proofs = [examine(link.surface, link.model, need, upper=True) for link in ready]
     steps = np.concatenate([link.surface.steps for link in ready])
     floor = float(ready[-1].surface.range_at(-1)[0].min())
-    best = Payment(log=0.0, lam=0.0, eps=0.0, growth=0.0)
+    best = Payment(log=0.0)
     for lift in _LIFTS:
         if level + lift >= best.log:
             break

@@ -15,8 +15,8 @@ from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.continuous.hypotheses import Model
+from certbound.values.continuous.line.initial_law import Start
 from certbound.values.continuous.line.phases import last_instant, limits_of, value_at
-from certbound.values.continuous.line.starts import Start
 
 _PATHS, _STEPS = 400, 200
 _DEVIATIONS = 7.0

@@ -1,0 +1,87 @@
+"""Bounds for every state of the line, not for the initial set alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.errors import InfeasibleError
+from certbound.problem.problem import Problem
+from certbound.values.charts import Chart, Charts
+from certbound.values.continuous.hypotheses import Model, chart_above, chart_below, check_noise
+from certbound.values.continuous.line import ladder
+from certbound.values.continuous.line.initial_law import start_of
+from certbound.values.continuous.line.linked import spans
+from certbound.values.continuous.line.reach import cuts_of
+
+_UNSEALED = -700.0
+
+
+def chart_line(problem: Problem, model: Model, levels: list[float], times: int, lower: bool) -> Charts:
+    """Charts at ``times`` times, sharp at the ``levels`` (natural logarithms, rising).
+
+    Raises
+    ------
+    InfeasibleError
+        Limits that move, come or go, or are missing, or noise that vanishes.
+    """
+    start = start_of(problem)
+    cuts = cuts_of(problem, model, start)
+    inner, outer = (ladder.room_of(problem, model, cuts, start, inner=side) for side in (True, False))
+    if any(_changing(room) for room in (inner, outer)) or start.random:
+        raise InfeasibleError(
+            "maps of value functions serve limits on both sides that stand still over the whole horizon, and a set of "
+            "starts."
+        )
+    phase = outer.phases[0]
+    check_noise(outer.models[0], (phase.start, phase.end), [(phase.low, phase.high)])
+    rough = ladder.sketches(inner)
+    least = max(levels[0], float(rough[0].values.min()))
+    levels = sorted({max(level, least) for level in levels})
+    _, (fineness, tolerance, lead), *_ = ladder.LADDER
+    share = lead / max(rough[0].growth, 1.0)
+    above: list[Chart] = []
+    for level in (_UNSEALED, levels[0]):  # a shorter line gives smaller bounds on it, the longer one more room
+        links = ladder.surfaces_above(
+            inner, start, [dataclasses.replace(rough[0], level=level)], (share, fineness, tolerance, lead)
+        )
+        if links is not None and spans(links, upper=True):
+            surface = links[0].surface
+            found = _at_times(model, surface.times, times, -1, partial(chart_above, surface, model, levels))
+            same = len(above) == len(found) and all(a.time == b.time for a, b in zip(above, found))
+            above = [a.joined(b) for a, b in zip(above, found)] if same else found
+    below: list[Chart] = []
+    rough = [dataclasses.replace(rough[0], level=levels[0])]
+    links = ladder.surfaces_below(outer, start, rough, (share, fineness, 0.5 * tolerance, lead)) if lower else None
+    if links is not None and spans(links, upper=False):
+        surface = links[0].surface
+        below = _at_times(model, surface.times, times, 1, partial(chart_below, surface, model, levels))
+    return Charts(upper=tuple(above), lower=tuple(below))
+
+
+def _changing(room: ladder.Room) -> bool:
+    """Whether the limits move, come or go in time, or one is missing."""
+    phase = room.phases[0]
+    moves = phase.origin is not None or phase.width is not None
+    return len(room.phases) > 1 or moves or not all(phase.closed) or ladder.is_gated(room, 0)
+
+
+def _at_times(
+    model: Model, ends: Array, count: int, side: int, chart: Callable[[list[int]], list[Chart]]
+) -> list[Chart]:
+    """Charts at ``count`` times from 0 on: at equal ones, or at ends of slabs where the model depends on time.
+
+    Where it does not (the limits stand still, `chart_line`), the probability falls with t: what holds at the end of a
+    slab before t (``side`` -1: an upper bound) or after it (1: a lower one) holds at t.
+    """
+    wanted = float(ends[-1]) * np.arange(count) / count
+    if not model.autonomous:
+        return chart(sorted({int(np.argmin(np.abs(ends[:-1] - time))) for time in wanted}))
+    slabs = np.searchsorted(ends, wanted) if side > 0 else np.searchsorted(ends, wanted, side="right") - 1
+    found = chart([min(int(slab), len(ends) - 2) for slab in slabs])
+    kept = [(one, float(time)) for one, time in zip(found, wanted) if side < 0 or one.time >= time]
+    return [dataclasses.replace(one, time=time) for one, time in kept]
