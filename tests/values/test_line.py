@@ -235,12 +235,14 @@ def test_the_mean_over_a_random_start_is_that_of_the_curve() -> None:
     ("changes", "message"),
     [
         ({"safe": [cb.Inside(BOX), cb.Outside(cb.Box([0.5], [0.6]), during=(0.5, 1.0))]}, "either side of it"),
+        ({"safe": [cb.Inside(BOX), cb.Outside(cb.Box([0.5], [0.6]))], "start": cb.GaussianStart([0.0], [[0.04]])},
+         "random start beside"),
         ({"safe": [cb.Inside(UP)], "f": lambda x: x**3, "horizon": 9.0}, "leave every bound"),
         ({"safe": [cb.Inside(cb.Box([-1], [1], center=lambda t: [2 * t])), cb.Inside(BOX)]}, "no interior"),
-        ({"safe": [cb.Inside(BOX, during=(0.0, 0.0))]}, "at time 0 alone"),
+        ({"safe": [cb.Inside(BOX), cb.Inside(BOX, during=(0.0, 0.0))]}, "at time 0 alone"),
         ({"safe": [cb.Inside(BOX)], "gain": lambda x: np.array([[x[0]]])}, "noise of full rank"),
     ],
-)
+)  # fmt: skip
 def test_what_is_not_served_is_refused_in_words(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InfeasibleError, match=message):
         bound_exits(problem(**changes), seconds=0.01)
@@ -253,3 +255,16 @@ def test_bounds_do_not_depend_on_the_clock(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(ticks)))
     second = bound_exits(asked, seconds=1.0)
     assert (first.upper, first.lower, first.words) == (second.upper, second.lower, second.words)
+
+
+def test_a_start_in_moving_coordinates_is_read_where_it_is() -> None:
+    f = np.polynomial.Polynomial([-2.0, 0.7, 0.3])
+    asked = problem([cb.Inside(cb.Box([-1], [1], center=lambda t: [0.3 + 0.2 * t]))])
+    (phase,), _ = pieces(asked, (-3.0, 3.0), inner=True)
+    surface = curve(np.linspace(-1, 1, 9), f)
+    point, wide = Start(low=0.1, high=0.1), Start(low=0.1, high=0.4)
+    assert point.highest(surface, phase) == pytest.approx(f(-0.2), abs=1e-12)
+    assert point.lowest(surface, phase) == pytest.approx(f(-0.2), abs=1e-12)
+    assert f(0.1) <= wide.highest(surface, phase) <= f(0.1) + 0.02
+    assert f(0.1) - 0.02 <= wide.lowest(surface, phase) <= f(0.1)
+    assert Start(low=2.0, high=2.0).highest(surface, phase) == math.inf

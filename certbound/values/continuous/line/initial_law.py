@@ -38,7 +38,9 @@ class Start:
     def highest(self, surface: Surface, phase: Phase) -> float:
         """An upper bound of V(0, .) over the set, or of log E e^V(0, .), starts off the grid counting 1."""
         if not self.random:
-            return extreme_over(surface, [self._local(phase)], upper=True)
+            if phase.origin is None and phase.width is None:
+                return extreme_over(surface, [(self.low, self.high)], upper=True)
+            return float(self._over(surface, phase).hi.max())
         edges, mass = self._masses(surface, phase, most=True)
         value = Profile(surface, 0).over(Interval(edges[:-1], edges[1:]))[0].hi
         total = float(np.sum(mass[1:-1] * np.exp(np.minimum(value, 700.0)))) + mass[0] + mass[-1]
@@ -47,18 +49,20 @@ class Start:
     def lowest(self, surface: Surface, phase: Phase) -> float:
         """A lower bound of V(0, .) at the best start, or of log E e^V(0, .), starts off a closed face counting 1."""
         if not self.random:
-            return extreme_over(surface, [self._local(phase)], upper=False)
+            if phase.origin is None and phase.width is None:
+                return extreme_over(surface, [(self.low, self.high)], upper=False)
+            return float(self._over(surface, phase).lo.max())
         edges, mass = self._masses(surface, phase, most=False)
         value = Profile(surface, 0).over(Interval(edges[:-1], edges[1:]))[0].lo
         total = float(np.sum(mass[1:-1] * np.exp(value)))
         total += sum(float(mass[end]) for end, closed in zip((0, -1), phase.closed) if closed)
         return math.log(total) - 1e-12 * (1 + abs(math.log(total))) if total > 0 else -math.inf
 
-    def _local(self, phase: Phase) -> tuple[float, float]:
-        if phase.origin is None and phase.width is None:
-            return self.low, self.high
-        ends = phase.local(Interval(self.low, self.high), phase.start)
-        return float(ends.lo), float(ends.hi)
+    def _over(self, surface: Surface, phase: Phase) -> Interval:
+        """V(0, .) over parts of the set; all reals for those that stick out of the grid."""
+        cuts = np.linspace(self.low, self.high, _PARTS + 1 if self.low < self.high else 2)
+        cuts[0], cuts[-1] = self.low, self.high
+        return Profile(surface, 0).over(phase.local(Interval(cuts[:-1], cuts[1:]), phase.start))[0]
 
     def _masses(self, surface: Surface, phase: Phase, *, most: bool) -> tuple[Array, Array]:
         """Edges of parts of the cells, and bounds of the start's mass below, on and above each of these parts."""

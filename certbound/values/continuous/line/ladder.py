@@ -17,7 +17,7 @@ from certbound.values.continuous.hypotheses import Model, check_noise
 from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import Link, prove_above, prove_below, spans
 from certbound.values.continuous.line.moved_model import model_on
-from certbound.values.continuous.line.phases import Gate, Phase, check_room, last_instant, pieces
+from certbound.values.continuous.line.phases import Gate, Phase, check_room, pieces
 from certbound.values.continuous.line.profiles import End, propose_above, propose_below, shifted, values_of
 from certbound.values.continuous.line.reach import cuts_of
 from certbound.values.continuous.proposal import Line, Sketch, sketch
@@ -64,7 +64,7 @@ def bound_line(
         Constraints at time 0 alone, obstacles that appear later, noise that vanishes, or paths beyond every bound.
     """
     start = start_of(problem)
-    if not last_instant(problem) > 0 or (start.random and any(c.during == (0.0, 0.0) for c in problem.constraints)):
+    if not problem.constraints or any(c.during == (0.0, 0.0) for c in problem.constraints):
         raise InfeasibleError("value functions do not serve constraints at time 0 alone.")
     cuts = cuts_of(problem, model, start)
     inner, outer = (room_of(problem, model, cuts, start, inner=side) for side in (True, False))
@@ -125,7 +125,7 @@ def _less(lower: float | None, leak: float) -> float | None:
     if lower is None or leak == -math.inf:
         return lower
     left = -math.expm1(min(leak - lower, 0.0))
-    return lower + math.log(left) - 1e-12 * (1 + abs(lower)) if left > 1e-9 else None
+    return lower + math.log(left) - 1e-12 * (1 + abs(lower)) if left > 1e-3 else None
 
 
 def _line(phase: Phase, model: Model, start: Start) -> Line:

@@ -117,9 +117,10 @@ def _beside(constraint: Inside, ends: dict[int, float], problem: Problem) -> dic
         raise InfeasibleError(
             f"value functions do not serve '{constraint.label}': it appears while paths may be on either side of it."
         )
-    around = constraint.region.hull(0.0)
     start = problem.initial
-    low, high = (start.mean[0],) * 2 if start.random else (start.hull().lo[0], start.hull().hi[0])
+    if start.random:  # a start beyond the obstacle has not failed, and belongs to another room
+        raise InfeasibleError(f"value functions do not serve a random start beside '{constraint.label}'; use a set.")
+    around, low, high = constraint.region.hull(0.0), start.hull().lo[0], start.hull().hi[0]
     if 0 in ends and high < around.lo[0]:
         return {0: ends[0]}
     if 1 in ends and low > around.hi[0]:

@@ -21,7 +21,8 @@ Values = Callable[[Array], Array]
 _SHARE = 0.005  # what a lower bound starts from at the horizon, as a share of P; it is subtracted at last
 _APART = 4.0  # how far beyond a gate a lower V begins to rise, in units of its slope
 _BENT = 3.0  # over which length V is bent at a gate, in units of its slope
-_SHARPER = 0.25  # what lower bounds need in addition: their V has to rise from far below
+_SHARPER = 0.25  # at jumps, what lower bounds need in addition: their V has to rise from far below
+_SOFTER = 2.0  # at gates where V need not jump: what is lost by bending it is of second order
 _SHIFTED = 1e-3  # a face at which the next V is lower than this is new
 
 
@@ -50,7 +51,7 @@ def propose_above(
 ) -> Surface | None:
     """V = 0 on both faces and beyond the gate."""
     layers = [layer(line, side, lead) for side in (0, 1)]
-    steep = _gate_slopes(line, rough, sharpness)
+    steep = _gate_slopes(line, end, rough, sharpness, 1.0)
 
     def profile(y: Array) -> Array:
         rows: list[tuple[Array, Array | None, float]] = []
@@ -83,7 +84,7 @@ def propose_below(
 ) -> Surface | None:
     """V <= 0; at the horizon and on cut faces a small share of P, on faces 0 after a rise, V' = 0 on far ones."""
     top = rough.level + float(np.log(_SHARE))
-    steep = _gate_slopes(line, rough, _SHARPER * sharpness)
+    steep = _gate_slopes(line, end, rough, sharpness, _SHARPER)
     rates = [rise(line, side, -2 * top / lead) for side in (0, 1)]
     profile = _profile_below(line, end, far, top, rates, steep)
     at_faces = profile(np.array([line.low, line.high]))
@@ -165,13 +166,14 @@ def _new(line: Line, end: End, side: int) -> bool:
     return bool(end.after(face)[0] < -_SHIFTED)
 
 
-def _gate_slopes(line: Line, rough: Sketch, sharpness: float) -> list[float]:
+def _gate_slopes(line: Line, end: End, rough: Sketch, sharpness: float, jump: float) -> list[float]:
     """How steep V may be beside a gate: it moves the gate by 1/k, and P by sqrt(2 |log P| / (a T)) times that."""
     found = []
     for side in (0, 1):
         place = np.array([line.low if side == 0 else line.high])
         spread_out = float(np.sqrt(line.square(line.horizon, place)[0] * line.horizon))
-        found.append(float(np.sqrt(2 * (1 - rough.level))) / (spread_out * sharpness))
+        sharp = sharpness * (jump if _jump(line, end, side) else _SOFTER)
+        found.append(float(np.sqrt(2 * (1 - rough.level))) / (spread_out * sharp))
     return found
 
 
