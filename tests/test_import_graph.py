@@ -17,7 +17,7 @@ PACKAGE = ROOT / "certbound"
 
 # What a line names may import the lines above it: rooms, sub-rooms, and single modules that stand between these.
 ORDER = """
-errors lazy arrays _version
+errors lazy arrays watch _version
 checks
 display
 rigor
@@ -55,7 +55,9 @@ safety.answers
 safety.engines
 safety.certificates
 safety.portfolio
-safety.certificate
+safety.certificate safety.falsification
+safety.verdict
+safety.decision
 safety
 synthesis
 synthesis.plans
@@ -63,7 +65,7 @@ synthesis.controllers
 plotting
 html_report
 cli.describe cli.messages cli.output
-cli.options cli.pictures
+cli.options cli.pictures cli.progress
 cli.clock
 cli.commands
 cli
@@ -81,7 +83,7 @@ LEVEL |= {
     f"checker.{unit}": level for level, line in enumerate(CHECKER_ORDER.split("\n")) for unit in line.split()
 } | {"checker": 99}
 
-GROUND = {"errors", "arrays", "_version", "checks", "display", "rigor"}
+GROUND = {"errors", "arrays", "watch", "_version", "checks", "display", "rigor"}
 KNOWS_ONLY = {  # rooms that may be taken out and used elsewhere
     "tubes": GROUND,
     "gaussian": GROUND | {"problem"},

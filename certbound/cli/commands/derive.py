@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
+from certbound.cli.clock import Clock, TimeLimitOption
 from certbound.cli.describe import describe_constants
 from certbound.cli.messages import computing
 from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, examples, load_problem
 from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.display import log10_text, name_text
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
+from certbound.watch import OutOfTime
 
 if TYPE_CHECKING:
     from rich.table import Table
