@@ -211,6 +211,12 @@ def share_of_time(part: float) -> Iterator[None]:
         yield
 
 
+def solver_limit() -> dict[str, float]:
+    """The option that keeps a call of Clarabel to the time that is left; none where there is no limit."""
+    left = seconds_left()
+    return {} if left == math.inf else {"time_limit": max(left, 0.01)}
+
+
 def seconds_left() -> float:
     """What is left to the work at hand; infinite where nobody watches."""
     watch = _CURRENT.get()

@@ -33,10 +33,11 @@ from certbound.reach.nominal import initial_cells
 from certbound.rigor.intervals import Interval
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
+from certbound.watch import poll, solver_limit
 
 _MOST_STATES = 3
 _DEGREES = {1: (4, 6), 2: (4, 6), 3: (4,)}
-_GRID = {1: 201, 2: 41, 3: 13}
+_GRID = {1: (51, 201), 2: (21, 41), 3: (7, 13)}  # the first shows whether the second, which takes long, is worth it
 _ROUNDS = 3
 _FAR = 1 / 3  # share of the exponent asked for, from which on the next degree is worth its time
 _CLOSE = 0.1  # of log10: what is proved may be that far from what the program hoped for
@@ -95,10 +96,15 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
             break
         if found is not None and found.log10_probability(problem.horizon) < level:
             best, level = found, found.log10_probability(problem.horizon)
+            asked.found(_answer(problem, best, level))
         if level <= math.log10(problem.delta) or 0 > level > _FAR * math.log10(problem.delta):
             break
     if best is None:
         return EngineAnswer(reason="no polynomial barrier was found.", method="barrier")
+    return _answer(problem, best, level)
+
+
+def _answer(problem: Problem, best: Barrier, level: float) -> EngineAnswer:
     return EngineAnswer(
         log10_delta=level,
         reason=f"exp(V) - V a polynomial of degree {int(best.exponents.sum(axis=1).max())} - grows by at most "
@@ -152,9 +158,13 @@ class _Work:
     def search(self, degree: int) -> Barrier | None:
         """The best polynomial of the convex program, and what is proved of it."""
         exponents = np.array([e for e in itertools.product(range(degree + 1), repeat=self.n) if 0 < sum(e) <= degree])
-        points = self._points()
+        coarse, fine = _GRID[self.n]
+        points = self._points(coarse)
+        if self._program(exponents, *points)[1] <= _FAR * math.log10(self.problem.delta):
+            points = self._points(fine)
         best: Barrier | None = None
-        for _ in range(_ROUNDS):
+        for number in range(_ROUNDS):
+            poll(f"a polynomial of degree {degree}, round {number + 1}")
             coefficients, hoped = self._program(exponents, *points)
             if coefficients is None:
                 return best
@@ -171,9 +181,8 @@ class _Work:
             points = tuple(np.concatenate([have, more]) for have, more in zip(points, worst))  # type: ignore[assignment]  # as many as before
         return best
 
-    def _points(self) -> tuple[Array, Array, Array]:
+    def _points(self, count: int) -> tuple[Array, Array, Array]:
         """Points (t, x, d) of the safe set, points x of the initial set, points x of the boundary."""
-        count = _GRID[self.n]
         axes = [np.linspace(a, b, count) for a, b in zip(self.hull.lo, self.hull.hi)]
         grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
         inside = self._gap(grid) <= 1e-12 * self.size
@@ -238,7 +247,7 @@ class _Work:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # an inaccurate proposal is a proposal
-                program.solve(solver=cp.CLARABEL)
+                program.solve(solver=cp.CLARABEL, **solver_limit())
         except cp.SolverError:
             return None, 0.0
         if c.value is None or not np.isfinite(program.value) or program.value >= 0:

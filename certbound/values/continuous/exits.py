@@ -22,6 +22,7 @@ from certbound.values.continuous.hypotheses import Model, covers, extreme_over, 
 from certbound.values.continuous.proposal import Line, sketch
 from certbound.values.continuous.room import Room, safe_room, starts_of
 from certbound.values.continuous.shapes import propose_lower, propose_upper, sealed
+from certbound.watch import OutOfTime
 
 Starts = list[tuple[float, float]]
 
@@ -199,9 +200,14 @@ def _one_state(
         begin = time.perf_counter()
         cells = int(effort * (1 + 0.2 * min(-found.level, 80)))
         span = inner.horizon * lead / max(rough.growth, 1.0)
-        gain = _raise_upper(found, inner, model, starts, span, cells, tolerance)
-        if lower:
-            gain = max(gain, _raise_lower(found, outer, model, starts, 3 * span, cells, tolerance))
+        try:
+            gain = _raise_upper(found, inner, model, starts, span, cells, tolerance)
+            if lower:
+                gain = max(gain, _raise_lower(found, outer, model, starts, 3 * span, cells, tolerance))
+        except OutOfTime:
+            if found.upper < 0:
+                break
+            raise
         spent = time.perf_counter() - begin
         if (gain < 0.005 and attempt > 0) or time.perf_counter() + 2.5 * spent > deadline:
             break

@@ -26,6 +26,7 @@ from certbound.values.continuous.hypotheses import (
 from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane
 from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
+from certbound.watch import OutOfTime
 
 _FACTOR = 1.12
 _TOP = -0.02  # where V is above, the proof may lift it over 0 instead
@@ -42,10 +43,15 @@ def two_states(
     upper, done = 0.0, []
     for plan in _plans(inner, level, 36 if deadline - time.perf_counter() < 15 else 50):
         begin = time.perf_counter()
-        for found in _uppers(inner, model, starts, plan):
-            upper = min(upper, found)
-            if time.perf_counter() > deadline:
+        try:
+            for found in _uppers(inner, model, starts, plan):
+                upper = min(upper, found)
+                if time.perf_counter() > deadline:
+                    break
+        except OutOfTime:
+            if upper < 0:
                 break
+            raise
         done.append(f"{plan.cells}^2")
         spent = time.perf_counter() - begin
         if time.perf_counter() + 2 * spent > deadline:
