@@ -108,7 +108,7 @@ MANY_DOORS = {
     "constants.programs": (15, "one program each for rate, gain and erosion, with what it is asked"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
     "problem.sets": (13, "the sets and constraints that users write, and the two forms that everybody reads"),
-    "reach.nominal": (10, "curves and series, which every kind of tube is made of"),
+    "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
     "checker.statement": (10, "what a certificate states is read once and asked by three proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
     "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),

@@ -85,7 +85,7 @@ def verify(
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
     started = time.perf_counter()
     clock = Clock(DEFAULT_LIMIT if time_limit is None else time_limit)
-    with progress(f"verifying {name_text(subject.name)}", silent=as_json) as tell:
+    with progress(f"verifying {name_text(subject.name)}", clock.limit) as tell:
         from certbound.safety.verification import verify_safety
 
         verdict = verify_safety(
@@ -98,7 +98,7 @@ def verify(
     if not as_json:  # the verdict comes first: it stands, whatever becomes of the rest
         _print(subject, result)
     if explain and verdict.status == "UNKNOWN":
-        result["limits"] = _limits(verdict, cells, clock, silent=as_json)
+        result["limits"] = _limits(verdict, cells, clock)
         if not as_json and not SETTINGS.quiet:
             console().print(result["limits"]["summary"], markup=False)
     proof = ""
@@ -126,13 +126,13 @@ def _engines(verdict: Verdict) -> list[dict[str, Any]]:
     return [{"engine": name, **attributes(answer, *keys)} for name, answer in verdict.answers.items()]
 
 
-def _limits(verdict: Verdict, cells: int | None, clock: Clock, *, silent: bool) -> dict[str, Any]:
+def _limits(verdict: Verdict, cells: int | None, clock: Clock) -> dict[str, Any]:
     """What would be SAFE, for --explain, as far as time allows."""
     from certbound.safety.limits import Limits, limits_so_far
 
     found, over = Limits(delta=None, horizon=None, noise=None, widening=None), ""
     try:
-        with progress("looking for what would be SAFE", silent=silent) as tell, contained("search for limits"):
+        with progress("looking for what would be SAFE") as tell, contained("search for limits"):
             watch = Watch(max(clock.left, _LEAST), progress=tell)
             with watch.running():
                 for better in limits_so_far(verdict, cells=cells):

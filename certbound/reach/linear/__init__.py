@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from certbound.reach.linear.answer import linear_answer, linear_reach, refusal
-from certbound.reach.linear.deviation_tube import DeviationTube
+from certbound.reach.linear.answer_tubes import DeviationTube
 from certbound.reach.linear.diffusion import Accepted, DiffusionRun, Reference, depends_on_state
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.proved import LinearAnswer, Path, SplitAnswer

@@ -26,7 +26,8 @@ from certbound.watch import poll
 _DEPTH = 4  # halvings of every side
 _LOOK = 3  # halvings between two looks at the middle of a cell
 _MOST_PIECES = 16_000  # pieces of time times cells that are looked at
-_SPARE = 4_000  # cells times pieces times squared states that may be spent on less than the target
+_SPARE = 4_000  # cells times steps times squared states that may be spent on less than the target
+_MORE = 2  # times the cells that the target took, at most
 _ENOUGH = 10.2  # times its logarithm, beyond which less is worth nothing
 
 
@@ -92,8 +93,9 @@ def bisected(problem: Problem, whole: LinearRun, target: Share) -> SplitAnswer |
             count += 1
             other = run_of(problem, cells=half.cells, pieces=pieces)
             heapq.heappush(heap, (-_urgency(other), count, half, other))
-    work = whole.engine.pieces * whole.engine.n**2
-    done = _further(problem, done, pieces, target, _SPARE // work - count)
+    if not whole.engine.continuous:  # elsewhere events are dear
+        work = whole.engine.pieces * whole.engine.n**2
+        done = _further(problem, done, pieces, target, min(_SPARE // work - count, _MORE * count))
     done.sort(key=lambda item: item[0].path)
     return SplitAnswer.of([(leaf.path, leaf.low, leaf.high, answer) for leaf, answer in done])
 

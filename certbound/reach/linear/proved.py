@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from certbound.arrays import Array
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear import answer_tubes
-from certbound.reach.linear.deviation_tube import DeviationTube
+from certbound.reach.linear.answer_tubes import DeviationTube
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share

@@ -249,7 +249,7 @@ def _padded(engine: Linearisation, bounds: tuple[Array, Array], pad: float) -> t
 
 
 def cuts_of(answer: EngineAnswer) -> list[Any] | None:
-    """How the initial set was cut into cells, part by part, as `certbound.checker` reads it; None: by a grid at most."""
+    """How the initial set was cut into cells, as `certbound.checker` reads it; None: by a grid, if at all."""
     found = answer.details
     return None if not isinstance(found, SplitAnswer) else _cuts(list(zip(found.paths, found.low, found.high)), 0)
 

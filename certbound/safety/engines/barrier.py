@@ -37,7 +37,7 @@ from certbound.watch import poll, solver_limit
 
 _MOST_STATES = 3
 _DEGREES = {1: (4, 6), 2: (4, 6), 3: (4,)}
-_GRID = {1: (51, 201), 2: (21, 41), 3: (7, 13)}  # the first shows whether the second, which takes long, is worth it
+_GRID = {1: (51, 201), 2: (21, 41), 3: (7, 11)}  # the first shows whether the second, which takes long, is worth it
 _ROUNDS = 3
 _FAR = 1 / 3  # share of the exponent asked for, from which on the next degree is worth its time
 _CLOSE = 0.1  # of log10: what is proved may be that far from what the program hoped for
@@ -160,12 +160,15 @@ class _Work:
         exponents = np.array([e for e in itertools.product(range(degree + 1), repeat=self.n) if 0 < sum(e) <= degree])
         coarse, fine = _GRID[self.n]
         points = self._points(coarse)
-        if self._program(exponents, *points)[1] <= _FAR * math.log10(self.problem.delta):
+        coefficients, hoped = self._program(exponents, *points)
+        if hoped <= _FAR * math.log10(self.problem.delta):
             points = self._points(fine)
+            coefficients, hoped = self._program(exponents, *points)
         best: Barrier | None = None
         for number in range(_ROUNDS):
             poll(f"a polynomial of degree {degree}, round {number + 1}")
-            coefficients, hoped = self._program(exponents, *points)
+            if number:
+                coefficients, hoped = self._program(exponents, *points)
             if coefficients is None:
                 return best
             found, worst = self._certified(exponents, coefficients)
