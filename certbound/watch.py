@@ -63,14 +63,19 @@ class Watch:
         Called with a `Progress` whenever the phase or a bound changes, and about four times a second.
     clock : callable
         Seconds from any beginning.
+    jobs : int
+        Processes that may work side by side.
     """
 
     def __init__(
         self, limit: float | None = None, *, progress: Callable[[Progress], object] | None = None,
-        clock: Callable[[], float] = time.perf_counter,
+        clock: Callable[[], float] = time.perf_counter, jobs: int = 1,
     ) -> None:
         if limit is not None and not limit > 0:
             raise ValueError(f"`time_limit` must be a positive number of seconds, got {limit!r}.")
+        if isinstance(jobs, bool) or int(jobs) != jobs or jobs < 1:
+            raise ValueError(f"`jobs` must be a positive number of processes, got {jobs!r}.")
+        self.jobs = int(jobs)
         self.limit, self._progress, self._clock = limit, progress, clock
         self.started = clock()
         self._end = math.inf if limit is None else self.started + limit
@@ -79,6 +84,10 @@ class Watch:
         self.engine, self.phase = "", ""
         self.log10_delta: float = 0.0
         self.log10_lower: float | None = None
+
+    def silence(self) -> None:
+        """Tell no more."""
+        self._progress = None
 
     @property
     def spent(self) -> float:
@@ -215,6 +224,19 @@ def solver_limit() -> dict[str, float]:
     """The option that keeps a call of Clarabel to the time that is left; none where there is no limit."""
     left = seconds_left()
     return {} if left == math.inf else {"time_limit": max(left, 0.01)}
+
+
+def jobs_allowed() -> int:
+    """Processes that may work side by side: one where nobody watches."""
+    watch = _CURRENT.get()
+    return 1 if watch is None else watch.jobs
+
+
+def silenced() -> None:
+    """Let the watch that runs, if any, tell no more: in a copy of the process."""
+    watch = _CURRENT.get()
+    if watch is not None:
+        watch.silence()
 
 
 def seconds_left() -> float:

@@ -18,6 +18,7 @@ PACKAGE = ROOT / "certbound"
 # What a line names may import the lines above it: rooms, sub-rooms, and single modules that stand between these.
 ORDER = """
 errors lazy arrays watch _version
+parallel
 checks
 display
 rigor
@@ -83,7 +84,7 @@ LEVEL |= {
     f"checker.{unit}": level for level, line in enumerate(CHECKER_ORDER.split("\n")) for unit in line.split()
 } | {"checker": 99}
 
-GROUND = {"errors", "arrays", "watch", "_version", "checks", "display", "rigor"}
+GROUND = {"errors", "arrays", "watch", "parallel", "_version", "checks", "display", "rigor"}
 KNOWS_ONLY = {  # rooms that may be taken out and used elsewhere
     "tubes": GROUND,
     "gaussian": GROUND | {"problem"},

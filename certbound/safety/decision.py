@@ -165,7 +165,7 @@ class _Search:
             self.answers.setdefault(name, answer)
         answers = {name: self.answers[name] for name in ENGINES if name in self.answers}
         found = verdict_of(self.problem, answers, names[0] if len(names) == 1 else "auto")
-        over = self.watch.limit is not None and self.watch.left <= 0
+        over = self.watch.limit is not None and self.watch.left <= 0 and found.status == "UNKNOWN"
         return replace(found, reason=f"{found.reason} {self._undone(names)}".strip()) if over else found
 
     def _undone(self, names: tuple[str, ...]) -> str:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def verify_safety(
     problem: Problem, method: str = "auto", cells: int | None = None, *, constants: Constants | None = None,
     time_limit: float | None = None, progress: Callable[[Progress], object] | None = None, smallest: bool = False,
-    explain: bool = False,
+    explain: bool = False, jobs: int = 1,
 ) -> Verdict:
     """Prove that a problem's constraints are broken with probability at most delta, or say why not.
 
@@ -49,6 +49,8 @@ def verify_safety(
         Once SAFE, go on to the smallest probability that can be proved.
     explain : bool
         Of what is not SAFE, find what would be: `Verdict.limits`.
+    jobs : int
+        Processes that prove cells of the initial set side by side; the answer is the same.
 
     Returns
     -------
@@ -70,8 +72,8 @@ def verify_safety(
     >>> verify_safety(problem, method="constants").status
     'SAFE'
     """
-    own = time_limit is not None or progress is not None
-    watch = Watch(time_limit, progress=progress) if own else current_watch() or Watch()
+    own = time_limit is not None or progress is not None or jobs != 1
+    watch = Watch(time_limit, progress=progress, jobs=jobs) if own else current_watch() or Watch()
     verdict = decide(problem, method=method, cells=cells, constants=constants, watch=watch)
     with contextlib.suppress(OutOfTime), watch.running():
         if smallest and verdict.status == "SAFE":

@@ -54,6 +54,7 @@ MethodOption = Annotated[
     typer.Option("--method", metavar="M", help="auto, an engine's (linear, values, ...), or a tube's (kummer, thm3)."),
 ]
 CellsOption = Annotated[int | None, option("--cells", "K", "Cells per side of the initial set.", integer)]
+JobsOption = Annotated[int, option("--jobs", "N", "Processes that prove cells side by side [1].", integer)]
 CertificateOption = Annotated[Path | None, option("--certificate", "FILE", "Write the certificate.")]
 ReportOption = Annotated[Path | None, option("--report", "FILE", "Write one HTML page.")]
 ExplainOption = Annotated[
@@ -77,6 +78,7 @@ def verify(
     explain: ExplainOption = False,
     smallest: SmallestOption = False,
     time_limit: VerdictLimitOption = None,
+    jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Decide whether the system stays safe but for a probability of delta, and prove it."""
@@ -89,7 +91,7 @@ def verify(
         from certbound.safety.verification import verify_safety
 
         verdict = verify_safety(
-            subject, method=method, cells=cells, time_limit=clock.limit, progress=tell, smallest=smallest
+            subject, method=method, cells=cells, time_limit=clock.limit, progress=tell, smallest=smallest, jobs=jobs
         )
     seconds = time.perf_counter() - started
     result = _result(subject, verdict, seconds)
@@ -103,7 +105,12 @@ def verify(
             console().print(result["limits"]["summary"], markup=False)
     proof = ""
     if certificate is not None:
-        proof, result["certificate"] = _certify(subject, verdict, certificate)
+        left = None if time_limit is None else max(clock.left, _LEAST)
+        proof, result["certificate"] = _certify(subject, verdict, certificate, left)
+        if proof and not as_json and not SETTINGS.quiet:
+            spent = result["certificate"]
+            share = f"the checker's share {spent['check_seconds']:.1f} s"
+            console().print(f"certificate: {spent['seconds']:.1f} s, {share}", markup=False)
     _write(subject, verdict, proof, report=report, plot=plot)
     show(result, as_json, lambda: None)
     raise typer.Exit(0 if verdict.status == "SAFE" else 1)
@@ -167,16 +174,21 @@ def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | Non
             write_file(report, report_page(scene, verdict, command=command, probability=probability, certificate=proof))
 
 
-def _certify(problem: Problem, verdict: Verdict, path: Path) -> tuple[str, dict[str, Any]]:
+def _certify(problem: Problem, verdict: Verdict, path: Path, left: float | None) -> tuple[str, dict[str, Any]]:
     """Write a certificate that the checker has proved; its text, and what ``--json`` says of it.
 
-    What it misses is said in one line on standard error: that none was written, or that it proves less than delta.
+    A limit that was given leaves it ``left`` seconds; the default one is of the search alone. What it misses is said in
+    one line on standard error: that none was written, or that it proves less than delta.
     """
+    started, checking = time.perf_counter(), list[float]()
     try:
-        with spinner("writing and checking the certificate"):
-            text = proved_certificate(problem, verdict)
-    except CertificateError as error:
-        reason = " ".join(str(error).split())
+        with progress("writing and checking the certificate", left) as tell:
+            watch = Watch(left, progress=tell)
+            with watch.running():
+                text = proved_certificate(problem, verdict, checking)
+    except (CertificateError, OutOfTime) as error:
+        over = "the time was over before its proof was written and checked; give a larger --time-limit"
+        reason = over if isinstance(error, OutOfTime) else " ".join(str(error).split())
         sys.stderr.write(f"certbound: no certificate was written: {reason}\n")
         return "", {"path": None, "log10_delta": None, "reason": reason}
     write_file(path, text)
@@ -186,7 +198,8 @@ def _certify(problem: Problem, verdict: Verdict, path: Path) -> tuple[str, dict[
     if verdict.status == "SAFE" and not is_at_most(min(proved, 0.0), problem.delta):
         reason = f"the certificate proves {log10_text(proved)}, not the {problem.delta:g} of the verdict"
         sys.stderr.write(f"certbound: {reason}\n")
-    return text, {"path": str(path), "log10_delta": proved, "reason": reason}
+    spent = {"seconds": time.perf_counter() - started, "check_seconds": sum(checking)}
+    return text, {"path": str(path), "log10_delta": proved, "reason": reason, **spent}
 
 
 def _print(problem: Problem, result: dict[str, Any]) -> None:

@@ -9,11 +9,14 @@ Where even its middle alone, as a start, is out of reach, no halving helps.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.parallel import side_by_side
 from certbound.problem.problem import Problem
 from certbound.reach.linear.hopes import meeting, promising, refined, run_of
 from certbound.reach.linear.proved import LinearAnswer, SplitAnswer
@@ -21,9 +24,10 @@ from certbound.reach.linear.run import LinearRun
 from certbound.reach.linear.shares import Share
 from certbound.reach.nominal import Cells, initial_cells
 from certbound.rigor.intervals import Interval
-from certbound.watch import poll
+from certbound.watch import jobs_allowed, poll
 
 _DEPTH = 4  # halvings of every side
+_BATCH = 4  # cells that are proved side by side, should there be processes for it
 _LOOK = 3  # halvings between two looks at the middle of a cell
 _MOST_PIECES = 16_000  # pieces of time times cells that are looked at
 _SPARE = 4_000  # cells times steps times squared states that may be spent on less than the target
@@ -77,22 +81,23 @@ def bisected(problem: Problem, whole: LinearRun, target: Share) -> SplitAnswer |
     done: list[_Proof] = []
     count = 1
     while heap:
-        _, _, leaf, run = heapq.heappop(heap)
-        poll(f"cells of the initial set: {len(done)} done, {len(heap) + 1} to do")
-        if run is not whole:
-            run.learnt = done[-1][1].run.learnt if done else None
-            proved = _proved(run, target)
+        poll(f"cells of the initial set: {len(done)} done, {len(heap)} to do")
+        worst = [heapq.heappop(heap) for _ in range(min(_BATCH, len(heap)))]
+        learnt = done[-1][1].run.learnt if done else None
+        found = _side_by_side([run for _, _, _, run in worst if run is not whole], target, learnt)
+        for _, _, leaf, run in worst:
+            proved = found.get(run)
             if proved is not None:
                 done.append((leaf, proved))
                 continue
-        if len(leaf.path) >= _DEPTH * wide or (count + 2) * whole.engine.pieces > _MOST_PIECES:
-            return None
-        if leaf.path and len(leaf.path) % _LOOK == 0 and not _middle_promises(problem, leaf, pieces, target):
-            return None
-        for half in leaf.halves(_side(run)):
-            count += 1
-            other = run_of(problem, cells=half.cells, pieces=pieces)
-            heapq.heappush(heap, (-_urgency(other), count, half, other))
+            if len(leaf.path) >= _DEPTH * wide or (count + 2) * whole.engine.pieces > _MOST_PIECES:
+                return None
+            if leaf.path and len(leaf.path) % _LOOK == 0 and not _middle_promises(problem, leaf, pieces, target):
+                return None
+            for half in leaf.halves(_side(run)):
+                count += 1
+                other = run_of(problem, cells=half.cells, pieces=pieces)
+                heapq.heappush(heap, (-_urgency(other), count, half, other))
     if not whole.engine.continuous:  # elsewhere events are dear
         work = whole.engine.pieces * whole.engine.n**2
         done = _further(problem, done, pieces, target, min(_SPARE // work - count, _MORE * count))
@@ -111,13 +116,36 @@ def _further(
             break
         poll(f"cells of the initial set: {len(done)} done, halving the worst")
         halves = [(half, run_of(problem, cells=half.cells, pieces=pieces)) for half in leaf.halves(_side(answer.run))]
-        found = [(half, _proved(run, target)) for half, run in halves]
+        proofs = _side_by_side([run for _, run in halves], target, None)
+        found = [(half, proofs[run]) for half, run in halves]
         better = [(half, part) for half, part in found if part is not None and part.outcome.log_probability < level]
         if len(better) < 2:
             break
         done = [item for item in done if item is not worst] + better
         spare -= 2
     return done
+
+
+def _side_by_side(
+    runs: list[LinearRun], target: Share, learnt: tuple[Array, Array] | None
+) -> dict[LinearRun, LinearAnswer | None]:
+    """What is proved of cells; each begins with what the proof of another one has learnt."""
+
+    def task(run: LinearRun) -> Callable[[], Any]:
+        def work() -> Any:
+            run.learnt = learnt
+            found = _proved(run, target)
+            return None if found is None else (found.outcome, found.shown, run.learnt)
+
+        return work
+
+    answers: dict[LinearRun, LinearAnswer | None] = {}
+    for run, found in zip(runs, side_by_side([task(run) for run in runs], jobs_allowed())):
+        answers[run] = None
+        if found is not None:
+            outcome, shown, run.learnt = found
+            answers[run] = LinearAnswer(run=run, outcome=outcome, shown=shown)
+    return answers
 
 
 def _proved(run: LinearRun, target: Share) -> LinearAnswer | None:
