@@ -111,8 +111,10 @@ class Watch:
         if self._alarm is not None and now >= self._alarm[0]:
             call, self._alarm = self._alarm[1], None
             place = self.engine, self.phase
-            call()
-            self.engine, self.phase = place
+            try:
+                call()
+            finally:
+                self.engine, self.phase = place
 
     @property
     def _news(self) -> str:

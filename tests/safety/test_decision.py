@@ -113,6 +113,12 @@ def test_no_engine_keeps_the_others_from_their_turn(monkeypatch: pytest.MonkeyPa
     assert all(f"{name} (step 0)" in verdict.reason for name in ENGINES)
 
 
+def test_what_an_engine_was_at_is_its_own(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    scripted(monkeypatch, clock, {"linear": [(1, -0.5), (500, -5)], "constants": [(500, -5)]})
+    verdict, _ = run(clock, 10)
+    assert "linear (step 1), then constants (step 0)" in verdict.reason
+
+
 @pytest.mark.parametrize("limit", [0.5, 1, 2, 4, 8, 16, 32])
 def test_a_longer_limit_is_never_worse(monkeypatch: pytest.MonkeyPatch, clock: Time, limit: float) -> None:
     scripts: dict[str, Steps] = {
