@@ -175,8 +175,8 @@ class _Work:
                 best = proved
                 found(best)
             level = 0.0 if best is None else best.log10_probability(horizon)
-            enough = hoped > _FAR * target or level <= target or (number > 1 and proved is None)
-            if (enough and self.n == _MOST_STATES) or (number and level <= hoped + _CLOSE):
+            vain = self.n == _MOST_STATES and (hoped > _FAR * target or (number > 1 and proved is None))
+            if level <= target or vain or (number and level <= hoped + _CLOSE):
                 return best  # more points only raise what is hoped for, and in many states they take many seconds
             more = self._points(_FINE[self.n]) if number == 0 and hoped <= _FAR * target else points
             points = tuple(np.concatenate([have, tight]) for have, tight in zip(more, worst))  # type: ignore[assignment]  # as many as before
