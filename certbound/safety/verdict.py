@@ -148,7 +148,7 @@ def is_safe(answer: EngineAnswer, problem: Problem) -> bool:
 def stopped(name: str, phase: str) -> EngineAnswer:
     """The answer of an engine that had found nothing when its time was over."""
     at = f", at '{phase}'" if phase else ""
-    return EngineAnswer(applicable=False, method=name, reason=f"its time was over before it had found anything{at}.")
+    return EngineAnswer(method=name, reason=f"its time was over before it had proved anything{at}.")
 
 
 def verdict_of(problem: Problem, answers: Mapping[str, EngineAnswer], method: str = "auto") -> Verdict:

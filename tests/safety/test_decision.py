@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -188,3 +189,17 @@ def test_limits_are_found_as_far_as_time_allows(monkeypatch: pytest.MonkeyPatch)
     limits = cb.verify_safety(wide, method="constants", explain=True).limits
     assert limits is not None
     assert limits.delta == 0.5
+
+
+def test_a_row_that_does_not_poll_is_ended_by_a_timer_that_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    def deaf(problem: cb.Problem, request: Request) -> EngineAnswer:
+        request.found(EngineAnswer(log10_delta=-1.0, method="linear"))
+        while True:
+            pass
+
+    monkeypatch.setitem(ENGINES, "linear", replace(ENGINES["linear"], prove=deaf))
+    before = signal.getsignal(signal.SIGALRM)
+    verdict = cb.verify_safety(problem(), method="linear", time_limit=0.1)
+    assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", -1.0)
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert signal.getsignal(signal.SIGALRM) is before
