@@ -145,7 +145,7 @@ class Watch:
 
         Where the system and the thread allow it, a timer ends what does not poll, a little after the limit.
         """
-        token, before = _CURRENT.set(self), _CURRENT.get()
+        before, token = _CURRENT.get(), _CURRENT.set(self)
         try:
             with contextlib.nullcontext() if before is self else self._timed():
                 yield
