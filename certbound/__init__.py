@@ -46,7 +46,7 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.problem.systems import linear_system as linear_system
     from certbound.reach import bound_reach as bound_reach
     from certbound.reach.sets import ReachTube as ReachTube
-    from certbound.safety.verification import Verdict as Verdict
+    from certbound.safety.verdict import Verdict as Verdict
     from certbound.safety.verification import verify_safety as verify_safety
     from certbound.simulation.estimates import sample_paths as sample_paths
     from certbound.simulation.estimates import simulate_exits as simulate_exits
@@ -83,7 +83,8 @@ _HOME = {
     "constants.metrics": "bound_metrics",
     "reach": "bound_reach",
     "reach.sets": "ReachTube",
-    "safety.verification": "verify_safety Verdict",
+    "safety.verification": "verify_safety",
+    "safety.verdict": "Verdict",
     "synthesis.plans": "synthesize_plan",
     "synthesis.controllers": "simulate_closed_loop PredictiveController ConvexPlanner SafetyFilter",
     "synthesis.terminal": "TerminalSet",

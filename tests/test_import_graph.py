@@ -18,7 +18,8 @@ PACKAGE = ROOT / "certbound"
 
 # What a line names may import the lines above it: rooms, sub-rooms, and single modules that stand between these.
 ORDER = """
-errors lazy arrays _version
+errors lazy arrays watch _version
+parallel
 checks
 display
 rigor
@@ -56,7 +57,9 @@ safety.answers
 safety.engines safety.starts
 safety.certificates
 safety.portfolio
-safety.certificate
+safety.certificate safety.falsification
+safety.verdict
+safety.decision
 safety
 synthesis
 synthesis.plans
@@ -64,7 +67,7 @@ synthesis.controllers
 plotting
 html_report
 cli.describe cli.messages cli.output
-cli.options cli.pictures
+cli.options cli.pictures cli.progress
 cli.clock
 cli.commands
 cli
@@ -82,7 +85,7 @@ LEVEL |= {
     f"checker.{unit}": level for level, line in enumerate(CHECKER_ORDER.split("\n")) for unit in line.split()
 } | {"checker": 99}
 
-GROUND = {"errors", "arrays", "_version", "checks", "display", "rigor"}
+GROUND = {"errors", "arrays", "watch", "parallel", "_version", "checks", "display", "rigor"}
 KNOWS_ONLY = {  # rooms that may be taken out and used elsewhere
     "tubes": GROUND,
     "gaussian": GROUND | {"problem"},
@@ -102,12 +105,12 @@ MANY_DOORS = {
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (23, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),
-    "reach.linear": (14, "certificates state the records of the search: its linearisation, shares, levels, references"),
+    "reach.linear": (16, "certificates state the records of the search: its linearisation, shares, levels, references"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
     "constants.programs": (15, "one program each for rate, gain and erosion, with what it is asked"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
     "problem.sets": (13, "the sets and constraints that users write, and the two forms that everybody reads"),
-    "reach.nominal": (10, "curves and series, which every kind of tube is made of"),
+    "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
     "checker.statement": (10, "what a certificate states is read once and asked by three proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
     "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),

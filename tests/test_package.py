@@ -51,7 +51,7 @@ def test_mypy_sees_real_types(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "mypy", "--strict", "--config-file", str(ROOT / "pyproject.toml"), str(file)]
     said = subprocess.run(words, capture_output=True, text=True, cwd=ROOT).stdout
     assert "Unexpected keyword argument" in said or "No overload" in said or "Too many positional arguments" in said
-    assert 'Revealed type is "certbound.safety.verification.Verdict"' in said
+    assert 'Revealed type is "certbound.safety.verdict.Verdict"' in said
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

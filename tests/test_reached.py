@@ -13,6 +13,7 @@ import certbound.constants
 
 ROOT = Path(__file__).resolve().parents[1]
 ALONE = {
+    "certbound.safety.limits.find_limits": "all limits in one call, where verify and --explain take them one by one",
     "certbound.checker.check.check_file": "a whole check in one call, for programs that hold no more than a file",
     "certbound.constants.recheck.holds_gain": "the proof of a gain at a stated value: says whether a bound is tight",
     "certbound.constants.recheck.holds_rate": "the proof of a rate at a stated value, likewise",

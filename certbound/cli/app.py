@@ -51,7 +51,7 @@ for _module in (verify, derive, tune, synthesize, simulate, check, problems, new
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; ``--verbose`` and ``--quiet`` may stand anywhere."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    SETTINGS.verbose, SETTINGS.quiet = "--verbose" in words, "--quiet" in words
+    SETTINGS.verbose, SETTINGS.quiet, SETTINGS.json = ("--verbose" in words, "--quiet" in words, "--json" in words)
     words = [word for word in words if word not in ("--verbose", "--quiet")]
     command = next((word for word in words if not word.startswith("-")), "")
     with logging_to_stderr(verbose=SETTINGS.verbose):

@@ -14,10 +14,7 @@ import typer
 
 from certbound.cli.messages import InputError
 from certbound.cli.options import number, option
-
-
-class OutOfTime(BaseException):
-    """The time limit has passed; like KeyboardInterrupt, it is no error that a handler may swallow."""
+from certbound.watch import OutOfTime
 
 
 def positive(text: str) -> float:
@@ -36,6 +33,9 @@ def positive(text: str) -> float:
 
 TimeLimitOption = Annotated[
     float | None, option("--time-limit", "SECONDS", "Stop searching then, and give the best answer so far.", positive)
+]
+VerdictLimitOption = Annotated[
+    float | None, option("--time-limit", "SECONDS", "Stop then, with the best answer so far [60].", positive)
 ]
 
 

@@ -1,4 +1,4 @@
-"""What the commands print: JSON for programs, short tables for people, a spinner on a terminal only."""
+"""What the commands print: JSON for programs, short tables for people, and what long work is at."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import logging
 import os
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +20,16 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+EVERY = 10.0
+"""Seconds between two lines on what is done, where nothing can be animated."""
+
+
 class Settings:
     """The global options of this run."""
 
     verbose: bool = False
     quiet: bool = False
+    json: bool = False
 
 
 SETTINGS = Settings()
@@ -54,17 +61,25 @@ def print_status(screen: Console, status: str) -> None:
 
 def animated() -> bool:
     """Whether somebody watches standard error, who did not ask for less or for more."""
-    return not SETTINGS.quiet and not SETTINGS.verbose and sys.stderr.isatty()
+    return _heard() and sys.stderr.isatty()
+
+
+def _heard() -> bool:
+    return not (SETTINGS.quiet or SETTINGS.verbose or SETTINGS.json)
 
 
 @contextlib.contextmanager
 def spinner(text: str) -> Iterator[Callable[[str], None]]:
-    """A spinner with the elapsed time on standard error while the work runs, on a terminal only.
+    """What is done, with the elapsed time, on standard error: a spinner on a terminal, a line every 10 s elsewhere.
 
-    What the block is given changes the text.
+    Nothing with --json, --quiet and --verbose. What the block is given changes the text.
     """
-    if not animated():
+    if not _heard():
         yield lambda text: None
+        return
+    if not animated():
+        with _lines(text) as change:
+            yield change
         return
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -73,6 +88,25 @@ def spinner(text: str) -> Iterator[Callable[[str], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(text, total=None)
         yield lambda text: progress.update(task, description=text)
+
+
+@contextlib.contextmanager
+def _lines(text: str) -> Iterator[Callable[[str], None]]:
+    """Lines from a thread of their own, so that work which says nothing is heard of too."""
+    begun, over, said = time.monotonic(), threading.Event(), [text]
+
+    def tell() -> None:
+        while not over.wait(EVERY):
+            sys.stderr.write(f"{said[-1]}, {time.monotonic() - begun:.0f} s\n")
+            sys.stderr.flush()
+
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield said.append
+    finally:
+        over.set()
+        thread.join()
 
 
 @contextlib.contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -130,7 +130,8 @@ class Request:
     ``method`` is "auto", or a tube method by name; ``cells`` are parts along each side of the initial set;
     ``constants`` are used instead of certified ones. ``quick``: another engine has proved SAFE or been conclusive, and
     what is slow and then seldom decides may be left out. Not ``thorough``: an engine may spare itself, as it is asked
-    again where that matters, with the ``details`` of its first answer as ``before``.
+    again where that matters, with the ``details`` of its first answer as ``before``. ``found`` takes an answer that
+    holds already while the engine looks for a better one: it stands where time ends the search (`certbound.watch`).
     """
 
     method: str = "auto"
@@ -139,6 +140,7 @@ class Request:
     quick: bool = False
     thorough: bool = True
     before: Any = None
+    found: Callable[[EngineAnswer], object] = lambda answer: None
 
 
 AS_IT_IS = Request()

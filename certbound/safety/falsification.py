@@ -18,6 +18,7 @@ from certbound.problem.sets import Inside, Outside, clearance
 from certbound.reach.nominal import Flow
 from certbound.reach.sets import ReachTube, constraint_clearance
 from certbound.rigor.norms import Norm
+from certbound.watch import poll
 
 PATHS = 64
 STEPS = 400
@@ -107,6 +108,7 @@ def _follow(flow: Flow, starts: Array, signals: Array) -> tuple[Array, Array]:
             return times, paths
         function, pushed = compile_numpy(flow.tape), signals.T
         for k in range(steps):
+            poll()
             t, h, row = float(times[k]), float(times[k + 1] - times[k]), rows[k]
             k1 = function(t, *x.T, *row, *pushed)
             if flow.continuous:

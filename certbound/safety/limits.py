@@ -19,8 +19,10 @@ from certbound.errors import CertboundError
 from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, System
+from certbound.safety.decision import decide
 from certbound.safety.portfolio import ENGINES
-from certbound.safety.verification import Verdict, verify_safety
+from certbound.safety.verdict import Verdict
+from certbound.watch import poll, share_of_time
 
 _HALVINGS = 5
 _WIDENINGS = 4
@@ -57,6 +59,15 @@ def find_limits(verdict: Verdict, *, cells: int | None = None) -> Limits:
 
     A SAFE verdict, or one that knows no problem, is a ValueError.
     """
+    *_, found = limits_so_far(verdict, cells=cells)
+    return found
+
+
+def limits_so_far(verdict: Verdict, *, cells: int | None = None) -> Iterator[Limits]:
+    """What `find_limits` finds, each as it is found: delta first, which costs nothing.
+
+    Under a limit of time (`certbound.watch`) noise, horizon and widening have a share of it each.
+    """
     problem = verdict.problem
     if problem is None or verdict.status == "SAFE":
         raise ValueError(f"`verdict` must be one that is not SAFE, of a problem; got {verdict.summary()}")
@@ -66,17 +77,25 @@ def find_limits(verdict: Verdict, *, cells: int | None = None) -> Limits:
 
     def safe(changed: Callable[[], Problem]) -> bool:
         try:
-            return verify_safety(changed(), method=engine, cells=cells).status == "SAFE"
+            found = decide(changed(), method=engine, cells=cells)
         except (CertboundError, ValueError, ArithmeticError):
             return False
+        poll("what would be SAFE")
+        return found.status == "SAFE"
 
     level = power_above(verdict.log10_delta)
-    return Limits(
-        delta=level if level < 1 else None,
-        horizon=_horizon(problem, safe),
-        noise=_largest(lambda factor: safe(lambda: _noisier(problem, factor)), 1e-3),
-        widening=_widening(problem, verdict, safe),
-    )
+    found = Limits(delta=level if level < 1 else None, horizon=None, noise=None, widening=None)
+    yield found
+    searches = {
+        "noise": _largest(lambda factor: safe(lambda: _noisier(problem, factor)), 1e-3),
+        "horizon": _horizon(problem, safe),
+        "widening": _widening(problem, verdict, safe),
+    }
+    for index, (name, values) in enumerate(searches.items()):
+        with share_of_time(1 / (len(searches) - index)):
+            for value in values:
+                found = replace(found, **{name: value})
+                yield found
 
 
 def smaller_verdicts(verdict: Verdict, *, method: str = "auto", cells: int | None = None) -> Iterator[Verdict]:
@@ -95,7 +114,7 @@ def smaller_verdicts(verdict: Verdict, *, method: str = "auto", cells: int | Non
         for name in (name for name, row in ENGINES.items() if row.reserve):
             asked = verdict.answers.get(name)
             if asked is None or not asked.applicable:  # left out so far, unless it refuses; its bound knows no delta
-                found = verify_safety(problem, method=name)
+                found = decide(problem, method=name)
                 if found.log10_delta < level:
                     yield found
                     level = found.log10_delta
@@ -103,7 +122,7 @@ def smaller_verdicts(verdict: Verdict, *, method: str = "auto", cells: int | Non
     while level > _LEAST_EXPONENT and step > 0.02 * -level:
         target = max(level - step, _LEAST_EXPONENT)
         try:
-            found = verify_safety(problem.replace(delta=10.0**target), method=method, cells=cells)
+            found = decide(problem.replace(delta=10.0**target), method=method, cells=cells)
         except (CertboundError, ArithmeticError):
             step /= 3
             continue
@@ -114,28 +133,32 @@ def smaller_verdicts(verdict: Verdict, *, method: str = "auto", cells: int | Non
             step = min(step / 3, max(0.99 * (level - found.log10_delta), step / 10))
 
 
-def _horizon(problem: Problem, safe: Callable[[Callable[[], Problem]], bool]) -> float | None:
+def _horizon(problem: Problem, safe: Callable[[Callable[[], Problem]], bool]) -> Iterator[float]:
+    """Longer and longer horizons."""
     if problem.system.time == "continuous":
-        share = _largest(lambda factor: safe(lambda: problem.replace(horizon=factor * problem.horizon)), 1 / 64)
-        return None if share is None else share * problem.horizon
+        shares = _largest(lambda factor: safe(lambda: problem.replace(horizon=factor * problem.horizon)), 1 / 64)
+        yield from (share * problem.horizon for share in shares)
+        return
     low, high = 0, int(problem.horizon)
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if safe(lambda: problem.replace(horizon=middle)) else (low, middle)  # noqa: B023  (called at once)
-    return float(low) if low else None
+        if safe(lambda: problem.replace(horizon=middle)):  # noqa: B023  (called at once)
+            low = middle
+            yield float(low)
+        else:
+            high = middle
 
 
-def _largest(holds: Callable[[float], bool], least: float) -> float | None:
-    """Nearly the largest factor in (least, 1) that holds, by bisection of its logarithm."""
+def _largest(holds: Callable[[float], bool], least: float) -> Iterator[float]:
+    """Factors in (least, 1) that hold, the last one nearly the largest, by bisection of the logarithm."""
     low, high = math.log(least), 0.0
-    found = None
     for _ in range(_HALVINGS + (low < -3)):
         middle = (low + high) / 2
         if holds(math.exp(middle)):
-            found, low = math.exp(middle), middle
+            low = middle
+            yield math.exp(middle)
         else:
             high = middle
-    return found
 
 
 def _noisier(problem: Problem, factor: float) -> Problem:
@@ -157,21 +180,25 @@ def _noisier(problem: Problem, factor: float) -> Problem:
     return problem.replace(system=system)
 
 
-def _widening(problem: Problem, verdict: Verdict, safe: Callable[[Callable[[], Problem]], bool]) -> float | None:
-    """Nearly the least distance, from the verdict's own margin on."""
+def _widening(problem: Problem, verdict: Verdict, safe: Callable[[Callable[[], Problem]], bool]) -> Iterator[float]:
+    """Smaller and smaller distances, from the verdict's own margin on."""
     if verdict.margin is None or not -math.inf < verdict.margin < 0:
-        return None
+        return
     low, high = 0.0, -1.05 * verdict.margin
     for _ in range(_WIDENINGS):
         if safe(lambda: _wider(problem, high)):  # noqa: B023
             break
         low, high = high, 2 * high
     else:
-        return None
+        return
+    yield high
     for _ in range(_HALVINGS - 2):
         middle = (low + high) / 2
-        low, high = (low, middle) if safe(lambda: _wider(problem, middle)) else (middle, high)  # noqa: B023
-    return high
+        if safe(lambda: _wider(problem, middle)):  # noqa: B023
+            high = middle
+            yield high
+        else:
+            low = middle
 
 
 def _wider(problem: Problem, distance: float) -> Problem:

@@ -27,7 +27,9 @@ class Engine:
     when : str
         When it is asked, and where it says most: with ``words`` the table of the documentation.
     prove : callable
-        ``prove(problem, request)`` to an `EngineAnswer`; ``prove(problem)`` asks for nothing but the problem.
+        ``prove(problem, request)`` to an `EngineAnswer`; ``prove(problem)`` asks for nothing but the problem. Loops
+        that may be long call `certbound.watch.poll`, and ``request.found`` takes what is proved on the way; an engine
+        that does neither loses what it has when the time is over.
     write : callable, optional
         ``write(problem, answer, attempt)`` to a proof that the checker knows; None: no certificate states it.
     methods : bool
@@ -36,6 +38,8 @@ class Engine:
         Asked while nothing else has proved SAFE, and for the smallest probability, as its bound knows no delta.
     again : bool
         Asked a second time, thoroughly, where nothing was proved SAFE.
+    sketch : bool
+        Asked before all others, quickly: that takes next to nothing.
     dear : bool
         Too slow to be asked a dozen times for what would be SAFE.
     """
@@ -48,6 +52,7 @@ class Engine:
     methods: bool = False
     reserve: bool = False
     again: bool = False
+    sketch: bool = False
     dear: bool = False
 
 
@@ -71,6 +76,7 @@ ENGINES: dict[str, Engine] = {
             prove=constants_engine,
             write=constants_proof,
             methods=True,
+            sketch=True,
         ),
         Engine(
             name="barrier",

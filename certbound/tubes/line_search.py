@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from certbound.watch import poll
+
 
 def golden(function: Callable[[float], float], low: float, high: float, width: float) -> float:
     """Place of the least value of a unimodal function on [low, high]."""
@@ -12,6 +14,7 @@ def golden(function: Callable[[float], float], low: float, high: float, width: f
     a, b = high - ratio * (high - low), low + ratio * (high - low)
     fa, fb = function(a), function(b)
     while high - low > width:
+        poll()
         if fa <= fb:
             high, b, fb = b, a, fa
             a = high - ratio * (high - low)

@@ -9,13 +9,16 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from certbound.cli.app import run
-from certbound.cli.clock import Clock, OutOfTime
+from certbound.cli.clock import Clock
+from certbound.safety.portfolio import ENGINES
+from certbound.watch import OutOfTime, poll
 
 
 def answer(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any]]:
@@ -57,26 +60,27 @@ def test_a_verdict_in_time_is_the_verdict(capsys: pytest.CaptureFixture[str]) ->
     assert answer(capsys, *words, "--time-limit", "60")[1].keys() == answer(capsys, *words)[1].keys()
 
 
-def test_the_engine_that_finished_answers_for_the_one_that_did_not(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    slowed(monkeypatch, "certbound.safety.verification", "verify_safety", lambda o: o["method"] == "constants")
-    code, found = answer(capsys, "verify", "ou", "--time-limit", "4")
-    assert code == 0
-    assert found["status"] == "SAFE"
-    assert found["method"] == "linear"
-    assert found["reason"].endswith("The search was stopped after 4 s.")
+def endless(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """Let engines take for ever."""
+
+    def slow(*_: Any) -> Any:
+        while True:
+            poll("waiting")
+            time.sleep(0.01)
+
+    for name in names:
+        monkeypatch.setitem(ENGINES, name, replace(ENGINES[name], prove=slow))
 
 
 def test_no_engine_in_time_is_unknown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slowed(monkeypatch, "certbound.safety.verification", "verify_safety", lambda _: True)
+    endless(monkeypatch, *ENGINES)
     monkeypatch.chdir(tmp_path)
     code, found = answer(capsys, "verify", "ou", "--time-limit", "0.2", "--plot", "ou.png", "--certificate", "ou.json")
     assert code == 1
     assert (found["status"], found["log10_delta"], found["tube"]) == ("UNKNOWN", 0.0, None)
-    assert "stopped after 0.2 s. Give it more time" in found["reason"]
+    assert "stopped after 0.2 s. More time would go on with" in found["reason"]
     assert list(tmp_path.iterdir()) == []
 
 

@@ -106,7 +106,7 @@ def test_a_search_for_limits_stops_when_the_time_is_over(
     def slow(*_: Any, **__: Any) -> Any:
         raise verify.OutOfTime
 
-    monkeypatch.setattr("certbound.safety.limits.find_limits", slow)
+    monkeypatch.setattr("certbound.safety.limits.limits_so_far", slow)
     assert run(["verify", "ou", "--delta", "1e-90", "--method", "constants", "--explain"]) == 1
     assert "The time was over before it was known what would be SAFE." in capsys.readouterr().out
 

@@ -100,7 +100,7 @@ def test_value_functions_bound_it_from_both_sides() -> None:
 
 
 def test_it_is_proved_in_continuous_time_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(barrier._GRID, 2, 21)  # where the program looks; what is proved does not rest on it
+    monkeypatch.setitem(barrier._FINE, 2, 21)  # where the program looks; what is proved does not rest on it
     flow = cb.ContinuousSystem(lambda x: [0.3 * x[1] - x[0], -x[1] - x[0] ** 3], states=2, diffusion=0.15 * np.eye(2))
     safe = [cb.Inside(Diamond([0.0, 0.0], 1.0)), cb.Outside(Diamond([0.6, 0.6], 0.3))]
     problem = cb.Problem(

@@ -24,7 +24,6 @@ from certbound.errors import CertificateError
 from certbound.reach.nominal import initial_cells
 from certbound.rigor import balls
 from certbound.rigor.intervals import Interval, matmul, sqrt
-from certbound.safety import verification
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Proof, Request, exact
 from certbound.safety.certificate import problem_data
 from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
@@ -267,6 +266,6 @@ def test_a_forged_level_is_not_proved_and_without_a_row_nothing_is(
 
 
 def test_without_its_row_it_is_unknown(file: str) -> None:
-    assert "boxes" not in verification.ENGINES
+    assert "boxes" not in ENGINES
     with pytest.raises(ValueError, match="`method` must be one of auto"):
         cb.verify_safety(cb.load(file), method="boxes")

@@ -12,7 +12,8 @@ from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
 from certbound.safety.certificate import certificate_data, problem_data
 from certbound.safety.portfolio import ENGINES, engine_named
-from certbound.safety.verification import best_lower, verify_safety
+from certbound.safety.verdict import best_lower
+from certbound.safety.verification import verify_safety
 from tests.zoo import ZOO
 
 LOOSER = {

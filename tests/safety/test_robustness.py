@@ -161,7 +161,7 @@ def test_a_search_for_violations_that_fails_ends_nothing(monkeypatch: pytest.Mon
     def failing(_: Any) -> Any:
         raise AssertionError
 
-    monkeypatch.setattr("certbound.safety.verification.find_violation", failing)
+    monkeypatch.setattr("certbound.safety.decision.find_violation", failing)
     assert verify_safety(sine_map()).status == "SAFE"
 
 

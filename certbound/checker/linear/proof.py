@@ -48,6 +48,7 @@ _MILD = 0.25
 """Norm of the slopes times a piece, up to which series run well in the states' own units."""
 
 _PROOF = ("engine", "splits", "pieces", "varying", "moving", "units", "windows", "cells")
+_MAY = ("cuts",)
 _CELL = (
     "nominal", "slopes", "drifts", "gains", "remainder_low", "remainder_high", "rows", "levels", "window_levels",
     "frames", "separations",
@@ -61,7 +62,7 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     state, for every disturbance that does not. CertificateError where the proof's data are malformed, Unproved where an
     inequality could not be proved.
     """
-    record = Record(value, "proof", _PROOF)
+    record = Record(value, "proof", _PROOF, _MAY)
     if model.continuous and model.dimension > MOST_STATES:
         raise Unproved(f"{model.dimension} states are too many for this proof in continuous time")
     shared = Shared(model, structure_of(model, budget), record)

@@ -1,4 +1,4 @@
-"""The initial set cut into cells."""
+"""The initial set cut into cells: by a grid of edges, or by halving a box again and again."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from itertools import pairwise, product
 
 from flint import arb
 
-from certbound.checker.reading import Record, numbers
+from certbound.checker.reading import Record, number, numbers, whole
 from certbound.checker.report import Unproved
 from certbound.checker.statement.problem import Model
 from certbound.errors import CertificateError
@@ -15,7 +15,10 @@ MOST_CELLS = 4096
 
 
 def cells_of(model: Model, record: Record) -> list[list[tuple[arb, arb]]]:
-    """Boxes that cover the initial set: products of the intervals between the edges of ``splits``."""
+    """Boxes that cover the initial set: products of the intervals between the edges of ``splits``.
+
+    With ``cuts`` the one product that ``splits`` makes is cut as they say.
+    """
     sides: list[list[tuple[arb, arb]]] = []
     count = 1
     for j, item in enumerate(record.items("splits", model.dimension, model.dimension)):
@@ -28,4 +31,34 @@ def cells_of(model: Model, record: Record) -> list[list[tuple[arb, arb]]]:
         count *= len(sides[-1])
         if count > MOST_CELLS:
             raise CertificateError(f"`proof.splits` must make at most {MOST_CELLS} cells.")
-    return [list(box) for box in product(*sides)]
+    boxes = [list(box) for box in product(*sides)]
+    return boxes if record["cuts"] is None else _cut(boxes, record, model.dimension)
+
+
+def _cut(boxes: list[list[tuple[arb, arb]]], record: Record, dimension: int) -> list[list[tuple[arb, arb]]]:
+    """The parts of one box, in order: an entry of ``cuts`` says where the next part is cut, or null that it is a cell.
+
+    Both parts of a cut follow it, the lower one with all its own cuts first. Each cut lies inside its part, so that
+    the parts cover what is cut.
+    """
+    if len(boxes) != 1:
+        raise CertificateError("`proof.splits` must make one box where `proof.cuts` cuts it.")
+    left, cells = boxes, []
+    for index, item in enumerate(record.items("cuts", 1, 2 * MOST_CELLS)):
+        if not left:
+            raise CertificateError("`proof.cuts` must end with its last cell.")
+        box = left.pop()
+        if item is None:
+            cells.append(box)
+            continue
+        path = f"proof.cuts[{index}]"
+        if not isinstance(item, list) or len(item) != 2:
+            raise CertificateError(f"`{path}` must be null, or a state's number and where it is cut.")
+        side, place = whole(item[0], path, 0, dimension - 1), arb(number(item[1], path))
+        low, high = box[side]
+        if not low < place < high:
+            raise CertificateError(f"`{path}` must lie inside the part that it cuts.")
+        left += [[*box[:side], part, *box[side + 1 :]] for part in ((place, high), (low, place))]
+    if left:
+        raise CertificateError("`proof.cuts` must end every part in a cell.")
+    return cells

@@ -14,6 +14,7 @@ from certbound.cli.messages import InputError
 from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, examples, load_problem, option
 from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.errors import CertificateError, EngineError, contained
+from certbound.watch import poll
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
@@ -81,17 +82,18 @@ def _stated(
     return problem_data(load_problem(problem, pairs, horizon=horizon, delta=delta))
 
 
-def proved_certificate(problem: Problem, verdict: Verdict) -> str:
+def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float] | None = None) -> str:
     """The text of a verdict's certificate, which the checker has proved again; it claims what was proved.
 
     Assumptions of the verdict are assumptions of the certificate, which names them. Where the checker proves no
     certificate of one engine, at any effort, the other engines' are tried. CertificateError where the verdict bounds no
-    probability, or the checker did not prove what was written.
+    probability, or the checker did not prove what was written. ``checking`` takes the seconds of every check.
     """
+    spent = [] if checking is None else checking
     left, reasons = dict(verdict.answers), list[str]()
     while left:
         try:
-            found, engine, reason = _proved(problem, replace(verdict, answers=left))
+            found, engine, reason = _proved(problem, replace(verdict, answers=left), spent)
         except EngineError as error:
             if not reasons:
                 raise CertificateError(str(error)) from error
@@ -106,7 +108,7 @@ def proved_certificate(problem: Problem, verdict: Verdict) -> str:
     raise CertificateError(f"no certificate could be proved again by the checker: {' '.join(reasons)}")
 
 
-def _proved(problem: Problem, verdict: Verdict) -> tuple[str | None, str, str]:
+def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[str | None, str, str]:
     """A certificate that the checker has proved (None: it proved none), its engine, and what stood in the way.
 
     EngineError where no certificate could be written.
@@ -126,7 +128,10 @@ def _proved(problem: Problem, verdict: Verdict) -> tuple[str | None, str, str]:
             continue
         data = parse(text)
         engine = str(data["claim"]["method"])
+        poll("checking the certificate")
+        begun = time.perf_counter()
         report = check_data(data, problem_data(problem), allow_assumptions=True)
+        checking.append(time.perf_counter() - begun)
         if report.valid and report.log10_proved is not None:
             return restated(text, report.log10_proved), engine, ""
         reason = report.reason

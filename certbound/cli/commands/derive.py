@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
+from certbound.cli.clock import Clock, TimeLimitOption
 from certbound.cli.describe import describe_constants
 from certbound.cli.messages import computing
 from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, examples, load_problem
-from certbound.cli.output import SETTINGS, console, show, spinner
+from certbound.cli.output import SETTINGS, console, show
+from certbound.cli.progress import watched
 from certbound.display import log10_text, name_text
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
+from certbound.watch import OutOfTime
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -37,7 +39,7 @@ def derive(
     """Bound the contraction rate (or gain) and the noise, with a metric for each constraint."""
     subject = load_problem(problem, pairs, horizon=horizon)
     started = time.perf_counter()
-    with spinner(f"bounding the constants of {name_text(subject.name)}"), computing("constants", subject):
+    with watched(f"bounding the constants of {name_text(subject.name)}"), computing("constants", subject):
         constants, metrics, where = _bound(subject, Clock(time_limit))
     seconds = time.perf_counter() - started
     result = {

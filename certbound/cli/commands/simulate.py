@@ -28,7 +28,7 @@ from certbound.cli.options import (
     number,
     option,
 )
-from certbound.cli.output import SETTINGS, animated, console, show
+from certbound.cli.output import SETTINGS, animated, console, show, spinner
 from certbound.display import one_line, rounded
 
 if TYPE_CHECKING:
@@ -174,9 +174,13 @@ def _executor(address: str | None) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def _progress_bar(paths: int) -> Iterator[Callable[[Progress], None] | None]:
-    """A bar with rate and time left on standard error, on a terminal only."""
+    """A bar with rate and time left on standard error on a terminal, a line now and then elsewhere."""
     if not animated():
-        yield None
+        with spinner("simulating: compiling") as change:
+            yield lambda state: change(
+                f"simulating: {state.paths} of {state.total} paths, {state.rate:.3g} path-steps/s, "
+                f"{state.remaining:.0f} s left"
+            )
         return
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn

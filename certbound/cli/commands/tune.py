@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
+from certbound.cli.clock import Clock, TimeLimitOption
 from certbound.cli.describe import describe_parameters
 from certbound.cli.messages import computing
 from certbound.cli.options import (
@@ -29,6 +29,7 @@ from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.cli.pictures import check_picture, sampled, write_picture
 from certbound.display import name_text
 from certbound.errors import SolverError
+from certbound.watch import OutOfTime
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shlex
 import sys
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certbound.cli.clock import Clock, OutOfTime, TimeLimitOption
+from certbound.cli.clock import Clock, VerdictLimitOption
 from certbound.cli.commands.check import proved_certificate
 from certbound.cli.describe import attributes, describe_constants, describe_deviation
 from certbound.cli.options import (
@@ -31,12 +30,13 @@ from certbound.cli.options import (
 )
 from certbound.cli.output import SETTINGS, console, print_status, show, spinner, write_file
 from certbound.cli.pictures import check_picture, scene_of, values_of, write_picture
+from certbound.cli.progress import progress
 from certbound.display import at_least_text, log10_text, name_text, one_line, rounded
 from certbound.errors import CertificateError, EngineError, contained
+from certbound.watch import OutOfTime, Watch
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
-    from certbound.safety.answers import EngineAnswer
     from certbound.safety.verification import Verdict
 
 EXAMPLES = examples(
@@ -46,11 +46,15 @@ EXAMPLES = examples(
     "certbound verify unicycle --smallest --time-limit 60",
 )
 
+DEFAULT_LIMIT = 60.0
+_LEAST = 1e-3
+
 MethodOption = Annotated[
     str,
     typer.Option("--method", metavar="M", help="auto, an engine's (linear, values, ...), or a tube's (kummer, thm3)."),
 ]
 CellsOption = Annotated[int | None, option("--cells", "K", "Cells per side of the initial set.", integer)]
+JobsOption = Annotated[int, option("--jobs", "N", "Processes that prove cells side by side [1].", integer)]
 CertificateOption = Annotated[Path | None, option("--certificate", "FILE", "Write the certificate.")]
 ReportOption = Annotated[Path | None, option("--report", "FILE", "Write one HTML page.")]
 ExplainOption = Annotated[
@@ -73,7 +77,8 @@ def verify(
     plot: PlotOption = None,
     explain: ExplainOption = False,
     smallest: SmallestOption = False,
-    time_limit: TimeLimitOption = None,
+    time_limit: VerdictLimitOption = None,
+    jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Decide whether the system stays safe but for a probability of delta, and prove it."""
@@ -81,11 +86,13 @@ def verify(
     check_picture(plot)
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
     started = time.perf_counter()
-    with spinner(f"verifying {name_text(subject.name)}"):
-        clock = Clock(time_limit)
-        verdict = _verdict(subject, method, cells, clock)
-        if smallest and verdict.status == "SAFE":
-            verdict = _smallest(verdict, method, cells, clock)
+    clock = Clock(DEFAULT_LIMIT if time_limit is None else time_limit)
+    with progress(f"verifying {name_text(subject.name)}", clock.limit) as tell:
+        from certbound.safety.verification import verify_safety
+
+        verdict = verify_safety(
+            subject, method=method, cells=cells, time_limit=clock.limit, progress=tell, smallest=smallest, jobs=jobs
+        )
     seconds = time.perf_counter() - started
     result = _result(subject, verdict, seconds)
     if explain:
@@ -98,53 +105,15 @@ def verify(
             console().print(result["limits"]["summary"], markup=False)
     proof = ""
     if certificate is not None:
-        proof, result["certificate"] = _certify(subject, verdict, certificate)
+        left = None if time_limit is None else max(clock.left, _LEAST)
+        proof, result["certificate"] = _certify(subject, verdict, certificate, left)
+        if proof and not as_json and not SETTINGS.quiet:
+            spent = result["certificate"]
+            share = f"the checker's share {spent['check_seconds']:.1f} s"
+            console().print(f"certificate: {spent['seconds']:.1f} s, {share}", markup=False)
     _write(subject, verdict, proof, report=report, plot=plot)
     show(result, as_json, lambda: None)
     raise typer.Exit(0 if verdict.status == "SAFE" else 1)
-
-
-def _verdict(problem: Problem, method: str, cells: int | None, clock: Clock) -> Verdict:
-    """The verdict; with a limit, the best one of the engines that finished in time."""
-    from certbound.safety.portfolio import ENGINES
-    from certbound.safety.verification import Verdict, best_lower, verify_safety
-
-    if clock.limit is None:
-        return verify_safety(problem, method=method, cells=cells)
-    best: Verdict | None = None
-    answers: dict[str, EngineAnswer] = {}
-    over = f"The search was stopped after {clock.limit:g} s."
-    try:
-        for engine in ENGINES if method == "auto" else (method,):
-            if engine in ENGINES and ENGINES[engine].reserve and best is not None and best.status == "SAFE":
-                continue
-            with clock.running():
-                found = verify_safety(problem, method=engine, cells=cells)
-            answers |= found.answers
-            if best is None or (found.status != "SAFE", found.log10_delta) < (best.status != "SAFE", best.log10_delta):
-                best = found
-            if found.status.startswith("UNSAFE"):
-                return found
-    except OutOfTime:
-        if best is not None:
-            return replace(best, reason=f"{best.reason} {over}", answers=answers, log10_lower=best_lower(answers))
-    if best is not None:
-        return replace(best, answers=answers, log10_lower=best_lower(answers))
-    cure = "Give it more time, fewer --cells or a shorter --horizon."
-    return Verdict(
-        status="UNKNOWN", log10_delta=0.0, margin=None, time=None, constraint=None, reason=f"{over} {cure}",
-        method=method, problem=problem,
-    )  # fmt: skip
-
-
-def _smallest(verdict: Verdict, method: str, cells: int | None, clock: Clock) -> Verdict:
-    """The last of ever smaller probabilities that time allows."""
-    from certbound.safety.limits import smaller_verdicts
-
-    with contextlib.suppress(OutOfTime), clock.running():
-        for found in smaller_verdicts(verdict, method=method, cells=cells):
-            verdict = found
-    return verdict
 
 
 def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any]:
@@ -166,17 +135,21 @@ def _engines(verdict: Verdict) -> list[dict[str, Any]]:
 
 def _limits(verdict: Verdict, cells: int | None, clock: Clock) -> dict[str, Any]:
     """What would be SAFE, for --explain, as far as time allows."""
-    from certbound.safety.limits import Limits, find_limits
+    from certbound.safety.limits import Limits, limits_so_far
 
-    nothing = asdict(Limits(delta=None, horizon=None, noise=None, widening=None))
+    found, over = Limits(delta=None, horizon=None, noise=None, widening=None), ""
     try:
-        with spinner("looking for what would be SAFE"), contained("search for limits"), clock.running():
-            found = find_limits(verdict, cells=cells)
+        with progress("looking for what would be SAFE") as tell, contained("search for limits"):
+            watch = Watch(max(clock.left, _LEAST), progress=tell)
+            with watch.running():
+                for better in limits_so_far(verdict, cells=cells):
+                    found = better
     except OutOfTime:
-        return nothing | {"summary": "The time was over before it was known what would be SAFE."}
+        over = "The time was over before it was known what would be SAFE. "
     except EngineError as error:
-        return nothing | {"summary": f"What would be SAFE is not known: {error}"}
-    return asdict(found) | {"summary": found.summary()}
+        return asdict(found) | {"summary": f"What would be SAFE is not known: {error}"}
+    nothing = all(value is None for value in asdict(found).values())
+    return asdict(found) | {"summary": over.strip() if over and nothing else f"{over}{found.summary()}"}
 
 
 def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | None, plot: Path | None) -> None:
@@ -206,16 +179,21 @@ def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | Non
             write_file(report, report_page(shown, verdict, command=command, probability=probability, certificate=proof))
 
 
-def _certify(problem: Problem, verdict: Verdict, path: Path) -> tuple[str, dict[str, Any]]:
+def _certify(problem: Problem, verdict: Verdict, path: Path, left: float | None) -> tuple[str, dict[str, Any]]:
     """Write a certificate that the checker has proved; its text, and what ``--json`` says of it.
 
-    What it misses is said in one line on standard error: that none was written, or that it proves less than delta.
+    A limit that was given leaves it ``left`` seconds; the default one is of the search alone. What it misses is said in
+    one line on standard error: that none was written, or that it proves less than delta.
     """
+    started, checking = time.perf_counter(), list[float]()
     try:
-        with spinner("writing and checking the certificate"):
-            text = proved_certificate(problem, verdict)
-    except CertificateError as error:
-        reason = " ".join(str(error).split())
+        with progress("writing and checking the certificate", left) as tell:
+            watch = Watch(left, progress=tell)
+            with watch.running():
+                text = proved_certificate(problem, verdict, checking)
+    except (CertificateError, OutOfTime) as error:
+        over = "the time was over before its proof was written and checked; give a larger --time-limit"
+        reason = over if isinstance(error, OutOfTime) else " ".join(str(error).split())
         sys.stderr.write(f"certbound: no certificate was written: {reason}\n")
         return "", {"path": None, "log10_delta": None, "reason": reason}
     write_file(path, text)
@@ -225,7 +203,8 @@ def _certify(problem: Problem, verdict: Verdict, path: Path) -> tuple[str, dict[
     if verdict.status == "SAFE" and not is_at_most(min(proved, 0.0), problem.delta):
         reason = f"the certificate proves {log10_text(proved)}, not the {problem.delta:g} of the verdict"
         sys.stderr.write(f"certbound: {reason}\n")
-    return text, {"path": str(path), "log10_delta": proved, "reason": reason}
+    spent = {"seconds": time.perf_counter() - started, "check_seconds": sum(checking)}
+    return text, {"path": str(path), "log10_delta": proved, "reason": reason, **spent}
 
 
 def _print(problem: Problem, result: dict[str, Any]) -> None:

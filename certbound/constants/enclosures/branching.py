@@ -9,6 +9,7 @@ import numpy as np
 
 from certbound.arrays import Array, Index
 from certbound.rigor.intervals import Interval
+from certbound.watch import poll
 
 ROUND = 2048
 """Boxes split at a time."""
@@ -74,6 +75,7 @@ def bound_supremum(
     uppers = np.minimum(uppers, ceiling)
     count += len(boxes)
     while len(boxes):
+        poll()
         done = uppers <= sampled + tolerance
         done |= ~np.any(boxes.lo < boxes.hi, axis=1)
         if done.any():

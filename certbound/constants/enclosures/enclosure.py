@@ -17,6 +17,7 @@ from certbound.arrays import Mask
 from certbound.errors import EnclosureError
 from certbound.problem.model import OPERATIONS, Node, Tape, enclosed, undefined_where
 from certbound.rigor.intervals import Interval
+from certbound.watch import poll
 
 CHUNK = 8192
 """Boxes evaluated at a time: the intermediate results stay in the processor's cache."""
@@ -54,6 +55,7 @@ def enclose(tape: Tape, inputs: Sequence[Interval], *, undefined: Literal["raise
     flat = [x if x.ndim == 0 else x.broadcast_to(batch).reshape(size) for x in inputs]
     lo, hi = np.empty((size, len(tape.outputs))), np.empty((size, len(tape.outputs)))
     for start in range(0, size, CHUNK):
+        poll()
         part = [x if x.ndim == 0 else x[start : start + CHUNK] for x in flat]
         count = min(CHUNK, size - start)
         outputs, refusals = _evaluate(tape, part)

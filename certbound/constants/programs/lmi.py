@@ -26,6 +26,7 @@ from certbound.checks import frozen
 from certbound.constants.jacobians import JacobianSet
 from certbound.constants.programs.sectors import Sector, contraction_value, lmi_blocks, transformed
 from certbound.errors import InfeasibleError, SolverError
+from certbound.watch import poll, solver_limit
 
 
 def solve(problem: Any) -> str:
@@ -42,8 +43,10 @@ def solve(problem: Any) -> str:
     ]
     statuses = []
     for name, options in attempts:
+        poll()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            options = options | (solver_limit() if name == "CLARABEL" else {})
             try:
                 problem.solve(solver=name, **options)
             except (cp.SolverError, ArithmeticError, ValueError) as error:

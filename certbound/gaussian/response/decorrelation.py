@@ -21,6 +21,7 @@ from certbound.gaussian.response.moments import UP, RowMoments, apply
 from certbound.gaussian.scalar import EPS
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
+from certbound.watch import poll
 
 _BATCH = 2_000_000
 
@@ -61,6 +62,7 @@ def _pairs(f: Array, phi: Array) -> Iterator[_Pairs]:
     matrix, error = np.zeros((0, n, n)), np.zeros(0)
     held: list[tuple[int, Array, Array]] = []
     for b in range(1, count + 1):
+        poll()
         norm = np.abs(matrix).max(axis=(1, 2), initial=0.0)
         later = (size[b - 1] * error + (n * phi[b - 1] + 4 * (n + 2) * EPS * size[b - 1]) * (norm + error)) * UP
         matrix = np.concatenate([f[b - 1] @ matrix, f[b - 1][None]])

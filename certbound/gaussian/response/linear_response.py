@@ -17,6 +17,7 @@ import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
+from certbound.watch import poll
 
 _UNIT = 2.0**-53
 _TINY = 1e-300
@@ -157,6 +158,7 @@ def _propagate(
     eye = np.eye(n)
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(pieces):
+            poll()
             f, phi = transition[:, k], transition_error[:, k]
             product = f @ v[:, k] @ _transposed(f) + noise[:, k]
             v[:, k + 1] = (product + _transposed(product)) / 2
@@ -239,6 +241,7 @@ class RowResponse:
         self.coefficients: list[Array] = [np.empty(0)] * (self.nodes - 1)
         self.rest: list[Array] = [np.empty(0)] * (self.nodes - 1)  # row sums over the other columns
         for j in range(self.nodes - 2, -1, -1):
+            poll()
             later = current[j + 1 :].reshape(-1, n).copy()
             self.coefficients[j] = np.ascontiguousarray(later[:, self.columns])
             if len(self.others):
@@ -250,6 +253,7 @@ class RowResponse:
         """Sum over j of the contributions of step j to all later nodes: shape (M, D)."""
         total = np.zeros((self.nodes, self.count))
         for j, part in enumerate(parts):
+            poll()
             total[j + 1 :] += part.reshape(-1, self.count)
         return total[:, self.place]
 

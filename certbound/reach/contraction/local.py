@@ -30,6 +30,7 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.question import Start
 from certbound.tubes.tube import Tube, supremum
 from certbound.tubes.tuning import tune_tube
+from certbound.watch import poll
 
 BLOCK = 16
 ITERATIONS = 12
@@ -125,6 +126,7 @@ class _March:
         slopes = np.broadcast_to(slope[:, None], eta.shape)
         guess = np.zeros(eta.shape)
         for _ in range(ITERATIONS):
+            poll("noise-free tube")
             radius, after = integrate_radius(part, gaps, rho, slopes, eta)
             if np.all(radius < guess):
                 return radius, after, slopes[:, -1]

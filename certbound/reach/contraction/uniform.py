@@ -27,6 +27,7 @@ from certbound.rigor import intervals as iv
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm, largest_over_box
 from certbound.tubes.constants import Constants
+from certbound.watch import poll
 
 CORNER_LIMIT = 6
 
@@ -147,6 +148,7 @@ def integrate_radius(curve: Curve, gaps: Array, rho: Array, slopes: Array, eta: 
     else:
         factor, integral = slopes, np.ones(slopes.shape)
     for k in range(curve.pieces):
+        poll()
         after = _step(factor[:, k], rho, integral[:, k], eta[:, k])
         radius[:, k] = np.maximum(rho, after) if curve.continuous else rho
         rho = np.nextafter(after + gaps[:, k], np.inf)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from certbound.reach.linear.answer import LinearAnswer, linear_answer, linear_reach, refusal
-from certbound.reach.linear.deviation_tube import DeviationTube
+from certbound.reach.linear.answer import linear_answer, linear_reach, refusal
+from certbound.reach.linear.answer_tubes import DeviationTube
 from certbound.reach.linear.diffusion import Accepted, DiffusionRun, Reference, depends_on_state
 from certbound.reach.linear.linearisation import Linearisation
+from certbound.reach.linear.proved import LinearAnswer, Path, SplitAnswer
 from certbound.reach.linear.run import Events, LinearRun, correlated
 from certbound.reach.linear.shares import Share
 
@@ -21,7 +22,9 @@ __all__ = [
     "LinearAnswer",
     "Linearisation",
     "LinearRun",
+    "Path",
     "Reference",
     "refusal",
     "Share",
+    "SplitAnswer",
 ]

@@ -14,6 +14,7 @@ from certbound.reach.linear.fixed_point import Inclusion
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.shares import Share
 from certbound.reach.remainder import fitted_slopes
+from certbound.watch import poll
 
 _PICARD = 10
 _CLOSE = 0.02
@@ -60,6 +61,7 @@ def _tube(run: Inclusion, nonlinear: Share) -> tuple[Array, Array, float] | None
     grown = 0.0
     tube = base
     for _ in range(_PICARD):
+        poll("slopes that fit the tube")
         sample = run.sampled(tube)
         if not (np.isfinite(sample[0]).all() and np.isfinite(sample[1]).all()):
             return *base, np.inf

@@ -16,6 +16,7 @@ from certbound.reach.linear.inclusion import Supports
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.rows import inner_rows
 from certbound.reach.remainder import sampled_range
+from certbound.watch import poll
 
 _LOG = logging.getLogger(__name__)
 
@@ -32,7 +33,8 @@ class Inclusion:
     """Supports of y and R for all cells of a linearisation, and the bounds of beta that they prove.
 
     ``outer`` holds rows of every cell, (N, n) each (N + 1 in discrete time), that R is bounded along beside the inner
-    ones.
+    ones. ``learnt`` is what the last proof needed beyond the sampled range of beta, (B, N, n) each: where it is given,
+    the first guess is made with it.
     """
 
     def __init__(self, engine: Linearisation, outer: Sequence[Sequence[Array]] | None = None) -> None:
@@ -46,6 +48,7 @@ class Inclusion:
             further = () if outer is None else (rows[:, None] for rows in outer[cell])
             self.supports.append(engine.supports(cell, np.concatenate([inner, *further], axis=1), engine.moved))
         self.failed_at = 0
+        self.learnt: tuple[Array, Array] | None = None
 
     @property
     def nothing(self) -> tuple[Array, Array]:
@@ -76,9 +79,12 @@ class Inclusion:
         # what the proof needs beyond the sampled range
         least = _ROUNDING * engine.remainder_sizes
         below = above = engine.model.defect(engine.frame).reshape(engine.shape) * 1.05 + least
+        if self.learnt is not None:
+            below, above = (np.maximum(own, known) for own, known in zip((below, above), self.learnt))
         low, high = self.nothing
         for attempt in range(_PICARD):
-            guess = self.guess(levels, (low, high), (below, above), PADS[effort] if attempt == 0 else 0.02)
+            first = attempt == 0 and self.learnt is None
+            guess = self.guess(levels, (low, high), (below, above), PADS[effort] if first else 0.02)
             if guess is None:
                 return None
             low, high = guess
@@ -91,6 +97,7 @@ class Inclusion:
                 return None
             closed, b_low, b_high = found
             if closed:
+                self.learnt = below, above
                 return b_low, b_high
             _LOG.debug("inclusion %d: widths %s, beyond the guess by %.3g", attempt, (b_high - b_low).max(
                 axis=(0, 2))[:: max(1, engine.pieces // 8)].round(4), max(np.max(low - b_low), np.max(b_high - high)))
@@ -111,6 +118,7 @@ class Inclusion:
         low, high = (part.reshape(-1, engine.n) for part in self.nothing)
         again = np.arange(len(p_low))
         for _ in range(_REPAIRS):
+            poll("remainder of the linearisation")
             found = engine.model.bound(
                 engine.frame, p_low, p_high, self.flat_extra, effort, (target[0], target[1]), again)
             low[again], high[again] = found[0][again], found[1][again]
@@ -143,6 +151,7 @@ class Inclusion:
         """The fixed point of the sampled range of beta, widened by ``share`` of itself and by what a proof needed."""
         low, high = start
         for _ in range(_GUESSES):
+            poll("a guess of the remainder")
             polytope = self.deviations(levels, low, high)
             if polytope is None:
                 return None

@@ -15,10 +15,11 @@ from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear.inclusion import Gathering, Supports, gathering_of
-from certbound.reach.nominal import initial_cells
+from certbound.reach.nominal import Cells, initial_cells
 from certbound.reach.remainder import Frame, Remainder
 from certbound.reach.sets import NominalPieces
 from certbound.rigor.intervals import Interval
+from certbound.watch import poll
 
 _FEWEST_PIECES, _MOST_PIECES = 50, 2000
 _STEP, _OWN_STEP, _SERIES = 0.1, 0.03, 2.0
@@ -38,8 +39,8 @@ class Linearisation:
     ----------
     problem : Problem
         Additive noise (a constant diffusion matrix, or any discrete-time law).
-    cells : int, optional
-        Cells along each side of the initial set.
+    cells : int or Cells, optional
+        Cells along each side of the initial set, or the cells themselves.
     pieces : int, optional
         Pieces of the horizon (continuous time).
     noise : bool
@@ -47,7 +48,7 @@ class Linearisation:
     """
 
     def __init__(
-        self, problem: Problem, *, cells: int | None = None, pieces: int | None = None, noise: bool = True,
+        self, problem: Problem, *, cells: int | Cells | None = None, pieces: int | None = None, noise: bool = True,
     ) -> None:
         self.problem, self.noise = problem, noise
         self.correction: Array | None = None
@@ -57,9 +58,9 @@ class Linearisation:
         self.model = Remainder(problem)
         self.pieces = self._pieces(pieces)
         self.step = float(problem.horizon) / self.pieces if self.continuous else 1.0
-        split = initial_cells(problem, cells)
-        self.centres = np.asarray(split.centres)
-        self.radii = np.asarray((split.boxes - self.centres).mag)
+        self.split = initial_cells(problem, cells)
+        self.centres = np.asarray(self.split.centres)
+        self.radii = np.asarray((self.split.boxes - self.centres).mag)
         random = noise and problem.initial.random
         self.start_covariance = (
             np.asarray(problem.initial.covariance) if random else np.zeros((self.n, self.n))
@@ -82,7 +83,7 @@ class Linearisation:
         return count
 
     @classmethod
-    def of(cls, problem: Problem, *, cells: int | None = None, noise: bool = True) -> Linearisation:
+    def of(cls, problem: Problem, *, cells: int | Cells | None = None, noise: bool = True) -> Linearisation:
         """The linearisation on a grid that resolves the nominal Jacobians: see ``_STEP``."""
         if problem.system.time == "discrete":
             return cls(problem, cells=cells, noise=noise)
@@ -140,6 +141,7 @@ class Linearisation:
         states = [x]
         with np.errstate(all="ignore"):
             for k in range(self.pieces):
+                poll("nominal trajectory")
                 x = self._advance(k, x) if self.continuous else self._evaluate(k, float(k), x)
                 states.append(x)
         return np.stack(states, axis=1)
@@ -199,8 +201,7 @@ class Linearisation:
 
     def on_grid(self, pieces: int) -> Linearisation:
         """The same cells and correction on another grid of pieces (continuous time)."""
-        along = max(len(np.unique(self.centres[:, j])) for j in range(self.n))
-        other = Linearisation(self.problem, cells=along if along > 1 else None, pieces=pieces, noise=self.noise)
+        other = Linearisation(self.problem, cells=self.split, pieces=pieces, noise=self.noise)
         if self.correction is None:
             return other
         place = np.clip(other.times / self.step, 0.0, self.pieces)

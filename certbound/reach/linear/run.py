@@ -32,6 +32,7 @@ from certbound.reach.linear.fixed_point import PADS, Inclusion
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.shares import Share
 from certbound.reach.sets import Requirement, requirements
+from certbound.watch import poll
 
 Events = StepEvents | ClockEvents | SplitEvents
 
@@ -87,6 +88,7 @@ class LinearRun(Inclusion):
             events = self.events(cell, nonlinear.common(count))
             found.append(events)
             for d in range(count):
+                poll(self.phase("levels of the noise", cell))
                 event = events.along(self.rows[cell, :, d])
                 if event.profile.max() > 0:
                     result[cell, :, d] = level_along(event, share)
@@ -144,6 +146,7 @@ class LinearRun(Inclusion):
             return 0.0
         worst = -np.inf
         for cell in range(len(self.supports)):
+            poll(self.phase("a guess of the probability", cell))
             worst = max(worst, self._cell(cell, guess, events[cell], nonlinear).log_probability)
             if worst > limit:
                 break
@@ -160,6 +163,10 @@ class LinearRun(Inclusion):
         outcomes = [self._cell(cell, bounds, events[cell], nonlinear) for cell in range(len(self.supports))]
         return max(outcomes, key=lambda outcome: outcome.log_probability)
 
+    def phase(self, work: str, cell: int) -> str:
+        """What is done, and in which cell of the initial set."""
+        return work if self.engine.cells == 1 else f"{work}, cell {cell + 1} of {self.engine.cells}"
+
     def rooms(self, cell: int, bounds: tuple[Array, Array]) -> Array:
         """Room that each requirement leaves to Z on each piece: (pieces, requirements), rounded down."""
         support = self.supports[cell]
@@ -175,7 +182,10 @@ class LinearRun(Inclusion):
         shared = nonlinear.log if self.curved else events.shared_log
         asked = self.requirements[cell]
         along = [events.along(r.rows) for r in asked]
-        logs = [event.log_exceedance(rooms[:, i]) for i, event in enumerate(along)]
+        logs = []
+        for i, event in enumerate(along):
+            poll(self.phase("probability of leaving", cell))
+            logs.append(event.log_exceedance(rooms[:, i]))
         if isinstance(events, StepEvents) and events.gaussian:
             logs = [self._entered(cell, r, log, bounds) for r, log in zip(asked, logs, strict=True)]
         total = logsumexp(np.array([shared, *logs]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certbound.reach.nominal.cells import initial_cells
+from certbound.reach.nominal.cells import Cells, initial_cells
 from certbound.reach.nominal.curve import Curve
 from certbound.reach.nominal.flow import Flow
 from certbound.reach.nominal.integration import bound_defect, bound_disturbance_slope, nominal_curve
@@ -12,6 +12,7 @@ from certbound.rigor.series import Series
 __all__ = [
     "bound_defect",
     "bound_disturbance_slope",
+    "Cells",
     "Curve",
     "expand",
     "Flow",

@@ -40,8 +40,8 @@ class Cells:
         return np.asarray(np.minimum(bound, around.hi))
 
 
-def initial_cells(problem: Problem, cells: int | None = None) -> Cells:
-    """Split the initial set into ``cells`` parts along every side that has width.
+def initial_cells(problem: Problem, cells: int | Cells | None = None) -> Cells:
+    """Split the initial set into ``cells`` parts along every side that has width, or as it is given.
 
     A random start is represented by its mean: its spread belongs to the stochastic deviation.
 
@@ -50,6 +50,8 @@ def initial_cells(problem: Problem, cells: int | None = None) -> Cells:
     ValueError
         If ``cells`` is not a positive integer, or asks for more than 4096 cells.
     """
+    if isinstance(cells, Cells):
+        return cells
     if cells is not None and (isinstance(cells, bool) or int(cells) != cells or cells < 1):
         raise ValueError(f"`cells` must be a positive integer (parts along each side), got {cells!r}.")
     start = problem.initial

@@ -24,6 +24,7 @@ from certbound.reach.nominal.curve import Curve
 from certbound.reach.nominal.flow import Flow
 from certbound.reach.nominal.series import taylor_bounds
 from certbound.rigor.intervals import Interval, stack
+from certbound.watch import poll
 
 ORDER = 6
 PIECES = 128  # at least, where the grid is chosen
@@ -60,6 +61,7 @@ def nominal_curve(problem: Problem | Flow, points: ArrayLike, *, times: ArrayLik
         return _through(flow, np.asarray(times, dtype=float), states)
     grid = time_grid(flow, PIECES)
     for _ in range(ROUNDS):
+        poll("nominal curve")
         curve = _through(flow, grid, states)
         coarse = _estimate_defect(flow, curve) > _tolerance(curve)
         if not np.any(coarse) or len(grid) > LARGEST_GRID:
@@ -215,6 +217,7 @@ def _node_states(flow: Flow, grid: Array, states: Array) -> Array:
 
         def slope(t: float, flat: Array, row: Array = row, patience: _Patience = patience) -> Array:
             patience.spend(t)
+            poll()
             return flow.value(t, flat.reshape(count, n), row).reshape(-1)
 
         start = nodes[:, first].reshape(-1)

@@ -25,6 +25,7 @@ from certbound.reach.remainder.expansion import Expansion, Parts
 from certbound.reach.remainder.frame import Frame
 from certbound.reach.remainder.polytope import Boxes, Polytope, grid
 from certbound.rigor.intervals import Interval
+from certbound.watch import poll
 
 Target = tuple[Array, Array]
 
@@ -149,6 +150,7 @@ class Remainder(Derivatives):
         curbed = alone and asked.polytope.rows.shape[1] > 0
         before = np.full(len(boxes), np.inf)  # by how much the box that a box was cut from exceeded
         for step in range(asked.rounds + 1):
+            poll()
             inside = np.ones(len(boxes), dtype=bool)
             if curbed:
                 keep, inside = asked.polytope.cull(boxes)

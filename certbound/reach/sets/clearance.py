@@ -31,6 +31,7 @@ from certbound.rigor import intervals as iv
 from certbound.rigor.intervals import Interval
 from certbound.rigor.norms import Norm, ball_root
 from certbound.rigor.series import product
+from certbound.watch import poll
 
 
 class Sets(Protocol):
@@ -70,6 +71,7 @@ class Clearance:
 
 def constraint_clearance(tube: Sets, constraint: Inside, norm: Norm) -> Clearance:
     """Room of ``constraint`` around the sets of ``tube``, measured in ``norm``."""
+    poll(f"room of '{constraint.label}'")
     curve = tube.curve
     asked, span = _window(curve, constraint)
     relative = _relative(curve, constraint.region, span)

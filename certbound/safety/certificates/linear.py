@@ -23,7 +23,7 @@ from certbound.problem.model import Tape, compile_numpy, jacobian, varying_outpu
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 from certbound.problem.systems import ContinuousSystem
-from certbound.reach.linear import Linearisation, LinearRun, Share, correlated
+from certbound.reach.linear import Linearisation, LinearRun, Path, Share, SplitAnswer, correlated
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.parts import separations
 
@@ -55,7 +55,7 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
         tried.insert(0, Share(found.outcome.log_probability).stated(linear=True))
     best: tuple[LinearRun, Stated] | None = None
     for grid in grids(engine, effort):
-        run = found.run if grid is engine else LinearRun(grid)
+        run = found.run if grid is found.run.engine else LinearRun(grid)
         stated = _search(run, list(dict.fromkeys(tried)), PADS[effort], target)
         if stated is not None and (best is None or stated.log_probability < best[1].log_probability):
             best = run, stated
@@ -66,13 +66,13 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     log10 = best[1].log_probability / _LOG10
     exact_sums = not engine.continuous and effort == 0 and log10 > _LIKELY
     slack = SLACK * (0.01 if exact_sums else 1 + 0.1 * abs(log10))
-    return proof_data(problem, *best), min(log10 + slack, 0.0), []
+    return proof_data(problem, *best, cuts_of(answer)), min(log10 + slack, 0.0), []
 
 
 def engine_of(answer: EngineAnswer) -> Linearisation:
     """The linearisation that an answer rests on; CertificateError where it bounds nothing."""
     found = answer.details
-    engine: Linearisation = found.run.engine
+    engine: Linearisation = found.engine
     if not engine.pieces or found.outcome.bounds is None:
         raise CertificateError("the linear response bounds nothing here.")
     return engine
@@ -90,15 +90,16 @@ def grids(engine: Linearisation, effort: int) -> Iterator[Linearisation]:
     yield engine
 
 
-def _edges(engine: Linearisation) -> list[list[float]]:
-    """Edges of the cells along every state: between them lies the initial set."""
+def _edges(engine: Linearisation, *, whole: bool) -> list[list[float]]:
+    """Edges of the cells along every state, or only of the ``whole``: between them lies the initial set."""
     low = np.nextafter(engine.centres - engine.radii, -np.inf)
     high = np.nextafter(engine.centres + engine.radii, np.inf)
     result = []
     for j in range(engine.n):
         centres = np.unique(engine.centres[:, j])
         first, last = low[:, j].min(), high[:, j].max()
-        result.append([float(first), *((centres[1:] + centres[:-1]) / 2).tolist(), float(last)])
+        inner = [] if whole else ((centres[1:] + centres[:-1]) / 2).tolist()
+        result.append([float(first), *inner, float(last)])
     return result
 
 
@@ -247,7 +248,25 @@ def _padded(engine: Linearisation, bounds: tuple[Array, Array], pad: float) -> t
 # ---- the data ----------------------------------------------------------------------------------------------
 
 
-def proof_data(problem: Problem, run: LinearRun, stated: Stated) -> dict[str, Any]:
+def cuts_of(answer: EngineAnswer) -> list[Any] | None:
+    """How the initial set was cut into cells, as `certbound.checker` reads it; None: by a grid, if at all."""
+    found = answer.details
+    return None if not isinstance(found, SplitAnswer) else _cuts(list(zip(found.paths, found.low, found.high)), 0)
+
+
+def _cuts(cells: list[tuple[Path, Array, Array]], depth: int) -> list[Any]:
+    if len(cells) == 1:
+        return [None]
+    side = cells[0][0][depth][0]
+    lower = [cell for cell in cells if not cell[0][depth][1]]
+    upper = [cell for cell in cells if cell[0][depth][1]]
+    place = max(float(high[side]) for _, _, high in lower)
+    return [[side, exact(place)], *_cuts(lower, depth + 1), *_cuts(upper, depth + 1)]
+
+
+def proof_data(
+    problem: Problem, run: LinearRun, stated: Stated, cuts: list[Any] | None = None
+) -> dict[str, Any]:
     engine, tape = run.engine, problem.closed_loop
     q = len(engine.d_middle)
     varying = _varying(tape, range(1, engine.n + 1))
@@ -256,7 +275,8 @@ def proof_data(problem: Problem, run: LinearRun, stated: Stated) -> dict[str, An
     windows = stated.events[0].bounds if isinstance(stated.events[0], WindowEvents) else None
     return {
         "engine": "linear",
-        "splits": exact(_edges(engine)),
+        "splits": exact(_edges(engine, whole=cuts is not None)),
+        **({} if cuts is None else {"cuts": cuts}),
         "pieces": engine.pieces,
         "varying": [list(entry) for entry in varying],
         "moving": [list(entry) for entry in moving],

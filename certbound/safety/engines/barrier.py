@@ -33,10 +33,11 @@ from certbound.reach.nominal import initial_cells
 from certbound.rigor.intervals import Interval
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
+from certbound.watch import poll, solver_limit
 
 _MOST_STATES = 3
 _DEGREES = {1: (4, 6), 2: (4, 6), 3: (4,)}
-_GRID = {1: 201, 2: 41, 3: 13}
+_COARSE, _FINE = {1: 51, 2: 21, 3: 7}, {1: 201, 2: 41, 3: 9}  # points along every side
 _ROUNDS = 3
 _FAR = 1 / 3  # share of the exponent asked for, from which on the next degree is worth its time
 _CLOSE = 0.1  # of log10: what is proved may be that far from what the program hoped for
@@ -88,7 +89,7 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     level = 0.0
     for degree in _DEGREES[work.n]:
         try:
-            found = work.search(degree)
+            found = work.search(degree, lambda barrier: asked.found(_answer(problem, barrier)))
         except EngineError:
             if best is None:
                 raise
@@ -99,8 +100,12 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
             break
     if best is None:
         return EngineAnswer(reason="no polynomial barrier was found.", method="barrier")
+    return _answer(problem, best)
+
+
+def _answer(problem: Problem, best: Barrier) -> EngineAnswer:
     return EngineAnswer(
-        log10_delta=level,
+        log10_delta=min(best.log10_probability(problem.horizon), 0.0),
         reason=f"exp(V) - V a polynomial of degree {int(best.exponents.sum(axis=1).max())} - grows by at most "
         f"{max(best.growth, 0.0) * problem.horizon:.3g} in logarithm within the horizon, from {best.start:.3g} to "
         f"{best.boundary:.3g} at the boundary.",
@@ -149,31 +154,36 @@ class _Work:
 
     # ---- the search ------------------------------------------------------------------------------------------
 
-    def search(self, degree: int) -> Barrier | None:
-        """The best polynomial of the convex program, and what is proved of it."""
+    def search(self, degree: int, found: Callable[[Barrier], object]) -> Barrier | None:
+        """The best polynomial of the convex program, and what is proved of it; ``found`` takes better and better ones.
+
+        Few points first: what they hope for says whether more, which take long, are worth it.
+        """
         exponents = np.array([e for e in itertools.product(range(degree + 1), repeat=self.n) if 0 < sum(e) <= degree])
-        points = self._points()
+        horizon, target = self.problem.horizon, math.log10(self.problem.delta)
+        points = self._points(_COARSE[self.n])
         best: Barrier | None = None
-        for _ in range(_ROUNDS):
+        for number in range(1 + _ROUNDS):
+            poll(f"a polynomial of degree {degree}, round {number + 1}")
             coefficients, hoped = self._program(exponents, *points)
             if coefficients is None:
                 return best
-            found, worst = self._certified(exponents, coefficients)
-            horizon = self.problem.horizon
-            if found is not None and (
-                best is None or found.log10_probability(horizon) < best.log10_probability(horizon)
+            proved, worst = self._certified(exponents, coefficients)
+            if proved is not None and (
+                best is None or proved.log10_probability(horizon) < best.log10_probability(horizon)
             ):
-                best = found
-            if best is not None and best.log10_probability(horizon) <= hoped + _CLOSE:
-                return best
-            if self.n == _MOST_STATES and hoped > _FAR * math.log10(self.problem.delta):
-                return best  # more points only raise what is hoped for, and here they take many seconds
-            points = tuple(np.concatenate([have, more]) for have, more in zip(points, worst))  # type: ignore[assignment]  # as many as before
+                best = proved
+                found(best)
+            level = 0.0 if best is None else best.log10_probability(horizon)
+            vain = self.n == _MOST_STATES and (hoped > _FAR * target or (number > 1 and proved is None))
+            if level <= target or vain or (number and level <= hoped + _CLOSE):
+                return best  # more points only raise what is hoped for, and in many states they take many seconds
+            more = self._points(_FINE[self.n]) if number == 0 and hoped <= _FAR * target else points
+            points = tuple(np.concatenate([have, tight]) for have, tight in zip(more, worst))  # type: ignore[assignment]  # as many as before
         return best
 
-    def _points(self) -> tuple[Array, Array, Array]:
+    def _points(self, count: int) -> tuple[Array, Array, Array]:
         """Points (t, x, d) of the safe set, points x of the initial set, points x of the boundary."""
-        count = _GRID[self.n]
         axes = [np.linspace(a, b, count) for a, b in zip(self.hull.lo, self.hull.hi)]
         grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
         inside = self._gap(grid) <= 1e-12 * self.size
@@ -238,7 +248,7 @@ class _Work:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # an inaccurate proposal is a proposal
-                program.solve(solver=cp.CLARABEL)
+                program.solve(solver=cp.CLARABEL, **solver_limit())
         except cp.SolverError:
             return None, 0.0
         if c.value is None or not np.isfinite(program.value) or program.value >= 0:

@@ -53,6 +53,7 @@ from certbound.tubes.constants import Constants
 from certbound.tubes.question import Start
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
+from certbound.watch import poll
 
 ONE_TIME = ("prop1", "prop1_cosh", "prop2", "markov", "chebyshev")
 """Methods that bound one time at a time: never SAFE."""
@@ -89,6 +90,7 @@ def constants_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
         for candidate in [constants] if constants is not None else _proposals(problem, quick=quick):
             answer = work.global_answer(candidate)
             best = answer if best is None else _better(best, answer)
+            asked.found(best)
             if best.certified and best.log10_delta <= target:
                 return best
         if best is not None and constants is None and not quick:
@@ -112,8 +114,10 @@ def _proposals(problem: Problem, *, quick: bool) -> Iterator[Constants]:
     if quick:
         yield bound_constants(problem, metric="euclidean", budget=QUICK_BUDGET)
         return
+    poll("constants in the Euclidean norm")
     euclidean = bound_constants(problem, metric="euclidean")
     yield euclidean
+    poll("constants in a metric of their own")
     if problem.system.dimension == 1:
         return
     proposed = bound_constants(problem, objective="erosion")
@@ -130,6 +134,7 @@ class _Work:
 
     def __init__(self, problem: Problem, asked: Request) -> None:
         self.problem, self.method, self.cells = problem, asked.method, asked.cells
+        self.found = asked.found
         self.flow = Flow(problem)
         self.name = "kummer" if self.method == "auto" else self.method
         self.segments = SEGMENTS if self.method in BY_CLEARANCE else SEGMENTS_BY_NAME
@@ -165,7 +170,9 @@ class _Work:
             if _taken(erosion, needed_radius(common.tube, common.reach.curve, NO_START)) > NEAR_MISS:
                 return common
         answers = []
+        poll("a metric for each constraint")
         for index, constants in enumerate(bound_metrics(self.problem)):
+            poll(f"constraint {index + 1} of {count} in its own metric")
             reach = contraction_tube(self.flow, constants, cells=self.cells, curve=self.curve)
             erosion = erode(reach, self.problem, reach.norm).only(index)
             answer = EngineAnswer(reach=reach, constants=constants, method=self.name)
@@ -194,6 +201,7 @@ class _Work:
                 applicable=False, reason=f"{why} Local constants need a bounded initial set.", method=self.name
             )
         try:
+            poll("local constants along the tube")
             reach = local_contraction_tube(self.flow, cells=self.cells, curve=self.curve)
         except EnclosureError as error:
             return EngineAnswer(applicable=False, reason=str(error), method=self.name)
@@ -206,6 +214,7 @@ class _Work:
         for cut, constants in self._cuts(reach, erosion):
             found = self._decided(answer, cut, constants)
             best = found if best is None else _better(best, found)
+            self.found(best)
         if best is None:
             tightest = erosion.tightest()
             return replace(

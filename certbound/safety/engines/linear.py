@@ -19,7 +19,17 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     hidden = hidden_jump(problem)
     if hidden is not None:
         return EngineAnswer(applicable=False, reason=hidden, method="linear")
-    answer = linear_answer(problem, cells=asked.cells, thorough=asked.thorough, before=asked.before)
+    if asked.quick and depends_on_state(problem):
+        return EngineAnswer(applicable=False, reason="left out, since another engine has answered.", method="linear")
+    foresight = not depends_on_state(problem)
+
+    def found(answer: LinearAnswer) -> None:
+        asked.found(EngineAnswer(
+            log10_delta=answer.log10_delta, method="linear", details=answer, foresight=foresight,
+            reason="the linear response had proved this much when its time was over.",
+        ))  # fmt: skip
+
+    answer = linear_answer(problem, cells=asked.cells, thorough=asked.thorough, before=asked.before, found=found)
     tube = answer.tube
     return EngineAnswer(
         log10_delta=answer.log10_delta,
@@ -33,7 +43,7 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         method="linear",
         details=answer,
         conclusive=answer.exact and answer.margin > -np.inf,
-        foresight=not depends_on_state(problem),
+        foresight=foresight,
     )
 
 

@@ -11,8 +11,10 @@ from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.values.continuous import ExitBounds, bound_exits
 from certbound.values.discrete import FailureBounds, bound_failure
+from certbound.watch import seconds_left
 
 _SECONDS = 20.0  # about what may be spent
+_LEAST = 1e-3
 _FLOOR = -300.0
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 
@@ -24,7 +26,7 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     """
     if asked.quick:
         return EngineAnswer(applicable=False, method="values", reason="left out, since another engine has answered.")
-    limit = _SECONDS if asked.thorough else _SECONDS / 4
+    limit = max(min(_SECONDS if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
     try:
         if not isinstance(problem.system, DiscreteSystem):
             return _continuous(bound_exits(problem, seconds=limit))

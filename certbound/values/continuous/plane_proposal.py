@@ -20,6 +20,7 @@ from numba import njit
 from certbound.arrays import Array
 from certbound.values.continuous.proposal import Splines, through
 from certbound.values.continuous.surface import Surface
+from certbound.watch import poll
 
 Pair = tuple[float, float]
 
@@ -109,6 +110,7 @@ def propose_plane(plane: Plane, plan: Plan, source: Source | None = None) -> Sur
             return None
         step = (end - begin) / steps
         for part in range(steps):
+            poll("a proposal of the value function")
             value = solver.step(begin + part * step, value, step)
         if not np.isfinite(value).all() or value.max() > 30:
             return None

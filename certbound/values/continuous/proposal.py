@@ -21,6 +21,7 @@ from scipy.linalg.lapack import dgbtrf, dgbtrs
 
 from certbound.arrays import Array
 from certbound.values.continuous.surface import Surface
+from certbound.watch import poll
 
 _DEGREE = 5
 _BAND = 5
@@ -208,6 +209,7 @@ def propose(
     ends, values, first, last = [0.0], [coefficients], [], []
     rate = system.rate(tau, coefficients)
     for _ in range(most_steps):
+        poll("a proposal of the value function")
         step = min(step, line.horizon - tau)
         try:
             new, error = system.step(tau, coefficients, step)

@@ -17,6 +17,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.values.continuous.polynomials import HERMITE, QUARTERS, TIME_HERMITE
 from certbound.values.continuous.residual import Patches, along, value_range
+from certbound.watch import poll
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -85,6 +86,7 @@ class Surface:
         """Ranges of slabs with at most ``limit`` patches (or one slab)."""
         stride = max(1, limit // int(np.prod(self.cells)))
         for first in range(0, self.slabs, stride):
+            poll("proof of the value function")
             yield first, min(first + stride, self.slabs)
 
     def range_at(self, index: int) -> tuple[Array, Array]:

@@ -30,6 +30,7 @@ from certbound.values.continuous.hypotheses import (
 from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane, slab_times
 from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
+from certbound.watch import OutOfTime
 
 _FACTOR = 1.12
 _TOPS = (-0.02, -0.1)  # where V is above, the proof may lift it over 0 instead
@@ -56,7 +57,12 @@ def two_states(
     upper, done = 0.0, []
     for share in _SHARES:
         plan = _plan(inner, level, share * patches)
-        upper = min(upper, _upper(inner, model, starts, plan))
+        try:
+            upper = min(upper, _upper(inner, model, starts, plan))
+        except OutOfTime:
+            if upper < 0:
+                break
+            raise
         done.append(f"{plan.cells}^2")
     return upper, None, f"value function in two states, cells: {', '.join(done)}"
 

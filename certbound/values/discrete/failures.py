@@ -34,6 +34,7 @@ from certbound.values.discrete.transitions import Transition
 from certbound.values.discrete.uniform_noise import UniformTables, UniformTransition
 from certbound.values.grids import Grid, corners
 from certbound.values.sets import active_at, box_around, contains, respected
+from certbound.watch import OutOfTime, poll
 
 MOST_STATES = 3
 _SHARES = {
@@ -139,7 +140,7 @@ def bound_failure(
             break
         try:
             found = work.bounds(layout, share)
-        except Inapplicable:
+        except (Inapplicable, OutOfTime):
             if not tried:
                 raise
             break
@@ -290,6 +291,7 @@ class _Work:
         yield last, above, below
         kept: tuple[object, AnyTransition] | None = None
         for t in range(last - 1, end - 1, -1):
+            poll(f"values at step {t}, {math.prod(grids[t].shape)} cells")
             key = (id(grids[t]), id(grids[t + 1])) if self.dynamics.steady else t
             if kept is None or kept[0] != key:
                 kept = (key, self._transition(t, grids[t], grids[t + 1], share))

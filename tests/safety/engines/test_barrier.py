@@ -75,7 +75,7 @@ def test_a_hardening_spring_is_certified_at_large_noise() -> None:
 
 
 def test_noise_that_depends_on_the_state_a_disturbance_and_an_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(engine._GRID, 2, 21)  # where the program looks; what is proved does not rest on it
+    monkeypatch.setitem(engine._FINE, 2, 21)  # where the program looks; what is proved does not rest on it
     system = cb.ContinuousSystem(
         lambda x, d: [-x[0] + d[0], -2 * x[1]], states=["a", "b"], disturbance=cb.Box([-0.1], [0.1]),
         diffusion=lambda t, x: np.array([[0.25 + 0.25 * x[0], 0.0], [0.0, 0.375]]),

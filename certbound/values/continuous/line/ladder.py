@@ -23,6 +23,7 @@ from certbound.values.continuous.line.reach import cuts_of
 from certbound.values.continuous.proposal import Line, Sketch, sketch
 from certbound.values.continuous.shapes import sealed
 from certbound.values.continuous.surface import Surface
+from certbound.watch import OutOfTime
 
 LADDER = ((4.0, 1e-4, 0.008), (4.5, 3e-5, 0.005), (6.0, 1e-5, 0.003), (8.0, 3e-6, 0.002))
 """Cells a bend, error a step, and lead (a share of the horizon, by d log P / d log T): one attempt after another."""
@@ -80,9 +81,14 @@ def bound_line(
     for fineness, tolerance, lead in LADDER:
         before = found.work
         share = lead / max(rough[0].growth, 1.0)
-        gain = _raise_upper(found, inner, start, rough, (share, fineness, tolerance, lead))
-        if lower:
-            gain = max(gain, _raise_lower(found, outer, start, rough, (share, fineness, 0.5 * tolerance, lead)))
+        try:
+            gain = _raise_upper(found, inner, start, rough, (share, fineness, tolerance, lead))
+            if lower:
+                gain = max(gain, _raise_lower(found, outer, start, rough, (share, fineness, 0.5 * tolerance, lead)))
+        except OutOfTime:
+            if found.upper < 0:
+                break
+            raise
         if gain < _SMALL_GAIN or found.work + _DEARER * (found.work - before) > seconds * _RATE:
             break
     found.lower = _less(found.lower, leak)

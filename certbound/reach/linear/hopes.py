@@ -1,0 +1,117 @@
+"""Attempts of the linear response at a target: which shares of it have a chance, and what they prove."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from certbound.problem.problem import Problem
+from certbound.reach.linear import shares
+from certbound.reach.linear.diffusion import DiffusionRun, depends_on_state
+from certbound.reach.linear.fit import fitted
+from certbound.reach.linear.linearisation import Linearisation
+from certbound.reach.linear.proved import LinearAnswer
+from certbound.reach.linear.run import LinearRun, Outcome
+from certbound.reach.linear.shares import Share
+from certbound.reach.nominal import Cells
+
+_REFINEMENTS = 3
+_MANY = 20  # nonlinear coordinates beyond which a probability below the target is not refined
+
+
+def nobody(answer: LinearAnswer) -> None:
+    """Takes answers that nobody waits for."""
+
+
+def run_of(
+    problem: Problem, *, cells: int | Cells | None, noise: bool = True, pieces: int | None = None
+) -> LinearRun:
+    """The engine for the problem's noise, on a grid that resolves it or on so many pieces."""
+    if pieces is None:
+        plain = Linearisation.of(problem, cells=cells, noise=noise)
+    else:
+        plain = Linearisation(problem, cells=cells, pieces=pieces, noise=noise)
+    engine = fitted(plain, Share.of(problem.delta * shares.FITTED))
+    return DiffusionRun(engine) if noise and depends_on_state(problem) else LinearRun(engine)
+
+
+def best_of(
+    run: LinearRun, target: Share, found: Callable[[LinearAnswer], object] = nobody
+) -> tuple[Outcome, int]:
+    """The least probability over a few shares of the target for delta_N, and the last effort.
+
+    Where a guess of the remainder tells which of them has a chance, only those are proved, and the last one if none.
+    """
+    guessed = run.curved and not isinstance(run, DiffusionRun)
+    parts = shares.GUESSED if guessed else shares.HOPED if run.curved else shares.HOPED_LINEAR
+    best: Outcome | None = None
+    for hope in _hopes(run, target) if guessed else parts:
+        outcome = tried(run, target, hope)
+        best = outcome if best is None else least(best, outcome)
+        found(LinearAnswer(run=run, outcome=best, shown=best))
+        if best.log_probability <= target.log or not (run.curved or run.engine.continuous):
+            return best, hope[1]
+    return best or tried(run, target, parts[-1]), parts[-1][1]
+
+
+def meeting(run: LinearRun, target: Share) -> tuple[Outcome, int] | None:
+    """The first outcome that meets the target, with its effort, among those that a guess promises; None without."""
+    for hope in _hopes(run, target):
+        outcome = tried(run, target, hope)
+        if outcome.log_probability <= target.log:
+            return outcome, hope[1]
+    return None
+
+
+def tried(run: LinearRun, target: Share, hope: tuple[float, int]) -> Outcome:
+    """What a part of the target proves, with its effort."""
+    return run.probability(target.part(hope[0]), hope[1])
+
+
+def _hopes(run: LinearRun, target: Share) -> Iterator[tuple[float, int]]:
+    """The shares of the target with which a guess of the remainder says that it is within reach.
+
+    Of all of them the last one has the least levels, and so the least remainder. Where the first has no chance, it is
+    looked at next: if the noise takes more than the target with it as well, the others need no look.
+    """
+    for index, (share, effort) in enumerate(shares.GUESSED):
+        if run.promise(target.part(share), effort, limit=target.log) <= target.log:
+            yield share, effort
+        elif index == 0 and not _within_reach(run, target):
+            return
+
+
+def _within_reach(run: LinearRun, target: Share) -> bool:
+    """Whether the noise alone, next to the least remainder that is tried, may cost no more than the target."""
+    share, effort = shares.GUESSED[-1]
+    limit = target.log + float(np.log1p(share))
+    return run.promise(target.part(share), effort, limit=limit) <= limit
+
+
+def promising(run: LinearRun, target: Share) -> bool:
+    """Whether a guess of the remainder says that the target is within reach."""
+    return _within_reach(run, target) and any(True for _ in _hopes(run, target))
+
+
+def least(first: Outcome, second: Outcome) -> Outcome:
+    return second if second.log_probability < first.log_probability else first
+
+
+
+
+def refined(
+    run: LinearRun, best: Outcome, effort: int, target: Share, found: Callable[[Outcome], object] = lambda outcome: None
+) -> Outcome:
+    """A smaller probability, where the levels cost most of what was proved: with smaller and smaller shares."""
+    above = best.log_probability - best.nonlinear.log
+    if best.log_probability > target.log or above <= -3.0 or (above >= 2.0 and not run.curved):
+        return best
+    coupled = max((len(group[0]) for group in run.engine.model.blocks), default=1) > 1
+    for _ in range(0 if coupled or len(run.engine.model.active) > _MANY else _REFINEMENTS):
+        outcome = run.probability(Share(2 * best.nonlinear.log), effort)
+        if outcome.log_probability >= best.log_probability:
+            break
+        best = outcome
+        found(best)
+    return best

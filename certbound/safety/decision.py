@@ -1,0 +1,213 @@
+"""The search for a verdict: which engine is asked when, and what is kept once the time is over.
+
+Sketches come first, since they cost next to nothing; then the engines in turn, until one has proved SAFE; then those
+that spared themselves, thoroughly. Under a limit of time an engine that takes long is interrupted for the others, and
+goes on with what they leave: none starves, and nothing is proved twice.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+from certbound.errors import EngineError, contained
+from certbound.problem.problem import Problem
+from certbound.reach.nominal import initial_cells
+from certbound.safety.answers import EngineAnswer, Request
+from certbound.safety.falsification import Violation, find_violation
+from certbound.safety.portfolio import ENGINES, engine_named
+from certbound.safety.verdict import Verdict, is_safe, stopped, unsafe, verdict_of
+from certbound.tubes.constants import Constants
+from certbound.watch import OutOfTime, Watch, current_watch
+
+_log = logging.getLogger(__name__)
+
+_LARGE = 60  # states beyond which no other engine is asked once one has proved SAFE
+_PATIENCE = 0.4  # of the time that is left, after which the other engines have a turn
+_TURN = 0.5  # of the time that is left then, for all of them
+_EXTRA = 0.2  # of the time that is left, for a bound that can no longer change the verdict
+
+
+def decide(
+    problem: Problem, *, method: str = "auto", cells: int | None = None, constants: Constants | None = None,
+    watch: Watch | None = None,
+) -> Verdict:
+    """The verdict that the engines find in the time that a watch leaves; see `verify_safety` for the arguments.
+
+    Without a watch the one that runs already, if any, ends the search.
+    """
+    request = Request(
+        method="auto" if method in ENGINES else method, cells=cells, constants=constants, thorough=method != "auto"
+    )
+    names = _chosen(method)
+    _checked(problem, request)
+    search = _Search(problem, request, watch or current_watch() or Watch())
+    try:
+        with search.watch.running():
+            violation = search.violation()
+            if violation is not None:
+                return unsafe(problem, violation)
+            if method == "auto":
+                search.whole(names)
+            else:
+                search.ask(names[0], request)
+    except OutOfTime:
+        _log.info("the search ended with its time")
+    return search.verdict(names)
+
+
+class _Search:
+    """One problem, one watch, and what each engine has answered so far."""
+
+    def __init__(self, problem: Problem, request: Request, watch: Watch) -> None:
+        self.problem, self.request, self.watch = problem, request, watch
+        self.answers: dict[str, EngineAnswer] = {}
+        self.left_at: dict[str, str] = {}
+        self.sketches: dict[str, EngineAnswer] = {}
+
+    @property
+    def settled(self) -> bool:
+        """Whether no other engine can change the verdict, or do much better."""
+        found = [*self.answers.values(), *self.sketches.values()]
+        return any(is_safe(answer, self.problem) or answer.conclusive for answer in found)
+
+    @property
+    def safe(self) -> bool:
+        """Whether SAFE is proved."""
+        return any(is_safe(answer, self.problem) for answer in (*self.answers.values(), *self.sketches.values()))
+
+    def violation(self) -> Violation | None:
+        """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
+        self.watch.engine = "noise-free"
+        try:
+            with contained("noise-free"):
+                self.watch.poll("noise-free trajectories")
+                return find_violation(self.problem)
+        except EngineError as error:
+            _log.info("no noise-free trajectory was followed: %s", error)
+            return None
+
+    def whole(self, names: tuple[str, ...]) -> None:
+        """Sketches, all engines in turn, and thoroughly those that spared themselves."""
+        if self.problem.system.dimension <= _LARGE and self.request.constants is None:
+            for name in (name for name in names if ENGINES[name].sketch):
+                self.sketches[name] = self._asked(name, replace(self.request, quick=True))
+        self._in_turn(names)
+        if self.safe or self.request.cells is not None:
+            return
+        for name in (name for name in names if ENGINES[name].again):
+            first = self.answers.get(name)
+            if first is not None and first.applicable and not first.conclusive:
+                self.ask(name, Request(before=first.details))
+
+    def _in_turn(self, names: tuple[str, ...]) -> None:
+        """Ask one engine after the other; one that takes long is interrupted for those after it."""
+        if not names:
+            return
+        turn: list[bool] = []
+
+        def others() -> None:
+            turn.append(True)
+            with self.watch.share(_TURN):
+                self._in_turn(names[1:])
+            if self.safe:
+                raise OutOfTime
+
+        with self.watch.after(_PATIENCE * self.watch.left, others):
+            self._turn_of(names[0])
+        if not turn:
+            self._in_turn(names[1:])
+
+    def _turn_of(self, name: str) -> None:
+        quick = self.settled
+        if quick and self.problem.system.dimension > _LARGE:
+            return
+        if quick and name in self.sketches:
+            self.answers[name] = self.sketches[name]
+            return
+        with self.watch.share(_EXTRA if self.safe else 1.0):
+            self.ask(name, replace(self.request, quick=quick))
+
+    def ask(self, name: str, request: Request) -> None:
+        """Keep the best that an engine finds; ``OutOfTime`` where the time ended it."""
+
+        def found(answer: EngineAnswer) -> None:
+            before = self.answers.get(name)
+            if before is None or not before.applicable or answer.log10_delta <= before.log10_delta:
+                self.answers[name] = answer
+            if answer.applicable and answer.certified:
+                self.watch.noted(answer.log10_delta, answer.log10_lower)
+
+        try:
+            answer = self._asked(name, replace(request, found=found))
+        except OutOfTime:
+            self.left_at[name] = self.watch.phase
+            if name not in self.answers:
+                self.answers[name] = stopped(name, self.watch.phase)
+            raise
+        self.left_at.pop(name, None)
+        if answer.applicable or name not in self.answers:
+            found(answer)
+
+    def _asked(self, name: str, request: Request) -> EngineAnswer:
+        """What an engine answers; where it fails, that it does not apply, and why."""
+        self.watch.engine, self.watch.phase = name, ""
+        self.watch.poll()
+        try:
+            with contained(name):
+                return ENGINES[name].prove(self.problem, request)
+        except EngineError as error:
+            return EngineAnswer(applicable=False, reason=str(error), method=name)
+
+    def verdict(self, names: tuple[str, ...]) -> Verdict:
+        """The best answer, and what was left undone."""
+        for name, answer in self.sketches.items():
+            self.answers.setdefault(name, answer)
+        answers = {name: self.answers[name] for name in ENGINES if name in self.answers}
+        found = verdict_of(self.problem, answers, names[0] if len(names) == 1 else "auto")
+        over = self.watch.limit is not None and self.watch.left <= 0 and found.status == "UNKNOWN"
+        return replace(found, reason=f"{found.reason} {self._undone(names)}".strip()) if over else found
+
+    def _undone(self, names: tuple[str, ...]) -> str:
+        """What more time would be spent on."""
+        begun = [(name, self.left_at[name]) for name in names if name in self.left_at]
+        rest = [f"{name} ({phase})" if phase else name for name, phase in begun]
+        rest += [name for name in names if name not in self.answers]
+        more = f" More time would go on with {', then '.join(rest)}." if rest else ""
+        return f"The search was stopped after {self.watch.limit:g} s.{more}"
+
+
+def _checked(problem: Problem, request: Request) -> None:
+    """Refuse what is wrong with a request before any engine runs: from then on whatever fails is an engine.
+
+    ValueError where the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit
+    it.
+    """
+    from certbound.tubes.paper import check_method
+
+    initial_cells(problem, request.cells)
+    _ = problem.closed_loop
+    continuous, n = problem.system.time == "continuous", problem.system.dimension
+    check_method(request.method, continuous=continuous, dimension=n)
+    constants = request.constants
+    if constants is None:
+        return
+    if constants.continuous != continuous:
+        raise ValueError(f"`constants` must state a {'rate' if continuous else 'gain'}, as the problem's time asks.")
+    if constants.times is not None and constants.times[-1] < problem.horizon:
+        raise ValueError(f"`constants` must reach the horizon {problem.horizon:g}, got {constants.times[-1]:g}.")
+    from certbound.constants.stated import refuse_contradiction
+
+    refuse_contradiction(problem, constants)
+
+
+def _chosen(method: str) -> tuple[str, ...]:
+    if method == "auto":
+        return tuple(ENGINES)
+    name = engine_named(method)
+    if name is not None:
+        return (name,)
+    from certbound.tubes.tuning import METHODS
+
+    known = ", ".join(["auto", *ENGINES, *(name for name in METHODS if name != "auto")])
+    raise ValueError(f"`method` must be one of {known}, got {method!r}.")

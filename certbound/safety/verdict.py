@@ -1,0 +1,264 @@
+"""The verdict: what is proved about a problem, made of the engines' answers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from certbound.display import Shown, at_least_text, log10_text, name_text, rounded
+from certbound.errors import CertificateError, SolverError
+from certbound.problem.problem import Problem
+from certbound.reach.sets import ReachTube
+from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, is_more_than, settled
+from certbound.safety.falsification import Violation
+
+if TYPE_CHECKING:
+    from certbound.safety.starts import SafeStarts
+    from certbound.tubes.constants import Constants
+
+_TAKEN = ("margin", "time", "constraint", "tube", "reach", "constants", "deviation")  # of the best answer
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Verdict(Shown):
+    """What is proved about a problem.
+
+    Parameters
+    ----------
+    status : {"SAFE", "UNSAFE", "UNSAFE_NOMINAL", "UNKNOWN"}
+        SAFE: the probability of breaking a constraint within the horizon is at most delta, proved.
+        UNSAFE: that probability exceeds delta from some start (of a normal start: in the mean), proved.
+        UNSAFE_NOMINAL: a noise-free trajectory from the initial set provably leaves the safe set.
+    log10_delta : float
+        log10 of the smallest bound on that probability that was proved: finite, at most 0 (0: nothing was). SAFE
+        exactly when it is at most log10 of the problem's delta.
+    margin : float or None
+        Least Euclidean distance to breaking a constraint that the tube at delta leaves; negative: it does not fit.
+    time, constraint
+        Where the margin is least, and for which constraint.
+    reason : str
+        Why, in words; the disturbances that the bound covers, and assumptions (stated constants), are named here.
+    method : str
+        What proved it.
+    tube, reach, constants
+        The stochastic tube at delta, the noise-free reach tube, the constants (each None where there is none).
+    deviation : Deviation or None
+        The stochastic deviation at delta as plain bounds per piece.
+    problem : Problem or None
+        What the verdict is about.
+    answers : mapping
+        What every engine answered, by name.
+    log10_lower : float or None
+        log10 of a proved lower bound of the probability from the worst start, under the worst disturbance; None where
+        no engine has one.
+    limits : Limits or None
+        What would be SAFE, where that was asked for and the problem is not (`certbound.safety.limits`).
+    """
+
+    status: str
+    log10_delta: float
+    margin: float | None
+    time: float | None
+    constraint: str | None
+    reason: str
+    method: str
+    tube: Any = None
+    reach: ReachTube | None = None
+    constants: Constants | None = None
+    deviation: Deviation | None = None
+    problem: Problem | None = field(default=None, repr=False)
+    answers: Mapping[str, EngineAnswer] = field(default_factory=dict, repr=False)
+    log10_lower: float | None = None
+    limits: Any = None
+
+    @cached_property
+    def certificate(self) -> dict[str, Any] | None:
+        """The proof as data, made when first asked for; None where no probability was bounded.
+
+        `certificate_text` says why in that case.
+        """
+        if self.problem is None:
+            return None
+        from certbound.safety.certificate import certificate_data
+
+        try:
+            return certificate_data(self.problem, self)
+        except CertificateError:
+            return None
+
+    def certificate_text(self, problem: Problem, *, attempt: int = 0) -> str:
+        """The proof as the text of a JSON file (docs/certificate.md); a later ``attempt`` spends more effort on it.
+
+        Raises
+        ------
+        CertificateError
+            If no probability was bounded that a certificate could state.
+        """
+        from certbound.safety.certificate import certificate_text
+
+        return certificate_text(problem, self, attempt=attempt)
+
+    def safe_starts(self, delta: float | None = None) -> SafeStarts:
+        """The largest set of starts that a value function proves safe: P(a constraint is broken) <= delta from each.
+
+        Parameters
+        ----------
+        delta : float, optional
+            The problem's own where it is left out.
+
+        Returns
+        -------
+        SafeStarts
+            With ``contains``, ``bound``, ``measure``, ``boxes``. The proof over the whole safe set is made now, in
+            about the time of the verdict.
+
+        Raises
+        ------
+        InfeasibleError
+            If the verdict rests on no value function (``method="values"`` gives one), or none applies.
+        ValueError
+            If ``delta`` does not lie in (0, 1), or the verdict has no problem.
+        """
+        from certbound.safety.starts import bound_safe_starts
+
+        if self.problem is None:
+            raise ValueError("`problem` must be set for safe starts; verify_safety sets it.")
+        return bound_safe_starts(self.problem, self.answers, delta)
+
+    def summary(self) -> str:
+        """The verdict in one line."""
+        asked = "" if self.problem is None else f"{name_text(self.problem.name)}: "
+        target = "" if self.problem is None else f", asked {self.problem.delta!r}"
+        bounds = f"{log10_text(self.log10_delta)}{at_least_text(self.log10_lower)}"
+        return f"{self.status}  {asked}P(leaving) <= {bounds}{target}"
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Margin, method and reason."""
+        where = "" if self.time is None else f" at t = {self.time:.4g}"
+        found = []
+        if self.margin is not None:
+            found.append(("margin", f"{rounded(self.margin, up=False, digits=4)}{where}, {self.constraint}"))
+        found += [] if self.constants is None else [("constants", self.constants.summary())]
+        return [*found, ("method", self.method), ("reason", self.reason)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``certbound verify --json`` prints, but for the seconds."""
+        names = ("status", "log10_delta", "log10_lower", "margin", "time", "constraint", "reason", "method")
+        found: dict[str, Any] = {name: getattr(self, name) for name in names}
+        found["delta"] = None if self.problem is None else self.problem.delta
+        found["constants"] = None if self.constants is None else self.constants.to_dict()
+        return found | {"tube": None if self.deviation is None else self.deviation.to_dict()}
+
+    def to_columns(self) -> dict[str, Any]:
+        """The stochastic deviation per piece of time, under the states' names, as ``pandas.DataFrame`` takes it.
+
+        Raises
+        ------
+        ValueError
+            If no tube could be certified.
+        """
+        if self.deviation is None:
+            raise ValueError(f"the verdict has no tube to tabulate; {self.reason}")
+        return self.deviation.to_columns(None if self.problem is None else self.problem.system.states)
+
+    def __bool__(self) -> bool:
+        raise TypeError("a Verdict is neither true nor false; compare `.status` with 'SAFE'.")
+
+
+def is_safe(answer: EngineAnswer, problem: Problem) -> bool:
+    return answer.applicable and answer.certified and is_at_most(min(answer.log10_delta, 0.0), problem.delta)
+
+
+def stopped(name: str, phase: str) -> EngineAnswer:
+    """The answer of an engine that had found nothing when its time was over."""
+    at = f", at '{phase}'" if phase else ""
+    return EngineAnswer(method=name, reason=f"its time was over before it had proved anything{at}.")
+
+
+def verdict_of(problem: Problem, answers: Mapping[str, EngineAnswer], method: str = "auto") -> Verdict:
+    """The best answer: certified before not, then the smaller probability, then the larger margin.
+
+    Without any answer, UNKNOWN by ``method``.
+    """
+    if not answers:
+        answers = {method: EngineAnswer(applicable=False, method=method, reason="no engine came to an answer.")}
+
+    def rank(name: str) -> tuple[bool, bool, float, float]:
+        answer = answers[name]
+        margin = -math.inf if answer.margin is None else answer.margin
+        return (not answer.applicable, not answer.certified, answer.log10_delta, -margin)
+
+    name = min(answers, key=rank)
+    best = answers[name]
+    level = settled(best.log10_delta, problem.delta)
+    safe = is_safe(best, problem)
+    reason = best.reason
+    if not best.certified:
+        reason = (
+            f"{best.method} bounds the deviation at one time, not along the whole trajectory: it says that the "
+            f"nominal {'fits' if level <= math.log10(problem.delta) else 'does not fit'}, and proves no more. {reason}"
+        )
+        level = 0.0
+    if best.applicable and level < 0 and problem.system.disturbance is not None:
+        reason = f"{_sentence(reason)} {_covered(best)}"
+    if best.assumption:
+        reason = f"{_sentence(reason)} Assumption: {best.assumption}."
+    lower = best_lower(answers)
+    unsafe = lower is not None and is_more_than(lower, problem.delta)
+    if unsafe and safe:
+        raise SolverError(
+            f"two engines contradict each other: {name} proves at most 10^{level:.6g}, another one at least "
+            f"10^{lower:.6g}; this is a defect of certbound, and nothing is answered."
+        )
+    others = [f"By {other}: {_sentence(answers[other].reason)}" for other in answers if other != name and not safe]
+    return Verdict(
+        status="SAFE" if safe else "UNSAFE" if unsafe else "UNKNOWN",
+        log10_delta=level,
+        log10_lower=lower,
+        reason=" ".join([_sentence(reason), *others]).strip(),
+        method=best.method or name,
+        **{part: getattr(best, part) for part in _TAKEN},
+        problem=problem,
+        answers=MappingProxyType(dict(answers)),
+    )
+
+
+def best_lower(answers: Mapping[str, EngineAnswer]) -> float | None:
+    """The largest proved lower bound of log10 of the probability, None where no engine has one."""
+    found = [answer.log10_lower for answer in answers.values() if answer.applicable and answer.log10_lower is not None]
+    return max(found, default=None)
+
+
+def _covered(answer: EngineAnswer) -> str:
+    """For which disturbances an answer holds."""
+    if answer.foresight:
+        return "It holds for every disturbance in its set, even one that sees coming noise."
+    return "It holds for every disturbance in its set that does not see coming noise."
+
+
+def _sentence(text: str) -> str:
+    """The text with a full stop at its end."""
+    return text if not text or text.endswith((".", "!", "?")) else f"{text}."
+
+
+def unsafe(problem: Problem, violation: Violation) -> Verdict:
+    when = f"t = {violation.time:.4g}" if problem.system.time == "continuous" else f"step {violation.time:g}"
+    start = ", ".join(f"{value:.4g}" for value in violation.start)
+    return Verdict(
+        status="UNSAFE_NOMINAL",
+        log10_delta=0.0,
+        margin=-violation.depth,
+        time=violation.time,
+        constraint=violation.constraint.label,
+        reason=(
+            f"without any noise the trajectory from ({start}) breaks '{violation.constraint.label}' at {when}, by "
+            f"{violation.depth:.3g} (proved by intervals)."
+        ),
+        method="noise-free trajectory",
+        reach=violation.reach,
+        problem=problem,
+    )

@@ -1,0 +1,96 @@
+"""Cells are halved only where they must be, their answers are joined, and out of reach is noticed early."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.reach.linear import SplitAnswer, bisection
+from certbound.reach.linear.answer import linear_answer
+
+
+def flattening(reach: float = 0.9, std: float = 0.02, delta: float = 1e-3) -> cb.Problem:
+    system = cb.DiscreteSystem(lambda x: 1.3 * x - 0.6 * x**3, states=1, noise=cb.Gaussian(std=std))
+    safe = [cb.Inside(cb.Box([-1.05], [1.05]))]
+    return cb.Problem(system, initial=cb.Box([-reach], [reach]), safe=safe, horizon=6, delta=delta)
+
+
+def beside(width: float) -> cb.Problem:
+    """Only the first state is bent; the second one drifts along."""
+    system = cb.DiscreteSystem(
+        lambda x: [1.3 * x[0] - 0.6 * x[0] ** 3, 0.9 * x[1]], states=2, noise=cb.Gaussian(std=0.02)
+    )
+    safe = [cb.Inside(cb.Box([-1.05, -1], [1.05, 1]))]
+    return cb.Problem(system, initial=cb.Box([-0.9, -width], [0.9, width]), safe=safe, horizon=4, delta=1e-3)
+
+
+@pytest.fixture(scope="module")
+def split() -> SplitAnswer:
+    found = linear_answer(flattening())
+    assert isinstance(found, SplitAnswer)
+    return found
+
+
+def test_unequal_cells_cover_the_starts_and_meet_the_target(split: SplitAnswer) -> None:
+    assert split.log10_delta <= -3
+    order = np.argsort(split.low[:, 0])
+    low, high = split.low[order, 0], split.high[order, 0]
+    assert (low[0], high[-1]) == (-0.9, 0.9)
+    np.testing.assert_array_equal(low[1:], high[:-1])
+    assert len({round(width, 9) for width in high - low}) > 1
+    assert split.outcome.log_probability == max(part.outcome.log_probability for part in split.parts)
+
+
+def test_less_is_proved_than_on_one_cell_and_than_on_as_many_equal_ones(split: SplitAnswer) -> None:
+    problem = flattening()
+    assert linear_answer(problem, cells=1).log10_delta > -3
+    assert linear_answer(problem, cells=len(split.parts) // 3).log10_delta > split.log10_delta
+
+
+def test_the_tubes_of_all_cells_are_joined(split: SplitAnswer) -> None:
+    tube, reach = split.tube, split.noise_free_reach
+    assert tube is not None
+    assert reach is not None
+    for part in split.parts:
+        assert part.tube is not None
+        assert np.all(tube.half_widths >= part.tube.half_widths)
+        assert tube.log10_delta >= part.tube.log10_delta
+    x = np.linspace(-0.9, 0.9, 41)
+    for step in range(7):
+        assert all(reach.contains(float(step), [value]) for value in x)
+        x = 1.3 * x - 0.6 * x**3
+    assert np.all(split.extent_along([1.0]) >= split.parts[0].extent_along([1.0]))
+    assert split.engine.cells == len(split.parts)
+    assert split.margin >= 0
+
+
+def test_the_side_that_makes_the_deviation_is_halved() -> None:
+    found = linear_answer(beside(0.001))
+    assert isinstance(found, SplitAnswer)
+    assert {side for path in found.paths for side, _ in path} == {0}
+
+
+def test_where_one_start_is_out_of_reach_nothing_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    original = bisection.run_of
+
+    def counted(*args: Any, **options: Any) -> Any:
+        made.append(options["cells"])
+        return original(*args, **options)
+
+    monkeypatch.setattr(bisection, "run_of", counted)
+    assert linear_answer(flattening(std=0.2)).log10_delta > -3
+    assert len(made) == 1
+
+
+def test_a_smaller_set_of_starts_is_never_worse(split: SplitAnswer) -> None:
+    assert linear_answer(flattening(reach=0.6)).log10_delta <= -3
+
+
+def test_a_grid_that_is_asked_for_is_kept() -> None:
+    found = linear_answer(flattening(), cells=8)
+    assert not isinstance(found, SplitAnswer)
+    assert found.run.engine.cells == 8

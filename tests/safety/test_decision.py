@@ -1,0 +1,205 @@
+"""What is asked when, what a limit of time leaves of it, and what is told meanwhile: by a clock of its own."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+import certbound as cb
+from certbound.safety.answers import EngineAnswer, Request
+from certbound.safety.decision import decide
+from certbound.safety.limits import Limits
+from certbound.safety.portfolio import ENGINES
+from certbound.safety.verdict import Verdict
+from certbound.watch import OutOfTime, Progress, Watch, poll, seconds_left
+
+Steps = list[tuple[float, float]]
+"""Seconds that an engine works, and the log10 that it has proved then."""
+
+
+class Time:
+    """A clock that only goes on when somebody works."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def work(self, seconds: float, phase: str) -> None:
+        for _ in range(round(10 * seconds)):
+            self.now += 0.1
+            poll(phase)
+
+
+@pytest.fixture
+def clock() -> Time:
+    return Time()
+
+
+def problem() -> cb.Problem:
+    system = cb.linear_system([[0.5]], noise=cb.Gaussian(std=0.1))
+    return cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3, delta=1e-3)
+
+
+def scripted(monkeypatch: pytest.MonkeyPatch, clock: Time, scripts: dict[str, Steps], **flags: Any) -> list[str]:
+    """Engines that work and prove as they are told; what was asked, in order."""
+    asked: list[str] = []
+
+    def row(name: str, steps: Steps) -> Any:
+        def prove(problem: cb.Problem, request: Request) -> EngineAnswer:
+            asked.append(name)
+            best = EngineAnswer(method=name)
+            for index, (seconds, level) in enumerate(steps):
+                clock.work(seconds, f"step {index}")
+                best = replace(best, log10_delta=min(best.log10_delta, level))
+                request.found(best)
+            return best
+
+        plain = {"sketch": False, "again": False, "reserve": False}
+        return replace(ENGINES[name], prove=prove, **plain | flags)
+
+    for name in ENGINES:
+        monkeypatch.setitem(ENGINES, name, row(name, scripts.get(name, [])))
+    return asked
+
+
+def run(clock: Time, limit: float | None, told: list[Progress] | None = None) -> tuple[Verdict, float]:
+    watch = Watch(limit, clock=clock, progress=None if told is None else told.append)
+    return decide(problem(), watch=watch), clock.now - watch.started
+
+
+def test_without_a_limit_every_engine_is_asked_in_order(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    asked = scripted(monkeypatch, clock, {"linear": [(3, -1)], "barrier": [(2, -2)]})
+    verdict, seconds = run(clock, None)
+    assert asked == list(ENGINES)
+    assert (verdict.status, verdict.log10_delta, verdict.method) == ("UNKNOWN", -2, "barrier")
+    assert seconds == pytest.approx(5)
+    assert "stopped" not in verdict.reason
+
+
+def test_what_was_proved_before_the_time_was_over_stands(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    scripted(monkeypatch, clock, {"linear": [(1, -1), (1, -2), (50, -9)]})
+    verdict, seconds = run(clock, 10)
+    assert verdict.log10_delta == -2
+    assert seconds == pytest.approx(10, abs=0.2)
+    assert verdict.reason.endswith("stopped after 10 s. More time would go on with linear (step 2).")
+
+
+def test_an_engine_that_takes_long_is_interrupted_and_goes_on(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    asked = scripted(monkeypatch, clock, {"linear": [(7, -5)], "constants": [(1, -1)]})
+    verdict, seconds = run(clock, 10)
+    assert asked == list(ENGINES)
+    assert (verdict.status, verdict.method) == ("SAFE", "linear")
+    assert seconds == pytest.approx(8, abs=0.3)
+
+
+def test_once_another_one_is_safe_the_one_that_takes_long_ends(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    scripted(monkeypatch, clock, {"linear": [(500, -5)], "constants": [(1, -4)]})
+    verdict, seconds = run(clock, 10)
+    assert (verdict.status, verdict.method) == ("SAFE", "constants")
+    assert seconds < 7
+
+
+def test_no_engine_keeps_the_others_from_their_turn(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    asked = scripted(monkeypatch, clock, {name: [(500, -5)] for name in ENGINES})
+    verdict, seconds = run(clock, 20)
+    assert set(asked) == set(ENGINES)
+    assert seconds == pytest.approx(20, abs=0.2)
+    assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", 0.0)
+    assert all(f"{name} (step 0)" in verdict.reason for name in ENGINES)
+
+
+def test_what_an_engine_was_at_is_its_own(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    scripted(monkeypatch, clock, {"linear": [(1, -0.5), (500, -5)], "constants": [(500, -5)]})
+    verdict, _ = run(clock, 10)
+    assert "linear (step 1), then constants (step 0)" in verdict.reason
+
+
+@pytest.mark.parametrize("limit", [0.5, 1, 2, 4, 8, 16, 32])
+def test_a_longer_limit_is_never_worse(monkeypatch: pytest.MonkeyPatch, clock: Time, limit: float) -> None:
+    scripts: dict[str, Steps] = {
+        "linear": [(1, -0.5), (6, -2)], "constants": [(2, -1)],
+        "barrier": [(1, -0.7), (3, -1.5)], "values": [(4, -2.5)],
+    }  # fmt: skip
+    scripted(monkeypatch, clock, scripts)
+    verdict, seconds = run(clock, limit)
+    longer, _ = run(clock, 2 * limit)
+    assert longer.log10_delta <= verdict.log10_delta
+    assert seconds <= limit + 0.2
+
+
+def test_a_sketch_that_proves_safe_spares_the_others(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    asked = scripted(monkeypatch, clock, {"constants": [(0.1, -4)]}, sketch=True)
+    verdict, _ = run(clock, None)
+    assert asked == list(ENGINES)  # each for its sketch, none a second time
+    assert verdict.status == "SAFE"
+
+
+def test_progress_tells_who_is_at_what_and_the_bound(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    scripted(monkeypatch, clock, {"linear": [(1, -1), (1, -2)], "barrier": [(0.5, -1.5)]})
+    told: list[Progress] = []
+    run(clock, 10, told)
+    rows = [(p.engine, p.phase, p.log10_delta) for p in told]
+    for row in (("linear", "step 0", 0.0), ("linear", "step 1", -1.0), ("barrier", "step 0", -2.0)):
+        assert row in rows
+    assert all(p.limit == 10 and 0 <= p.seconds <= 10 for p in told)
+    assert [p.log10_delta for p in told] == sorted((p.log10_delta for p in told), reverse=True)
+
+
+def test_a_share_of_time_ends_quietly_and_the_whole_does_not(clock: Time) -> None:
+    watch = Watch(10, clock=clock)
+    with watch.running():
+        with watch.share(0.5):
+            assert seconds_left() == pytest.approx(5)
+            clock.work(50, "long")
+        assert seconds_left() == pytest.approx(5, abs=0.2)
+        clock.now += 50
+        with pytest.raises(OutOfTime), watch.share(0.5), watch.share(1.0):
+            poll()
+    assert seconds_left() == float("inf")
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, float("nan")])
+def test_a_limit_must_be_positive(limit: float) -> None:
+    with pytest.raises(ValueError, match="`time_limit` must be a positive number of seconds"):
+        cb.verify_safety(problem(), time_limit=limit)
+
+
+def test_the_callback_may_be_all_that_is_given() -> None:
+    told: list[Progress] = []
+    verdict = cb.verify_safety(problem(), progress=told.append)
+    assert verdict.status == "SAFE"
+    assert {"noise-free", "linear"} <= {found.engine for found in told}
+
+
+def test_limits_are_found_as_far_as_time_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    from certbound.safety import verification
+
+    def partly(*_: Any, **__: Any) -> Iterator[Limits]:
+        yield Limits(delta=0.5, horizon=None, noise=None, widening=None)
+        raise OutOfTime
+
+    monkeypatch.setattr(verification, "limits_so_far", partly)
+    wide = problem().replace(delta=1e-40)
+    limits = cb.verify_safety(wide, method="constants", explain=True).limits
+    assert limits is not None
+    assert limits.delta == 0.5
+
+
+def test_a_row_that_does_not_poll_is_ended_by_a_timer_that_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    def deaf(problem: cb.Problem, request: Request) -> EngineAnswer:
+        request.found(EngineAnswer(log10_delta=-1.0, method="linear"))
+        while True:
+            pass
+
+    monkeypatch.setitem(ENGINES, "linear", replace(ENGINES["linear"], prove=deaf))
+    before = signal.getsignal(signal.SIGALRM)
+    verdict = cb.verify_safety(problem(), method="linear", time_limit=0.1)
+    assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", -1.0)
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert signal.getsignal(signal.SIGALRM) is before
