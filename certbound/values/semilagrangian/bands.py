@@ -74,15 +74,17 @@ def band_of(frame: Frame, first: int, last: int, base: Base, excess: Array, live
         Standard deviations up to which D's effect is followed.
     """
     sigma = base.sigma
-    reach = follow * np.sqrt(excess[[0, 2]]) * _UP
-    rows = _rows(frame, first, last, live, reach[0])
+    reach = follow * np.sqrt(excess[0]) * _UP
+    rows = _rows(frame, first, last, live, reach)
     mesh = frame.y[rows]
     margin = (REACH + 0.1) * sigma[0]
     start = int(np.searchsorted(frame.y, mesh[0] - margin, side="right")) - 1
     stop = int(np.searchsorted(frame.y, mesh[-1] + margin)) + 1
     lines = slice(max(start, 0), min(stop, len(frame.y)))
+    live = live & _far_from_ends(frame, first, last, sigma, (float(mesh[0]) - margin, float(mesh[-1]) + margin))
     one = along(frame.y, sigma[0], 1e-15, rows, lines)
-    two = across(frame.q, sigma[1], 1e-15)
+    wider = float(np.where(live, excess[2], 0.0).max(initial=0.0)) / sigma[1] ** 2
+    two = across(frame.q, sigma[1], 1e-15, math.sqrt(1 + wider) * _UP)
     share = float(np.where(live, excess[0] / sigma[0] ** 2 + excess[2] / sigma[1] ** 2, 0.0).max(initial=0.0))
     c = 0.5 * (1 - (1 + share) / WIDER**2)
     factor = WIDER**2 * math.exp(c - 1) / c * _UP if c > 0.02 else math.inf
@@ -90,13 +92,28 @@ def band_of(frame: Frame, first: int, last: int, base: Base, excess: Array, live
         live = np.zeros_like(live)
         factor = 0.0
     drift = frame.drift[:, first:last] * factor
-    prices = np.stack([excess[0] * 0, excess[1], excess[0] / 2, drift[0], drift[1]]) * _UP
-    prices[0] = excess[2] / 2 * _UP
+    prices = np.stack([excess[2] / 2, excess[1], excess[0] / 2, drift[0], drift[1]]) * _UP
     error = 300 * (one.error + two.error + 1e-13)
     return Band(
         first=first, last=last, rows=rows, lines=lines, one=one, two=two, reach=reach, prices=prices, live=live,
         error=error,
     )  # fmt: skip
+
+
+def _far_from_ends(
+    frame: Frame, first: int, last: int, sigma: tuple[float, float], needed: tuple[float, float]
+) -> Mask:
+    """Cells from whose images the smoothing does not look beyond the grid."""
+    fine = frame.y[0] <= needed[0] and needed[1] <= frame.y[-1]
+    d = np.diff(frame.y)[first:last, None]
+    sag = frame.bends[1, first:last] * d**2 / 8 + frame.bends[3, first:last] * np.diff(frame.q) ** 2 / 8
+    found = np.full(sag.shape, fine)
+    image, radius = frame.image[1, first : last + 1], frame.radius[1, first : last + 1]
+    for a in (slice(None, -1), slice(1, None)):
+        for b in (slice(None, -1), slice(1, None)):
+            away = radius[a, b] + sag + REACH * sigma[1]
+            found &= (image[a, b] - away >= frame.q[0]) & (image[a, b] + away <= frame.q[-1])
+    return found
 
 
 def _rows(frame: Frame, first: int, last: int, live: Mask, reach: Array) -> slice:

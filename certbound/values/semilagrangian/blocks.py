@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sh
 from certbound.values.semilagrangian.remainders import Remainders, remainders
 from certbound.values.semilagrangian.setting import Setting
 
-_ORDER = 5
+_ORDER = 8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -42,7 +43,7 @@ class Blocks:
     covariance : (Interval, Interval, Interval)
         S_yy, S_yq, S_qq.
     strays : Remainders
-        In (p, q), flat.
+        In (p, q).
     known : ndarray of bool
     """
 
@@ -54,13 +55,14 @@ class Blocks:
     known: Mask
 
 
-def blocks_of(setting: Setting, clock: Clock, y: Array, q: Array) -> Blocks:
-    """Enclose one step from every box of the grid y x q."""
+def blocks_of(setting: Setting, clock: Clock, y: Array, q: Array, wanted: Mask | None = None) -> Blocks:
+    """Enclose one step from every box of the grid y x q (from those ``wanted``; nothing is known of the others)."""
     low = np.meshgrid(y[:-1], q[:-1], indexing="ij")
     high = np.meshgrid(y[1:], q[1:], indexing="ij")
     shape = low[0].shape
-    box = [Interval(a.ravel(), b.ravel()) for a, b in zip(low, high)]
-    size = low[0].size
+    keep = np.ones(shape, dtype=bool) if wanted is None else wanted
+    box = [Interval(a[keep], b[keep]) for a, b in zip(low, high)]
+    size = int(keep.sum())
     zero, one = Interval.point(np.zeros(size)), Interval.point(np.ones(size))
     tape = augmented(sheared(setting.tape, clock.shear), setting.noise, clock.shear)
     rest = [one, zero, zero, one, *[zero] * (EQUATIONS - 6)]
@@ -76,15 +78,28 @@ def blocks_of(setting: Setting, clock: Clock, y: Array, q: Array) -> Blocks:
     )  # fmt: skip
     loose = Interval(1 - 4 * setting.spread - 1e-15, 1 + 4 * setting.spread + 1e-15)
 
+    def filled(part: Array, rest: float = 0.0) -> Array:
+        whole = np.full((*part.shape[:-1], *shape), rest, dtype=part.dtype)
+        whole[..., keep] = part
+        return whole
+
     def shaped(value: Interval) -> Interval:
-        return value.reshape(shape)
+        return Interval(filled(value.lo), filled(value.hi))
 
     return Blocks(
         image=(shaped(end[0]), shaped(end[1])),
-        slopes=np.stack([getattr(end[k], side).reshape(shape) for k in (2, 3) for side in ("lo", "hi")]),
-        bends=np.stack([end[k].mag.reshape(shape) for k in range(6, 10)]),
+        slopes=filled(np.stack([getattr(end[k], side) for k in (2, 3) for side in ("lo", "hi")])),
+        bends=filled(np.stack([end[k].mag for k in range(6, 10)])),
         covariance=tuple(shaped(value * loose) for value in covariance),  # type: ignore[arg-type]
-        strays=strays, known=(flown.known & centre.known & strays.known).reshape(shape),
+        strays=_filled(strays, filled), known=filled(flown.known & centre.known & strays.known, False),
+    )  # fmt: skip
+
+
+def _filled(strays: Remainders, filled: Callable[[Array], Array]) -> Remainders:
+    p, q = (Interval(filled(part.lo), filled(part.hi)) for part in strays.tube)
+    return replace(
+        strays, most=filled(strays.most), mean=filled(strays.mean), dip=filled(strays.dip),
+        inward=filled(strays.inward), tube=(p, q),
     )  # fmt: skip
 
 

@@ -10,8 +10,8 @@ with absolute values; sup over a cell is over all y of the cell [Y_k, Y_{k+1}].
     density  sup over cell k of phi_s(y - y_i)
     mass     min(1, D_i sup of phi over cell k - cell i), for s and for the wider s kappa
 
-For the q-axis: matrices of values, first and second derivatives from nodal values and from parabolas, and the suprema
-of |phi|, |phi'|, |phi''| over cell - cell.
+For the q-axis: matrices of values, first and second derivatives from nodal values and from parabolas, the suprema of
+|phi|, |phi'|, |phi''| over cell - cell, and the suprema of phi and of the mass over all s between s_q and s_q stretch.
 """
 
 from __future__ import annotations
@@ -53,6 +53,8 @@ class Across:
     values: tuple[Array, ...]
     parabolas: tuple[Array, ...]
     sup: tuple[Array, ...]
+    density: Array
+    mass: Array
     wide: Array
     error: float
 
@@ -89,15 +91,17 @@ def along(nodes: Array, sigma: float, spread: float, rows: slice, lines: slice) 
     )  # fmt: skip
 
 
-def across(nodes: Array, sigma: float, spread: float) -> Across:
+def across(nodes: Array, sigma: float, spread: float, stretch: float) -> Across:
     """The matrices of a band's q-axis, all nodes from all nodes."""
     kernel = axis_kernel(nodes, nodes, sigma, spread)
     values = tuple(_dense(kernel, "hat", len(nodes), order) for order in range(3))
     parabolas = tuple(_dense(kernel, "bubble", len(nodes) - 1, order) for order in range(3))
     sup = _peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma)
+    density = _peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma, stretch)[0]
     return Across(
-        values=values, parabolas=parabolas, sup=sup, wide=_mass(nodes, nodes, sigma, WIDER), error=kernel.error
-    )
+        values=values, parabolas=parabolas, sup=sup, density=density,
+        mass=np.minimum(density * np.diff(nodes), 1.0), wide=_mass(nodes, nodes, sigma, WIDER), error=kernel.error,
+    )  # fmt: skip
 
 
 def _dense(kernel: object, name: str, columns: int, order: int = 0) -> Array:
@@ -110,10 +114,13 @@ def _dense(kernel: object, name: str, columns: int, order: int = 0) -> Array:
     return found
 
 
-def _peak(low: Array, high: Array, left: Array, right: Array, sigma: float) -> tuple[Array, Array, Array]:
-    """sup of |phi_s|, |phi_s'|, |phi_s''| over differences of cells, shape (cells, other cells)."""
+def _peak(
+    low: Array, high: Array, left: Array, right: Array, sigma: float, stretch: float = 1.0
+) -> tuple[Array, Array, Array]:
+    """sup of |phi_s|, |phi_s'|, |phi_s''| over differences of cells and s in [sigma, sigma stretch]."""
     first = (low[:, None] - right[None]) / sigma
     last = (high[:, None] - left[None]) / sigma
+    first, last = np.minimum(first, first / stretch), np.maximum(last, last / stretch)
     slack = 1e-12 * (1 + np.abs(first) + np.abs(last))
     first, last = first - slack, last + slack
     nearest = np.maximum(np.maximum(first, -last), 0.0)

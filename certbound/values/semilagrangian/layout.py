@@ -18,7 +18,7 @@ from certbound.values.semilagrangian.induction import Bounds, start_levels
 from certbound.values.semilagrangian.remainders import chord_level, level_of
 from certbound.values.semilagrangian.setting import Setting
 
-_BLOCKS = (80, 28)
+_BLOCKS = (90, 40)
 _NODE_ORDER = 7
 _MOST_BANDS = 12
 _MOST_REACH = 6
@@ -70,9 +70,9 @@ def layout_of(setting: Setting, plan: Plan) -> Layout:
     rough = _rough(setting, clock)
     axes = _axes(setting, clock, plan, rough)
     index, edges = zip(*(_chunks(axis, count) for axis, count in zip(axes, _BLOCKS)))
-    blocks = blocks_of(setting, clock, edges[0], edges[1])
     within = _inside(clock.shear, edges[0], edges[1], p, q, whole=False)
-    usable = blocks.known & within & _gentle(blocks, clock, axes)
+    blocks = blocks_of(setting, clock, edges[0], edges[1], within)
+    usable = blocks.known & _gentle(blocks, clock, axes)
     frame, inner, safe = _frame(setting, clock, axes, blocks, usable, (index[0], index[1]))
     bands, live = _bands(frame, blocks, usable, (index[0], index[1]), clock)
     frame = replace(frame, live=live)
@@ -111,11 +111,11 @@ def _axes(setting: Setting, clock: Clock, plan: Plan, rough: Blocks) -> tuple[Ar
         raise InfeasibleError(
             "the noise hardly reaches the coordinate without noise; another engine's answer stands."
         )
-    dip = rough.strays.dip[:, known.ravel()]
+    dip = rough.strays.dip[:, known]
     p0, p1 = p0 + float(np.median(dip[0])), p1 - float(np.median(dip[1]))
     away = sorted((clock.shear * q0, clock.shear * q1))
     tube = rough.strays.tube
-    keep = known.ravel()
+    keep = known
     ends = [float(tube[0].lo[keep].min()), float(tube[0].hi[keep].max())]
     tall = [float(tube[1].lo[keep].min()), float(tube[1].hi[keep].max())]
     slant = sorted((clock.shear * tall[0], clock.shear * tall[1]))
@@ -153,13 +153,13 @@ def _inside(shear: float, y: Array, q: Array, p_ends: tuple[float, float], q_end
 
 def _gentle(blocks: Blocks, clock: Clock, axes: tuple[Array, Array]) -> Mask:
     """Blocks whose remainder reaches a few cells at most."""
-    most = blocks.strays.most.reshape(2, *blocks.known.shape)
+    most = blocks.strays.most
     reach = (most[0] + abs(clock.shear) * most[1], most[1])
     return np.all([r <= _MOST_REACH * np.diff(axis).min() for r, axis in zip(reach, axes)], axis=0)
 
 
 def _reach(blocks: Blocks, clock: Clock, usable: Mask, axes: tuple[Array, Array]) -> tuple[int, int]:
-    most = blocks.strays.most.reshape(2, *blocks.known.shape)
+    most = blocks.strays.most
     reach = (most[0] + abs(clock.shear) * most[1], most[1])
     counts = [math.ceil(float(np.where(usable, r, 0.0).max()) / float(np.diff(axis).min()) * 1.000001) for r, axis in zip(reach, axes)]
     return counts[0], counts[1]
@@ -171,7 +171,7 @@ def _frame(
     """The frame, and the cells surely within the noisy faces, and within the others."""
     y, q = axes
     spread = np.ix_(*index)
-    dips = blocks.strays.dip.reshape(2, *usable.shape)
+    dips = blocks.strays.dip
     touched = [float(np.where(usable, d, 0.0).max()) for d in dips]
     p, faces = setting.faces
     dip = _dips(blocks, usable, clock, p, touched)
@@ -180,7 +180,7 @@ def _frame(
     live = safe & usable[spread] & ((q[:-1] >= faces[0]) & (q[1:] <= faces[1]))[None]
     image, radius, known = _images(setting, clock, y, q, live)
     live &= known
-    mean = blocks.strays.mean.reshape(2, *usable.shape)
+    mean = blocks.strays.mean
     drift = np.stack([mean[0] + abs(clock.shear) * mean[1], mean[1]])
     zero = np.where(usable, 1.0, 0.0)
     frame = Frame(
@@ -192,8 +192,8 @@ def _frame(
 
 def _dips(blocks: Blocks, usable: Mask, clock: Clock, p: tuple[float, float], most: list[float]) -> tuple[float, float]:
     """How far the noise-free faces move inward: the largest dip of the blocks whose tube may meet a face."""
-    low, high = blocks.strays.tube[0].lo.reshape(usable.shape), blocks.strays.tube[0].hi.reshape(usable.shape)
-    dips = blocks.strays.dip.reshape(2, *usable.shape)
+    low, high = blocks.strays.tube[0].lo, blocks.strays.tube[0].hi
+    dips = blocks.strays.dip
     near = (usable & (low <= p[0] + most[0]), usable & (high >= p[1] - most[1]))
     return float(np.where(near[0], dips[0], 0.0).max()), float(np.where(near[1], dips[1], 0.0).max())
 
@@ -204,10 +204,9 @@ def _within_noisy(setting: Setting, clock: Clock, axes: tuple[Array, Array], blo
     low_face, high_face = setting.faces[1]
     tubes = blocks.strays.tube
     low, high = np.full(len(y) - 1, low_face), np.full(len(y) - 1, high_face)
-    shape = usable.shape
-    inward = blocks.strays.inward.reshape(2, *shape)
+    inward = blocks.strays.inward
     around = tubes[0] - tubes[1] * clock.shear
-    box = [part.reshape(shape) for part in (around.lo, around.hi, tubes[1].lo, tubes[1].hi)]
+    box = (around.lo, around.hi, tubes[1].lo, tubes[1].hi)
     for i, j in zip(*np.nonzero(usable)):
         first, last = np.searchsorted(y, box[0][i, j], side="right") - 1, np.searchsorted(y, box[1][i, j])
         part = slice(max(int(first), 0), int(last))

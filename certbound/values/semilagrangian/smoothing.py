@@ -10,7 +10,10 @@ derivatives at the nodes) the mean is T(y, w) = sum_i E h_i(y + s_y z) V_i(w). E
   V'''' = sum kappa_j phi'' - sum b_j int phi'', and so on with |phi'|, |phi| for lower orders;
 - d_yy T = sum_i K_i(w) phi(y - y_i), K_i = S_i - S_{i-1}; the rows' own kinks are KW_k = sum_i E h_k(y_i + s z) K_i, and
   between the rows T <= linear interpolation + (D_k/4) sum_i (-K_i)^+ P(y_i + s z in cell k);
-- d_ww T <= sum_i ceiling_ki sup (V_i'')^+, |d_yw T| <= sum_i mass_ki sup |S_i'|, |d_yy T| <= sum density_ki sup |K_i|.
+- d_ww T, |d_yw T|, |d_yy T| lie below sums with non-negative coefficients of densities or masses at kinks and cells:
+  sum_i ceiling_ki sum_j (kappa_ij^+ + (-b_ij)^+ D_j) phi, sum_i mass_ki sum_j sup |d_q S_i| P, sum_i density_ki sum_j
+  sup |K_i| P; with the supremum over s in [s_q, s_q stretch] they bound the means over a further N(0, (stretch^2 - 1)
+  s_q^2) of w, too.
 
 All of this is a majorant on cells [Y_k, Y_{k+1}] x [w_l, w_{l+1}], which is what `Rows` holds.
 """
@@ -94,20 +97,21 @@ def smoothed(
     u, b = lines.nodal, lines.bend
     v, v1, v2 = (u @ value.T + b @ parabola.T for value, parabola in zip(two.values, two.parabolas))
     fourth = _kinks(u, b, dq) @ two.sup[2].T * eighth
-    down, up = _ends(np.maximum, -v2) + fourth, _ends(np.maximum, v2) + fourth
+    down = _ends(np.maximum, -v2) + fourth
     slope_u, slope_b = np.diff(u, axis=0) / dy, np.diff(b, axis=0) / dy
     turn = _kinks(slope_u, slope_b, dq) @ two.sup[1].T * eighth
-    tilt = _ends(np.maximum, np.abs(np.diff(v1, axis=0)) / dy) + turn
+    tilt = (np.abs(np.diff(slope_u, axis=1)) / dq + np.abs(slope_b) * dq / 2) @ two.mass.T
     jump = np.diff(np.diff(v, axis=0) / dy, axis=0)
     wave = _kinks(np.diff(slope_u, axis=0), np.diff(slope_b, axis=0), dq) @ two.sup[0].T * eighth
     edge = ((1, 1), (0, 0))
     drop = np.pad(_ends(np.maximum, -jump) + wave, edge)
-    size = np.pad(_ends(np.maximum, np.abs(jump)) + wave, edge)
+    bow = _ends(np.maximum, np.abs(np.diff(slope_u, axis=0))) + np.abs(np.diff(slope_b, axis=0)) * eighth
+    size = np.pad(bow @ two.mass.T, edge)
     rows, rows1, bend = one.rows @ v, one.rows @ v1, one.rows @ down
     cross = np.diff(rows1, axis=0) / dm
     spare = one.mass @ turn
     low, high = _ends(np.minimum, cross) - spare, _ends(np.maximum, cross) + spare
-    bent = (one.ceiling @ np.maximum(up, 0.0)) * _UP
+    bent = one.ceiling @ (_rising(u, b, dq) @ two.density.T) * _UP
     inner = np.maximum(np.maximum(bend[:-1], bend[1:]), bent)
     rate = np.abs(np.diff(rows, axis=1)) / dq
     return Rows(
@@ -128,6 +132,15 @@ def _kinks(u: Array, b: Array, dq: Array) -> Array:
     found[:, 0] += np.abs((slope + half)[:, 0])
     found += 1e-13 * (np.abs(u[:, 1:]) + np.abs(u[:, :-1])) / dq
     return found
+
+
+def _rising(u: Array, b: Array, dq: Array) -> Array:
+    """kappa_j^+ + (-b_j)^+ D_j, assigned to the cells right of the kinks."""
+    slope, half = np.diff(u, axis=1) / dq, b * dq / 2
+    found = np.maximum(-b, 0.0) * dq + 1e-13 * (np.abs(u[:, 1:]) + np.abs(u[:, :-1])) / dq
+    found[:, 1:] += np.maximum((slope + half)[:, 1:] - (slope - half)[:, :-1], 0.0)
+    found[:, 0] += np.maximum((slope + half)[:, 0], 0.0)
+    return np.asarray(found)
 
 
 def _ends(pick: np.ufunc, values: Array) -> Array:

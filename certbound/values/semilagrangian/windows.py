@@ -155,8 +155,8 @@ def over_cells(
         |d_yy m| and |d_qq m|, two each.
     sides : (ndarray, ndarray)
         Widths along y and q.
-    reach : (2, cells, nq - 1)
-        How far the covariance's excess is followed.
+    reach : (cells, nq - 1)
+        How far the covariance's excess is followed along y.
     prices : (5, cells, nq - 1)
         Of ``wide`` (three: bent, mixed, bowed) and of the first two of ``close`` (lean_y, lean_q, then lift and near,
         which cost themselves).
@@ -186,8 +186,7 @@ def over_cells(
             total += share * longest * _kinked(window, kinks, mesh, longest)
             total += _largest(window, close[2]) + _largest(window, close[3])
             total += prices[3, i, j] * _largest(window, close[0]) + prices[4, i, j] * _largest(window, close[1])
-            window = _window(mesh, q, ends[0] - reach[0, i, j], ends[1] + reach[0, i, j], ends[2] - reach[1, i, j],
-                             ends[3] + reach[1, i, j])
+            window = _window(mesh, q, ends[0] - reach[i, j], ends[1] + reach[i, j], ends[2], ends[3])
             for part in range(3):
                 total += prices[part, i, j] * _largest(window, wide[part])
             found[i, j] = total
