@@ -8,7 +8,7 @@ after the noise, as a function of where the noise-free step ends), ``steps`` (th
 
 from certbound.values.discrete.dominance import KAPPA
 from certbound.values.discrete.failures import FailureBounds, bound_failure
-from certbound.values.discrete.kernels import axis_kernel
+from certbound.values.discrete.kernels import AxisKernel, axis_kernel
 from certbound.values.discrete.steps import evaluate
 
-__all__ = ["FailureBounds", "KAPPA", "axis_kernel", "bound_failure", "evaluate"]
+__all__ = ["FailureBounds", "KAPPA", "AxisKernel", "axis_kernel", "bound_failure", "evaluate"]

@@ -9,12 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.rigor.intervals import Interval, sq
+from certbound.rigor.intervals import Interval, concatenate, sq
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
 from certbound.values.semilagrangian.remainders import Remainders, remainders
 from certbound.values.semilagrangian.setting import Setting
-
-_ORDER = 8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -55,7 +53,9 @@ class Blocks:
     known: Mask
 
 
-def blocks_of(setting: Setting, clock: Clock, y: Array, q: Array, wanted: Mask | None = None) -> Blocks:
+def blocks_of(
+    setting: Setting, clock: Clock, y: Array, q: Array, *, order: int, wanted: Mask | None = None
+) -> Blocks:
     """Enclose one step from every box of the grid y x q (from those ``wanted``; nothing is known of the others)."""
     low = np.meshgrid(y[:-1], q[:-1], indexing="ij")
     high = np.meshgrid(y[1:], q[1:], indexing="ij")
@@ -63,14 +63,15 @@ def blocks_of(setting: Setting, clock: Clock, y: Array, q: Array, wanted: Mask |
     keep = np.ones(shape, dtype=bool) if wanted is None else wanted
     box = [Interval(a[keep], b[keep]) for a, b in zip(low, high)]
     size = int(keep.sum())
-    zero, one = Interval.point(np.zeros(size)), Interval.point(np.ones(size))
+    middle = [Interval.point(value.mid) for value in box]
+    both = [concatenate([value, point]) for value, point in zip(box, middle)]  # boxes and their middles in one go
+    zero, one = Interval.point(np.zeros(2 * size)), Interval.point(np.ones(2 * size))
     tape = augmented(sheared(setting.tape, clock.shear), setting.noise, clock.shear)
     rest = [one, zero, zero, one, *[zero] * (EQUATIONS - 6)]
-    flown = flow(tape, [*box, *rest], clock.step, _ORDER)
-    middle = [Interval.point(value.mid) for value in box]
-    centre = flow(tape, [*middle, *rest], clock.step, _ORDER)
-    end, away = flown.end, [value - point for value, point in zip(box, middle)]
-    covariance = [_both(end[k], centre.end[k] + end[k + 3] * away[0] + end[k + 6] * away[1]) for k in range(10, 13)]
+    flown = flow(tape, [*both, *rest], clock.step, order)
+    end, centre = [value[:size] for value in flown.end], [value[size:] for value in flown.end]
+    away = [value - point for value, point in zip(box, middle)]
+    covariance = [_both(end[k], centre[k] + end[k + 3] * away[0] + end[k + 6] * away[1]) for k in range(10, 13)]
     p = box[0] + box[1] * clock.shear
     strays = remainders(
         setting.tape, setting.noise * (1 + setting.spread), p, box[1], step=clock.step, omega=clock.omega,
@@ -78,20 +79,21 @@ def blocks_of(setting: Setting, clock: Clock, y: Array, q: Array, wanted: Mask |
     )  # fmt: skip
     loose = Interval(1 - 4 * setting.spread - 1e-15, 1 + 4 * setting.spread + 1e-15)
 
-    def filled(part: Array, rest: float = 0.0) -> Array:
-        whole = np.full((*part.shape[:-1], *shape), rest, dtype=part.dtype)
+    def filled(part: Array) -> Array:
+        whole = np.zeros((*part.shape[:-1], *shape))
         whole[..., keep] = part
         return whole
 
     def shaped(value: Interval) -> Interval:
         return Interval(filled(value.lo), filled(value.hi))
 
+    known = flown.known[:size] & flown.known[size:] & strays.known
     return Blocks(
         image=(shaped(end[0]), shaped(end[1])),
         slopes=filled(np.stack([getattr(end[k], side) for k in (2, 3) for side in ("lo", "hi")])),
         bends=filled(np.stack([end[k].mag for k in range(6, 10)])),
         covariance=tuple(shaped(value * loose) for value in covariance),  # type: ignore[arg-type]
-        strays=_filled(strays, filled), known=filled(flown.known & centre.known & strays.known, False),
+        strays=_filled(strays, filled), known=filled(known.astype(float)) > 0,
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,10 +23,12 @@ _RARE = 16
 """Rare events a step, each of probability ``Plan.spare``, that are paid for; see the package."""
 _TALLEST = 3.0  # the payment for rare events takes U to be at most 4
 _SHARE = 1e-3
-_TURNS = (0.32, 0.2, 0.14, 0.1)
+_TURNS = (0.2, 0.13, 0.1, 0.08)
 """Lengths of the steps that are tried, relative to the time in which the flow turns by one radian."""
 _CELLS = ((0.7, 0.005, 0.33), (0.5, 0.0025, 0.25), (0.45, 0.002, 0.22), (0.4, 0.0016, 0.2))
 _LEAST, _MOST = 8, 2000
+
+Cells = tuple[float, float, float]
 
 
 @dataclass(slots=True)
@@ -46,7 +49,7 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     problem : Problem
         Two states in continuous time, constant noise in one of them, a bounded safe box, no time in the model.
     seconds : float
-        When to stop refining; the first attempt is finished in any case.
+        Processor time after which refining stops; the first attempt is finished in any case.
 
     Raises
     ------
@@ -64,25 +67,38 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     """
     if not seconds > 0:
         raise ValueError(f"`seconds` must be positive, got {seconds!r}.")
-    begin = time.perf_counter()
+    begin = time.process_time()
     setting = setting_of(problem)
     turn, found = _turn(setting), _Found()
     spare = 1e-9
-    for ratio, cells in zip(_TURNS, _CELLS):
+    for ratio, cells in _plans(setting, turn, found, begin + seconds):
         count = min(max(_LEAST, math.ceil(setting.horizon / (ratio * turn))), _MOST)
         plan = Plan(count=count, fine=cells[0], wide=cells[1], cell=cells[2], spare=min(spare, 0.01 / (_RARE * count)))
-        start = time.perf_counter()
-        work = count / (cells[0] * cells[2] * math.sqrt(setting.horizon / count))
-        if found.work and start - begin + 1.2 * found.spent * work / found.work > seconds:
-            break
+        start = time.process_time()
         bound = bound_by_steps(setting, plan)
+        found.work, found.spent = _work(setting, turn, ratio, cells), time.process_time() - start
         found.done.append(f"{count} steps")
-        found.work, found.spent = work, time.perf_counter() - start
         found.upper = min(found.upper, bound)
         spare = max(_SHARE * found.upper / (_RARE * count), 1e-200)
     words = f"value function along the flow, {', '.join(found.done)}"
     upper = min(0.0, math.log10(found.upper) * (1 - 1e-15) + 1e-15)
-    return ExitBounds(upper=upper, lower=None, words=words, seconds=time.perf_counter() - begin)
+    return ExitBounds(upper=upper, lower=None, words=words, seconds=time.process_time() - begin)
+
+
+def _plans(setting: Setting, turn: float, found: _Found, deadline: float) -> Iterator[tuple[float, Cells]]:
+    """The coarsest plan, and then the finest one that the time will do for."""
+    yield _TURNS[0], _CELLS[0]
+    left = deadline - time.process_time()
+    for ratio, cells in zip(_TURNS[:0:-1], _CELLS[:0:-1]):
+        if found.spent * _work(setting, turn, ratio, cells) / found.work < left:
+            yield ratio, cells
+            return
+
+
+def _work(setting: Setting, turn: float, ratio: float, cells: Cells) -> float:
+    """About in proportion to the time that a plan takes."""
+    steps = setting.horizon / (ratio * turn)
+    return float((25 + steps) / cells[2] * ratio**-0.5)  # the preparation takes about as long as 25 steps
 
 
 def bound_by_steps(setting: Setting, plan: Plan) -> float:

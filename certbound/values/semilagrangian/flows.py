@@ -3,7 +3,8 @@
 For x' = f(x) with noise along b the augmented system is (first and second derivatives by the start's coordinates)
     x' = f,  J' = Df J,  (H^i)' = Df H^i + D^2 f[J_i, J_i],  S' = Df S + S Df' + b b',  and (S^i)' = d_i of that,
 from J = 1, H = 0, S = 0: m = x(h) is the flow, J and H^i = d_ii m its derivatives, S(h) the covariance of the
-linearised noise, S^i its derivatives by the start. Taylor's formula in time with Lagrange's remainder over an a-priori box (Picard) encloses x(h).
+linearised noise, S^i its derivatives by the start. Taylor's formula in time with Lagrange's remainder over an a-priori
+box (Picard) encloses x(h).
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines
 def limited(frame: Frame, bounds: Bounds, nodal: Array, bend: Array) -> Lines:
     """Raise a function to its levels, and lower it to 1 where it is at least that all around."""
     nodal = np.maximum(nodal, bounds.level)
-    full = np.logical_and.reduce(corners(nodal >= 1))
+    full = np.minimum.reduce(corners(nodal)) >= 1
     capped = (around_nodes((~full).astype(float), largest=True) <= 0) & (bounds.level <= 1)
     nodal = np.where(capped, 1.0, nodal)
     fixed = capped | (bounds.level > 0)
@@ -92,7 +92,7 @@ def _over_strip(frame: Frame, value: Lines, j: int, q: tuple[float, float], y: t
 
 
 def start_levels(frame: Frame, safe: Mask, inner: Mask) -> Array:
-    """Least values at nodes: 1 at corners of cells that are not surely safe, 2 where a noisy face may have been crossed.
+    """Least values at nodes: 1 at corners of cells not surely safe, 2 where a noisy face may have been crossed.
 
     ``safe`` and ``inner``, shape (ny - 1, nq - 1): cells within the noise-free faces, and within the noisy ones.
     """

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
-from certbound.arrays import Array
-from certbound.values.discrete import KAPPA, axis_kernel
+from certbound.arrays import Array, Mask
+from certbound.values.discrete import KAPPA, AxisKernel, axis_kernel
 
 REACH = 10.0
 """Standard deviations beyond which smoothing neglects what it meets; the neglected mass is below 2e-23."""
@@ -104,9 +104,9 @@ def across(nodes: Array, sigma: float, spread: float, stretch: float) -> Across:
     )  # fmt: skip
 
 
-def _dense(kernel: object, name: str, columns: int, order: int = 0) -> Array:
+def _dense(kernel: AxisKernel, name: str, columns: int, order: int = 0) -> Array:
     """One matrix of an axis kernel, rows by columns."""
-    blocks = kernel.blocks  # type: ignore[attr-defined]
+    blocks = kernel.blocks
     found = np.zeros((blocks[-1].last, columns))
     for block in blocks:
         part = block.parts[name][order]
@@ -130,8 +130,8 @@ def _peak(
     def phi(z: Array) -> Array:
         return np.asarray(np.exp(-0.5 * z * z))
 
-    def holds(z: float) -> Array:
-        return (first <= z) & (last >= z) | (first <= -z) & (last >= -z)
+    def holds(z: float) -> Mask:
+        return np.asarray((first <= z) & (last >= z) | (first <= -z) & (last >= -z))
 
     zero = phi(nearest)
     one = np.maximum(np.abs(first) * phi(first), np.abs(last) * phi(last))

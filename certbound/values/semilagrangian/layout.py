@@ -12,14 +12,15 @@ from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.values.grids import Grid, graded_axis
 from certbound.values.semilagrangian.bands import Band, Frame, band_of
-from certbound.values.semilagrangian.blocks import Base, Blocks, Clock, base_of, blocks_of
+from certbound.values.semilagrangian.blocks import Blocks, Clock, base_of, blocks_of
 from certbound.values.semilagrangian.flows import flow, sheared
 from certbound.values.semilagrangian.induction import Bounds, start_levels
 from certbound.values.semilagrangian.remainders import chord_level, level_of
 from certbound.values.semilagrangian.setting import Setting
 
 _BLOCKS = (90, 40)
-_NODE_ORDER = 7
+_ORDERS = (4, 8, 7)
+"""Of Taylor's polynomials in time: for a first look, on blocks, at nodes."""
 _MOST_BANDS = 12
 _MOST_REACH = 6
 
@@ -71,13 +72,14 @@ def layout_of(setting: Setting, plan: Plan) -> Layout:
     axes = _axes(setting, clock, plan, rough)
     index, edges = zip(*(_chunks(axis, count) for axis, count in zip(axes, _BLOCKS)))
     within = _inside(clock.shear, edges[0], edges[1], p, q, whole=False)
-    blocks = blocks_of(setting, clock, edges[0], edges[1], within)
+    blocks = blocks_of(setting, clock, edges[0], edges[1], order=_ORDERS[1], wanted=within)
     usable = blocks.known & _gentle(blocks, clock, axes)
     frame, inner, safe = _frame(setting, clock, axes, blocks, usable, (index[0], index[1]))
     bands, live = _bands(frame, blocks, usable, (index[0], index[1]), clock)
     frame = replace(frame, live=live)
     level = start_levels(frame, safe & live, inner)
-    return Layout(clock=clock, frame=frame, bands=bands, bounds=Bounds(level=level, reach=_reach(blocks, clock, usable, axes)))
+    bounds = Bounds(level=level, reach=_reach(blocks, clock, usable, axes))
+    return Layout(clock=clock, frame=frame, bands=bands, bounds=bounds)
 
 
 def _clock(setting: Setting, plan: Plan) -> Clock:
@@ -90,7 +92,9 @@ def _clock(setting: Setting, plan: Plan) -> Clock:
     blocks = _rough(setting, replace(first, shear=0.0))
     known = blocks.known
     if not known.any():
-        raise InfeasibleError("the model is undefined, or its steps are too long to be enclosed; another engine's answer stands.")
+        raise InfeasibleError(
+            "the model is undefined, or steps of this length cannot be enclosed; another engine's answer stands."
+        )
     ratio = blocks.covariance[1].mid[known] / blocks.covariance[2].mid[known]
     return replace(first, shear=float(np.median(ratio)))
 
@@ -99,7 +103,8 @@ def _rough(setting: Setting, clock: Clock) -> Blocks:
     """Blocks over the safe set's bounding box in (y, q)."""
     (p0, p1), (q0, q1) = setting.faces
     away = sorted((clock.shear * q0, clock.shear * q1))
-    return blocks_of(setting, clock, np.linspace(p0 - away[1], p1 - away[0], 25), np.linspace(q0, q1, 17))
+    ends = np.linspace(p0 - away[1], p1 - away[0], 21), np.linspace(q0, q1, 15)
+    return blocks_of(setting, clock, *ends, order=_ORDERS[0])
 
 
 def _axes(setting: Setting, clock: Clock, plan: Plan, rough: Blocks) -> tuple[Array, Array]:
@@ -142,27 +147,32 @@ def _chunks(axis: Array, count: int) -> tuple[Index, Array]:
     return index, edges
 
 
-def _inside(shear: float, y: Array, q: Array, p_ends: tuple[float, float], q_ends: tuple[float, float], *, whole: bool) -> Mask:
+def _inside(
+    shear: float, y: Array, q: Array, p_ends: tuple[float, float], q_ends: tuple[float, float], *, whole: bool
+) -> Mask:
     """Boxes of y x q all of which (or some of which) lie in p_ends x q_ends."""
     ends = Interval(q[:-1], q[1:])
     p = Interval(y[:-1], y[1:])[:, None] + (ends * shear)[None]
     if whole:
-        return (p.lo >= p_ends[0]) & (p.hi <= p_ends[1]) & ((ends.lo >= q_ends[0]) & (ends.hi <= q_ends[1]))[None]
-    return (p.hi >= p_ends[0]) & (p.lo <= p_ends[1]) & ((ends.hi > q_ends[0]) & (ends.lo < q_ends[1]))[None]
+        fine = (ends.lo >= q_ends[0]) & (ends.hi <= q_ends[1])
+        return np.asarray((p.lo >= p_ends[0]) & (p.hi <= p_ends[1]) & fine[None])
+    fine = (ends.hi > q_ends[0]) & (ends.lo < q_ends[1])
+    return np.asarray((p.hi >= p_ends[0]) & (p.lo <= p_ends[1]) & fine[None])
 
 
 def _gentle(blocks: Blocks, clock: Clock, axes: tuple[Array, Array]) -> Mask:
     """Blocks whose remainder reaches a few cells at most."""
     most = blocks.strays.most
     reach = (most[0] + abs(clock.shear) * most[1], most[1])
-    return np.all([r <= _MOST_REACH * np.diff(axis).min() for r, axis in zip(reach, axes)], axis=0)
+    fine = [r <= _MOST_REACH * np.diff(axis).min() for r, axis in zip(reach, axes)]
+    return np.logical_and(*fine)
 
 
 def _reach(blocks: Blocks, clock: Clock, usable: Mask, axes: tuple[Array, Array]) -> tuple[int, int]:
     most = blocks.strays.most
     reach = (most[0] + abs(clock.shear) * most[1], most[1])
-    counts = [math.ceil(float(np.where(usable, r, 0.0).max()) / float(np.diff(axis).min()) * 1.000001) for r, axis in zip(reach, axes)]
-    return counts[0], counts[1]
+    farthest = [float(np.where(usable, r, 0.0).max()) / float(np.diff(axis).min()) for r, axis in zip(reach, axes)]
+    return math.ceil(farthest[0] * 1.000001), math.ceil(farthest[1] * 1.000001)
 
 
 def _frame(
@@ -214,7 +224,7 @@ def _within_noisy(setting: Setting, clock: Clock, axes: tuple[Array, Array], blo
             high[part] = np.minimum(high[part], high_face - inward[1, i, j] * clock.step * (1 + 1e-12))
         if box[2][i, j] <= low_face:
             low[part] = np.maximum(low[part], low_face + inward[0, i, j] * clock.step * (1 + 1e-12))
-    return (q[:-1][None] >= low[:, None]) & (q[1:][None] <= high[:, None])
+    return np.asarray((q[:-1][None] >= low[:, None]) & (q[1:][None] <= high[:, None]))
 
 
 def _images(setting: Setting, clock: Clock, y: Array, q: Array, live: Mask) -> tuple[Array, Array, Mask]:
@@ -226,13 +236,13 @@ def _images(setting: Setting, clock: Clock, y: Array, q: Array, live: Mask) -> t
         touched[a, b] |= live
     place = np.nonzero(touched)
     tape = sheared(setting.tape, clock.shear)
-    flown = flow(tape, [Interval.point(y[place[0]]), Interval.point(q[place[1]])], clock.step, _NODE_ORDER)
+    flown = flow(tape, [Interval.point(y[place[0]]), Interval.point(q[place[1]])], clock.step, _ORDERS[2])
     image, radius = np.zeros((2, *touched.shape)), np.zeros((2, *touched.shape))
     known = np.zeros(touched.shape, dtype=bool)
     known[place] = flown.known
     for axis in range(2):
-        image[(axis, *place)] = flown.end[axis].mid
-        radius[(axis, *place)] = flown.end[axis].rad
+        image[axis][place] = flown.end[axis].mid
+        radius[axis][place] = flown.end[axis].rad
     return image, radius, np.logical_and.reduce([known[a, b] for a, b in sides])
 
 
@@ -253,7 +263,8 @@ def _bands(
         alive = frame.live[a:b] & base.known[spread]
         if not alive.any():
             continue
-        band = band_of(frame, a, b, base, np.where(alive, base.excess[:, spread[0], spread[1]], 0.0), alive, clock.omega)
+        excess = np.where(alive, base.excess[:, spread[0], spread[1]], 0.0)
+        band = band_of(frame, a, b, base, excess, alive, clock.omega)
         live[a:b] = band.live
         bands.append(band)
     return bands, live

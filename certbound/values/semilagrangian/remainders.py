@@ -141,7 +141,7 @@ def remainders(
     )
 
 
-def _magnitudes(tape: Tape, tube: list[Interval]) -> tuple[Array, Array]:
+def _magnitudes(tape: Tape, tube: list[Interval]) -> tuple[Array, Mask]:
     """sup |outputs| over the boxes, shape (rows, columns, N), and where it is known."""
     found, undefined, jumps = evaluate(tape, [Interval.point(np.zeros(tube[0].lo.shape)), *tube])
     size = found.mag

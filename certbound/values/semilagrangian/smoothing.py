@@ -8,7 +8,7 @@ derivatives at the nodes) the mean is T(y, w) = sum_i E h_i(y + s_y z) V_i(w). E
 - over a cell of the q-axis a function g differs from its values at the ends by at most D^2/8 sup |g''|; for -V_i'' and
   the slopes' derivatives S_i' (S_i = (V_{i+1} - V_i)/D_i) that supremum is a sum over kinks of L_i:
   V'''' = sum kappa_j phi'' - sum b_j int phi'', and so on with |phi'|, |phi| for lower orders;
-- d_yy T = sum_i K_i(w) phi(y - y_i), K_i = S_i - S_{i-1}; the rows' own kinks are KW_k = sum_i E h_k(y_i + s z) K_i, and
+- d_yy T = sum_i K_i(w) phi(y - y_i), K_i = S_i - S_{i-1}; the rows' own kinks are KW_k = sum_i E h_k(y_i + s z) K_i;
   between the rows T <= linear interpolation + (D_k/4) sum_i (-K_i)^+ P(y_i + s z in cell k);
 - d_ww T, |d_yw T|, |d_yy T| lie below sums with non-negative coefficients of densities or masses at kinks and cells:
   sum_i ceiling_ki sum_j (kappa_ij^+ + (-b_ij)^+ D_j) phi, sum_i mass_ki sum_j sup |d_q S_i| P, sum_i density_ki sum_j

@@ -3,9 +3,9 @@
 With phi0 = (linear interpolation between rows) o m, m the flow, a path x(tau), tau in [0, 1], along a side of a cell
 has the image (y(tau), w(tau)) and, in the sense of distributions,
     -phi0'' <= (-W'') w_t^2 - 2 X y_t w_t + |W_y| |y_tt| + |W_w| |w_tt| + sum_k (-KW_k)^+ |y_t| delta(tau - tau_k),
-tau_k where the path crosses the row Y_k. A measure's part exceeds phi0's chord by int G(tau, .): at most tau (1 - tau)/2
-times a bound of the density, and 1/4 a unit of mass; where y_t may vanish a kink exceeds the chord by at most its slope
-times the range of y. Along q the density goes into the parabola, along y it is paid as a constant.
+tau_k where the path crosses the row Y_k. phi0 exceeds its chord by int G(tau, .) of that: at most tau (1 - tau)/2 times
+a bound of the density, and 1/4 a unit of mass; where y_t may vanish a kink exceeds the chord by at most its slope times
+the range of y. Along q the density goes into the parabola, along y it is paid as a constant.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _kinked(window: Index, kinks: Array, mesh: Array, longest: float) -> float:
         least = min(least, mesh[k + 1] - mesh[k])
     if largest == 0.0:
         return 0.0
-    return min(total, largest * (1 + np.floor(longest / least * 1.000001)))
+    return float(min(total, largest * (1 + np.floor(longest / least * 1.000001))))
 
 
 @njit(cache=True)

