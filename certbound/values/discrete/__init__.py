@@ -6,9 +6,8 @@ after the noise, as a function of where the noise-free step ends), ``steps`` (th
 ``induction`` (one step back), ``failures`` (the answer, refined until it is good).
 """
 
-from certbound.values.discrete.dominance import KAPPA
 from certbound.values.discrete.failures import FailureBounds, bound_failure
 from certbound.values.discrete.kernels import AxisKernel, axis_kernel
 from certbound.values.discrete.steps import evaluate
 
-__all__ = ["FailureBounds", "KAPPA", "AxisKernel", "axis_kernel", "bound_failure", "evaluate"]
+__all__ = ["AxisKernel", "FailureBounds", "axis_kernel", "bound_failure", "evaluate"]

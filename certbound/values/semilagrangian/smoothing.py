@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.values.semilagrangian.kernels import Across, Along
+from certbound.values.semilagrangian.smoothers import Across, Along
 
 _UP = 1 + 1e-9
 

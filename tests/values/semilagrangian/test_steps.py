@@ -14,13 +14,14 @@ import certbound as cb
 from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.rigor.intervals import Interval
+from certbound.values.discrete.dominance import KAPPA
+from certbound.values.semilagrangian.backward import Bounds, back, limited
 from certbound.values.semilagrangian.bands import Frame
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
-from certbound.values.semilagrangian.induction import Bounds, back, limited
-from certbound.values.semilagrangian.kernels import across, along
-from certbound.values.semilagrangian.layout import Plan, layout_of
+from certbound.values.semilagrangian.groundwork import Plan, layout_of
 from certbound.values.semilagrangian.remainders import chord_level, level_of, remainders, upper_tail
 from certbound.values.semilagrangian.setting import serves, setting_of
+from certbound.values.semilagrangian.smoothers import WIDER, across, along
 from certbound.values.semilagrangian.smoothing import Lines, smoothed
 
 
@@ -227,6 +228,10 @@ def reading(frame: Frame, value: Lines, y, q):
         (1 - s) * value.nodal[k, j] + s * value.nodal[k, j + 1] + arch * value.bend[k, j] for k in (i, i + 1)
     )
     return (1 - t) * low + t * high
+
+
+def test_the_dominating_density_is_wide_enough_for_the_kernels() -> None:
+    assert WIDER >= KAPPA
 
 
 def test_values_are_cut_down_to_one_only_where_all_around_is_at_least_one() -> None:

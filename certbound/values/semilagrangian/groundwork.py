@@ -11,10 +11,10 @@ from certbound.arrays import Array, Index, Mask
 from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.values.grids import Grid, graded_axis
+from certbound.values.semilagrangian.backward import Bounds, start_levels
 from certbound.values.semilagrangian.bands import Band, Frame, band_of
-from certbound.values.semilagrangian.blocks import Blocks, Clock, base_of, blocks_of
 from certbound.values.semilagrangian.flows import flow, sheared
-from certbound.values.semilagrangian.induction import Bounds, start_levels
+from certbound.values.semilagrangian.local_steps import Blocks, Clock, base_of, blocks_of
 from certbound.values.semilagrangian.remainders import chord_level, level_of
 from certbound.values.semilagrangian.setting import Setting
 
@@ -165,7 +165,7 @@ def _gentle(blocks: Blocks, clock: Clock, axes: tuple[Array, Array]) -> Mask:
     most = blocks.strays.most
     reach = (most[0] + abs(clock.shear) * most[1], most[1])
     fine = [r <= _MOST_REACH * np.diff(axis).min() for r, axis in zip(reach, axes)]
-    return np.logical_and(*fine)
+    return np.asarray(fine[0] & fine[1])
 
 
 def _reach(blocks: Blocks, clock: Clock, usable: Mask, axes: tuple[Array, Array]) -> tuple[int, int]:

@@ -23,12 +23,12 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from certbound.arrays import Array, Mask
-from certbound.values.discrete import KAPPA, AxisKernel, axis_kernel
+from certbound.values.discrete import AxisKernel, axis_kernel
 
 REACH = 10.0
 """Standard deviations beyond which smoothing neglects what it meets; the neglected mass is below 2e-23."""
-WIDER = KAPPA + 0.1
-"""Ratio of the standard deviations of the dominating density and of the noise: phi_{KAPPA s} <= 1.08 phi_{WIDER s}."""
+WIDER = 1.4
+"""Ratio of the standard deviations of the dominating density and of the noise; at least that of ``axis_kernel``."""
 _ROUND = 1 + 1e-9
 
 
