@@ -42,6 +42,7 @@ tubes.exact
 tubes
 values
 values.continuous values.discrete
+values.semilagrangian
 simulation.compiled
 simulation
 simulation.estimates

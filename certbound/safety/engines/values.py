@@ -11,6 +11,7 @@ from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.values.continuous import ExitBounds, bound_exits
 from certbound.values.discrete import FailureBounds, bound_failure
+from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
 
 _SECONDS = 20.0  # about what may be spent
@@ -28,6 +29,8 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         return EngineAnswer(applicable=False, method="values", reason="left out, since another engine has answered.")
     limit = max(min(_SECONDS if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
     try:
+        if serves(problem):
+            return _continuous(bound_exits_by_steps(problem, seconds=limit))
         if not isinstance(problem.system, DiscreteSystem):
             return _continuous(bound_exits(problem, seconds=limit))
         found = bound_failure(problem, seconds=limit, delta=problem.delta)

@@ -4,5 +4,6 @@
 """
 
 from certbound.values.continuous.exits import ExitBounds, bound_exits, chart_exits
+from certbound.values.continuous.room import safe_room, starts_of
 
-__all__ = ["ExitBounds", "bound_exits", "chart_exits"]
+__all__ = ["ExitBounds", "bound_exits", "chart_exits", "safe_room", "starts_of"]

@@ -7,5 +7,7 @@ after the noise, as a function of where the noise-free step ends), ``steps`` (th
 """
 
 from certbound.values.discrete.failures import FailureBounds, bound_failure, chart_failures
+from certbound.values.discrete.kernels import AxisKernel, axis_kernel
+from certbound.values.discrete.steps import evaluate
 
-__all__ = ["FailureBounds", "bound_failure", "chart_failures"]
+__all__ = ["AxisKernel", "FailureBounds", "axis_kernel", "bound_failure", "chart_failures", "evaluate"]

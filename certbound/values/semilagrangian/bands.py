@@ -1,0 +1,177 @@
+"""A band of cells between two lines of the grid, with the normal law that all of them share in one step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from certbound.arrays import Array, Mask
+from certbound.values.semilagrangian.images import along_q, at_nodes, over_cells
+from certbound.values.semilagrangian.local_steps import Base
+from certbound.values.semilagrangian.smoothers import REACH, WIDER, Across, Along, across, along
+from certbound.values.semilagrangian.smoothing import Lines, Rows, smoothed
+
+_UP = 1 + 1e-9
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Frame:
+    """The grid of (y, q), and what one noise-free step does to its nodes and cells.
+
+    Attributes
+    ----------
+    y, q : ndarray, shapes (ny,), (nq,)
+        Nodes.
+    image, radius : ndarray, shape (2, ny, nq)
+        Where nodes land, and how well that is known.
+    slopes, bends : ndarray, shape (4, ny - 1, nq - 1)
+        See ``Blocks``, on cells.
+    drift : ndarray, shape (2, ny - 1, nq - 1)
+        Mean sizes of the remainder in y and q, ``Remainders.mean`` in these coordinates.
+    live : ndarray of bool, shape (ny - 1, nq - 1)
+        Cells that lie in the safe set, for which all of this is known.
+    """
+
+    y: Array
+    q: Array
+    image: Array
+    radius: Array
+    slopes: Array
+    bends: Array
+    drift: Array
+    live: Mask
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Band:
+    """Cells ``first:last`` along y; see the module."""
+
+    first: int
+    last: int
+    rows: slice
+    lines: slice
+    one: Along
+    two: Across
+    reach: Array
+    prices: Array
+    live: Mask
+    error: float
+
+
+def band_of(frame: Frame, first: int, last: int, base: Base, excess: Array, live: Mask, follow: float) -> Band:
+    """Prepare a band.
+
+    Parameters
+    ----------
+    first, last : int
+        Its cells along y.
+    base, excess : Base, ndarray of shape (3, last - first, nq - 1)
+        The shared law, and D on the band's cells.
+    live : ndarray of bool, shape (last - first, nq - 1)
+    follow : float
+        Standard deviations up to which D's effect is followed.
+    """
+    sigma = base.sigma
+    reach = follow * np.sqrt(excess[0]) * _UP
+    rows = _rows(frame, first, last, live, reach)
+    mesh = frame.y[rows]
+    margin = (REACH + 0.1) * sigma[0]
+    start = int(np.searchsorted(frame.y, mesh[0] - margin, side="right")) - 1
+    stop = int(np.searchsorted(frame.y, mesh[-1] + margin)) + 1
+    lines = slice(max(start, 0), min(stop, len(frame.y)))
+    live = live & _far_from_ends(frame, first, last, sigma, (float(mesh[0]) - margin, float(mesh[-1]) + margin))
+    one = along(frame.y, sigma[0], 1e-15, rows, lines)
+    wider = float(np.where(live, excess[2], 0.0).max(initial=0.0)) / sigma[1] ** 2
+    two = across(frame.q, sigma[1], 1e-15, math.sqrt(1 + wider) * _UP)
+    share = float(np.where(live, excess[0] / sigma[0] ** 2 + excess[2] / sigma[1] ** 2, 0.0).max(initial=0.0))
+    c = 0.5 * (1 - (1 + share) / WIDER**2)
+    factor = WIDER**2 * math.exp(c - 1) / c * _UP if c > 0.02 else math.inf
+    if not math.isfinite(factor):
+        live = np.zeros_like(live)
+        factor = 0.0
+    drift = frame.drift[:, first:last] * factor
+    prices = np.stack([excess[2] / 2, excess[1], excess[0] / 2, drift[0], drift[1]]) * _UP
+    error = 300 * (one.error + two.error + 1e-13)
+    return Band(
+        first=first, last=last, rows=rows, lines=lines, one=one, two=two, reach=reach, prices=prices, live=live,
+        error=error,
+    )  # fmt: skip
+
+
+def _far_from_ends(
+    frame: Frame, first: int, last: int, sigma: tuple[float, float], needed: tuple[float, float]
+) -> Mask:
+    """Cells from whose images the smoothing does not look beyond the grid."""
+    fine = frame.y[0] <= needed[0] and needed[1] <= frame.y[-1]
+    d = np.diff(frame.y)[first:last, None]
+    sag = frame.bends[1, first:last] * d**2 / 8 + frame.bends[3, first:last] * np.diff(frame.q) ** 2 / 8
+    found = np.full(sag.shape, fine)
+    image, radius = frame.image[1, first : last + 1], frame.radius[1, first : last + 1]
+    for a in (slice(None, -1), slice(1, None)):
+        for b in (slice(None, -1), slice(1, None)):
+            away = radius[a, b] + sag + REACH * sigma[1]
+            found &= (image[a, b] - away >= frame.q[0]) & (image[a, b] + away <= frame.q[-1])
+    return found
+
+
+def _rows(frame: Frame, first: int, last: int, live: Mask, reach: Array) -> slice:
+    """The mesh's rows that the band's windows touch, and one more on either side."""
+    d = np.diff(frame.y)[first:last, None]
+    sag = frame.bends[0, first:last] * d**2 / 8 + frame.bends[2, first:last] * np.diff(frame.q) ** 2 / 8
+    low, high = np.inf, -np.inf
+    image, radius = frame.image[0, first : last + 1], frame.radius[0, first : last + 1]
+    for a in (slice(None, -1), slice(1, None)):
+        for b in (slice(None, -1), slice(1, None)):
+            away = radius[a, b] + sag + reach
+            low = min(low, float(np.where(live, image[a, b] - away, np.inf).min()))
+            high = max(high, float(np.where(live, image[a, b] + away, -np.inf).max()))
+    start = int(np.searchsorted(frame.y, low)) - 2
+    stop = int(np.searchsorted(frame.y, high)) + 2
+    return slice(max(start, 1), min(stop + 1, len(frame.y) - 1))
+
+
+def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+    """One step back on the band: node values, parabolas of its lines, and what its cells pay.
+
+    Returns
+    -------
+    nodal, bend : ndarray, shapes (cells + 1, nq), (cells + 1, nq - 1)
+    payment : ndarray, shape (cells, nq - 1)
+    """
+    lines, rows = band.lines, frame.y[band.rows]
+    inner = slice(lines.start, lines.stop - 1)
+    part = Lines(nodal=value.nodal[lines], bend=value.bend[lines])
+    found = smoothed(
+        part, (slopes[0][inner], slopes[1][inner]), frame.y[lines], rows, frame.q, band.one, band.two
+    )
+    nodes, cells = slice(band.first, band.last + 1), slice(band.first, band.last)
+    image, radius = frame.image[:, nodes], frame.radius[:, nodes]
+    tables = np.stack([found.cross_low, found.cross_high, found.steep_y, found.steep_w])
+    wanted = _touched(band.live)
+    nodal = at_nodes(image, radius, wanted, rows, frame.q, found.values, found.bend, tables[2:])
+    dq = np.diff(frame.q)
+    bend, extra = along_q(
+        image, radius, band.live, frame.bends[2:, cells], dq, rows, frame.q, tables, found.bend, found.kinks
+    )
+    wide = np.stack([found.bent, found.mixed, found.bowed])
+    close = np.stack([found.lean_y, found.lean_q, found.lift, _dominated(found, band.error)])
+    payment = over_cells(
+        image, radius, band.live, frame.slopes[:, cells], frame.bends[:, cells], (np.diff(frame.y)[cells], dq), rows,
+        frame.q, tables, found.bend, found.kinks, band.reach, band.prices, wide, close,
+    )  # fmt: skip
+    payment += np.maximum(extra[:-1], extra[1:])
+    return nodal, bend, payment * _UP
+
+
+def _dominated(found: Rows, error: float) -> Array:
+    return np.asarray(found.near * error + 1e-20)
+
+
+def _touched(live: Mask) -> Mask:
+    found = np.zeros((live.shape[0] + 1, live.shape[1] + 1), dtype=bool)
+    for a in (slice(None, -1), slice(1, None)):
+        for b in (slice(None, -1), slice(1, None)):
+            found[a, b] |= live
+    return found

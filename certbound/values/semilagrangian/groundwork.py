@@ -1,0 +1,295 @@
+"""The grid, the bands and the levels for one length of the steps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from certbound.arrays import Array, Index, Mask
+from certbound.errors import InfeasibleError
+from certbound.rigor.intervals import Interval
+from certbound.values.grids import Grid, graded_axis
+from certbound.values.semilagrangian.backward import Bounds, start_levels
+from certbound.values.semilagrangian.bands import Band, Frame, band_of
+from certbound.values.semilagrangian.flows import flow, sheared
+from certbound.values.semilagrangian.local_steps import Blocks, Clock, base_of, blocks_of
+from certbound.values.semilagrangian.remainders import chord_level, level_of
+from certbound.values.semilagrangian.setting import Setting
+
+_BLOCKS = (90, 40)
+_ORDERS = (4, 8, 7)
+"""Of Taylor's polynomials in time: for a first look, on blocks, at nodes."""
+_MOST_BANDS = 12
+_MOST_REACH = 6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Plan:
+    """How fine: steps, and the cells' sizes.
+
+    Attributes
+    ----------
+    count : int
+        Steps.
+    fine, wide : float
+        Cells along y at the faces, in units of sigma_y, and the most anywhere, in units of the safe set's width.
+    cell : float
+        Cells along q, in units of sigma_q.
+    spare : float
+        Probability per step that may be paid for each rare event.
+    """
+
+    count: int
+    fine: float
+    wide: float
+    cell: float
+    spare: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Layout:
+    """All that an induction needs."""
+
+    clock: Clock
+    frame: Frame
+    bands: list[Band]
+    bounds: Bounds
+
+
+def layout_of(setting: Setting, plan: Plan) -> Layout:
+    """Prepare the steps.
+
+    Raises
+    ------
+    InfeasibleError
+        The noise hardly reaches the other coordinate, so that steps along the flow have nothing to smooth with.
+    """
+    clock = _clock(setting, plan)
+    p, q = setting.faces
+    rough = _rough(setting, clock)
+    axes = _axes(setting, clock, plan, rough)
+    index, edges = zip(*(_chunks(axis, count) for axis, count in zip(axes, _BLOCKS)))
+    within = _inside(clock.shear, edges[0], edges[1], p, q, whole=False)
+    blocks = blocks_of(setting, clock, edges[0], edges[1], order=_ORDERS[1], wanted=within)
+    usable = blocks.known & _gentle(blocks, clock, axes)
+    frame, inner, safe = _frame(setting, clock, axes, blocks, usable, (index[0], index[1]))
+    bands, live = _bands(frame, blocks, usable, (index[0], index[1]), clock)
+    frame = replace(frame, live=live)
+    level = start_levels(frame, safe & live, inner)
+    bounds = Bounds(level=level, reach=_reach(blocks, clock, usable, axes))
+    return Layout(clock=clock, frame=frame, bands=bands, bounds=bounds)
+
+
+def _clock(setting: Setting, plan: Plan) -> Clock:
+    omega = level_of(plan.spare)
+    step = setting.horizon / plan.count
+    first = Clock(
+        step=step * (1 + 1e-15), count=plan.count, shear=step / 2, omega=omega,
+        chord=chord_level(plan.spare, omega),
+    )  # fmt: skip
+    blocks = _rough(setting, replace(first, shear=0.0))
+    known = blocks.known
+    if not known.any():
+        raise InfeasibleError(
+            "the model is undefined, or steps of this length cannot be enclosed; another engine's answer stands."
+        )
+    ratio = blocks.covariance[1].mid[known] / blocks.covariance[2].mid[known]
+    return replace(first, shear=float(np.median(ratio)))
+
+
+def _rough(setting: Setting, clock: Clock) -> Blocks:
+    """Blocks over the safe set's bounding box in (y, q)."""
+    (p0, p1), (q0, q1) = setting.faces
+    away = sorted((clock.shear * q0, clock.shear * q1))
+    ends = np.linspace(p0 - away[1], p1 - away[0], 21), np.linspace(q0, q1, 15)
+    return blocks_of(setting, clock, *ends, order=_ORDERS[0])
+
+
+def _axes(setting: Setting, clock: Clock, plan: Plan, rough: Blocks) -> tuple[Array, Array]:
+    (p0, p1), (q0, q1) = setting.faces
+    known = rough.known
+    yy, qq = rough.covariance[0].mid, rough.covariance[2].mid
+    sigma = math.sqrt(max(float(np.median(yy[known])), 0.0)), math.sqrt(float(np.median(qq[known])))
+    if not sigma[0] > 1e-7 * (p1 - p0):
+        raise InfeasibleError(
+            "the noise hardly reaches the coordinate without noise; another engine's answer stands."
+        )
+    dip = rough.strays.dip[:, known]
+    p0, p1 = p0 + float(np.median(dip[0])), p1 - float(np.median(dip[1]))
+    away = sorted((clock.shear * q0, clock.shear * q1))
+    tube = rough.strays.tube
+    keep = known
+    ends = [float(tube[0].lo[keep].min()), float(tube[0].hi[keep].max())]
+    tall = [float(tube[1].lo[keep].min()), float(tube[1].hi[keep].max())]
+    slant = sorted((clock.shear * tall[0], clock.shear * tall[1]))
+    low = min(ends[0] - slant[1], p0 - away[1]) - 13 * sigma[0]
+    high = max(ends[1] - slant[0], p1 - away[0]) + 13 * sigma[0]
+    places = np.linspace(low, high, 4001)
+    gap = np.minimum(*(np.maximum(np.maximum(f - away[1] - places, places - f + away[0]), 0.0) for f in (p0, p1)))
+    wanted = np.minimum(plan.fine * sigma[0] + 0.1 * gap, plan.wide * (p1 - p0))
+    y = graded_axis(low, high, places, np.maximum(wanted, 1e-12))
+    count = max(8, math.ceil((q1 - q0) / (plan.cell * sigma[1])))
+    core = np.linspace(q0, q1, count + 1)
+    beyond = 11 * sigma[1] + max(q0 - tall[0], tall[1] - q1, 0.0)
+    steps = np.cumsum(np.minimum(plan.cell * 1.35 ** np.arange(1, 60), 1.6)) * sigma[1]
+    steps = steps[: int(np.searchsorted(steps, beyond)) + 1]
+    return y, np.concatenate([q0 - steps[::-1], core, q1 + steps])
+
+
+def _chunks(axis: Array, count: int) -> tuple[Index, Array]:
+    """Block of every cell, and the blocks' edges."""
+    cells = len(axis) - 1
+    share = (np.arange(cells) / cells + (axis[:-1] - axis[0]) / (axis[-1] - axis[0])) / 2
+    index = np.unique(np.floor(share * count), return_inverse=True)[1].reshape(-1)
+    edges = axis[np.append(np.flatnonzero(np.diff(index, prepend=-1)), cells)]
+    return index, edges
+
+
+def _inside(
+    shear: float, y: Array, q: Array, p_ends: tuple[float, float], q_ends: tuple[float, float], *, whole: bool
+) -> Mask:
+    """Boxes of y x q all of which (or some of which) lie in p_ends x q_ends."""
+    ends = Interval(q[:-1], q[1:])
+    p = Interval(y[:-1], y[1:])[:, None] + (ends * shear)[None]
+    if whole:
+        fine = (ends.lo >= q_ends[0]) & (ends.hi <= q_ends[1])
+        return np.asarray((p.lo >= p_ends[0]) & (p.hi <= p_ends[1]) & fine[None])
+    fine = (ends.hi > q_ends[0]) & (ends.lo < q_ends[1])
+    return np.asarray((p.hi >= p_ends[0]) & (p.lo <= p_ends[1]) & fine[None])
+
+
+def _gentle(blocks: Blocks, clock: Clock, axes: tuple[Array, Array]) -> Mask:
+    """Blocks whose remainder reaches a few cells at most."""
+    most = blocks.strays.most
+    reach = (most[0] + abs(clock.shear) * most[1], most[1])
+    fine = [r <= _MOST_REACH * np.diff(axis).min() for r, axis in zip(reach, axes)]
+    return np.asarray(fine[0] & fine[1])
+
+
+def _reach(blocks: Blocks, clock: Clock, usable: Mask, axes: tuple[Array, Array]) -> tuple[int, int]:
+    most = blocks.strays.most
+    reach = (most[0] + abs(clock.shear) * most[1], most[1])
+    farthest = [float(np.where(usable, r, 0.0).max()) / float(np.diff(axis).min()) for r, axis in zip(reach, axes)]
+    return math.ceil(farthest[0] * 1.000001), math.ceil(farthest[1] * 1.000001)
+
+
+def _frame(
+    setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask, index: tuple[Index, Index]
+) -> tuple[Frame, Mask, Mask]:
+    """The frame, and the cells surely within the noisy faces, and within the others."""
+    y, q = axes
+    spread = np.ix_(*index)
+    dips = blocks.strays.dip
+    touched = [float(np.where(usable, d, 0.0).max()) for d in dips]
+    p, faces = setting.faces
+    dip = _dips(blocks, usable, clock, p, touched)
+    safe = _inside(clock.shear, y, q, (p[0] + dip[0], p[1] - dip[1]), (-np.inf, np.inf), whole=True)
+    inner = _within_noisy(setting, clock, axes, blocks, usable)
+    live = safe & usable[spread] & ((q[:-1] >= faces[0]) & (q[1:] <= faces[1]))[None]
+    image, radius, known = _images(setting, clock, y, q, live)
+    live &= known
+    mean = blocks.strays.mean
+    drift = np.stack([mean[0] + abs(clock.shear) * mean[1], mean[1]])
+    zero = np.where(usable, 1.0, 0.0)
+    frame = Frame(
+        y=y, q=q, image=image, radius=radius, slopes=(blocks.slopes * zero)[:, spread[0], spread[1]],
+        bends=(blocks.bends * zero)[:, spread[0], spread[1]], drift=(drift * zero)[:, spread[0], spread[1]], live=live,
+    )  # fmt: skip
+    return frame, inner, safe
+
+
+def _dips(blocks: Blocks, usable: Mask, clock: Clock, p: tuple[float, float], most: list[float]) -> tuple[float, float]:
+    """How far the noise-free faces move inward: the largest dip of the blocks whose tube may meet a face."""
+    low, high = blocks.strays.tube[0].lo, blocks.strays.tube[0].hi
+    dips = blocks.strays.dip
+    near = (usable & (low <= p[0] + most[0]), usable & (high >= p[1] - most[1]))
+    return float(np.where(near[0], dips[0], 0.0).max()), float(np.where(near[1], dips[1], 0.0).max())
+
+
+def _within_noisy(setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask) -> Mask:
+    """Cells where no path ends that has crossed a noisy face in the step and had its share of noise outward since."""
+    y, q = axes
+    low_face, high_face = setting.faces[1]
+    tubes = blocks.strays.tube
+    low, high = np.full(len(y) - 1, low_face), np.full(len(y) - 1, high_face)
+    inward = blocks.strays.inward
+    around = tubes[0] - tubes[1] * clock.shear
+    box = (around.lo, around.hi, tubes[1].lo, tubes[1].hi)
+    for i, j in zip(*np.nonzero(usable)):
+        first, last = np.searchsorted(y, box[0][i, j], side="right") - 1, np.searchsorted(y, box[1][i, j])
+        part = slice(max(int(first), 0), int(last))
+        if box[3][i, j] >= high_face:
+            high[part] = np.minimum(high[part], high_face - inward[1, i, j] * clock.step * (1 + 1e-12))
+        if box[2][i, j] <= low_face:
+            low[part] = np.maximum(low[part], low_face + inward[0, i, j] * clock.step * (1 + 1e-12))
+    return np.asarray((q[:-1][None] >= low[:, None]) & (q[1:][None] <= high[:, None]))
+
+
+def _images(setting: Setting, clock: Clock, y: Array, q: Array, live: Mask) -> tuple[Array, Array, Mask]:
+    """Images of the nodes of live cells, their radii, and the cells all of whose nodes are known."""
+    grid = Grid(axes=(y, q))
+    touched = np.zeros(grid.node_shape, dtype=bool)
+    sides = [(a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None))]
+    for a, b in sides:
+        touched[a, b] |= live
+    place = np.nonzero(touched)
+    tape = sheared(setting.tape, clock.shear)
+    flown = flow(tape, [Interval.point(y[place[0]]), Interval.point(q[place[1]])], clock.step, _ORDERS[2])
+    image, radius = np.zeros((2, *touched.shape)), np.zeros((2, *touched.shape))
+    known = np.zeros(touched.shape, dtype=bool)
+    known[place] = flown.known
+    for axis in range(2):
+        image[axis][place] = flown.end[axis].mid
+        radius[axis][place] = flown.end[axis].rad
+    return image, radius, np.logical_and.reduce([known[a, b] for a, b in sides])
+
+
+def _bands(
+    frame: Frame, blocks: Blocks, usable: Mask, index: tuple[Index, Index], clock: Clock
+) -> tuple[list[Band], Mask]:
+    """Bands between which the covariance changes little, and the cells for which a band was found."""
+    live = np.zeros_like(frame.live)
+    bands = []
+    for first, last in _groups(blocks, usable):
+        part = usable.copy()
+        part[:first] = False
+        part[last:] = False
+        base = base_of(blocks, part)
+        cells = np.flatnonzero((index[0] >= first) & (index[0] < last))
+        a, b = int(cells[0]), int(cells[-1]) + 1
+        spread = np.ix_(index[0][a:b], index[1])
+        alive = frame.live[a:b] & base.known[spread]
+        if not alive.any():
+            continue
+        excess = np.where(alive, base.excess[:, spread[0], spread[1]], 0.0)
+        band = band_of(frame, a, b, base, excess, alive, clock.omega)
+        live[a:b] = band.live
+        bands.append(band)
+    return bands, live
+
+
+def _groups(blocks: Blocks, usable: Mask) -> list[tuple[int, int]]:
+    """Rows of blocks, taken together while S_qq differs by little; at most `_MOST_BANDS` groups."""
+    qq = blocks.covariance[2].mid
+    rows = np.flatnonzero(usable.any(axis=1))
+    if not len(rows):
+        raise InfeasibleError("no part of the safe set could be followed over a step; another engine's answer stands.")
+    middle = np.array([float(np.median(line[keep])) if keep.any() else 0.0 for line, keep in zip(qq, usable)])
+    tolerance = 5e-4
+    while True:
+        groups: list[tuple[int, int]] = []
+        start, least, most = int(rows[0]), np.inf, -np.inf
+        for row in range(int(rows[0]), int(rows[-1]) + 1):
+            if not usable[row].any():
+                continue
+            a, b = min(least, middle[row]), max(most, middle[row])
+            if b > a * (1 + tolerance) and row > start:
+                groups.append((start, row))
+                start, a, b = row, middle[row], middle[row]
+            least, most = a, b
+        groups.append((start, int(rows[-1]) + 1))
+        if len(groups) <= _MOST_BANDS:
+            return groups
+        tolerance *= 1.5

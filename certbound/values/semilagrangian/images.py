@@ -1,0 +1,202 @@
+"""The smoothed function at the images of nodes and over the images of cells, compiled.
+
+With phi0 = (linear interpolation between rows) o m, m the flow, a path x(tau), tau in [0, 1], along a side of a cell
+has the image (y(tau), w(tau)) and, in the sense of distributions,
+    -phi0'' <= (-W'') w_t^2 - 2 X y_t w_t + |W_y| |y_tt| + |W_w| |w_tt| + sum_k (-KW_k)^+ |y_t| delta(tau - tau_k),
+tau_k where the path crosses the row Y_k. phi0 exceeds its chord by int G(tau, .) of that: at most tau (1 - tau)/2 times
+a bound of the density, and 1/4 a unit of mass; where y_t may vanish a kink exceeds the chord by at most its slope times
+the range of y. Along q the density goes into the parabola, along y it is paid as a constant.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from certbound.arrays import Array, Index, Mask
+
+
+@njit(cache=True)
+def _cell_of(axis: Array, place: float) -> int:
+    low, high = 0, len(axis) - 2
+    while low < high:
+        middle = (low + high + 1) // 2
+        if axis[middle] <= place:
+            low = middle
+        else:
+            high = middle - 1
+    return low
+
+
+@njit(cache=True)
+def _density(window: Index, tables: Array, rates: Array, bend: Array) -> float:
+    """sup of the density over a window; ``tables`` cross_low, cross_high, steep_y, steep_w; ``rates`` y_t, w_t ranges.
+
+    The last two of ``rates`` are bounds of |y_tt| and |w_tt|.
+    """
+    y0, y1, w0, w1 = rates[0], rates[1], rates[2], rates[3]
+    largest = max(abs(w0), abs(w1)) ** 2
+    smallest = 0.0 if w0 <= 0.0 <= w1 else min(abs(w0), abs(w1)) ** 2
+    p = min(min(y0 * w0, y0 * w1), min(y1 * w0, y1 * w1))
+    r = max(max(y0 * w0, y0 * w1), max(y1 * w0, y1 * w1))
+    best = -np.inf
+    for k in range(window[0], window[1] + 1):
+        for c in range(window[2], window[3] + 1):
+            b = max(bend[k, c], bend[k + 1, c])
+            a, d = tables[0, k, c], tables[1, k, c]
+            mixed = min(min(a * p, a * r), min(d * p, d * r))
+            total = (b * largest if b > 0 else b * smallest) - 2 * mixed
+            total += tables[2, k, c] * rates[4] + tables[3, k, c] * rates[5]
+            best = max(best, total)
+    return best
+
+
+@njit(cache=True)
+def _kinked(window: Index, kinks: Array, mesh: Array, longest: float) -> float:
+    """Upper bound of the sum of the kinks that a path of that length in y crosses within a window."""
+    total, largest, least = 0.0, 0.0, np.inf
+    for k in range(window[0] + 1, window[1] + 1):
+        most = 0.0
+        for c in range(window[2], window[3] + 1):
+            most = max(most, kinks[k, c])
+        total += most
+        largest = max(largest, most)
+        least = min(least, mesh[k + 1] - mesh[k])
+    if largest == 0.0:
+        return 0.0
+    return float(min(total, largest * (1 + np.floor(longest / least * 1.000001))))
+
+
+@njit(cache=True)
+def _window(mesh: Array, q: Array, y0: float, y1: float, w0: float, w1: float) -> Index:
+    found = np.empty(4, dtype=np.intp)
+    found[0], found[1] = _cell_of(mesh, y0), _cell_of(mesh, y1)
+    found[2], found[3] = _cell_of(q, w0), _cell_of(q, w1)
+    return found
+
+
+@njit(cache=True)
+def at_nodes(
+    image: Array, radius: Array, wanted: Mask, mesh: Array, q: Array, values: Array, bend: Array, steep: Array
+) -> Array:
+    """phi0 at the images, from above; ``image`` and ``radius`` (2, nx, nq), ``steep`` (2, rows - 1, nq - 1)."""
+    found = np.zeros(wanted.shape)
+    for i in range(wanted.shape[0]):
+        for j in range(wanted.shape[1]):
+            if not wanted[i, j]:
+                continue
+            y, w = image[0, i, j], image[1, i, j]
+            k, c = _cell_of(mesh, y), _cell_of(q, w)
+            d = q[c + 1] - q[c]
+            t = min(max((y - mesh[k]) / (mesh[k + 1] - mesh[k]), 0.0), 1.0)
+            s = min(max((w - q[c]) / d, 0.0), 1.0)
+            arch = s * (1 - s) * d * d / 2
+            low = (1 - s) * values[k, c] + s * values[k, c + 1] + arch * bend[k, c]
+            high = (1 - s) * values[k + 1, c] + s * values[k + 1, c + 1] + arch * bend[k + 1, c]
+            near_y, near_w = 0.0, 0.0
+            for a in range(max(k - 1, 0), min(k + 2, steep.shape[1])):
+                for e in range(max(c - 1, 0), min(c + 2, steep.shape[2])):
+                    near_y, near_w = max(near_y, steep[0, a, e]), max(near_w, steep[1, a, e])
+            found[i, j] = (1 - t) * low + t * high + radius[0, i, j] * near_y + radius[1, i, j] * near_w
+    return found
+
+
+@njit(cache=True)
+def along_q(
+    image: Array, radius: Array, live: Mask, bends: Array, dq: Array, mesh: Array, q: Array, tables: Array,
+    bend: Array, kinks: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Per line and cell of the q-axis: the parabola's coefficient and the constant for kinks.
+
+    ``live`` (cells, nq - 1); ``bends`` (2, cells, nq - 1): |d_qq m|; lines are the cells' ends.
+    """
+    lines, columns = image.shape[1], image.shape[2] - 1
+    curve, extra = np.zeros((lines, columns)), np.zeros((lines, columns))
+    rates = np.empty(6)
+    for i in range(lines):
+        for j in range(columns):
+            below, above = i > 0 and live[i - 1, j], i < lines - 1 and live[i, j]
+            if not below and not above:
+                continue
+            square = dq[j] ** 2
+            for axis in range(2):
+                size = 0.0
+                if below:
+                    size = bends[axis, i - 1, j]
+                if above:
+                    size = max(size, bends[axis, i, j])
+                spare = size * square / 2 + radius[axis, i, j] + radius[axis, i, j + 1]
+                step = image[axis, i, j + 1] - image[axis, i, j]
+                rates[2 * axis], rates[2 * axis + 1], rates[4 + axis] = step - spare, step + spare, size * square
+            sag_y = rates[4] / 8 + max(radius[0, i, j], radius[0, i, j + 1])
+            sag_w = rates[5] / 8 + max(radius[1, i, j], radius[1, i, j + 1])
+            y0, y1 = min(image[0, i, j], image[0, i, j + 1]) - sag_y, max(image[0, i, j], image[0, i, j + 1]) + sag_y
+            w0, w1 = min(image[1, i, j], image[1, i, j + 1]) - sag_w, max(image[1, i, j], image[1, i, j + 1]) + sag_w
+            window = _window(mesh, q, y0, y1, w0, w1)
+            curve[i, j] = _density(window, tables, rates, bend) / square
+            longest = max(abs(rates[0]), abs(rates[1]))
+            share = 1.0 if rates[0] <= 0.0 <= rates[1] else 0.25
+            extra[i, j] = share * longest * _kinked(window, kinks, mesh, longest)
+    return curve, extra
+
+
+@njit(cache=True)
+def over_cells(
+    image: Array, radius: Array, live: Mask, slopes: Array, bends: Array, sides: tuple[Array, Array], mesh: Array,
+    q: Array, tables: Array, bend: Array, kinks: Array, reach: Array, prices: Array, wide: Array, close: Array,
+) -> Array:  # fmt: skip
+    """What every cell pays: interpolation along y, the rows' interpolation, covariance, remainder, rounding.
+
+    Parameters
+    ----------
+    slopes : (4, cells, nq - 1)
+        Ranges of d_y y and d_y w.
+    bends : (4, cells, nq - 1)
+        |d_yy m| and |d_qq m|, two each.
+    sides : (ndarray, ndarray)
+        Widths along y and q.
+    reach : (cells, nq - 1)
+        How far the covariance's excess is followed along y.
+    prices : (5, cells, nq - 1)
+        Of ``wide`` (three: bent, mixed, bowed) and of the first two of ``close`` (lean_y, lean_q, then lift and near,
+        which cost themselves).
+    """
+    found = np.zeros(live.shape)
+    rates = np.empty(6)
+    ends = np.empty(4)
+    for i in range(live.shape[0]):
+        for j in range(live.shape[1]):
+            if not live[i, j]:
+                continue
+            d, e = sides[0][i], sides[1][j]
+            for axis in range(2):
+                sag = (bends[axis, i, j] * d * d + bends[2 + axis, i, j] * e * e) / 8
+                low, high = np.inf, -np.inf
+                for a in range(2):
+                    for b in range(2):
+                        low = min(low, image[axis, i + a, j + b] - radius[axis, i + a, j + b])
+                        high = max(high, image[axis, i + a, j + b] + radius[axis, i + a, j + b])
+                ends[2 * axis], ends[2 * axis + 1] = low - sag, high + sag
+                rates[2 * axis], rates[2 * axis + 1] = d * slopes[2 * axis, i, j], d * slopes[2 * axis + 1, i, j]
+                rates[4 + axis] = bends[axis, i, j] * d * d
+            window = _window(mesh, q, ends[0], ends[1], ends[2], ends[3])
+            longest = max(abs(rates[0]), abs(rates[1]))
+            share = 1.0 if rates[0] <= 0.0 <= rates[1] else 0.25
+            total = max(_density(window, tables, rates, bend), 0.0) / 8
+            total += share * longest * _kinked(window, kinks, mesh, longest)
+            total += _largest(window, close[2]) + _largest(window, close[3])
+            total += prices[3, i, j] * _largest(window, close[0]) + prices[4, i, j] * _largest(window, close[1])
+            window = _window(mesh, q, ends[0] - reach[i, j], ends[1] + reach[i, j], ends[2], ends[3])
+            for part in range(3):
+                total += prices[part, i, j] * _largest(window, wide[part])
+            found[i, j] = total
+    return found
+
+
+@njit(cache=True)
+def _largest(window: Index, table: Array) -> float:
+    best = -np.inf
+    for k in range(window[0], window[1] + 1):
+        for c in range(window[2], window[3] + 1):
+            best = max(best, table[k, c])
+    return best

@@ -1,0 +1,257 @@
+"""One step along the flow: every majorant against numerics, at random points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.special import ndtr
+
+import certbound as cb
+from certbound.errors import InfeasibleError
+from certbound.problem.model import compile_numpy
+from certbound.rigor.intervals import Interval
+from certbound.values.discrete.dominance import KAPPA
+from certbound.values.semilagrangian.backward import Bounds, back, limited
+from certbound.values.semilagrangian.bands import Frame
+from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
+from certbound.values.semilagrangian.groundwork import Plan, layout_of
+from certbound.values.semilagrangian.remainders import chord_level, level_of, remainders, upper_tail
+from certbound.values.semilagrangian.setting import serves, setting_of
+from certbound.values.semilagrangian.smoothers import WIDER, across, along
+from certbound.values.semilagrangian.smoothing import Lines, smoothed
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+def mechanical(force, s: float, low, high, horizon: float = 1.0, start=(0.0, 0.0)) -> cb.Problem:
+    system = cb.ContinuousSystem(lambda x: [x[1], force(x)], states=2, diffusion=[[0.0], [s]])
+    return cb.Problem(system, initial=list(start), safe=[cb.Inside(cb.Box(low, high))], horizon=horizon)
+
+
+def duffing(s: float = 0.4) -> cb.Problem:
+    return mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1], s, [0, -2], [2, 2], 5.0, (1.0, 0.0))
+
+
+def test_flow_derivatives_and_covariance_contain_a_numerical_solution(rng) -> None:
+    tape = sheared(setting_of(duffing()).tape, 0.05)
+    whole = augmented(tape, 0.4, 0.05)
+    low = rng.uniform([0.1, -1.0], [1.5, 1.0], size=(6, 2))
+    rest = [Interval.point(np.full(6, v)) for v in [1.0, 0, 0, 1.0] + [0.0] * (EQUATIONS - 6)]
+    found = flow(whole, [Interval(low[:, 0], low[:, 0] + 0.02), Interval(low[:, 1], low[:, 1] + 0.05), *rest], 0.1, 8)
+    assert found.known.all()
+    right = compile_numpy(whole)
+    for k in range(6):
+        start = np.r_[low[k] + rng.uniform(0, 1, 2) * [0.02, 0.05], 1, 0, 0, 1, np.zeros(EQUATIONS - 6)]
+        end = solve_ivp(lambda t, z: np.ravel(right(t, *z)), (0, 0.1), start, rtol=1e-12, atol=1e-14).y[:, -1]
+        for part, value in zip(found.end, end):
+            assert part.lo[k] - 1e-11 <= value <= part.hi[k] + 1e-11
+    assert max(float((part.hi - part.lo).max()) for part in found.end[:2]) < 0.08
+
+
+def test_a_step_too_long_to_be_enclosed_is_not_known() -> None:
+    setting = setting_of(mechanical(lambda x: x[0] ** 3 * 50, 0.4, [-3, -3], [3, 3]))
+    found = flow(setting.tape, [Interval.point(np.array([0.0, 3.0])), Interval.point(np.array([0.0, 3.0]))], 1.0, 4)
+    assert found.known.tolist() == [True, False]
+
+
+def test_linear_models_leave_no_remainder() -> None:
+    setting = setting_of(mechanical(lambda x: -x[0] - x[1], 0.4, [-1, -2], [1, 2]))
+    box = Interval(np.array([-0.5]), np.array([0.5]))
+    found = remainders(setting.tape, 0.4, box, box, step=0.1, omega=5.0, chord=1.0)
+    assert found.known.all()
+    assert not np.any([found.most, found.mean])
+
+
+def test_remainder_and_dip_bound_what_simulated_paths_do(rng) -> None:
+    setting = setting_of(mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1] * x[1], 0.5, [0, -2], [2, 2]))
+    h, omega = 0.1, level_of(1e-6)
+    point = Interval.point(np.array([1.2])), Interval.point(np.array([-0.5]))
+    bound = remainders(setting.tape, 0.5, *point, step=h, omega=omega, chord=chord_level(1e-6, omega))
+    assert bound.known.all()
+    count, parts = 4000, 100
+    d = h / parts
+    p, q = np.full(count, 1.2), np.full(count, -0.5)
+    mp, mq, zp, zq = 1.2, -0.5, np.zeros(count), np.zeros(count)
+    path = [p]
+    for _ in range(parts):
+        noise = 0.5 * math.sqrt(d) * rng.standard_normal(count)
+        zp, zq = zp + d * zq, zq + d * ((1 - 3 * mp**2) * zp - mq * zq) + noise
+        p, q = p + d * q, q + d * (p - p**3 - 0.5 * q * q) + noise
+        mp, mq = mp + d * mq, mq + d * (mp - mp**3 - 0.5 * mq * mq)
+        path.append(p)
+    for left, most, mean in zip((p - mp - zp, q - mq - zq), bound.most[:, 0], bound.mean[:, 0]):
+        assert np.abs(left).max() <= most
+        assert np.abs(left).mean() <= 3 * mean  # 1 + |e|^2 has mean 3
+        assert np.abs(left).mean() > mean / 60
+    time = np.linspace(0, 1, parts + 1)[:, None]
+    below = ((1 - time) * path[0] + time * path[-1] - np.array(path)).max()
+    assert 0.2 * bound.dip[0, 0] < below <= bound.dip[0, 0]
+
+
+def test_levels_of_rare_events(rng) -> None:
+    assert 4 * upper_tail(level_of(1e-9)) <= 1e-9 <= 4 * upper_tail(level_of(1e-9) * 0.999)
+    walk = np.cumsum(rng.standard_normal((4000, 400)), axis=1) / 20
+    time = np.arange(1, 401) / 400
+    swing = np.abs(time * walk.mean(axis=1, keepdims=True) - np.cumsum(walk, axis=1) / 400).max(axis=1)
+    level = chord_level(0.01, 4.0)
+    assert (swing > level).mean() < 0.01
+    assert (swing > level / 2).any()
+
+
+Y = np.concatenate([[-1.0, -0.7, -0.5], np.linspace(-0.4, 0.6, 41), [0.7, 0.9, 1.2]])
+Q = np.linspace(-3.0, 3.0, 49)
+SIGMA = (0.02, 0.2)
+ROWS = slice(10, 35)
+
+
+def random_lines(rng) -> Lines:
+    y, q = np.meshgrid(Y, Q, indexing="ij")
+    nodal = np.exp(-3 * (y - 0.3 * q) ** 2) + 0.2 * np.abs(y) + 0.02 * rng.uniform(size=y.shape)
+    return Lines(nodal=nodal, bend=rng.normal(0, 2, size=(len(Y), len(Q) - 1)))
+
+
+def at(value: Lines, y, q):
+    """The function itself, at arrays of points."""
+    i = np.clip(np.searchsorted(Y, y, side="right") - 1, 0, len(Y) - 2)
+    j = np.clip(np.searchsorted(Q, q, side="right") - 1, 0, len(Q) - 2)
+    t, d = (y - Y[i]) / (Y[i + 1] - Y[i]), Q[j + 1] - Q[j]
+    s = (q - Q[j]) / d
+    arch = d**2 * s * (1 - s) / 2
+    low, high = (
+        (1 - s) * value.nodal[k, j] + s * value.nodal[k, j + 1] + arch * value.bend[k, j] for k in (i, i + 1)
+    )
+    return (1 - t) * low + t * high
+
+
+def mean(value: Lines, y: float, w: float) -> float:
+    """E U(y + s_y z, w + s_q z') by the exact law in y and fine sums in q."""
+    z = np.linspace(-8, 8, 1201)
+    weight = np.exp(-0.5 * z * z)
+    weight /= weight.sum()
+    edges = np.linspace(-8, 8, 321)
+    cells = np.diff(ndtr(edges))
+    points = (edges[1:] + edges[:-1]) / 2
+    table = at(value, (y + SIGMA[0] * points)[:, None], (w + SIGMA[1] * z)[None])
+    return float(cells @ table @ weight)
+
+
+def test_the_majorant_of_the_smoothed_function_lies_above_it_and_so_do_its_derivatives(rng) -> None:
+    value = random_lines(rng)
+    one = along(Y, SIGMA[0], 1e-15, ROWS, slice(0, len(Y)))
+    two = across(Q, SIGMA[1], 1e-15, 1.05)
+    flat = np.zeros((len(Y) - 1, len(Q) - 1))
+    mesh = Y[ROWS]
+    rows = smoothed(value, (flat, flat), Y, mesh, Q, one, two)
+    gain = []
+    for _ in range(8):
+        y, w = rng.uniform(mesh[2], mesh[-3]), rng.uniform(-0.8, 0.8)
+        k, c = int(np.searchsorted(mesh, y)) - 1, int(np.searchsorted(Q, w)) - 1
+        t, d = (y - mesh[k]) / (mesh[k + 1] - mesh[k]), Q[c + 1] - Q[c]
+        s = (w - Q[c]) / d
+        arch = d**2 * s * (1 - s) / 2
+        row = [
+            (1 - s) * rows.values[r, c] + s * rows.values[r, c + 1] + arch * rows.bend[r, c] for r in (k, k + 1)
+        ]
+        exact = mean(value, y, w)
+        assert exact <= (1 - t) * row[0] + t * row[1] + rows.lift[k, c] + 3e-5
+        gain.append((1 - t) * row[0] + t * row[1] + rows.lift[k, c] - exact)
+        e = 0.02
+        ww = (mean(value, y, w + e) - 2 * exact + mean(value, y, w - e)) / e**2
+        yw = (mean(value, y + e / 9, w + e) - mean(value, y - e / 9, w + e)
+              - mean(value, y + e / 9, w - e) + mean(value, y - e / 9, w - e)) / (4 * e * e / 9)  # fmt: skip
+        yy = (mean(value, y + e / 9, w) - 2 * exact + mean(value, y - e / 9, w)) / (e / 9) ** 2
+        assert ww <= rows.bent[k, c] + 0.05
+        assert abs(yw) <= rows.mixed[k, c] + 0.05
+        assert abs(yy) <= rows.bowed[k, c] + 1.0
+    assert np.median(gain) < 0.01
+
+
+def frame_and_bands(problem: cb.Problem, **plan):
+    settings = {"count": 10, "fine": 1.2, "wide": 0.02, "cell": 0.5, "spare": 1e-7} | plan
+    setting = setting_of(problem)
+    return setting, layout_of(setting, Plan(**settings))
+
+
+def step_law(setting, clock, x, rng, count: int):
+    """Simulated ends of one step in (y, q), by small steps with antithetic noise."""
+    drift = compile_numpy(setting.tape)
+    parts = 40
+    d = clock.step / parts
+    p, q = np.full(count, x[0] + clock.shear * x[1]), np.full(count, x[1])
+    for _ in range(parts):
+        half = rng.standard_normal(count // 2)
+        noise = setting.noise * math.sqrt(d) * np.concatenate([half, -half])
+        f = drift(0.0, p + d / 2 * q, q)
+        p, q = p + d * (q + noise / 2) + d * d / 2 * f[..., 1], q + d * f[..., 1] + noise
+    return p - clock.shear * q, q
+
+
+@pytest.mark.parametrize("force", [lambda x: -x[0] - 0.5 * x[1], lambda x: x[0] - x[0] ** 3 - 0.5 * x[1]])
+def test_a_step_back_lies_above_the_mean_of_any_function_on_the_grid(force, rng) -> None:
+    problem = mechanical(force, 0.5, [0, -1.5], [1.6, 1.5], 1.0, (1.0, 0.0))
+    setting, layout = frame_and_bands(problem)
+    frame = layout.frame
+    y, q = np.meshgrid(frame.y, frame.q, indexing="ij")
+    value = Lines(nodal=np.exp(2 * (q - 2 * y)) / 40, bend=np.full((y.shape[0], y.shape[1] - 1), -0.05))
+    free = Bounds(level=np.zeros_like(y), reach=layout.bounds.reach)
+    found = back(frame, layout.bands, free, value)
+    ratios = []
+    for i, j in zip(*np.nonzero(frame.live)):
+        if rng.uniform() > 8 / frame.live.sum():
+            continue
+        at_, bt = rng.uniform(size=2)
+        x = (frame.y[i] + at_ * np.diff(frame.y)[i], frame.q[j] + bt * np.diff(frame.q)[j])
+        ends = step_law(setting, layout.clock, x, rng, 20000)
+        sample = reading(frame, value, *ends)
+        paired = sample.reshape(2, -1).mean(axis=0)
+        above = reading(frame, found, np.array([x[0]]), np.array([x[1]]))[0]
+        assert above >= paired.mean() - 4 * paired.std() / math.sqrt(len(paired)) - 1e-9
+        ratios.append(above / paired.mean())
+    assert len(ratios) > 3
+    assert np.median(ratios) < 1.3
+
+
+def reading(frame: Frame, value: Lines, y, q):
+    i = np.clip(np.searchsorted(frame.y, y, side="right") - 1, 0, len(frame.y) - 2)
+    j = np.clip(np.searchsorted(frame.q, q, side="right") - 1, 0, len(frame.q) - 2)
+    t, d = (y - frame.y[i]) / (frame.y[i + 1] - frame.y[i]), frame.q[j + 1] - frame.q[j]
+    s = (q - frame.q[j]) / d
+    arch = d**2 * s * (1 - s) / 2
+    low, high = (
+        (1 - s) * value.nodal[k, j] + s * value.nodal[k, j + 1] + arch * value.bend[k, j] for k in (i, i + 1)
+    )
+    return (1 - t) * low + t * high
+
+
+def test_the_dominating_density_is_wide_enough_for_the_kernels() -> None:
+    assert WIDER >= KAPPA
+
+
+def test_values_are_cut_down_to_one_only_where_all_around_is_at_least_one() -> None:
+    _, layout = frame_and_bands(mechanical(lambda x: -x[0], 0.5, [-1, -1], [1, 1]))
+    shape = layout.frame.y.size, layout.frame.q.size
+    nodal = np.full(shape, 1.5)
+    nodal[10, 10] = 0.5
+    free = Bounds(level=np.zeros(shape), reach=(1, 1))
+    cut = limited(layout.frame, free, nodal, np.full((shape[0], shape[1] - 1), -1.0))
+    assert [cut.nodal[10, 10], cut.nodal[9, 10], cut.nodal[8, 8], cut.bend[8, 8]] == [0.5, 1.5, 1.0, 0.0]
+
+
+def test_which_problems_are_served_and_what_the_others_are_told() -> None:
+    assert serves(duffing())
+    both = cb.ContinuousSystem(lambda x: [x[1], -x[0]], states=2, diffusion=[[0.1, 0], [0, 0.3]])
+    assert not serves(replace(duffing(), system=both))
+    clocked = cb.ContinuousSystem(lambda x, t: [x[1], -x[0] + t], states=2, diffusion=[[0.0], [0.3]])
+    with pytest.raises(InfeasibleError, match="change with time"):
+        setting_of(cb.Problem(clocked, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1))
+    lonely = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=[[0.0], [0.3]])
+    problem = cb.Problem(lonely, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
+    with pytest.raises(InfeasibleError, match="hardly reaches"):
+        layout_of(setting_of(problem), Plan(count=10, fine=0.7, wide=0.01, cell=0.35, spare=1e-7))
