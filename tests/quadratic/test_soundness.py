@@ -1,0 +1,83 @@
+"""Quadratic value bounds stay above what simulation finds, whatever the solver says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.arrays import Array
+from certbound.quadratic import bound_quadratic, refinement
+from certbound.quadratic.inequality import prove
+from certbound.quadratic.wall_program import Proposal, propose
+
+
+def random_problem(seed: int) -> cb.Problem:
+    """A stable system of three or four states with a quadratic and a sine term, noise that may depend on the state."""
+    rng = np.random.default_rng(seed)
+    n = 3 + (seed == 1)
+    linear = 0.6 * rng.standard_normal((n, n)) - 1.2 * np.eye(n)
+    bent = 0.3 * rng.standard_normal((n, 3)) * (np.arange(n) < 2)[:, None]
+    picks = rng.integers(0, n, (n, 3))
+    noise, tilt = 0.45 * rng.standard_normal((n, 2)), 0.1 * rng.standard_normal(n) * (seed % 3 == 0)
+
+    def f(x: Array) -> list[object]:
+        rows = []
+        for i in range(n):
+            a, b, c = picks[i]
+            rows.append(linear[i] @ x + bent[i, 0] * x[a] * x[b] + bent[i, 1] * np.sin(x[c]) + bent[i, 2] * 0.2)
+        return rows
+
+    def g(x: Array) -> list[list[object]]:
+        return [[noise[i, j] + tilt[i] * x[picks[0, 0]] for j in range(2)] for i in range(n)]
+
+    system = cb.ContinuousSystem(f, states=n, diffusion=g if seed % 3 == 0 else noise)
+    return cb.Problem(system, initial=cb.Box([-0.1] * n, [0.1] * n), horizon=1.0, delta=0.5,
+                      safe=[cb.Inside(cb.Box([-1.2] * n, [1.2] * n))])  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_bound_is_above_the_frequency_of_failures(seed: int) -> None:
+    problem = random_problem(seed)
+    found = bound_quadratic(problem, target=1e-9, seconds=3.0)
+    seen = cb.simulate_exits(problem, paths=4000, rng=np.random.default_rng(seed))
+    assert seen.lower <= 10**found.upper <= 1
+    assert found.upper < 0 or seen.probability > 0.02
+
+
+def spoilt(proposal: Proposal, rng: np.random.Generator, size: float) -> Proposal:
+    """The proposal with everything that the solver gave moved at random."""
+
+    def moved(values: Array) -> Array:
+        return values + size * rng.standard_normal(values.shape)
+
+    matrices = moved(proposal.matrices)
+    return replace(
+        proposal, matrices=(matrices + matrices.swapaxes(1, 2)) / 2, moves=moved(proposal.moves),
+        weights=moved(proposal.weights), wall_weights=moved(proposal.wall_weights),
+        wall_rows=moved(proposal.wall_rows), start_weights=moved(proposal.start_weights),
+        level=proposal.level - abs(float(rng.standard_normal())) * size,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e-3, 0.1, 3.0])
+def test_a_wrong_proposal_is_never_believed(size: float) -> None:
+    """For x' = -x + noise in three states the truth is known from one state; spoilt matrices only raise the bound."""
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1], -x[2]], states=3, diffusion=0.6 * np.eye(3))
+    problem = cb.Problem(system, initial=[0, 0, 0], safe=[cb.Inside(cb.Box([-1] * 3, [1] * 3))], horizon=1.0)
+    one = cb.Problem(cb.ContinuousSystem(lambda x: -x, states=1, diffusion=0.6), initial=[0], horizon=1.0,
+                     safe=[cb.Inside(cb.Box([-1], [1]))])  # fmt: skip
+    truth = cb.simulate_exits(one, paths=20_000, rng=np.random.default_rng(1)).lower / 2  # through one of two sides
+    search = refinement.make_search(problem, np.full(3, -1.0), np.full(3, 1.0))
+    cells, times = search.cells(8, ()), np.linspace(0.0, 1.0, 9)
+    wall = search.setting.walls[1]
+    proposal = propose(search.setting, wall, times, cells, seconds=10.0)
+    assert proposal is not None
+    plain = [one.cells for one in cells]
+    honest = prove(search.setting, wall, proposal, plain).level
+    assert np.log(truth) < honest < np.log(truth) + 2
+    for seed in range(10):
+        wrong = spoilt(proposal, np.random.default_rng(seed), size)
+        assert prove(search.setting, wall, wrong, plain).level > np.log(truth)
