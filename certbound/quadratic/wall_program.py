@@ -84,27 +84,24 @@ class StatedCells:
         self.basis = symmetric_basis(self.size)
         self.splits = splitting(setting.dimension, cells.held)
         self.forms = setting.inside.mid.transpose(1, 2, 0)
-        self.common = _is_common(cells)
+        spread = cells.spread.mid.reshape(-1, *cells.spread.shape[2:])
+        self.spreads, group = np.unique(spread, axis=0, return_inverse=True)
+        self.group = group.reshape(cells.values.shape[:2])
         self.blocks = [[self._block(cells, v, c) for c in range(len(cells.low))] for v in range(len(cells.values))]
 
     def _block(self, cells: Cells, v: int, c: int) -> Block:
         size, basis = self.size, self.basis
-        drift, spread = cells.drift.mid[v, c], cells.spread.mid[v, c]
-        product = np.einsum("ijk,jl->ilk", basis, drift)
+        product = np.einsum("ijk,jl->ilk", basis, cells.drift.mid[v, c])
         main = -(product + product.transpose(1, 0, 2)) / 2 - self._trace(cells, c)
         sides = side_forms(cells.low[c], cells.high[c]).transpose(1, 2, 0)
         split = np.einsum("a,baij->ijb", cells.values[v, c], self.splits)
-        maps = [main, -basis / 2, basis / 2, -split, -np.concatenate([sides, self.forms], axis=2)]
+        maps = [main, -basis / 2, basis / 2, -split, -np.concatenate([sides, self.forms], axis=2), -basis / 2]
         constant = np.zeros((size, size))
         constant[-1, -1] = -cells.toll.mid[c]
-        if self.common:
-            maps.append(-basis / 2)
-        else:
-            constant, maps = self._with_noise(constant, maps, spread)
         if cells.affine is None:
             radius = cells.square.rad[c][np.triu_indices(size - 1)]
             twice = np.where(np.equal(*np.triu_indices(size - 1)), 0.5, 1.0)
-            extra = np.zeros((len(constant), len(constant), len(radius)))
+            extra = np.zeros((size, size, len(radius)))
             extra[size - 1, size - 1] = -radius * twice
             maps.append(extra)
         return block(constant, maps)
@@ -117,21 +114,6 @@ class StatedCells:
         form = np.zeros((size, size, self.basis.shape[2]))
         form[-1, -1] = np.einsum("ij,ijk->k", cells.square.mid[c], self.basis[:-1, :-1]) / 2
         return form
-
-    def _with_noise(self, inner: Array, maps: list[Array], spread: Array) -> tuple[Array, list[Array]]:
-        """The maps bordered by H G / sqrt 2, and the constant with a unit block."""
-        size, m = self.size, spread.shape[1]
-        constant = np.zeros((size + m, size + m))
-        constant[:size, :size], constant[size:, size:] = inner, np.eye(m)
-        wider = []
-        for k, part in enumerate(maps):
-            bordered = np.zeros((size + m, size + m, part.shape[2]))
-            bordered[:size, :size] = part
-            if k == 0:
-                border = np.einsum("ijk,jc->ick", self.basis, spread) / np.sqrt(2.0)
-                bordered[:size, size:], bordered[size:, :size] = border, border.transpose(1, 0, 2)
-            wider.append(bordered)
-        return constant, wider
 
 
 def propose(
@@ -156,9 +138,9 @@ class _WallProgram:
         self.program = Program()
         count = self.basis.shape[2]
         self.nodes = [self.program.variables(count) for _ in times]
-        self.splits = splitting(setting.dimension, cells[0].held)  # of no use where only the noise depends on them
+        self.splits = splitting(setting.dimension, cells[0].held)
         self.forms = setting.inside.mid.transpose(1, 2, 0)
-        self.common = all(_is_common(one) for one in cells)
+        self.squares: dict[tuple[int, int, int], Integers] = {}
         self.moves: list[list[list[Integers]]] = []
         self.weights: list[list[list[list[Integers]]]] = []
         self.absolute: list[Integers | None] = []
@@ -184,36 +166,38 @@ class _WallProgram:
     # ---- the inequality of the generator -----------------------------------------------------------------------
 
     def _generator(self) -> None:
-        squares = [self._square(node) if self.common else None for node in self.nodes]
         if self.cells[0].affine is None:
             self.absolute = [self._absolutes(node) for node in self.nodes]
         for k, one in enumerate(self.stated):
             length = float(self.times[k + 1] - self.times[k])
             blocks = [[_timed(block_, self.basis.shape[2], length) for block_ in row] for row in one.blocks]
-            ends = [self._piece(k, end, one.cells, blocks, squares[end]) for end in (k, k + 1)]
+            ends = [self._piece(k, end, one, blocks) for end in (k, k + 1)]
             self.moves.append([moves for moves, _ in ends])
             self.weights.append([weights for _, weights in ends])
 
     def _piece(
-        self, k: int, end: int, cells: Cells, blocks: list[list[Block]], square: Integers | None
+        self, k: int, end: int, one: StatedCells, blocks: list[list[Block]]
     ) -> tuple[list[Integers], list[list[Integers]]]:
         """State the inequality at one end of a piece, for all cells and corners: the places of D and mu."""
-        program, many = self.program, len(cells.low)
+        program, many = self.program, len(one.cells.low)
         moves = [program.variables(len(self.splits)) for _ in range(many)]
         weights = []
-        for corner, row in zip(range(len(cells.values)), blocks):
+        for corner, row in enumerate(blocks):
             weights.append([program.nonnegative(self.size - 1 + self.forms.shape[2]) for _ in range(many)])
             for c, stated in enumerate(row):
-                parts = [self.nodes[end], self.nodes[k + 1], self.nodes[k], moves[c], weights[corner][c]]
-                parts += [] if square is None else [square]
+                square = self._square(end, one, int(one.group[corner, c]))
+                parts = [self.nodes[end], self.nodes[k + 1], self.nodes[k], moves[c], weights[corner][c], square]
                 parts += [] if not self.absolute else [self.absolute[end]]  # type: ignore[list-item]
                 program.semidefinite(stated, np.concatenate(parts))
         return moves, weights
 
-    def _square(self, node: Integers) -> Integers:
-        """New variables Y >= H G G' H, for a diffusion that is the same everywhere."""
-        own = self.program.variables(len(node))
-        spread = self.cells[0].spread.mid[0, 0]
+    def _square(self, end: int, one: StatedCells, group: int) -> Integers:
+        """Variables Y >= H G G' H at a time, the same for all corners with that diffusion."""
+        key, node = (end, id(one), group), self.nodes[end]
+        if key in self.squares:
+            return self.squares[key]
+        own = self.squares[key] = self.program.variables(len(node))
+        spread = one.spreads[group]
         size, m = self.size, spread.shape[1]
         whole = np.zeros((size + m, size + m, len(node)))
         whole[:size, :size] = self.basis
@@ -269,12 +253,6 @@ class _WallProgram:
         program.semidefinite(stated, np.concatenate([level, self.nodes[0], weights]))
         program.at_least(np.array([-_DEEPEST]), [Part(np.eye(1), level)])
         return level, weights
-
-
-def _is_common(cells: Cells) -> bool:
-    """Whether the diffusion is the same at every corner of every cell."""
-    spread = cells.spread
-    return cells.affine is not None and bool(np.all(spread.mid == spread.mid[0, 0]))
 
 
 def _timed(stated: Block, count: int, length: float) -> Block:
