@@ -29,10 +29,10 @@ MOST_CORNERS = 256
 _EXACT = 1e-10
 """Remainders below this share of a working box a second are left to the proof, which pays for them."""
 _SMALL = 0.02
-"""Remainders below this share of a working box within the horizon are columns."""
+"""Remainders below this share of a working box within the horizon (a quarter of it in one piece) are columns."""
 _FEW_CORNERS = 16
 _SLOPE = 8.0  # q: about |grad V|
-_SHARE = 0.02  # a: the share by which the known part of the diffusion is enlarged where something is left
+_SHARE = 0.02  # least a: the share by which the known part of the diffusion is enlarged where something is left
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -89,7 +89,9 @@ class Dynamics:
 
     @property
     def autonomous(self) -> bool:
-        """Whether neither drift nor diffusion reads the time."""
+        """Whether neither drift nor diffusion changes with time."""
+        if self.setting.path is not None:
+            return False
         return self.drift.autonomous and (self.noise is None or self.noise.autonomous)
 
     def _held(self) -> tuple[int, ...]:
@@ -105,8 +107,8 @@ class Dynamics:
             left = {pair for pair in left if best not in pair}
         return tuple(sorted(found))
 
-    def over(self, low: Array, high: Array, start: float, end: float) -> Cells:
-        """The cells [low, high], shape (C, n), of the working box during [start, end].
+    def over(self, low: Array, high: Array, piece: int, start: float, end: float) -> Cells:
+        """The cells [low, high], shape (C, n), of the working box during a piece of time [start, end].
 
         Raises
         ------
@@ -115,12 +117,13 @@ class Dynamics:
         EnclosureError
             The model is undefined somewhere in a cell.
         """
-        cells = _Boxes(low, high, Interval(start, end), self.setting, self.disturbed)
+        cells = _Boxes(low, high, piece, Interval(start, end), self.setting, self.disturbed)
         base, by_state, by_disturbance, rest = self._drift_parts(cells)
         plain = len(self.held) + len(self.disturbed)
         order = sorted(range(self.n), key=lambda i: -np.max(rest.hi[:, i]))
         room = max(int(np.log2(_FEW_CORNERS)) - plain, 0)
-        large = [i for i in order[:room] if np.max(rest.hi[:, i]) * self.horizon > _SMALL]
+        least = _SMALL / self.horizon if self.autonomous else _SMALL / 4 / (end - start)
+        large = [i for i in order[:room] if np.max(rest.hi[:, i]) > least]
         small = [i for i in order if i not in large and np.max(rest.hi[:, i]) > _EXACT]
         count = plain + len(large)
         if 2**count > MOST_CORNERS:
@@ -167,6 +170,8 @@ class Dynamics:
         """A at the middle, its slopes along N and d, and bounds of the remainder (C, n)."""
         n = self.n
         value, slope, curve = self.drift.at(cells)
+        if cells.defect is not None:
+            value = (-(cells.defect / Interval.point(self.setting.width))).broadcast_to(value.shape)
         size = cells.size  # (C, q): half widths of xi and d
         rest = Interval.point(np.zeros((len(cells.low), n)))
         value, first = self._noted(value, 0, size)
@@ -194,7 +199,7 @@ class Dynamics:
 
     def _noted(self, part: Interval, order: int, size: Interval) -> tuple[Interval, Interval]:
         """A coefficient as a narrow one, and what its width (from the time) adds to the remainder (C, n)."""
-        if self.drift.autonomous:
+        if self.autonomous:
             return part, Interval.point(np.zeros(part.shape[:2]))
         wide = Interval(np.zeros(part.shape), part.rad)
         extra = wide if order == 0 else (wide * size.reshape(-1, 1, size.shape[-1])).sum(axis=-1)
@@ -241,7 +246,7 @@ class Dynamics:
             middle = np.zeros(n)
         else:
             if self.noise.pairs or not self.noise.autonomous:
-                return None
+                return None  # where the box moves its path is enclosed: narrow on short pieces
             value, slope, _ = self.noise.at(cells)
             columns, slopes, middle = value[0].reshape(n, m), slope[0].reshape(n, m, n), cells.middle[0]
         last = columns - (slopes * Interval.point(middle)).sum(axis=-1)
@@ -263,18 +268,25 @@ class Dynamics:
 class _Boxes:
     """Cells as inputs of tapes: their middles and whole extents in x, and half widths in xi and d."""
 
-    def __init__(self, low: Array, high: Array, span: Interval, setting: Setting, disturbed: Interval) -> None:
+    def __init__(
+        self, low: Array, high: Array, piece: int, span: Interval, setting: Setting, disturbed: Interval
+    ) -> None:
         self.low, self.high, self.span, self.setting = low, high, span, setting
-        self.middle = (low + high) / 2
+        self.middle, path = (low + high) / 2, setting.path
+        self.defect = None if path is None else path.defect[piece]
+        still = Interval.point(disturbed.mid)
+        if path is not None:  # expanded about the path, whose own drift is known
+            self.middle = np.zeros(low.shape)
+            low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
+            still = Interval.point(path.disturbance)
         half = Interval(np.zeros(low.shape), (Interval(low, high) - Interval.point(self.middle)).mag)
         self.disturbed = disturbed
-        still = Interval.point(disturbed.mid)
         radius = Interval(np.zeros(len(disturbed)), (disturbed - still).mag)
         self.sway = [Interval.point(end) for end in radius.hi]
         many = radius.reshape(1, -1).broadcast_to((len(low), len(disturbed)))
         self.size = Interval(np.zeros((len(low), low.shape[1] + len(disturbed))), np.hstack([half.hi, many.hi]))
-        self.at_middle = self._inputs(setting.over(self.middle, self.middle), still)
-        self.at_all = self._inputs(setting.over(low, high), disturbed)
+        self.at_middle = self._inputs(setting.over(self.middle, self.middle, piece), still)
+        self.at_all = self._inputs(setting.over(low, high, piece), disturbed)
 
     def _inputs(self, x: Interval, d: Interval) -> list[Interval]:
         return [self.span, *(x[:, i] for i in range(x.shape[1])), *(d[k] for k in range(len(d)))]
@@ -352,14 +364,17 @@ def _padded(columns: Interval) -> Interval:
 
 def _with_columns(columns: Interval, rest: Interval) -> Interval:
     """The columns enlarged, with others for what is left of them: rest (C, n) bounds the row sums of |E|."""
-    if not np.any(rest.hi > 0):
-        return _padded(columns)
-    n = columns.shape[1]
+    if np.max(rest.hi) < _EXACT:  # rounding: the proof pays for it
+        wide = Interval(-rest.hi, rest.hi).reshape(*rest.shape, 1)
+        return _padded(columns + wide)
+    n, loose = columns.shape[1], np.flatnonzero(np.max(rest.hi, axis=0) > 0)
     total = rest.sum(axis=-1).hi
-    known = columns * sqrt(Interval.point(1.0) + Interval.point(_SHARE))
-    weight = (Interval.point(1.0) + Interval.point(1.0) / Interval.point(_SHARE)) * Interval.point(total)
+    size = float(np.max(np.linalg.norm(columns.mid, axis=1)))
+    share = float(np.clip(np.max(total) / max(size, 1e-300), _SHARE, 1.0))
+    known = columns * sqrt(Interval.point(1.0) + Interval.point(share))
+    weight = (Interval.point(1.0) + Interval.point(1.0) / Interval.point(share)) * Interval.point(total)
     side = sqrt(weight.reshape(-1, 1) * Interval.point(rest.hi))
-    others = side.reshape(-1, n, 1) * Interval.point(np.eye(n))
+    others = side.reshape(-1, n, 1) * Interval.point(np.eye(n)[:, loose])
     return _padded(Interval(np.concatenate([known.lo, others.lo], 2), np.concatenate([known.hi, others.hi], 2)))
 
 
