@@ -29,7 +29,7 @@ MOST_CORNERS = 256
 _EXACT = 1e-10
 """Remainders below this share of a working box a second are left to the proof, which pays for them."""
 _SMALL = 0.02
-"""Remainders below this share of a working box within the horizon (a quarter of it in one piece) are columns."""
+"""Remainders below this share of a working box within the horizon are columns."""
 _FEW_CORNERS = 16
 _SLOPE = 8.0  # q: about |grad V|
 _SHARE = 0.02  # least a: the share by which the known part of the diffusion is enlarged where something is left
@@ -89,9 +89,7 @@ class Dynamics:
 
     @property
     def autonomous(self) -> bool:
-        """Whether neither drift nor diffusion changes with time."""
-        if self.setting.path is not None:
-            return False
+        """Whether neither drift nor diffusion reads the time."""
         return self.drift.autonomous and (self.noise is None or self.noise.autonomous)
 
     def _held(self) -> tuple[int, ...]:
@@ -107,8 +105,8 @@ class Dynamics:
             left = {pair for pair in left if best not in pair}
         return tuple(sorted(found))
 
-    def over(self, low: Array, high: Array, piece: int, start: float, end: float) -> Cells:
-        """The cells [low, high], shape (C, n), of the working box during a piece of time [start, end].
+    def over(self, low: Array, high: Array, start: float, end: float) -> Cells:
+        """The cells [low, high], shape (C, n), of the working box during [start, end].
 
         Raises
         ------
@@ -117,13 +115,12 @@ class Dynamics:
         EnclosureError
             The model is undefined somewhere in a cell.
         """
-        cells = _Boxes(low, high, piece, Interval(start, end), self.setting, self.disturbed)
+        cells = _Boxes(low, high, Interval(start, end), self.setting, self.disturbed)
         base, by_state, by_disturbance, rest = self._drift_parts(cells)
         plain = len(self.held) + len(self.disturbed)
         order = sorted(range(self.n), key=lambda i: -np.max(rest.hi[:, i]))
         room = max(int(np.log2(_FEW_CORNERS)) - plain, 0)
-        least = _SMALL / self.horizon if self.autonomous else _SMALL / 4 / (end - start)
-        large = [i for i in order[:room] if np.max(rest.hi[:, i]) > least]
+        large = [i for i in order[:room] if np.max(rest.hi[:, i]) * self.horizon > _SMALL]
         small = [i for i in order if i not in large and np.max(rest.hi[:, i]) > _EXACT]
         count = plain + len(large)
         if 2**count > MOST_CORNERS:
@@ -170,8 +167,6 @@ class Dynamics:
         """A at the middle, its slopes along N and d, and bounds of the remainder (C, n)."""
         n = self.n
         value, slope, curve = self.drift.at(cells)
-        if cells.defect is not None:
-            value = (-(cells.defect / Interval.point(self.setting.width))).broadcast_to(value.shape)
         size = cells.size  # (C, q): half widths of xi and d
         rest = Interval.point(np.zeros((len(cells.low), n)))
         value, first = self._noted(value, 0, size)
@@ -199,7 +194,7 @@ class Dynamics:
 
     def _noted(self, part: Interval, order: int, size: Interval) -> tuple[Interval, Interval]:
         """A coefficient as a narrow one, and what its width (from the time) adds to the remainder (C, n)."""
-        if self.autonomous:
+        if self.drift.autonomous:
             return part, Interval.point(np.zeros(part.shape[:2]))
         wide = Interval(np.zeros(part.shape), part.rad)
         extra = wide if order == 0 else (wide * size.reshape(-1, 1, size.shape[-1])).sum(axis=-1)
@@ -246,7 +241,7 @@ class Dynamics:
             middle = np.zeros(n)
         else:
             if self.noise.pairs or not self.noise.autonomous:
-                return None  # where the box moves its path is enclosed: narrow on short pieces
+                return None
             value, slope, _ = self.noise.at(cells)
             columns, slopes, middle = value[0].reshape(n, m), slope[0].reshape(n, m, n), cells.middle[0]
         last = columns - (slopes * Interval.point(middle)).sum(axis=-1)
@@ -268,25 +263,18 @@ class Dynamics:
 class _Boxes:
     """Cells as inputs of tapes: their middles and whole extents in x, and half widths in xi and d."""
 
-    def __init__(
-        self, low: Array, high: Array, piece: int, span: Interval, setting: Setting, disturbed: Interval
-    ) -> None:
+    def __init__(self, low: Array, high: Array, span: Interval, setting: Setting, disturbed: Interval) -> None:
         self.low, self.high, self.span, self.setting = low, high, span, setting
-        self.middle, path = (low + high) / 2, setting.path
-        self.defect = None if path is None else path.defect[piece]
-        still = Interval.point(disturbed.mid)
-        if path is not None:  # expanded about the path, whose own drift is known
-            self.middle = np.zeros(low.shape)
-            low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
-            still = Interval.point(path.disturbance)
+        self.middle = (low + high) / 2
         half = Interval(np.zeros(low.shape), (Interval(low, high) - Interval.point(self.middle)).mag)
         self.disturbed = disturbed
+        still = Interval.point(disturbed.mid)
         radius = Interval(np.zeros(len(disturbed)), (disturbed - still).mag)
         self.sway = [Interval.point(end) for end in radius.hi]
         many = radius.reshape(1, -1).broadcast_to((len(low), len(disturbed)))
         self.size = Interval(np.zeros((len(low), low.shape[1] + len(disturbed))), np.hstack([half.hi, many.hi]))
-        self.at_middle = self._inputs(setting.over(self.middle, self.middle, piece), still)
-        self.at_all = self._inputs(setting.over(low, high, piece), disturbed)
+        self.at_middle = self._inputs(setting.over(self.middle, self.middle), still)
+        self.at_all = self._inputs(setting.over(low, high), disturbed)
 
     def _inputs(self, x: Interval, d: Interval) -> list[Interval]:
         return [self.span, *(x[:, i] for i in range(x.shape[1])), *(d[k] for k in range(len(d)))]

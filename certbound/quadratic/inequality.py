@@ -69,7 +69,6 @@ def prove(setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cell
         if not np.isfinite(worst):
             return Proved(growth=np.inf, gap=np.inf, top=np.inf, proposal=proposal)
         growth = growth + Interval.point(worst) * step
-    growth = growth + _jumps(setting, proposal)
     return Proved(growth=float(growth.hi), gap=_gap(setting, wall, proposal), top=_top(setting, proposal),
                   proposal=proposal)  # fmt: skip
 
@@ -94,7 +93,7 @@ def _slack_matrices(
     border = matmul(matrix, cells.spread)
     total = total + matmul(border, border.T) * half
     total = total + _split(proposal.moves[k, side], cells) + _last(cells.toll, setting.dimension)
-    return -(total + _weighed(setting, proposal.weights[k][side], cells))
+    return -(total + _weighed(setting, proposal.weights[k, side], cells))
 
 
 def _last(values: Interval, n: int) -> Interval:
@@ -147,30 +146,15 @@ def _combined(weights: Array, forms: Interval) -> Interval:
 
 def _gap(setting: Setting, wall: Wall, proposal: Proposal) -> float:
     """A bound of -V over the wall at the times of H, between which V is linear in time."""
-    worst, edge = 0.0, np.full(setting.dimension, 1.0 + setting.pad)
-    known = _known(-edge, edge, setting.inside)
-    conditions = wall.conditions(len(proposal.times))
-    groups = {group: place for place, group in enumerate(dict.fromkeys(one.group for one in conditions))}
-    for weights, one in zip(proposal.side_weights, conditions):
-        matrix = Interval.point(proposal.matrices[one.node]) * Interval.point(0.5) - _combined(weights, known)
-        matrix = matrix - _combined(proposal.wall_weights[groups[one.group]], one.forms)
-        if one.row is not None:
-            free = Interval.point(proposal.wall_rows[groups[one.group]])
-            outer = one.row.reshape(-1, 1) * free.reshape(1, -1)
+    n, worst = setting.dimension, 0.0
+    known = _known(-np.ones(n), np.ones(n), setting.inside, wall.forms)
+    for k, weights in enumerate(proposal.wall_weights):
+        matrix = Interval.point(proposal.matrices[k]) * Interval.point(0.5) - _combined(weights, known)
+        if wall.row is not None:
+            outer = wall.row.reshape(-1, 1) * Interval.point(proposal.wall_rows[k]).reshape(1, -1)
             matrix = matrix - (outer + outer.T) * Interval.point(0.5)
         worst = max(worst, float(-eigenvalue_lower(matrix)))
-    size = Interval.point(1.0) + (Interval.point(edge) * Interval.point(edge)).sum()
-    return float((Interval.point(worst) * size).hi) if np.isfinite(worst) else np.inf
-
-
-def _jumps(setting: Setting, proposal: Proposal) -> Interval:
-    """What V may rise by at the jumps of a moving box: |H z| . shift, z of the padded box."""
-    if setting.path is None:
-        return Interval.point(0.0)
-    shift = Interval.point(setting.path.jumps) / Interval.point(setting.width)
-    size = Interval.point(1.0 + 2 * setting.pad)
-    rows = Interval.point(np.abs(proposal.matrices[1:-1])).sum(axis=-1) * size
-    return (rows[:, :-1] * shift).sum()
+    return float((Interval.point(worst) * Interval.point(float(n + 1))).hi) if np.isfinite(worst) else np.inf
 
 
 def _frame(setting: Setting) -> tuple[Integers, Interval]:

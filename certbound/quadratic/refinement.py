@@ -184,8 +184,7 @@ class Search:
             if parts[place] < level + math.log(_DONE):
                 return False
             attempt = self.attempts[place]
-            first = -1 if self.setting.path is None else 0  # a moving box has the pieces of its path
-            hopes = {k: attempt.gains.get(k, self.gains.get(k, math.inf)) for k in range(first, len(attempt.slabs))}
+            hopes = {k: attempt.gains.get(k, self.gains.get(k, math.inf)) for k in range(-1, len(attempt.slabs))}
             sizes = {k: self._blocks(*_finer(attempt, k)) for k in hopes}
             grown = {k: 1.3 * sizes[k] / self._blocks(attempt.pieces, attempt.slabs) for k in hopes}
             left = until - time.perf_counter()
@@ -207,10 +206,10 @@ class Search:
         """The cells of every piece of time."""
         key = (0 if self.dynamics.autonomous else pieces, *slabs)
         if key not in self.kept:
-            low, high = _grid(self.setting, self.dynamics.held, slabs)
+            low, high = _grid(self.setting.dimension, self.dynamics.held, slabs)
             times = _times(self.horizon, pieces)
             spans = [(0.0, self.horizon)] if self.dynamics.autonomous else list(itertools.pairwise(times))
-            cells = [self.dynamics.over(low, high, k, *span) for k, span in enumerate(spans)]
+            cells = [self.dynamics.over(low, high, *span) for span in spans]
             self.kept[key] = [StatedCells(self.setting, one) for one in cells]
         found = self.kept[key]
         return found * pieces if self.dynamics.autonomous else found
@@ -246,11 +245,9 @@ def _times(horizon: float, pieces: int) -> Array:
     return times
 
 
-def _grid(setting: Setting, held: Sequence[int], slabs: Sequence[int]) -> tuple[Array, Array]:
-    """Cells that cover the padded working box: slabs of the held coordinates."""
-    edge = 1.0 + setting.pad
-    counts = [slabs[held.index(axis)] if axis in held else 1 for axis in range(setting.dimension)]
-    cuts = [np.linspace(-edge, edge, count + 1) for count in counts]
+def _grid(n: int, held: Sequence[int], slabs: Sequence[int]) -> tuple[Array, Array]:
+    """Cells that cover [-1, 1]^n: slabs of the held coordinates."""
+    cuts = [np.linspace(-1.0, 1.0, slabs[held.index(axis)] + 1 if axis in held else 2) for axis in range(n)]
     low = np.stack([axis.ravel() for axis in np.meshgrid(*(cut[:-1] for cut in cuts), indexing="ij")], axis=1)
     high = np.stack([axis.ravel() for axis in np.meshgrid(*(cut[1:] for cut in cuts), indexing="ij")], axis=1)
     return low, high

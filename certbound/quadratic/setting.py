@@ -11,7 +11,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -24,21 +23,6 @@ from certbound.problem.sets import Faces, Inside, Quadratic
 from certbound.problem.systems import ContinuousSystem
 from certbound.quadratic.form_matrices import as_forms, ball_form, linear_form, scaled_row
 from certbound.rigor.intervals import Interval, concatenate
-
-if TYPE_CHECKING:
-    from certbound.quadratic.moving import Path
-
-
-class Condition(NamedTuple):
-    """V must be at least 0 at a time of H where ``row`` . z = 0 and all forms are at least 0.
-
-    Conditions of one group share the multipliers of row and forms: both ends of a piece on which these are linear.
-    """
-
-    node: int
-    row: Interval | None
-    forms: Interval
-    group: int
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -53,20 +37,11 @@ class Wall:
         ``row . z`` is 0 on the wall and grows outward; None for an obstacle or a curved wall.
     forms : Interval, shape (k, n + 1, n + 1)
         Quadratic forms that are at least 0 where paths can leave.
-    moving : tuple of Condition, or None
-        Instead of both, in a working box that moves.
     """
 
     label: str
     row: Interval | None
     forms: Interval
-    moving: tuple[Condition, ...] | None = None
-
-    def conditions(self, nodes: int) -> tuple[Condition, ...]:
-        """What is asked of V at the times of H."""
-        if self.moving is not None:
-            return self.moving
-        return tuple(Condition(k, self.row, self.forms, k) for k in range(nodes))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -87,18 +62,15 @@ class Setting:
     walls: tuple[Wall, ...]
     inside: Interval  # (k, n + 1, n + 1): forms that are at least 0 on the safe set, besides the box
     start: Start
-    path: Path | None = None
-    pad: float = 0.0  # what is looked at beyond the working box
 
     @property
     def dimension(self) -> int:
         """Number of states."""
         return len(self.center)
 
-    def over(self, low: Array, high: Array, piece: int) -> Interval:
-        """x over boxes of xi, shape (..., n), during a piece of time."""
-        center = Interval.point(self.center) if self.path is None else self.path.range[piece]
-        return center + Interval.point(self.width) * Interval(low, high)
+    def over(self, low: Array, high: Array) -> Interval:
+        """x over boxes of xi, shape (..., n)."""
+        return Interval.point(self.center) + Interval.point(self.width) * Interval(low, high)
 
 
 def diffusion_of(problem: Problem) -> Array | Tape:
@@ -145,7 +117,7 @@ def make_setting(problem: Problem, low: Array, high: Array) -> Setting:
     InfeasibleError
         Constraints of a kind that is not served, or a start outside the box.
     """
-    refuse(problem)
+    _refuse(problem)
     center, width = _scaled(low, high)
     n = len(center)
     start = _start(problem, center, width)
@@ -176,8 +148,7 @@ def _side(n: int, axis: int, sign: float) -> Interval:
     return Interval(low, high)
 
 
-def refuse(problem: Problem) -> None:
-    """Refuse what this room does not serve, with an InfeasibleError that says what it is."""
+def _refuse(problem: Problem) -> None:
     if problem.initial.random:
         raise InfeasibleError("quadratic value bounds need a bounded set of starts, not a random start.")
     if problem.input_sequence is not None:
@@ -253,13 +224,9 @@ def _check_start(start: Start, form: Interval, label: str) -> None:
 def _flat(problem: Problem, center: Array, width: Array, row: Interval, label: str) -> Wall | None:
     """A flat wall; one without noise is left only where the drift points outward, and None where it nowhere does."""
     n = len(center)
-    functional = outward_drift(problem, row[:n] / Interval.point(width), Interval.point(0.0))
-    forms = []
-    if functional is not None:
-        entries = functional[0] * Interval.point(width)
-        last = (functional[0] * Interval.point(center)).sum() + functional[1]
-        drift = concatenate([entries, last.reshape(1)])
-        forms.append(linear_form(drift))
+    drift = _outward_drift(problem, center, width, row)
+    forms = [] if drift is None else [linear_form(drift)]
+    if drift is not None:
         used = np.flatnonzero(row.mag[:n])
         z = _side(n, used[0] if len(used) == 1 else n, float(np.sign(row.mid[used[0]])) if len(used) == 1 else 1.0)
         if (drift * z).sum().hi < 0:
@@ -267,10 +234,10 @@ def _flat(problem: Problem, center: Array, width: Array, row: Interval, label: s
     return Wall(label=label, row=row, forms=as_forms(forms, n + 1))
 
 
-def outward_drift(problem: Problem, normal: Interval, offset: Interval) -> tuple[Interval, Interval] | None:
-    """The drift of normal . x + offset as such a function, where it is affine, without noise, disturbances and time."""
-    n = len(normal)
-    states = np.flatnonzero(normal.mag).tolist()
+def _outward_drift(problem: Problem, center: Array, width: Array, row: Interval) -> Interval | None:
+    """d(row . z)/dt as a row over z where it is affine and free of noise, disturbances and time; None elsewhere."""
+    n = len(center)
+    states = np.flatnonzero(row.mag[:n]).tolist()
     if not _without_noise(problem, states):
         return None
     tape = problem.closed_loop
@@ -285,10 +252,14 @@ def outward_drift(problem: Problem, normal: Interval, offset: Interval) -> tuple
     point = [Interval.point(0.0)] * count
     value = enclose(tape, point, undefined="infinite")
     slope = enclose(slopes, point, undefined="infinite")[:, 1 : n + 1]
-    if not np.all(np.isfinite(value.mag)):
+    if not np.all(np.isfinite(value.mag[states])):
         return None
-    found = (normal.reshape(-1, 1) * slope).sum(axis=0), (normal * value).sum()
-    return (found[0], found[1] + offset * Interval.point(0.0)) if np.all(np.isfinite(found[0].mag)) else None
+    total: Interval = Interval.point(np.zeros(n + 1))
+    for i in states:
+        at = value[i] + (slope[i] * Interval.point(center)).sum()
+        entries = concatenate([slope[i] * Interval.point(width), at.reshape(1)])
+        total = total + row[i] * entries / Interval.point(width[i])
+    return total
 
 
 def _without_noise(problem: Problem, states: Sequence[int]) -> bool:

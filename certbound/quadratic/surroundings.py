@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from certbound.arrays import Array
@@ -52,56 +50,20 @@ def _sampled(problem: Problem, low: Array, high: Array) -> tuple[Array, Array, A
     """Lowest and highest states on paths inside the box, and the largest standard deviation of each state."""
     rng = np.random.default_rng(_SEED)
     x = problem.initial.sample(rng, _PATHS)
-    step = float(problem.horizon) / _STEPS
-    move = _Mover(problem, rng, step)
+    drift, step = compile_numpy(problem.closed_loop), float(problem.horizon) / _STEPS
+    diffusion = diffusion_of(problem)
+    noise = compile_numpy(diffusion) if isinstance(diffusion, Tape) else None
+    box = problem.system.disturbance
+    d = np.zeros((_PATHS, 0)) if box is None else np.where(rng.random((_PATHS, len(box.low))) < 0.5, box.low, box.high)
     bottom, top, spread = x.min(axis=0), x.max(axis=0), np.zeros(x.shape[1])
     for k in range(_STEPS):
-        x = move(k * step, x, noisy=True)
+        t = k * step
+        gain = np.asarray(diffusion)[None] if noise is None else noise(t, *x.T)
+        shock = (gain @ rng.standard_normal((_PATHS, diffusion.shape[1], 1)))[..., 0]
+        x = x + step * drift(t, *x.T, *d.T) + np.sqrt(step) * shock
         x = np.clip(x, low, high)
         if not np.all(np.isfinite(x)):
             raise InfeasibleError("sampled paths run away; quadratic value bounds need them bounded.")
         bottom, top = np.minimum(bottom, x.min(axis=0)), np.maximum(top, x.max(axis=0))
         spread = np.maximum(spread, x.std(axis=0))
     return bottom, top, spread
-
-
-def deviations(problem: Problem, nominal: Array) -> tuple[Array, Array]:
-    """The largest deviation of the starts and of d from a noise-free path, and the largest standard deviation.
-
-    ``nominal`` holds the path at equal steps, shape (steps, n).
-    """
-    rng = np.random.default_rng(_SEED)
-    x = problem.initial.sample(rng, _PATHS)
-    still = x.copy()
-    step = float(problem.horizon) / len(nominal)
-    move = _Mover(problem, rng, step)
-    reach, spread = np.zeros(x.shape[1]), np.zeros(x.shape[1])
-    for k, middle in enumerate(nominal):
-        apart = x - still
-        reach = np.maximum(reach, np.abs(still - middle).max(axis=0))
-        spread = np.maximum(spread, np.sqrt((apart**2).mean(axis=0)))
-        x, still = move(k * step, x, noisy=True), move(k * step, still, noisy=False)
-        if not np.all(np.isfinite(x)):
-            raise InfeasibleError("sampled paths run away; quadratic value bounds need them bounded.")
-    return reach, spread
-
-
-class _Mover:
-    """Euler steps of many paths, each with a disturbance of its own."""
-
-    def __init__(self, problem: Problem, rng: np.random.Generator, step: float) -> None:
-        self.rng, self.step, self.drift = rng, step, compile_numpy(problem.closed_loop)
-        diffusion = diffusion_of(problem)
-        self.gain: Callable[..., Array] = lambda *_: np.asarray(diffusion)[None]
-        if isinstance(diffusion, Tape):
-            self.gain = compile_numpy(diffusion)
-        self.noises, box = diffusion.shape[1], problem.system.disturbance
-        corner = rng.random((_PATHS, 0 if box is None else len(box.low))) < 0.5
-        self.d = np.where(corner, box.low, box.high) if box is not None else np.zeros((_PATHS, 0))
-
-    def __call__(self, t: float, x: Array, *, noisy: bool) -> Array:
-        moved = x + self.step * self.drift(t, *x.T, *self.d.T)
-        if not noisy:
-            return np.asarray(moved)
-        shock = self.gain(t, *x.T) @ self.rng.standard_normal((_PATHS, self.noises, 1))
-        return np.asarray(moved + np.sqrt(self.step) * shock[..., 0])

@@ -34,13 +34,11 @@ class Proposal:
         H at the times.
     moves : ndarray, shape (K, 2, C, b)
         Coefficients of the splitting at the two ends of each piece.
-    weights : tuple of ndarray, shape (2, V, C, n + k), one a piece
+    weights : ndarray, shape (K, 2, V, C, n + k)
         mu of the cells' sides and of the inside forms.
-    side_weights : ndarray, shape (conditions, n + k)
-        mu on the wall, of the sides of the working box and the inside forms.
-    wall_weights : ndarray, shape (groups, w)
-        mu of the forms of the wall.
-    wall_rows : ndarray, shape (groups, n + 1)
+    wall_weights : ndarray, shape (K + 1, n + k + w)
+        mu on the wall: sides of the working box, inside forms, forms of the wall.
+    wall_rows : ndarray, shape (K + 1, n + 1)
         nu.
     start_weights : ndarray, shape (n' + s,)
         mu of the wide sides of the starts, and of their forms.
@@ -51,8 +49,7 @@ class Proposal:
     times: Array
     matrices: Array
     moves: Array
-    weights: tuple[Array, ...]
-    side_weights: Array
+    weights: Array
     wall_weights: Array
     wall_rows: Array
     start_weights: Array
@@ -150,7 +147,7 @@ class _WallProgram:
 
     def solve(self, seconds: float) -> Proposal | None:
         self._generator()
-        sides, forms, rows = self._at_wall()
+        walls = [self._at_wall(node) for node in self.nodes]
         level, start = self._at_start()
         found = self.program.minimise(int(level[0]), seconds=seconds)
         if found is None:
@@ -159,10 +156,9 @@ class _WallProgram:
             times=self.times,
             matrices=np.array([self.basis @ found[node] for node in self.nodes]),
             moves=found[np.array(self.moves, dtype=np.int64)],
-            weights=tuple(np.maximum(found[np.array(piece)], 0.0) for piece in self.weights),
-            side_weights=np.maximum(found[np.array(sides)], 0.0),
-            wall_weights=np.maximum(found[np.array(forms, dtype=np.int64)], 0.0),
-            wall_rows=found[np.array(rows, dtype=np.int64)],
+            weights=np.maximum(found[np.array(self.weights)], 0.0),
+            wall_weights=np.maximum(found[np.array([mu for mu, _ in walls])], 0.0),
+            wall_rows=found[np.array([nu for _, nu in walls], dtype=np.int64)],
             start_weights=np.maximum(found[np.asarray(start, dtype=np.int64)], 0.0),
             level=float(found[level[0]]),
         )
@@ -225,28 +221,21 @@ class _WallProgram:
 
     # ---- wall and starts ---------------------------------------------------------------------------------------
 
-    def _at_wall(self) -> tuple[list[Integers], list[Integers], list[Integers]]:
-        """State V >= 0 on the wall: the places of the sides' weights, and of the forms' and nu of each group."""
+    def _at_wall(self, node: Integers) -> tuple[Integers, Integers]:
         n, program = self.size - 1, self.program
+        forms = self.wall.forms.mid.transpose(1, 2, 0)
         sides = side_forms(-np.ones(n), np.ones(n)).transpose(1, 2, 0)
-        known = np.concatenate([sides, self.forms], axis=2)
-        conditions = self.wall.conditions(len(self.times))
-        shared: dict[int, tuple[Integers, Integers]] = {}
-        own = []
-        for condition in conditions:
-            if condition.group not in shared:
-                free = program.variables(0 if condition.row is None else self.size)
-                shared[condition.group] = program.nonnegative(len(condition.forms)), free
-            weights, row = shared[condition.group]
-            own.append(program.nonnegative(known.shape[2]))
-            maps = [self.basis / 2, -known, -condition.forms.mid.transpose(1, 2, 0)]
-            columns = [self.nodes[condition.node], own[-1], weights]
-            if condition.row is not None:
-                outer = np.einsum("i,jk->ijk", condition.row.mid, np.eye(self.size))
-                maps.append(-(outer + outer.transpose(1, 0, 2)) / 2)
-                columns.append(row)
-            program.semidefinite(block(np.zeros((self.size, self.size)), maps), np.concatenate(columns))
-        return own, [weights for weights, _ in shared.values()], [row for _, row in shared.values()]
+        known = np.concatenate([sides, self.forms, forms], axis=2)
+        weights = program.nonnegative(known.shape[2])
+        maps, columns = [self.basis / 2, -known], [node, weights]
+        rows = program.variables(self.size if self.wall.row is not None else 0)
+        if self.wall.row is not None:
+            row, eye = self.wall.row.mid, np.eye(self.size)
+            outer = np.einsum("i,jk->ijk", row, eye)
+            maps.append(-(outer + outer.transpose(1, 0, 2)) / 2)
+            columns.append(rows)
+        program.semidefinite(block(np.zeros((self.size, self.size)), maps), np.concatenate(columns))
+        return weights, rows
 
     def _at_start(self) -> tuple[Integers, Integers]:
         program, start = self.program, self.setting.start

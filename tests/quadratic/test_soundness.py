@@ -55,8 +55,7 @@ def spoilt(proposal: Proposal, rng: np.random.Generator, size: float) -> Proposa
     matrices = moved(proposal.matrices)
     return replace(
         proposal, matrices=(matrices + matrices.swapaxes(1, 2)) / 2, moves=moved(proposal.moves),
-        weights=tuple(moved(piece) for piece in proposal.weights),
-        side_weights=moved(proposal.side_weights), wall_weights=moved(proposal.wall_weights),
+        weights=moved(proposal.weights), wall_weights=moved(proposal.wall_weights),
         wall_rows=moved(proposal.wall_rows), start_weights=moved(proposal.start_weights),
         level=proposal.level - abs(float(rng.standard_normal())) * size,
     )  # fmt: skip
