@@ -105,6 +105,11 @@ class Dynamics:
             left = {pair for pair in left if best not in pair}
         return tuple(sorted(found))
 
+    def remainder(self, low: Array, high: Array) -> float:
+        """The largest remainder of the drift over cells at time 0, in working boxes within the horizon."""
+        cells = _Boxes(low, high, Interval.point(0.0), self.setting, self.disturbed)
+        return float(np.max(self._drift_parts(cells)[-1].hi)) * self.horizon
+
     def over(self, low: Array, high: Array, start: float, end: float) -> Cells:
         """The cells [low, high], shape (C, n), of the working box during [start, end].
 

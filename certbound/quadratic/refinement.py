@@ -23,6 +23,8 @@ from certbound.rigor.balls import precision, upper
 
 _PIECES = 8
 _MOST_STATES = 12
+_LOOSE = 0.1  # remainder, in working boxes within the horizon, that is small
+_FIRST_SLABS = 8
 _MOST_BLOCKS = 12_000
 _MARGINS = (4.0, 7.0, 2.5)
 _GAIN = 0.03  # of a wall's logarithm: a refinement that gains less is not repeated
@@ -108,22 +110,23 @@ def bound_quadratic(problem: Problem, *, target: float = 0.0, seconds: float = 2
     if n > _MOST_STATES:
         raise InfeasibleError(f"quadratic value bounds serve at most {_MOST_STATES} states, the problem has {n}.")
     best: QuadraticBound | None = None
+    chosen: Search | None = None
     failure: InfeasibleError | None = None
-    boxes = _boxes(problem)
-    for place, (low, high) in enumerate(boxes):
+    for low, high in _boxes(problem):
         left = begin + seconds - time.perf_counter()
-        if best is not None and (left <= 0 or best.upper <= _log10(target)):
+        if best is not None and (left <= seconds / 2 or best.upper <= _log10(target)):
             break
         try:
             search = make_search(problem, low, high)
         except InfeasibleError as error:
             failure = error
             continue
-        found = search.run(target, left / (1 if place == len(boxes) - 1 else 2))
+        found = search.run(target, left / 3)
         if best is None or found.upper < best.upper:
-            best = found
-    if best is None:
+            best, chosen = found, search
+    if best is None or chosen is None:
         raise failure or InfeasibleError("no working box was found.")
+    best = chosen.run(target, begin + seconds - time.perf_counter())
     return QuadraticBound(upper=best.upper, words=best.words, seconds=time.perf_counter() - begin,
                           setting=best.setting, walls=best.walls)  # fmt: skip
 
@@ -150,14 +153,27 @@ class Search:
         self.dynamics = Dynamics(problem, setting)
         self.kept: dict[tuple[int, ...], list[StatedCells]] = {}
         self.gains: dict[int, float] = {}  # of each kind of refinement, at the wall that had it last
-        slabs = tuple(1 for _ in self.dynamics.held)
+        slabs = self._first_slabs()
         self.attempts = [Attempt(wall=wall, slabs=slabs) for wall in setting.walls]
+
+    def _first_slabs(self) -> tuple[int, ...]:
+        """Slabs that make the remainder small, as far as a few do: without them many a bound is 1."""
+        held, n = self.dynamics.held, self.setting.dimension
+        slabs = [1] * len(held)
+        least = self.dynamics.remainder(*_grid(n, held, slabs))
+        while least > _LOOSE and math.prod(slabs) < _FIRST_SLABS:
+            trials = [[2 * count if k == axis else count for k, count in enumerate(slabs)] for axis in range(len(held))]
+            values = [self.dynamics.remainder(*_grid(n, held, trial)) for trial in trials]
+            if not values or min(values) > 0.9 * least:
+                break
+            slabs, least = trials[int(np.argmin(values))], min(values)
+        return tuple(slabs)
 
     def run(self, target: float, share: float) -> QuadraticBound:
         """Bound every wall, then refine the one that counts most until the target or the time is reached."""
         until = time.perf_counter() + share
         for attempt in self.attempts:
-            if time.perf_counter() < until:
+            if attempt.seconds == 0.0 and time.perf_counter() < until:
                 self._solve(attempt, attempt.pieces, attempt.slabs, until)
         while True:
             level, parts = total(self.attempts)

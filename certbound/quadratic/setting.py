@@ -252,7 +252,7 @@ def _outward_drift(problem: Problem, center: Array, width: Array, row: Interval)
     point = [Interval.point(0.0)] * count
     value = enclose(tape, point, undefined="infinite")
     slope = enclose(slopes, point, undefined="infinite")[:, 1 : n + 1]
-    if not np.all(np.isfinite(value.mag[states])):
+    if not np.all(np.isfinite(value.mag[states])) or not np.all(np.isfinite(slope.mag[states])):
         return None
     total: Interval = Interval.point(np.zeros(n + 1))
     for i in states:
