@@ -30,7 +30,8 @@ _EXACT = 1e-10
 """Remainders below this share of a working box a second are left to the proof, which pays for them."""
 _SMALL = 0.02
 """Remainders below this share of a working box within the horizon are columns."""
-_FEW_CORNERS = 16
+_FEW_CORNERS, _SMALL_DIMENSION = 16, 4
+"""Corners up to which remainders are some, and states up to which: beyond, columns and more slabs are cheaper."""
 _SLOPE = 8.0  # q: about |grad V|
 _SHARE = 0.02  # least a: the share by which the known part of the diffusion is enlarged where something is left
 
@@ -124,7 +125,7 @@ class Dynamics:
         base, by_state, by_disturbance, rest = self._drift_parts(cells)
         plain = len(self.held) + len(self.disturbed)
         order = sorted(range(self.n), key=lambda i: -np.max(rest.hi[:, i]))
-        room = max(int(np.log2(_FEW_CORNERS)) - plain, 0)
+        room = max(int(np.log2(_FEW_CORNERS)) - plain, 0) if self.n <= _SMALL_DIMENSION else 0
         large = [i for i in order[:room] if np.max(rest.hi[:, i]) * self.horizon > _SMALL]
         small = [i for i in order if i not in large and np.max(rest.hi[:, i]) > _EXACT]
         count = plain + len(large)

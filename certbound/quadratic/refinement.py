@@ -24,7 +24,7 @@ from certbound.rigor.balls import precision, upper
 _PIECES = 8
 _MOST_STATES = 12
 _LOOSE = 0.1  # remainder, in working boxes within the horizon, that is small
-_FIRST_SLABS = 8
+_FIRST_SLABS, _FEWER_SLABS, _SMALL_DIMENSION = 8, 4, 4  # at first, up to so many states and beyond
 _MOST_BLOCKS = 12_000
 _MARGINS = (4.0, 7.0, 2.5)
 _GAIN = 0.03  # of a wall's logarithm: a refinement that gains less is not repeated
@@ -121,9 +121,11 @@ def bound_quadratic(problem: Problem, *, target: float = 0.0, seconds: float = 2
         except InfeasibleError as error:
             failure = error
             continue
-        found = search.run(target, left / 3)
+        found = search.run(target, left / 2)
         if best is None or found.upper < best.upper:
             best, chosen = found, search
+        if not search.complete:
+            break
     if best is None or chosen is None:
         raise failure or InfeasibleError("no working box was found.")
     best = chosen.run(target, begin + seconds - time.perf_counter())
@@ -156,12 +158,19 @@ class Search:
         slabs = self._first_slabs()
         self.attempts = [Attempt(wall=wall, slabs=slabs) for wall in setting.walls]
 
+    @property
+    def complete(self) -> bool:
+        """Whether every wall was tried."""
+        return all(attempt.seconds > 0 for attempt in self.attempts)
+
     def _first_slabs(self) -> tuple[int, ...]:
         """Slabs that make the remainder small, as far as a few do: without them many a bound is 1."""
         held, n = self.dynamics.held, self.setting.dimension
         slabs = [1] * len(held)
-        least = self.dynamics.remainder(*_grid(n, held, slabs))
-        while least > _LOOSE and math.prod(slabs) < _FIRST_SLABS:
+        least, most = self.dynamics.remainder(*_grid(n, held, slabs)), _FIRST_SLABS
+        if n > _SMALL_DIMENSION:
+            most = _FEWER_SLABS
+        while least > _LOOSE and math.prod(slabs) < most:
             trials = [[2 * count if k == axis else count for k, count in enumerate(slabs)] for axis in range(len(held))]
             values = [self.dynamics.remainder(*_grid(n, held, trial)) for trial in trials]
             if not values or min(values) > 0.9 * least:
