@@ -64,6 +64,21 @@ def test_drift_and_diffusion_lie_among_the_corners(diffusion: object) -> None:
                 assert np.allclose(cells.affine.mid @ z, np.vstack([g, np.zeros(g.shape[1])]).T)
 
 
+def test_curved_noise_lies_below_its_columns() -> None:
+    """With a linear drift nothing else is in the columns: along every direction they must bear the noise."""
+    system = cb.ContinuousSystem(lambda x: -x, states=3, diffusion=lambda x: [[0.1], [0.2 * x[0] * x[1]],
+                                                                              [(x[2] + 0.25) ** 2]])  # fmt: skip
+    problem = cb.Problem(system, initial=[0.5, 0.8, -0.2], safe=[cb.Inside(cb.Box(LOW, HIGH))], horizon=1.0)
+    setting = make_setting(problem, LOW, HIGH)
+    cells = Dynamics(problem, setting).over(-np.ones((1, 3)), np.ones((1, 3)), 0.0, 1.0)
+    noise, rng = compile_numpy(system.diffusion), np.random.default_rng(2)
+    for p in [*np.eye(3), *rng.standard_normal((20, 3))]:
+        xi = rng.uniform(-1, 1, (500, 3))
+        g = noise(0.0, *setting.over(xi, xi).mid.T)[:, :, 0] / setting.width
+        square = [np.sum((p @ columns[:3]) ** 2) for columns in cells.spread.mid[:, 0]]
+        assert np.max((g @ p) ** 2) <= max(square) + 1e-12
+
+
 def test_a_splitting_is_zero_where_its_coordinates_are_the_states() -> None:
     rng, held = np.random.default_rng(1), (0, 2)
     basis = splitting(3, held)
