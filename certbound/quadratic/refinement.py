@@ -288,12 +288,12 @@ def total(attempts: Sequence[Attempt]) -> tuple[float, Array]:
         return -math.inf, worst
     best = _log_sum(worst)
     if all(attempt.corners is not None for attempt in attempts):
-        table = np.minimum(np.array([attempt.corners for attempt in attempts]), worst[:, None])
+        # as they are: cut off at the walls' own suprema they would no longer be the corners of convex functions
+        table = np.array([attempt.corners for attempt in attempts])
         rough = table.max(axis=0) + np.log(np.exp(table - table.max(axis=0)).sum(axis=0))
-        corners = np.argsort(-rough)
-        level = max(_log_sum(table[:, k]) for k in corners)
+        level = max(_log_sum(column) for column in table.T)
         if level < best:
-            return level, table[:, corners[0]]
+            return level, table[:, int(np.argmax(rough))]
     return best, worst
 
 

@@ -116,3 +116,18 @@ def test_a_lower_function_pays_on_the_wall(known: Known) -> None:
 
 def test_a_level_below_the_start_is_raised(known: Known) -> None:
     assert known.level(replace(known.proposal, level=known.proposal.level - 20)) > known.truth
+
+
+def test_the_worst_start_may_lie_between_the_corners_of_functions_that_are_cut_off(known: Known) -> None:
+    """min(U, -10) of a convex U is not convex: its corners bound no sum."""
+    honest = prove(known.setting, known.wall, known.proposal, known.cells)
+    first = replace(honest, growth=0.0, gap=0.0, top=-10.0)
+    second = replace(honest, growth=0.0, gap=0.0, top=-9.0)
+    attempts = [
+        refinement.Attempt(wall=known.wall, proved=first, corners=np.array([-20.0, 80.0])),
+        refinement.Attempt(wall=known.wall, proved=second, corners=np.array([-9.0, -20.0])),
+    ]
+    level, _ = refinement.total(attempts)  # at a point between, both may nearly reach their suprema
+    assert level >= np.log(np.exp(-10) + np.exp(-9)) - 1e-12
+    attempts[0].corners = np.array([-20.0, -10.0])
+    assert refinement.total(attempts)[0] == pytest.approx(np.log(np.exp(-20) + np.exp(-9)), abs=1e-9)

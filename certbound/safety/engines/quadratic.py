@@ -22,7 +22,8 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
         reason = "left out, since value functions on grids say more in one or two states; ask for it by name."
         return EngineAnswer(applicable=False, method="quadratic", reason=reason)
     try:
-        found = bound_quadratic(problem, target=problem.delta, seconds=_SECONDS)
+        limit = _SECONDS if asked.thorough else _SECONDS / 2
+        found = bound_quadratic(problem, target=problem.delta, seconds=limit)
     except (InfeasibleError, EnclosureError) as error:
         return EngineAnswer(applicable=False, method="quadratic", reason=str(error))
     return EngineAnswer(log10_delta=found.upper, reason=found.words + ".", method="quadratic", details=found)
