@@ -154,7 +154,7 @@ class Search:
         self.setting, self.horizon = setting, float(problem.horizon)
         self.dynamics = Dynamics(problem, setting)
         self.kept: dict[tuple[int, ...], list[StatedCells]] = {}
-        self.gains: dict[int, float] = {}  # of each kind of refinement, at the wall that had it last
+        self.gains: dict[int, float] = {}  # of more pieces, at the wall that had them last
         slabs = self._first_slabs()
         self.attempts = [Attempt(wall=wall, slabs=slabs) for wall in setting.walls]
 
@@ -220,7 +220,9 @@ class Search:
             option = max(options, key=lambda k: hopes[k] / grown[k])
             before = attempt.level
             worked = self._solve(attempt, *_finer(attempt, option), until)
-            attempt.gains[option] = self.gains[option] = before - attempt.level if worked else 0.0
+            attempt.gains[option] = before - attempt.level if worked else 0.0
+            if option < 0:  # which coordinate's slabs help differs from wall to wall
+                self.gains[option] = attempt.gains[option]
             return True
         return False
 
