@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -73,3 +74,23 @@ def enclosed_side_forms(low: Array, high: Array) -> Interval:
             side[i, -1, -1] = end[i]
         ends.append(side)
     return Interval(*ends)
+
+
+def splitting(n: int, held: Sequence[int]) -> Array:
+    """A basis of (D_a), symmetric, with sum_a s_a z' D_a z = 0 where s = z[held]: shape (b, len(held), n + 1, n + 1).
+
+    Each member moves one monomial between two places, by halves and ones: exact in floating point.
+    """
+    places: dict[tuple[int, ...], list[tuple[int, int, int]]] = {}
+    for a, axis in enumerate(held):
+        for i, j in itertools.combinations_with_replacement(range(n + 1), 2):
+            places.setdefault(tuple(sorted((axis, i, j))), []).append((a, i, j))
+    basis = []
+    for first, *others in places.values():
+        for other in others:
+            member = np.zeros((len(held), n + 1, n + 1))
+            for (a, i, j), sign in ((other, 1.0), (first, -1.0)):
+                member[a, i, j] += sign if i == j else sign / 2
+                member[a, j, i] += 0.0 if i == j else sign / 2
+            basis.append(member)
+    return np.array(basis) if basis else np.zeros((0, len(held), n + 1, n + 1))

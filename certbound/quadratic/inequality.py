@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Integers
-from certbound.quadratic.corners import Cells, splitting
-from certbound.quadratic.form_matrices import enclosed_side_forms
+from certbound.quadratic.corners import Cells
+from certbound.quadratic.form_matrices import enclosed_side_forms, splitting
 from certbound.quadratic.setting import Setting, Wall
 from certbound.quadratic.wall_program import Proposal, start_frame
 from certbound.rigor.definite import eigenvalue_lower

@@ -16,8 +16,8 @@ import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.quadratic.conic import Block, Part, Program, block
-from certbound.quadratic.corners import Cells, splitting
-from certbound.quadratic.form_matrices import side_forms
+from certbound.quadratic.corners import Cells
+from certbound.quadratic.form_matrices import side_forms, splitting
 from certbound.quadratic.setting import Setting, Wall
 
 _DEEPEST = -120.0  # log of the smallest probability that is looked for

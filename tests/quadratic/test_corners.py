@@ -9,7 +9,8 @@ import certbound as cb
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
-from certbound.quadratic.corners import Cells, Dynamics, splitting
+from certbound.quadratic.corners import Cells, Dynamics
+from certbound.quadratic.form_matrices import splitting
 from certbound.quadratic.setting import make_setting
 
 LOW, HIGH = np.array([-0.5, 0.2, -1.0]), np.array([1.5, 1.4, 0.5])
