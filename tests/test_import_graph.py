@@ -54,6 +54,7 @@ reach.nominal
 reach.sets reach.remainder
 reach.contraction reach.linear reach.sampled
 reach
+quadratic
 safety.answers
 safety.engines safety.starts
 safety.certificates
@@ -119,7 +120,7 @@ MANY_DOORS = {
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (7, "to and from each library"),
-    "safety.engines": (9, "three engines, and the rooms that their certificates restate"),
+    "safety.engines": (10, "the engines, and the rooms that their certificates restate"),
     "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),
     "reach.sets": (7, "tubes, requirements, and directions for the certificate"),
 }
@@ -146,6 +147,7 @@ TWICE = {
     "operations": "the table of the operations of a tape: the prover's, and the checker's own",
     "problem": "a safety problem",
     "proof": "the proof of a whole certificate of one kind",
+    "quadratic": "quadratic forms in the checker's expansions; the engine of quadratic value bounds",
     "reach_tube": "the noise-free reach tube",
     "regions": "sets of states",
     "reading": "files of strangers",

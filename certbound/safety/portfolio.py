@@ -11,7 +11,13 @@ from dataclasses import dataclass
 from certbound.problem.problem import Problem
 from certbound.safety.answers import EngineAnswer, Proof
 from certbound.safety.certificates import barrier_proof, constants_proof, response_proof
-from certbound.safety.engines import barrier_engine, constants_engine, linear_engine, values_engine
+from certbound.safety.engines import (
+    barrier_engine,
+    constants_engine,
+    linear_engine,
+    quadratic_engine,
+    values_engine,
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -92,6 +98,16 @@ ENGINES: dict[str, Engine] = {
             when="while nothing else has proved SAFE; the only one with a lower bound, so the only one that answers "
             "UNSAFE",
             prove=values_engine,
+            reserve=True,
+            dear=True,
+        ),
+        Engine(
+            name="quadratic",
+            words="one quadratic value bound a wall of the safe set, by semidefinite programming (Thm K9, continuous "
+            "time, up to twelve states)",
+            when="while nothing else has proved SAFE; says most in three to ten states where the noise is too "
+            "large for a linearisation",
+            prove=quadratic_engine,
             reserve=True,
             dear=True,
         ),

@@ -6,6 +6,7 @@ from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.constants import constants_engine
 from certbound.safety.engines.erosion import Erosion, erode
 from certbound.safety.engines.linear import linear_engine
+from certbound.safety.engines.quadratic import quadratic_engine
 from certbound.safety.engines.rooms import joined
 from certbound.safety.engines.values import values_engine
 
@@ -17,5 +18,6 @@ __all__ = [
     "Erosion",
     "joined",
     "linear_engine",
+    "quadratic_engine",
     "values_engine",
 ]

@@ -1,0 +1,104 @@
+"""A semidefinite program as it is written down: blocks of variables, matrix inequalities, one linear objective.
+
+Everything is handed to Clarabel as it stands. What comes back is a proposal; a failure is a None.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from certbound.arrays import Array, Integers
+
+_ROOT = float(np.sqrt(2.0))
+
+
+class Part(NamedTuple):
+    """A linear map from some variables to symmetric matrices (k, k, len(columns)), or to vectors."""
+
+    map: Array
+    columns: Integers
+
+
+class Block(NamedTuple):
+    """The nonzeros of a matrix inequality over columns of its own, so that it can be stated many times."""
+
+    size: int
+    rows: Integers
+    columns: Integers
+    values: Array
+    constant: Array
+
+
+def block(constant: Array, maps: Sequence[Array]) -> Block:
+    """constant + sum of maps (k, k, v) >= 0, the columns of the maps numbered one after the other."""
+    size = len(constant)
+    place = np.array([(i, j) for j in range(size) for i in range(j + 1)]).T
+    scale = np.where(place[0] == place[1], 1.0, _ROOT)
+    joined = np.concatenate([part[place[0], place[1]] for part in maps], axis=1) * scale[:, None]
+    rows, columns = np.nonzero(joined)
+    return Block(size, rows, columns, joined[rows, columns], constant[place[0], place[1]] * scale)
+
+
+class Program:
+    """minimise one variable, subject to matrix and scalar inequalities."""
+
+    def __init__(self) -> None:
+        self.clarabel: Any = importlib.import_module("clarabel")
+        self.width, self.height = 0, 0
+        self.cones: list[Any] = []
+        self.entries: list[tuple[Integers, Integers, Array]] = []
+        self.constants: list[Array] = []
+
+    def variables(self, count: int) -> Integers:
+        """Places of new free variables."""
+        first, self.width = self.width, self.width + count
+        return np.arange(first, first + count)
+
+    def nonnegative(self, count: int) -> Integers:
+        """Places of new variables that are at least 0."""
+        columns = self.variables(count)
+        if count:
+            self.at_least(np.zeros(count), [Part(np.eye(count), columns)])
+        return columns
+
+    def at_least(self, constant: Array, parts: Sequence[Part]) -> None:
+        """constant + sum of parts >= 0, entry by entry."""
+        for part in parts:
+            rows, places = np.nonzero(part.map)
+            self.entries.append((rows + self.height, part.columns[places], -part.map[rows, places]))
+        self._state(constant, self.clarabel.NonnegativeConeT(len(constant)))
+
+    def semidefinite(self, stated: Block, columns: Integers) -> None:
+        """The block with its columns standing for the given variables."""
+        self.entries.append((stated.rows + self.height, columns[stated.columns], -stated.values))
+        self._state(stated.constant, self.clarabel.PSDTriangleConeT(stated.size))
+
+    def _state(self, constant: Array, cone: Any) -> None:
+        self.constants.append(constant)
+        self.cones.append(cone)
+        self.height += len(constant)
+
+    def minimise(self, column: int, *, seconds: float) -> Array | None:
+        """The variables at about the least value of one of them; None where the solver came to nothing."""
+        rows, columns, values = (np.concatenate(parts) for parts in zip(*self.entries))
+        matrix = sparse.csc_matrix((values, (rows, columns)), shape=(self.height, self.width))
+        objective = np.zeros(self.width)
+        objective[column] = 1.0
+        settings = self.clarabel.DefaultSettings()
+        settings.verbose, settings.max_iter, settings.time_limit = False, 80, float(seconds)
+        settings.tol_gap_rel, settings.tol_gap_abs, settings.tol_feas = 1e-4, 1e-4, 1e-8
+        settings.max_threads = 1
+        settings.equilibrate_enable, settings.static_regularization_constant = False, 1e-7  # else it may break down
+        nothing = sparse.csc_matrix((self.width, self.width))
+        solver = self.clarabel.DefaultSolver(
+            nothing, objective, matrix, np.concatenate(self.constants), self.cones, settings
+        )
+        solution = solver.solve()
+        found = np.array(solution.x)
+        dead = solution.iterations < 5 or str(solution.status) in ("PrimalInfeasible", "DualInfeasible")
+        return None if dead or not np.isfinite(found).all() else found

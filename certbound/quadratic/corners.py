@@ -1,0 +1,382 @@
+"""The dynamics over cells of the working box as corners of linear maps.
+
+On a cell, f is its second-order Taylor polynomial about the middle plus a remainder |e_i| <= r_i (half the spread of
+the second derivatives over the cell). With the coordinates N that carry every second-order term held at a value s, it
+is A(s, d, e) z, affine in each of s, d, e: its values at the cell's corners contain it in their convex hull, and
+z' D(s) z = 0 for the free splittings D of `splitting`. The diffusion is likewise affine in each of s where it is
+polynomial of that kind; what is left of it goes into columns of its own:
+    |(G + E)' p|^2 <= (1 + a)|G' p|^2 + (1 + 1/a) (sum_i rho_i) sum_i rho_i p_i^2,   |E_i.| <= rho_i.
+Small remainders, and all beyond a few, are no corners but columns too: r |p| <= r q/2 + (r/q) p^2/2 for any q > 0.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.constants.enclosures import enclose
+from certbound.errors import InfeasibleError
+from certbound.problem.model import Tape, edged, is_zero, jacobian
+from certbound.problem.problem import Problem
+from certbound.quadratic.setting import Setting, diffusion_of
+from certbound.rigor.intervals import Interval, sqrt, stack
+
+MOST_CORNERS = 256
+_EXACT = 1e-10
+"""Remainders below this share of a working box a second are left to the proof, which pays for them."""
+_SMALL = 0.02
+"""Remainders below this share of a working box within the horizon are columns."""
+_FEW_CORNERS, _SMALL_DIMENSION = 16, 4
+"""Corners up to which remainders are some, and states up to which: beyond, columns and more slabs are cheaper."""
+_SLOPE = 8.0  # q: about |grad V|
+_SHARE = 0.02  # least a: the share by which the known part of the diffusion is enlarged where something is left
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Cells:
+    """What f and g may be on each cell.
+
+    Attributes
+    ----------
+    low, high : ndarray, shape (C, n)
+        The cells in xi.
+    held : tuple of int
+        N, the coordinates that are held at corners.
+    values : ndarray, shape (V, C, len(held))
+        Their values there.
+    drift : Interval, shape (V, C, n + 1, n + 1)
+        A, the last row 0.
+    spread : Interval, shape (V, C, n + 1, m)
+        Columns of the diffusion, the last row 0.
+    affine : Interval, shape (m, n + 1, n + 1), or None
+        G_c with g = (G_1 z, ..., G_m z) where the diffusion is affine.
+    square : Interval, shape (C, n, n)
+        g g' over the cells.
+    toll : Interval, shape (C,)
+        What the remainders that are columns add to R besides.
+    """
+
+    low: Array
+    high: Array
+    held: tuple[int, ...]
+    values: Array
+    drift: Interval
+    spread: Interval
+    affine: Interval | None
+    square: Interval
+    toll: Interval
+
+
+class Dynamics:
+    """Drift and diffusion of a problem in the coordinates of a setting."""
+
+    def __init__(self, problem: Problem, setting: Setting) -> None:
+        tape, diffusion = problem.closed_loop, diffusion_of(problem)
+        tapes = [tape] + ([diffusion] if isinstance(diffusion, Tape) else [])
+        if any(edged(one) for one in tapes):
+            raise InfeasibleError("quadratic value bounds need a smooth model; this one has kinks or jumps.")
+        self.setting, self.horizon = setting, float(problem.horizon)
+        self.n, self.noises = setting.dimension, int(diffusion.shape[1])
+        self.drift = _Jet(tape, self.n)
+        self.noise = _Jet(diffusion, self.n) if isinstance(diffusion, Tape) else None
+        self.constant = None if self.noise is not None else Interval.point(np.asarray(diffusion, dtype=float))
+        box = problem.system.disturbance
+        self.disturbed = Interval.point(np.zeros(0)) if box is None else Interval(box.low, box.high)
+        self.held = self._held()
+
+    @property
+    def autonomous(self) -> bool:
+        """Whether neither drift nor diffusion reads the time."""
+        return self.drift.autonomous and (self.noise is None or self.noise.autonomous)
+
+    def _held(self) -> tuple[int, ...]:
+        """Coordinates that meet every second-order term of f, and all that g depends on: a greedy cover."""
+        pairs = self.drift.pairs
+        if self.noise is not None:
+            pairs = pairs | self.noise.pairs | {(a, a) for a in self.noise.used}
+        found = {a for a, b in pairs if a == b and a < self.n}
+        left = {(a, b) for a, b in pairs if a < self.n and b < self.n and not {a, b} & found}
+        while left:
+            best = max(range(self.n), key=lambda a: sum(a in pair for pair in left))
+            found.add(best)
+            left = {pair for pair in left if best not in pair}
+        return tuple(sorted(found))
+
+    def remainder(self, low: Array, high: Array) -> float:
+        """The largest remainder of the drift over cells at time 0, in working boxes within the horizon."""
+        cells = _Boxes(low, high, Interval.point(0.0), self.setting, self.disturbed)
+        return float(np.max(self._drift_parts(cells)[-1].hi)) * self.horizon
+
+    def over(self, low: Array, high: Array, start: float, end: float) -> Cells:
+        """The cells [low, high], shape (C, n), of the working box during [start, end].
+
+        Raises
+        ------
+        InfeasibleError
+            More corners than are practical.
+        EnclosureError
+            The model is undefined somewhere in a cell.
+        """
+        cells = _Boxes(low, high, Interval(start, end), self.setting, self.disturbed)
+        base, by_state, by_disturbance, rest = self._drift_parts(cells)
+        plain = len(self.held) + len(self.disturbed)
+        order = sorted(range(self.n), key=lambda i: -np.max(rest.hi[:, i]))
+        room = max(int(np.log2(_FEW_CORNERS)) - plain, 0) if self.n <= _SMALL_DIMENSION else 0
+        large = [i for i in order[:room] if np.max(rest.hi[:, i]) * self.horizon > _SMALL]
+        small = [i for i in order if i not in large and np.max(rest.hi[:, i]) > _EXACT]
+        count = plain + len(large)
+        if 2**count > MOST_CORNERS:
+            raise InfeasibleError(f"the dynamics have {2**count} corners on a cell; at most {MOST_CORNERS} are served.")
+        worst = Interval(np.zeros(self.n), np.max(rest.hi, axis=0))
+        values, drifts, spreads = [], [], []
+        noise = self._noise_parts(cells)
+        for corner in itertools.product((0, 1), repeat=count):
+            held, shaken, extra = np.split(np.array(corner), [len(self.held), len(self.held) + len(self.disturbed)])
+            at = np.where(held, high[:, self.held], low[:, self.held])
+            step = [Interval.point(at[:, k]) - Interval.point(cells.middle[:, a]) for k, a in enumerate(self.held)]
+            matrix = base
+            for part, shift in zip(by_state, step):
+                matrix = matrix + part * shift.reshape(-1, 1, 1)
+            signs = [2.0 * bit - 1.0 for bit in shaken]
+            for part, sign, radius in zip(by_disturbance, signs, cells.sway):
+                matrix = matrix + part * (radius * Interval.point(sign))
+            drifts.append(self._with_rest(matrix, rest, dict(zip(large, 2.0 * extra - 1.0)), small))
+            values.append(at)
+            spreads.append(_with_small(noise(step), worst, small))
+        return Cells(
+            low=low, high=high, held=self.held, values=np.array(values), drift=stack(drifts), spread=stack(spreads),
+            affine=self._affine(cells), square=self._square(cells), toll=self._toll(worst, small, len(low)),
+        )  # fmt: skip
+
+    def _toll(self, worst: Interval, small: Sequence[int], many: int) -> Interval:
+        """sum r q/2 over the remainders that are columns, the same for all cells."""
+        total = (Interval.point(worst.hi[list(small)]) * Interval.point(_SLOPE / 2)).sum() if small else 0.0
+        return Interval.point(np.zeros(many)) + total
+
+    def _with_rest(
+        self, matrix: Interval, rest: Interval, signs: dict[int, float], small: Sequence[int]
+    ) -> Interval:
+        """The constant column moved by the remainders: by their end where it is a corner, else widened."""
+        lo, hi = np.zeros(matrix.shape), np.zeros(matrix.shape)
+        for i in range(self.n):
+            if i in small:
+                continue
+            lo[:, i, -1] = rest.hi[:, i] * signs[i] if i in signs else -rest.hi[:, i]
+            hi[:, i, -1] = rest.hi[:, i] * signs[i] if i in signs else rest.hi[:, i]
+        return matrix + Interval(lo, hi)
+
+    def _drift_parts(self, cells: _Boxes) -> tuple[Interval, list[Interval], list[Interval], Interval]:
+        """A at the middle, its slopes along N and d, and bounds of the remainder (C, n)."""
+        n = self.n
+        value, slope, curve = self.drift.at(cells)
+        size = cells.size  # (C, q): half widths of xi and d
+        rest = Interval.point(np.zeros((len(cells.low), n)))
+        value, first = self._noted(value, 0, size)
+        slope, second = self._noted(slope, 1, size)
+        rest = rest + first + second
+        base, owned = _linear(value, slope[..., :n], cells.middle), [_empty(cells, n) for _ in self.held]
+        shaken = [_linear(slope[..., n + b], None, cells.middle) for b in range(len(self.disturbed))]
+        for a, b in sorted(self.drift.pairs):
+            both = curve[:, :, a, b]
+            factor = 1.0 if a != b else 0.5
+            middle = Interval.point(both.mid)
+            wide = Interval(np.zeros(both.shape), both.rad)
+            rest = rest + wide * Interval.point(factor) * (size[:, a] * size[:, b]).reshape(-1, 1)
+            if b < n:
+                owner, other = (a, b) if a in self.held else (b, a)
+                place = self.held.index(owner)
+                owned[place] = owned[place] + _along(middle * Interval.point(factor), other, cells.middle)
+            elif a < n:
+                shaken[b - n] = shaken[b - n] + _along(middle, a, cells.middle)
+            else:  # a product of disturbances
+                rest = rest + Interval(np.zeros(both.shape), middle.mag) * Interval.point(factor) * (
+                    size[:, a] * size[:, b]
+                ).reshape(-1, 1)
+        return base, owned, shaken, rest
+
+    def _noted(self, part: Interval, order: int, size: Interval) -> tuple[Interval, Interval]:
+        """A coefficient as a narrow one, and what its width (from the time) adds to the remainder (C, n)."""
+        if self.drift.autonomous:
+            return part, Interval.point(np.zeros(part.shape[:2]))
+        wide = Interval(np.zeros(part.shape), part.rad)
+        extra = wide if order == 0 else (wide * size.reshape(-1, 1, size.shape[-1])).sum(axis=-1)
+        return Interval.point(part.mid), extra
+
+    def _noise_parts(self, cells: _Boxes) -> Callable[[Sequence[Interval]], Interval]:
+        """A function from the steps along N to the columns of the diffusion."""
+        n, m = self.n, self.noises
+        width = Interval.point(self.setting.width).reshape(1, -1, 1)
+        if self.noise is None:
+            fixed = _padded((self.constant.reshape(1, n, m) / width).broadcast_to((len(cells.low), n, m)))  # type: ignore[union-attr]
+            return lambda step: fixed
+        value, slope, curve = self.noise.at(cells)
+        size = cells.size
+        rest = Interval(np.zeros(value.shape), value.rad)
+        rest = rest + (Interval(np.zeros(slope.shape), slope.rad) * size[:, None, : n]).sum(axis=-1)
+        value, slope = Interval.point(value.mid), Interval.point(slope.mid)
+        cross = []
+        for a, b in sorted(self.noise.pairs):
+            both, factor = curve[:, :, a, b], 1.0 if a != b else 0.5
+            grown = Interval(np.zeros(both.shape), both.rad if a != b else both.mag)
+            rest = rest + grown * Interval.point(factor) * (size[:, a] * size[:, b]).reshape(-1, 1)
+            if a != b:
+                cross.append((self.held.index(a), self.held.index(b), Interval.point(both.mid)))
+        rest = Interval(np.zeros(rest.shape), rest.hi).reshape(-1, n, m).sum(axis=-1)
+
+        def columns(step: Sequence[Interval]) -> Interval:
+            total = value
+            for k, a in enumerate(self.held):
+                total = total + slope[:, :, a] * step[k].reshape(-1, 1)
+            for first, second, part in cross:
+                total = total + part * (step[first] * step[second]).reshape(-1, 1)
+            return _with_columns(total.reshape(-1, n, m), rest)
+
+        return columns
+
+    def _affine(self, cells: _Boxes) -> Interval | None:
+        """G_c with g = (G_c z)_c, where the diffusion is affine and does not change with time."""
+        n, m = self.n, self.noises
+        if self.noise is None:
+            width = Interval.point(self.setting.width).reshape(-1, 1)
+            columns = self.constant / width  # type: ignore[operator]
+            slopes: Interval = Interval.point(np.zeros((n, m, n)))
+            middle = np.zeros(n)
+        else:
+            if self.noise.pairs or not self.noise.autonomous:
+                return None
+            value, slope, _ = self.noise.at(cells)
+            columns, slopes, middle = value[0].reshape(n, m), slope[0].reshape(n, m, n), cells.middle[0]
+        last = columns - (slopes * Interval.point(middle)).sum(axis=-1)
+        lo, hi = np.zeros((m, n + 1, n + 1)), np.zeros((m, n + 1, n + 1))
+        for array, part, end in ((lo, slopes.lo, last.lo), (hi, slopes.hi, last.hi)):
+            array[:, :n, :n], array[:, :n, n] = part.transpose(1, 0, 2), end.T
+        return Interval(lo, hi)
+
+    def _square(self, cells: _Boxes) -> Interval:
+        n, m = self.n, self.noises
+        width = Interval.point(self.setting.width).reshape(1, -1, 1)
+        if self.noise is None:
+            columns = (self.constant.reshape(1, n, m) / width).broadcast_to((len(cells.low), n, m))  # type: ignore[union-attr]
+        else:
+            columns = self.noise.whole(cells).reshape(-1, n, m)
+        return columns @ columns.T
+
+
+class _Boxes:
+    """Cells as inputs of tapes: their middles and whole extents in x, and half widths in xi and d."""
+
+    def __init__(self, low: Array, high: Array, span: Interval, setting: Setting, disturbed: Interval) -> None:
+        self.low, self.high, self.span, self.setting = low, high, span, setting
+        self.middle = (low + high) / 2
+        half = Interval(np.zeros(low.shape), (Interval(low, high) - Interval.point(self.middle)).mag)
+        self.disturbed = disturbed
+        still = Interval.point(disturbed.mid)
+        radius = Interval(np.zeros(len(disturbed)), (disturbed - still).mag)
+        self.sway = [Interval.point(end) for end in radius.hi]
+        many = radius.reshape(1, -1).broadcast_to((len(low), len(disturbed)))
+        self.size = Interval(np.zeros((len(low), low.shape[1] + len(disturbed))), np.hstack([half.hi, many.hi]))
+        self.at_middle = self._inputs(setting.over(self.middle, self.middle), still)
+        self.at_all = self._inputs(setting.over(low, high), disturbed)
+
+    def _inputs(self, x: Interval, d: Interval) -> list[Interval]:
+        return [self.span, *(x[:, i] for i in range(x.shape[1])), *(d[k] for k in range(len(d)))]
+
+
+class _Jet:
+    """A tape with its first and second derivatives, in xi and d; values divided by the widths of the states."""
+
+    def __init__(self, tape: Tape, n: int) -> None:
+        self.tape, self.n = tape, n
+        count = len(tape.inputs)
+        self.slots = list(range(1, count))
+        self.slope = jacobian(tape, self.slots)
+        self.curve = jacobian(self.slope, self.slots)
+        self.outputs = len(tape.outputs)
+        q = count - 1
+        self.pairs = {
+            (min(a, b), max(a, b)) for i in range(self.outputs) for a in range(q) for b in range(q)
+            if not is_zero(self.curve, (i * q + a) * q + b)
+        }  # fmt: skip
+        self.used = {a for i in range(self.outputs) for a in range(q) if not is_zero(self.slope, i * q + a)}
+        moving = jacobian(tape, [0])
+        self.autonomous = all(is_zero(moving, i) for i in range(self.outputs))
+
+    def at(self, cells: _Boxes) -> tuple[Interval, Interval, Interval]:
+        """Value (C, k) and slope (C, k, q) at the middles, second derivatives (C, k, q, q) over the cells."""
+        q, batch = len(self.slots), len(cells.low)
+        middle, whole = cells.at_middle[: q + 1], cells.at_all[: q + 1]
+        value = enclose(self.tape, middle).reshape(batch, self.outputs)
+        slope = enclose(self.slope, middle).reshape(batch, self.outputs, q)
+        curve = enclose(self.curve, whole).reshape(batch, self.outputs, q, q)
+        rows = np.repeat(cells.setting.width, self.outputs // self.n)
+        scale = Interval.point(np.concatenate([cells.setting.width, np.ones(q - self.n)]))
+        value = value / Interval.point(rows).reshape(1, -1)
+        slope = slope * scale / Interval.point(rows).reshape(1, -1, 1)
+        curve = curve * scale.reshape(1, 1, -1, 1) * scale / Interval.point(rows).reshape(1, -1, 1, 1)
+        return value, slope, curve
+
+    def whole(self, cells: _Boxes) -> Interval:
+        """The values over the cells, shape (C, k)."""
+        rows = np.repeat(cells.setting.width, self.outputs // self.n)
+        found = enclose(self.tape, cells.at_all[: len(self.slots) + 1])
+        return found.reshape(len(cells.low), self.outputs) / Interval.point(rows)
+
+
+def _empty(cells: _Boxes, n: int) -> Interval:
+    return Interval.point(np.zeros((len(cells.low), n + 1, n + 1)))
+
+
+def _linear(value: Interval, slope: Interval | None, middle: Array) -> Interval:
+    """value + slope (xi - middle) as matrices over z, shape (C, n + 1, n + 1)."""
+    batch, n = value.shape
+    last = value if slope is None else value - (slope * Interval.point(middle[:, None, :])).sum(axis=-1)
+    lo, hi = np.zeros((batch, n + 1, n + 1)), np.zeros((batch, n + 1, n + 1))
+    lo[:, :n, n], hi[:, :n, n] = last.lo, last.hi
+    if slope is not None:
+        lo[:, :n, :n], hi[:, :n, :n] = slope.lo, slope.hi
+    return Interval(lo, hi)
+
+
+def _along(value: Interval, axis: int, middle: Array) -> Interval:
+    """value (xi_axis - middle) as matrices over z."""
+    batch, n = value.shape
+    lo, hi = np.zeros((batch, n + 1, n + 1)), np.zeros((batch, n + 1, n + 1))
+    last = -(value * Interval.point(middle[:, axis]).reshape(-1, 1))
+    lo[:, :n, axis], hi[:, :n, axis], lo[:, :n, n], hi[:, :n, n] = value.lo, value.hi, last.lo, last.hi
+    return Interval(lo, hi)
+
+
+def _padded(columns: Interval) -> Interval:
+    """A row of zeros below matrices of shape (C, n, m)."""
+    pad = [(0, 0), (0, 1), (0, 0)]
+    return Interval(np.pad(columns.lo, pad), np.pad(columns.hi, pad))
+
+
+def _with_columns(columns: Interval, rest: Interval) -> Interval:
+    """The columns enlarged, with others for what is left of them: rest (C, n) bounds the row sums of |E|."""
+    if np.max(rest.hi) < _EXACT:  # rounding: the proof pays for it
+        wide = Interval(-rest.hi, rest.hi).reshape(*rest.shape, 1)
+        return _padded(columns + wide)
+    n, loose = columns.shape[1], np.flatnonzero(np.max(rest.hi, axis=0) > 0)
+    total = rest.sum(axis=-1).hi
+    size = float(np.max(np.linalg.norm(columns.mid, axis=1)))
+    share = float(np.clip(np.max(total) / max(size, 1e-300), _SHARE, 1.0))
+    known = columns * sqrt(Interval.point(1.0) + Interval.point(share))
+    weight = (Interval.point(1.0) + Interval.point(1.0) / Interval.point(share)) * Interval.point(total)
+    side = sqrt(weight.reshape(-1, 1) * Interval.point(rest.hi))
+    others = side.reshape(-1, n, 1) * Interval.point(np.eye(n)[:, loose])
+    return _padded(Interval(np.concatenate([known.lo, others.lo], 2), np.concatenate([known.hi, others.hi], 2)))
+
+
+def _with_small(columns: Interval, worst: Interval, small: Sequence[int]) -> Interval:
+    """More columns sqrt(r_i / q) e_i."""
+    if not small:
+        return columns
+    batch, size, _ = columns.shape
+    more = np.zeros((batch, size, len(small)))
+    more[:, list(small), np.arange(len(small))] = (sqrt(Interval.point(worst.hi[list(small)] / _SLOPE))).hi
+    return Interval(np.concatenate([columns.lo, more], axis=2), np.concatenate([columns.hi, more], axis=2))

@@ -1,0 +1,29 @@
+"""The engine of quadratic value bounds (Thm K9): several states at everyday noise, continuous time."""
+
+from __future__ import annotations
+
+from certbound.errors import EnclosureError, InfeasibleError
+from certbound.problem.problem import Problem
+from certbound.quadratic import bound_quadratic
+from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
+
+_SECONDS = 20.0  # about what may be spent
+_FEW = 3  # states below which value functions on grids say more
+
+
+def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+    """A certified bound of the probability of failing by semidefinite programming; nothing where another has answered.
+
+    Proves: P(failing) <= 10**log10_delta for every start and every disturbance that does not see coming noise.
+    """
+    if asked.quick:
+        return EngineAnswer(applicable=False, method="quadratic", reason="left out, since another engine has answered.")
+    if not asked.thorough and problem.system.dimension < _FEW:
+        reason = "left out, since value functions on grids say more in one or two states; ask for it by name."
+        return EngineAnswer(applicable=False, method="quadratic", reason=reason)
+    try:
+        limit = _SECONDS if asked.thorough else _SECONDS / 2
+        found = bound_quadratic(problem, target=problem.delta, seconds=limit)
+    except (InfeasibleError, EnclosureError) as error:
+        return EngineAnswer(applicable=False, method="quadratic", reason=str(error))
+    return EngineAnswer(log10_delta=found.upper, reason=found.words + ".", method="quadratic", details=found)

@@ -1,0 +1,98 @@
+"""Walls, working boxes, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.quadratic import bound_quadratic
+from certbound.quadratic.setting import make_setting, safe_sides
+from certbound.quadratic.surroundings import working_box
+from certbound.safety.engines import quadratic_engine
+
+PUSHED = cb.ContinuousSystem(lambda x: [x[1], -x[0] - x[1]], states=["p", "v"], diffusion=[[0.0], [0.3]])
+
+
+def of(safe: list[Any], **changes: Any) -> cb.Problem:
+    asked: dict[str, Any] = {"initial": [0.0, 0.0], "horizon": 1.0, "delta": 0.01} | changes
+    return cb.Problem(changes.pop("system", PUSHED), safe=safe, **{k: v for k, v in asked.items() if k != "system"})
+
+
+def labels(problem: cb.Problem) -> list[str]:
+    return [wall.label for wall in make_setting(problem, *working_box(problem, 4.0)).walls]
+
+
+def test_a_state_without_bounds_gets_sides_that_are_paid_for() -> None:
+    problem = of([cb.Inside(cb.Box([-1.0, -np.inf], [1.0, np.inf]))])
+    low, high = working_box(problem, 4.0)
+    assert np.isfinite([low, high]).all()
+    assert not np.isfinite(safe_sides(problem)[0][1])
+    assert labels(problem) == ["p below", "p above", "v below", "v above"]
+    found = bound_quadratic(problem, target=1.0, seconds=10.0)
+    seen = cb.simulate_exits(problem, paths=4000, rng=np.random.default_rng(0))
+    assert seen.lower <= 10**found.upper < 0.5
+
+
+def test_a_side_without_noise_is_left_only_where_the_drift_points_outward() -> None:
+    setting = make_setting(of([]), -np.ones(2), np.ones(2))
+    forms = {wall.label: wall.forms for wall in setting.walls}
+    assert [len(forms[name]) for name in ("p below", "p above", "v below", "v above")] == [1, 1, 0, 0]
+    z = np.array([1.0, 0.5, 1.0])  # p = 1, v = .5: outward
+    assert z @ forms["p above"].mid[0] @ z > 0 > z @ forms["p below"].mid[0] @ z
+
+
+def test_a_side_that_nothing_crosses_is_no_wall() -> None:
+    system = cb.ContinuousSystem(lambda x: [0.1 * x[0] * x[1], -x[1]], states=["a", "b"],
+                                 diffusion=lambda x: [[0.2 * x[0], 0.0], [0.0, 0.1]])  # fmt: skip
+    problem = cb.Problem(system, initial=[1.0, 0.0], safe=[cb.Inside(cb.Box([0.0, -1.0], [3.0, 1.0]))], horizon=1.0)
+    names = [wall.label for wall in make_setting(problem, *safe_sides(problem)).walls]
+    assert names == ["a above", "b below", "b above"]
+
+
+def test_half_spaces_balls_and_obstacles_are_walls() -> None:
+    safe = [
+        cb.Inside(cb.Ball([0.0, 0.0], 1.0)), cb.Inside(cb.HalfSpace([1.0, 1.0], 0.9)),
+        cb.Outside(cb.Ball([-0.6, 0.0], 0.1)), cb.Outside(cb.Box([0.3, -0.9], [0.9, -0.6])),
+    ]  # fmt: skip
+    problem = of(safe)
+    assert len([name for name in labels(problem) if "inside" in name or "<=" in name]) == 3
+    assert "outside" in labels(problem)[2]
+    found = bound_quadratic(problem, target=1.0, seconds=10.0)
+    seen = cb.simulate_exits(problem, paths=4000, rng=np.random.default_rng(0))
+    assert seen.lower <= 10**found.upper < 1
+
+
+def test_disturbances_are_covered() -> None:
+    pushed = cb.ContinuousSystem(lambda x, d: [x[1], -x[0] - x[1] + d[0]], states=2, diffusion=[[0.05], [0.3]],
+                                 disturbance=cb.Box([-0.4], [0.4]))  # fmt: skip
+    problem = of([cb.Inside(cb.Box([-0.6, -1.0], [0.6, 1.0]))], system=pushed)
+    found = bound_quadratic(problem, target=1.0, seconds=10.0)
+    worst = cb.ContinuousSystem(lambda x: [x[1], -x[0] - x[1] + 0.4], states=2, diffusion=[[0.05], [0.3]])
+    seen = cb.simulate_exits(problem.replace(system=worst), paths=4000, rng=np.random.default_rng(0))
+    assert seen.lower <= 10**found.upper < 1
+    assert 10**found.upper > 10 ** bound_quadratic(of(problem.safe), target=1.0, seconds=10.0).upper
+
+
+@pytest.mark.parametrize(
+    ("problem", "reason"),
+    [
+        (of([cb.Inside(cb.Box([-1, -1], [1, 1]), during=(0.0, 0.5))]), "windows of time"),
+        (of([cb.Inside(cb.Ball(lambda t: [t, 0.0], 1.0))]), "moving sets"),
+        (of([cb.Inside(cb.Ellipsoid([0.0, 0.0], np.diag([1.0, 2.0])))]), "ellipsoids"),
+        (of([cb.Inside(cb.Box([-1, -1], [1, 1]))], initial=cb.GaussianStart([0, 0], 0.01 * np.eye(2))), "random start"),
+        (of([cb.Inside(cb.Box([-1, -1], [1, 1]))], initial=cb.Box([-1, 0], [0, 0])), "reach the boundary"),
+    ],
+)
+def test_what_is_not_served_is_an_answer(problem: cb.Problem, reason: str) -> None:
+    answer = quadratic_engine(problem)
+    assert not answer.applicable
+    assert reason in answer.reason
+
+
+def test_discrete_time_is_not_served() -> None:
+    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=1, noise=cb.Gaussian(std=0.1))
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3)
+    assert "continuous time" in quadratic_engine(problem).reason
