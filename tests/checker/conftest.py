@@ -95,6 +95,26 @@ def stirred() -> cb.Problem:
     )
 
 
+def valued() -> cb.Problem:
+    """Discrete time, for value functions: a wave, a disturbance, an obstacle with a window."""
+    system = cb.DiscreteSystem(
+        lambda x, d: [0.7 * x[0] + 0.1 * np.sin(3 * x[0]) + d[0]], states=["x"], disturbance=cb.Box([-0.05], [0.05]),
+        noise=cb.Gaussian(std=0.15),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1], [1])), cb.Outside(cb.Box([0.75], [0.9]), during=(2, 3))]
+    return cb.Problem(system, initial=cb.Box([-0.1], [0.2]), safe=safe, horizon=4, delta=0.1)
+
+
+def valued_plane() -> cb.Problem:
+    """The same in two states, without a disturbance."""
+    system = cb.DiscreteSystem(
+        lambda x: [0.8 * x[0] + 0.2 * x[1], 0.7 * x[1] - 0.1 * np.sin(x[0])], states=["x", "y"],
+        noise=cb.Gaussian(covariance=[[0.04, 0.0], [0.0, 0.03]]),
+    )
+    safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    return cb.Problem(system, initial=[0.1, 0.0], safe=safe, horizon=3, delta=0.1)
+
+
 @pytest.fixture(autouse=True)
 def precise() -> Iterator[None]:
     """The working precision of a check."""
@@ -125,3 +145,8 @@ def springing() -> Case:
 @pytest.fixture(scope="session")
 def stirring() -> Case:
     return Case(stirred(), "linear")
+
+
+@pytest.fixture(scope="session")
+def valuing() -> Case:
+    return Case(valued(), "values")

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 import certbound as cb
-from certbound.checker import parse
+from certbound.checker import check_data, parse
 from certbound.safety.answers import exact
-from certbound.safety.certificate import certificate_text, problem_data
+from certbound.safety.certificate import certificate_text, problem_data, restated
 from certbound.safety.verification import verify_safety
 from tests.checker import conftest
 from tests.checker.linear.test_diffusion import growth
@@ -137,6 +137,18 @@ def _stated(build: Callable[[], cb.Problem], method: str) -> Callable[[], str]:
     return text
 
 
+def _sharp(build: Callable[[], cb.Problem]) -> Callable[[], str]:
+    """A certificate by value functions that claims what is proved of it, and no more."""
+
+    def text() -> str:
+        found = _stated(build, "values")()
+        proved = check_data(parse(found)).log10_proved
+        assert proved is not None
+        return restated(found, proved)
+
+    return text
+
+
 _BASES: dict[str, Callable[[], str]] = {
     "steps": _stated(conftest.steps, "linear"),
     "flow": _stated(conftest.flow, "linear"),
@@ -154,6 +166,8 @@ _BASES: dict[str, Callable[[], str]] = {
     "bounded": _stated(_bounded, "constants"),
     "planned": _stated(_planned, "constants"),
     "rising": lambda: json.dumps(_rising()),
+    "valued": _sharp(conftest.valued),
+    "valued plane": _sharp(conftest.valued_plane),
     "barrier": lambda: json.dumps(by_hand(kinked(), 8.0, 0.7201, 0.0801, 7.999)),
 }
 
@@ -352,7 +366,7 @@ def _(data: Data) -> None:
 
 
 @forges(
-    "an obstacle is kept off at every moment of a piece", "flow", "statement/rooms.py", "_centres", "nothing is left",
+    "an obstacle is kept off at every moment of a piece", "flow", "statement/rooms.py", "centres_of", "nothing is left",
 )
 def _(data: Data) -> None:
     tape = data["problem"]["constraints"][1]["region"]["center"]  # o(t) (1 - exp(-(1e4 (t - .615))^2))
@@ -752,5 +766,95 @@ def _(data: Data) -> None:
 
 
 @forges("a barrier treats bounded starts only", "barrier", "barrier.py", "_refuse", "bounded initial set")
+def _(data: Data) -> None:
+    data["problem"]["initial"] = {"kind": "gaussian", "mean": exact([0.0]), "covariance": exact([[1e-4]])}
+
+
+# ---- value functions in discrete time ------------------------------------------------------------------------
+
+
+def _grid(data: Data, edges: list[float]) -> None:
+    """The same few cells at every step."""
+    data["proof"] |= {"grids": [[exact(edges)]], "steps": [0] * len(data["proof"]["steps"])}
+
+
+@forges(
+    "a cell that is not shown to be safe counts as failed", "valued", "values/backward.py", "bounded", MORE,
+)
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["region"] |= {"low": exact([-0.8]), "high": exact([0.8])}
+
+
+@forges("what lies beyond the grid counts as failed", "valued", "values/backward.py", "Values", MORE)
+def _(data: Data) -> None:
+    for grid in data["proof"]["grids"]:
+        grid[0] = grid[0][2:-2]
+
+
+@forges("the cells of a grid are in order", "valued", "values/proof.py", "_grid", "rising numbers")
+def _(data: Data) -> None:
+    for grid in data["proof"]["grids"]:
+        grid[0].insert(2, grid[0][1])
+
+
+@forges("the mean is taken over the noise", "valued", "values/normal_means.py", "axis_table", MORE)
+def _(data: Data) -> None:
+    _scale(data["problem"]["noise"], "values", 1.001)
+
+
+@forges("what a polynomial misses of the mean is added", "valued", "values/normal_means.py", "MeanTable.missing", MORE)
+def _(data: Data) -> None:
+    _grid(data, [-1.0 + 0.2 * k for k in range(11)])
+    _claim(data, -2.3)
+
+
+@forges("what a polynomial misses of the dynamics is added", "valued", "values/batches.py", "composed", MORE)
+def _(data: Data) -> None:
+    _grid(data, [-1.0 + 0.2 * k for k in range(11)])
+
+
+@forges("nothing is known where the dynamics jumps", "valued", "values/images.py", "run", MORE)
+def _(data: Data) -> None:
+    jumping(data, "sign", 1, 0.6)
+
+
+@forges("every disturbance counts", "valued", "values/backward.py", "_without", MORE)
+def _(data: Data) -> None:
+    data["problem"]["disturbance_set"] = [exact([-0.051, 0.05])]
+
+
+@forges("the worst part of the disturbances counts", "valued", "values/backward.py", "_larger", MORE)
+def _(data: Data) -> None:
+    data["problem"]["disturbance_set"] = [exact([-0.05, 0.06])]
+
+
+@forges("the starts break no constraint", "valued", "values/proof.py", "_Discrete.upper", "lie in the safe set")
+def _(data: Data) -> None:
+    data["problem"]["constraints"].append(
+        {"kind": "inside", "label": "x", "during": exact([0.0, 0.0]), "region": {
+            "kind": "halfspace", "normal": exact([1.0]), "bound": exact(0.1),
+        }}
+    )  # fmt: skip
+
+
+@forges("a constraint counts at every step of its window", "valued", "statement/safe_set.py", "StepSet", MORE)
+def _(data: Data) -> None:
+    data["problem"]["constraints"][1]["during"] = exact([1.0, 4.0])
+
+
+@forges("value functions need noise that is exactly normal", "valued", "values/backward.py", "_deviations", "normal")
+def _(data: Data) -> None:
+    data["problem"]["noise"]["law"] = "subgaussian"
+
+
+@forges(
+    "value functions need noise that is independent from state to state", "valued plane", "values/backward.py",
+    "_deviations", "independent",
+)
+def _(data: Data) -> None:
+    data["problem"]["noise"]["values"] = exact([[0.04, 0.001], [0.001, 0.03]])
+
+
+@forges("value functions need bounded starts", "valued", "values/proof.py", "_Discrete", "bounded starts")
 def _(data: Data) -> None:
     data["problem"]["initial"] = {"kind": "gaussian", "mean": exact([0.0]), "covariance": exact([[1e-4]])}

@@ -6,6 +6,6 @@ after the noise, as a function of where the noise-free step ends), ``steps`` (th
 ``induction`` (one step back), ``failures`` (the answer, refined until it is good).
 """
 
-from certbound.values.discrete.failures import FailureBounds, bound_failure
+from certbound.values.discrete.failures import FailureBounds, bound_failure, step_grids
 
-__all__ = ["FailureBounds", "bound_failure"]
+__all__ = ["FailureBounds", "bound_failure", "step_grids"]

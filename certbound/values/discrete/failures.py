@@ -153,6 +153,18 @@ def bound_failure(
     )
 
 
+def step_grids(problem: Problem, share: float) -> list[Grid]:
+    """The grids of all steps at one size of the cells, one object where steps share one; as certificates state them.
+
+    Inapplicable where value functions do not fit the problem, or the grids would be too large.
+    """
+    work = _Work(problem, None, 1)
+    found = work.layout(share)
+    if found is None:
+        raise Inapplicable(work.too_large)
+    return found
+
+
 def _expected(spent: list[tuple[int, float]], cells: int) -> float:
     """Seconds that so many cells will take: a straight line through the last two grids, or half in proportion."""
     (count, last) = spent[-1]
