@@ -14,8 +14,10 @@ times as many calls. Functions of one variable (``composed``) are expanded by ba
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import lru_cache
 from typing import Any
 
@@ -95,9 +97,37 @@ class Batch:
         slack = (np.abs(self.value) + reach) * 2 * _UNIT
         return self.value - reach - slack, self.value + reach + slack
 
+    def sharp_ends(self) -> tuple[Array, Array]:
+        """Bounds of all values from the Bernstein coefficients, between which a polynomial lies."""
+        which, count = self.terms, self.terms.degree + 1
+        table = np.zeros((count,) * which.variables + self.error.shape)
+        for exponents, row in zip(which.exponents, self.coefficients):
+            table[exponents] = row
+        for axis in range(which.variables):
+            table = np.moveaxis(np.tensordot(_to_bernstein(count - 1), table, axes=([1], [axis])), 0, axis)
+        table = table.reshape(-1, len(self.error))
+        size = np.abs(self.coefficients).sum(axis=0)  # the matrices' entries are at most 1
+        slack = (self.error + which.variables * (count + 4) * _UNIT * size + _TINY) * _UP
+        low, high = self.ends()
+        return np.maximum(low, table.min(axis=0) - slack), np.minimum(high, table.max(axis=0) + slack)
+
     def take(self, places: Any) -> Batch:
         """Some of the boxes."""
         return Batch(self.terms, self.coefficients[:, places], self.error[places])
+
+
+@lru_cache(maxsize=8)
+def _to_bernstein(degree: int) -> Array:
+    """From powers of xi in [-1, 1] to Bernstein coefficients, entries rounded once: xi^k = (2 s - 1)^k."""
+    rows = []
+    for j in range(degree + 1):
+        row = []
+        for k in range(degree + 1):
+            parts = (Fraction(math.comb(k, i) * 2**i * (-1) ** (k - i) * math.comb(j, i), math.comb(degree, i))
+                     for i in range(min(j, k) + 1))  # fmt: skip
+            row.append(float(sum(parts, Fraction(0))))
+        rows.append(row)
+    return np.array(rows)
 
 
 def joined(parts: list[Batch]) -> Batch:

@@ -22,6 +22,7 @@ from certbound.checker.values.backward import (
     zones,
 )
 from certbound.checker.values.batches import above, below
+from certbound.checker.values.passage import Passage
 from certbound.errors import CertificateError
 
 MOST_STATES = 2
@@ -32,9 +33,9 @@ MOST_STEPS = 2_000
 
 def check_values(model: Model, value: object, budget: Budget) -> arb:
     """Upper bound of the probability that a constraint is broken."""
-    if model.continuous:
-        raise Unproved("value functions are not proved in continuous time")
     with np.errstate(all="ignore"):  # what is no number is unknown
+        if model.continuous:
+            return Passage(model, value, budget).upper()
         return _Discrete(model, value, budget).upper()
 
 

@@ -19,9 +19,11 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Reader, enclose, squared_diffusion
 from certbound.values.continuous.hypotheses import Model, covers, extreme_over, prove_lower, prove_upper
+from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.proposal import Line, sketch
 from certbound.values.continuous.room import Room, safe_room, starts_of
 from certbound.values.continuous.shapes import propose_lower, propose_upper, sealed
+from certbound.values.continuous.surface import Surface
 
 Starts = list[tuple[float, float]]
 
@@ -43,12 +45,15 @@ class ExitBounds:
     words : str
         What was done.
     seconds : float
+    proposed : tuple of (Surface, Payment)
+        V of every upper bound that was better than those before, and what it was paid with.
     """
 
     upper: float
     lower: float | None
     words: str
     seconds: float
+    proposed: tuple[tuple[Surface, Payment], ...] = ()
 
 
 def bound_exits(
@@ -92,15 +97,16 @@ def bound_exits(
     room = safe_room(problem)
     model = _model(problem)
     _check_noise(model, room, problem)
+    proposed: list[tuple[Surface, Payment]] = []
     if problem.system.dimension == 1:
-        upper, least, words = _one_state(problem, model, room, begin + seconds, lower)
+        upper, least, words, proposed = _one_state(problem, model, room, begin + seconds, lower)
     else:
         from certbound.values.continuous.two_states import two_states
 
         upper, least, words = two_states(problem, model, room, begin + seconds)
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
-        words=words, seconds=time.perf_counter() - begin,
+        words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),
     )  # fmt: skip
 
 
@@ -187,7 +193,7 @@ def _line(problem: Problem, model: Model, low: float, high: float) -> Line:
 
 def _one_state(
     problem: Problem, model: Model, room: Room, deadline: float, lower: bool
-) -> tuple[float, float | None, str]:
+) -> tuple[float, float | None, str, list[tuple[Surface, Payment]]]:
     """Refine both sides until the time is spent or a refinement gains less than half a per cent."""
     starts = starts_of(problem)
     inner = _line(problem, model, room.inner_low[0], room.inner_high[0])
@@ -207,7 +213,7 @@ def _one_state(
             break
         effort, tolerance, lead = effort * 1.4, tolerance / 3, lead * 0.6
     words = f"value function in one state, cells x slabs of time: {', '.join(found.done) or 'none came to an end'}"
-    return found.upper, found.lower, words
+    return found.upper, found.lower, words, found.proposed
 
 
 @dataclass(slots=True)
@@ -218,6 +224,7 @@ class _Found:
     upper: float = 0.0
     lower: float | None = None
     done: list[str] = field(default_factory=list)
+    proposed: list[tuple[Surface, Payment]] = field(default_factory=list)
 
 
 def _raise_upper(
@@ -230,9 +237,11 @@ def _raise_upper(
         return 0.0
     found.done.append(f"{cells} x {surface.slabs}")
     found.level = min(found.level, extreme_over(surface, starts, upper=True))
-    value = prove_upper(surface, model, starts).log
-    gain = found.upper - value
-    found.upper = min(found.upper, value)
+    payment = prove_upper(surface, model, starts)
+    gain = found.upper - payment.log
+    if gain > 0:
+        found.upper = payment.log
+        found.proposed.append((surface, payment))
     return gain
 
 

@@ -19,7 +19,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -209,6 +209,7 @@ def examine_upper(
             break
         patched = _patched(proof, proof.ranges.residual_high, need, surface.steps, lift)
         payment = pay_upper(patched, _up(start + lift), floor + lift - 1e-15 * (1 + abs(floor)))
+        payment = replace(payment, lift=lift)
         best = payment if best is None or payment.log < best.log else best
     assert best is not None
     high = proof.spread(proof.ranges.residual_high, surface, -np.inf)

@@ -79,13 +79,17 @@ class Levels:
 class Payment:
     """A bound of the probability as a natural logarithm, and what it was paid with.
 
-    ``lam`` and ``eps`` (in units of exp(v0)) are summed over time; ``growth`` is the size of theta(v0) - v0.
+    ``lam`` and ``eps`` (in units of exp(v0)) are summed over time; ``growth`` is the size of theta(v0) - v0. Upper
+    bounds also say with which levels, with which eps of every slab, and by how much V was lifted.
     """
 
     log: float
     lam: float
     eps: float
     growth: float
+    levels: Levels | None = None
+    rates: Array | None = None
+    lift: float = 0.0
 
 
 def repay(m: Array, *, upper: bool) -> Array | None:
@@ -252,7 +256,9 @@ def _settle_upper(patched: Patched, levels: Levels, start: float, floor: float) 
         kept = Interval.point(1.0) - exp(Interval.point(floor) - level)
         level = level + log(kept) - log(Interval.point(1.0) - exp(Interval.point(floor)))
     value = min(float(level.hi), 0.0)
-    return Payment(log=value, lam=float(later[0]), eps=float(rest.hi), growth=float(growth.hi))
+    return Payment(
+        log=value, lam=float(later[0]), eps=float(rest.hi), growth=float(growth.hi), levels=levels, rates=eps
+    )
 
 
 def _settle_lower(patched: Patched, levels: Levels, start: float, ceiling: float) -> Payment | None:
