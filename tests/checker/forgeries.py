@@ -6,7 +6,9 @@ inequality's name in docs/certificate.md.
 
 from __future__ import annotations
 
+import base64
 import json
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -137,11 +139,11 @@ def _stated(build: Callable[[], cb.Problem], method: str) -> Callable[[], str]:
     return text
 
 
-def _sharp(build: Callable[[], cb.Problem]) -> Callable[[], str]:
+def _sharp(written: Callable[[], str]) -> Callable[[], str]:
     """A certificate by value functions that claims what is proved of it, and no more."""
 
     def text() -> str:
-        found = _stated(build, "values")()
+        found = written()
         proved = check_data(parse(found)).log10_proved
         assert proved is not None
         return restated(found, proved)
@@ -166,8 +168,9 @@ _BASES: dict[str, Callable[[], str]] = {
     "bounded": _stated(_bounded, "constants"),
     "planned": _stated(_planned, "constants"),
     "rising": lambda: json.dumps(_rising()),
-    "valued": _sharp(conftest.valued),
-    "valued plane": _sharp(conftest.valued_plane),
+    "valued": _sharp(_stated(conftest.valued, "values")),
+    "valued plane": _sharp(_stated(conftest.valued_plane, "values")),
+    "leaving": _sharp(lambda: conftest.exit_certificate(conftest.leaving())),
     "barrier": lambda: json.dumps(by_hand(kinked(), 8.0, 0.7201, 0.0801, 7.999)),
 }
 
@@ -858,3 +861,95 @@ def _(data: Data) -> None:
 @forges("value functions need bounded starts", "valued", "values/proof.py", "_Discrete", "bounded starts")
 def _(data: Data) -> None:
     data["problem"]["initial"] = {"kind": "gaussian", "mean": exact([0.0]), "covariance": exact([[1e-4]])}
+
+
+# ---- value functions in continuous time ----------------------------------------------------------------------
+
+
+def repacked(data: Data, name: str, change: Callable[[np.ndarray], None]) -> None:
+    """Change the numbers of a packed array."""
+    proof = data["proof"]
+    shape = (len(proof["times"]), *(size for axis in proof["axes"] for size in (len(axis), 3)))
+    words = zlib.decompress(base64.b64decode(proof[name])).decode().split(" ")
+    numbers = np.array([float.fromhex(word) for word in words]).reshape(shape)
+    change(numbers)
+    words = [float(value).hex() for value in numbers.ravel()]
+    proof[name] = base64.b64encode(zlib.compress(" ".join(words).encode())).decode()
+
+
+def _lower(data: Data, amount: float) -> None:
+    """Claim less."""
+    _claim(data, float.fromhex(data["claim"]["log10_delta"]) - amount)
+
+
+@forges("the grid of V lies in the safe set", "leaving", "values/passage.py", "Passage._check_box", "grid was not shown")
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["region"]["high"] = exact([0.999])
+
+
+@forges("the grid of V holds the starts", "leaving", "values/passage.py", "Passage._check_box", "lie in the grid")
+def _(data: Data) -> None:
+    data["problem"]["initial"]["high"] = exact([1.5])
+
+
+@forges("V is at least 0 on the sides of its grid", "leaving", "values/passage.py", "Passage._missing", MORE)
+def _(data: Data) -> None:
+    def change(values: np.ndarray) -> None:
+        values[:, :, 0] -= 0.5
+
+    repacked(data, "values", change)
+    _lower(data, 0.1)
+
+
+@forges("V is what it is at every start", "leaving", "values/passage.py", "Passage._at_start", MORE)
+def _(data: Data) -> None:
+    data["problem"]["initial"]["high"] = exact([0.25])
+
+
+@forges("the slabs of time cover the horizon", "leaving", "values/passage.py", "Passage._read", "cover the horizon")
+def _(data: Data) -> None:
+    data["problem"]["horizon"] = exact(0.5)
+
+
+@forges("the residual of V is paid for", "leaving", "values/passage.py", "Passage._residual", MORE)
+def _(data: Data) -> None:
+    nodes = data["problem"]["noise"]["diffusion"]["nodes"]
+    nodes[nodes.index(["const", exact(0.75)])][1] = exact(0.755)
+
+
+@forges("the residual is taken for every disturbance", "leaving", "values/passage.py", "Passage._residual", MORE)
+def _(data: Data) -> None:
+    data["problem"]["disturbance_set"] = [exact([-0.1, 0.11])]
+
+
+@forges("the dynamics is defined where V is negative", "leaving", "values/passage.py", "Passage._payments", "defined")
+def _(data: Data) -> None:
+    jumping(data, "sign", 1, 0.6)
+
+
+@forges("what is paid as eps is not negative", "leaving", "values/passage.py", "Passage", "must not be negative")
+def _(data: Data) -> None:
+    data["proof"]["eps"] = exact([-0.01] * len(data["proof"]["eps"]))
+    _lower(data, 0.005)
+
+
+@forges("q grows as its inequality asks", "leaving", "values/passage.py", "Levels", "q was not shown")
+def _(data: Data) -> None:
+    data["proof"] |= {"edges": exact([-8.0, 0.0]), "m": exact([0.5]), "q": exact([0.0, 0.1])}
+
+
+@forges("q lies between 0 and 1", "leaving", "values/passage.py", "Levels", "stay below 1")
+def _(data: Data) -> None:
+    data["proof"] |= {"edges": exact([-8.0, 0.0]), "m": exact([0.5]), "q": exact([0.0, 1.0])}
+
+
+@forges("value functions need a bounded start in continuous time too", "leaving", "values/passage.py", "Passage", "bounded")
+def _(data: Data) -> None:
+    data["problem"]["initial"] = {"kind": "gaussian", "mean": exact([0.0]), "covariance": exact([[1e-4]])}
+
+
+@forges("value functions need a plan without steps in time", "leaving", "values/passage.py", "Passage", "steps in time")
+def _(data: Data) -> None:
+    data["problem"] |= {"inputs": ["u"], "plan": exact([[0.0]])}
+    nodes = data["problem"]["dynamics"]["nodes"]
+    nodes[nodes.index(["input", 2])] = ["input", 3]

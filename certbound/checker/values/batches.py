@@ -29,6 +29,7 @@ from certbound.checker.expressions import Undecided
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+Index = npt.NDArray[np.intp]
 Series = list[arb]
 
 _UNIT = 2.0**-52

@@ -1,7 +1,7 @@
 """The function V that a certificate states in continuous time, patch by patch, as Taylor models of it and its slopes.
 
-V takes stated values and derivatives (up to the second in every state) at the nodes of a grid, and their stated rates, at the
-ends of slabs of time: degree 5 in every state and 3 in time on every patch. The data are shared by
+V takes stated values and derivatives (up to the second in every state) at the nodes of a grid, and stated rates, at the ends
+of slabs of time: degree 5 in every state and 3 in time on every patch. The data are shared by
 neighbours, so that V is twice continuously differentiable in the states and once in time, whatever they are.
 
 On a patch, tau and xi in [-1, 1], V is the sum of data times the products of the basis polynomials below, whose
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from certbound.checker.values.batches import Array, Batch, Terms
+from certbound.checker.values.batches import Array, Batch, Index, Terms
 
 _ROUNDING = 400 * 2.0**-53
 _UP = 1 + 2.0**-40
@@ -78,14 +78,13 @@ class Surface:
 
     def face(self, axis: int, side: int) -> Surface:
         """V on one side of the grid (0: lower, 1: upper), as a function of time and of the other states."""
-        values, rates = (
-            array.take(-side, axis=1 + 2 * axis).take(0, axis=1 + 2 * axis) for array in (self.values, self.rates)
-        )
+        cut = (slice(None),) * (1 + 2 * axis) + (-side, 0)
+        values, rates = self.values[cut], self.rates[cut]
         return Surface(self.times, tuple(row for k, row in enumerate(self.axes) if k != axis), values, rates)
 
-    def at_start(self) -> Surface:
-        """V(0, .) as a function that stays the same over a slab."""
-        same = self.values[[0, 0]]
+    def frozen(self, index: int) -> Surface:
+        """V at the end of a slab as a function that stays the same in time."""
+        same = self.values[[index, index]]
         return Surface(np.array([0.0, 1.0]), self.axes, same, np.zeros_like(same))
 
 
@@ -97,7 +96,7 @@ class Patches:
     high: Array
     data: Array
 
-    def take(self, places: Array | slice) -> Patches:
+    def take(self, places: Index | slice) -> Patches:
         """Some of the patches."""
         return Patches(self.low[:, places], self.high[:, places], self.data[..., places])
 

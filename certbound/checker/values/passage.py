@@ -11,9 +11,12 @@ Then w = exp(theta(V)), theta(V) = V + int_V^0 q, has w_t + L w <= lam_k w + eps
 levels, since theta' = 1 - q is in (0, 1], theta'' + theta'^2 - theta' <= -m theta' and theta(V) - V <= Q. With L_k the
 integral of lam over slab k and all later ones,
 
-    P(leaving within T) <= exp(L_0 + theta(v0)) + exp(v0 + Q) sum_k eps_k h_k exp(L_k).
+    P + (1 - P) exp(inf V(T, .)) <= exp(L_0 + theta(v0)) + exp(v0 + Q) sum_k eps_k h_k exp(L_k)
 
-m, q and eps are stated in the file; lam is what the patches of each slab then need.
+for the probability P of leaving within T: at T the process is at least 1 on paths that left, exp(V(T, .)) on others.
+
+m, q and eps are stated in the file. lam is what the patches of each slab then need; the lam of the file only says where
+a closer look is worth its time.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from certbound.checker.reading import Record, numbers
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, SafeSet
 from certbound.checker.values import batches as tm
-from certbound.checker.values.batches import Array, Batch, Terms, above, below, terms
+from certbound.checker.values.batches import Array, Batch, Index, Terms, above, below, terms
 from certbound.checker.values.hermite import Patches, Surface
 from certbound.checker.values.images import run
 from certbound.checker.values.packed import unpacked
@@ -39,7 +42,9 @@ from certbound.problem.model import Tape
 
 MOST_PATCHES = 1_000_000
 MOST_LEVELS = 200
-_DEGREES = {1: 6, 2: 6}
+_DEGREES = {1: (6, 8), 2: (6, 8, 10, 12)}
+"""Of the Taylor models by the number of states: higher ones where lower ones do not show what the file states."""
+_ENTRIES = 4_000_000
 _CHUNK = 4096
 
 
@@ -83,7 +88,7 @@ class Passage:
     """The proof's numbers, and what follows from them."""
 
     def __init__(self, model: Model, value: object, budget: Budget) -> None:
-        names = ("engine", "axes", "times", "values", "rates", "edges", "m", "q", "eps")
+        names = ("engine", "axes", "times", "values", "rates", "edges", "m", "q", "lam", "eps")
         record = Record(value, "proof", names)
         self.model, self.budget, n = model, budget, model.dimension
         if n not in _DEGREES:
@@ -94,10 +99,11 @@ class Passage:
             raise Unproved("value functions are proved for bounded starts only")
         self.surface = self._read(record)
         self.levels = Levels(record.array("edges", None), record.array("m", None), record.array("q", None))
-        self.eps = np.array(record.array("eps", len(self.surface.times) - 1))
+        slabs = len(self.surface.times) - 1
+        self.stated, self.eps = np.array(record.array("lam", slabs)), np.array(record.array("eps", slabs))
         if len(self.levels.m) > MOST_LEVELS or not (self.eps >= 0).all():
             raise CertificateError(f"`proof.eps` must not be negative, nor `proof.m` have over {MOST_LEVELS} entries.")
-        self.terms = terms(1 + n + len(model.disturbance), _DEGREES[n])
+        self.degrees = _DEGREES[n]
         self.lift = 0.0
 
     def _read(self, record: Record) -> Surface:
@@ -131,7 +137,8 @@ class Passage:
             total += arb(float(self.eps[k])) * step * later.exp()
         most = self.levels.above(arb(self.levels.edges[0]))
         found = (later + v0 + self.levels.above(v0)).exp() + (v0 + most).exp() * total
-        return arb.min(found, arb(1)).upper()
+        floor = arb.min(arb(self._at_end()), arb(-1)).exp()
+        return arb.min((found - floor) / (1 - floor), arb(1)).upper()
 
     def _check_box(self) -> None:
         """The box of the grid lies in the safe set, and the starts in it."""
@@ -155,7 +162,7 @@ class Passage:
 
     def _at_start(self) -> float:
         """At least V(0, .) on the initial set."""
-        surface, n = self.surface.at_start(), self.model.dimension
+        surface, n = self.surface.frozen(0), self.model.dimension
         low = [below(x) for x in self.model.initial.low]
         high = [above(x) for x in self.model.initial.high]
         patches = surface.patches(0, 1)
@@ -167,12 +174,18 @@ class Passage:
         parts = [self._part(found, i, low[i], high[i], whole.terms) for i in range(n)]
         return float(_substituted(whole, parts).sharp_ends()[1].max())
 
+    def _at_end(self) -> float:
+        """At most V at the horizon."""
+        n = self.model.dimension
+        patches = self.surface.frozen(-1).patches(0, 1)
+        low = patches.derivative(terms(n + 1, 5 + 3 * (n - 1)), (0,) * (n + 1)).sharp_ends()[0]
+        return float(np.nextafter(low.min() + self.lift, -np.inf))
+
     def _part(self, patches: Patches, i: int, low: float, high: float, which: Terms) -> Batch:
         """xi of a state on the part of every patch that the initial set may meet."""
         a, b = patches.low[1 + i], patches.high[1 + i]
         x = tm.variable(which, 1 + i, np.maximum(a, low), np.minimum(b, high))
-        middle = tm.variable(which, 1 + i, a, b)
-        middle.coefficients[1 + i] = 0.0
+        middle = tm.fixed(which, a / 2 + b / 2, (np.abs(a) + np.abs(b)) * 2.0**-51)
         return tm.scaled(tm.sub(x, middle), 2 / (b - a), 4 / (b - a) * 2.0**-52)
 
     def _chunks(self, surface: Surface) -> list[tuple[int, int]]:
@@ -183,36 +196,46 @@ class Passage:
     # ---- the residual ----------------------------------------------------------------------------------------
 
     def _payments(self, start: float) -> Array:
-        """lam of every slab."""
-        count = len(self.surface.times) - 1
-        lam, per = np.zeros(count), int(np.prod(self.surface.cells))
+        """lam of every slab: what its patches need, which the file says about."""
+        lam, per = np.zeros(len(self.eps)), int(np.prod(self.surface.cells))
         for first, last in self._chunks(self.surface):
             patches = self.surface.patches(first, last)
-            for begin in range(0, patches.low.shape[1], _CHUNK):
-                self.budget.check()
-                part = patches.take(slice(begin, begin + _CHUNK))
-                slab = first + (begin + np.arange(part.low.shape[1])) // per
-                self._pay(part, slab, start, lam)
+            slab = first + np.arange(patches.low.shape[1]) // per
+            for degree in self.degrees:
+                need = self._needs(patches, slab, start, degree)
+                settled = (need <= self.stated[slab]) | (degree == self.degrees[-1])
+                np.maximum.at(lam, slab[settled], need[settled])
+                rest = np.flatnonzero(~settled)
+                patches, slab = patches.take(rest), slab[rest]
+        if not np.isfinite(lam).all():
+            raise Unproved("the dynamics was not shown to be defined where V is negative")
         return lam
 
-    def _pay(self, patches: Patches, slab: np.ndarray, start: float, lam: Array) -> None:
-        """Raise lam to what some patches need."""
-        n = self.model.dimension
-        low, high = patches.derivative(self.terms, (0,) * (n + 1)).sharp_ends()
-        low, high = np.nextafter(low + self.lift, -np.inf), np.nextafter(high + self.lift, np.inf)
-        due = np.flatnonzero(~(low >= 0))
-        if not len(due):
-            return
-        patches, low, high = patches.take(due), low[due], high[due]
-        excess = self._residual(patches, self.levels.least(low, high)).sharp_ends()[1]
-        if not np.isfinite(excess).all():
-            raise Unproved("the dynamics was not shown to be defined where V is negative")
-        reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
-        np.maximum.at(lam, slab[due], (excess - self.eps[slab[due]] * reach * (1 - 1e-12)) * (1 + 1e-12))
+    def _needs(self, patches: Patches, slab: Index, start: float, degree: int) -> Array:
+        """What every patch needs as lam, from Taylor models of some degree."""
+        which = terms(1 + self.model.dimension + len(self.model.disturbance), degree)
+        need, size = np.zeros(len(slab)), max(32, _ENTRIES // (degree + 1) ** which.variables)
+        for first in range(0, len(slab), size):
+            self.budget.check()
+            part = slice(first, first + size)
+            need[part] = self._need(patches.take(part), self.eps[slab[part]], start, which)
+        return need
 
-    def _residual(self, patches: Patches, m: Array) -> Batch:
+    def _need(self, patches: Patches, eps: Array, start: float, which: Terms) -> Array:
+        low, high = patches.derivative(which, (0,) * (self.model.dimension + 1)).sharp_ends()
+        low, high = np.nextafter(low + self.lift, -np.inf), np.nextafter(high + self.lift, np.inf)
+        need, due = np.zeros(len(eps)), np.flatnonzero(~(low >= 0))
+        if len(due):
+            low, high = low[due], high[due]
+            excess = self._residual(patches.take(due), self.levels.least(low, high), which).sharp_ends()[1]
+            reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
+            found = (excess - eps[due] * reach * (1 - 1e-12)) * (1 + 1e-12)
+            need[due] = np.where(np.isfinite(excess), np.maximum(found, 0.0), np.inf)
+        return need
+
+    def _residual(self, patches: Patches, m: Array, which: Terms) -> Batch:
         """R - m Q2, the disturbance being a variable."""
-        model, which, n = self.model, self.terms, self.model.dimension
+        model, n = self.model, self.model.dimension
         count = patches.low.shape[1]
         inputs = [tm.variable(which, i, patches.low[i], patches.high[i]) for i in range(n + 1)]
         pushed = [
@@ -239,7 +262,7 @@ class Passage:
             entries, columns = run(given, inputs), given.shape[1]
         else:
             columns = given.ncols()
-            entries = [tm.fixed(self.terms, np.full(inputs[0].error.shape, float(x))) for x in given.entries()]
+            entries = [tm.fixed(inputs[0].terms, np.full(inputs[0].error.shape, float(x))) for x in given.entries()]
         rows = [entries[i * columns : (i + 1) * columns] for i in range(n)]
         return [[_summed([tm.mul(x, y) for x, y in zip(one, two)]) for two in rows] for one in rows]
 

@@ -19,14 +19,16 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.values.continuous import ExitBounds
-from certbound.values.discrete import FailureBounds, step_grids
+from certbound.values.discrete import step_grids
 
 _SHARES = {1: (0.42, 0.3, 0.2), 2: (0.55, 0.4, 0.28)}
 _ROOMS = (0.05, 0.15, 0.5)
 _PARTS = (12, 24, 48)  # of one disturbance; of several, their product
 _COARSE = (0.04, 0.01, 0.0)  # of log P, for a smaller file
+_MORE_ROOM = 3  # in continuous time and two states
+_MORE = 1.02  # of lam, which the checker need not prove
 _BITS = {"values": (42, 30, 22), "rates": (24, 18, 14)}  # of a value, a slope, a second derivative and beyond
-_MOST_NUMBERS = 2_000_000
+_MOST_NUMBERS = 12_000_000
 _INWARD = 1e-13  # of a side of the grid: its faces must lie in the safe set, whatever has been rounded
 
 
@@ -36,7 +38,8 @@ def values_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     CertificateError where the checker knows no proof of what was bounded.
     """
     effort = min(attempt, len(_ROOMS) - 1)
-    claim = _claim(answer.log10_delta, problem.delta, _ROOMS[effort])
+    flat = isinstance(answer.details, ExitBounds) and problem.system.dimension > 1
+    claim = _claim(answer.log10_delta, problem.delta, _ROOMS[effort] * (_MORE_ROOM if flat else 1))
     if isinstance(answer.details, ExitBounds):
         return _passage(answer.details, effort), claim, []
     _refuse(problem)
@@ -59,7 +62,7 @@ def values_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
 def _passage(found: ExitBounds, effort: int) -> dict[str, Any]:
     """Continuous time: V and what it is paid with; the coarsest one that costs little."""
     if not found.proposed:
-        raise CertificateError("the checker knows value functions in continuous time for one state only.")
+        raise CertificateError("no value function was found that bounds anything.")
     best = min(payment.log for _, payment in found.proposed)
     share = _COARSE[effort] * max(1.0, -0.1 * best)
     surface, payment = next(pair for pair in found.proposed if pair[1].log <= best + share)
@@ -78,7 +81,8 @@ def _passage(found: ExitBounds, effort: int) -> dict[str, Any]:
         "edges": exact(payment.levels.edges),
         "m": exact(payment.levels.m),
         "q": exact(payment.levels.q),
-        "eps": exact(payment.rates),
+        "lam": exact(payment.rates[0] * _MORE),
+        "eps": exact(payment.rates[1]),
     }
 
 

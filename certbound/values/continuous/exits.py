@@ -103,7 +103,7 @@ def bound_exits(
     else:
         from certbound.values.continuous.two_states import two_states
 
-        upper, least, words = two_states(problem, model, room, begin + seconds)
+        upper, least, words, proposed = two_states(problem, model, room, begin + seconds)
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),

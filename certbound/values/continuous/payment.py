@@ -80,7 +80,7 @@ class Payment:
     """A bound of the probability as a natural logarithm, and what it was paid with.
 
     ``lam`` and ``eps`` (in units of exp(v0)) are summed over time; ``growth`` is the size of theta(v0) - v0. Upper
-    bounds also say with which levels, with which eps of every slab, and by how much V was lifted.
+    bounds also say with which levels, with which lam and eps of every slab, and by how much V was lifted.
     """
 
     log: float
@@ -88,7 +88,7 @@ class Payment:
     eps: float
     growth: float
     levels: Levels | None = None
-    rates: Array | None = None
+    rates: tuple[Array, Array] | None = None
     lift: float = 0.0
 
 
@@ -257,7 +257,8 @@ def _settle_upper(patched: Patched, levels: Levels, start: float, floor: float) 
         level = level + log(kept) - log(Interval.point(1.0) - exp(Interval.point(floor)))
     value = min(float(level.hi), 0.0)
     return Payment(
-        log=value, lam=float(later[0]), eps=float(rest.hi), growth=float(growth.hi), levels=levels, rates=eps
+        log=value, lam=float(later[0]), eps=float(rest.hi), growth=float(growth.hi), levels=levels,
+        rates=(lam, eps),
     )
 
 

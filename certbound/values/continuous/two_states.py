@@ -23,6 +23,7 @@ from certbound.values.continuous.hypotheses import (
     extreme_over,
     sampled_residual,
 )  # fmt: skip
+from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane
 from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
@@ -34,16 +35,19 @@ _CAP = 50.0
 
 def two_states(
     problem: Problem, model: Model, room: Room, deadline: float
-) -> tuple[float, None, str]:
+) -> tuple[float, None, str, list[tuple[Surface, Payment]]]:
     """Refine the upper bound until the time is spent; lower bounds in two states are not looked for."""
     starts = starts_of(problem)
     inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
     level = _rough_level(inner)
     upper, done = 0.0, []
+    proposed: list[tuple[Surface, Payment]] = []
     for plan in _plans(inner, level, 36 if deadline - time.perf_counter() < 15 else 50):
         begin = time.perf_counter()
-        for found in _uppers(inner, model, starts, plan):
-            upper = min(upper, found)
+        for surface, payment in _uppers(inner, model, starts, plan):
+            if payment.log < upper:
+                upper = payment.log
+                proposed.append((surface, payment))
             if time.perf_counter() > deadline:
                 break
         done.append(f"{plan.cells}^2")
@@ -51,7 +55,7 @@ def two_states(
         if time.perf_counter() + 2 * spent > deadline:
             break
     words = f"value function in two states, cells: {', '.join(done) or 'none came to an end'}"
-    return upper, None, words
+    return upper, None, words, proposed
 
 
 def _plans(plane: Plane, level: float, cells: int) -> Iterator[Plan]:
@@ -75,7 +79,7 @@ def _rough_level(plane: Plane) -> float:
     return level
 
 
-def _uppers(plane: Plane, model: Model, starts: list[Pair], plan: Plan) -> Iterator[float]:
+def _uppers(plane: Plane, model: Model, starts: list[Pair], plan: Plan) -> Iterator[tuple[Surface, Payment]]:
     """Proved upper bounds, one after another."""
     surface = propose_plane(plane, plan)
     if surface is None:
@@ -89,7 +93,7 @@ def _uppers(plane: Plane, model: Model, starts: list[Pair], plan: Plan) -> Itera
         if not covers(candidate, plane.horizon, plane.low, plane.high, within=True):
             return
         payment, excess, low = examine_upper(candidate, model, starts)
-        yield payment.log
+        yield candidate, payment
         if better is None:
             return
         source = source.plus(_source(better, excess, low))
