@@ -1,8 +1,8 @@
 """The function V that a certificate states in continuous time, patch by patch, as Taylor models of it and its slopes.
 
-V takes stated values and derivatives (up to the second in every state) at the nodes of a grid, and stated rates, at the ends
-of slabs of time: degree 5 in every state and 3 in time on every patch. The data are shared by
-neighbours, so that V is twice continuously differentiable in the states and once in time, whatever they are.
+V takes stated values and derivatives (up to the second in every state) at the nodes of a grid, and stated rates, at the
+ends of slabs of time: degree 5 in every state and 3 in time on every patch. The data are shared by neighbours, so that
+V is twice continuously differentiable in the states and once in time, whatever they are.
 
 On a patch, tau and xi in [-1, 1], V is the sum of data times the products of the basis polynomials below, whose
 coefficients are exact. A derivative of V has the basis' derivatives instead, and powers of the half-sides: it is made
