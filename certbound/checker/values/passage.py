@@ -40,7 +40,7 @@ from certbound.checker.values.packed import unpacked
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
-MOST_PATCHES = 1_000_000
+MOST_PATCHES = 400_000
 MOST_LEVELS = 200
 _DEGREES = {1: (6, 8), 2: (6, 8, 10, 12)}
 """Of the Taylor models by the number of states: higher ones where lower ones do not show what the file states."""

@@ -28,7 +28,8 @@ _COARSE = (0.04, 0.01, 0.0)  # of log P, for a smaller file
 _MORE_ROOM = 3  # in continuous time and two states
 _MORE = 1.02  # of lam, which the checker need not prove
 _BITS = {"values": (42, 30, 22), "rates": (24, 18, 14)}  # of a value, a slope, a second derivative and beyond
-_MOST_NUMBERS = 12_000_000
+_MOST_PATCHES = 400_000
+_LONGEST = 15 * 2**20  # characters of the packed arrays
 _INWARD = 1e-13  # of a side of the grid: its faces must lie in the safe set, whatever has been rounded
 
 
@@ -70,14 +71,17 @@ def _passage(found: ExitBounds, effort: int) -> dict[str, Any]:
         raise CertificateError("the value function bounds nothing.")
     surface = surface.raised(payment.lift)
     rates = np.concatenate([surface.start_rates, surface.end_rates[-1:]])
-    if 2 * rates.size > _MOST_NUMBERS:
-        raise CertificateError(f"the value function has more than {_MOST_NUMBERS} numbers: too many for a certificate.")
+    if surface.slabs * math.prod(surface.cells) > _MOST_PATCHES:
+        raise CertificateError(f"the value function has more than {_MOST_PATCHES} patches: too many for a certificate.")
+    values, slopes = _packed(surface.values, _BITS["values"]), _packed(rates, _BITS["rates"])
+    if len(values) + len(slopes) > _LONGEST:
+        raise CertificateError(f"the value function takes more than {_LONGEST // 2**20} MiB: too much for a certificate.")
     return {
         "engine": "values",
         "axes": [exact(axis) for axis in surface.axes],
         "times": exact(surface.times),
-        "values": _packed(surface.values, _BITS["values"]),
-        "rates": _packed(rates, _BITS["rates"]),
+        "values": values,
+        "rates": slopes,
         "edges": exact(payment.levels.edges),
         "m": exact(payment.levels.m),
         "q": exact(payment.levels.q),
@@ -102,7 +106,7 @@ def _packed(numbers: Array, bits: tuple[int, ...]) -> str:
 
 def _parts(problem: Problem, most: int) -> int:
     count = len(problem.system.disturbance_names)
-    return max(2, round(most ** (1 / count))) if count else 1
+    return max(2, round((most / problem.system.dimension) ** (1 / count))) if count else 1
 
 
 def _inward(edges: Array) -> Array:
