@@ -75,7 +75,7 @@ def _passage(found: ExitBounds, effort: int) -> dict[str, Any]:
         raise CertificateError(f"the value function has more than {_MOST_PATCHES} patches: too many for a certificate.")
     values, slopes = _packed(surface.values, _BITS["values"]), _packed(rates, _BITS["rates"])
     if len(values) + len(slopes) > _LONGEST:
-        raise CertificateError(f"the value function takes more than {_LONGEST // 2**20} MiB: too much for a certificate.")
+        raise CertificateError(f"the value function takes over {_LONGEST // 2**20} MiB: too much for a certificate.")
     return {
         "engine": "values",
         "axes": [exact(axis) for axis in surface.axes],
