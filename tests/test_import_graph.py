@@ -78,7 +78,7 @@ CHECKER_ORDER = """
 report reading words
 balls expressions
 statement
-constants linear barrier
+constants linear barrier values
 claims
 check
 """
@@ -96,6 +96,8 @@ KNOWS_ONLY = {  # rooms that may be taken out and used elsewhere
 CHECKER_MAY_IMPORT = {"certbound.errors", "certbound.problem.model", "flint"}
 CHECKER_TAKES = {"Tape", "Node", "JUMPS"}
 """What the checker may take of ``problem.model``: the description of a tape."""
+ON_ARRAYS = "certbound.checker.values"
+"""The part of the checker that may take NumPy besides; it is loaded only for certificates that need it."""
 
 ENTERED = {
     ("cli", "cli.commands"): "one module a command, and the application lists them",
@@ -104,7 +106,7 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
-    "values.discrete": (6, "kernels and interpolation of discrete time are those of the steps along the flow too"),
+    "values.discrete": (7, "kernels and interpolation of discrete time are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (23, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),
@@ -114,7 +116,7 @@ MANY_DOORS = {
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
     "problem.sets": (13, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
-    "checker.statement": (10, "what a certificate states is read once and asked by three proofs"),
+    "checker.statement": (11, "what a certificate states is read once and asked by four proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
     "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),
@@ -153,6 +155,7 @@ TWICE = {
     "reading": "files of strangers",
     "rooms": "what constraints leave to the deviation",
     "series": "Taylor series in time",
+    "values": "the engine of value functions, its certificate",
     "structure": "which entries of a Jacobian vary, and how",
 }
 """Module names that stand in more than one folder, and the one thing that they mean."""
@@ -238,7 +241,8 @@ def allowed(importer: str, found: Import) -> bool:
     if room == "checker" and other != "checker":
         if imported == "certbound.problem.model":
             return found.name in CHECKER_TAKES
-        named = any(imported == name or imported.startswith(name + ".") for name in CHECKER_MAY_IMPORT)
+        may = CHECKER_MAY_IMPORT | ({"numpy"} if importer.startswith(ON_ARRAYS) else set())
+        named = any(imported == name or imported.startswith(name + ".") for name in may)
         return named or imported.split(".")[0] in sys.stdlib_module_names
     if other is None or room is None or imported == "certbound.problem.__init__":
         return True
@@ -395,6 +399,9 @@ def test_a_module_name_means_one_thing() -> None:
         ("safety/planted.py", "from certbound.reach.linear import run"),
         ("reach/contraction/planted.py", "from certbound.reach.nominal.curve import Curve"),
         ("checker/planted.py", "import numpy"),
+        ("checker/linear/planted.py", "import numpy.linalg"),
+        ("checker/values/planted.py", "import scipy"),
+        ("checker/values/planted.py", "from certbound.values import grids"),
         ("checker/planted.py", "from certbound.problem.systems import ContinuousSystem"),
         ("checker/planted.py", "from certbound.problem.model import compile_numpy"),
         ("checker/planted.py", "from certbound.rigor import intervals"),
@@ -414,6 +421,7 @@ def test_a_planted_wrong_import_is_detected(tmp_path: Path, file: str, source: s
             "from certbound.rigor import balls\nfrom .constants import Constants\nimport numpy",
         ),
         ("checker/planted.py", "import json\nfrom flint import arb\nfrom certbound.problem.model import Tape"),
+        ("checker/values/planted.py", "import numpy as np\nimport numpy.typing as npt"),
         ("safety/planted.py", "from ..reach import linear\nfrom certbound import __version__"),
         ("safety/planted.py", "from certbound.reach.linear import LinearRun"),
         ("reach/linear/planted.py", "from certbound.reach.linear.run import LinearRun"),

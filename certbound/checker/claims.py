@@ -103,9 +103,17 @@ def claim(model: Model, engine: str, level: float, assumed: Sequence[str]) -> st
     return words + "".join(f"; assuming that {item}" for item in assumed)
 
 
+def _values(model: Model, proof: object, budget: Budget) -> arb:
+    """Loaded when it is needed: NumPy comes with it."""
+    from certbound.checker.values import check_values
+
+    return check_values(model, proof, budget)
+
+
 ENGINES = {
     "linear": Engine(words="linear response (Thm K7)", prove=check_linear, foresees=_additive),
     "constants": Engine(words="contraction constants (Thms K2, K5)", prove=check_constants, assumes=_stated),
     "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
+    "values": Engine(words="the value function itself (Thm K8)", prove=_values),
 }
 """By the name that a proof gives: all that the checker knows of an engine."""

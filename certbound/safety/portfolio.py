@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from certbound.problem.problem import Problem
 from certbound.safety.answers import EngineAnswer, Proof
-from certbound.safety.certificates import barrier_proof, constants_proof, response_proof
+from certbound.safety.certificates import barrier_proof, constants_proof, response_proof, values_proof
 from certbound.safety.engines import (
     barrier_engine,
     constants_engine,
@@ -98,6 +98,7 @@ ENGINES: dict[str, Engine] = {
             when="while nothing else has proved SAFE; the only one with a lower bound, so the only one that answers "
             "UNSAFE",
             prove=values_engine,
+            write=values_proof,
             reserve=True,
             dear=True,
         ),

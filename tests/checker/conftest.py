@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,10 @@ from flint import ctx
 
 import certbound as cb
 from certbound.checker import parse
+from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
+from certbound.values.continuous import bound_exits
 
 
 class Case:
@@ -95,6 +98,43 @@ def stirred() -> cb.Problem:
     )
 
 
+def valued() -> cb.Problem:
+    """Discrete time, for value functions: a wave, a disturbance, an obstacle with a window."""
+    system = cb.DiscreteSystem(
+        lambda x, d: [0.7 * x[0] + 0.1 * np.sin(3 * x[0]) + d[0]], states=["x"], disturbance=cb.Box([-0.05], [0.05]),
+        noise=cb.Gaussian(std=0.15),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1], [1])), cb.Outside(cb.Box([0.75], [0.9]), during=(2, 3))]
+    return cb.Problem(system, initial=cb.Box([-0.1], [0.2]), safe=safe, horizon=4, delta=0.1)
+
+
+def valued_plane() -> cb.Problem:
+    """The same in two states, without a disturbance."""
+    system = cb.DiscreteSystem(
+        lambda x: [0.8 * x[0] + 0.2 * x[1], 0.7 * x[1] - 0.1 * np.sin(x[0])], states=["x", "y"],
+        noise=cb.Gaussian(covariance=[[0.04, 0.0], [0.0, 0.03]]),
+    )
+    safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    return cb.Problem(system, initial=[0.1, 0.0], safe=safe, horizon=3, delta=0.1)
+
+
+def leaving() -> cb.Problem:
+    """Continuous time, for value functions: a wave, noise that grows with the state, a disturbance."""
+    system = cb.ContinuousSystem(
+        lambda x, d: [-x[0] + 0.2 * np.sin(3 * x[0]) + d[0]], states=["x"], disturbance=cb.Box([-0.1], [0.1]),
+        diffusion=lambda t, x: [[0.75 + 0.1 * x[0] ** 2]],
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1], [1]))]
+    return cb.Problem(system, initial=cb.Box([-0.1], [0.2]), safe=safe, horizon=0.4, delta=0.5)
+
+
+def exit_certificate(problem: cb.Problem, seconds: float = 0.1) -> str:
+    """A certificate by a value function in continuous time from the first attempt alone."""
+    found = bound_exits(problem, seconds=seconds, lower=False)
+    answer = EngineAnswer(log10_delta=found.upper, method="values", details=found)
+    return certificate_text(problem, SimpleNamespace(status="UNKNOWN", reason="", answers={"values": answer}))
+
+
 @pytest.fixture(autouse=True)
 def precise() -> Iterator[None]:
     """The working precision of a check."""
@@ -125,3 +165,8 @@ def springing() -> Case:
 @pytest.fixture(scope="session")
 def stirring() -> Case:
     return Case(stirred(), "linear")
+
+
+@pytest.fixture(scope="session")
+def valuing() -> Case:
+    return Case(valued(), "values")

@@ -6,7 +6,9 @@ inequality's name in docs/certificate.md.
 
 from __future__ import annotations
 
+import base64
 import json
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -15,9 +17,9 @@ from typing import Any
 import numpy as np
 
 import certbound as cb
-from certbound.checker import parse
+from certbound.checker import check_data, parse
 from certbound.safety.answers import exact
-from certbound.safety.certificate import certificate_text, problem_data
+from certbound.safety.certificate import certificate_text, problem_data, restated
 from certbound.safety.verification import verify_safety
 from tests.checker import conftest
 from tests.checker.linear.test_diffusion import growth
@@ -137,6 +139,18 @@ def _stated(build: Callable[[], cb.Problem], method: str) -> Callable[[], str]:
     return text
 
 
+def _sharp(written: Callable[[], str]) -> Callable[[], str]:
+    """A certificate by value functions that claims what is proved of it, and no more."""
+
+    def text() -> str:
+        found = written()
+        proved = check_data(parse(found)).log10_proved
+        assert proved is not None
+        return restated(found, proved)
+
+    return text
+
+
 _BASES: dict[str, Callable[[], str]] = {
     "steps": _stated(conftest.steps, "linear"),
     "flow": _stated(conftest.flow, "linear"),
@@ -154,6 +168,9 @@ _BASES: dict[str, Callable[[], str]] = {
     "bounded": _stated(_bounded, "constants"),
     "planned": _stated(_planned, "constants"),
     "rising": lambda: json.dumps(_rising()),
+    "valued": _sharp(_stated(conftest.valued, "values")),
+    "valued plane": _sharp(_stated(conftest.valued_plane, "values")),
+    "leaving": _sharp(lambda: conftest.exit_certificate(conftest.leaving())),
     "barrier": lambda: json.dumps(by_hand(kinked(), 8.0, 0.7201, 0.0801, 7.999)),
 }
 
@@ -352,7 +369,7 @@ def _(data: Data) -> None:
 
 
 @forges(
-    "an obstacle is kept off at every moment of a piece", "flow", "statement/rooms.py", "_centres", "nothing is left",
+    "an obstacle is kept off at every moment of a piece", "flow", "statement/rooms.py", "centres_of", "nothing is left",
 )
 def _(data: Data) -> None:
     tape = data["problem"]["constraints"][1]["region"]["center"]  # o(t) (1 - exp(-(1e4 (t - .615))^2))
@@ -754,3 +771,190 @@ def _(data: Data) -> None:
 @forges("a barrier treats bounded starts only", "barrier", "barrier.py", "_refuse", "bounded initial set")
 def _(data: Data) -> None:
     data["problem"]["initial"] = {"kind": "gaussian", "mean": exact([0.0]), "covariance": exact([[1e-4]])}
+
+
+# ---- value functions in discrete time ------------------------------------------------------------------------
+
+
+def _grid(data: Data, edges: list[float]) -> None:
+    """The same few cells at every step."""
+    data["proof"] |= {"grids": [[exact(edges)]], "steps": [0] * len(data["proof"]["steps"])}
+
+
+@forges(
+    "a cell that is not shown to be safe counts as failed", "valued", "values/step_back.py", "zones", MORE,
+)
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["region"] |= {"low": exact([-0.8]), "high": exact([0.8])}
+
+
+@forges("what lies beyond the grid counts as failed", "valued", "values/step_back.py", "Values", MORE)
+def _(data: Data) -> None:
+    for grid in data["proof"]["grids"]:
+        grid[0] = grid[0][2:-2]
+
+
+@forges("the cells of a grid are in order", "valued", "values/proof.py", "_grid", "rising numbers")
+def _(data: Data) -> None:
+    for grid in data["proof"]["grids"]:
+        grid[0].insert(2, grid[0][1])
+
+
+@forges("the mean is taken over the noise", "valued", "values/normal_means.py", "axis_table", MORE)
+def _(data: Data) -> None:
+    _scale(data["problem"]["noise"], "values", 1.001)
+
+
+@forges("what a polynomial misses of the mean is added", "valued", "values/normal_means.py", "MeanTable.missing", MORE)
+def _(data: Data) -> None:
+    _grid(data, [-1.0 + 0.4 * k for k in range(6)])
+    _claim(data, -0.3)
+
+
+@forges("what a polynomial misses of the dynamics is added", "valued", "values/batches.py", "composed", MORE)
+def _(data: Data) -> None:
+    nodes = data["problem"]["dynamics"]["nodes"]
+    nodes[nodes.index(["const", exact(3.0)])][1] = exact(20.0)
+    _grid(data, [-1.0 + 0.125 * k for k in range(17)])
+    _claim(data, -0.08)
+
+
+@forges("nothing is known where the dynamics jumps", "valued", "values/batch_tapes.py", "run", MORE)
+def _(data: Data) -> None:
+    jumping(data, "sign", 1, 0.6)
+
+
+@forges("every disturbance counts", "valued", "values/step_back.py", "_without", MORE)
+def _(data: Data) -> None:
+    data["problem"]["disturbance_set"] = [exact([-0.051, 0.05])]
+
+
+@forges("the worst part of the disturbances counts", "valued", "values/step_back.py", "Transition.apply", MORE)
+def _(data: Data) -> None:
+    data["problem"]["disturbance_set"] = [exact([-0.05, 0.06])]
+
+
+@forges("the starts break no constraint", "valued", "values/proof.py", "_Discrete.upper", "lie in the safe set")
+def _(data: Data) -> None:
+    data["problem"]["constraints"].append(
+        {"kind": "inside", "label": "x", "during": exact([0.0, 0.0]), "region": {
+            "kind": "halfspace", "normal": exact([1.0]), "bound": exact(0.1),
+        }}
+    )  # fmt: skip
+
+
+@forges("a constraint counts at every step of its window", "valued", "statement/safe_set.py", "StepSet", MORE)
+def _(data: Data) -> None:
+    data["problem"]["constraints"][1]["during"] = exact([1.0, 4.0])
+
+
+@forges("value functions need noise that is exactly normal", "valued", "values/step_back.py", "_deviations", "normal")
+def _(data: Data) -> None:
+    data["problem"]["noise"]["law"] = "subgaussian"
+
+
+@forges(
+    "value functions need noise that is independent from state to state", "valued plane", "values/step_back.py",
+    "_deviations", "independent",
+)
+def _(data: Data) -> None:
+    data["problem"]["noise"]["values"] = exact([[0.04, 0.001], [0.001, 0.03]])
+
+
+@forges("value functions need bounded starts", "valued", "values/proof.py", "_Discrete", "bounded starts")
+def _(data: Data) -> None:
+    data["problem"]["initial"] = {"kind": "gaussian", "mean": exact([0.0]), "covariance": exact([[1e-4]])}
+
+
+# ---- value functions in continuous time ----------------------------------------------------------------------
+
+
+def repacked(data: Data, name: str, change: Callable[[np.ndarray], None]) -> None:
+    """Change the numbers of a packed array."""
+    proof = data["proof"]
+    shape = (len(proof["times"]), *(size for axis in proof["axes"] for size in (len(axis), 3)))
+    words = zlib.decompress(base64.b64decode(proof[name])).decode().split(" ")
+    numbers = np.array([float.fromhex(word) for word in words]).reshape(shape)
+    change(numbers)
+    words = [float(value).hex() for value in numbers.ravel()]
+    proof[name] = base64.b64encode(zlib.compress(" ".join(words).encode())).decode()
+
+
+def _lower(data: Data, amount: float) -> None:
+    """Claim less."""
+    _claim(data, float.fromhex(data["claim"]["log10_delta"]) - amount)
+
+
+@forges("the grid of V lies in the safe set", "leaving", "values/passage.py", "Passage._check_box", "grid was not")
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["region"]["high"] = exact([0.999])
+
+
+@forges("the grid of V holds the starts", "leaving", "values/passage.py", "Passage._check_box", "lie in the grid")
+def _(data: Data) -> None:
+    data["problem"]["initial"]["high"] = exact([1.5])
+
+
+@forges("V is at least 0 on the sides of its grid", "leaving", "values/passage.py", "Passage._missing", MORE)
+def _(data: Data) -> None:
+    def change(values: np.ndarray) -> None:
+        values[:, :, 0] -= 0.5
+
+    repacked(data, "values", change)
+    _lower(data, 0.1)
+
+
+@forges("V is what it is at every start", "leaving", "values/passage.py", "Passage._at_start", MORE)
+def _(data: Data) -> None:
+    data["problem"]["initial"]["high"] = exact([0.25])
+
+
+@forges("the slabs of time cover the horizon", "leaving", "values/passage.py", "Passage._read", "cover the horizon")
+def _(data: Data) -> None:
+    data["problem"]["horizon"] = exact(0.5)
+
+
+@forges("the residual of V is paid for", "leaving", "values/passage.py", "Passage._residual", MORE)
+def _(data: Data) -> None:
+    nodes = data["problem"]["noise"]["diffusion"]["nodes"]
+    nodes[nodes.index(["const", exact(0.75)])][1] = exact(0.755)
+
+
+@forges("the residual is taken for every disturbance", "leaving", "values/passage.py", "Passage._residual", MORE)
+def _(data: Data) -> None:
+    data["problem"]["disturbance_set"] = [exact([-0.1, 0.11])]
+
+
+@forges("the dynamics is defined where V is negative", "leaving", "values/passage.py", "Passage._payments", "defined")
+def _(data: Data) -> None:
+    jumping(data, "sign", 1, 0.6)
+
+
+@forges("what is paid as eps is not negative", "leaving", "values/passage.py", "Passage", "must not be negative")
+def _(data: Data) -> None:
+    data["proof"]["eps"] = exact([-0.01] * len(data["proof"]["eps"]))
+    _lower(data, 0.005)
+
+
+@forges("q grows as its inequality asks", "leaving", "values/passage.py", "Levels", "q was not shown")
+def _(data: Data) -> None:
+    data["proof"] |= {"edges": exact([-8.0, 0.0]), "m": exact([0.5]), "q": exact([0.0, 0.0])}
+
+
+@forges("q lies between 0 and 1", "leaving", "values/passage.py", "Levels", "stay below 1")
+def _(data: Data) -> None:
+    data["proof"] |= {"edges": exact([-8.0, 0.0]), "m": exact([0.5]), "q": exact([0.0, 1.0])}
+
+
+@forges(
+    "value functions need a bounded start in continuous time too", "leaving", "values/passage.py", "Passage", "bounded",
+)
+def _(data: Data) -> None:
+    data["problem"]["initial"] = {"kind": "gaussian", "mean": exact([0.0]), "covariance": exact([[1e-4]])}
+
+
+@forges("value functions need a plan without steps in time", "leaving", "values/passage.py", "Passage", "steps in time")
+def _(data: Data) -> None:
+    data["problem"] |= {"inputs": ["u"], "plan": exact([[0.0]])}
+    nodes = data["problem"]["dynamics"]["nodes"]
+    nodes[nodes.index(["input", 2])] = ["input", 3]

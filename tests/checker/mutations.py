@@ -424,6 +424,51 @@ BARRIER: list[Change] = [
 ]  # fmt: skip
 
 
+# ---- value functions ---------------------------------------------------------------------------------------
+
+
+def lost_cells(data: Data, rng: random.Random) -> str | None:
+    """A grid without its last cells, beyond which everything counts as failed."""
+    for grid in data["proof"]["grids"]:
+        for row in grid:
+            del row[len(row) - max(2, len(row) // 3) :]
+    return "lost"
+
+
+def coarse_cells(data: Data, rng: random.Random) -> str | None:
+    """A grid of so large cells that polynomials are of no use."""
+    for grid in data["proof"]["grids"]:
+        for row in grid:
+            row[1:-1] = []
+    return "coarse"
+
+
+def unordered_cells(data: Data, rng: random.Random) -> str | None:
+    """Edges that fall, or a cell of no width."""
+    row = rng.choice(rng.choice(data["proof"]["grids"]))
+    k = rng.randrange(len(row) - 1)
+    if rng.random() < 0.5:
+        row[k], row[k + 1] = row[k + 1], row[k]
+    else:
+        row[k] = row[k + 1]
+    return "unordered"
+
+
+def other_steps(data: Data, rng: random.Random) -> str | None:
+    """One step more or less than the horizon has."""
+    steps = data["proof"]["steps"]
+    if rng.random() < 0.5:
+        steps.pop()
+    else:
+        steps.append(steps[-1])
+    return "steps"
+
+
+VALUES: list[Change] = [
+    other_problem, other_dynamics, fewer_starts, lost_cells, coarse_cells, unordered_cells, other_steps,
+]
+
+
 # ---- changes that do no harm -------------------------------------------------------------------------------
 
 
@@ -463,6 +508,8 @@ def wider(data: Data, rng: random.Random) -> str | None:
         name = rng.choice(("growth", "start"))
         data["proof"][name] = _scaled(data["proof"][name], 1.0, 1e-9)
         return "wider"
+    if data["proof"]["engine"] == "values":
+        return None
     cell = rng.choice(data["proof"]["cells"])
     names = [name for name in ("eta", "radius", "remainder_high", "levels") if name in cell]
     values = cell[rng.choice(names)]

@@ -15,7 +15,17 @@ from certbound.checker import check_data, parse
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
 from tests.checker.conftest import contraction, stirred
-from tests.checker.mutations import BARRIER, CONSTANTS, HARMLESS, LINEAR, STATE, mutated, rejected, stronger_claim
+from tests.checker.mutations import (
+    BARRIER,
+    CONSTANTS,
+    HARMLESS,
+    LINEAR,
+    STATE,
+    VALUES,
+    mutated,
+    rejected,
+    stronger_claim,
+)
 
 
 def survivors(data: Any, problem: Any, changes: Any, count: int, seed: int) -> list[str]:
@@ -29,7 +39,7 @@ def survivors(data: Any, problem: Any, changes: Any, count: int, seed: int) -> l
 @pytest.mark.parametrize(
     ("name", "changes", "count"),
     [("stepping", LINEAR, 55), ("flowing", LINEAR, 11), ("contracting", CONSTANTS, 14), ("springing", BARRIER, 27),
-     ("stirring", STATE, 36)],
+     ("stirring", STATE, 36), ("valuing", VALUES, 16)],
 )
 def test_what_weakens_the_support_of_a_claim_is_rejected(
     name: str, changes: Any, count: int, request: pytest.FixtureRequest
@@ -38,7 +48,7 @@ def test_what_weakens_the_support_of_a_claim_is_rejected(
     assert survivors(case.data, case.given, changes, count, seed=1) == []
 
 
-@pytest.mark.parametrize(("name", "count"), [("stepping", 12), ("contracting", 4), ("springing", 6)])
+@pytest.mark.parametrize(("name", "count"), [("stepping", 12), ("contracting", 4), ("springing", 6), ("valuing", 4)])
 def test_harmless_changes_crash_nothing(name: str, count: int, request: pytest.FixtureRequest) -> None:
     case = request.getfixturevalue(name)
     for kind, altered in mutated(case.data, HARMLESS, count, seed=2):
@@ -65,7 +75,7 @@ def anything_anywhere(data: Any, rng: random.Random) -> str | None:
 
 
 @pytest.mark.parametrize(
-    ("name", "count"), [("stepping", 120), ("contracting", 8), ("springing", 40), ("stirring", 30)]
+    ("name", "count"), [("stepping", 120), ("contracting", 8), ("springing", 40), ("stirring", 30), ("valuing", 20)]
 )
 def test_anything_anywhere_ends_in_a_report_or_a_refusal(
     name: str, count: int, request: pytest.FixtureRequest

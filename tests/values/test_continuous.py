@@ -519,6 +519,6 @@ def test_a_proposal_of_two_states_that_does_not_span_the_horizon_proves_nothing(
         surface = real(plane, plan, source)
         return surface if source is None else dataclasses.replace(surface, times=0.5 * surface.times)
 
-    assert two_states._upper(plane, model, starts, plan) < 0
+    assert two_states._promising(plane, model, plan) is not None
     monkeypatch.setattr(two_states, "propose_plane", short)
-    assert two_states._upper(plane, model, starts, plan) == 0
+    assert two_states._promising(plane, model, plan) is None

@@ -6,7 +6,7 @@ from certbound.checker.statement.comparison import first_difference
 from certbound.checker.statement.partition import cells_of
 from certbound.checker.statement.problem import Model, read_model
 from certbound.checker.statement.rooms import Grid, demands, round_demands
-from certbound.checker.statement.safe_set import SafeSet
+from certbound.checker.statement.safe_set import SafeSet, StepSet
 from certbound.checker.statement.structure import Structure, structure_of
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "read_model",
     "round_demands",
     "SafeSet",
+    "StepSet",
     "Structure",
     "structure_of",
 ]

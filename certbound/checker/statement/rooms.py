@@ -90,7 +90,7 @@ def _demand(
         families = [
             [(region.face(number), arb(b))] * count for number, b in enumerate(region.bounds)
         ]
-    centres = _centres(region, grid, budget)
+    centres = centres_of(region, grid, budget)
     asked = grid.asked(constraint.during)
     found = []
     for family in families:
@@ -135,7 +135,7 @@ def round_demands(model: Model, grid: Grid, budget: Budget) -> list[RoundDemand]
         if not (constraint.inside and region.round):
             continue
         image, bound = region.image(model.dimension)
-        asked, centres = grid.asked(constraint.during), _centres(region, grid, budget)
+        asked, centres = grid.asked(constraint.during), centres_of(region, grid, budget)
         budget.hold(len(grid.times))
         rooms: list[arb | None] = []
         for k in range(len(grid.times)):
@@ -157,7 +157,7 @@ def _dot(row: Sequence[arb], point: Sequence[arb]) -> arb:
     return sum((a * b for a, b in zip(row, point) if not a.is_zero()), arb(0))
 
 
-def _centres(region: Region, grid: Grid, budget: Budget) -> list[list[arb]]:
+def centres_of(region: Region, grid: Grid, budget: Budget) -> list[list[arb]]:
     """Enclosures of the centre on every piece."""
     if not isinstance(region.center, Tape):
         return [[arb(x) for x in region.center]] * len(grid.times)

@@ -10,6 +10,7 @@ from flint import arb
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint
+from certbound.checker.statement.rooms import Grid, centres_of
 from certbound.problem.model import Tape
 
 _MOST_BOXES = 20_000
@@ -58,6 +59,51 @@ class _Shape:
         return (-high, -low) if self.outside else (low, high)
 
 
+def _shape_of(constraint: Constraint, center: Sequence[arb], dimension: int) -> _Shape | None:
+    """A constraint whose region lies around ``center``; None where nothing is asked."""
+    region = constraint.region
+    middle = [arb(0)] * dimension
+    for place, value in zip(region.coordinates, center):
+        middle[place] = value
+    if region.round:
+        image, bound = region.image(dimension)
+        rows = [[image[i, j] for j in range(dimension)] for i in range(image.nrows())]
+        bounds = [arb(0)] * len(rows)
+    else:
+        rows = [region.lift(region.face(number), dimension) for number in range(len(region.faces))]
+        bounds, bound = [arb(b) for b in region.bounds], None
+        if not rows and not constraint.inside:
+            raise Unproved(f"'{constraint.label}' leaves nothing")
+        if not rows:
+            return None
+    forms = [[(j, x) for j, x in enumerate(row) if not x.is_zero()] for row in rows]
+    offsets = [b + sum((x * middle[j] for j, x in form), arb(0)) for form, b in zip(forms, bounds)]
+    return _Shape(forms=forms, offsets=offsets, outside=not constraint.inside, bound=bound)
+
+
+class StepSet:
+    """The states that break no constraint at one step: windows, and where moving sets are then, count."""
+
+    def __init__(self, model: Model, step: int, budget: Budget) -> None:
+        asked = [c for c in model.constraints if c.during is None or c.during[0] <= step <= c.during[1]]
+        now = Grid(times=[(arb(step), arb(step))], hulls=[])
+        shapes = [_shape_of(c, centres_of(c.region, now, budget)[0], model.dimension) for c in asked]
+        self._shapes = [shape for shape in shapes if shape is not None]
+
+    def holds(self, box: Sequence[Side], *, strictly: bool = False) -> bool:
+        """Whether no point of a box breaks a constraint; ``strictly``: an obstacle must not be touched either."""
+        centre = [(a + b) / 2 for a, b in box]
+        radius = [(b - a) / 2 for a, b in box]
+        ends = [(shape, shape.over(centre, radius)[1]) for shape in self._shapes]
+        return all(high < 0 or (high <= 0 and not (strictly and shape.outside)) for shape, high in ends)
+
+    def excludes(self, box: Sequence[Side]) -> bool:
+        """Whether every point of a box breaks a constraint, the same one."""
+        centre = [(a + b) / 2 for a, b in box]
+        radius = [(b - a) / 2 for a, b in box]
+        return any(shape.over(centre, radius)[0] > 0 for shape in self._shapes)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Part:
     """A part of the boundary: the points of ``box`` that ``skip`` does not rule out; ``exact``: that lie in the set."""
@@ -97,23 +143,7 @@ class SafeSet:
             raise Unproved(f"'{constraint.label}' has a time window, which this proof does not treat")
         if isinstance(region.center, Tape):
             raise Unproved(f"'{constraint.label}' moves, which this proof does not treat")
-        middle = [arb(0)] * self.n
-        for place, value in zip(region.coordinates, region.center):
-            middle[place] = arb(value)
-        if region.round:
-            image, bound = region.image(self.n)
-            rows = [[image[i, j] for j in range(self.n)] for i in range(image.nrows())]
-            bounds = [arb(0)] * len(rows)
-        else:
-            rows = [region.lift(region.face(number), self.n) for number in range(len(region.faces))]
-            bounds, bound = [arb(b) for b in region.bounds], None
-            if not rows and not constraint.inside:
-                raise Unproved(f"'{constraint.label}' leaves nothing")
-            if not rows:
-                return None
-        forms = [[(j, x) for j, x in enumerate(row) if not x.is_zero()] for row in rows]
-        offsets = [b + sum((x * middle[j] for j, x in form), arb(0)) for form, b in zip(forms, bounds)]
-        return _Shape(forms=forms, offsets=offsets, outside=not constraint.inside, bound=bound)
+        return _shape_of(constraint, [arb(value) for value in region.center], self.n)
 
     def _narrow(self, shape: _Shape, low: list[arb | None], high: list[arb | None]) -> None:
         """Take what a constraint says about single states."""

@@ -20,7 +20,9 @@ from certbound.rigor.intervals import Interval
 from certbound.values.charts import Charts
 from certbound.values.continuous.coefficients import Reader, squared_diffusion
 from certbound.values.continuous.hypotheses import Model, check_noise
+from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.room import safe_room
+from certbound.values.continuous.surface import Surface
 
 _LN10 = math.log(10)
 
@@ -38,12 +40,15 @@ class ExitBounds:
     words : str
         What was done.
     seconds : float
+    proposed : tuple of (Surface, Payment)
+        V of every upper bound that was better than those before, and what it was paid with.
     """
 
     upper: float
     lower: float | None
     words: str
     seconds: float
+    proposed: tuple[tuple[Surface, Payment], ...] = ()
 
 
 def bound_exits(
@@ -90,7 +95,7 @@ def bound_exits(
     if problem.system.dimension == 1:
         from certbound.values.continuous.line import bound_line
 
-        upper, least, words = bound_line(problem, model, seconds, lower)
+        upper, least, words, proposed = bound_line(problem, model, seconds, lower)
     else:
         from certbound.values.continuous.two_states import two_states
 
@@ -98,10 +103,10 @@ def bound_exits(
             raise InfeasibleError("value functions in two states do not serve a random start; use a set of starts.")
         room = safe_room(problem)
         check_noise(model, (0.0, float(problem.horizon)), list(zip(room.inner_low, room.inner_high)))
-        upper, least, words = two_states(problem, model, room, begin + seconds)
+        upper, least, words, proposed = two_states(problem, model, room, begin + seconds)
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
-        words=words, seconds=time.perf_counter() - begin,
+        words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -193,7 +193,8 @@ def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, fl
     start = up(extreme_over(surface, starts, upper=True))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
     proof = examine(surface, model, need, upper=True)
-    return _cheapest(proof, need, surface, start)[0]
+    payment, lift = _cheapest(proof, need, surface, start)
+    return replace(payment, lift=lift)
 
 
 def _cheapest(proof: Proof, need: Need, surface: Surface, start: float) -> tuple[Payment, float]:

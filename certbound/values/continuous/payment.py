@@ -103,11 +103,12 @@ class Terms:
 class Payment:
     """A bound of the probability as a natural logarithm, and what it was paid with.
 
-    ``terms`` holds what each slab paid; None where nothing was proved.
+    ``terms`` holds what each slab paid; None where nothing was proved. V was lifted by ``lift`` over the faces.
     """
 
     log: float
     terms: Terms | None = None
+    lift: float = 0.0
 
 
 def repay(m: Array, *, upper: bool) -> Array | None:

@@ -25,8 +25,10 @@ from certbound.values.continuous.hypotheses import (
     covers,
     extreme_over,
     prove_upper,
+    raised_above,
     sampled_residual,
 )  # fmt: skip
+from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane, slab_times
 from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
@@ -45,26 +47,33 @@ _SHARES = (0.12, 0.8)  # of the patches, for one grid after the other
 
 def two_states(
     problem: Problem, model: Model, room: Room, deadline: float
-) -> tuple[float, None, str]:
+) -> tuple[float, None, str, list[tuple[Surface, Payment]]]:
     """The upper bound on one grid after another; lower bounds in two states are not looked for.
 
     The seconds until the deadline are turned into a number of patches, so that the bound does not depend on the clock.
+    What certificates state comes last.
     """
     starts = starts_of(problem)
     inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
     patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     level = _rough_level(inner)
     upper, done = 0.0, []
+    proposed: list[tuple[Surface, Payment]] = []
     for share in _SHARES:
         plan = _plan(inner, level, share * patches)
         try:
-            upper = min(upper, _upper(inner, model, starts, plan))
+            surface = _promising(inner, model, plan)
+            if surface is not None:
+                payment = prove_upper(surface, model, starts)
+                if payment.log < upper:
+                    upper = payment.log
+                    proposed.append((raised_above(surface), payment))
         except OutOfTime:
             if upper < 0:
                 break
             raise
         done.append(f"{plan.cells}^2")
-    return upper, None, f"value function in two states, cells: {', '.join(done)}"
+    return upper, None, f"value function in two states, cells: {', '.join(done)}", proposed
 
 
 def _plan(plane: Plane, level: float, patches: float) -> Plan:
@@ -98,12 +107,6 @@ def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float],
     plan = _plan(plane, levels[0], _SHARES[0] * _RATE * seconds)
     surface = _promising(plane, model, plan, levels[-1])
     return [] if surface is None else chart_above(surface, model, levels, [0])
-
-
-def _upper(plane: Plane, model: Model, starts: list[Pair], plan: Plan) -> float:
-    """A proved upper bound of log P from the most promising proposal; 0 where none comes to an end."""
-    surface = _promising(plane, model, plan)
-    return 0.0 if surface is None else prove_upper(surface, model, starts).log
 
 
 def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = None) -> Surface | None:

@@ -6,8 +6,16 @@ after the noise, as a function of where the noise-free step ends), ``steps`` (th
 ``induction`` (one step back), ``failures`` (the answer, refined until it is good).
 """
 
-from certbound.values.discrete.failures import FailureBounds, bound_failure, chart_failures
+from certbound.values.discrete.failures import FailureBounds, bound_failure, chart_failures, step_grids
 from certbound.values.discrete.kernels import AxisKernel, axis_kernel
 from certbound.values.discrete.steps import evaluate
 
-__all__ = ["AxisKernel", "FailureBounds", "axis_kernel", "bound_failure", "chart_failures", "evaluate"]
+__all__ = [
+    "AxisKernel",
+    "FailureBounds",
+    "axis_kernel",
+    "bound_failure",
+    "chart_failures",
+    "evaluate",
+    "step_grids",
+]

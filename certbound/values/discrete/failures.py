@@ -183,6 +183,18 @@ def chart_failures(problem: Problem, *, share: float, times: int = 1, parts: int
     return work.charts(share, sorted({work.horizon * k // times for k in range(times)}))
 
 
+def step_grids(problem: Problem, share: float) -> list[Grid]:
+    """The grids of all steps at one size of the cells, one object where steps share one; as certificates state them.
+
+    Inapplicable where value functions do not fit the problem, or the grids would be too large.
+    """
+    work = _Work(problem, None, 1)
+    found = work.layout(share)
+    if found is None:
+        raise Inapplicable(work.too_large)
+    return found
+
+
 def _settled(upper: float, lower: float, delta: float | None) -> bool:
     """Whether the question is answered with room to spare."""
     return delta is not None and (upper <= delta / 100 or lower >= min(100 * delta, 0.5))

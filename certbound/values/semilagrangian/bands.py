@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.values.semilagrangian.images import along_q, at_nodes, over_cells
+from certbound.values.semilagrangian.landings import along_q, at_nodes, over_cells
 from certbound.values.semilagrangian.local_steps import Base
 from certbound.values.semilagrangian.smoothers import REACH, WIDER, Across, Along, across, along
 from certbound.values.semilagrangian.smoothing import Lines, Rows, smoothed

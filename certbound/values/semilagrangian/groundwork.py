@@ -15,8 +15,8 @@ from certbound.values.semilagrangian.backward import Bounds, start_levels
 from certbound.values.semilagrangian.bands import Band, Frame, band_of
 from certbound.values.semilagrangian.flows import flow, sheared
 from certbound.values.semilagrangian.local_steps import Blocks, Clock, base_of, blocks_of
+from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.remainders import chord_level, level_of
-from certbound.values.semilagrangian.setting import Setting
 
 _BLOCKS = (90, 40)
 _ORDERS = (4, 8, 7)

@@ -16,7 +16,7 @@ from certbound.problem.problem import Problem
 from certbound.values.continuous import ExitBounds
 from certbound.values.semilagrangian.backward import back, highest, limited
 from certbound.values.semilagrangian.groundwork import Layout, Plan, layout_of
-from certbound.values.semilagrangian.setting import Setting, setting_of
+from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
 
 _RARE = 16

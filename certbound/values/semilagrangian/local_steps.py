@@ -11,8 +11,8 @@ import numpy as np
 from certbound.arrays import Array, Mask
 from certbound.rigor.intervals import Interval, concatenate, sq
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
+from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.remainders import Remainders, remainders
-from certbound.values.semilagrangian.setting import Setting
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -16,7 +16,7 @@ from certbound.safety.engines import values
 from certbound.values.semilagrangian import bound_exits_by_steps
 from certbound.values.semilagrangian.groundwork import Plan
 from certbound.values.semilagrangian.leaving import bound_by_steps
-from certbound.values.semilagrangian.setting import setting_of
+from certbound.values.semilagrangian.noisy_axis import setting_of
 
 COARSE = Plan(count=20, fine=1.0, wide=0.012, cell=0.4, spare=1e-7)
 

@@ -19,8 +19,8 @@ from certbound.values.semilagrangian.backward import Bounds, back, limited
 from certbound.values.semilagrangian.bands import Frame
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
 from certbound.values.semilagrangian.groundwork import Plan, layout_of
+from certbound.values.semilagrangian.noisy_axis import serves, setting_of
 from certbound.values.semilagrangian.remainders import chord_level, level_of, remainders, upper_tail
-from certbound.values.semilagrangian.setting import serves, setting_of
 from certbound.values.semilagrangian.smoothers import WIDER, across, along
 from certbound.values.semilagrangian.smoothing import Lines, smoothed
 

@@ -13,13 +13,14 @@ from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.hypotheses import Model, check_noise
+from certbound.values.continuous.hypotheses import Model, check_noise, raised_above
 from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import Link, prove_above, prove_below, spans
 from certbound.values.continuous.line.moved_model import model_on
 from certbound.values.continuous.line.phases import Gate, Phase, check_room, pieces
 from certbound.values.continuous.line.profiles import End, propose_above, propose_below, shifted, values_of
 from certbound.values.continuous.line.reach import cuts_of
+from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.proposal import Line, Sketch, sketch
 from certbound.values.continuous.shapes import sealed
 from certbound.values.continuous.surface import Surface
@@ -52,12 +53,13 @@ class _Found:
     lower: float | None = None
     done: list[str] = field(default_factory=list)
     work: float = 0.0
+    proposed: list[tuple[Surface, Payment]] = field(default_factory=list)
 
 
 def bound_line(
     problem: Problem, model: Model, seconds: float, lower: bool
-) -> tuple[float, float | None, str]:
-    """Natural logarithms of an upper and a lower bound (None: there is none), and words.
+) -> tuple[float, float | None, str, list[tuple[Surface, Payment]]]:
+    """Natural logarithms of an upper and a lower bound (None: there is none), words, and what certificates state.
 
     Raises
     ------
@@ -93,7 +95,7 @@ def bound_line(
             break
     found.lower = _less(found.lower, leak)
     words = f"value function in one state, cells x slabs of time: {', '.join(found.done) or 'none came to an end'}"
-    return found.upper, found.lower, words
+    return found.upper, found.lower, words, found.proposed
 
 
 def room_of(
@@ -218,10 +220,18 @@ def _raise_upper(
         return 0.0
     found.done.append(" + ".join(f"{link.surface.cells[0]} x {link.surface.slabs}" for link in links))
     found.work += _patches_in(links)
-    value = prove_above(links, start).log
-    gain = found.upper - value
-    found.upper = min(found.upper, value)
+    payment = prove_above(links, start)
+    gain = found.upper - payment.log
+    if gain > 0 and is_plain(room) and not start.random:
+        found.proposed.append((raised_above(links[0].surface), payment))
+    found.upper = min(found.upper, payment.log)
     return gain
+
+
+def is_plain(room: Room) -> bool:
+    """Whether one surface in the state itself says all: limits that stand still over the whole horizon."""
+    phase = room.phases[0]
+    return len(room.phases) == 1 and phase.origin is None and phase.width is None and not is_gated(room, 0)
 
 
 def _raise_lower(

@@ -80,7 +80,7 @@ def prove_above(links: Sequence[Link], start: Start) -> Payment:
         parts = [patched_of(proof, proof.ranges.residual_high, need, steps, lift) for proof in proofs]
         lowest = floor + lift - 1e-15 * (1 + abs(floor))
         payment = pay_upper(_joined(parts, ready, steps, need), up(level + lift), lowest, whole=start.random)
-        best = min(best, payment, key=lambda one: one.log)
+        best = min(best, replace(payment, lift=lift), key=lambda one: one.log)
     return best
 
 

@@ -65,9 +65,7 @@ def chart_line(problem: Problem, model: Model, levels: list[float], times: int, 
 
 def _changing(room: ladder.Room) -> bool:
     """Whether the limits move, come or go in time, or one is missing."""
-    phase = room.phases[0]
-    moves = phase.origin is not None or phase.width is not None
-    return len(room.phases) > 1 or moves or not all(phase.closed) or ladder.is_gated(room, 0)
+    return not ladder.is_plain(room) or not all(room.phases[0].closed)
 
 
 def _at_times(

@@ -1,0 +1,10 @@
+"""Value functions: the probability of failing as a function of the state, proved step by step.
+
+The only part of the checker that uses NumPy: ``batches`` are Taylor models over many boxes at once, ``spans`` intervals
+over arrays. Both are the checker's own; ``batch_tapes`` (a tape on batches), ``normal_means`` (the mean after the
+noise) and ``step_back`` (one step back) rest on them.
+"""
+
+from certbound.checker.values.proof import check_values
+
+__all__ = ["check_values"]

@@ -1,0 +1,153 @@
+"""The function V that a certificate states in continuous time, patch by patch, as Taylor models of it and its slopes.
+
+V takes stated values and derivatives (up to the second in every state) at the nodes of a grid, and stated rates, at the
+ends of slabs of time: degree 5 in every state and 3 in time on every patch. The data are shared by neighbours, so that
+V is twice continuously differentiable in the states and once in time, whatever they are.
+
+On a patch, tau and xi in [-1, 1], V is the sum of data times the products of the basis polynomials below, whose
+coefficients are exact. A derivative of V has the basis' derivatives instead, and powers of the half-sides: it is made
+from the data, not from V's rounded coefficients. All roundings together are below ``_ROUNDING`` times the sum of the
+absolute terms (a patch has at most 144 data, and each a dozen operations).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from certbound.checker.values.batches import Array, Batch, Index, Terms
+
+_ROUNDING = 400 * 2.0**-53
+_UP = 1 + 2.0**-40
+
+# Columns: v, r v', r^2 v'' at -1, then at 1; rows: powers of xi. In time v and r v' at both ends.
+IN_SPACE = np.array([
+    [8, 5, 1, 8, -5, 1],
+    [-15, -7, -1, 15, -7, 1],
+    [0, -6, -2, 0, 6, -2],
+    [10, 10, 2, -10, 10, -2],
+    [0, 1, 1, 0, -1, 1],
+    [-3, -3, -1, 3, -3, 1],
+]) / 16.0  # fmt: skip
+IN_TIME = np.array([[2, 1, 2, -1], [-3, -1, 3, -1], [0, -1, 0, 1], [1, 1, -1, 1]]) / 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The data of V.
+
+    Attributes
+    ----------
+    times : ndarray, shape (K + 1,)
+    axes : tuple of ndarray, shapes (N_i + 1,)
+    values : ndarray, shape (K + 1, N_1 + 1, 3[, N_2 + 1, 3])
+        V and its derivatives by order in every state, at the ends of the slabs.
+    rates : ndarray, of the same shape
+        Their derivatives by time.
+    """
+
+    times: Array
+    axes: tuple[Array, ...]
+    values: Array
+    rates: Array
+
+    @property
+    def cells(self) -> tuple[int, ...]:
+        """Cells along the states."""
+        return tuple(len(axis) - 1 for axis in self.axes)
+
+    def patches(self, first: int, last: int) -> Patches:
+        """All patches of some slabs, time slowest."""
+        early, late = slice(first, last), slice(first + 1, last + 1)
+        data = np.stack([self.values[early], self.rates[early], self.values[late], self.rates[late]], axis=1)
+        for axis in range(len(self.axes)):
+            place = 2 + 2 * axis
+            cut = [np.take(data, range(k, data.shape[place] - 1 + k), axis=place) for k in (0, 1)]
+            data = np.concatenate(cut, axis=place + 1)
+        n = len(self.axes)
+        order = [1, *(3 + 2 * i for i in range(n)), 0, *(2 + 2 * i for i in range(n))]
+        flat = data.transpose(order).reshape(4, *([6] * n), -1)
+        sides = [(self.times[first:last], self.times[first + 1 : last + 1])]
+        sides += [(axis[:-1], axis[1:]) for axis in self.axes]
+        low = np.meshgrid(*(side[0] for side in sides), indexing="ij")
+        high = np.meshgrid(*(side[1] for side in sides), indexing="ij")
+        return Patches(np.stack([a.ravel() for a in low]), np.stack([a.ravel() for a in high]), flat)
+
+
+    def face(self, axis: int, side: int) -> Surface:
+        """V on one side of the grid (0: lower, 1: upper), as a function of time and of the other states."""
+        cut = (slice(None),) * (1 + 2 * axis) + (-side, 0)
+        values, rates = self.values[cut], self.rates[cut]
+        return Surface(self.times, tuple(row for k, row in enumerate(self.axes) if k != axis), values, rates)
+
+    def frozen(self, index: int) -> Surface:
+        """V at the end of a slab as a function that stays the same in time."""
+        same = self.values[[index, index]]
+        return Surface(np.array([0.0, 1.0]), self.axes, same, np.zeros_like(same))
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """P patches: ``low`` and ``high`` of shape (1 + n, P), time first, and the data, shape (4, 6[, 6], P)."""
+
+    low: Array
+    high: Array
+    data: Array
+
+    def take(self, places: Index | slice) -> Patches:
+        """Some of the patches."""
+        return Patches(self.low[:, places], self.high[:, places], self.data[..., places])
+
+    def derivative(self, which: Terms, orders: tuple[int, ...]) -> Batch:
+        """d^orders V, time first, as Taylor models; terms beyond the degree lie in the error."""
+        half = (self.high - self.low) / 2
+        total, size = self._scaled(half)
+        for axis, order in enumerate(orders):
+            basis = _derived(IN_TIME if axis == 0 else IN_SPACE, order)
+            total, size = _along(basis, total, axis), _along(np.abs(basis), size, axis)
+        factor = np.ones(half.shape[1])
+        for axis, order in enumerate(orders):
+            for _ in range(order):
+                factor = factor / half[axis]
+        total, error = total * factor, size.reshape(-1, size.shape[-1]).sum(axis=0) * np.abs(factor) * _ROUNDING
+        coefficients = np.zeros((len(which.exponents), total.shape[-1]))
+        place = {a: k for k, a in enumerate(which.exponents)}
+        rest = which.variables - len(orders)
+        for powers in itertools.product(*(range(count) for count in total.shape[:-1])):
+            row, k = total[powers], place.get(powers + (0,) * rest)
+            if k is None:
+                error = error + np.abs(row)
+            else:
+                coefficients[k] = row
+        if not any(orders):
+            coefficients[0] += self._reference()
+            error = error + np.abs(coefficients[0]) * 2.0**-52
+        return Batch(which, coefficients, error * _UP + 1e-300)
+
+    def _reference(self) -> Array:
+        """V at one corner: the basis of the values sums to 1, so that derivatives do not need it."""
+        return np.asarray(self.data[(0,) * (self.data.ndim - 1)])
+
+    def _scaled(self, half: Array) -> tuple[Array, Array]:
+        """Data in units of the patch, less the reference, and their absolute values."""
+        data = self.data.copy()
+        corner = (slice(0, 4, 2), *([slice(0, 6, 3)] * (data.ndim - 2)))
+        data[corner] -= self._reference()
+        data[1::2] *= half[0]
+        for axis in range(1, data.ndim - 1):
+            for k in (1, 2, 4, 5):
+                data[(slice(None),) * axis + (k,)] *= half[axis] if k % 3 == 1 else half[axis] * half[axis]
+        return data, np.abs(data)
+
+
+def _derived(basis: Array, order: int) -> Array:
+    """Coefficients of the basis' derivative."""
+    for _ in range(order):
+        basis = np.arange(1, len(basis))[:, None] * basis[1:]
+    return basis
+
+
+def _along(matrix: Array, array: Array, axis: int) -> Array:
+    return np.moveaxis(np.tensordot(matrix, array, axes=([1], [axis])), 0, axis)

@@ -1,0 +1,293 @@
+"""Continuous time: V of the file is proved to be, but for what is paid, above log of the probability of leaving.
+
+On a box of states in the safe set, with R = V_t + sup_d f . V_x + tr(a V_xx)/2 + Q2, Q2 = V_x . a V_x/2, a = g g^T:
+
+- V >= 0 on the sides of the box at all times (what it lacks is added to V everywhere);
+- R <= lam_k + eps_k exp(v0 - V) + m(V) Q2 wherever V < 0 in slab k, v0 being at least V(0, .) on the initial set;
+- m is a step function of the level, q is continuous and linear on every step, q = 0 below the lowest one, 0 <= q < 1,
+  and q' >= (1 - q)(m - q).
+
+Then w = exp(theta(V)), theta(V) = V + int_V^0 q, has w_t + L w <= lam_k w + eps_k exp(v0 + Q), Q = int q over all
+levels, since theta' = 1 - q is in (0, 1], theta'' + theta'^2 - theta' <= -m theta' and theta(V) - V <= Q. With L_k the
+integral of lam over slab k and all later ones,
+
+    P + (1 - P) exp(inf V(T, .)) <= exp(L_0 + theta(v0)) + exp(v0 + Q) sum_k eps_k h_k exp(L_k)
+
+for the probability P of leaving within T: at T the process is at least 1 on paths that left, exp(V(T, .)) on others.
+
+m, q and eps are stated in the file. lam is what the patches of each slab then need; the lam of the file only says where
+a closer look is worth its time.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from flint import arb
+
+from certbound.checker.reading import Record, numbers
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.statement import Model, SafeSet
+from certbound.checker.values import batches as tm
+from certbound.checker.values.batch_tapes import run
+from certbound.checker.values.batches import Array, Batch, Index, Terms, above, below, terms
+from certbound.checker.values.hermite import Patches, Surface
+from certbound.checker.values.packed import unpacked
+from certbound.errors import CertificateError
+from certbound.problem.model import Tape
+
+MOST_PATCHES = 400_000
+MOST_LEVELS = 200
+_DEGREES = {1: (6, 8), 2: (6, 8, 10, 12)}
+"""Of the Taylor models by the number of states: higher ones where lower ones do not show what the file states."""
+_ENTRIES = 4_000_000
+_CHUNK = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """m between ``edges`` (rising, the last one 0) and q at them."""
+
+    edges: list[float]
+    m: list[float]
+    q: list[float]
+
+    def __post_init__(self) -> None:
+        edges, m, q = self.edges, self.m, self.q
+        if not (len(edges) == len(q) == len(m) + 1 and edges[-1] == 0 and all(a < b for a, b in pairwise(edges))):
+            raise CertificateError("`proof.edges` must rise to 0, with one m less and as many q.")
+        if not all(rate >= 0 for rate in m) or q[0] != 0 or not all(0 <= value < 1 for value in q):
+            raise CertificateError("`proof.m` must not be negative, and `proof.q` must rise from 0 and stay below 1.")
+        for (a, b), (left, right), rate in zip(pairwise(edges), pairwise(q), m):
+            slope = (arb(right) - left) / (arb(b) - a)
+            if not all(slope >= (1 - arb(end)) * (rate - arb(end)) for end in (left, right)):  # convex in q
+                raise Unproved("q was not shown to grow as fast as its inequality asks")
+
+    def least(self, low: Array, high: Array) -> Array:
+        """The least m of the levels in [low, min(high, 0)]."""
+        found = np.full(low.shape, np.inf)
+        for (a, b), rate in zip(pairwise(self.edges), self.m):
+            found = np.where((low <= b) & (high >= a), np.minimum(found, rate), found)
+        return np.where((low > self.edges[0]) & np.isfinite(found), found, 0.0)
+
+    def above(self, level: arb) -> arb:
+        """At least the integral of q from a level to 0."""
+        total = arb(0)
+        for (a, b), (left, right) in zip(pairwise(self.edges), pairwise(self.q)):
+            start = arb.max(arb.min(level, arb(b)), arb(a))
+            share = (arb(b) - start) / (arb(b) - a)
+            total += (arb(right) - (arb(right) - left) * share / 2) * (arb(b) - start)
+        return total
+
+
+class Passage:
+    """The proof's numbers, and what follows from them."""
+
+    def __init__(self, model: Model, value: object, budget: Budget) -> None:
+        names = ("engine", "axes", "times", "values", "rates", "edges", "m", "q", "lam", "eps")
+        record = Record(value, "proof", names)
+        self.model, self.budget, n = model, budget, model.dimension
+        if n not in _DEGREES:
+            raise Unproved(f"value functions are proved for at most {max(_DEGREES)} states")
+        if model.plan is not None:
+            raise Unproved("this proof does not treat a plan with steps in time")
+        if model.initial.covariance is not None:
+            raise Unproved("value functions are proved for bounded starts only")
+        self.surface = self._read(record)
+        self.levels = Levels(record.array("edges", None), record.array("m", None), record.array("q", None))
+        slabs = len(self.surface.times) - 1
+        self.stated, self.eps = np.array(record.array("lam", slabs)), np.array(record.array("eps", slabs))
+        if len(self.levels.m) > MOST_LEVELS or not (self.eps >= 0).all():
+            raise CertificateError(f"`proof.eps` must not be negative, nor `proof.m` have over {MOST_LEVELS} entries.")
+        self.degrees = _DEGREES[n]
+        self.lift = 0.0
+
+    def _read(self, record: Record) -> Surface:
+        n = self.model.dimension
+        axes = [np.array(numbers(row, "proof.axes", None)) for row in record.items("axes", n, n)]
+        times = np.array(record.array("times", None))
+        for name, row in [("times", times), *(("axes", axis) for axis in axes)]:
+            if len(row) < 2 or not (np.diff(row) > 0).all():
+                raise CertificateError(f"`proof.{name}` must be two or more numbers that rise.")
+        if times[0] != 0 or times[-1] != self.model.horizon:
+            raise Unproved("the slabs of time do not cover the horizon")
+        if (len(times) - 1) * np.prod([len(axis) - 1 for axis in axes]) > MOST_PATCHES:
+            raise CertificateError(f"`proof.axes` and `proof.times` must make at most {MOST_PATCHES} patches.")
+        shape = (len(times), *(size for axis in axes for size in (len(axis), 3)))
+        values, rates = (unpacked(record[name], record.at(name), shape) for name in ("values", "rates"))
+        return Surface(times, tuple(axes), values, rates)
+
+    def upper(self) -> arb:
+        """At least the probability of leaving."""
+        self._check_box()
+        self.lift = self._missing()
+        start = float(np.nextafter(self._at_start() + self.lift, np.inf))
+        if not start < 0:
+            return arb(1)
+        lam = self._payments(start)
+        total, later, v0 = arb(0), arb(0), arb(start)
+        times = [arb(float(t)) for t in self.surface.times]
+        for k in reversed(range(len(lam))):
+            step = times[k + 1] - times[k]
+            later += arb(float(lam[k])) * step
+            total += arb(float(self.eps[k])) * step * later.exp()
+        most = self.levels.above(arb(self.levels.edges[0]))
+        found = (later + v0 + self.levels.above(v0)).exp() + (v0 + most).exp() * total
+        floor = arb.min(arb(self._at_end()), arb(-1)).exp()
+        return arb.min((found - floor) / (1 - floor), arb(1)).upper()
+
+    def _check_box(self) -> None:
+        """The box of the grid lies in the safe set, and the starts in it."""
+        sides = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in self.surface.axes]
+        centre, radius = [(a + b) / 2 for a, b in sides], [(b - a) / 2 for a, b in sides]
+        if not SafeSet(self.model).holds(centre, radius):
+            raise Unproved("the grid was not shown to lie in the safe set")
+        initial = self.model.initial
+        if not all(low >= a and high <= b for (a, b), low, high in zip(sides, initial.low, initial.high)):
+            raise Unproved("the initial set was not shown to lie in the grid")
+
+    def _missing(self) -> float:
+        """What V lacks of 0 on the sides of the box: V plus that has the same residual."""
+        least, n = 0.0, self.model.dimension
+        for axis, side in itertools.product(range(n), (0, 1)):
+            face = self.surface.face(axis, side)
+            for first, last in self._chunks(face):
+                low, _ = face.patches(first, last).derivative(terms(n, 3 + 5 * (n - 1)), (0,) * n).sharp_ends()
+                least = min(least, float(low.min()))
+        return -least
+
+    def _at_start(self) -> float:
+        """At least V(0, .) on the initial set."""
+        surface, n = self.surface.frozen(0), self.model.dimension
+        low = [below(x) for x in self.model.initial.low]
+        high = [above(x) for x in self.model.initial.high]
+        patches = surface.patches(0, 1)
+        met = np.ones(patches.low.shape[1], dtype=bool)
+        for i in range(n):
+            met &= (patches.low[1 + i] <= high[i]) & (patches.high[1 + i] >= low[i])
+        found = patches.take(np.flatnonzero(met))
+        whole = found.derivative(terms(n + 1, 5 * n), (0,) * (n + 1))
+        parts = [self._part(found, i, low[i], high[i], whole.terms) for i in range(n)]
+        return float(_substituted(whole, parts).sharp_ends()[1].max())
+
+    def _at_end(self) -> float:
+        """At most V at the horizon."""
+        n = self.model.dimension
+        patches = self.surface.frozen(-1).patches(0, 1)
+        low = patches.derivative(terms(n + 1, 5 + 3 * (n - 1)), (0,) * (n + 1)).sharp_ends()[0]
+        return float(np.nextafter(low.min() + self.lift, -np.inf))
+
+    def _part(self, patches: Patches, i: int, low: float, high: float, which: Terms) -> Batch:
+        """xi of a state on the part of every patch that the initial set may meet."""
+        a, b = patches.low[1 + i], patches.high[1 + i]
+        x = tm.variable(which, 1 + i, np.maximum(a, low), np.minimum(b, high))
+        middle = tm.fixed(which, a / 2 + b / 2, (np.abs(a) + np.abs(b)) * 2.0**-51)
+        return tm.scaled(tm.sub(x, middle), 2 / (b - a), 4 / (b - a) * 2.0**-52)
+
+    def _chunks(self, surface: Surface) -> list[tuple[int, int]]:
+        count = len(surface.times) - 1
+        stride = max(1, _CHUNK // max(1, int(np.prod(surface.cells))))
+        return [(first, min(first + stride, count)) for first in range(0, count, stride)]
+
+    # ---- the residual ----------------------------------------------------------------------------------------
+
+    def _payments(self, start: float) -> Array:
+        """lam of every slab: what its patches need, which the file says about."""
+        lam, per = np.zeros(len(self.eps)), int(np.prod(self.surface.cells))
+        for first, last in self._chunks(self.surface):
+            patches = self.surface.patches(first, last)
+            slab = first + np.arange(patches.low.shape[1]) // per
+            for degree in self.degrees:
+                need = self._needs(patches, slab, start, degree)
+                settled = (need <= self.stated[slab]) | (degree == self.degrees[-1])
+                np.maximum.at(lam, slab[settled], need[settled])
+                rest = np.flatnonzero(~settled)
+                patches, slab = patches.take(rest), slab[rest]
+        if not np.isfinite(lam).all():
+            raise Unproved("the dynamics was not shown to be defined where V is negative")
+        return lam
+
+    def _needs(self, patches: Patches, slab: Index, start: float, degree: int) -> Array:
+        """What every patch needs as lam, from Taylor models of some degree."""
+        which = terms(1 + self.model.dimension + len(self.model.disturbance), degree)
+        need, size = np.zeros(len(slab)), max(32, _ENTRIES // (degree + 1) ** which.variables)
+        for first in range(0, len(slab), size):
+            self.budget.check()
+            part = slice(first, first + size)
+            need[part] = self._need(patches.take(part), self.eps[slab[part]], start, which)
+        return need
+
+    def _need(self, patches: Patches, eps: Array, start: float, which: Terms) -> Array:
+        low, high = patches.derivative(which, (0,) * (self.model.dimension + 1)).sharp_ends()
+        low, high = np.nextafter(low + self.lift, -np.inf), np.nextafter(high + self.lift, np.inf)
+        need, due = np.zeros(len(eps)), np.flatnonzero(~(low >= 0))
+        if len(due):
+            low, high = low[due], high[due]
+            excess = self._residual(patches.take(due), self.levels.least(low, high), which).sharp_ends()[1]
+            reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
+            found = (excess - eps[due] * reach * (1 - 1e-12)) * (1 + 1e-12)
+            need[due] = np.where(np.isfinite(excess), np.maximum(found, 0.0), np.inf)
+        return need
+
+    def _residual(self, patches: Patches, m: Array, which: Terms) -> Batch:
+        """R - m Q2, the disturbance being a variable."""
+        model, n = self.model, self.model.dimension
+        count = patches.low.shape[1]
+        inputs = [tm.variable(which, i, patches.low[i], patches.high[i]) for i in range(n + 1)]
+        pushed = [
+            tm.variable(which, 1 + n + j, np.full(count, a), np.full(count, b))
+            for j, (a, b) in enumerate(model.disturbance)
+        ]
+        slope = [patches.derivative(which, _order(n, i)) for i in range(n)]
+        total = patches.derivative(which, (1,) + (0,) * n)
+        for rate, one in zip(run(model.dynamics, inputs + pushed), slope):
+            total = tm.add(total, tm.mul(rate, one))
+        a = self._squares(inputs)
+        for i, j in itertools.product(range(n), repeat=2):
+            if j < i:
+                continue
+            energy = tm.scaled(tm.mul(slope[i], slope[j]), 1 - m, (1 + m) * 2.0**-52)
+            inner = tm.add(patches.derivative(which, _order(n, i, j)), energy)
+            total = tm.add(total, tm.mul(tm.scaled(a[i][j], 0.5 if i == j else 1.0), inner))
+        return total
+
+    def _squares(self, inputs: Sequence[Batch]) -> list[list[Batch]]:
+        """g g^T."""
+        given, n = self.model.noise.diffusion, self.model.dimension
+        if isinstance(given, Tape):
+            entries, columns = run(given, inputs), given.shape[1]
+        else:
+            columns = given.ncols()
+            entries = [tm.fixed(inputs[0].terms, np.full(inputs[0].error.shape, float(x))) for x in given.entries()]
+        rows = [entries[i * columns : (i + 1) * columns] for i in range(n)]
+        return [[_summed([tm.mul(x, y) for x, y in zip(one, two)]) for two in rows] for one in rows]
+
+
+def _order(n: int, *states: int) -> tuple[int, ...]:
+    """The orders of a derivative by some states."""
+    return (0, *(states.count(i) for i in range(n)))
+
+
+def _summed(parts: list[Batch]) -> Batch:
+    total = parts[0]
+    for part in parts[1:]:
+        total = tm.add(total, part)
+    return total
+
+
+def _substituted(x: Batch, parts: Sequence[Batch]) -> Batch:
+    """x at tau = 0, with other models for the states' xi."""
+    total = tm.fixed(x.terms, np.zeros(x.error.shape))
+    for exponents, row in zip(x.terms.exponents, x.coefficients):
+        if not row.any():
+            continue
+        term = tm.fixed(x.terms, row)
+        for part, power in zip(parts, exponents[1:]):
+            for _ in range(power):
+                term = tm.mul(term, part)
+        total = tm.add(total, term)
+    return Batch(x.terms, total.coefficients, total.error + x.error)

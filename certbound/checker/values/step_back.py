@@ -1,0 +1,302 @@
+"""Discrete time: one step back of a function that lies above (below) the probability of failing, cell by cell.
+
+With V_t(x) the largest probability of failing from x at step t on, V_t = 1 off the safe set of step t and elsewhere
+
+    V_t(x) = sup over d of E V_(t+1)(f(t, x, d) + w),        V_T = 0 on the safe set.
+
+``Values`` holds a function of the same kind for V_t: a polynomial on every cell of a grid, one number beyond. If it
+lies above V_(t+1), so does the mean h of it after the noise, and h of f(t, x, d) is bounded from above on every cell by
+a polynomial: h by its Taylor polynomial about a point of a mesh (`normal_means`), f by a Taylor model, whatever both
+miss added to the constant. A cell that is not shown to be safe counts as 1, and so does all that lies beyond the grid.
+From below: what is missed is subtracted, only cells that are shown to be unsafe count as 1, and others of which nothing
+is known as 0; any one disturbance will do.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from flint import arb
+
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.statement import Model, StepSet
+from certbound.checker.values import batches as tm
+from certbound.checker.values.batch_tapes import run
+from certbound.checker.values.batches import Array, Batch, Mask, Terms, above, terms
+from certbound.checker.values.normal_means import (
+    FARTHEST,
+    ORDER,
+    PER_DEVIATION,
+    AxisTable,
+    MeanTable,
+    axis_table,
+    mean_table,
+)
+
+DEGREE = 4
+_CHUNK = 4096
+_MOST_POINTS = 400_000
+_MOST_ENTRIES = 1_000_000
+"""Of the integrals of one axis, which are held 40 times over."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A box cut into cells by rising edges of every state; cells are numbered with the last state fastest."""
+
+    edges: tuple[Array, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Cells along the states."""
+        return tuple(len(edges) - 1 for edges in self.edges)
+
+    def boxes(self) -> tuple[Array, Array]:
+        """Lower and upper ends of all cells, shape (states, cells)."""
+        low = np.meshgrid(*(edges[:-1] for edges in self.edges), indexing="ij")
+        high = np.meshgrid(*(edges[1:] for edges in self.edges), indexing="ij")
+        return np.stack([a.ravel() for a in low]), np.stack([a.ravel() for a in high])
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """A polynomial on every cell, shape (terms, cells), and a number beyond the grid."""
+
+    grid: Grid
+    coefficients: Array
+    beyond: float
+
+    def pieces(self) -> Array:
+        """Coefficients by exponents and cells, with the outer cells, shape (degree + 1, ..., cells + 2, ...)."""
+        n = len(self.grid.edges)
+        table = np.zeros((DEGREE + 1,) * n + tuple(count + 2 for count in self.grid.shape))
+        table[(0,) * n] = self.beyond
+        inner = (slice(1, -1),) * n
+        for exponents, row in zip(terms(n, DEGREE).exponents, self.coefficients):
+            table[exponents + inner] = row.reshape(self.grid.shape)
+        return table
+
+
+class Steps:
+    """The dynamics and the noise of a model; ``parts`` cut every side of the set of disturbances."""
+
+    def __init__(self, model: Model, parts: int, budget: Budget, *, upper: bool) -> None:
+        self.model, self.budget, self.upper = model, budget, upper
+        self.deviations = _deviations(model)
+        self.terms = terms(model.dimension + len(model.disturbance), DEGREE)
+        self.disturbances = _parts(model.disturbance, parts, upper)
+        clock = any(node.op == "input" and node.args[0] == 0 for node in model.dynamics.nodes)
+        rows = model.plan
+        self.steady = not clock and (rows is None or all(row == rows[0] for row in rows))
+
+    def images(self, step: int, low: Array, high: Array) -> list[list[Batch]]:
+        """f over some boxes, shape (states, boxes), per part of the disturbances and state."""
+        found = []
+        for part in self.disturbances:
+            chunks = []
+            for start in range(0, low.shape[1], _CHUNK):
+                self.budget.check()
+                chunks.append(self._image(step, low[:, start : start + _CHUNK], high[:, start : start + _CHUNK], part))
+            found.append([tm.joined([chunk[i] for chunk in chunks]) for i in range(len(low))])
+        return found
+
+    def _image(self, step: int, low: Array, high: Array, part: Sequence[tuple[float, float]]) -> list[Batch]:
+        which, count, n = self.terms, low.shape[1], len(low)
+        inputs = [tm.fixed(which, np.full(count, float(step)))]
+        inputs += [tm.variable(which, i, low[i], high[i]) for i in range(n)]
+        if self.model.plan is not None:
+            inputs += [tm.fixed(which, np.full(count, value)) for value in self.model.plan[step]]
+        for j, (a, b) in enumerate(part):
+            inputs.append(tm.variable(which, n + j, np.full(count, a), np.full(count, b)))
+        return run(self.model.dynamics, inputs)
+
+
+def _deviations(model: Model) -> list[arb]:
+    """Standard deviations of the noise, which must move every state on its own."""
+    if not model.noise.gaussian:
+        raise Unproved("value functions are proved for normal noise only")
+    covariance = model.noise.covariance()
+    n = model.dimension
+    if any(not covariance[i, j].is_zero() for i in range(n) for j in range(n) if i != j):
+        raise Unproved("value functions are proved for noise only that is independent from state to state")
+    if not all(covariance[i, i] > 0 for i in range(n)):
+        raise Unproved("value functions are proved only where every state has noise")
+    return [covariance[i, i].sqrt() for i in range(n)]
+
+
+def _parts(ranges: list[tuple[float, float]], parts: int, upper: bool) -> list[tuple[tuple[float, float], ...]]:
+    """Boxes that cover the disturbances; from below their corners, any of which will do."""
+    sides = []
+    for low, high in ranges:
+        cuts = [low, *(low + (high - low) * k / parts for k in range(1, parts)), high] if low < high else [low, high]
+        sides.append(list(itertools.pairwise(sorted(cuts))) if upper else [(cut, cut) for cut in sorted({low, high})])
+    return list(itertools.product(*sides))
+
+
+class Transition:
+    """One step from some boxes into a grid: the images of the boxes, a mesh around these, and the axes' integrals."""
+
+    def __init__(self, steps: Steps, step: int, low: Array, high: Array, after: Grid) -> None:
+        self.steps, self.n = steps, len(low)
+        self.images = steps.images(step, low, high)
+        self._scales = [(float((1 / s).mid()), above(abs(1 / s - float((1 / s).mid())))) for s in steps.deviations]
+        self._spacing = [float(s.mid()) / PER_DEVIATION for s in steps.deviations]
+        points = [self._points(i, after.edges[i]) for i in range(self.n)]
+        if np.prod([len(one) for one in points]) > _MOST_POINTS:
+            raise Unproved(f"the mesh around the images would have more than {_MOST_POINTS} points")
+        if max(len(one) * len(edges) for one, edges in zip(points, after.edges)) > _MOST_ENTRIES:
+            raise Unproved(f"the mesh and the grid of one state make more than {_MOST_ENTRIES} pairs")
+        self.axes: list[AxisTable] = [
+            axis_table(one, edges, s, DEGREE, steps.budget)
+            for one, edges, s in zip(points, after.edges, steps.deviations)
+        ]
+
+    def _points(self, i: int, edges: Array) -> Array:
+        """The mesh of one state: all images that come near the grid."""
+        values = np.concatenate([part[i].value[np.isfinite(part[i].error)] for part in self.images])
+        reach = FARTHEST * self._spacing[i] * PER_DEVIATION
+        low, high = edges[0] - reach, edges[-1] + reach
+        values = values[(values >= low) & (values <= high)]
+        first, last = (float(values.min()), float(values.max())) if len(values) else (low, low)
+        count = int((last - first) / self._spacing[i]) + 2
+        return np.asarray(first + self._spacing[i] * np.arange(min(count, _MOST_POINTS + 1)), dtype=float)
+
+    def apply(self, value: Values) -> Batch:
+        """A bound of sup over d of E U(f + w) on every box, the constant terms included; unknown where none is."""
+        table = mean_table(self.axes, value.pieces(), self.steps.budget)
+        best: Batch | None = None
+        for images in self.images:
+            found = _without(self._means(images, table), self.n, upper=self.steps.upper)
+            best = found if best is None else _larger(best, found, upper=self.steps.upper)
+        assert best is not None
+        return best
+
+    def _means(self, images: list[Batch], table: MeanTable) -> Batch:
+        chunks = []
+        for start in range(0, len(images[0].error), _CHUNK):
+            self.steps.budget.check()
+            chunks.append(self._mean([image.take(slice(start, start + _CHUNK)) for image in images], table))
+        return tm.joined(chunks)
+
+    def _mean(self, images: list[Batch], table: MeanTable) -> Batch:
+        """Taylor models of h(f)."""
+        which, places, shifts = self.steps.terms, [], []
+        square = np.zeros(images[0].error.shape)
+        for i, image in enumerate(images):
+            points = self.axes[i].points
+            place = np.clip(np.rint((image.value - points[0]) / self._spacing[i]), 0, len(points) - 1).astype(int)
+            shift = tm.scaled(tm.sub(image, tm.fixed(which, points[place])), *self._scales[i])
+            places.append(place)
+            shifts.append(shift)
+            square = square + (np.abs(shift.value) + shift.reach()) ** 2
+        index = tuple(places)
+        total = self._polynomial(shifts, {a: part[index] for a, part in table.derivatives.items()})
+        missing = table.missing(np.sqrt(square) * (1 + 1e-12))
+        error = total.error + (table.dominant[index] * missing + table.far) * (1 + 1e-9)
+        return tm.known(Batch(which, total.coefficients, error))
+
+    def _polynomial(self, shifts: list[Batch], parts: dict[tuple[int, ...], Array]) -> Batch:
+        """sum over a of D_a v^a, by Horner's scheme in one state after the other."""
+        which = self.steps.terms
+        if self.n == 1:
+            return _horner(which, shifts[0], [parts[a,] for a in range(ORDER)])
+        total: Batch | None = None
+        for b in reversed(range(ORDER)):
+            inner = _horner(which, shifts[0], [parts[a, b] for a in range(ORDER - b)])
+            total = inner if total is None else tm.add(tm.mul(total, shifts[1]), inner)
+        assert total is not None
+        return total
+
+
+def _horner(which: Terms, x: Batch, factors: list[Array]) -> Batch:
+    total = tm.fixed(which, factors[-1])
+    for factor in reversed(factors[:-1]):
+        total = tm.add(tm.mul(total, x), tm.fixed(which, factor))
+    return total
+
+
+def _without(x: Batch, n: int, *, upper: bool) -> Batch:
+    """The bound over all disturbances of a part: a polynomial in the states alone, its error in the constant."""
+    which = terms(n, x.terms.degree)
+    place = {a: k for k, a in enumerate(which.exponents)}
+    coefficients, error = np.zeros((len(which.exponents), len(x.error))), x.error.copy()
+    for exponents, row in zip(x.terms.exponents, x.coefficients):
+        if any(exponents[n:]):
+            error = error + np.abs(row)
+        else:
+            coefficients[place[exponents[:n]]] = row
+    error = error * (1 + 1e-12)
+    sign = 1.0 if upper else -1.0
+    moved = coefficients[0] + sign * error
+    coefficients[0] = np.nextafter(moved, sign * np.inf)
+    return tm.known(Batch(which, coefficients, np.where(np.isfinite(error), 0.0, np.inf)))
+
+
+def _larger(x: Batch, y: Batch, *, upper: bool) -> Batch:
+    """At least the larger of two functions everywhere (upper), or one of them on each box (lower)."""
+    good = np.isfinite(x.error) & np.isfinite(y.error)
+    first = np.where(np.isfinite(x.error), x.value, -np.inf) >= np.where(np.isfinite(y.error), y.value, -np.inf)
+    found, other = tm.chosen(first, x, y), tm.chosen(first, y, x)
+    if not upper:
+        return found
+    gap = np.abs(other.coefficients[1:] - found.coefficients[1:]).sum(axis=0) + (other.value - found.value)
+    coefficients = found.coefficients.copy()
+    size = np.abs(found.coefficients).sum(axis=0) + np.abs(other.coefficients).sum(axis=0)
+    coefficients[0] += np.maximum(gap, 0.0) + 1e-14 * size
+    return tm.known(Batch(x.terms, coefficients, np.where(good, 0.0, np.inf)))
+
+
+# ---- functions on grids --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Zones:
+    """Which cells of a grid surely break no constraint at a step, and which surely break one throughout."""
+
+    safe: Mask
+    unsafe: Mask
+
+
+def zones(grid: Grid, allowed: StepSet, budget: Budget) -> Zones:
+    """What is known of every cell."""
+    low, high = grid.boxes()
+    safe, unsafe = np.zeros(low.shape[1], dtype=bool), np.zeros(low.shape[1], dtype=bool)
+    for k in range(low.shape[1]):
+        budget.box()
+        box = [(arb(a), arb(b)) for a, b in zip(low[:, k], high[:, k])]
+        safe[k], unsafe[k] = allowed.holds(box), allowed.excludes(box)
+    return Zones(safe, unsafe)
+
+
+def final(grid: Grid, zone: Zones, *, upper: bool) -> Values:
+    """The function at the horizon."""
+    coefficients = np.zeros((len(terms(len(grid.edges), DEGREE).exponents), len(zone.safe)))
+    coefficients[0] = ~zone.safe if upper else zone.unsafe
+    return Values(grid, coefficients, 1.0 if upper else 0.0)
+
+
+def bounded(found: Batch, grid: Grid, zone: Zones, *, upper: bool) -> Values:
+    """The function of a step from what its cells lead to: 1 where they are (not shown to be) unsafe."""
+    coefficients = found.coefficients.copy()
+    rest = np.abs(coefficients[1:]).sum(axis=0)
+    lost = ~np.isfinite(found.error) | (rest > 8)
+    if upper:
+        flat = lost | ~zone.safe | (coefficients[0] - rest * (1 + 1e-9) >= 1)
+        coefficients[:, flat] = 0.0
+        coefficients[0, flat] = 1.0
+    else:
+        coefficients[:, lost] = 0.0
+        coefficients[:, zone.unsafe] = 0.0
+        coefficients[0, zone.unsafe] = 1.0
+    return Values(grid, coefficients, 1.0 if upper else 0.0)
+
+
+def highest(found: Batch) -> float:
+    """At least the largest value over all boxes."""
+    tops = (found.coefficients[0] + np.abs(found.coefficients[1:]).sum(axis=0)) * (1 + 1e-12) + 1e-300
+    return float(np.where(np.isfinite(found.error), tops, 1.0).max())
+
+

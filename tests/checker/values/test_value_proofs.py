@@ -1,0 +1,259 @@
+"""Value functions in the checker: its arithmetic against samples, its bounds against the engine's, forged files."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import math
+import zlib
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb
+from scipy.integrate import quad
+from scipy.stats import norm
+
+import certbound as cb
+from certbound.checker import check_data, parse
+from certbound.checker.report import Budget
+from certbound.checker.statement import read_model
+from certbound.checker.values import batches as tm
+from certbound.checker.values.batch_tapes import run
+from certbound.checker.values.hermite import Surface
+from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
+from certbound.checker.values.packed import unpacked
+from certbound.checker.values.passage import Passage
+from certbound.errors import CertificateError
+from certbound.problem.model import trace
+from certbound.safety.answers import exact
+from certbound.safety.certificate import certificate_text, problem_data
+from certbound.safety.verification import verify_safety
+from tests.checker.conftest import exit_certificate, leaving, valued
+from tests.checker.forgeries import repacked, text
+from tests.checker.mutations import rejected
+
+FUNCTIONS = [
+    lambda x: [np.sin(3 * x[0]) * x[1] + np.exp(-x[0])], lambda x: [np.sqrt(x[0] + 3) / (2 + x[1])],
+    lambda x: [np.abs(x[0] - x[1])], lambda x: [np.maximum(x[0], x[1]) + np.minimum(0.3, x[0])],
+    lambda x: [np.where(x[0] > 0.2, x[1] ** 3, np.tanh(x[0]))],
+    lambda x: [np.log(x[0] + 4.5) ** 2.5 + np.hypot(x[0], x[1])],
+]  # fmt: skip
+
+
+def value_of(batch: tm.Batch, xi: np.ndarray) -> np.ndarray:
+    powers = [np.prod([x**k for x, k in zip(xi, a)]) for a in batch.terms.exponents]
+    return np.asarray(np.tensordot(powers, batch.coefficients, axes=1))
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_taylor_models_hold_the_function_everywhere_on_their_boxes(function: Any) -> None:
+    rng = np.random.default_rng(3)
+    tape = trace(function, {"x": ["a", "b"]})
+    which = tm.terms(2, 4)
+    low = rng.uniform(-1, 0.9, (2, 60))
+    high = low + rng.choice([0.0, 0.01, 0.2, 0.7], (2, 60))
+    with np.errstate(all="ignore"):
+        (found,) = run(tape, [tm.variable(which, i, low[i], high[i]) for i in range(2)])
+        ends, sharp = found.ends(), found.sharp_ends()
+    for xi in itertools.product((-1.0, -0.3, 0.55, 1.0), repeat=2):
+        x = (low + high) / 2 + np.array(xi)[:, None] * (high - low) / 2
+        truth = np.array([function(point)[0] for point in x.T])
+        assert (np.abs(value_of(found, np.array(xi)) - truth) <= found.error + 1e-15).all()
+        for bottom, top in (ends, sharp):
+            assert (truth >= bottom - 1e-15).all()
+            assert (truth <= top + 1e-15).all()
+    assert np.isfinite(found.error).mean() > 0.5
+
+
+def test_what_is_undefined_or_jumps_on_a_box_is_unknown() -> None:
+    which = tm.terms(1, 3)
+    x = tm.variable(which, 0, np.array([-0.5, 0.5]), np.array([0.1, 0.6]))
+    with np.errstate(all="ignore"):
+        for function in (lambda x: [np.log(x[0])], lambda x: [1 / x[0]], lambda x: [np.sign(x[0])]):
+            (found,) = run(trace(function, {"x": ["a"]}), [x])
+            assert not np.isfinite(found.error[0])
+            assert found.error[1] < 1e-3
+
+
+def test_means_after_the_noise_agree_with_quadrature() -> None:
+    edges, points = np.array([-1.0, -0.2, 0.1, 1.5]), np.array([-0.7, 0.0, 2.0])
+    deviation, degree = 0.4, 3
+    table = axis_table(points, edges, arb(deviation), degree, Budget(60.0))
+    rng = np.random.default_rng(1)
+    pieces = np.zeros((degree + 1, len(edges) + 1))
+    pieces[:, 1:-1] = rng.normal(size=(degree + 1, 3))
+    pieces[0, [0, -1]] = 1.0, 0.5
+    found = mean_table([table], pieces, Budget(60.0))
+
+    def u(y: float) -> float:
+        k = int(np.searchsorted(edges, y))
+        if k in (0, len(edges)):
+            return float(pieces[0, k])
+        xi = (y - (edges[k] + edges[k - 1]) / 2) / ((edges[k] - edges[k - 1]) / 2)
+        return float(np.polyval(pieces[::-1, k], xi))
+
+    def mean(m: float) -> float:
+        return sum(quad(lambda y: u(y) * norm.pdf(y, m, deviation), a, b, epsabs=1e-13)[0]
+                   for a, b in itertools.pairwise([-4.0, *edges, 6.0]))  # fmt: skip
+
+    for j, m in enumerate(points):
+        for v in (0.0, 0.3, -0.9):
+            taylor = sum(found.derivatives[a,][j] * v**a for a in range(ORDER))
+            allowed = found.dominant[j] * float(found.missing(np.array([abs(v)]))[0]) + found.far
+            assert abs(taylor - mean(m + v * deviation)) <= allowed + 1e-10
+    assert float(found.missing(np.array([0.2]))[0]) < 1e-5
+    assert found.missing(np.array([2.0]))[0] == math.inf
+
+
+def test_patches_have_the_stated_derivatives() -> None:
+    """V = exp(t) sin(x) cos(2 y), whose data are known: values, slopes and bends come out, and meet across nodes."""
+    times, axes = np.array([0.0, 0.1, 0.25]), (np.array([0.0, 0.1, 0.3]), np.array([-0.2, 0.0, 0.1]))
+    one = np.stack([np.sin(axes[0]), np.cos(axes[0]), -np.sin(axes[0])], axis=1)
+    two = np.stack([np.cos(2 * axes[1]), -2 * np.sin(2 * axes[1]), -4 * np.cos(2 * axes[1])], axis=1)
+    values = np.exp(times)[:, None, None, None, None] * one[None, :, :, None, None] * two[None, None, None]
+    patches = Surface(times, axes, values, values).patches(0, 2)
+    which = tm.terms(3, 13)
+    for orders, exact_one in (
+        ((0, 0, 0), lambda t, x, y: np.exp(t) * np.sin(x) * np.cos(2 * y)),
+        ((1, 0, 0), lambda t, x, y: np.exp(t) * np.sin(x) * np.cos(2 * y)),
+        ((0, 1, 0), lambda t, x, y: np.exp(t) * np.cos(x) * np.cos(2 * y)),
+        ((0, 1, 1), lambda t, x, y: -2 * np.exp(t) * np.cos(x) * np.sin(2 * y)),
+        ((0, 0, 2), lambda t, x, y: -4 * np.exp(t) * np.sin(x) * np.cos(2 * y)),
+    ):
+        found = patches.derivative(which, orders)
+        assert found.error.max() < 1e-9
+        for xi in ((0.0, 0.0, 0.0), (-1.0, 1.0, -1.0), (0.4, -0.7, 0.2)):
+            t, x, y = (patches.low + patches.high) / 2 + np.array(xi)[:, None] * (patches.high - patches.low) / 2
+            assert value_of(found, np.array(xi)) == pytest.approx(exact_one(t, x, y), abs=2e-4)
+
+
+def test_the_bound_is_as_good_as_the_engines_and_above_its_lower_one() -> None:
+    problem = valued()
+    verdict = verify_safety(problem, method="values")
+    report = check_data(parse(certificate_text(problem, verdict)), problem_data(problem))
+    assert report.valid, report.reason
+    assert report.log10_proved is not None
+    assert verdict.log10_lower < report.log10_proved < verdict.log10_delta + 0.02
+
+
+def test_one_step_is_a_normal_probability() -> None:
+    system = cb.DiscreteSystem(lambda x: 0.8 * x, states=1, noise=cb.Gaussian(std=0.3))
+    problem = cb.Problem(system, initial=[0.1], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1, delta=0.1)
+    data = parse(certificate_text(problem, verify_safety(problem, method="values")))
+    truth = math.log10(norm.sf((1 - 0.08) / 0.3) + norm.cdf((-1 - 0.08) / 0.3))
+    assert truth <= check_data(data).log10_proved < truth + 1e-6
+
+
+def test_a_surface_in_two_states_starts_from_its_own_cells_only() -> None:
+    """V = -1 - x^2 - y^2 on [-1, 1]^2: at most -1 - .02 on a start off the nodes, and not what a neighbour holds."""
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.4 * np.eye(2))
+    start = cb.Box([0.3, -0.35], [0.4, -0.3])
+    problem = cb.Problem(system, initial=start, safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=0.1, delta=0.5)
+    axis = np.linspace(-1, 1, 5)
+    square = np.stack([axis**2, 2 * axis, np.full(5, 2.0)], axis=1)
+    flat = np.stack([np.ones(5), np.zeros(5), np.zeros(5)], axis=1)
+    values = -np.einsum("ia,jb->iajb", flat, flat) * 3
+    values += np.einsum("ia,jb->iajb", square, flat) + np.einsum("ia,jb->iajb", flat, square)
+    def packed(numbers: np.ndarray) -> str:
+        words = " ".join(float(x).hex() for x in numbers.ravel())
+        return base64.b64encode(zlib.compress(words.encode())).decode()
+
+    proof = {
+        "engine": "values", "axes": [exact(axis), exact(axis)], "times": exact([0.0, 0.1]),
+        "values": packed(np.stack([values, values])), "rates": packed(np.zeros((2, 5, 3, 5, 3))),
+        "edges": exact([0.0]), "m": [], "q": exact([0.0]), "lam": exact([1.0]), "eps": exact([0.0]),
+    }  # fmt: skip
+    model = read_model(json.loads(json.dumps(problem_data(problem))), Budget(60.0))
+    with np.errstate(all="ignore"):
+        passage = Passage(model, json.loads(json.dumps(proof)), Budget(60.0))
+        assert passage._at_start() == pytest.approx(-3 + 0.4**2 + 0.35**2, abs=1e-9)
+        assert passage._missing() == pytest.approx(2.0, abs=1e-9)
+        assert passage._at_end() == pytest.approx(-3.0, abs=1e-9)
+
+
+# ---- files made to fool --------------------------------------------------------------------------------------
+
+
+def packed_text(content: bytes) -> str:
+    return base64.b64encode(zlib.compress(content, 9)).decode()
+
+
+@pytest.mark.parametrize(
+    ("value", "why"),
+    [
+        (None, "text in base 64"), ("é", "text in base 64"), ("%%%", "compressed text"), ("AAAA", "compressed text"),
+        (packed_text(b"0x1.8p+1"), "hold 2 numbers"), (packed_text(b"0x1.8p+1 " * 9), "nothing else|hold 2 numbers"),
+        (packed_text(b"nan 0x1.8p+1"), "hexadecimal"), (packed_text(b"0x1.8p+1 0x1.8p+9999"), "finite"),
+        (packed_text(b"0x1.8p+1 inf"), "hexadecimal"), (packed_text(b"0x1.8p+1  0x1.8p+1"), "hold 2 numbers"),
+        (packed_text(b"\xff\xfe 0x1.8p+1"), "hexadecimal"), (packed_text(b" " * 10**7), "nothing else"),
+        (packed_text(b"0x1.8p+1 0x1.8p+1") + packed_text(b"more"), "compressed text|nothing else"),
+    ],
+)  # fmt: skip
+def test_packed_numbers_that_are_none_are_refused(value: Any, why: str) -> None:
+    with pytest.raises(CertificateError, match=why):
+        unpacked(value, "proof.values", (2,))
+
+
+def test_a_text_that_unpacks_to_very_much_is_not_unpacked() -> None:
+    bomb = base64.b64encode(zlib.compress(b"0" * 10**8, 9)).decode()
+    assert len(bomb) < 200_000
+    with pytest.raises(CertificateError, match="nothing else"):
+        unpacked(bomb, "proof.values", (4,))
+
+
+@pytest.fixture(scope="module")
+def exiting() -> str:
+    return text("leaving")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"times": exact([0.0, 0.4])}, {"axes": []}, {"axes": [exact([1.0, -1.0])]}, {"edges": []}, {"q": exact([0.1])},
+        {"m": exact([-1.0]), "edges": exact([-1.0, 0.0]), "q": exact([0.0, 0.0])}, {"eps": []}, {"values": ""},
+        {"edges": exact([1.0])}, {"axes": [exact([-1.0, 1.0]), exact([-1.0, 1.0])]}, {"engine": "barrier"},
+        {"q": exact([-0.5])}, {"lam": None}, {"axes": [[None]]}, {"more": 1},
+    ],
+)  # fmt: skip
+def test_malformed_value_functions_are_refused(exiting: str, change: dict[str, Any]) -> None:
+    data = parse(exiting)
+    data["proof"] |= change
+    assert rejected(data)
+
+
+def test_a_lower_surface_proves_no_less(exiting: str) -> None:
+    """Values, slopes and rates changed on purpose: whatever is claimed below what was proved is refused."""
+
+    def dent(values: np.ndarray) -> None:
+        values[:, 5:-5, 0] -= 0.3
+
+    def bend(values: np.ndarray) -> None:
+        values[:, :, 2] -= 5.0
+
+    def fall(values: np.ndarray) -> None:
+        values[:, :, 0] -= 1.0
+
+    for name, change in (("values", dent), ("values", bend), ("rates", fall)):
+        data = parse(exiting)
+        data["claim"]["log10_delta"] = exact(float.fromhex(data["claim"]["log10_delta"]) - 0.02)
+        repacked(data, name, change)
+        assert rejected(data)
+
+
+def test_lam_of_the_file_proves_nothing(exiting: str) -> None:
+    data = parse(exiting)
+    data["proof"]["lam"] = exact([1e9] * len(data["proof"]["lam"]))
+    generous = check_data(data).log10_proved
+    data["proof"]["lam"] = exact([-1e9] * len(data["proof"]["lam"]))
+    assert generous >= check_data(data).log10_proved >= check_data(parse(exiting)).log10_proved - 1e-3
+
+
+def test_a_door_writes_what_the_checker_proves() -> None:
+    problem = leaving()
+    data = parse(exit_certificate(problem))
+    assert data["claim"]["method"] == "values"
+    report = check_data(data, json.loads(json.dumps(problem_data(problem))))
+    assert report.valid, report.reason
+    assert "for every disturbance in its set that does not see coming noise" in report.claim
