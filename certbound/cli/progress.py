@@ -16,7 +16,7 @@ def line_of(found: Progress) -> str:
     Examples
     --------
     >>> line_of(Progress(engine="linear", phase="cell 3", log10_delta=-2.0, log10_lower=None, seconds=4.2, limit=60.0))
-    'linear, cell 3; P <= 0.01 so far'
+    'linear, cell 3; P <= 1e-2 so far'
     """
     work = ", ".join(word for word in (found.engine, found.phase) if word) or "at work"
     return work + (f"; P <= {log10_text(found.log10_delta)} so far" if found.log10_delta < 0 else "")
