@@ -6,8 +6,10 @@ from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.quadratic import bound_quadratic
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
+from certbound.watch import seconds_left
 
 _SECONDS = 20.0  # about what may be spent
+_LEAST = 0.1
 _FEW = 3  # states below which value functions on grids say more
 
 
@@ -22,7 +24,7 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
         reason = "left out, since value functions on grids say more in one or two states; ask for it by name."
         return EngineAnswer(applicable=False, method="quadratic", reason=reason)
     try:
-        limit = _SECONDS if asked.thorough else _SECONDS / 2
+        limit = max(min(_SECONDS if asked.thorough else _SECONDS / 2, seconds_left()), _LEAST)
         found = bound_quadratic(problem, target=problem.delta, seconds=limit)
     except (InfeasibleError, EnclosureError) as error:
         return EngineAnswer(applicable=False, method="quadratic", reason=str(error))
