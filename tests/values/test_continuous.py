@@ -381,7 +381,7 @@ TWO_FREE_STATES = math.log10(1 - (1 - exit_probability(lambda t, x: -x, lambda t
 
 
 def test_two_states_without_coupling_are_as_safe_as_each_alone() -> None:
-    found = bound_exits(two_free_states(), seconds=1.6)
+    found = bound_exits(two_free_states(), seconds=2.3)
     assert TWO_FREE_STATES <= found.upper < TWO_FREE_STATES + 0.09
     assert found.lower is None
 

@@ -38,9 +38,10 @@ _FACTOR = 1.12
 _TOPS = (-0.02, -0.1)  # where V is above, the proof may lift it over 0 instead
 _CAP = 50.0
 _GRANTED = 0.005  # eps that the proof may pay, in units of the bound, summed over the horizon
-_RATE = 10_000  # patches that are proposed and proved in a second
+_RATE = 7_000  # patches that are proposed and proved in a second
 _PASSES = 2
 _CLOSE = 0.15
+_HOPELESS = 60.0  # what a first proposal may lose (log P): sources make that ten times less, not a hundred
 _VARIED = 1.0  # about how much V varies on a patch
 _SHARES = (0.12, 0.8)  # of the patches, for one grid after the other
 
@@ -115,6 +116,8 @@ def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = Non
     if surface is None:
         return None
     first = best = _Sketch.of(surface, model, plane.starts, level)
+    if first.estimate() > first.start + _HOPELESS:
+        return None
     for top in _TOPS:
         sketch, source = first, None
         for _ in range(_PASSES):
@@ -127,6 +130,8 @@ def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = Non
             best = min(best, sketch, key=lambda one: one.estimate())
         if best.estimate() < best.start + _CLOSE:
             break
+    if level is None and best.estimate() >= 0:
+        return None
     return best.surface if covers(best.surface, plane.horizon, plane.low, plane.high, within=True) else None
 
 
