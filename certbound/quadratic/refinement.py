@@ -16,7 +16,7 @@ from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.quadratic.corners import Dynamics
 from certbound.quadratic.inequality import Proved, corner_levels, prove
-from certbound.quadratic.setting import Setting, Wall, make_setting
+from certbound.quadratic.setting import Setting, Wall, make_setting, refuse
 from certbound.quadratic.surroundings import working_box
 from certbound.quadratic.wall_program import StatedCells, propose
 from certbound.rigor.balls import precision, upper
@@ -112,6 +112,7 @@ def bound_quadratic(problem: Problem, *, target: float = 0.0, seconds: float = 2
     best: QuadraticBound | None = None
     chosen: Search | None = None
     failure: InfeasibleError | None = None
+    refuse(problem)
     for low, high in _boxes(problem):
         left = begin + seconds - time.perf_counter()
         if best is not None and (left <= seconds / 2 or best.upper <= _log10(target)):

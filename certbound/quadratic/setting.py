@@ -117,7 +117,7 @@ def make_setting(problem: Problem, low: Array, high: Array) -> Setting:
     InfeasibleError
         Constraints of a kind that is not served, or a start outside the box.
     """
-    _refuse(problem)
+    refuse(problem)
     center, width = _scaled(low, high)
     n = len(center)
     start = _start(problem, center, width)
@@ -148,7 +148,8 @@ def _side(n: int, axis: int, sign: float) -> Interval:
     return Interval(low, high)
 
 
-def _refuse(problem: Problem) -> None:
+def refuse(problem: Problem) -> None:
+    """InfeasibleError for what the theorem, or this implementation of it, does not serve."""
     if problem.initial.random:
         raise InfeasibleError("quadratic value bounds need a bounded set of starts, not a random start.")
     if problem.input_sequence is not None:
