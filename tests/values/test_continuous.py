@@ -157,8 +157,8 @@ def hermite_values(surface, slab, cell, time_share, shares):
     return value(0 * unit[0]), value(unit[0]), gradient, second
 
 
-@pytest.mark.parametrize("n", [1, 2])
-def test_ranges_of_the_residual_contain_samples_of_a_random_surface(n: int) -> None:
+@pytest.mark.parametrize(("n", "parts"), [(1, False), (2, False), (2, True)])
+def test_ranges_of_the_residual_contain_samples_of_a_random_surface(n: int, parts: bool) -> None:
     rng = np.random.default_rng(5 + n)
     axes = (np.array([-1.0, -0.4, 0.1]), np.array([0.0, 0.5, 0.8]))[:n]
     surface = random_surface(rng, axes, 2)
@@ -174,7 +174,15 @@ def test_ranges_of_the_residual_contain_samples_of_a_random_surface(n: int) -> N
     counts = model.counts()
     drifts, squares = interpolants(surface, model, 0, 2, counts)
     patches = surface.patches(0, 2)
-    ranges = bound_ranges(patches, drifts, squares, np.arange(len(patches.size)), counts)
+    place = np.arange(len(patches.size))
+    ranges = bound_ranges(patches, drifts, squares, place, counts)
+    if parts:  # bounds on the quarters of every patch, which are closer
+        found = [
+            bound_ranges(patches, drifts, squares, place, counts, near=0.0, upper=upper) for upper in (True, False)
+        ]
+        assert np.all(found[0].residual_high < ranges.residual_high)
+        assert np.all(found[1].residual_low > ranges.residual_low)
+        ranges = dataclasses.replace(found[0], residual_low=found[1].residual_low)
     for index in range(len(patches.size)):
         slab, *cell = np.unravel_index(index, (2, *surface.cells))
         for _ in range(30):
