@@ -18,7 +18,7 @@ def in_space(table: Array) -> Array:
 
 @njit(cache=True)
 def window_extremes(table: Array, start: Integers, size: tuple[int, int, int], largest: bool, out: Array) -> None:
-    """The largest (least) entry of the window of some size from every flat index in ``start`` on, written to ``out``."""
+    """The largest (least) entry of a window from every flat index in ``start`` on, written to ``out``."""
     plane, row = table.shape[1] * table.shape[2], table.shape[2]
     flat = table.ravel()
     for c in range(len(start)):
@@ -53,28 +53,37 @@ def second_differences(table: Array) -> Array:
     return total
 
 
-def corners_of(table: Array) -> tuple[Array, Array]:
-    """The least and the largest corner of every cell of a mesh."""
+def cell_ranges(table: Array, close: Array, near: float, beyond: float) -> tuple[Array, Array]:
+    """The least and the largest corner of every cell of a mesh, widened.
+
+    By an eighth of the largest sum of second differences at a corner, and by ``near`` times ``close`` (over cells)
+    plus ``beyond``.
+    """
     shape = tuple(size - 1 for size in table.shape)
-    low = np.empty((1,) * (3 - table.ndim) + shape)
-    high = np.empty_like(low)
-    _corner_extremes(in_space(table), 2 if table.ndim > 2 else 1, 2 if table.ndim > 1 else 1, low, high)
+    cells = (1,) * (3 - table.ndim) + shape
+    low, high = np.empty(cells), np.empty(cells)
+    bent, own = second_differences(in_space(table)), np.ascontiguousarray(close).reshape(cells)
+    corners = 2 if table.ndim > 2 else 1, 2 if table.ndim > 1 else 1
+    _cell_ranges(in_space(table), bent, own, near, beyond, corners, low, high)
     return low.reshape(shape), high.reshape(shape)
 
 
 @njit(cache=True)
-def _corner_extremes(table: Array, first: int, second: int, low: Array, high: Array) -> None:
-    """``corners_of``, with ``first`` and ``second`` corners along the first two axes and two along the last."""
+def _cell_ranges(
+    table: Array, bent: Array, close: Array, near: float, beyond: float, corners: tuple[int, int],
+    low: Array, high: Array,
+) -> None:  # fmt: skip
+    """``cell_ranges`` with so many corners along the first two axes and two along the last."""
     p, q, r = low.shape
     for i in range(p):
         for j in range(q):
             for k in range(r):
-                least, most, unknown = np.inf, -np.inf, False
-                for x in range(first):
-                    for y in range(second):
+                least, most, turn, total = np.inf, -np.inf, 0.0, 0.0
+                for x in range(corners[0]):
+                    for y in range(corners[1]):
                         for z in range(2):
-                            value = table[i + x, j + y, k + z]
-                            unknown = unknown or value != value
-                            least, most = min(least, value), max(most, value)
-                low[i, j, k] = np.nan if unknown else least
-                high[i, j, k] = np.nan if unknown else most
+                            value, other = table[i + x, j + y, k + z], bent[i + x, j + y, k + z]
+                            least, most, turn = min(least, value), max(most, value), max(turn, other)
+                            total += 0.0 * (value + other)  # no number as soon as one of them is none
+                wide = (turn * 0.125 + close[i, j, k] * near + beyond) * (1 + 1e-9) + total
+                low[i, j, k], high[i, j, k] = least - wide, most + wide

@@ -12,7 +12,6 @@ from certbound.errors import InfeasibleError
 from certbound.problem.noise import Law
 from certbound.rigor.intervals import Interval, sq, sqrt
 
-
 _SIZES = (1e-60, 1e60)
 """Sizes of noise between which tables of second derivatives neither vanish nor overflow: rounding is paid for in units
 of the numbers themselves, which says nothing of what has fallen below the smallest float."""

@@ -18,7 +18,7 @@ from certbound.arrays import Array, Integers, Mask
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import dominance
 from certbound.values.discrete.fields import POINTS, Field, Tables
-from certbound.values.discrete.scans import corners_of, in_space, second_differences, window_extremes
+from certbound.values.discrete.scans import cell_ranges, in_space, window_extremes
 from certbound.values.discrete.steps import CellImages, Step
 from certbound.values.grids import over_corners
 
@@ -132,8 +132,8 @@ class Windows:
         for size, members, flat in self.groups:
             if math.prod(size) * len(members) < _DIRECT * table.size:
                 whole = np.empty(len(members))
-                box = (1,) * (3 - len(size)) + size
-                window_extremes(in_space(table), flat, box, largest, whole)
+                depth, rows, columns = (1,) * (3 - len(size)) + size
+                window_extremes(in_space(table), flat, (depth, rows, columns), largest, whole)
                 found[members] = whole
                 continue
             part = table
@@ -254,14 +254,13 @@ class Transition:
                 order, share = _raised(alpha, i, 2), float(self._ratio[i]) ** 2 / 8 * scale
                 ends[i, 0] += share * math.prod(dominance(a, float(r) / 2) for a, r in zip(order, self._ratio))
                 ends[i, 1] += share * self.tables.beyond(order)
-        low, high = corners_of(table)
-        slack = corners_of(second_differences(in_space(table)).reshape(table.shape))[1] / 8
-        slack += close * near + beyond * field.largest
+        low, high = cell_ranges(table, close, near * (1 + 1e-9), beyond * field.largest * (1 + 1e-9))
         for i in range(self.n):
             for end in (0, -1):
-                np.moveaxis(slack, i, 0)[end] += ends[i, 0] * np.moveaxis(close, i, 0)[end] + ends[i, 1] * field.largest
-        slack *= 1 + 1e-9
-        return low - slack, high + slack
+                more = (ends[i, 0] * np.moveaxis(close, i, 0)[end] + ends[i, 1] * field.largest) * (1 + 1e-9)
+                np.moveaxis(low, i, 0)[end] -= more
+                np.moveaxis(high, i, 0)[end] += more
+        return low, high
 
     def _fourth(self, alpha: Alpha, i: int) -> tuple[float, float]:
         """What the second difference along axis i misses, times delta_i^2/8: relative to H, and beyond its reach."""

@@ -13,7 +13,7 @@ from certbound.problem.model.evaluation import compile_numpy
 from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import back_above, back_below, zones_of
-from certbound.values.discrete.scans import corners_of, in_space, second_differences, window_extremes
+from certbound.values.discrete.scans import cell_ranges, in_space, second_differences, window_extremes
 from certbound.values.discrete.shocks import shocks_of
 from certbound.values.discrete.steps import Dynamics
 from certbound.values.discrete.transitions import Transition
@@ -165,15 +165,21 @@ def test_compiled_scans_agree_with_numpy_and_keep_what_is_no_number(shape: tuple
         g, out = np.moveaxis(table, axis, 0), np.moveaxis(bent, axis, 0)
         out[1:-1] += np.abs(g[2:] + g[:-2] - 2 * g[1:-1])
     assert np.array_equal(second_differences(in_space(table)).reshape(shape), bent)
+    close = np.abs(table[(slice(1, None),) * len(shape)])
+    wide = over_corners(np.maximum, bent) / 8 + 0.3 * close + 0.1
     for hole in (False, True):
         if hole:
             table[(2,) * len(shape)] = np.nan
-        low, high = corners_of(table)
-        assert np.array_equal(low, over_corners(np.minimum, table), equal_nan=True)
-        assert np.array_equal(high, over_corners(np.maximum, table), equal_nan=True)
+        low, high = cell_ranges(table, close, 0.3, 0.1)
+        known = np.isfinite(over_corners(np.minimum, table))
+        assert hole != known.all()
+        assert low[known] == pytest.approx((over_corners(np.minimum, table) - wide)[known], rel=1e-8) or hole
+        assert high[known] == pytest.approx((over_corners(np.maximum, table) + wide)[known], rel=1e-8) or hole
+        assert np.isnan(low[~known]).all()
+        assert np.isnan(high[~known]).all()
         size = (2,) * len(shape)
         places = np.stack(np.unravel_index(np.arange(table.size), shape), axis=-1)
         start = np.flatnonzero(np.all(places + 2 <= shape, axis=1))
         found = np.empty(len(start))
         window_extremes(in_space(table), start, (1,) * (3 - len(size)) + size, True, found)
-        assert np.array_equal(found, high.ravel(), equal_nan=True)
+        assert np.array_equal(found, over_corners(np.maximum, table).ravel(), equal_nan=True)
