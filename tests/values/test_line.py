@@ -268,3 +268,16 @@ def test_a_start_in_moving_coordinates_is_read_where_it_is() -> None:
     assert f(0.1) <= wide.highest(surface, phase) <= f(0.1) + 0.02
     assert f(0.1) - 0.02 <= wide.lowest(surface, phase) <= f(0.1)
     assert Start(low=2.0, high=2.0).highest(surface, phase) == math.inf
+
+
+def test_units_do_not_matter_until_floats_end() -> None:
+    """Limits at 1e9 were refused, as if paths left every bound."""
+
+    def bound(unit: float) -> Any:
+        system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=0.6 * unit)
+        safe = [cb.Inside(cb.Box([-unit], [unit]))]
+        return bound_exits(cb.Problem(system, initial=[0.0], safe=safe, horizon=0.5), seconds=0.01)
+
+    assert bound(1e12).upper == pytest.approx(bound(1.0).upper, rel=1e-6)
+    with pytest.raises(InfeasibleError, match="another unit"):
+        bound(1e100)

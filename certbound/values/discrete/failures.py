@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from certbound.problem.sets import Box, Inside, Region
 from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Chart, Charts, from_probability
+from certbound.values.discrete.effort import seconds_of, shares_of, without_hopeless
 from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import (
@@ -37,25 +39,10 @@ from certbound.values.sets import active_at, box_around, contains, respected
 from certbound.watch import OutOfTime, poll
 
 MOST_STATES = 3
-_SHARES = {
-    1: (0.33, 0.15, 0.07, 0.035, 0.0175, 0.01),
-    2: (0.5, 0.33, 0.22, 0.15, 0.1, 0.07, 0.05, 0.035),
-    3: (0.4, 0.17, 0.1, 0.07),
-}
-"""Sizes of the cells that are tried, relative to the lengths over which the solution changes."""
 _UNIFORM_FLOOR = 1e-9  # means over boxes are known up to an absolute error
-_UNIFORM_SHARES = {
-    1: (0.2, 0.07, 0.025, 0.01, 0.005),
-    2: (0.3, 0.15, 0.07, 0.035, 0.02, 0.012),
-    3: (0.5, 0.3, 0.2, 0.12),
-}
 _MOST_NODES = 3_000_000
 _NODE_SECONDS = {False: 1e-4, True: 2e-3}
 """Roughly what a node of a first grid takes, without and with a common factor in the noise; measured, for refusing."""
-_CELL_SECONDS = 5e-6  # what a cell takes for one step, both bounds; measured once
-_COMMON_FACTOR = 20.0  # how much more that is with a common factor in the noise
-_UNIFORM_FACTOR = 0.4
-_OVERHEAD = 250  # cells that every step is worth in addition
 _PATIENCE = 1.0  # seconds for which grids are refined although the question is answered
 _CHARTED = 300_000  # parts of cells that a map has at most
 _FLOOR = 1e-16  # where what lies beyond ten standard deviations begins to count
@@ -126,7 +113,12 @@ def bound_failure(
     upper, lower, spent = 1.0, 0.0, 0.0
     tried: list[tuple[float, float, float]] = []
     cells: tuple[int, ...] = ()
-    for share in (_UNIFORM_SHARES if work.shocks.uniform else _SHARES)[work.n]:
+    shares = shares_of(work.n, uniform=work.shocks.uniform)
+    while shares:
+        if tried:
+            affordable = partial(work.fits, seconds=seconds - spent)
+            shares = without_hopeless(shares, tried[-1], ratio, work.shocks.uniform, affordable)
+        share = shares.pop(0)
         layout = work.layout(share)
         if layout is None:
             if not tried:
@@ -236,10 +228,13 @@ class _Work:
 
     def cost(self, layout: list[Grid]) -> float:
         """Seconds that a layout stands for, at fixed rates: bounds must not depend on the machine's load."""
-        rate = _CELL_SECONDS * (_COMMON_FACTOR if self.shocks.common else 1.0)
-        rate *= _UNIFORM_FACTOR if self.shocks.uniform else 1.0
         boxes = float(self.dynamics.parts) ** len(self.problem.system.disturbance_names)
-        return rate * boxes * sum(_OVERHEAD + math.prod(grid.shape) for grid in layout)
+        return boxes * seconds_of(layout, common=self.shocks.common, uniform=self.shocks.uniform)
+
+    def fits(self, share: float, seconds: float) -> bool:
+        """Whether grids with cells of this size exist and cost no more."""
+        layout = self.layout(share)
+        return layout is not None and self.cost(layout) <= seconds
 
     def _start_shocks(self) -> Shocks | None:
         initial = self.problem.initial

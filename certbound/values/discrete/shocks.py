@@ -12,6 +12,10 @@ from certbound.errors import InfeasibleError
 from certbound.problem.noise import Law
 from certbound.rigor.intervals import Interval, sq, sqrt
 
+_SIZES = (1e-60, 1e60)
+"""Sizes of noise between which tables of second derivatives neither vanish nor overflow: rounding is paid for in units
+of the numbers themselves, which says nothing of what has fallen below the smallest float."""
+
 
 class Inapplicable(InfeasibleError):
     """Value functions do not fit the problem; the message says why, and what would make them fit."""
@@ -73,6 +77,7 @@ def _uniform_shocks(halfwidth: Array, gain: Array) -> Shocks:
         raise Inapplicable("value functions need uniform noise that moves every state by an entry of its own.")
     place = np.argmax(gain != 0, axis=1)
     sides = Interval.point(np.abs(gain[np.arange(n), place])) * Interval.point(halfwidth[place])
+    _check_sizes(sides)
     return Shocks(sigma=sides, factor=Interval.point(np.zeros(n)), uniform=True)
 
 
@@ -98,7 +103,18 @@ def gaussian_shocks(covariance: Interval) -> Shocks:
                 "of the others'. Add a little noise there, or use another engine."
             )
     sigma = sqrt(Interval(np.array([float(v.lo) for v in rest]), np.array([float(v.hi) for v in rest])))
+    _check_sizes(sigma)
     return Shocks(sigma=sigma, factor=factor)
+
+
+def _check_sizes(sigma: Interval) -> None:
+    """Refuse units in which the noise is so small or so large that floats end."""
+    for i, (low, high) in enumerate(zip(sigma.lo, sigma.hi)):
+        if not (_SIZES[0] <= low and high <= _SIZES[1]):
+            raise Inapplicable(
+                f"value functions need noise between {_SIZES[0]:g} and {_SIZES[1]:g} on every state, that of state "
+                f"{i + 1} is {float(high):g}: write the state in another unit."
+            )
 
 
 def _factor(covariance: Interval) -> Interval:

@@ -18,10 +18,13 @@ from certbound.arrays import Array, Integers, Mask
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import dominance
 from certbound.values.discrete.fields import POINTS, Field, Tables
+from certbound.values.discrete.scans import cell_ranges, in_space, window_extremes
 from certbound.values.discrete.steps import CellImages, Step
 from certbound.values.grids import over_corners
 
 Alpha = tuple[int, ...]
+
+_DIRECT = 16  # entries of windows, in units of the table's, below which they are read one by one
 
 
 @lru_cache(maxsize=8)
@@ -127,6 +130,12 @@ class Windows:
         found = np.empty(self.count)
         pick = np.maximum if largest else np.minimum
         for size, members, flat in self.groups:
+            if math.prod(size) * len(members) < _DIRECT * table.size:
+                whole = np.empty(len(members))
+                depth, rows, columns = (1,) * (3 - len(size)) + size
+                window_extremes(in_space(table), flat, (depth, rows, columns), largest, whole)
+                found[members] = whole
+                continue
             part = table
             for axis, width in enumerate(size):
                 part = _sliding(pick, part, width, axis)
@@ -245,15 +254,13 @@ class Transition:
                 order, share = _raised(alpha, i, 2), float(self._ratio[i]) ** 2 / 8 * scale
                 ends[i, 0] += share * math.prod(dominance(a, float(r) / 2) for a, r in zip(order, self._ratio))
                 ends[i, 1] += share * self.tables.beyond(order)
-        bent = np.zeros_like(table)
-        for i in range(self.n):
-            _add_second_differences(table, i, bent)
-        slack = over_corners(np.maximum, bent) / 8 + close * near + beyond * field.largest
+        low, high = cell_ranges(table, close, near * (1 + 1e-9), beyond * field.largest * (1 + 1e-9))
         for i in range(self.n):
             for end in (0, -1):
-                np.moveaxis(slack, i, 0)[end] += ends[i, 0] * np.moveaxis(close, i, 0)[end] + ends[i, 1] * field.largest
-        slack *= 1 + 1e-9
-        return over_corners(np.minimum, table) - slack, over_corners(np.maximum, table) + slack
+                more = (ends[i, 0] * np.moveaxis(close, i, 0)[end] + ends[i, 1] * field.largest) * (1 + 1e-9)
+                np.moveaxis(low, i, 0)[end] -= more
+                np.moveaxis(high, i, 0)[end] += more
+        return low, high
 
     def _fourth(self, alpha: Alpha, i: int) -> tuple[float, float]:
         """What the second difference along axis i misses, times delta_i^2/8: relative to H, and beyond its reach."""
@@ -341,14 +348,6 @@ def _combined(over: dict[Alpha, Interval], terms: list[tuple[Alpha, Interval | N
 
 def _raised(alpha: Alpha, i: int, by: int) -> Alpha:
     return tuple(a + (by if k == i else 0) for k, a in enumerate(alpha))
-
-
-def _add_second_differences(table: Array, axis: int, total: Array) -> None:
-    """Add |g_{j-1} - 2 g_j + g_{j+1}| along an axis, but at its ends."""
-    g, out = np.moveaxis(table, axis, 0), np.moveaxis(total, axis, 0)
-    found = g[2:] + g[:-2]
-    found -= 2 * g[1:-1]
-    out[1:-1] += np.abs(found, out=found)
 
 
 _ONE = Interval.point(1.0)

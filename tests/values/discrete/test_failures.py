@@ -10,6 +10,7 @@ from scipy.stats import beta, norm
 
 import certbound as cb
 from certbound.problem.model.evaluation import compile_numpy
+from certbound.values.discrete.effort import without_hopeless
 from certbound.values.discrete.failures import bound_failure
 from certbound.values.discrete.shocks import Inapplicable
 
@@ -255,11 +256,21 @@ def test_four_states_and_too_many_nodes_are_refused() -> None:
 
 def test_bounds_do_not_depend_on_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = scalar(horizon=6)
-    first = bound_failure(problem, seconds=0.05, ratio=1.0001)
+    first = bound_failure(problem, seconds=0.02, ratio=1.0001)
     ticks = iter(range(0, 10**9, 1000))
     monkeypatch.setattr("certbound.values.discrete.failures.time.perf_counter", lambda: float(next(ticks)))
-    second = bound_failure(problem, seconds=0.05, ratio=1.0001)
+    second = bound_failure(problem, seconds=0.02, ratio=1.0001)
     assert first.tried == second.tried
     assert len(first.tried) > 1
     longer = bound_failure(problem, seconds=5.0, ratio=1.0001)
-    assert len(longer.tried) > len(first.tried)
+    assert longer.share < first.share
+
+
+def test_sizes_of_cells_that_would_leave_too_wide_a_gap_are_left_out() -> None:
+    shares = [share for share, _, _ in bound_failure(scalar(horizon=6), ratio=1.001).tried]
+    assert shares[0] == 0.33
+    assert 0.15 not in shares
+    left = [0.33, 0.22, 0.15, 0.1]
+    assert without_hopeless(left, (0.5, 2.8, 1.58), 1.05, False, lambda share: True)[0] == 0.15
+    assert without_hopeless(left, (0.5, 2.8, 1.58), 1.05, False, lambda share: share > 0.3) == left
+    assert without_hopeless(left, (0.5, 2.8, 0.0), 1.05, False, lambda share: True) == left

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 import certbound as cb
 from certbound.rigor.intervals import Interval
+from certbound.values.discrete.failures import bound_failure
 from certbound.values.discrete.shocks import Inapplicable, gaussian_shocks, shocks_of
 
 
@@ -55,3 +58,13 @@ def test_what_is_no_such_sum_is_refused(covariance: list[list[float]]) -> None:
 def test_a_class_of_laws_is_refused(law: object) -> None:
     with pytest.raises(Inapplicable, match="class of laws"):
         shocks_of(law.resolve(1), np.eye(1))  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("unit", [1e-150, 1e150])
+@pytest.mark.parametrize("law", [lambda c: cb.Gaussian(std=0.2 * c), lambda c: cb.Uniform(halfwidth=0.2 * c)])
+def test_units_in_which_floats_end_are_refused(law: Callable[[float], object], unit: float) -> None:
+    """Second derivatives of 1e-300 vanished from the tables: the lower bound was .0491 where .0489 is an upper one."""
+    system = cb.DiscreteSystem(lambda x: 0.9 * x, states=1, noise=law(unit))
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-unit], [unit]))], horizon=10)
+    with pytest.raises(Inapplicable, match="another unit"):
+        bound_failure(problem, seconds=1.0)

@@ -13,10 +13,11 @@ from certbound.problem.model.evaluation import compile_numpy
 from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import back_above, back_below, zones_of
+from certbound.values.discrete.scans import cell_ranges, in_space, second_differences, window_extremes
 from certbound.values.discrete.shocks import shocks_of
 from certbound.values.discrete.steps import Dynamics
 from certbound.values.discrete.transitions import Transition
-from certbound.values.grids import Grid
+from certbound.values.grids import Grid, over_corners
 from tests.values.discrete.helpers import mean_after_noise, random_function
 
 STEPS: dict[str, Callable[..., Any]] = {
@@ -154,3 +155,31 @@ def test_finer_cells_bring_both_sides_together() -> None:
         )
     assert gaps[1] < gaps[0] / 3
     assert gaps[2] < gaps[1] / 3
+
+
+@pytest.mark.parametrize("shape", [(9,), (5, 8), (4, 5, 6)])
+def test_compiled_scans_agree_with_numpy_and_keep_what_is_no_number(shape: tuple[int, ...]) -> None:
+    table = np.random.default_rng(0).normal(size=shape)
+    bent = np.zeros(shape)
+    for axis in range(len(shape)):
+        g, out = np.moveaxis(table, axis, 0), np.moveaxis(bent, axis, 0)
+        out[1:-1] += np.abs(g[2:] + g[:-2] - 2 * g[1:-1])
+    assert np.array_equal(second_differences(in_space(table)).reshape(shape), bent)
+    close = np.abs(table[(slice(1, None),) * len(shape)])
+    wide = over_corners(np.maximum, bent) / 8 + 0.3 * close + 0.1
+    for hole in (False, True):
+        if hole:
+            table[(2,) * len(shape)] = np.nan
+        low, high = cell_ranges(table, close, 0.3, 0.1)
+        known = np.isfinite(over_corners(np.minimum, table))
+        assert hole != known.all()
+        assert low[known] == pytest.approx((over_corners(np.minimum, table) - wide)[known], rel=1e-8) or hole
+        assert high[known] == pytest.approx((over_corners(np.maximum, table) + wide)[known], rel=1e-8) or hole
+        assert np.isnan(low[~known]).all()
+        assert np.isnan(high[~known]).all()
+        size = (2,) * len(shape)
+        places = np.stack(np.unravel_index(np.arange(table.size), shape), axis=-1)
+        start = np.flatnonzero(np.all(places + 2 <= shape, axis=1))
+        found = np.empty(len(start))
+        window_extremes(in_space(table), start, (1,) * (3 - len(size)) + size, True, found)
+        assert np.array_equal(found, over_corners(np.maximum, table).ravel(), equal_nan=True)

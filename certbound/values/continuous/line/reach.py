@@ -20,7 +20,8 @@ from certbound.values.continuous.line.phases import last_instant, limits_of, val
 
 _PATHS, _STEPS = 400, 200
 _DEVIATIONS = 7.0
-_FARTHEST = 1e9
+_FARTHEST = 1e9  # times the largest of the starts and limits, and times 1
+_LARGEST = 1e60  # units in which V's second derivatives would fall below the smallest float are refused
 
 
 def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]:
@@ -31,19 +32,24 @@ def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]
     InfeasibleError
         Paths get beyond any bound, so that no cut helps.
     """
-    low, high = _spread(problem, model, start)
+    places = []
     for limit, _ in limits_of(problem, inner=False):
         times = [0.0, last_instant(problem)] if limit.center is None else np.linspace(0, last_instant(problem), 9)
         for t in times:
-            place = limit.offset + (0.0 if limit.center is None else float(value_at(limit.center, float(t)).mid))
-            low, high = min(low, place), max(high, place)
+            moved = 0.0 if limit.center is None else float(value_at(limit.center, float(t)).mid)
+            places.append(limit.offset + moved)
+    scale = max(1.0, *(abs(place) for place in (start.low, start.high, *places)))
+    if not scale < _LARGEST:
+        raise InfeasibleError(f"value functions need states below {_LARGEST:g}: write the state in another unit.")
+    low, high = _spread(problem, model, start, _FARTHEST * scale)
+    low, high = min([low, *places]), max([high, *places])
     square = compile_numpy(model.square.tape)
     room = 0.02 * (high - low)
     at = [_beyond(lambda y: square(0.0, y)[..., 0, 0], place, way) for place, way in ((low, -room), (high, room))]
     return at[0], at[1]
 
 
-def _spread(problem: Problem, model: Model, start: Start) -> tuple[float, float]:
+def _spread(problem: Problem, model: Model, start: Start, farthest: float) -> tuple[float, float]:
     """Extremes of a few paths with the worst disturbances each way, extended by so many deviations."""
     drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
     corners = [[float(value.mid) for value in branch] for branch in model.branches]
@@ -60,13 +66,13 @@ def _spread(problem: Problem, model: Model, start: Start) -> tuple[float, float]
                 f = np.array([np.broadcast_to(drift(k * step, x, *c)[..., 0], x.shape) for c in corners])
                 g = np.sqrt(np.broadcast_to(square(k * step, x)[..., 0, 0], x.shape))
                 x = x + step * sign * (sign * f).max(axis=0) + np.sqrt(step) * g * rng.standard_normal(_PATHS)
-            if not np.all(np.abs(x) < _FARTHEST):
+            if not np.all(np.abs(x) < farthest):
                 raise InfeasibleError(_BEYOND)
             middle, deviation = float(np.median(x)), float(np.std(x))
             beyond = _beyond(lambda y, t=k * step: square(t, y)[..., 0, 0], middle, sign * _DEVIATIONS * deviation)
             far = sign * max(sign * far, sign * beyond, float((sign * x).max()))
         ends.append(far)
-    if not max(-ends[0], ends[1]) < _FARTHEST:
+    if not max(-ends[0], ends[1]) < farthest:
         raise InfeasibleError(_BEYOND)
     return ends[0], ends[1]
 
