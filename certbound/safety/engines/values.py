@@ -32,7 +32,7 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         if serves(problem):
             return _continuous(bound_exits_by_steps(problem, seconds=limit))
         if not isinstance(problem.system, DiscreteSystem):
-            return _continuous(bound_exits(problem, seconds=limit))
+            return _continuous(bound_exits(problem, seconds=limit, delta=problem.delta))
         found = bound_failure(problem, seconds=limit, delta=problem.delta)
     except (InfeasibleError, EnclosureError) as error:
         return EngineAnswer(applicable=False, method="values", reason=str(error))

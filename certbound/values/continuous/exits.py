@@ -52,7 +52,7 @@ class ExitBounds:
 
 
 def bound_exits(
-    problem: Problem, *, target: Any = None, seconds: float = 10.0, lower: bool = True
+    problem: Problem, *, target: Any = None, seconds: float = 10.0, lower: bool = True, delta: float = 0.0
 ) -> ExitBounds:
     """Bound P(X_t leaves the safe set for some t <= T) from above and from below by Theorem K8-CT.
 
@@ -67,7 +67,9 @@ def bound_exits(
         How long to refine; the first attempt is finished in any case. In one state seconds stand for so many
         patches of work, so that the bounds do not depend on the machine or its load.
     lower : bool
-        Whether to look for a lower bound too (one state; there is none in two).
+        Whether to look for a lower bound too.
+    delta : float
+        Where the upper bound is at most this, no lower bound is looked for in two states, which takes as long again.
 
     Returns
     -------
@@ -103,7 +105,10 @@ def bound_exits(
             raise InfeasibleError("value functions in two states do not serve a random start; use a set of starts.")
         room = safe_room(problem)
         check_noise(model, (0.0, float(problem.horizon)), list(zip(room.inner_low, room.inner_high)))
-        upper, least, words, proposed = two_states(problem, model, room, begin + seconds)
+        if lower:
+            check_noise(model, (0.0, float(problem.horizon)), list(zip(room.outer_low, room.outer_high)))
+        wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
+        upper, least, words, proposed = two_states(problem, model, room, begin + seconds, wanted)
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),

@@ -137,10 +137,11 @@ def _side_by_side(look: Callable[[tuple[int, int]], Found], chunks: list[tuple[i
         return list(pool.map(look, chunks))
 
 
-def sampled_residual(surface: Surface, model: Model) -> tuple[Array, Array]:
+def sampled_residual(surface: Surface, model: Model, *, upper: bool = True) -> tuple[Array, Array]:
     """The largest R among a few samples of each patch in two states, and V's least value there: no bounds.
 
-    Both have shape (slabs, *cells); a sketch of what `examine` finds, at a tenth of its cost.
+    For lower bounds the largest -R of the best branch, and V's largest value. Both have shape (slabs, *cells); a
+    sketch of what `examine` finds, at a tenth of its cost.
     """
     counts = (4, 5, 5)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
@@ -150,12 +151,13 @@ def sampled_residual(surface: Surface, model: Model) -> tuple[Array, Array]:
         patches = surface.patches(*ends)
         place = np.arange(len(patches.size)) % (per if fixed else len(patches.size))
         drifts, squares = fixed or interpolants(surface, model, *ends, counts)
-        return sample_in_plane(patches, drifts, squares, place, counts), value_range(patches)[0]
+        excess = sample_in_plane(patches, drifts, squares, place, counts, upper=upper)
+        return excess, value_range(patches)[0 if upper else 1]
 
     found = _side_by_side(look, list(surface.chunks()))
     shape = (surface.slabs, *surface.cells)
-    highest, lowest = (np.concatenate(parts).reshape(shape) for parts in zip(*found))
-    return highest, lowest
+    excess, values = (np.concatenate(parts).reshape(shape) for parts in zip(*found))
+    return excess, values
 
 
 def interpolants(

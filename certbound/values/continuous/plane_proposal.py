@@ -28,6 +28,11 @@ _GAMMA = 0.5
 _COURANT = 3.0
 _GATE = 0.004  # a source weakens where V is above minus this, and ends at 0
 _MOST_STEPS = 40_000
+_OUTSIDE = 12  # cells of the margin around the box, for lower bounds
+_MARGIN = 4.0  # its width, in units of 1/k
+_DRAWN = 400.0  # how fast V is drawn there, in units of the speed at which it rises
+_STIFF = 20.0  # by how much that may exceed one over a step
+_DEEPER = 3.0  # below what V is on the faces at T, for lower bounds
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -47,13 +52,15 @@ class Plane:
 class Plan:
     """How a proposal is made: cells along each axis, the slabs' growth, and what it starts from.
 
-    At T there is a layer at each face, as if it had evolved for the time ``lead``, over V = ``floor``.
+    At T there is a layer at each face, as if it had evolved for the time ``lead``, over V = ``floor``. For lower
+    bounds (``below``) V is ``floor`` everywhere at T, and rises to 0 on the faces within ``lead``.
     """
 
     cells: int
     growth: float
     lead: float
     floor: float
+    below: bool = False
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -98,7 +105,7 @@ def _linear(nodes: Array, points: Array) -> Array:
 
 def propose_plane(plane: Plane, plan: Plan, source: Source | None = None) -> Surface | None:
     """V on a tensor grid; None where the integration breaks down or needs too many steps."""
-    solver = _Solver(plane, plan, source)
+    solver = (_SolverBelow if plan.below else _Solver)(plane, plan, source)
     times = slab_times(plane.horizon, plan)
     value, taken = solver.start(), 0
     values, first, last = [value], [], []
@@ -132,7 +139,7 @@ class _Solver:
 
     def __init__(self, plane: Plane, plan: Plan, source: Source | None) -> None:
         self.plane, self.plan = plane, plan
-        self.nodes = [_grid(plane, plan, axis) for axis in (0, 1)]
+        self.nodes = [self._nodes(axis) for axis in (0, 1)]
         self.splines = [Splines(nodes) for nodes in self.nodes]
         self.inverse = [np.linalg.inv(one.dense[0]) for one in self.splines]
         self.slope = [one.dense[1] @ inverse for one, inverse in zip(self.splines, self.inverse)]
@@ -143,9 +150,12 @@ class _Solver:
         self.edge = np.ones(self.x.shape, dtype=bool)
         self.edge[1:-1, 1:-1] = False
         self.fixed = self._model(0.0) if plane.autonomous else None
-        self.source = None if source is None else (source.times, source.at(points))
+        self.source = None if source is None else (source.times, source.at([np.clip(p, a[0], a[-1]) for p, a in zip(points, source.axes)]))
 
-    def _model(self, t: float) -> tuple[Array, Array, Array]:
+    def _nodes(self, axis: int) -> Array:
+        return _grid(self.plane, self.plan, axis)
+
+    def _model(self, t: float) -> tuple[Array, Array, Array | None]:
         drift, square = self.plane.drift(t, self.x, self.y), self.plane.square(t, self.x, self.y)
         weak = _weakened(self.plane, self.plan, drift[0], square, self.x, self.y)
         return drift, square, weak
@@ -174,23 +184,35 @@ class _Solver:
         bend = np.clip((0.5 - share) / np.maximum(1 - share, 0.1), 0.0, 0.9)
         return rate, bend, np.clip(2 * share - 1, 0.0, 2.0)
 
+    def face(self, tau: float) -> tuple[float, float]:
+        """V and its rate on the faces."""
+        return 0.0, 0.0
+
     def _right(self, tau: float, value: Array) -> tuple[Array, Array, Array, Array]:
         drift, a, weak = self.fixed or self._model(self.plane.horizon - tau)
         vx, vy = self.slope[0] @ value, value @ self.slope[1].T
         along_drift = drift[:, 0] * vx + drift[:, 1] * vy
         best = np.argmax(along_drift, axis=0) if len(drift) > 1 else np.zeros(value.shape, dtype=int)
         force = np.take_along_axis(drift, best[None, None], axis=0)[0]
-        force = np.stack([np.where((w - f) * v > 0, w, f) for w, f, v in zip(weak, force, (vx, vy))])
+        if weak is not None:
+            force = np.stack([np.where((w - f) * v > 0, w, f) for w, f, v in zip(weak, force, (vx, vy))])
         bends = a[0, 0] * (self.bend[0] @ value) + a[1, 1] * (value @ self.bend[1].T)
         if np.any(a[0, 1]):
             bends = bends + 2 * a[0, 1] * (vx @ self.slope[1].T)
         energy = a[0, 0] * vx * vx + 2 * a[0, 1] * vx * vy + a[1, 1] * vy * vy
         rate = force[0] * vx + force[1] * vy + 0.5 * (bends + energy)
-        rate = rate + self._source(tau) * np.clip(-value / _GATE, 0.0, 1.0)
-        rate[self.edge] = 0.0
+        rate = rate + self._fed(tau, value)
+        rate[self.edge] = self.face(tau)[1]
         speed_x = force[0] + a[0, 0] * vx + a[0, 1] * vy
         speed_y = force[1] + a[1, 1] * vy + a[0, 1] * vx
         return rate, speed_x, speed_y, a
+
+    def _fed(self, tau: float, value: Array) -> Array:
+        return self._source(tau) * np.clip(-value / _GATE, 0.0, 1.0)
+
+    def _falls(self, tau: float, value: Array) -> Array:
+        """How fast what the source gives falls with V."""
+        return np.where((value < 0) & (value > -_GATE), self._source(tau) / _GATE, 0.0)
 
     def _source(self, tau: float) -> Array:
         if self.source is None:
@@ -225,11 +247,13 @@ class _Solver:
 
     def step(self, tau: float, value: Array, h: float) -> Array:
         rate, speed_x, speed_y, a = self._right(tau, value)
-        fed = np.where((value < 0) & (value > -_GATE), self._source(tau) / _GATE, 0.0)
+        fed = self._falls(tau, value)
         k1 = self._divided(rate, (speed_x, speed_y), a, h, fed)
         again = self._right(tau + h, value + h * k1)[0]
         k2 = self._divided(again - 2 * k1, (speed_x, speed_y), a, h, fed)
-        return value + 1.5 * h * k1 + 0.5 * h * k2
+        value = value + 1.5 * h * k1 + 0.5 * h * k2
+        value[self.edge] = self.face(tau + h)[0]
+        return np.asarray(value)
 
     def surface(self, times: Array, values: list[Array], first: list[Array], last: list[Array]) -> Surface:
         maps = [np.stack([m @ inverse for m in one.at_nodes], axis=1)
@@ -238,8 +262,9 @@ class _Solver:
         def data(tables: list[Array]) -> Array:
             part = np.einsum("iap,kpq->kiaq", maps[0], np.array(tables), optimize=True)
             found = np.einsum("jbq,kiaq->kiajb", maps[1], part, optimize=True)[::-1]
-            found[:, [0, -1], 0] = 0.0  # V = 0 on the faces, exactly
-            found[:, :, :, [0, -1], 0] = 0.0
+            if not self.plan.below:
+                found[:, [0, -1], 0] = 0.0  # V = 0 on the faces, exactly
+                found[:, :, :, [0, -1], 0] = 0.0
             return np.asarray(found)
 
         forward = self.plane.horizon - times[::-1]
@@ -247,6 +272,68 @@ class _Solver:
         return Surface(
             axes=tuple(self.nodes), times=forward, values=data(values), start_rates=-data(last),
             end_rates=-data(first),
+        )  # fmt: skip
+
+
+class _SolverBelow(_Solver):
+    """For lower bounds: a margin around the box, where V is drawn to what it should be on the faces at each time.
+
+    On the faces themselves V may be anything that is not positive. Were it given there, it would rise on two of them
+    at each corner, where V has no curvature then that could make it rise: a residual that nothing pays for.
+    """
+
+    def __init__(self, plane: Plane, plan: Plan, source: Source | None) -> None:
+        super().__init__(plane, plan, source)
+        shares = [
+            np.maximum(np.maximum((low - place) / (low - nodes[0]), (place - high) / (nodes[-1] - high)), 0.0)
+            for place, low, high, nodes in zip((self.x, self.y), plane.low, plane.high, self.nodes)
+        ]
+        drawn = np.minimum(shares[0] ** 2 + shares[1] ** 2, 1.0)
+        self.drawn = -_DRAWN * plan.floor / plan.lead * drawn
+
+    def _nodes(self, axis: int) -> Array:
+        nodes = _grid(self.plane, self.plan, axis)
+        wide = [_MARGIN / _layer_rate(self.plane, self.plan, axis, side) for side in (0, 1)]
+        out = [width * np.arange(1, _OUTSIDE + 1) / _OUTSIDE for width in wide]
+        return np.concatenate([nodes[0] - out[0][::-1], nodes, nodes[-1] + out[1]])
+
+    def _model(self, t: float) -> tuple[Array, Array, Array | None]:
+        x, y = (np.clip(p, low, high) for p, low, high in zip((self.x, self.y), self.plane.low, self.plane.high))
+        return self.plane.drift(t, x, y), self.plane.square(t, x, y), None
+
+    def start(self) -> Array:
+        """V falls from the faces as steeply as it has to where it follows them, and ends a little deeper."""
+        product = np.ones(self.x.shape)
+        for axis, place in enumerate((self.x, self.y)):
+            for side in (0, 1):
+                away = place - self.plane.low[axis] if side == 0 else self.plane.high[axis] - place
+                k = _rise(self.plane, self.plan, axis, side, self.x, self.y)
+                product = product * -np.expm1(-k * np.maximum(away, 0.0))
+        least = math.exp(-_DEEPER)
+        return np.asarray(self.plan.floor + np.log(least + (1 - least) * (1 - product)))
+
+    def face(self, tau: float) -> tuple[float, float]:
+        s, top = min(tau / self.plan.lead, 1.0), self.plan.floor
+        rise = s**3 * (10 - 15 * s + 6 * s * s)
+        return top * (1 - rise), -top * 30 * (s * (1 - s)) ** 2 / self.plan.lead
+
+    def _fed(self, tau: float, value: Array) -> Array:
+        return np.asarray(self.drawn * (self.face(tau)[0] - value) - self._source(tau))
+
+    def _falls(self, tau: float, value: Array) -> Array:
+        return np.asarray(self.drawn)
+
+    def steps(self, tau: float, value: Array, span: float) -> int:
+        return max(super().steps(tau, value, span), math.ceil(span * float(self.drawn.max()) / _STIFF))
+
+    def surface(self, times: Array, values: list[Array], first: list[Array], last: list[Array]) -> Surface:
+        """What lies in the box."""
+        whole = super().surface(times, values, first, last)
+        kept = slice(_OUTSIDE, -_OUTSIDE)
+        parts = [part[:, kept, :, kept] for part in (whole.values, whole.start_rates, whole.end_rates)]
+        return Surface(
+            axes=tuple(axis[kept] for axis in whole.axes), times=whole.times, values=parts[0], start_rates=parts[1],
+            end_rates=parts[2],
         )  # fmt: skip
 
 
@@ -279,8 +366,20 @@ def _layer_rate(plane: Plane, plan: Plan, axis: int, side: int) -> float:
     ends[axis] = np.array([plane.low[axis] if side == 0 else plane.high[axis]])
     x, y = np.meshgrid(*ends, indexing="ij")
     a = np.maximum(plane.square(plane.horizon, x, y)[axis, axis] * np.ones(x.shape), 1e-300)
+    if plan.below:
+        return float(np.max(_rise(plane, plan, axis, side, x, y)))
     inward = np.max(plane.drift(plane.horizon, x, y)[:, axis] * (1 if side == 0 else -1), axis=0)
     return float(np.max(np.maximum(1.3 * np.sqrt(2 / (a * plan.lead)), inward / (1.5 * a))))
+
+
+def _rise(plane: Plane, plan: Plan, axis: int, side: int, x: Array, y: Array) -> Array:
+    """k at a face, with a k^2 / 2 - f k = the speed at which V rises there."""
+    place = [x, y]
+    place[axis] = np.full(x.shape, plane.low[axis] if side == 0 else plane.high[axis])
+    a = plane.square(plane.horizon, *place)[axis, axis] * np.ones(x.shape)
+    drift = plane.drift(plane.horizon, *place)[:, axis] * (1 if side == 0 else -1)
+    inward = np.maximum(drift.min(axis=0), 0.0)
+    return np.asarray((inward + np.sqrt(inward**2 - 4 * a * plan.floor / plan.lead)) / np.maximum(a, 1e-300))
 
 
 def _weakened(plane: Plane, plan: Plan, drift: Array, a: Array, x: Array, y: Array) -> Array:

@@ -169,10 +169,11 @@ def _in_plane(
 
 def sample_in_plane(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int],
+    counts: Sequence[int], *, upper: bool,
 ) -> Array:
-    """The largest sample of R over each patch and all branches, two states: a sketch, no bound."""
-    return np.asarray(_run_plane(patches, drifts, squares, place, counts, 0, np.inf)[:, :, 4].max(axis=1))
+    """The largest sample of R over each patch and all branches, or of -R for the best branch: a sketch, no bound."""
+    out = _run_plane(patches, drifts, squares, place, counts, 0, np.inf)
+    return np.asarray(out[:, :, 4].max(axis=1) if upper else -out[:, :, 3].max(axis=1))
 
 
 def _run_plane(

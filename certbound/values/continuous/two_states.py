@@ -8,6 +8,7 @@ its way out. All this is proposal, the proof is that of `hypotheses`.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import time
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from certbound.values.continuous.hypotheses import (
     sampled_residual,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
+from certbound.values.continuous.plane_below import bound_plane_below, plan_below
 from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane, slab_times
 from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
@@ -44,12 +46,13 @@ _CLOSE = 0.15
 _HOPELESS = 60.0  # what a first proposal may lose (log P): sources make that ten times less, not a hundred
 _VARIED = 1.0  # about how much V varies on a patch
 _SHARES = (0.12, 0.8)  # of the patches, for one grid after the other
+_BELOW = 0.6  # of as many patches again, for a lower bound
 
 
 def two_states(
-    problem: Problem, model: Model, room: Room, deadline: float
-) -> tuple[float, None, str, list[tuple[Surface, Payment]]]:
-    """The upper bound on one grid after another; lower bounds in two states are not looked for.
+    problem: Problem, model: Model, room: Room, deadline: float, wanted: float
+) -> tuple[float, float | None, str, list[tuple[Surface, Payment]]]:
+    """The upper bound on one grid after another, and the lower one where the upper one is above ``wanted``.
 
     The seconds until the deadline are turned into a number of patches, so that the bound does not depend on the clock.
     What certificates state comes last.
@@ -74,7 +77,14 @@ def two_states(
                 break
             raise
         done.append(f"{plan.cells}^2")
-    return upper, None, f"value function in two states, cells: {', '.join(done)}", proposed
+    lower = None
+    if upper > wanted:
+        outer = _plane(problem, model, room.outer_low, room.outer_high, starts)
+        plan = plan_below(outer, min(level, upper), _BELOW * patches)
+        with contextlib.suppress(OutOfTime):
+            lower = bound_plane_below(outer, model, plan, starts)
+        done.append(f"{plan.cells}^2 below")
+    return upper, lower, f"value function in two states, cells: {', '.join(done)}", proposed
 
 
 def _plan(plane: Plane, level: float, patches: float) -> Plan:
