@@ -19,6 +19,7 @@ from certbound.plotting.value_maps import coarser, outline_of
 from certbound.problem.problem import Problem
 from certbound.safety.starts import SafeStarts, bound_safe_starts
 from certbound.values.charts import Chart, Charts
+from certbound.values.continuous.line import ladder
 
 Make = Callable[[], Problem]
 
@@ -49,6 +50,12 @@ def swirl() -> Problem:
     )
     safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
     return Problem(system, initial=[0.1, 0.0], safe=safe, horizon=1, delta=0.05)
+
+
+@pytest.fixture(autouse=True)
+def _coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Proposals of one state that cost a tenth."""
+    monkeypatch.setattr(ladder, "LADDER", ((2.5, 1e-3, 0.03), (2.5, 1e-3, 0.03)))
 
 
 def starts_of(problem: Problem, **options: bool) -> SafeStarts:

@@ -150,7 +150,10 @@ class _Solver:
         self.edge = np.ones(self.x.shape, dtype=bool)
         self.edge[1:-1, 1:-1] = False
         self.fixed = self._model(0.0) if plane.autonomous else None
-        self.source = None if source is None else (source.times, source.at([np.clip(p, a[0], a[-1]) for p, a in zip(points, source.axes)]))
+        self.source = None
+        if source is not None:
+            places = [np.clip(place, axis[0], axis[-1]) for place, axis in zip(points, source.axes)]
+            self.source = source.times, source.at(places)
 
     def _nodes(self, axis: int) -> Array:
         return _grid(self.plane, self.plan, axis)

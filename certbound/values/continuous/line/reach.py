@@ -45,8 +45,8 @@ def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]
     low, high = min([low, *places]), max([high, *places])
     square = compile_numpy(model.square.tape)
     room = 0.02 * (high - low)
-    at = [_beyond(lambda y: square(0.0, y)[..., 0, 0], place, way) for place, way in ((low, -room), (high, room))]
-    return at[0], at[1]
+    at = _beyond(square, np.zeros(2), np.array([low, high]), np.array([-room, room]))
+    return float(at[0]), float(at[1])
 
 
 def _spread(problem: Problem, model: Model, start: Start, farthest: float) -> tuple[float, float]:
@@ -60,31 +60,32 @@ def _spread(problem: Problem, model: Model, start: Start, farthest: float) -> tu
     ends = []
     for sign, begin in ((-1.0, start.low), (1.0, start.high)):
         x: Array = begin + sigma * rng.standard_normal(_PATHS)
-        far, middle, deviation = begin + sign * _DEVIATIONS * sigma, begin, sigma
+        far = begin + sign * _DEVIATIONS * sigma
+        middle, deviation, clock = np.empty(_STEPS), np.empty(_STEPS), np.linspace(0, horizon - step, _STEPS)
         for k in range(_STEPS):
             with np.errstate(all="ignore"):
-                f = np.array([np.broadcast_to(drift(k * step, x, *c)[..., 0], x.shape) for c in corners])
-                g = np.sqrt(np.broadcast_to(square(k * step, x)[..., 0, 0], x.shape))
+                f = np.array([np.broadcast_to(drift(clock[k], x, *c)[..., 0], x.shape) for c in corners])
+                g = np.sqrt(np.broadcast_to(square(clock[k], x)[..., 0, 0], x.shape))
                 x = x + step * sign * (sign * f).max(axis=0) + np.sqrt(step) * g * rng.standard_normal(_PATHS)
             if not np.all(np.abs(x) < farthest):
                 raise InfeasibleError(_BEYOND)
-            middle, deviation = float(np.median(x)), float(np.std(x))
-            beyond = _beyond(lambda y, t=k * step: square(t, y)[..., 0, 0], middle, sign * _DEVIATIONS * deviation)
-            far = sign * max(sign * far, sign * beyond, float((sign * x).max()))
-        ends.append(far)
+            middle[k], deviation[k] = np.median(x), np.std(x)
+            far = sign * max(sign * far, float((sign * x).max()))
+        beyond = _beyond(square, clock, middle, sign * _DEVIATIONS * deviation)
+        ends.append(sign * max(sign * far, float((sign * beyond).max())))
     if not max(-ends[0], ends[1]) < farthest:
         raise InfeasibleError(_BEYOND)
     return ends[0], ends[1]
 
 
-def _beyond(square: Callable[..., Array], middle: float, way: float) -> float:
-    """The place at a distance from the middle that is measured by the noise: multiplicative noise never reaches 0."""
+def _beyond(square: Callable[..., Array], clock: Array, middle: Array, way: Array) -> Array:
+    """The places at a distance from the middle that is measured by the noise: multiplicative noise never reaches 0."""
     parts, x = 64, middle
-    start = max(float(np.ravel(square(np.array([middle])))[0]), 1e-300)
     with np.errstate(all="ignore"):
+        start = np.maximum(square(clock, middle)[..., 0, 0], 1e-300)
         for _ in range(parts):
-            x += way / parts * math.sqrt(max(float(np.ravel(square(np.array([x])))[0]), 0.0) / start)
-    return x if math.isfinite(x) else middle + way
+            x = x + way / parts * np.sqrt(np.maximum(square(clock, x)[..., 0, 0], 0.0) / start)
+        return np.where(np.isfinite(x), x, middle + way)
 
 
 _BEYOND = (
