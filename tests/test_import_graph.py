@@ -61,6 +61,7 @@ safety.certificates
 safety.portfolio
 safety.certificate safety.falsification
 safety.verdict
+safety.members
 safety.decision
 safety
 synthesis
@@ -114,7 +115,7 @@ MANY_DOORS = {
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
     "constants.programs": (15, "one program each for rate, gain and erosion, with what it is asked"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
-    "problem.sets": (13, "the sets and constraints that users write, and the two forms that everybody reads"),
+    "problem.sets": (14, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
     "checker.statement": (11, "what a certificate states is read once and asked by four proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),

@@ -13,7 +13,7 @@ from certbound.arrays import Array
 from certbound.checks import assign, frozen, nearest, number, positive_definite, vector
 from certbound.display import Shown, ask_later_room, name_text
 from certbound.problem.model import Tape, substitute, trace
-from certbound.problem.sets import Box, GaussianStart, Inside, Outside, Region, check_start
+from certbound.problem.sets import Box, GaussianStart, Inside, Outside, Region, StartUnion, check_start
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
 
@@ -25,9 +25,9 @@ class Problem(Shown):
     ----------
     system : ContinuousSystem or DiscreteSystem
         The model.
-    initial : Box, Ball, Ellipsoid, GaussianStart or array_like of shape (n,)
+    initial : Box, Ball, Ellipsoid, GaussianStart, array_like of shape (n,), or a list of sets
         Every start in a set counts (also one chosen by an adversary who does not see coming noise); a point is stored
-        as a degenerate box.
+        as a degenerate box. A list or tuple of sets is their union: the worst of them counts.
     safe : sequence of Inside and Outside
         Constraints, each over its own window.
     horizon : float or int
@@ -91,7 +91,8 @@ class Problem(Shown):
         assign(self, parameters=dict(self.parameters or {}))
         assign(self, plan=self._checked_plan())
         assign(self, cost=self._cost())
-        check_start(self.initial, self.constraints)
+        for member in self.starts:
+            check_start(member, self.constraints)
         if self.plan is not None or self.system.inputs is None:
             assign(self, _closed_loop=self._closed())
 
@@ -101,6 +102,11 @@ class Problem(Shown):
         if self.domain is None:
             return tuple(self.safe)
         return (*self.safe, Inside(self.domain, label="the model's domain"))
+
+    @property
+    def starts(self) -> tuple[Region | GaussianStart, ...]:
+        """The initial set, or the members of a union."""
+        return self.initial.members if isinstance(self.initial, StartUnion) else (self.initial,)
 
     @property
     def closed_loop(self) -> Tape:
@@ -144,7 +150,8 @@ class Problem(Shown):
         signals = {"states": self.system.states, "inputs": self.system.input_names}
         signals["disturbances"] = self.system.disturbance_names
         found = [(name, ", ".join(values)) for name, values in signals.items() if values]
-        found.append(("start", "a point" if self.fixed_start else type(self.initial).__name__))
+        starts = ["a point" if start.is_point else type(start).__name__ for start in self.starts]
+        found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))
         return [*found, *(("constraint", constraint.label) for constraint in self.constraints)]
 
     def to_dict(self) -> dict[str, Any]:
@@ -304,10 +311,21 @@ def _check_dimension(name: str, region: Any, dimension: int) -> None:
 
 
 def _start(value: Any, dimension: int) -> Any:
+    sets = value.members if isinstance(value, StartUnion) else value
+    if not isinstance(sets, list | tuple) or not any(isinstance(entry, Region | GaussianStart) for entry in sets):
+        return _one_start(value, dimension)
+    members = [_one_start(entry, dimension) for entry in sets]
+    if any(member.random for member in members):
+        raise ValueError("`initial` must hold sets and points in a union; a GaussianStart stands alone.")
+    return StartUnion(tuple(members)) if len(members) > 1 else members[0]
+
+
+def _one_start(value: Any, dimension: int) -> Any:
     kind: Any = type(value)
-    if issubclass(kind, Region | GaussianStart | Mapping | str):
+    if issubclass(kind, Region | GaussianStart | StartUnion | Mapping | str):
         if kind is not GaussianStart and not (Region in kind.__bases__ and kind.starts):
-            raise TypeError(f"`initial` must be a point, Box, Ball, Ellipsoid or GaussianStart, got {value!r}.")
+            kinds = "a point, Box, Ball, Ellipsoid or GaussianStart, or a list of sets"
+            raise TypeError(f"`initial` must be {kinds}, got {value!r}.")
     else:
         point = vector("initial", value, dimension)
         value = Box(point, point)

@@ -8,7 +8,7 @@ schema is docs/certificate.md.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 from certbound.problem.noise import Law, check_law
 from certbound.problem.problem import Problem
+from certbound.problem.sets import StartUnion
 from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most
 from certbound.safety.portfolio import ENGINES
@@ -63,6 +64,9 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
+    members = [certificate_data(one.problem, one, attempt=attempt) for one in getattr(verdict, "members", ())]
+    if members:
+        return united(problem, members)
     refusals: list[str] = []
     best: tuple[str, Proof] | None = None
     for name, answer in _answers(problem, verdict):
@@ -89,6 +93,24 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
         }
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
+
+
+def united(problem: Problem, members: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The certificate of a problem whose start is a union, from those of its members: the largest of their claims.
+
+    CertificateError where a member has none.
+    """
+    if len(members) != len(problem.starts):
+        raise CertificateError("no probability was bounded for every member of the initial union.")
+    levels = [float.fromhex(member["claim"]["log10_delta"]) for member in members]
+    assumed = dict.fromkeys(item for member in members for item in member["claim"]["assumptions"])
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "claim": {"log10_delta": exact(max(levels)), "method": "union", "assumptions": list(assumed)},
+        "problem": problem_data(problem),
+        "proof": {"engine": "union", "members": [member["proof"] for member in members]},
+    }
 
 
 def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineAnswer]]:
@@ -191,6 +213,8 @@ _KINDS = ("box", "ball", "ellipsoid", "halfspace", "polytope")  # those that the
 
 
 def _initial(start: Any) -> dict[str, Any]:
+    if isinstance(start, StartUnion):
+        return {"kind": "union", "members": [_initial(member) for member in start.members]}
     data = start.data(_KINDS)
     if data["kind"] == "polytope":  # by a box around it
         around = start.hull()

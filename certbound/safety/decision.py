@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from typing import Any
 
 from certbound.errors import EngineError, contained
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
 from certbound.safety.answers import EngineAnswer, Request
 from certbound.safety.falsification import Violation, find_violation
+from certbound.safety.members import worst_verdict
 from certbound.safety.portfolio import ENGINES, engine_named
 from certbound.safety.verdict import Verdict, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
@@ -40,8 +42,13 @@ def decide(
         method="auto" if method in ENGINES else method, cells=cells, constants=constants, thorough=method != "auto"
     )
     names = _chosen(method)
-    _checked(problem, request)
-    search = _Search(problem, request, watch or current_watch() or Watch())
+    watch = watch or current_watch() or Watch()
+    for start in problem.starts:
+        _checked(problem.replace(initial=start) if len(problem.starts) > 1 else problem, request)
+    if len(problem.starts) > 1:
+        options: dict[str, Any] = {"method": method, "cells": cells, "constants": constants, "watch": watch}
+        return worst_verdict(problem, watch, lambda member: decide(member, **options))
+    search = _Search(problem, request, watch)
     try:
         with search.watch.running():
             violation = search.violation()

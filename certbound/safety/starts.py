@@ -80,7 +80,9 @@ class SafeStarts(Shown):
     @property
     def holds_initial(self) -> bool:
         """Whether the problem's initial set lies in it (of a random start: its mean)."""
-        start = self.problem.initial
+        return all(self._holds(start) for start in self.problem.starts)
+
+    def _holds(self, start: Any) -> bool:
         good: Mask = self.cells
         around = Interval.point(start.mean) if start.random else start.hull()
         if not start.random and np.all(around.lo < around.hi):

@@ -77,6 +77,7 @@ class Model:
     constraints: tuple[Constraint, ...]
     domain: list[tuple[float | None, float | None]] | None
     states: tuple[str, ...] = field(default=())
+    members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
     @property
     def dimension(self) -> int:
@@ -121,6 +122,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         read_constraint(item, f"{path}.constraints[{index}]", n, horizon, budget)
         for index, item in enumerate(record.items("constraints", 0, 1000))
     ]
+    initial, members = _starts(record["initial"], path + ".initial", n, budget)
     if domain is not None:
         budget.hold(n * n // 4 + 1)
         constraints.append(Constraint.of_domain(domain))
@@ -129,8 +131,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         plan=_plan(record, len(inputs), continuous, horizon), states=states,
         disturbance=_disturbance(record, len(disturbances)),
         noise=_noise(record["noise"], path + ".noise", states, time, budget),
-        initial=_initial(record["initial"], path + ".initial", n, budget), constraints=tuple(constraints),
-        domain=domain,
+        initial=initial, members=members, constraints=tuple(constraints), domain=domain,
     )
 
 
@@ -231,6 +232,19 @@ def _semidefinite(a: arb_mat, path: str, budget: Budget) -> arb_mat:
     if not is_positive_definite(scaled + diagonal([_SLACK] * len(kept)), budget):
         raise CertificateError(f"`{path}` must be positive semidefinite.")
     return a + diagonal([value * _SLACK for value in variances])
+
+
+def _starts(value: object, path: str, n: int, budget: Budget) -> tuple[Initial, tuple[Initial, ...]]:
+    """The start, and the members of one that is a union."""
+    if not isinstance(value, dict) or value.get("kind") != "union":
+        return _initial(value, path, n, budget), ()
+    rows = Record(value, path, ("kind", "members")).items("members", 2, 1000)
+    members = tuple(_initial(row, f"{path}.members[{index}]", n, budget) for index, row in enumerate(rows))
+    if any(member.covariance is not None for member in members):
+        raise CertificateError(f"`{path}.members` must be sets, not random starts.")
+    low = tuple(min(member.low[j].lower() for member in members) for j in range(n))
+    high = tuple(max(member.high[j].upper() for member in members) for j in range(n))
+    return Initial(kind="box", low=low, high=high), members
 
 
 def _initial(value: object, path: str, n: int, budget: Budget) -> Initial:

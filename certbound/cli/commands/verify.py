@@ -155,6 +155,9 @@ def _limits(verdict: Verdict, cells: int | None, clock: Clock) -> dict[str, Any]
 def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | None, plot: Path | None) -> None:
     if plot is None and report is None:
         return
+    if verdict.reach is not None and verdict.members:  # the picture is of the worst member
+        verdict = verdict.worst
+        problem = verdict.problem or problem
     title = f"{name_text(problem.name)}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
     with spinner("looking for what can be drawn"):
         shown = (

@@ -59,7 +59,7 @@ class _Reader:
         safe += [self.constraint(sets.Outside, entry, f"avoid.{k}") for k, entry in enumerate(spec.avoid)]
         return Problem(
             system,
-            initial=self.start(spec.initial),
+            initial=self.starts(spec.initial),
             safe=safe,
             horizon=self.number(spec.horizon, "horizon"),
             delta=self.number(spec.delta, "delta"),
@@ -278,25 +278,33 @@ class _Reader:
             low[index], high[index] = pair
         return sets.Box(low, high, center=center)
 
-    def start(self, table: Start) -> Any:
+    def starts(self, tables: Start | list[Start]) -> Any:
+        if isinstance(tables, Start):
+            return self.start(tables, "initial")
+        found = [self.start(table, f"initial.{k}") for k, table in enumerate(tables)]
+        points = [sets.Box(start, start) if isinstance(start, list) else start for start in found]
+        return points if len(points) > 1 else points[0]
+
+    def start(self, table: Start, where: str) -> Any:
+        where = f"{where}.{table.chosen}"
         match table.chosen:
             case "point":
-                values, coordinates = self.by_state(table.point, "initial.point")
-                return self.array(self._ordered(values, coordinates, "initial.point"), "initial.point")
+                values, coordinates = self.by_state(table.point, where)
+                return self.array(self._ordered(values, coordinates, where), where)
             case "box":
-                return self.box(table.box, "initial.box", None)
+                return self.box(table.box, where, None)
             case "gaussian":
                 assert table.gaussian is not None
-                mean = self.array(table.gaussian.mean, "initial.gaussian.mean")
-                covariance = self.matrix(table.gaussian.covariance, "initial.gaussian.covariance")
+                mean = self.array(table.gaussian.mean, f"{where}.mean")
+                covariance = self.matrix(table.gaussian.covariance, f"{where}.covariance")
                 return sets.GaussianStart(mean, covariance)
-        region = self.shape(getattr(table, table.chosen), table.chosen, f"initial.{table.chosen}")
+        region = self.shape(getattr(table, table.chosen), table.chosen, where)
         if region.moving:
-            raise ValueError(f"`initial.{table.chosen}` must not move with t.")
+            raise ValueError(f"`{where}` must not move with t.")
         if region.coordinates is not None:
             order = np.argsort(region.coordinates)
             if len(order) != len(self.states):
-                raise ValueError(f"`initial.{table.chosen}` must give every state.")
+                raise ValueError(f"`{where}` must give every state.")
             shape = {} if table.ellipsoid is None else {"shape": region.shape[np.ix_(order, order)]}
             return replace(region, center=region.center[order], coordinates=None, **shape)
         return region

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from certbound.checks import nearest
 from certbound.problem.noise import LAWS
@@ -126,6 +126,13 @@ class Start(_Choice):
     gaussian: GaussianTable | None = None
 
 
+_ONE, _SEVERAL = "[one]", "[several]"  # brackets: `explain` leaves them out
+Starts = Annotated[
+    Annotated[Start, Tag(_ONE)] | Annotated[list[Start], Field(min_length=1), Tag(_SEVERAL)],
+    Discriminator(lambda value: _SEVERAL if isinstance(value, list) else _ONE),
+]
+
+
 class Constraint(_Choice):
     """One region to stay in or to avoid; ``center`` moves a box."""
 
@@ -174,7 +181,7 @@ class Specification(_Table):
     horizon: Number
     states: Annotated[list[str], Field(min_length=1)]
     dynamics: dict[str, Any]
-    initial: Start
+    initial: Starts
     name: str = "problem"
     delta: Number = 1e-3
     parameters: dict[str, Annotated[float, BeforeValidator(_no_boolean)]] = {}

@@ -7,6 +7,7 @@ from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
 from certbound.problem.sets.initial import check_start
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
+from certbound.problem.sets.unions import StartUnion
 
 __all__ = [
     "Ball",
@@ -22,4 +23,5 @@ __all__ = [
     "Polytope",
     "Quadratic",
     "Region",
+    "StartUnion",
 ]
