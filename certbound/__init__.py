@@ -40,6 +40,7 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.problem.sets import Inside as Inside
     from certbound.problem.sets import Outside as Outside
     from certbound.problem.sets import Polytope as Polytope
+    from certbound.problem.sets import Reach as Reach
     from certbound.problem.systems import ContinuousSystem as ContinuousSystem
     from certbound.problem.systems import DiscreteSystem as DiscreteSystem
     from certbound.problem.systems import from_control as from_control
@@ -69,7 +70,7 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 _HOME = {
     "problem.systems": "ContinuousSystem DiscreteSystem linear_system from_control",
     "problem.noise": "Gaussian Uniform Rademacher Bounded SubGaussian",
-    "problem.sets": "Box Ball Ellipsoid HalfSpace Polytope GaussianStart Inside Outside",
+    "problem.sets": "Box Ball Ellipsoid HalfSpace Polytope GaussianStart Inside Outside Reach",
     "problem.problem": "Problem",
     "problem.files": "load save",
     "problem.export": "export_casadi export_control",

@@ -17,13 +17,16 @@ from certbound.checker.constants import check_constants
 from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, number
 from certbound.checker.report import Budget
-from certbound.checker.statement import Model
+from certbound.checker.statement import Model, met_at
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
 UNION = "union"
 """The engine that a proof names where the start is a union: it has one proof a member."""
+
+REACH = "reach"
+"""The engine that a proof names where the problem has a target: it meets the target at one time."""
 
 STATED = "the stated constants hold"
 """How a certificate's own list names what `assumptions` derives from the proof."""
@@ -57,7 +60,7 @@ class Engine:
 
 def engine_of(proof: object, method: str) -> str:
     """The engine that a proof names, which ``claim.method`` must name too."""
-    engine = _named(proof, "proof", (*ENGINES, UNION))
+    engine = _named(proof, "proof", (*ENGINES, UNION, REACH))
     if method != engine:
         raise CertificateError(f"`claim.method` must be \"{engine}\", the proof's engine, got {quoted(method)}.")
     return engine
@@ -70,21 +73,24 @@ def _named(proof: object, path: str, known: Sequence[str]) -> str:
     return engine
 
 
-def _parts(model: Model, proof: object) -> Iterator[tuple[str, Model, Mapping[str, object]]]:
-    """A proof's engine, model and proof; where the start is a union, those of every member.
+def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[str, Model, Mapping[str, object]]]:
+    """A proof's engine, its plain model and its numbers; where the start is a union, those of every member.
 
-    CertificateError where the start is a union and the proof is not, or the other way round.
+    A target is met at one time, which the proof names. CertificateError where the start is a union, or there is a
+    target, and the proof does not say so, or the other way round.
     """
-    assert isinstance(proof, Mapping)  # `engine_of` has seen to it
-    if not model.members:
-        yield _named(proof, "proof", tuple(ENGINES)), model, proof
-        return
-    _named(proof, "proof", (UNION,))
-    count = len(model.members)
-    rows = Record(proof, "proof", ("engine", "members")).items("members", count, count)
-    for index, (member, row) in enumerate(zip(model.members, rows)):
-        engine = _named(row, f"proof.members[{index}]", tuple(ENGINES))
-        yield engine, replace(model, initial=member, members=()), row
+    if model.members:
+        _named(proof, path, (UNION,))
+        count = len(model.members)
+        rows = Record(proof, path, ("engine", "members")).items("members", count, count)
+        for index, (member, row) in enumerate(zip(model.members, rows)):
+            yield from _parts(replace(model, initial=member, members=()), row, f"{path}.members[{index}]")
+    elif model.target is not None:
+        _named(proof, path, (REACH,))
+        record = Record(proof, path, ("engine", "time", "proof"))
+        yield from _parts(met_at(model, record.number("time")), record["proof"], f"{path}.proof")
+    else:
+        yield _named(proof, path, tuple(ENGINES)), model, proof  # type: ignore[misc]  # a mapping: it names an engine
 
 
 def prove(model: Model, proof: object, budget: Budget) -> arb:
@@ -138,8 +144,11 @@ def claim(model: Model, proof: object, level: float, assumed: Sequence[str]) -> 
     foresees = all(ENGINES[engine].foresees(one) for engine, one, _ in _parts(model, proof))
     whose = "" if not model.disturbance else f", {_ANY if foresees else _BLIND},"
     safe = "at most" if arb(level) <= arb(model.delta).log() / arb(10).log() else "more than"
+    kept = f"breaks one of its {len(model.constraints)} constraints"
+    if model.target is not None:
+        kept += f" before it is in its target ({quoted(model.target.label)}), or is not in it"
     words = (
-        f"from {start}{whose} the problem {quoted(model.name)} breaks one of its {len(model.constraints)} constraints "
+        f"from {start}{whose} the problem {quoted(model.name)} {kept} "
         f"within {plainly(model.horizon)} {unit} with probability at most 10^{rounded(level, up=True)} "
         f"({safe} delta = {plainly(model.delta)})"
     )

@@ -12,8 +12,19 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.checks import assign, frozen, nearest, number, positive_definite, vector
 from certbound.display import Shown, ask_later_room, name_text
+from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, substitute, trace
-from certbound.problem.sets import Box, GaussianStart, Inside, Outside, Region, StartUnion, check_start
+from certbound.problem.sets import (
+    Box,
+    GaussianStart,
+    Inside,
+    Outside,
+    Reach,
+    Region,
+    StartUnion,
+    check_start,
+    check_target,
+)
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
 
@@ -34,6 +45,8 @@ class Problem(Shown):
         Seconds (CT) or steps (DT); positive.
     delta : float
         Accepted probability of leaving the safe set, in (0, 1).
+    reach : Reach or a set, optional
+        A target: then a path fails if it breaks a constraint before it has entered the target, or never enters it.
     plan : array_like of shape (K, m), function u(t, x), or Tape, optional
         Inputs: one row a step (DT; rows beyond the horizon are ignored), constant on K equal pieces of the
         horizon (CT), or a feedback law. A system with inputs may go without, for synthesis.
@@ -69,6 +82,7 @@ class Problem(Shown):
     safe: Any = field(kw_only=True)
     horizon: Any = field(kw_only=True)
     delta: Any = field(default=1e-3, kw_only=True)
+    reach: Any = field(default=None, kw_only=True)
     plan: Any = field(default=None, kw_only=True)
     cost: Any = field(default=None, kw_only=True)
     domain: Any = field(default=None, kw_only=True)
@@ -87,18 +101,42 @@ class Problem(Shown):
         assign(self, delta=_delta(self.delta))
         assign(self, safe=self._constraints())
         assign(self, domain=self._domain())
+        assign(self, reach=self._target())
         assign(self, initial=_start(self.initial, self.system.dimension))
         assign(self, parameters=dict(self.parameters or {}))
         assign(self, plan=self._checked_plan())
         assign(self, cost=self._cost())
         for member in self.starts:
-            check_start(member, self.constraints)
+            check_start(member, self.kept)
+        if self.reach is not None:
+            check_target(self.reach.region, self.kept, self.system.dimension)
         if self.plan is not None or self.system.inputs is None:
             assign(self, _closed_loop=self._closed())
 
     @property
     def constraints(self) -> tuple[Inside, ...]:
-        """Everything that a safe path respects: ``safe``, and staying in the domain where there is one."""
+        """Everything that a path respects that does not fail: ``safe``, and staying in the domain where there is one.
+
+        Raises
+        ------
+        InfeasibleError
+            If the problem has a target: these constraints do not say what failing is then (``kept`` has them).
+        """
+        if self.reach is not None:
+            raise InfeasibleError(
+                f"the problem has a target ('{self.reach.label}'), and this serves constraints only; leave `reach` "
+                "out, or use verify_safety or simulate_exits."
+            )
+        return self.kept
+
+    @property
+    def failing(self) -> str:
+        """What is bounded, in a word."""
+        return "leaving" if self.reach is None else "failing"
+
+    @property
+    def kept(self) -> tuple[Inside, ...]:
+        """What a path respects until it is in the target, where there is one; otherwise ``constraints``."""
         if self.domain is None:
             return tuple(self.safe)
         return (*self.safe, Inside(self.domain, label="the model's domain"))
@@ -152,7 +190,8 @@ class Problem(Shown):
         found = [(name, ", ".join(values)) for name, values in signals.items() if values]
         starts = ["a point" if start.is_point else type(start).__name__ for start in self.starts]
         found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))
-        return [*found, *(("constraint", constraint.label) for constraint in self.constraints)]
+        found += [("constraint", constraint.label) for constraint in self.kept]
+        return found if self.reach is None else [*found, ("target", self.reach.label)]
 
     def to_dict(self) -> dict[str, Any]:
         """The content of the problem file that ``cb.save`` writes.
@@ -196,22 +235,38 @@ class Problem(Shown):
             raise TypeError(f"`safe` must be a list of cb.Inside and cb.Outside, got {safe!r}.")
         result = []
         for place, constraint in enumerate(safe):
+            if isinstance(constraint, Reach):
+                raise TypeError(f"`safe[{place}]` must be cb.Inside or cb.Outside, got a target; give it as `reach=`.")
             if type(constraint) not in (Inside, Outside):
                 raise TypeError(f"`safe[{place}]` must be cb.Inside or cb.Outside itself, got {constraint!r}.")
             _check_dimension(f"safe[{place}]", constraint.region, self.system.dimension)
             if constraint.during is not None:
-                self._check_window(place, constraint.during)
+                self._check_window(f"safe[{place}]", constraint.during)
             result.append(constraint.named(self.system.states))
         return tuple(result)
 
-    def _check_window(self, place: int, window: tuple[float, float]) -> None:
+    def _check_window(self, name: str, window: tuple[float, float]) -> None:
         if window[1] > self.horizon:
             raise ValueError(
-                f"`safe[{place}]` must have `during` within [0, {self.horizon:g}], got {list(window)}; "
+                f"`{name}` must have `during` within [0, {self.horizon:g}], got {list(window)}; "
                 "change the window or the horizon."
             )
         if self.system.time == "discrete" and any(end != int(end) for end in window):
-            raise ValueError(f"`safe[{place}]` must have whole steps in `during`, got {list(window)}; round them.")
+            raise ValueError(f"`{name}` must have whole steps in `during`, got {list(window)}; round them.")
+
+    def _target(self) -> Reach | None:
+        target: Any = Reach(self.reach) if isinstance(self.reach, Region) else self.reach
+        if target is None:
+            return None
+        if type(target) is not Reach:
+            raise TypeError(f"`reach` must be cb.Reach or a set, got {target!r}.")
+        _check_dimension("reach", target.region, self.system.dimension)
+        if target.during is not None:
+            self._check_window("reach", target.during)
+            if target.during[1] <= 0:
+                raise ValueError(f"`reach` must have a time after 0 in `during`, got {list(target.during)}.")
+        named: Reach = target.named(self.system.states)
+        return named
 
     def _domain(self) -> Box | None:
         if self.domain is None:

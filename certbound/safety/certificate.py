@@ -8,16 +8,17 @@ schema is docs/certificate.md.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from certbound.errors import CertificateError
+from certbound.problem.goals import met_at
 from certbound.problem.model import Tape
 from certbound.problem.noise import Law, check_law
 from certbound.problem.problem import Problem
-from certbound.problem.sets import StartUnion
+from certbound.problem.sets import Inside, StartUnion
 from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most
 from certbound.safety.portfolio import ENGINES
@@ -74,7 +75,7 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
             write = ENGINES[name].write
             if write is None:
                 raise CertificateError("certificates do not state what this engine proves.")
-            found = write(problem, answer, attempt)
+            found = write(problem, answer, attempt) if problem.reach is None else _met(problem, answer, attempt, write)
         except CertificateError as error:
             refusals.append(f"{name}: {error}")
             continue
@@ -87,12 +88,26 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
         return {
             "format": FORMAT,
             "version": VERSION,
-            "claim": {"log10_delta": exact(min(log10, 0.0)), "method": name, "assumptions": assumptions},
+            "claim": {
+                "log10_delta": exact(min(log10, 0.0)),
+                "method": name if problem.reach is None else "reach",
+                "assumptions": assumptions,
+            },
             "problem": problem_data(problem),
             "proof": proof,
         }
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
+
+
+def _met(
+    problem: Problem, answer: EngineAnswer, attempt: int, write: Callable[[Problem, EngineAnswer, int], Proof]
+) -> Proof:
+    """The proof that the target is met at one time."""
+    if answer.hit is None:
+        raise CertificateError("certificates state that a target is met at one time, and this engine counts all times.")
+    proof, log10, assumptions = write(met_at(problem, answer.hit), answer, attempt)
+    return {"engine": "reach", "time": exact(float(answer.hit)), "proof": proof}, log10, assumptions
 
 
 def united(problem: Problem, members: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -122,7 +137,9 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
     yield from sorted(useful, key=lambda item: (not item[1].certified, item[1].log10_delta))
     for name, row in ENGINES.items():
         asked = verdict.answers.get(name)
-        if row.reserve and row.write and verdict.status == "SAFE" and asked is not None and not asked.applicable:
+        if problem.reach is not None or verdict.status != "SAFE" or asked is None or asked.applicable:
+            continue
+        if row.reserve and row.write:
             answer = row.prove(problem)
             if answer.applicable and answer.log10_delta < 0:
                 yield name, answer
@@ -157,16 +174,18 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "disturbance_set": [] if box is None else _ranges(zip(box.low, box.high)),
         "noise": _noise(system),
         "initial": _initial(problem.initial),
-        "constraints": [
-            {
-                "kind": constraint.word,
-                "region": _region(constraint.region.data(_KINDS)),
-                "during": None if constraint.during is None else exact([float(end) for end in constraint.during]),
-                "label": str(constraint.label),
-            }
-            for constraint in problem.safe
-        ],
+        "constraints": [_constraint(constraint) for constraint in problem.safe],
         "domain": None if problem.domain is None else _ranges(zip(problem.domain.low, problem.domain.high)),
+        **({} if problem.reach is None else {"reach": _constraint(problem.reach)}),
+    }
+
+
+def _constraint(constraint: Inside) -> dict[str, Any]:
+    return {
+        "kind": constraint.word,
+        "region": _region(constraint.region.data(_KINDS)),
+        "during": None if constraint.during is None else exact([float(end) for end in constraint.during]),
+        "label": str(constraint.label),
     }
 
 

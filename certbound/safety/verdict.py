@@ -144,8 +144,9 @@ class Verdict(Shown):
         """The verdict in one line."""
         asked = "" if self.problem is None else f"{name_text(self.problem.name)}: "
         target = "" if self.problem is None else f", asked {self.problem.delta!r}"
+        failing = "leaving" if self.problem is None else self.problem.failing
         bounds = f"{log10_text(self.log10_delta)}{at_least_text(self.log10_lower)}"
-        return f"{self.status}  {asked}P(leaving) <= {bounds}{target}"
+        return f"{self.status}  {asked}P({failing}) <= {bounds}{target}"
 
     def rows(self) -> list[tuple[str, str]]:
         """Margin, method and reason."""
@@ -259,6 +260,11 @@ def _sentence(text: str) -> str:
 def unsafe(problem: Problem, violation: Violation) -> Verdict:
     when = f"t = {violation.time:.4g}" if problem.system.time == "continuous" else f"step {violation.time:g}"
     start = ", ".join(f"{value:.4g}" for value in violation.start)
+    what = f"breaks '{violation.constraint.label}' at {when}, by {violation.depth:.3g}"
+    if violation.constraint is problem.reach:
+        what = f"does not '{violation.constraint.label}' by {when}, and misses it by {violation.depth:.3g}"
+    elif problem.reach is not None:
+        what = f"breaks '{violation.constraint.label}' at {when}, before it is in the target"
     return Verdict(
         status="UNSAFE_NOMINAL",
         log10_delta=0.0,
@@ -266,8 +272,7 @@ def unsafe(problem: Problem, violation: Violation) -> Verdict:
         time=violation.time,
         constraint=violation.constraint.label,
         reason=(
-            f"without any noise the trajectory from ({start}) breaks '{violation.constraint.label}' at {when}, by "
-            f"{violation.depth:.3g} (proved by intervals)."
+            f"without any noise the trajectory from ({start}) {what} (proved by intervals)."
         ),
         method="noise-free trajectory",
         reach=violation.reach,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from flint import arb, arb_mat
 
@@ -77,6 +77,7 @@ class Model:
     constraints: tuple[Constraint, ...]
     domain: list[tuple[float | None, float | None]] | None
     states: tuple[str, ...] = field(default=())
+    target: Constraint | None = None  # then a path fails that breaks a constraint before it is there, or never is
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
     @property
@@ -103,7 +104,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     CertificateError where a field is missing, has the wrong size, or makes no sense; Unproved where it is too large for
     the budget.
     """
-    record = Record(value, path, _FIELDS)
+    record = Record(value, path, _FIELDS, ("reach",))
     time = record["time"]
     if time not in ("continuous", "discrete"):
         raise CertificateError(f"`{path}.time` must be \"continuous\" or \"discrete\".")
@@ -131,7 +132,8 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         plan=_plan(record, len(inputs), continuous, horizon), states=states,
         disturbance=_disturbance(record, len(disturbances)),
         noise=_noise(record["noise"], path + ".noise", states, time, budget),
-        initial=initial, members=members, constraints=tuple(constraints), domain=domain,
+        initial=initial, members=members, target=_target(record, n, horizon, budget),
+        constraints=tuple(constraints), domain=domain,
     )
 
 
@@ -232,6 +234,40 @@ def _semidefinite(a: arb_mat, path: str, budget: Budget) -> arb_mat:
     if not is_positive_definite(scaled + diagonal([_SLACK] * len(kept)), budget):
         raise CertificateError(f"`{path}` must be positive semidefinite.")
     return a + diagonal([value * _SLACK for value in variances])
+
+
+def _target(record: Record, n: int, horizon: float, budget: Budget) -> Constraint | None:
+    if "reach" not in record.value:
+        return None
+    return read_constraint(record["reach"], record.at("reach"), n, horizon, budget, ("reach",))
+
+
+def met_at(model: Model, time: float) -> Model:
+    """The problem of keeping the constraints up to a time of the target's window, and of being in the target then.
+
+    It is one way of not failing. Constraints that begin later are dropped, the others end with that time.
+
+    CertificateError where the time is none of the window, or the plan is an array over a longer time.
+    """
+    target = model.target
+    assert target is not None
+    first, last = target.during or (0.0, model.horizon)
+    if not (first <= time <= last and time > 0) or (not model.continuous and time != int(time)):
+        raise CertificateError("`proof.time` must be a time of the target's window, after 0.")
+    plan = model.plan
+    if plan is not None and time != model.horizon:
+        if model.continuous:
+            raise CertificateError("`proof.time` must be the horizon where the plan is an array.")
+        plan = plan[: int(time)]
+    kept = []
+    for constraint in model.constraints:
+        begin, end = constraint.during or (0.0, model.horizon)
+        if begin <= time:
+            whole = constraint.during is None
+            kept.append(replace(constraint, during=None if whole else (begin, min(end, time))))
+    due = replace(target, during=(time, time))
+    number = len(kept) if model.domain is None else len(kept) - 1  # the domain stands last
+    return replace(model, horizon=time, plan=plan, target=None, constraints=(*kept[:number], due, *kept[number:]))
 
 
 def _starts(value: object, path: str, n: int, budget: Budget) -> tuple[Initial, tuple[Initial, ...]]:

@@ -158,7 +158,7 @@ def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | Non
     if verdict.reach is not None and verdict.members:  # the picture is of the worst member
         verdict = verdict.worst
         problem = verdict.problem or problem
-    title = f"{name_text(problem.name)}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
+    title = f"{name_text(problem.name)}: {verdict.status}, P({problem.failing}) <= {log10_text(verdict.log10_delta)}"
     with spinner("looking for what can be drawn"):
         shown = (
             values_of(problem, verdict)
@@ -215,7 +215,7 @@ def _print(problem: Problem, result: dict[str, Any]) -> None:
     unit = "s" if problem.system.time == "continuous" else "steps"
     print_status(screen, result["status"])
     screen.print(
-        f"{name_text(problem.name)}: P(leaving within {problem.horizon:g} {unit}) <= "
+        f"{name_text(problem.name)}: P({problem.failing} within {problem.horizon:g} {unit}) <= "
         f"{log10_text(result['log10_delta'])}{at_least_text(result['log10_lower'])}, asked {result['delta']!r}",
         markup=False,
     )

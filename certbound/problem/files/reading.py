@@ -57,10 +57,12 @@ class _Reader:
         system = self.system()
         safe = [self.constraint(sets.Inside, entry, f"stay.{k}") for k, entry in enumerate(spec.stay)]
         safe += [self.constraint(sets.Outside, entry, f"avoid.{k}") for k, entry in enumerate(spec.avoid)]
+        targets = [self.constraint(sets.Reach, entry, f"reach.{k}") for k, entry in enumerate(spec.reach)]
         return Problem(
             system,
             initial=self.starts(spec.initial),
             safe=safe,
+            reach=targets[0] if targets else None,
             horizon=self.number(spec.horizon, "horizon"),
             delta=self.number(spec.delta, "delta"),
             plan=self.plan(),

@@ -136,7 +136,7 @@ Starts = Annotated[
 class Constraint(_Choice):
     """One region to stay in or to avoid; ``center`` moves a box."""
 
-    title: ClassVar[str] = "[[stay]] or [[avoid]]"
+    title: ClassVar[str] = "[[stay]], [[avoid]] or [[reach]]"
     choices: ClassVar[tuple[str, ...]] = ("box", "ball", "ellipsoid", "halfspace", "polytope")
     box: Intervals | None = None
     ball: BallTable | None = None
@@ -193,6 +193,7 @@ class Specification(_Table):
     noise: Noise | None = None
     stay: list[Constraint] = []
     avoid: list[Constraint] = []
+    reach: Annotated[list[Constraint], Field(max_length=1)] = []
     domain: DomainTable | None = None
 
 

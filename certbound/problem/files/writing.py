@@ -83,6 +83,7 @@ class _Writer:
             "domain": None if problem.domain is None else {"box": self.intervals(problem.domain)},
             "stay": stay,
             "avoid": avoid,
+            "reach": [] if problem.reach is None else [self.constraint(problem.reach)],
         }
 
     @staticmethod

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
+from certbound.problem.sets.constraints import GaussianStart, Inside, Outside, Reach
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
-from certbound.problem.sets.initial import check_start
+from certbound.problem.sets.initial import check_start, check_target
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 from certbound.problem.sets.unions import StartUnion
 
@@ -13,6 +13,7 @@ __all__ = [
     "Ball",
     "Box",
     "check_start",
+    "check_target",
     "clearance",
     "Ellipsoid",
     "Faces",
@@ -22,6 +23,7 @@ __all__ = [
     "Outside",
     "Polytope",
     "Quadratic",
+    "Reach",
     "Region",
     "StartUnion",
 ]
