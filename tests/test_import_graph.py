@@ -25,6 +25,7 @@ display
 rigor
 problem.model
 problem.sets problem.noise
+problem.table_laws
 problem.adapters
 problem.systems
 problem.problem

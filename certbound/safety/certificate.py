@@ -225,6 +225,7 @@ def _noise(system: Any) -> dict[str, Any]:
         "values": exact(np.asarray(getattr(law, law.level), dtype=float)),
         "matrix": exact(np.asarray(system.noise_matrix, dtype=float)),
         **{flag: bool(getattr(law, flag)) for flag in law.flags},
+        **({"tables": {name: exact(getattr(law, name)) for name in law.tables}} if law.tables else {}),
     }
 
 

@@ -190,7 +190,8 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
     if name not in LAWS:
         raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {name[:40]!r}.")
     law = LAWS[name]
-    record = Record(value, path, ("law", "level", "values", "matrix", *law.flags))
+    tables = ("tables",) if law.tables else ()
+    record = Record(value, path, ("law", "level", "values", "matrix", *law.flags, *tables))
     rows = _same_length(record.array("matrix", n, None), path)
     proxy = _proxy(record, law, len(rows[0]), budget)
     return Noise(diffusion=matrix(rows), proxy=proxy, gaussian=law.gaussian)

@@ -218,6 +218,9 @@ class _Reader:
             )
         build, entries = LAWS[table.law], dict(table.model_extra or {})
         flags = {key: entries.pop(key) for key in list(entries) if any(key in law.flags for law in LAWS.values())}
+        tables = {key: self.array(entries.pop(key), f"noise.{key}") for key in build.tables if key in entries}
+        if not entries and build.tables:
+            entries = {build.levels[0]: 1.0}
         if len(entries) != 1 or not entries.keys() <= set(build.levels):
             raise ValueError(
                 f"`noise` with law {table.law!r} needs exactly one of {', '.join(build.levels)}; "
@@ -226,7 +229,7 @@ class _Reader:
         for flag in flags.keys() - set(build.flags):
             raise ValueError(f"`noise.{flag}` must be omitted for law {table.law!r}.")
         level = {key: self.array(value, f"noise.{key}") for key, value in entries.items()}
-        result: dict[str, Any] = {"noise": build(**level, **flags)}
+        result: dict[str, Any] = {"noise": build(**level, **tables, **flags)}
         if table.matrix is not None:
             result["noise_matrix"] = self.matrix(table.matrix, "noise.matrix")
         return result

@@ -168,7 +168,7 @@ class Noise(_Table):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Matrix | Number | Vector | bool]
     title: ClassVar[str] = "[noise]"
-    more_keys = staticmethod(lambda: [key for law in LAWS.values() for key in (*law.levels, *law.flags)])
+    more_keys = staticmethod(lambda: [key for law in LAWS.values() for key in (*law.levels, *law.flags, *law.tables)])
     diffusion: Matrix | Number | Vector | None = None
     law: str | None = None
     matrix: Matrix | Number | Vector | None = None
