@@ -51,6 +51,7 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.problem.table_laws import Laplace as Laplace
     from certbound.reach import bound_reach as bound_reach
     from certbound.reach.sets import ReachTube as ReachTube
+    from certbound.safety.first_exits import bound_exit_times as bound_exit_times
     from certbound.safety.verdict import Verdict as Verdict
     from certbound.safety.verification import verify_safety as verify_safety
     from certbound.simulation.estimates import sample_paths as sample_paths
@@ -91,6 +92,7 @@ _HOME = {
     "reach.sets": "ReachTube",
     "safety.verification": "verify_safety",
     "safety.verdict": "Verdict",
+    "safety.first_exits": "bound_exit_times",
     "synthesis.plans": "synthesize_plan",
     "synthesis.controllers": "simulate_closed_loop PredictiveController ConvexPlanner SafetyFilter",
     "synthesis.terminal": "TerminalSet",

@@ -57,7 +57,7 @@ reach.contraction reach.linear reach.sampled
 reach
 quadratic
 safety.answers
-safety.engines safety.starts
+safety.engines safety.starts safety.first_exits
 safety.certificates
 safety.portfolio
 safety.certificate safety.falsification
@@ -108,6 +108,7 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
+    "values.continuous": (6, "bounds and charts, the latter at chosen times or at the ends of slabs"),
     "values.discrete": (7, "kernels and interpolation of discrete time are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (23, "the one description of functions, which every room reads, differentiates and evaluates"),

@@ -158,6 +158,37 @@ def chart_exits(
     return charts
 
 
+def chart_slabs_of(problem: Problem, *, levels: Sequence[float], slabs: int, last: float) -> Charts:
+    """Charts as `chart_exits` makes them, of one state, at the ends of slabs of time.
+
+    Parameters
+    ----------
+    problem : Problem
+        One state; its model must not depend on time.
+    levels : sequence of float
+        log10 of probabilities at which the bounds should be sharp.
+    slabs : int
+        No slab is longer than one of so many equal ones.
+    last : float
+        Time after which no chart is made.
+
+    Returns
+    -------
+    Charts
+
+    Raises
+    ------
+    InfeasibleError
+        The theorem does not apply; the message says why.
+    EnclosureError
+        The model is undefined somewhere in the safe set.
+    """
+    from certbound.values.continuous.line import chart_slabs
+
+    _check(problem, None, 1.0)
+    return chart_slabs(problem, _model(problem), [_LN10 * level for level in levels], slabs, last)
+
+
 def _check(problem: Problem, target: Any, seconds: float) -> None:
     if not isinstance(problem, Problem):
         raise TypeError(f"`problem` must be a Problem, got {problem!r}.")

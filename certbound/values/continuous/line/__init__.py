@@ -7,6 +7,6 @@ instead of the initial set).
 """
 
 from certbound.values.continuous.line.ladder import bound_line
-from certbound.values.continuous.line.maps import chart_line
+from certbound.values.continuous.line.maps import chart_line, chart_slabs
 
-__all__ = ["bound_line", "chart_line"]
+__all__ = ["bound_line", "chart_line", "chart_slabs"]
