@@ -117,7 +117,7 @@ MANY_DOORS = {
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
     "constants.programs": (15, "one program each for rate, gain and erosion, with what it is asked"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
-    "problem.sets": (16, "the sets and constraints that users write, and the two forms that everybody reads"),
+    "problem.sets": (18, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
     "checker.statement": (12, "what a certificate states is read once and asked by four proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),

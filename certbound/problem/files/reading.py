@@ -15,7 +15,7 @@ from certbound.checks import nearest
 from certbound.problem import sets
 from certbound.problem.files.parser import CONSTANTS, constant, is_function, parse
 from certbound.problem.files.plans import read_plan
-from certbound.problem.files.schema import Constraint, Specification, Start
+from certbound.problem.files.schema import Constraint, Cost, Part, PolygonTable, Specification, Start
 from certbound.problem.model import OPERATIONS, Graph, Tape
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
@@ -55,7 +55,7 @@ class _Reader:
     def problem(self, source: Mapping[str, Any] | None) -> Problem:
         spec = self.spec
         system = self.system()
-        safe = [self.constraint(sets.Inside, entry, f"stay.{k}") for k, entry in enumerate(spec.stay)]
+        safe = [one for k, entry in enumerate(spec.stay) for one in self.stays(entry, f"stay.{k}")]
         safe += [self.constraint(sets.Outside, entry, f"avoid.{k}") for k, entry in enumerate(spec.avoid)]
         targets = [self.constraint(sets.Reach, entry, f"reach.{k}") for k, entry in enumerate(spec.reach)]
         return Problem(
@@ -66,7 +66,7 @@ class _Reader:
             horizon=self.number(spec.horizon, "horizon"),
             delta=self.number(spec.delta, "delta"),
             plan=self.plan(),
-            cost=None if spec.cost is None else (self.weight("Q"), self.weight("R")),
+            cost=None if spec.cost is None else self.weights(spec.cost),
             domain=None if spec.domain is None else self.box(spec.domain.box, "domain.box", np.inf),
             name=spec.name,
             parameters=self.parameters,
@@ -258,8 +258,8 @@ class _Reader:
             raise ValueError(f"`plan.file` must be a file in the problem file's folder, got {value!r}.")
         return self.folder / path
 
-    def weight(self, name: str) -> Array:
-        return self.matrix(getattr(self.spec.cost, name), f"cost.{name}")
+    def weights(self, cost: Cost) -> tuple[Array, Array]:
+        return self.matrix(cost.Q, "cost.Q"), self.matrix(cost.R, "cost.R")
 
     def place(self, table: Any, where: str) -> tuple[Any, tuple[int, ...] | None]:
         """A centre (a tape where it moves), and the coordinates that it is in."""
@@ -340,11 +340,40 @@ class _Reader:
                 fields[name] = self.number(value, place)
         return _SHAPES[kind](**fields)
 
+    def stays(self, table: Constraint, where: str) -> list[Any]:
+        """Staying in an intersection is staying in each of its parts."""
+        during = None if table.during is None else self.array(table.during, f"{where}.during")
+        return [sets.Inside(part, during=during, label=table.label) for part in self.parts(table, where)]
+
     def constraint(self, kind: Callable[..., Any], table: Constraint, where: str) -> Any:
         during = None if table.during is None else self.array(table.during, f"{where}.during")
-        return kind(self.region(table, f"{where}.{table.chosen}"), during=during, label=table.label)
+        whole, outward = table.all is not None, kind is sets.Outside
+        parts = self.parts(table, where, outward=outward)
+        region = sets.intersection(parts, dimension=len(self.states), outward=outward) if whole else parts[0]
+        return kind(region, during=during, label=table.label)
 
-    def region(self, table: Constraint, where: str) -> Any:
+    def parts(self, table: Constraint, where: str, *, outward: bool = False) -> list[Any]:
+        if table.all is None:
+            return [self.region(table, f"{where}.{table.chosen}", outward=outward)]
+        found = [(f"{where}.all.{k}.{part.chosen}", part) for k, part in enumerate(table.all)]
+        return [self.region(part, place, outward=outward) for place, part in found]
+
+    def polygon(self, table: PolygonTable, where: str, *, outward: bool) -> sets.Polytope:
+        vertices: Any = table.vertices
+        names = list(vertices) if isinstance(vertices, dict) else self.states
+        if len(names) != 2 or not set(names) <= set(self.states):
+            raise ValueError(f"`{where}.vertices` must give two of the states {', '.join(self.states)} by name.")
+        rows = list(vertices.values()) if isinstance(vertices, dict) else vertices
+        if len({len(row) for row in rows}) > 1:
+            raise ValueError(f"`{where}.vertices` must have rows of equal length.")
+        corners = self.matrix(rows, f"{where}.vertices")
+        places = [self.states.index(name) for name in names]
+        points = corners.T if isinstance(vertices, dict) else corners
+        return sets.polygon(points, places=places, dimension=len(self.states), outward=outward)
+
+    def region(self, table: Part | Constraint, where: str, *, outward: bool = False) -> Any:
+        if table.polygon is not None:
+            return self.polygon(table.polygon, where, outward=outward)
         if table.box is not None:
             center = None
             if table.center is not None:

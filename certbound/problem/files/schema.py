@@ -80,6 +80,13 @@ class PolytopeTable(_Table):
     b: Vector
 
 
+class PolygonTable(_Table):
+    """A convex polygon by its corners, in two states: rows of two, or a list for each state."""
+
+    title: ClassVar[str] = "polygon"
+    vertices: dict[str, Vector] | Matrix
+
+
 class GaussianTable(_Table):
     """A random start."""
 
@@ -133,25 +140,39 @@ Starts = Annotated[
 ]
 
 
-class Constraint(_Choice):
-    """One region to stay in or to avoid; ``center`` moves a box."""
+class _Shapes(_Choice):
+    """One region; ``center`` moves a box."""
 
-    title: ClassVar[str] = "[[stay]], [[avoid]] or [[reach]]"
-    choices: ClassVar[tuple[str, ...]] = ("box", "ball", "ellipsoid", "halfspace", "polytope")
+    choices: ClassVar[tuple[str, ...]] = ("box", "ball", "ellipsoid", "halfspace", "polytope", "polygon")
     box: Intervals | None = None
     ball: BallTable | None = None
     ellipsoid: EllipsoidTable | None = None
     halfspace: HalfSpaceTable | None = None
     polytope: PolytopeTable | None = None
+    polygon: PolygonTable | None = None
     center: Place | None = None
-    during: Pair | None = None
-    label: str | None = None
 
     @model_validator(mode="after")
     def _center_of_box(self) -> Any:
         if self.center is not None and self.box is None:
             raise ValueError("`center` beside the region moves a box; a ball has one of its own")
         return self
+
+
+class Part(_Shapes):
+    """One of the sets whose intersection is meant."""
+
+    title: ClassVar[str] = "a part of all"
+
+
+class Constraint(_Shapes):
+    """One region to stay in, to avoid or to reach, or the intersection of several."""
+
+    title: ClassVar[str] = "[[stay]], [[avoid]] or [[reach]]"
+    choices: ClassVar[tuple[str, ...]] = (*_Shapes.choices, "all")
+    all: Annotated[list[Part], Field(min_length=1)] | None = None
+    during: Pair | None = None
+    label: str | None = None
 
 
 class Cost(_Table):

@@ -6,6 +6,7 @@ from certbound.problem.sets.constraints import GaussianStart, Inside, Outside, R
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
 from certbound.problem.sets.initial import check_start, check_target
+from certbound.problem.sets.polytopes import intersection, polygon
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 from certbound.problem.sets.unions import StartUnion
 
@@ -20,7 +21,9 @@ __all__ = [
     "GaussianStart",
     "HalfSpace",
     "Inside",
+    "intersection",
     "Outside",
+    "polygon",
     "Polytope",
     "Quadratic",
     "Reach",
