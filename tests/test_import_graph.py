@@ -72,7 +72,7 @@ plotting
 html_report
 cli.describe cli.messages cli.output
 cli.options cli.pictures cli.progress
-cli.clock
+cli.clock cli.starters
 cli.commands
 cli
 """

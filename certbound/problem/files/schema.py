@@ -218,6 +218,14 @@ class Specification(_Table):
     domain: DomainTable | None = None
 
 
+def json_schema() -> dict[str, Any]:
+    """The JSON schema of problem files, for editors; what values mean is checked when a file is read."""
+    schema: dict[str, Any] = Specification.model_json_schema()
+    schema["$defs"]["Noise"]["properties"] |= {key: {} for key in Noise.more_keys()}
+    schema["$defs"]["Noise"]["additionalProperties"] = False
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "certbound problem"}
+
+
 def explain(error: ValidationError) -> str:
     """The faults of a problem file in one line each, without the machinery."""
     lines: list[str] = []
