@@ -28,6 +28,7 @@ problem.sets problem.noise
 problem.table_laws
 problem.adapters
 problem.systems
+problem.ingredients
 problem.problem
 problem problem.library
 problem.export problem.files

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.checks import assign, frozen, nearest, number, positive_definite, vector
+from certbound.checks import assign, frozen, nearest
 from certbound.display import Shown, ask_later_room, name_text
 from certbound.errors import InfeasibleError
+from certbound.problem.ingredients import check_dimension, checked_delta, checked_horizon, checked_start, checked_weight
 from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.sets import (
     Box,
@@ -47,6 +48,8 @@ class Problem(Shown):
         Accepted probability of leaving the safe set, in (0, 1).
     reach : Reach or a set, optional
         A target: then a path fails if it breaks a constraint before it has entered the target, or never enters it.
+    unknown : sequence of str, optional
+        Names of disturbances that are constants: unknown, but the same at all times.
     plan : array_like of shape (K, m), function u(t, x), or Tape, optional
         Inputs: one row a step (DT; rows beyond the horizon are ignored), constant on K equal pieces of the
         horizon (CT), or a feedback law. A system with inputs may go without, for synthesis.
@@ -83,6 +86,7 @@ class Problem(Shown):
     horizon: Any = field(kw_only=True)
     delta: Any = field(default=1e-3, kw_only=True)
     reach: Any = field(default=None, kw_only=True)
+    unknown: Any = field(default=(), kw_only=True)
     plan: Any = field(default=None, kw_only=True)
     cost: Any = field(default=None, kw_only=True)
     domain: Any = field(default=None, kw_only=True)
@@ -97,13 +101,13 @@ class Problem(Shown):
         if not isinstance(self.name, str):
             raise TypeError(f"`name` must be text, got {self.name!r}.")
         discrete = self.system.time == "discrete"
-        assign(self, horizon=_horizon(self.horizon, discrete))
-        assign(self, delta=_delta(self.delta))
+        assign(self, horizon=checked_horizon(self.horizon, discrete))
+        assign(self, delta=checked_delta(self.delta))
         assign(self, safe=self._constraints())
         assign(self, domain=self._domain())
         assign(self, reach=self._target())
-        assign(self, initial=_start(self.initial, self.system.dimension))
-        assign(self, parameters=dict(self.parameters or {}))
+        assign(self, initial=checked_start(self.initial, self.system.dimension))
+        assign(self, parameters=dict(self.parameters or {}), unknown=self._constants())
         assign(self, plan=self._checked_plan())
         assign(self, cost=self._cost())
         for member in self.starts:
@@ -239,7 +243,7 @@ class Problem(Shown):
                 raise TypeError(f"`safe[{place}]` must be cb.Inside or cb.Outside, got a target; give it as `reach=`.")
             if type(constraint) not in (Inside, Outside):
                 raise TypeError(f"`safe[{place}]` must be cb.Inside or cb.Outside itself, got {constraint!r}.")
-            _check_dimension(f"safe[{place}]", constraint.region, self.system.dimension)
+            check_dimension(f"safe[{place}]", constraint.region, self.system.dimension)
             if constraint.during is not None:
                 self._check_window(f"safe[{place}]", constraint.during)
             result.append(constraint.named(self.system.states))
@@ -254,13 +258,21 @@ class Problem(Shown):
         if self.system.time == "discrete" and any(end != int(end) for end in window):
             raise ValueError(f"`{name}` must have whole steps in `during`, got {list(window)}; round them.")
 
+    def _constants(self) -> tuple[str, ...]:
+        names = (self.unknown,) if isinstance(self.unknown, str) else tuple(self.unknown)
+        for name in names:
+            if name not in self.system.disturbance_names:
+                known = nearest(str(name), self.system.disturbance_names)
+                raise ValueError(f"`unknown` must name disturbances of the system, got {name!r}{known}")
+        return names
+
     def _target(self) -> Reach | None:
         target: Any = Reach(self.reach) if isinstance(self.reach, Region) else self.reach
         if target is None:
             return None
         if type(target) is not Reach:
             raise TypeError(f"`reach` must be cb.Reach or a set, got {target!r}.")
-        _check_dimension("reach", target.region, self.system.dimension)
+        check_dimension("reach", target.region, self.system.dimension)
         if target.during is not None:
             self._check_window("reach", target.during)
             if target.during[1] <= 0:
@@ -273,7 +285,7 @@ class Problem(Shown):
             return None
         if not isinstance(self.domain, Box) or self.domain.moving or self.domain.coordinates is not None:
             raise TypeError(f"`domain` must be a fixed Box over all states, got {self.domain!r}.")
-        _check_dimension("domain", self.domain, self.system.dimension)
+        check_dimension("domain", self.domain, self.system.dimension)
         return self.domain
 
     def _checked_plan(self) -> Array | Tape | None:
@@ -321,8 +333,8 @@ class Problem(Shown):
             raise ValueError("`cost` must be omitted for a system without inputs.")
         if not isinstance(self.cost, Sequence) or len(self.cost) != 2:
             raise ValueError(f"`cost` must be the pair (Q, R), got {self.cost!r}.")
-        state = _weight("Q", self.cost[0], self.system.dimension, strict=False)
-        return state, _weight("R", self.cost[1], len(self.system.input_names), strict=True)
+        state = checked_weight("Q", self.cost[0], self.system.dimension, strict=False)
+        return state, checked_weight("R", self.cost[1], len(self.system.input_names), strict=True)
 
     def _closed(self) -> Tape:
         system = self.system
@@ -331,70 +343,3 @@ class Problem(Shown):
         inputs = ("t", *system.states, *system.disturbance_names)
         law = {name: (self.plan, place) for place, name in enumerate(system.input_names)}
         return substitute(system.dynamics, inputs, law)
-
-
-def _horizon(value: Any, discrete: bool) -> float | int:
-    horizon = number("horizon", value)
-    if horizon <= 0:
-        raise ValueError(f"`horizon` must be positive, got {horizon:g}.")
-    if discrete:
-        if horizon != int(horizon):
-            raise ValueError(f"`horizon` must be a whole number of steps in discrete time, got {horizon:g}.")
-        return int(horizon)
-    return horizon
-
-
-def _delta(value: Any) -> float:
-    delta = number("delta", value)
-    if not 0 < delta < 1:
-        raise ValueError(f"`delta` must lie in (0, 1), got {delta:g}.")
-    return delta
-
-
-def _check_dimension(name: str, region: Any, dimension: int) -> None:
-    if region.coordinates is not None:
-        if max(region.coordinates) >= dimension:
-            raise ValueError(
-                f"`{name}` must use state indices below {dimension}, got coordinates {region.coordinates}; "
-                "the first state has index 0."
-            )
-    elif region.dimension != dimension:
-        raise ValueError(
-            f"`{name}` must have dimension {dimension} (the states), got {region.dimension}; a set in some of the "
-            "states names them by `coordinates`."
-        )
-
-
-def _start(value: Any, dimension: int) -> Any:
-    sets = value.members if isinstance(value, StartUnion) else value
-    if not isinstance(sets, list | tuple) or not any(isinstance(entry, Region | GaussianStart) for entry in sets):
-        return _one_start(value, dimension)
-    members = [_one_start(entry, dimension) for entry in sets]
-    if any(member.random for member in members):
-        raise ValueError("`initial` must hold sets and points in a union; a GaussianStart stands alone.")
-    return StartUnion(tuple(members)) if len(members) > 1 else members[0]
-
-
-def _one_start(value: Any, dimension: int) -> Any:
-    kind: Any = type(value)
-    if issubclass(kind, Region | GaussianStart | StartUnion | Mapping | str):
-        if kind is not GaussianStart and not (Region in kind.__bases__ and kind.starts):
-            kinds = "a point, Box, Ball, Ellipsoid or GaussianStart, or a list of sets"
-            raise TypeError(f"`initial` must be {kinds}, got {value!r}.")
-    else:
-        point = vector("initial", value, dimension)
-        value = Box(point, point)
-    start: Any = value
-    if not start.random:
-        if start.moving or start.coordinates is not None:
-            raise ValueError("`initial` must be a fixed set over all states, without `coordinates`.")
-        if not np.all(np.isfinite([start.extent().lo, start.extent().hi])):
-            raise ValueError("`initial` must be bounded, got a set with infinite sides.")
-    if start.dimension != dimension:
-        raise ValueError(f"`initial` must have dimension {dimension} (the states), got {start.dimension}.")
-    return start
-
-
-def _weight(name: str, value: Any, size: int, *, strict: bool) -> Array:
-    matrix = np.diag(vector(name, value, size)) if np.ndim(value) == 1 else value
-    return positive_definite(name, matrix, size, strict=strict)

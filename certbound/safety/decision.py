@@ -165,11 +165,17 @@ class _Search:
         self.watch.poll()
         try:
             with contained(name):
+                found = request.found
+                asked = replace(request, found=lambda answer: found(self._without(answer)))
                 if self.problem.reach is None or (ENGINES[name].reaches and not self.fixed):
-                    return ENGINES[name].prove(self.problem, request)
-                return self._meeting(name, request)
+                    return self._without(ENGINES[name].prove(self.problem, asked))
+                return self._without(self._meeting(name, asked))
         except EngineError as error:
             return EngineAnswer(applicable=False, reason=str(error), method=name)
+
+    def _without(self, answer: EngineAnswer) -> EngineAnswer:
+        """The answer without its lower bound where constants are unknown: it is of disturbances that may change."""
+        return replace(answer, log10_lower=None, conclusive=False) if self.problem.unknown else answer
 
     @cached_property
     def fixed(self) -> bool:

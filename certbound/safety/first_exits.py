@@ -175,6 +175,8 @@ def _check(problem: Problem) -> None:
         raise InfeasibleError(f"exit times are bounded in one state, the problem has {problem.system.dimension}.")
     if len(problem.starts) > 1 or problem.initial.random:
         raise InfeasibleError("exit times need one set of starts; take the members of a union one by one.")
+    if problem.unknown:
+        raise InfeasibleError("exit times have no bounds for unknown constants; give them values.")
     window = (0.0, float(problem.horizon))
     for constraint in problem.constraints:
         if constraint.region.moving or constraint.during not in (None, window):

@@ -46,7 +46,7 @@ class _Reader:
         self.states = checked_names("states", spec.states, RESERVED)
         self.inputs = checked_names("inputs", list(spec.inputs), {*RESERVED, *self.states})
         taken = {*RESERVED, *self.states, *self.inputs}
-        self.disturbances = checked_names("disturbances", list(spec.disturbances), taken)
+        self.disturbances = checked_names("disturbances", [*spec.disturbances, *spec.uncertain], taken)
         taken |= set(self.disturbances)
         self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
         self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
@@ -61,7 +61,7 @@ class _Reader:
         return Problem(
             system,
             initial=self.starts(spec.initial),
-            safe=safe,
+            safe=safe, unknown=list(spec.uncertain),
             reach=targets[0] if targets else None,
             horizon=self.number(spec.horizon, "horizon"),
             delta=self.number(spec.delta, "delta"),
@@ -153,7 +153,7 @@ class _Reader:
         options: dict[str, Any] = {
             "states": self.states,
             "inputs": self.signal(spec.inputs, "inputs"),
-            "disturbance": self.signal(spec.disturbances, "disturbances"),
+            "disturbance": self.signal({**spec.disturbances, **spec.uncertain}, "disturbances"),
             "input_names": self.inputs or None,
             "disturbance_names": self.disturbances or None,
         }

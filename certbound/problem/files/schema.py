@@ -208,6 +208,7 @@ class Specification(_Table):
     parameters: dict[str, Annotated[float, BeforeValidator(_no_boolean)]] = {}
     inputs: dict[str, Pair] = {}
     disturbances: dict[str, Pair] = {}
+    uncertain: dict[str, Pair] = {}
     definitions: dict[str, Number] = {}
     plan: dict[str, Number] | None = None
     cost: Cost | None = None

@@ -63,6 +63,7 @@ class _Writer:
         problem, system = self.problem, self.system
         dynamics = dict(zip(self.states, self.texts(system.dynamics)))
         noise, plan, cost = self.noise(), self.plan(), problem.cost
+        bounded = self.signal(system.disturbance, system.disturbance_names)
         starts = [self.start(member) for member in problem.starts]
         stay = [self.constraint(c) for c in problem.safe if not c.outside]
         avoid = [self.constraint(c) for c in problem.safe if c.outside]
@@ -73,7 +74,8 @@ class _Writer:
             "delta": problem.delta,
             "states": list(self.states),
             "inputs": self.signal(system.inputs, system.input_names),
-            "disturbances": self.signal(system.disturbance, system.disturbance_names),
+            "disturbances": {name: ends for name, ends in bounded.items() if name not in problem.unknown},
+            "uncertain": {name: ends for name, ends in bounded.items() if name in problem.unknown},
             "definitions": self.definitions,
             "dynamics": dynamics,
             "plan": plan,
