@@ -50,9 +50,13 @@ def _failure(problem: Problem, limit: float) -> FailureBounds:
 
 
 def _exits(problem: Problem, limit: float) -> ExitBounds:
-    if problem.reach is None:
+    target = problem.reach
+    if target is None:
         return bound_exits(problem, seconds=limit)
-    raise InfeasibleError("value functions in continuous time do not serve targets yet.")
+    first, last = target.during or (0.0, float(problem.horizon))
+    if first > 0:
+        raise InfeasibleError("value functions in continuous time need a target that counts from the beginning.")
+    return bound_exits(until(problem, last), target=target.region, seconds=limit)
 
 
 def _continuous(found: ExitBounds) -> EngineAnswer:

@@ -62,7 +62,8 @@ def bound_exits(
         Continuous time, one or two states, noise of full rank. In one state any limits, windows, moving sets, obstacles
         and a random start; in two a bounded safe box over the whole horizon.
     target : region, optional
-        Not served yet.
+        In one state: then the bounds are those of the probability of breaking a constraint before the target is
+        entered, or of not entering it by the horizon.
     seconds : float
         How long to refine; the first attempt is finished in any case. In one state seconds stand for so many
         patches of work, so that the bounds do not depend on the machine or its load.
@@ -92,7 +93,13 @@ def bound_exits(
     begin = time.perf_counter()
     _check(problem, target, seconds)
     model = _model(problem)
-    if problem.system.dimension == 1:
+    proposed: Sequence[tuple[Surface, Payment]] = ()
+    if target is not None:
+        from certbound.values.continuous.line import bound_arrival
+
+        most, rest, words = bound_arrival(problem, model, target)
+        upper, least = most, None if rest == -math.inf else rest
+    elif problem.system.dimension == 1:
         from certbound.values.continuous.line import bound_line
 
         upper, least, words, proposed = bound_line(problem, model, seconds, lower)
@@ -200,8 +207,8 @@ def _check(problem: Problem, target: Any, seconds: float) -> None:
         raise InfeasibleError(
             f"value functions in continuous time serve one or two states, the problem has {problem.system.dimension}."
         )
-    if target is not None:
-        raise InfeasibleError("value functions in continuous time do not serve targets yet.")
+    if target is not None and problem.system.dimension > 1:
+        raise InfeasibleError("value functions in continuous time serve targets in one state only.")
     if problem.input_sequence is not None:
         raise InfeasibleError("value functions in continuous time need a feedback law; the plan is an array.")
 
