@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.values.continuous.line.arrivals import _not
+from certbound.values.continuous.line.arrivals import complement
 
 
 def flow(start=(0.8,), *, drift=-1.0, sigma=0.3, horizon=3.0, target=(-0.2, 0.2), safe=(-1.5, 1.0), **more):
@@ -62,9 +62,9 @@ def test_where_nothing_limits_the_other_side_a_path_may_come_back():
 
 
 def test_one_minus_a_bound_is_rounded_outward():
-    assert np.exp(_not(np.log(0.25), up=False)) <= 0.75 <= np.exp(_not(np.log(0.25), up=True))
-    assert _not(-np.inf, up=True) == 0.0
-    assert _not(0.0, up=False) == -np.inf
+    assert np.exp(complement(np.log(0.25), up=False)) <= 0.75 <= np.exp(complement(np.log(0.25), up=True))
+    assert complement(-np.inf, up=True) == 0.0
+    assert complement(0.0, up=False) == -np.inf
 
 
 @pytest.mark.parametrize(

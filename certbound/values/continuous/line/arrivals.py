@@ -60,7 +60,7 @@ def bound_arrival(problem: Problem, model: Model, target: Region) -> tuple[float
     least, most, done = _bounds(early if limited else None, late, start, side)
     found = ", ".join(done) or "none came to an end"
     words = f"value function in one state for arriving, cells x slabs of time: {found}"
-    return _not(least, up=True), _not(most, up=False), words
+    return complement(least, up=True), complement(most, up=False), words
 
 
 def _placed(problem: Problem, model: Model, target: Region) -> tuple[int, Start]:
@@ -131,7 +131,7 @@ def _prove_above(link: Link, start: Start, side: int) -> float:
     return pay_upper(parts, level, floor - 1e-15 * (1 + abs(floor))).log
 
 
-def _not(log: float, *, up: bool) -> float:
+def complement(log: float, *, up: bool) -> float:
     """log(1 - e^log), rounded up or down."""
     rest = -math.expm1(log) if log > -math.inf else 1.0
     rest = rest * (1 + 1e-13) + 1e-300 if up else rest * (1 - 1e-13)
