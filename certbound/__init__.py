@@ -30,6 +30,7 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.problem.noise import Gaussian as Gaussian
     from certbound.problem.noise import Rademacher as Rademacher
     from certbound.problem.noise import SubGaussian as SubGaussian
+    from certbound.problem.noise import Triangular as Triangular
     from certbound.problem.noise import Uniform as Uniform
     from certbound.problem.problem import Problem as Problem
     from certbound.problem.sets import Ball as Ball
@@ -40,12 +41,17 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.problem.sets import Inside as Inside
     from certbound.problem.sets import Outside as Outside
     from certbound.problem.sets import Polytope as Polytope
+    from certbound.problem.sets import Reach as Reach
     from certbound.problem.systems import ContinuousSystem as ContinuousSystem
     from certbound.problem.systems import DiscreteSystem as DiscreteSystem
     from certbound.problem.systems import from_control as from_control
     from certbound.problem.systems import linear_system as linear_system
+    from certbound.problem.table_laws import Discrete as Discrete
+    from certbound.problem.table_laws import Histogram as Histogram
+    from certbound.problem.table_laws import Laplace as Laplace
     from certbound.reach import bound_reach as bound_reach
     from certbound.reach.sets import ReachTube as ReachTube
+    from certbound.safety.first_exits import bound_exit_times as bound_exit_times
     from certbound.safety.verdict import Verdict as Verdict
     from certbound.safety.verification import verify_safety as verify_safety
     from certbound.simulation.estimates import sample_paths as sample_paths
@@ -68,8 +74,9 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 _HOME = {
     "problem.systems": "ContinuousSystem DiscreteSystem linear_system from_control",
-    "problem.noise": "Gaussian Uniform Rademacher Bounded SubGaussian",
-    "problem.sets": "Box Ball Ellipsoid HalfSpace Polytope GaussianStart Inside Outside",
+    "problem.noise": "Gaussian Uniform Triangular Rademacher Bounded SubGaussian",
+    "problem.table_laws": "Discrete Histogram Laplace",
+    "problem.sets": "Box Ball Ellipsoid HalfSpace Polytope GaussianStart Inside Outside Reach",
     "problem.problem": "Problem",
     "problem.files": "load save",
     "problem.export": "export_casadi export_control",
@@ -85,6 +92,7 @@ _HOME = {
     "reach.sets": "ReachTube",
     "safety.verification": "verify_safety",
     "safety.verdict": "Verdict",
+    "safety.first_exits": "bound_exit_times",
     "synthesis.plans": "synthesize_plan",
     "synthesis.controllers": "simulate_closed_loop PredictiveController ConvexPlanner SafetyFilter",
     "synthesis.terminal": "TerminalSet",

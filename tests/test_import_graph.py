@@ -25,8 +25,10 @@ display
 rigor
 problem.model
 problem.sets problem.noise
+problem.table_laws
 problem.adapters
 problem.systems
+problem.ingredients
 problem.problem
 problem problem.library
 problem.export problem.files
@@ -56,11 +58,12 @@ reach.contraction reach.linear reach.sampled
 reach
 quadratic
 safety.answers
-safety.engines safety.starts
+safety.engines safety.starts safety.first_exits
 safety.certificates
 safety.portfolio
 safety.certificate safety.falsification
 safety.verdict
+safety.members safety.misses
 safety.decision
 safety
 synthesis
@@ -70,7 +73,7 @@ plotting
 html_report
 cli.describe cli.messages cli.output
 cli.options cli.pictures cli.progress
-cli.clock
+cli.clock cli.starters
 cli.commands
 cli
 """
@@ -106,6 +109,7 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
+    "values.continuous": (6, "bounds and charts, the latter at chosen times or at the ends of slabs"),
     "values.discrete": (7, "kernels and interpolation of discrete time are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (23, "the one description of functions, which every room reads, differentiates and evaluates"),
@@ -114,9 +118,9 @@ MANY_DOORS = {
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
     "constants.programs": (15, "one program each for rate, gain and erosion, with what it is asked"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
-    "problem.sets": (13, "the sets and constraints that users write, and the two forms that everybody reads"),
+    "problem.sets": (18, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
-    "checker.statement": (11, "what a certificate states is read once and asked by four proofs"),
+    "checker.statement": (12, "what a certificate states is read once and asked by four proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
     "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),

@@ -17,7 +17,6 @@ ALONE = {
     "certbound.checker.check.check_file": "a whole check in one call, for programs that hold no more than a file",
     "certbound.constants.recheck.holds_gain": "the proof of a gain at a stated value: says whether a bound is tight",
     "certbound.constants.recheck.holds_rate": "the proof of a rate at a stated value, likewise",
-    "certbound.values.continuous.hypotheses.prove_lower": "the theorem for one surface, which tests spoil on purpose",
 }
 """Functions and classes that nothing but tests reach, and why they are there."""
 

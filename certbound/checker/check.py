@@ -9,7 +9,7 @@ from typing import Any
 
 from flint import arb, ctx
 
-from certbound.checker.claims import ENGINES, assumptions, claim, engine_of
+from certbound.checker.claims import assumptions, claim, engine_of, prove, words_of
 from certbound.checker.reading import Record, read, text
 from certbound.checker.report import Budget, Report, Unproved
 from certbound.checker.statement import first_difference, read_model
@@ -79,16 +79,16 @@ def check_data(
         except Unproved as error:
             raise CertificateError(f"`problem` cannot be read: {error}.") from error
         proof = record["proof"]
-        engine = engine_of(proof, method)
+        engine_of(proof, method)
         assumed = tuple(assumptions(model, proof, named))
-        words = claim(model, engine, level, assumed)
+        words = claim(model, proof, level, assumed)
         proved = None
         try:
             if problem is not None:
                 difference = first_difference(record["problem"], problem)
                 if difference:
                     raise Unproved(f"the certificate speaks of another problem: {difference}")
-            proved = ENGINES[engine].prove(model, proof, budget)
+            proved = prove(model, proof, budget)
             _compare(proved, level)
         except Unproved as error:
             return Report(
@@ -97,7 +97,8 @@ def check_data(
             )  # fmt: skip
         return Report(
             valid=allow_assumptions or not assumed, proved=True, claim=words,
-            reason=_reason(engine, _log10(proved), problem is not None, assumed), seconds=budget.elapsed,
+            reason=_reason(words_of(model, proof), _log10(proved), problem is not None, assumed),
+            seconds=budget.elapsed,
             log10_delta=level, log10_proved=_log10(proved), assumptions=assumed,
         )  # fmt: skip
 
@@ -119,9 +120,9 @@ def _log10(value: arb) -> float:
     return min(math.nextafter(float(top), math.inf), 0.0) if top.is_finite() else 0.0
 
 
-def _reason(engine: str, proved: float, compared: bool, assumed: Sequence[str]) -> str:
+def _reason(engines: str, proved: float, compared: bool, assumed: Sequence[str]) -> str:
     same = ", and the certificate speaks of the given problem" if compared else ""
     found = f"the probability is at most 10^{rounded(proved, up=True)}"
     bound = "no noise can break them" if proved <= -1e12 else found
     but = "but what the claim assumes " if assumed else ""
-    return f"every inequality {but}was proved again in ball arithmetic, by {ENGINES[engine].words}: {bound}{same}"
+    return f"every inequality {but}was proved again in ball arithmetic, by {engines}: {bound}{same}"

@@ -7,20 +7,26 @@ assumption: the claim says for which disturbances it holds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from flint import arb
 
 from certbound.checker.barrier import check_barrier
 from certbound.checker.constants import check_constants
 from certbound.checker.linear import check_linear
-from certbound.checker.reading import number
+from certbound.checker.reading import Record, number
 from certbound.checker.report import Budget
-from certbound.checker.statement import Model
+from certbound.checker.statement import Model, met_at
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
+
+UNION = "union"
+"""The engine that a proof names where the start is a union: it has one proof a member."""
+
+REACH = "reach"
+"""The engine that a proof names where the problem has a target: it meets the target at one time."""
 
 STATED = "the stated constants hold"
 """How a certificate's own list names what `assumptions` derives from the proof."""
@@ -54,18 +60,59 @@ class Engine:
 
 def engine_of(proof: object, method: str) -> str:
     """The engine that a proof names, which ``claim.method`` must name too."""
-    engine = proof.get("engine") if isinstance(proof, Mapping) else None
-    if not isinstance(engine, str) or engine not in ENGINES:
-        raise CertificateError(f"`proof.engine` must be one of {', '.join(ENGINES)}.")
+    engine = _named(proof, "proof", (*ENGINES, UNION, REACH))
     if method != engine:
         raise CertificateError(f"`claim.method` must be \"{engine}\", the proof's engine, got {quoted(method)}.")
     return engine
 
 
+def _named(proof: object, path: str, known: Sequence[str]) -> str:
+    engine = proof.get("engine") if isinstance(proof, Mapping) else None
+    if not isinstance(engine, str) or engine not in known:
+        raise CertificateError(f"`{path}.engine` must be one of {', '.join(known)}.")
+    return engine
+
+
+def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[str, Model, Mapping[str, object]]]:
+    """A proof's engine, its plain model and its numbers; where the start is a union, those of every member.
+
+    A target is met at one time, which the proof names. CertificateError where the start is a union, or there is a
+    target, and the proof does not say so, or the other way round.
+    """
+    if model.members:
+        _named(proof, path, (UNION,))
+        count = len(model.members)
+        rows = Record(proof, path, ("engine", "members")).items("members", count, count)
+        for index, (member, row) in enumerate(zip(model.members, rows)):
+            yield from _parts(replace(model, initial=member, members=()), row, f"{path}.members[{index}]")
+    elif model.target is not None:
+        _named(proof, path, (REACH,))
+        record = Record(proof, path, ("engine", "time", "proof"))
+        yield from _parts(met_at(model, record.number("time")), record["proof"], f"{path}.proof")
+    else:
+        yield _named(proof, path, tuple(ENGINES)), model, proof  # type: ignore[misc]  # a mapping: it names an engine
+
+
+def prove(model: Model, proof: object, budget: Budget) -> arb:
+    """The probability that a proof bounds; where the start is a union, the largest of its members'."""
+    found = arb(0)
+    for engine, one, part in _parts(model, proof):
+        bound = ENGINES[engine].prove(one, part, budget)
+        if not bound.is_finite():
+            return bound
+        found = found.max(bound)
+    return found
+
+
+def words_of(model: Model, proof: object) -> str:
+    """What it was proved by."""
+    return ", ".join(dict.fromkeys(ENGINES[engine].words for engine, _, _ in _parts(model, proof)))
+
+
 def assumptions(model: Model, proof: Mapping[str, object], named: Sequence[str]) -> list[str]:
     """What the proof takes for granted, and what else the file says that it assumes, in quotes."""
-    found = ENGINES[str(proof["engine"])].assumes(model, proof)
-    own = [] if found is None else [found]
+    found = (ENGINES[engine].assumes(one, part) for engine, one, part in _parts(model, proof))
+    own = list(dict.fromkeys(item for item in found if item is not None))
     return own + [f"as the file says, {quoted(item, 200)}" for item in named if not (own and item == STATED)]
 
 
@@ -89,14 +136,19 @@ def _stated(model: Model, proof: Mapping[str, object]) -> str | None:
     )
 
 
-def claim(model: Model, engine: str, level: float, assumed: Sequence[str]) -> str:
+def claim(model: Model, proof: object, level: float, assumed: Sequence[str]) -> str:
     """The claim as one sentence."""
     unit = "s" if model.continuous else "steps"
     start = "a normal start" if model.initial.covariance is not None else "every start in the initial set"
-    whose = "" if not model.disturbance else f", {_ANY if ENGINES[engine].foresees(model) else _BLIND},"
+    start += f" (a union of {len(model.members)})" if model.members else ""
+    foresees = all(ENGINES[engine].foresees(one) for engine, one, _ in _parts(model, proof))
+    whose = "" if not model.disturbance else f", {_ANY if foresees else _BLIND},"
     safe = "at most" if arb(level) <= arb(model.delta).log() / arb(10).log() else "more than"
+    kept = f"breaks one of its {len(model.constraints)} constraints"
+    if model.target is not None:
+        kept += f" before it is in its target ({quoted(model.target.label)}), or is not in it"
     words = (
-        f"from {start}{whose} the problem {quoted(model.name)} breaks one of its {len(model.constraints)} constraints "
+        f"from {start}{whose} the problem {quoted(model.name)} {kept} "
         f"within {plainly(model.horizon)} {unit} with probability at most 10^{rounded(level, up=True)} "
         f"({safe} delta = {plainly(model.delta)})"
     )

@@ -11,7 +11,18 @@ from typing import Annotated
 import typer
 
 from certbound._version import __version__
-from certbound.cli.commands import check, derive, doctor, new, problems, simulate, synthesize, tune, verify
+from certbound.cli.commands import (
+    check,
+    derive,
+    doctor,
+    exit_times,
+    new,
+    problems,
+    simulate,
+    synthesize,
+    tune,
+    verify,
+)
 from certbound.cli.messages import BAD_INPUT, INTERRUPTED, explain, write_error
 from certbound.cli.output import SETTINGS, logging_to_stderr
 
@@ -43,9 +54,9 @@ def _global_options(
         raise typer.Exit(BAD_INPUT)
 
 
-for _module in (verify, derive, tune, synthesize, simulate, check, problems, new, doctor):
+for _module in (verify, derive, tune, synthesize, simulate, exit_times, check, problems, new, doctor):
     _name = _module.__name__.rpartition(".")[2]
-    app.command(_name, epilog=_module.EXAMPLES)(getattr(_module, _name))
+    app.command(_name.replace("_", "-"), epilog=_module.EXAMPLES)(getattr(_module, _name))
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -81,7 +92,7 @@ def _run(words: list[str], command: str) -> int:
 
 
 def _shorter(command: str) -> str:
-    limited = command in ("verify", "derive", "tune", "simulate")
+    limited = command in ("verify", "derive", "tune", "simulate", "exit-times")
     return "; --time-limit SECONDS gives the best answer after some time" if limited else " and let it finish"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,7 +64,9 @@ def values_of(problem: Problem, verdict: Verdict) -> SafeStarts | None:
 
     try:
         with contained("values"):
-            return bound_safe_starts(problem, verdict.answers, pictured=True) if verdict.answers else None
+            one = problem.replace(initial=problem.starts[0]) if verdict.members else problem
+            found = bound_safe_starts(one, verdict.answers, pictured=True) if verdict.answers else None
+            return None if found is None else replace(found, problem=problem)
     except EngineError as error:
         _log.info("no value function is drawn: %s", error)
         return None

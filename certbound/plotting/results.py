@@ -14,6 +14,7 @@ from certbound.plotting.value_maps import draw_curves, draw_map, slices_of
 from certbound.problem.problem import Problem
 from certbound.reach.sets import ReachTube
 from certbound.safety.answers import Deviation
+from certbound.safety.first_exits import ExitTimes
 from certbound.safety.starts import SafeStarts
 from certbound.safety.verification import Verdict
 from certbound.tubes.constants import Constants
@@ -92,6 +93,17 @@ def _starts(result: SafeStarts, axes: Axes) -> None:
         draw_map(axes, result, slices[0][0], slices[0][2])
     else:
         draw_curves(axes, result)
+    axes.set_title(result.summary(), fontsize="small")
+
+
+@draw.register(ExitTimes)
+def _exit_times(result: ExitTimes, axes: Axes) -> None:
+    continuous = result.problem.system.time == "continuous"
+    axes.step(result.times, result.upper, where="pre", color=OUTER, linewidth=1.4, label="at most")
+    axes.step(result.times, result.lower, where="post", color=BLUE, linewidth=1.4, linestyle=(0, (4, 1.5)),
+              label="at least")  # fmt: skip
+    axes.set(xlabel=_time(continuous), ylabel="P(exit before)", ylim=(0, 1.02), xlim=(0, float(result.problem.horizon)))
+    axes.legend()
     axes.set_title(result.summary(), fontsize="small")
 
 

@@ -74,9 +74,10 @@ def draw_curves(axes: Axes, starts: SafeStarts) -> None:
         axes.plot(*steps_of(chart, -np.inf), color=colour, linewidth=1.0, linestyle=(0, (4, 1.5)),
                   label="lower bounds" if number == 0 else None)  # fmt: skip
     axes.axhline(starts.delta, label=f"delta = {starts.delta:g}", **BORDER)
-    around = problem.initial.hull() if not problem.initial.random else None
-    low, high = (problem.initial.mean,) * 2 if around is None else (around.lo, around.hi)
-    axes.axvspan(low[0], high[0], facecolor=GREY, edgecolor=GREY, alpha=0.35, linewidth=1.0, label="stated start")
+    for number, start in enumerate(problem.starts):
+        low, high = _ends(start)
+        axes.axvspan(low[0], high[0], facecolor=GREY, edgecolor=GREY, alpha=0.35, linewidth=1.0,
+                     label="stated start" if number == 0 else None)  # fmt: skip
     for number, (box,) in enumerate(starts.boxes):
         axes.plot(box, [0.015, 0.015], transform=axes.get_xaxis_transform(), color=BLUE, linewidth=5,
                   solid_capstyle="butt", label="safe starts" if number == 0 else None)  # fmt: skip
@@ -86,6 +87,12 @@ def draw_curves(axes: Axes, starts: SafeStarts) -> None:
     axes.margins(x=0.01)
     axes.grid(color="#e6e6e6", linewidth=0.5)
     axes.set_axisbelow(True)
+
+
+def _ends(start: Any) -> tuple[Array, Array]:
+    """Lowest and highest states of a start; of a random one its mean."""
+    around = None if start.random else start.hull()
+    return (start.mean, start.mean) if around is None else (around.lo, around.hi)
 
 
 def _of_times(starts: SafeStarts) -> Iterator[str]:
@@ -105,8 +112,8 @@ def steps_of(chart: Chart, least: float) -> tuple[Array, Array]:
 def slices_of(starts: SafeStarts) -> Iterator[tuple[Plane, str, Chart]]:
     """Planes of two states, through the middle of the stated start: (plane, words, the chart in it); none for one."""
     chart, names = starts.chart, starts.problem.system.states
-    start = starts.problem.initial
-    middle = start.mean if start.random else start.hull().mid
+    low, high = _ends(starts.problem.starts[0])
+    middle = 0.5 * (low + high)
     for plane in itertools.combinations(range(len(chart.axes)), 2):
         index: list[Any] = [slice(None)] * len(chart.axes)
         words = []
@@ -135,16 +142,14 @@ def draw_map(axes: Axes, starts: SafeStarts, plane: Plane, chart: Chart) -> Any:
                              linewidths=0.7, linestyles="solid", zorder=2)  # fmt: skip
         axes.clabel(lines, fmt=lambda value: f"1e{value:.0f}", fontsize=6.5, inline_spacing=2)
     _draw_outline(axes, chart.axes, starts.safe(chart))
-    start = starts.problem.initial
-    around = start.hull() if not start.random else None
-    low = start.mean[list(plane)] if around is None else around.lo[list(plane)]
-    size = np.zeros(2) if around is None else (around.hi - around.lo)[list(plane)]
-    if np.all(size > 0):
-        for colour, width in (("white", 2.6), (INK, 1.4)):
-            axes.add_patch(Rectangle(tuple(low), *size, fill=False, edgecolor=colour, linewidth=width, zorder=7))
-    else:
-        for colour, width in (("white", 3.2), (INK, 1.6)):
-            axes.plot(*(low + size / 2), marker="x", color=colour, markersize=6, markeredgewidth=width, zorder=7)
+    for low, high in (_ends(start) for start in starts.problem.starts):
+        corner, size = low[list(plane)], (high - low)[list(plane)]
+        if np.all(size > 0):
+            for colour, width in (("white", 2.6), (INK, 1.4)):
+                axes.add_patch(Rectangle(tuple(corner), *size, fill=False, edgecolor=colour, linewidth=width, zorder=7))
+        else:
+            for colour, width in (("white", 3.2), (INK, 1.6)):
+                axes.plot(*(corner + size / 2), marker="x", color=colour, markersize=6, markeredgewidth=width, zorder=7)
     _frame(axes, starts, plane, chart)
     return mesh
 

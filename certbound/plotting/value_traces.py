@@ -12,7 +12,7 @@ from certbound.plotting.plane import Plane, lives_in
 from certbound.plotting.scene import BLUE, INK, RIM, VERMILION
 from certbound.plotting.value_maps import DEEPEST, TIMES, coarser, outline_of, slices_of, steps_of
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Quadratic
+from certbound.problem.sets import GaussianStart, Quadratic
 from certbound.safety.starts import SafeStarts
 from certbound.values.charts import Chart
 
@@ -74,13 +74,16 @@ def _curves_figure(starts: SafeStarts) -> tuple[str, str, list[Trace], Trace]:
 
 
 def _stated(starts: SafeStarts, plane: Plane) -> list[Trace]:
-    """The box around the stated start as a frame; of a random one nothing."""
-    if starts.problem.initial.random:
-        return []
-    around = starts.problem.initial.hull()
-    (x0, y0), (x1, y1) = (end[list(plane)] for end in (around.lo, around.hi))
-    ends = {"x0": float(x0), "x1": float(x1), "y0": float(y0), "y1": float(y1)}
-    return [{"type": "rect", **ends, "line": {"color": INK, "width": 2}}]
+    """Boxes around the stated starts as frames; of a random one nothing."""
+    shapes = []
+    for start in starts.problem.starts:
+        if isinstance(start, GaussianStart):
+            continue
+        around = start.hull()
+        (x0, y0), (x1, y1) = (end[list(plane)] for end in (around.lo, around.hi))
+        ends = {"x0": float(x0), "x1": float(x1), "y0": float(y0), "y1": float(y1)}
+        shapes.append({"type": "rect", **ends, "line": {"color": INK, "width": 2}})
+    return shapes
 
 
 def circles(problem: Problem, plane: Plane) -> list[Trace]:

@@ -44,6 +44,7 @@ class Law:
     name = ""  # in problem files and certificates; a law without one is neither simulated nor written
     levels: tuple[str, ...] = ()  # the fields of which one is given: a matrix if it ends with "covariance", or a vector
     flags: tuple[str, ...] = ()  # further fields, true or false
+    tables: tuple[str, ...] = ()  # further fields, each a list of numbers
     variate = ""  # what it is drawn from: "normal", "uniform" (on (-1, 1)) or "sign"; "": it cannot be drawn
     gaussian = False  # exactly normal, with ``proxy`` as covariance
     exact_covariance: Callable[[], list[list[Fraction]]]  # of a Gaussian law
@@ -109,13 +110,14 @@ class Law:
         if len(value) not in (1, dimension):
             raise ValueError(f"`{kind}` must be a number or {dimension} numbers, got {len(value)}.")
         fields = {kind: frozen(np.broadcast_to(value, (dimension,)))}
-        return type(self)(**fields, **{flag: getattr(self, flag) for flag in self.flags})
+        return type(self)(**fields, **{name: getattr(self, name) for name in (*self.flags, *self.tables)})
 
     def data(self) -> dict[str, Any]:
         """Name, level, and the flags that are not at their defaults, as a problem file states them."""
         flags = {flag: bool(getattr(self, flag)) for flag in self.flags}
         changed = {flag: value for flag, value in flags.items() if value != getattr(type(self), flag, None)}
-        return {"law": self.name, self.level: getattr(self, self.level).tolist(), **changed}
+        tables = {name: getattr(self, name).tolist() for name in self.tables}
+        return {"law": self.name, self.level: getattr(self, self.level).tolist(), **tables, **changed}
 
     @property
     def dimension(self) -> int:
@@ -169,8 +171,8 @@ def check_law(law: Law, task: str, error: type[Exception] = TypeError) -> None:
 
 
 def known_laws() -> str:
-    """The laws of this module and how each is given, in words."""
-    own = [law for law in LAWS.values() if law.__module__ == __name__]
+    """The laws of the package and how each is given, in words."""
+    own = [law for law in LAWS.values() if law.__module__.startswith("certbound.")]
     return ", ".join(f"cb.{law.__name__}({' | '.join(f'{level}=...' for level in law.levels)})" for law in own)
 
 
@@ -303,6 +305,32 @@ class Uniform(BoxLaw):
     @property
     def proxy(self) -> Array:
         return frozen(np.diag(np.nextafter(_square_up(self.halfwidth) / 3.0, np.inf)) * (self.halfwidth > 0))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Triangular(BoxLaw):
+    """Independent entries with the density (h_i - |w|)/h_i^2 on [-h_i, h_i]; proxy h_i^2 / 6, the variance.
+
+    Each is the sum of two independent ones, uniform on [-h_i/2, h_i/2], whose proxies h_i^2/12 add.
+
+    Parameters
+    ----------
+    halfwidth : float or array_like, shape (m,)
+        h, not negative; a number holds for each entry.
+    """
+
+    halfwidth: Any
+
+    name = "triangular"
+    levels = ("halfwidth",)
+    variate = "uniform"
+
+    @property
+    def proxy(self) -> Array:
+        return frozen(np.diag(np.nextafter(_square_up(self.halfwidth) / 6.0, np.inf)) * (self.halfwidth > 0))
+
+    def unit(self, v: Array) -> Array:
+        return np.asarray(np.sign(v) * (1.0 - np.sqrt(1.0 - np.abs(v))))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

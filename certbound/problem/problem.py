@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.checks import assign, frozen, nearest, number, positive_definite, vector
+from certbound.checks import assign, frozen, nearest
 from certbound.display import Shown, ask_later_room, name_text
+from certbound.errors import InfeasibleError
+from certbound.problem.ingredients import check_dimension, checked_delta, checked_horizon, checked_start, checked_weight
 from certbound.problem.model import Tape, substitute, trace
-from certbound.problem.sets import Box, GaussianStart, Inside, Outside, Region, check_start
+from certbound.problem.sets import (
+    Box,
+    GaussianStart,
+    Inside,
+    Outside,
+    Reach,
+    Region,
+    StartUnion,
+    check_start,
+    check_target,
+)
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
 
@@ -25,15 +37,19 @@ class Problem(Shown):
     ----------
     system : ContinuousSystem or DiscreteSystem
         The model.
-    initial : Box, Ball, Ellipsoid, GaussianStart or array_like of shape (n,)
+    initial : Box, Ball, Ellipsoid, GaussianStart, array_like of shape (n,), or a list of sets
         Every start in a set counts (also one chosen by an adversary who does not see coming noise); a point is stored
-        as a degenerate box.
+        as a degenerate box. A list or tuple of sets is their union: the worst of them counts.
     safe : sequence of Inside and Outside
         Constraints, each over its own window.
     horizon : float or int
         Seconds (CT) or steps (DT); positive.
     delta : float
         Accepted probability of leaving the safe set, in (0, 1).
+    reach : Reach or a set, optional
+        A target: then a path fails if it breaks a constraint before it has entered the target, or never enters it.
+    unknown : sequence of str, optional
+        Names of disturbances that are constants: unknown, but the same at all times.
     plan : array_like of shape (K, m), function u(t, x), or Tape, optional
         Inputs: one row a step (DT; rows beyond the horizon are ignored), constant on K equal pieces of the
         horizon (CT), or a feedback law. A system with inputs may go without, for synthesis.
@@ -69,6 +85,8 @@ class Problem(Shown):
     safe: Any = field(kw_only=True)
     horizon: Any = field(kw_only=True)
     delta: Any = field(default=1e-3, kw_only=True)
+    reach: Any = field(default=None, kw_only=True)
+    unknown: Any = field(default=(), kw_only=True)
     plan: Any = field(default=None, kw_only=True)
     cost: Any = field(default=None, kw_only=True)
     domain: Any = field(default=None, kw_only=True)
@@ -83,24 +101,54 @@ class Problem(Shown):
         if not isinstance(self.name, str):
             raise TypeError(f"`name` must be text, got {self.name!r}.")
         discrete = self.system.time == "discrete"
-        assign(self, horizon=_horizon(self.horizon, discrete))
-        assign(self, delta=_delta(self.delta))
+        assign(self, horizon=checked_horizon(self.horizon, discrete))
+        assign(self, delta=checked_delta(self.delta))
         assign(self, safe=self._constraints())
         assign(self, domain=self._domain())
-        assign(self, initial=_start(self.initial, self.system.dimension))
-        assign(self, parameters=dict(self.parameters or {}))
+        assign(self, reach=self._target())
+        assign(self, initial=checked_start(self.initial, self.system.dimension))
+        assign(self, parameters=dict(self.parameters or {}), unknown=self._constants())
         assign(self, plan=self._checked_plan())
         assign(self, cost=self._cost())
-        check_start(self.initial, self.constraints)
+        for member in self.starts:
+            check_start(member, self.kept)
+        if self.reach is not None:
+            check_target(self.reach.region, self.kept, self.system.dimension)
         if self.plan is not None or self.system.inputs is None:
             assign(self, _closed_loop=self._closed())
 
     @property
     def constraints(self) -> tuple[Inside, ...]:
-        """Everything that a safe path respects: ``safe``, and staying in the domain where there is one."""
+        """Everything that a path respects that does not fail: ``safe``, and staying in the domain where there is one.
+
+        Raises
+        ------
+        InfeasibleError
+            If the problem has a target: these constraints do not say what failing is then (``kept`` has them).
+        """
+        if self.reach is not None:
+            raise InfeasibleError(
+                f"the problem has a target ('{self.reach.label}'), and this serves constraints only; leave `reach` "
+                "out, or use verify_safety or simulate_exits."
+            )
+        return self.kept
+
+    @property
+    def failing(self) -> str:
+        """What is bounded, in a word."""
+        return "leaving" if self.reach is None else "failing"
+
+    @property
+    def kept(self) -> tuple[Inside, ...]:
+        """What a path respects until it is in the target, where there is one; otherwise ``constraints``."""
         if self.domain is None:
             return tuple(self.safe)
         return (*self.safe, Inside(self.domain, label="the model's domain"))
+
+    @property
+    def starts(self) -> tuple[Region | GaussianStart, ...]:
+        """The initial set, or the members of a union."""
+        return self.initial.members if isinstance(self.initial, StartUnion) else (self.initial,)
 
     @property
     def closed_loop(self) -> Tape:
@@ -144,8 +192,10 @@ class Problem(Shown):
         signals = {"states": self.system.states, "inputs": self.system.input_names}
         signals["disturbances"] = self.system.disturbance_names
         found = [(name, ", ".join(values)) for name, values in signals.items() if values]
-        found.append(("start", "a point" if self.fixed_start else type(self.initial).__name__))
-        return [*found, *(("constraint", constraint.label) for constraint in self.constraints)]
+        starts = ["a point" if start.is_point else type(start).__name__ for start in self.starts]
+        found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))
+        found += [("constraint", constraint.label) for constraint in self.kept]
+        return found if self.reach is None else [*found, ("target", self.reach.label)]
 
     def to_dict(self) -> dict[str, Any]:
         """The content of the problem file that ``cb.save`` writes.
@@ -189,29 +239,53 @@ class Problem(Shown):
             raise TypeError(f"`safe` must be a list of cb.Inside and cb.Outside, got {safe!r}.")
         result = []
         for place, constraint in enumerate(safe):
+            if isinstance(constraint, Reach):
+                raise TypeError(f"`safe[{place}]` must be cb.Inside or cb.Outside, got a target; give it as `reach=`.")
             if type(constraint) not in (Inside, Outside):
                 raise TypeError(f"`safe[{place}]` must be cb.Inside or cb.Outside itself, got {constraint!r}.")
-            _check_dimension(f"safe[{place}]", constraint.region, self.system.dimension)
+            check_dimension(f"safe[{place}]", constraint.region, self.system.dimension)
             if constraint.during is not None:
-                self._check_window(place, constraint.during)
+                self._check_window(f"safe[{place}]", constraint.during)
             result.append(constraint.named(self.system.states))
         return tuple(result)
 
-    def _check_window(self, place: int, window: tuple[float, float]) -> None:
+    def _check_window(self, name: str, window: tuple[float, float]) -> None:
         if window[1] > self.horizon:
             raise ValueError(
-                f"`safe[{place}]` must have `during` within [0, {self.horizon:g}], got {list(window)}; "
+                f"`{name}` must have `during` within [0, {self.horizon:g}], got {list(window)}; "
                 "change the window or the horizon."
             )
         if self.system.time == "discrete" and any(end != int(end) for end in window):
-            raise ValueError(f"`safe[{place}]` must have whole steps in `during`, got {list(window)}; round them.")
+            raise ValueError(f"`{name}` must have whole steps in `during`, got {list(window)}; round them.")
+
+    def _constants(self) -> tuple[str, ...]:
+        names = (self.unknown,) if isinstance(self.unknown, str) else tuple(self.unknown)
+        for name in names:
+            if name not in self.system.disturbance_names:
+                known = nearest(str(name), self.system.disturbance_names)
+                raise ValueError(f"`unknown` must name disturbances of the system, got {name!r}{known}")
+        return names
+
+    def _target(self) -> Reach | None:
+        target: Any = Reach(self.reach) if isinstance(self.reach, Region) else self.reach
+        if target is None:
+            return None
+        if type(target) is not Reach:
+            raise TypeError(f"`reach` must be cb.Reach or a set, got {target!r}.")
+        check_dimension("reach", target.region, self.system.dimension)
+        if target.during is not None:
+            self._check_window("reach", target.during)
+            if target.during[1] <= 0:
+                raise ValueError(f"`reach` must have a time after 0 in `during`, got {list(target.during)}.")
+        named: Reach = target.named(self.system.states)
+        return named
 
     def _domain(self) -> Box | None:
         if self.domain is None:
             return None
         if not isinstance(self.domain, Box) or self.domain.moving or self.domain.coordinates is not None:
             raise TypeError(f"`domain` must be a fixed Box over all states, got {self.domain!r}.")
-        _check_dimension("domain", self.domain, self.system.dimension)
+        check_dimension("domain", self.domain, self.system.dimension)
         return self.domain
 
     def _checked_plan(self) -> Array | Tape | None:
@@ -259,8 +333,8 @@ class Problem(Shown):
             raise ValueError("`cost` must be omitted for a system without inputs.")
         if not isinstance(self.cost, Sequence) or len(self.cost) != 2:
             raise ValueError(f"`cost` must be the pair (Q, R), got {self.cost!r}.")
-        state = _weight("Q", self.cost[0], self.system.dimension, strict=False)
-        return state, _weight("R", self.cost[1], len(self.system.input_names), strict=True)
+        state = checked_weight("Q", self.cost[0], self.system.dimension, strict=False)
+        return state, checked_weight("R", self.cost[1], len(self.system.input_names), strict=True)
 
     def _closed(self) -> Tape:
         system = self.system
@@ -269,59 +343,3 @@ class Problem(Shown):
         inputs = ("t", *system.states, *system.disturbance_names)
         law = {name: (self.plan, place) for place, name in enumerate(system.input_names)}
         return substitute(system.dynamics, inputs, law)
-
-
-def _horizon(value: Any, discrete: bool) -> float | int:
-    horizon = number("horizon", value)
-    if horizon <= 0:
-        raise ValueError(f"`horizon` must be positive, got {horizon:g}.")
-    if discrete:
-        if horizon != int(horizon):
-            raise ValueError(f"`horizon` must be a whole number of steps in discrete time, got {horizon:g}.")
-        return int(horizon)
-    return horizon
-
-
-def _delta(value: Any) -> float:
-    delta = number("delta", value)
-    if not 0 < delta < 1:
-        raise ValueError(f"`delta` must lie in (0, 1), got {delta:g}.")
-    return delta
-
-
-def _check_dimension(name: str, region: Any, dimension: int) -> None:
-    if region.coordinates is not None:
-        if max(region.coordinates) >= dimension:
-            raise ValueError(
-                f"`{name}` must use state indices below {dimension}, got coordinates {region.coordinates}; "
-                "the first state has index 0."
-            )
-    elif region.dimension != dimension:
-        raise ValueError(
-            f"`{name}` must have dimension {dimension} (the states), got {region.dimension}; a set in some of the "
-            "states names them by `coordinates`."
-        )
-
-
-def _start(value: Any, dimension: int) -> Any:
-    kind: Any = type(value)
-    if issubclass(kind, Region | GaussianStart | Mapping | str):
-        if kind is not GaussianStart and not (Region in kind.__bases__ and kind.starts):
-            raise TypeError(f"`initial` must be a point, Box, Ball, Ellipsoid or GaussianStart, got {value!r}.")
-    else:
-        point = vector("initial", value, dimension)
-        value = Box(point, point)
-    start: Any = value
-    if not start.random:
-        if start.moving or start.coordinates is not None:
-            raise ValueError("`initial` must be a fixed set over all states, without `coordinates`.")
-        if not np.all(np.isfinite([start.extent().lo, start.extent().hi])):
-            raise ValueError("`initial` must be bounded, got a set with infinite sides.")
-    if start.dimension != dimension:
-        raise ValueError(f"`initial` must have dimension {dimension} (the states), got {start.dimension}.")
-    return start
-
-
-def _weight(name: str, value: Any, size: int, *, strict: bool) -> Array:
-    matrix = np.diag(vector(name, value, size)) if np.ndim(value) == 1 else value
-    return positive_definite(name, matrix, size, strict=strict)

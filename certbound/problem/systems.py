@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
 from certbound.checks import assign, frozen, matrix, names, number, vector
+from certbound.problem import table_laws  # noqa: F401  (its laws enter the list of laws)
 from certbound.problem.adapters import import_control, is_control_system, is_symbolic, read_model, symbol_names
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.noise import Gaussian, Law, known_laws

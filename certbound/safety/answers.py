@@ -98,6 +98,8 @@ class EngineAnswer:
         What the answer rests on besides the problem (stated constants); empty when nothing.
     foresight : bool
         Whether the probability covers even disturbances that see coming noise; the others are always covered.
+    hit : float or None
+        Where the problem has a target: the one time at which the answer has it met; None where it counts all of them.
     details : Any
         Whatever a certificate needs of the engine.
     conclusive : bool
@@ -119,6 +121,7 @@ class EngineAnswer:
     certified: bool = True
     assumption: str = ""
     foresight: bool = False
+    hit: float | None = None
     details: Any = None
     conclusive: bool = False
 

@@ -8,15 +8,17 @@ schema is docs/certificate.md.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from certbound.errors import CertificateError
+from certbound.problem.goals import met_at
 from certbound.problem.model import Tape
 from certbound.problem.noise import Law, check_law
 from certbound.problem.problem import Problem
+from certbound.problem.sets import Inside, StartUnion
 from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most
 from certbound.safety.portfolio import ENGINES
@@ -63,6 +65,9 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
+    members = [certificate_data(one.problem, one, attempt=attempt) for one in getattr(verdict, "members", ())]
+    if members:
+        return united(problem, members)
     refusals: list[str] = []
     best: tuple[str, Proof] | None = None
     for name, answer in _answers(problem, verdict):
@@ -70,7 +75,7 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
             write = ENGINES[name].write
             if write is None:
                 raise CertificateError("certificates do not state what this engine proves.")
-            found = write(problem, answer, attempt)
+            found = write(problem, answer, attempt) if problem.reach is None else _met(problem, answer, attempt, write)
         except CertificateError as error:
             refusals.append(f"{name}: {error}")
             continue
@@ -83,12 +88,44 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
         return {
             "format": FORMAT,
             "version": VERSION,
-            "claim": {"log10_delta": exact(min(log10, 0.0)), "method": name, "assumptions": assumptions},
+            "claim": {
+                "log10_delta": exact(min(log10, 0.0)),
+                "method": name if problem.reach is None else "reach",
+                "assumptions": assumptions,
+            },
             "problem": problem_data(problem),
             "proof": proof,
         }
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
+
+
+def _met(
+    problem: Problem, answer: EngineAnswer, attempt: int, write: Callable[[Problem, EngineAnswer, int], Proof]
+) -> Proof:
+    """The proof that the target is met at one time."""
+    if answer.hit is None:
+        raise CertificateError("certificates state that a target is met at one time, and this engine counts all times.")
+    proof, log10, assumptions = write(met_at(problem, answer.hit), answer, attempt)
+    return {"engine": "reach", "time": exact(float(answer.hit)), "proof": proof}, log10, assumptions
+
+
+def united(problem: Problem, members: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The certificate of a problem whose start is a union, from those of its members: the largest of their claims.
+
+    CertificateError where a member has none.
+    """
+    if len(members) != len(problem.starts):
+        raise CertificateError("no probability was bounded for every member of the initial union.")
+    levels = [float.fromhex(member["claim"]["log10_delta"]) for member in members]
+    assumed = dict.fromkeys(item for member in members for item in member["claim"]["assumptions"])
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "claim": {"log10_delta": exact(max(levels)), "method": "union", "assumptions": list(assumed)},
+        "problem": problem_data(problem),
+        "proof": {"engine": "union", "members": [member["proof"] for member in members]},
+    }
 
 
 def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineAnswer]]:
@@ -100,7 +137,9 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
     yield from sorted(useful, key=lambda item: (not item[1].certified, item[1].log10_delta))
     for name, row in ENGINES.items():
         asked = verdict.answers.get(name)
-        if row.reserve and row.write and verdict.status == "SAFE" and asked is not None and not asked.applicable:
+        if problem.reach is not None or verdict.status != "SAFE" or asked is None or asked.applicable:
+            continue
+        if row.reserve and row.write:
             answer = row.prove(problem)
             if answer.applicable and answer.log10_delta < 0:
                 yield name, answer
@@ -135,16 +174,18 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "disturbance_set": [] if box is None else _ranges(zip(box.low, box.high)),
         "noise": _noise(system),
         "initial": _initial(problem.initial),
-        "constraints": [
-            {
-                "kind": constraint.word,
-                "region": _region(constraint.region.data(_KINDS)),
-                "during": None if constraint.during is None else exact([float(end) for end in constraint.during]),
-                "label": str(constraint.label),
-            }
-            for constraint in problem.safe
-        ],
+        "constraints": [_constraint(constraint) for constraint in problem.safe],
         "domain": None if problem.domain is None else _ranges(zip(problem.domain.low, problem.domain.high)),
+        **({} if problem.reach is None else {"reach": _constraint(problem.reach)}),
+    }
+
+
+def _constraint(constraint: Inside) -> dict[str, Any]:
+    return {
+        "kind": constraint.word,
+        "region": _region(constraint.region.data(_KINDS)),
+        "during": None if constraint.during is None else exact([float(end) for end in constraint.during]),
+        "label": str(constraint.label),
     }
 
 
@@ -184,6 +225,7 @@ def _noise(system: Any) -> dict[str, Any]:
         "values": exact(np.asarray(getattr(law, law.level), dtype=float)),
         "matrix": exact(np.asarray(system.noise_matrix, dtype=float)),
         **{flag: bool(getattr(law, flag)) for flag in law.flags},
+        **({"tables": {name: exact(getattr(law, name)) for name in law.tables}} if law.tables else {}),
     }
 
 
@@ -191,6 +233,8 @@ _KINDS = ("box", "ball", "ellipsoid", "halfspace", "polytope")  # those that the
 
 
 def _initial(start: Any) -> dict[str, Any]:
+    if isinstance(start, StartUnion):
+        return {"kind": "union", "members": [_initial(member) for member in start.members]}
     data = start.data(_KINDS)
     if data["kind"] == "polytope":  # by a box around it
         around = start.hull()

@@ -9,12 +9,17 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from functools import cached_property
+from typing import Any
 
 from certbound.errors import EngineError, contained
+from certbound.problem.goals import met_at
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
 from certbound.safety.answers import EngineAnswer, Request
 from certbound.safety.falsification import Violation, find_violation
+from certbound.safety.members import worst_verdict
+from certbound.safety.misses import best_time, find_miss, window_of
 from certbound.safety.portfolio import ENGINES, engine_named
 from certbound.safety.verdict import Verdict, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
@@ -40,8 +45,13 @@ def decide(
         method="auto" if method in ENGINES else method, cells=cells, constants=constants, thorough=method != "auto"
     )
     names = _chosen(method)
-    _checked(problem, request)
-    search = _Search(problem, request, watch or current_watch() or Watch())
+    watch = watch or current_watch() or Watch()
+    for start in problem.starts:
+        _checked(problem.replace(initial=start) if len(problem.starts) > 1 else problem, request)
+    if len(problem.starts) > 1:
+        options: dict[str, Any] = {"method": method, "cells": cells, "constants": constants, "watch": watch}
+        return worst_verdict(problem, watch, lambda member: decide(member, **options))
+    search = _Search(problem, request, watch)
     try:
         with search.watch.running():
             violation = search.violation()
@@ -82,7 +92,7 @@ class _Search:
         try:
             with contained("noise-free"):
                 self.watch.poll("noise-free trajectories")
-                return find_violation(self.problem)
+                return find_violation(self.problem) if self.problem.reach is None else find_miss(self.problem)
         except EngineError as error:
             _log.info("no noise-free trajectory was followed: %s", error)
             return None
@@ -155,9 +165,43 @@ class _Search:
         self.watch.poll()
         try:
             with contained(name):
-                return ENGINES[name].prove(self.problem, request)
+                found = request.found
+                asked = replace(request, found=lambda answer: found(self._without(answer)))
+                if self.problem.reach is None or (ENGINES[name].reaches and not self.fixed):
+                    return self._without(ENGINES[name].prove(self.problem, asked))
+                return self._without(self._meeting(name, asked))
         except EngineError as error:
             return EngineAnswer(applicable=False, reason=str(error), method=name)
+
+    def _without(self, answer: EngineAnswer) -> EngineAnswer:
+        """The answer without its lower bound where constants are unknown: it is of disturbances that may change."""
+        return replace(answer, log10_lower=None, conclusive=False) if self.problem.unknown else answer
+
+    @cached_property
+    def fixed(self) -> bool:
+        """Whether the target counts at one time only, so that to meet it then is all that is asked."""
+        first, last = window_of(self.problem)
+        return first == last
+
+    @cached_property
+    def meeting(self) -> tuple[float, Problem]:
+        """A time, and the plain problem of meeting the target then."""
+        time = best_time(self.problem)
+        return time, met_at(self.problem, int(time) if self.problem.system.time == "discrete" else time)
+
+    def _meeting(self, name: str, request: Request) -> EngineAnswer:
+        """What an engine answers about meeting the target at one time: of more than one no lower bound follows."""
+        time, plain = self.meeting
+
+        def of_target(answer: EngineAnswer) -> EngineAnswer:
+            words = f"to be in the target at {time:g} is one way of not failing, and {answer.reason}"
+            reason = words if answer.applicable and not self.fixed else answer.reason
+            if not self.fixed:
+                answer = replace(answer, log10_lower=None, conclusive=False)
+            return replace(answer, hit=time, reason=reason)
+
+        found = request.found
+        return of_target(ENGINES[name].prove(plain, replace(request, found=lambda answer: found(of_target(answer)))))
 
     def verdict(self, names: tuple[str, ...]) -> Verdict:
         """The best answer, and what was left undone."""

@@ -47,11 +47,11 @@ def find_violation(problem: Problem) -> Violation | None:
     """
     flow = Flow(problem)
     rng = np.random.default_rng(0)
-    starts, signals = _candidates(problem, flow, rng)
-    times, paths = _follow(flow, starts, signals)
+    starts, signals = candidates(problem, flow, rng)
+    times, paths = follow(flow, starts, signals)
     deepest: dict[int, tuple[float, float, Inside]] = {}
     for constraint in problem.safe:
-        room = _rooms(constraint, flow, times, paths)
+        room = rooms(constraint, flow, times, paths)
         when = np.argmin(room, axis=1)
         for path in np.flatnonzero(room.min(axis=1) < 0).tolist():
             depth = float(room[path, when[path]])
@@ -60,13 +60,13 @@ def find_violation(problem: Problem) -> Violation | None:
     order = sorted(deepest, key=lambda path: deepest[path][0])
     for path in order[:ATTEMPTS]:
         depth, time, constraint = deepest[path]
-        violation = _proved(problem, starts[path], signals[path], time, constraint, -depth)
+        violation = proved(problem, starts[path], signals[path], time, constraint, -depth)
         if violation is not None:
             return violation
     return None
 
 
-def _rooms(constraint: Inside, flow: Flow, times: Array, paths: Array) -> Array:
+def rooms(constraint: Inside, flow: Flow, times: Array, paths: Array) -> Array:
     """Signed distances of every path to the constraint at every time: (paths, K + 1), inf where nothing is asked."""
     first, last = (0.0, flow.horizon) if constraint.during is None else constraint.during
     usable = np.all(np.isfinite(paths), axis=-1) & (times >= first) & (times <= last)
@@ -78,7 +78,7 @@ def _rooms(constraint: Inside, flow: Flow, times: Array, paths: Array) -> Array:
     return np.where(usable, room, np.inf)
 
 
-def _candidates(problem: Problem, flow: Flow, rng: np.random.Generator) -> tuple[Array, Array]:
+def candidates(problem: Problem, flow: Flow, rng: np.random.Generator) -> tuple[Array, Array]:
     """Starts and constant disturbances: the middles first, then corners, then random ones."""
     start = problem.initial
     starts = np.tile(start.middle, (PATHS, 1)) if start.random else np.asarray(start.sample(rng, PATHS))
@@ -93,7 +93,7 @@ def _candidates(problem: Problem, flow: Flow, rng: np.random.Generator) -> tuple
     return starts, signals
 
 
-def _follow(flow: Flow, starts: Array, signals: Array) -> tuple[Array, Array]:
+def follow(flow: Flow, starts: Array, signals: Array) -> tuple[Array, Array]:
     """Times (K + 1,) and noise-free paths (paths, K + 1, n) in floating point."""
     steps = STEPS if flow.continuous else int(flow.horizon)
     times = np.linspace(0.0, flow.horizon, steps + 1)
@@ -140,7 +140,7 @@ def _affine(flow: Flow, times: Array, rows: Array, signals: Array) -> tuple[Arra
     return powers, h / 6 * (start + 2 * two + 2 * three + four)
 
 
-def _proved(
+def proved(
     problem: Problem, start: Array, signal: Array, time: float, constraint: Inside, depth: float
 ) -> Violation | None:
     """The violation, if the enclosed trajectory shows it."""

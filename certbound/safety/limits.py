@@ -202,7 +202,8 @@ def _widening(problem: Problem, verdict: Verdict, safe: Callable[[Callable[[], P
 
 
 def _wider(problem: Problem, distance: float) -> Problem:
-    """Every constraint and the domain moved outward by ``distance``."""
+    """Every constraint, the domain and the target moved outward by ``distance``."""
     safe = [replace(c, region=c.region.grown(-distance if c.outside else distance)) for c in problem.safe]
     domain = None if problem.domain is None else problem.domain.grown(distance)
-    return problem.replace(safe=safe, domain=domain)
+    target = problem.reach and replace(problem.reach, region=problem.reach.region.grown(distance))
+    return problem.replace(safe=safe, domain=domain, reach=target)

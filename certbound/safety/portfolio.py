@@ -48,6 +48,8 @@ class Engine:
         Asked before all others, quickly: that takes next to nothing.
     dear : bool
         Too slow to be asked a dozen times for what would be SAFE.
+    reaches : bool
+        Whether it takes targets itself; others are asked to meet the target at one time (`certbound.problem.goals`).
     """
 
     name: str
@@ -60,6 +62,7 @@ class Engine:
     again: bool = False
     sketch: bool = False
     dear: bool = False
+    reaches: bool = False
 
 
 ENGINES: dict[str, Engine] = {
@@ -101,6 +104,7 @@ ENGINES: dict[str, Engine] = {
             write=values_proof,
             reserve=True,
             dear=True,
+            reaches=True,
         ),
         Engine(
             name="quadratic",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -80,7 +80,9 @@ class SafeStarts(Shown):
     @property
     def holds_initial(self) -> bool:
         """Whether the problem's initial set lies in it (of a random start: its mean)."""
-        start = self.problem.initial
+        return all(self._holds(start) for start in self.problem.starts)
+
+    def _holds(self, start: Any) -> bool:
         good: Mask = self.cells
         around = Interval.point(start.mean) if start.random else start.hull()
         if not start.random and np.all(around.lo < around.hi):
@@ -210,12 +212,13 @@ def _charted(problem: Problem, answer: EngineAnswer | None, target: float, pictu
     if isinstance(problem.system, DiscreteSystem):
         details = None if answer is None else answer.details
         found = details if isinstance(details, FailureBounds) else bound_failure(problem, delta=target)
-        return chart_failures(problem, share=found.share, times=times)
+        charts = chart_failures(problem, share=found.share, times=times)
+        return replace(charts, lower=()) if problem.unknown else charts
     levels = [math.log10(target)]
     if pictured:
         proved = [] if answer is None else [answer.log10_delta]
         levels += [*_DECADES, *(max(level, _DEEPEST) for level in proved if level < 0)]
-    return chart_exits(problem, levels=levels, times=times, lower=pictured)
+    return chart_exits(problem, levels=levels, times=times, lower=pictured and not problem.unknown)
 
 
 def _threshold(delta: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from certbound.safety.starts import SafeStarts
     from certbound.tubes.constants import Constants
 
+_BADNESS = ("SAFE", "UNKNOWN", "UNSAFE", "UNSAFE_NOMINAL")
 _TAKEN = ("margin", "time", "constraint", "tube", "reach", "constants", "deviation")  # of the best answer
 
 
@@ -57,6 +58,8 @@ class Verdict(Shown):
         no engine has one.
     limits : Limits or None
         What would be SAFE, where that was asked for and the problem is not (`certbound.safety.limits`).
+    members : tuple of Verdict
+        Where the start is a union, the verdict on every member; this one is the worst of them.
     """
 
     status: str
@@ -74,6 +77,12 @@ class Verdict(Shown):
     answers: Mapping[str, EngineAnswer] = field(default_factory=dict, repr=False)
     log10_lower: float | None = None
     limits: Any = None
+    members: tuple[Verdict, ...] = field(default=(), repr=False)
+
+    @property
+    def worst(self) -> Verdict:
+        """Where the start is a union, the verdict on its worst member as a problem of its own; else this one."""
+        return max(self.members, key=lambda one: (_BADNESS.index(one.status), one.log10_delta), default=self)
 
     @cached_property
     def certificate(self) -> dict[str, Any] | None:
@@ -127,14 +136,17 @@ class Verdict(Shown):
 
         if self.problem is None:
             raise ValueError("`problem` must be set for safe starts; verify_safety sets it.")
-        return bound_safe_starts(self.problem, self.answers, delta)
+        problem = self.problem.replace(initial=self.problem.starts[0]) if self.members else self.problem
+        found = bound_safe_starts(problem, self.answers, delta)  # the set is the same for every member of a union
+        return replace(found, problem=self.problem)
 
     def summary(self) -> str:
         """The verdict in one line."""
         asked = "" if self.problem is None else f"{name_text(self.problem.name)}: "
         target = "" if self.problem is None else f", asked {self.problem.delta!r}"
+        failing = "leaving" if self.problem is None else self.problem.failing
         bounds = f"{log10_text(self.log10_delta)}{at_least_text(self.log10_lower)}"
-        return f"{self.status}  {asked}P(leaving) <= {bounds}{target}"
+        return f"{self.status}  {asked}P({failing}) <= {bounds}{target}"
 
     def rows(self) -> list[tuple[str, str]]:
         """Margin, method and reason."""
@@ -248,6 +260,11 @@ def _sentence(text: str) -> str:
 def unsafe(problem: Problem, violation: Violation) -> Verdict:
     when = f"t = {violation.time:.4g}" if problem.system.time == "continuous" else f"step {violation.time:g}"
     start = ", ".join(f"{value:.4g}" for value in violation.start)
+    what = f"breaks '{violation.constraint.label}' at {when}, by {violation.depth:.3g}"
+    if violation.constraint is problem.reach:
+        what = f"does not '{violation.constraint.label}' by {when}, and misses it by {violation.depth:.3g}"
+    elif problem.reach is not None:
+        what = f"breaks '{violation.constraint.label}' at {when}, before it is in the target"
     return Verdict(
         status="UNSAFE_NOMINAL",
         log10_delta=0.0,
@@ -255,8 +272,7 @@ def unsafe(problem: Problem, violation: Violation) -> Verdict:
         time=violation.time,
         constraint=violation.constraint.label,
         reason=(
-            f"without any noise the trajectory from ({start}) breaks '{violation.constraint.label}' at {when}, by "
-            f"{violation.depth:.3g} (proved by intervals)."
+            f"without any noise the trajectory from ({start}) {what} (proved by intervals)."
         ),
         method="noise-free trajectory",
         reach=violation.reach,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.problem.sets import Faces, Quadratic
+from certbound.problem.sets import Faces, Inside, Outside, Quadratic
 from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 
 EXPONENT = 40.0
@@ -89,8 +89,23 @@ def barriers_of(problem: Any, times: Array) -> list[Barrier]:
 
     A window that holds no grid time is watched at the nearest one.
     """
+    return _watched(problem, problem.kept, times)
+
+
+def goal_of(problem: Any, times: Array) -> Barrier | None:
+    """The target of a problem, as an obstacle that a path runs into; None where there is none."""
+    if problem.reach is None:
+        return None
+    target = problem.reach
+    found = _watched(problem, [Outside(target.region, target.during, f"not in time: {target.label}")], times)
+    if not found:
+        raise ValueError(f"the target '{target.label}' has no boundary; leave `reach` out.")
+    return found[0]
+
+
+def _watched(problem: Any, constraints: Sequence[Inside], times: Array) -> list[Barrier]:
     barriers = []
-    for constraint in problem.constraints:
+    for constraint in constraints:
         region, last = constraint.region, len(times) - 1
         start, stop = constraint.during if constraint.during is not None else (times[0], times[-1])
         slack = 1e-9 * max(abs(float(times[-1])), 1.0)

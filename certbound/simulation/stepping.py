@@ -108,7 +108,7 @@ def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
     disturbances = len(tape.inputs) - 1 - system.dimension - inputs
     rows = [] if sequence is None else [_table(sequence, steps)]
     fields: dict[str, Any] = {"dimension": system.dimension}
-    fields |= _disturbance(system, disturbances, steps, scenario)
+    fields |= _disturbance(system, disturbances, steps, scenario, problem.unknown)
     if "row" in fields:
         rows.append(_table(fields.pop("row"), steps))
         inputs, disturbances = inputs + disturbances, 0
@@ -140,12 +140,17 @@ def _unit(law: Law) -> Tape | None:
     return tape
 
 
-def _disturbance(system: Any, count: int, steps: int, scenario: Scenario) -> dict[str, Any]:
+def _disturbance(
+    system: Any, count: int, steps: int, scenario: Scenario, unknown: tuple[str, ...]
+) -> dict[str, Any]:
     choice = scenario.disturbance
     if count == 0:
         if not isinstance(choice, str):
             raise ValueError("`disturbance` must be left out: this system has none.")
         return {}
+    moving = choice == "switching" if isinstance(choice, str) else callable(choice) or np.ndim(choice) > 1
+    if unknown and moving:
+        raise ValueError(f"`disturbance` must be constant: {', '.join(unknown)} is an unknown constant of the problem.")
     box = system.disturbance
     fields: dict[str, Any] = {"low": np.asarray(box.low), "high": np.asarray(box.high)}
     if isinstance(choice, str):

@@ -30,6 +30,7 @@ class Task:
     # largest distance to the associated noise-free path) or ``record`` (store states)
     kind: Literal["exits", "deviation", "record"]
     barriers: Sequence[Barrier] = ()  # constraints of an ``exits`` task
+    goal: Barrier | None = None  # its target, where it has one: a path that never enters it counts in a last row
     norm: Array | None = None  # (rows, n): the deviation s is measured by ‖norm s‖ ...
     directions: Array | None = None  # (rows, n): ... or by the value of each directions . s (with one histogram each)
     # whether each path has a noise-free path of its own (which shares its start and disturbance); otherwise all
@@ -68,9 +69,23 @@ def _exits(task: Task, bridge: Bridge | None, p: Parameters) -> Lines:
         before, during, after = barrier_source(number, barrier, bridge, p, column)
         begin, within, end = begin + before, within + during, end + after
         column += len(barrier.matrix) if barrier.moving else 0
+    if task.goal is not None:
+        number = len(task.barriers)
+        return _until_goal(number, barrier_source(number, task.goal, bridge, p, column), (begin, within, end))
     begin += ["if left >= 0:", "    counts[left, 0] += 1", "    continue"]
     within += ["if left >= 0:", "    counts[left, 1 + k * (counts.shape[1] - 1) // steps] += 1", "    break"]
     return begin, within, end, []
+
+
+def _until_goal(
+    number: int, watch: tuple[list[str], list[str], list[str]], lines: tuple[list[str], list[str], list[str]]
+) -> Lines:
+    """A path ends without failing when it runs into the goal; one that never does fails at the horizon."""
+    begin, within, end = lines[0], lines[1], lines[2] + watch[2]
+    begin += ["if left >= 0:", "    counts[left, 0] += 1", "    continue", *watch[0], "if left >= 0:", "    continue"]
+    within += ["if left >= 0:", "    counts[left, 1 + k * (counts.shape[1] - 1) // steps] += 1", "    break"]
+    within += [*watch[1], "if left >= 0:", "    break"]
+    return begin, within, end, ["if left < 0:", f"    counts[{number}, counts.shape[1] - 1] += 1"]
 
 
 def _record(task: Task, dimension: int, bridge: Bridge | None, p: Parameters) -> Lines:

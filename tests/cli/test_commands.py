@@ -12,6 +12,7 @@ import pytest
 
 import certbound as cb
 from certbound.cli.app import app, run
+from certbound.cli.starters import STARTERS
 
 VERIFY_KEYS = {
     "status", "log10_delta", "log10_lower", "delta", "margin", "time", "constraint", "reason", "method", "constants",
@@ -183,7 +184,25 @@ def test_a_new_file_loads_and_is_never_overwritten(
     assert "exists already" in refusal(capsys, "new", "my_system")
     assert Path(found["path"]).read_text() == before
     assert "letters, digits" in refusal(capsys, "new", "two words")
-    assert [path.name for path in tmp_path.iterdir()] == ["my_system.toml"]
+    assert {path.name for path in tmp_path.iterdir()} == {"my_system.toml", "problem.schema.json"}
+    assert before.splitlines()[0] == "#:schema problem.schema.json"
+    schema = json.loads((tmp_path / "problem.schema.json").read_text())
+    assert {"dynamics", "initial", "stay", "avoid", "reach", "noise"} <= schema["properties"].keys()
+    assert schema["additionalProperties"] is False
+    assert {"law", "std", "probabilities", "independent"} <= schema["$defs"]["Noise"]["properties"].keys()
+
+
+@pytest.mark.parametrize("example", STARTERS)
+def test_every_example_is_a_problem_that_is_verified(
+    example: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, found = answer(capsys, "new", f"my_{example}", "--example", example)
+    assert code == 0
+    assert cb.load(found["path"]).name == f"my {example}"
+    code, found = answer(capsys, "verify", found["path"])
+    assert (code, found["status"]) == (0, "SAFE")
+    assert "must be one of pendulum, " in refusal(capsys, "new", "other", "--example", "none")
 
 
 def test_the_doctor_reports_every_dependency(capsys: pytest.CaptureFixture[str]) -> None:

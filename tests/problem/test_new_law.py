@@ -1,4 +1,4 @@
-"""A noise law is added by its class and its row in the checker: the triangular law, defined here, does all the rest."""
+"""A noise law is added by its class and its row in the checker: the arc sine law, defined here, does all the rest."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import kstest, triang
+from scipy.special import i0
+from scipy.stats import arcsine, kstest
 
 import certbound as cb
 from certbound.checker import check_data, parse
@@ -22,42 +23,42 @@ from certbound.values.discrete.shocks import Inapplicable, shocks_of
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Triangular(BoxLaw):
-    """Independent entries with the density (h_i - |w|)/h_i^2 on [-h_i, h_i].
+class ArcSine(BoxLaw):
+    """Independent entries h_i sin(phase) with a phase that is uniform: the density is 1/(pi sqrt(h_i^2 - w^2)).
 
-    Each is the sum of two independent ones, uniform on [-h_i/2, h_i/2], whose proxies h_i^2/12 add.
+    E exp(l w) = I_0(l h) = sum of (l h/2)^(2k)/k!^2 <= exp(l^2 h^2/4), so that h^2/2 is a proxy: the variance.
     """
 
     halfwidth: Any
 
-    name = "triangular"
+    name = "arcsine"
     levels = ("halfwidth",)
     variate = "uniform"
 
     @property
     def proxy(self) -> np.ndarray:
-        return np.nextafter(super().proxy / 6, np.inf) * (super().proxy > 0)
+        return super().proxy / 2
 
     def unit(self, v):
-        return np.sign(v) * (1 - np.sqrt(1 - np.abs(v)))
+        return np.sin(0.5 * np.pi * v)
 
 
-ROW = laws.Law(levels=("halfwidth",), proxies=lambda squares, data: [square / 6 for square in squares])
+ROW = laws.Law(levels=("halfwidth",), proxies=lambda squares, data: [square / 2 for square in squares])
 """The checker's row: what it proves itself."""
 
 
 @pytest.fixture
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(laws.LAWS, "triangular", ROW)
+    monkeypatch.setitem(laws.LAWS, "arcsine", ROW)
 
 
-del LAWS["triangular"]  # for other tests there is no such law
+del LAWS["arcsine"]  # for other tests there is no such law
 
 
 @pytest.fixture(autouse=True)
 def _registered() -> Iterator[None]:
     before = dict(LAWS)
-    LAWS["triangular"] = Triangular
+    LAWS["arcsine"] = ArcSine
     yield
     LAWS.clear()
     LAWS.update(before)
@@ -70,15 +71,15 @@ def walk(law: Law, states: int = 1, horizon: int = 10, delta: float = 0.2) -> cb
 
 
 def test_its_proxy_bounds_the_moment_generating_function():
-    h, proxy = 0.7, Triangular(halfwidth=0.7).resolve(1).proxy[0, 0]
+    h, proxy = 0.7, ArcSine(halfwidth=0.7).resolve(1).proxy[0, 0]
     slopes = np.linspace(0.01, 60, 400)
-    assert np.all(2 * np.log(np.sinh(slopes * h / 2) / (slopes * h / 2)) <= proxy * slopes**2 / 2)
-    assert proxy == pytest.approx(h**2 / 6, rel=1e-15)
+    assert np.all(np.log(i0(slopes * h)) <= proxy * slopes**2 / 2)
+    assert proxy == pytest.approx(h**2 / 2, rel=1e-15)
 
 
 @pytest.mark.parametrize("compiled", [False, True])
 def test_it_is_drawn_by_numpy_and_in_kernels_as_its_class_says(compiled):
-    law, h = Triangular(halfwidth=[0.5, 0.2]), np.array([0.5, 0.2])
+    law, h = ArcSine(halfwidth=[0.5, 0.2]), np.array([0.5, 0.2])
     if compiled:
         system = cb.DiscreteSystem(lambda x: 0 * x, states=2, noise=law)
         everywhere = [cb.Inside(cb.Box([-9, -9], [9, 9]))]
@@ -89,42 +90,42 @@ def test_it_is_drawn_by_numpy_and_in_kernels_as_its_class_says(compiled):
     assert np.all(np.abs(draws) <= h)
     assert abs(np.corrcoef(draws.T)[0, 1]) < 0.02
     for entry, width in zip(draws.T, h):
-        assert kstest(entry, triang(0.5, loc=-width, scale=2 * width).cdf).pvalue > 1e-3
+        assert kstest(entry, arcsine(loc=-width, scale=2 * width).cdf).pvalue > 1e-3
 
 
 @pytest.mark.parametrize("method", ["linear", "constants"])
 def test_its_certified_bound_lies_above_its_simulation_and_is_proved_again(known, method):
-    problem = walk(Triangular(halfwidth=0.5))
+    problem = walk(ArcSine(halfwidth=0.3))
     verdict = cb.verify_safety(problem, method=method)
     exits = cb.simulate_exits(problem, paths=100_000, rng=2)
     rare = simulate_rare_exits(problem, rng=3)
     assert 0 < max(exits.lower, rare.lower) < 10**verdict.log10_delta < 1
-    assert verdict.log10_delta < cb.verify_safety(walk(cb.Bounded(halfwidth=0.5)), method=method).log10_delta
+    assert verdict.log10_delta < cb.verify_safety(walk(cb.Bounded(halfwidth=0.3)), method=method).log10_delta
     result = check_data(parse(verdict.certificate_text(problem)))
     assert result.valid, result.reason
     assert exits.lower < 10**result.log10_proved < 1
 
 
 def test_it_is_saved_and_loaded_under_its_name(tmp_path):
-    save(walk(Triangular(halfwidth=[0.5, 0.2]), states=2), tmp_path / "walk.toml")
+    save(walk(ArcSine(halfwidth=[0.5, 0.2]), states=2), tmp_path / "walk.toml")
     loaded = load(tmp_path / "walk.toml").system.noise
-    assert isinstance(loaded, Triangular)
+    assert isinstance(loaded, ArcSine)
     np.testing.assert_array_equal(loaded.halfwidth, [0.5, 0.2])
-    assert 'law = "triangular"' in (tmp_path / "walk.toml").read_text()
+    assert 'law = "arcsine"' in (tmp_path / "walk.toml").read_text()
 
 
 def test_without_a_row_the_checker_refuses_it():
-    problem = walk(Triangular(halfwidth=0.1))
+    problem = walk(ArcSine(halfwidth=0.1))
     text = cb.verify_safety(problem, method="linear").certificate_text
-    with pytest.raises(CertificateError, match=r"`problem\.noise\.law` must be one of gaussian, .*got 'triangular'"):
+    with pytest.raises(CertificateError, match=r"`problem\.noise\.law` must be one of gaussian, .*got 'arcsine'"):
         check_data(parse(text(problem)))
 
 
 def test_the_row_alone_decides_what_is_proved(known, monkeypatch):
-    problem = walk(Triangular(halfwidth=0.5))
+    problem = walk(ArcSine(halfwidth=0.3))
     data = parse(cb.verify_safety(problem, method="linear").certificate_text(problem))
     worse = laws.Law(levels=("halfwidth",), proxies=lambda squares, data: squares)
-    monkeypatch.setitem(laws.LAWS, "triangular", worse)
+    monkeypatch.setitem(laws.LAWS, "arcsine", worse)
     assert not check_data(data).valid
     data["problem"]["noise"]["independent"] = True
     with pytest.raises(CertificateError, match="unknown entry `independent`"):
@@ -132,8 +133,8 @@ def test_the_row_alone_decides_what_is_proved(known, monkeypatch):
 
 
 def test_value_functions_say_that_they_do_not_apply():
-    with pytest.raises(Inapplicable, match=r"exactly Gaussian or uniform so far.*got Triangular"):
-        shocks_of(Triangular(halfwidth=0.1).resolve(1), np.eye(1))
+    with pytest.raises(Inapplicable, match=r"exactly Gaussian or uniform so far.*got ArcSine"):
+        shocks_of(ArcSine(halfwidth=0.1).resolve(1), np.eye(1))
 
 
 def test_what_a_law_lacks_is_said_when_its_class_is_defined():
@@ -159,7 +160,7 @@ def test_what_a_law_lacks_is_said_when_its_class_is_defined():
     ],
 )
 def test_a_law_that_cannot_be_drawn_is_not_simulated(facts, error, message):
-    made: Any = type("Vague", (Triangular,), {"name": "vague", **facts})
+    made: Any = type("Vague", (ArcSine,), {"name": "vague", **facts})
     with pytest.raises(error, match=message):
         cb.simulate_exits(walk(made(halfwidth=0.1)), paths=10, rng=0)
 

@@ -95,7 +95,7 @@ def test_a_wrong_proposal_is_not_believed(monkeypatch):
     """The sampled path is off by 0.6 and seems to leave; its enclosure shows that it does not."""
     from certbound.safety import falsification
 
-    honest = falsification._follow
+    honest = falsification.follow
     calls = []
 
     def lying(*arguments):
@@ -103,7 +103,7 @@ def test_a_wrong_proposal_is_not_believed(monkeypatch):
         calls.append(1)
         return times, paths + 0.6
 
-    monkeypatch.setattr(falsification, "_follow", lying)
+    monkeypatch.setattr(falsification, "follow", lying)
     assert find_violation(drift([Inside(HalfSpace([1.0, 0.0], 2.5))])) is None
     assert calls
 
@@ -121,10 +121,10 @@ def test_affine_dynamics_are_followed_as_step_by_step(time: str, monkeypatch: py
         system, initial=Box([-1, -1], [1, 0]), safe=[Inside(Box([-90, -90], [90, 90]))], horizon=6, plan=plan
     )
     flow = Flow(problem)
-    starts, signals = falsification._candidates(problem, flow, np.random.default_rng(0))
-    times, whole = falsification._follow(flow, starts, signals)
+    starts, signals = falsification.candidates(problem, flow, np.random.default_rng(0))
+    times, whole = falsification.follow(flow, starts, signals)
     monkeypatch.setattr(falsification, "_WHOLE", -1)
-    again, single = falsification._follow(flow, starts, signals)
+    again, single = falsification.follow(flow, starts, signals)
     assert np.array_equal(times, again)
     assert np.abs(single).max() > 1
     assert np.allclose(whole, single, rtol=1e-12, atol=1e-12)
@@ -133,5 +133,5 @@ def test_affine_dynamics_are_followed_as_step_by_step(time: str, monkeypatch: py
 def test_what_jumps_is_not_followed_as_affine() -> None:
     system = DiscreteSystem(lambda x: [0.5 * x[0] + np.sign(x[0] - 1.0)], states=1, noise=Gaussian(std=0.01))
     flow = Flow(Problem(system, initial=[3.0], safe=[Inside(Box([-9.0], [9.0]))], horizon=2))
-    paths = falsification._follow(flow, np.array([[3.0]]), np.zeros((1, 0)))[1]
+    paths = falsification.follow(flow, np.array([[3.0]]), np.zeros((1, 0)))[1]
     assert paths[0, :, 0] == pytest.approx([3.0, 2.5, 2.25])

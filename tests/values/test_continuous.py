@@ -496,7 +496,7 @@ def test_noise_in_some_coordinates_only_is_refused() -> None:
 
 def test_bad_arguments_are_named() -> None:
     problem = line_problem(lambda x: [-x[0]], 0.4, -1.0, 1.0, 1.0, (0.0, 0.0))
-    with pytest.raises(InfeasibleError, match="targets"):
+    with pytest.raises(InfeasibleError, match="on one side of the target"):
         bound_exits(problem, target=cb.Box([0], [1]))
     with pytest.raises(ValueError, match="`seconds` must be positive"):
         bound_exits(problem, seconds=0)

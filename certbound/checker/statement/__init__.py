@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from certbound.checker.statement.comparison import first_difference
 from certbound.checker.statement.partition import cells_of
-from certbound.checker.statement.problem import Model, read_model
+from certbound.checker.statement.problem import Model, met_at, read_model
 from certbound.checker.statement.rooms import Grid, demands, round_demands
 from certbound.checker.statement.safe_set import SafeSet, StepSet
 from certbound.checker.statement.structure import Structure, structure_of
@@ -14,6 +14,7 @@ __all__ = [
     "demands",
     "first_difference",
     "Grid",
+    "met_at",
     "Model",
     "read_model",
     "round_demands",

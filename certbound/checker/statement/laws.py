@@ -5,14 +5,17 @@ A row trusts nothing that a certificate or the prover says of the law but its na
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from flint import arb
 
 from certbound.checker.reading import Record
+from certbound.errors import CertificateError
 
 Squares = list[arb]
+_SUM = arb(2) ** -39
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -20,12 +23,14 @@ class Law:
     """What is proved of a law: E exp(l.w) <= exp(sum p_i l_i^2 / 2) for every l, given the past.
 
     It is given by one of ``levels``. ``proxies`` finds the p_i from the squared levels of the entries (a variance is
-    one already, and a covariance stands as it is) and from the law's data, if it has ``flags``, true or false.
+    one already, and a covariance stands as it is) and from the law's data, if it has ``flags``, true or false, or
+    ``tables``.
     """
 
     levels: tuple[str, ...]
     proxies: Callable[[Squares, Record], Squares]
     flags: tuple[str, ...] = ()
+    tables: tuple[str, ...] = ()  # lists of numbers, under ``tables``
     gaussian: bool = False  # exactly normal
 
 
@@ -38,6 +43,28 @@ def _bounded(squares: Squares, data: Record) -> Squares:
     return squares if data.flag("independent") else [sum(squares[1:], squares[0])] * len(squares)
 
 
+def _tabled(places: str, more: int) -> Callable[[Squares, Record], Squares]:
+    """Hoeffding's lemma for a law about its mean: a quarter of the squared range, in units of the scale.
+
+    ``places`` names the table of its values or edges, which has ``more`` entries than that of the probabilities.
+    """
+
+    def proxies(squares: Squares, data: Record) -> Squares:
+        tables = Record(data["tables"], data.at("tables"), (places, "probabilities"))
+        weights = tables.array("probabilities", None)
+        values = tables.array(places, len(weights) + more)
+        if not weights or any(weight < 0 for weight in weights):
+            raise CertificateError(f"`{tables.at('probabilities')}` must not be empty or negative.")
+        if not abs(sum(map(arb, weights), arb(0)) - 1) <= _SUM:
+            raise CertificateError(f"`{tables.at('probabilities')}` must sum to 1.")
+        if any(b <= a for a, b in itertools.pairwise(values)):
+            raise CertificateError(f"`{tables.at(places)}` must rise.")
+        square = (arb(values[-1]) - arb(values[0])) ** 2 / 4
+        return [entry * square for entry in squares]
+
+    return proxies
+
+
 LAWS = {
     # E exp(l.w) = exp(l' S l / 2): S is the covariance
     "gaussian": Law(levels=("std", "variance", "covariance"), proxies=_as_they_are, gaussian=True),
@@ -47,5 +74,9 @@ LAWS = {
     "uniform": Law(levels=("halfwidth",), proxies=lambda squares, data: [square / 3 for square in squares]),
     # cosh(x) <= exp(x^2/2)
     "rademacher": Law(levels=("scale",), proxies=_as_they_are),
+    # the sum of two uniform ones
+    "triangular": Law(levels=("halfwidth",), proxies=lambda squares, data: [square / 6 for square in squares]),
+    "discrete": Law(levels=("scale",), proxies=_tabled("values", 0), tables=("values", "probabilities")),
+    "histogram": Law(levels=("scale",), proxies=_tabled("edges", 1), tables=("edges", "probabilities")),
     "bounded": Law(levels=("halfwidth",), proxies=_bounded, flags=("independent",)),
 }

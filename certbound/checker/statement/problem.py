@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from flint import arb, arb_mat
 
@@ -77,6 +77,8 @@ class Model:
     constraints: tuple[Constraint, ...]
     domain: list[tuple[float | None, float | None]] | None
     states: tuple[str, ...] = field(default=())
+    target: Constraint | None = None  # then a path fails that breaks a constraint before it is there, or never is
+    members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
     @property
     def dimension(self) -> int:
@@ -102,7 +104,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     CertificateError where a field is missing, has the wrong size, or makes no sense; Unproved where it is too large for
     the budget.
     """
-    record = Record(value, path, _FIELDS)
+    record = Record(value, path, _FIELDS, ("reach",))
     time = record["time"]
     if time not in ("continuous", "discrete"):
         raise CertificateError(f"`{path}.time` must be \"continuous\" or \"discrete\".")
@@ -121,6 +123,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         read_constraint(item, f"{path}.constraints[{index}]", n, horizon, budget)
         for index, item in enumerate(record.items("constraints", 0, 1000))
     ]
+    initial, members = _starts(record["initial"], path + ".initial", n, budget)
     if domain is not None:
         budget.hold(n * n // 4 + 1)
         constraints.append(Constraint.of_domain(domain))
@@ -129,8 +132,8 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         plan=_plan(record, len(inputs), continuous, horizon), states=states,
         disturbance=_disturbance(record, len(disturbances)),
         noise=_noise(record["noise"], path + ".noise", states, time, budget),
-        initial=_initial(record["initial"], path + ".initial", n, budget), constraints=tuple(constraints),
-        domain=domain,
+        initial=initial, members=members, target=_target(record, n, horizon, budget),
+        constraints=tuple(constraints), domain=domain,
     )
 
 
@@ -187,7 +190,8 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
     if name not in LAWS:
         raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {name[:40]!r}.")
     law = LAWS[name]
-    record = Record(value, path, ("law", "level", "values", "matrix", *law.flags))
+    tables = ("tables",) if law.tables else ()
+    record = Record(value, path, ("law", "level", "values", "matrix", *law.flags, *tables))
     rows = _same_length(record.array("matrix", n, None), path)
     proxy = _proxy(record, law, len(rows[0]), budget)
     return Noise(diffusion=matrix(rows), proxy=proxy, gaussian=law.gaussian)
@@ -231,6 +235,53 @@ def _semidefinite(a: arb_mat, path: str, budget: Budget) -> arb_mat:
     if not is_positive_definite(scaled + diagonal([_SLACK] * len(kept)), budget):
         raise CertificateError(f"`{path}` must be positive semidefinite.")
     return a + diagonal([value * _SLACK for value in variances])
+
+
+def _target(record: Record, n: int, horizon: float, budget: Budget) -> Constraint | None:
+    if "reach" not in record.value:
+        return None
+    return read_constraint(record["reach"], record.at("reach"), n, horizon, budget, ("reach",))
+
+
+def met_at(model: Model, time: float) -> Model:
+    """The problem of keeping the constraints up to a time of the target's window, and of being in the target then.
+
+    It is one way of not failing. Constraints that begin later are dropped, the others end with that time.
+
+    CertificateError where the time is none of the window, or the plan is an array over a longer time.
+    """
+    target = model.target
+    assert target is not None
+    first, last = target.during or (0.0, model.horizon)
+    if not (first <= time <= last and time > 0) or (not model.continuous and time != int(time)):
+        raise CertificateError("`proof.time` must be a time of the target's window, after 0.")
+    plan = model.plan
+    if plan is not None and time != model.horizon:
+        if model.continuous:
+            raise CertificateError("`proof.time` must be the horizon where the plan is an array.")
+        plan = plan[: int(time)]
+    kept = []
+    for constraint in model.constraints:
+        begin, end = constraint.during or (0.0, model.horizon)
+        if begin <= time:
+            whole = constraint.during is None
+            kept.append(replace(constraint, during=None if whole else (begin, min(end, time))))
+    due = replace(target, during=(time, time))
+    number = len(kept) if model.domain is None else len(kept) - 1  # the domain stands last
+    return replace(model, horizon=time, plan=plan, target=None, constraints=(*kept[:number], due, *kept[number:]))
+
+
+def _starts(value: object, path: str, n: int, budget: Budget) -> tuple[Initial, tuple[Initial, ...]]:
+    """The start, and the members of one that is a union."""
+    if not isinstance(value, dict) or value.get("kind") != "union":
+        return _initial(value, path, n, budget), ()
+    rows = Record(value, path, ("kind", "members")).items("members", 2, 1000)
+    members = tuple(_initial(row, f"{path}.members[{index}]", n, budget) for index, row in enumerate(rows))
+    if any(member.covariance is not None for member in members):
+        raise CertificateError(f"`{path}.members` must be sets, not random starts.")
+    low = tuple(min(member.low[j].lower() for member in members) for j in range(n))
+    high = tuple(max(member.high[j].upper() for member in members) for j in range(n))
+    return Initial(kind="box", low=low, high=high), members
 
 
 def _initial(value: object, path: str, n: int, budget: Budget) -> Initial:

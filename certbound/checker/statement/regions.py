@@ -166,11 +166,14 @@ def _sides(low: list[float | None], high: list[float | None]) -> tuple[list[list
     return faces, bounds
 
 
-def read_constraint(value: object, path: str, dimension: int, horizon: float, budget: Budget) -> Constraint:
-    """One constraint of a certificate."""
+def read_constraint(
+    value: object, path: str, dimension: int, horizon: float, budget: Budget,
+    kinds: tuple[str, ...] = ("inside", "outside"),
+) -> Constraint:  # fmt: skip
+    """One constraint of a certificate, or its target."""
     record = Record(value, path, ("kind", "region", "during", "label"))
-    if record["kind"] not in ("inside", "outside"):
-        raise CertificateError(f"`{path}.kind` must be \"inside\" or \"outside\".")
+    if record["kind"] not in kinds:
+        raise CertificateError(f"`{path}.kind` must be " + " or ".join(f'"{kind}"' for kind in kinds) + ".")
     during = None
     if record["during"] is not None:
         first, last = numbers(record["during"], record.at("during"), 2)
@@ -179,7 +182,7 @@ def read_constraint(value: object, path: str, dimension: int, horizon: float, bu
         during = (first, last)
     region = _region(record["region"], record.at("region"), dimension, budget)
     return Constraint(
-        inside=record["kind"] == "inside", region=region, during=during,
+        inside=record["kind"] != "outside", region=region, during=during,
         label=text(record["label"], record.at("label"), 1000),
     )  # fmt: skip
 

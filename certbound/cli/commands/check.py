@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -90,6 +91,8 @@ def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float]
     probability, or the checker did not prove what was written. ``checking`` takes the seconds of every check.
     """
     spent = [] if checking is None else checking
+    if verdict.members:
+        return _united(problem, verdict, spent)
     left, reasons = dict(verdict.answers), list[str]()
     while left:
         try:
@@ -106,6 +109,22 @@ def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float]
     if not reasons:
         raise CertificateError(f"no probability was bounded that a certificate could state: {verdict.reason}")
     raise CertificateError(f"no certificate could be proved again by the checker: {' '.join(reasons)}")
+
+
+def _united(problem: Problem, verdict: Verdict, spent: list[float]) -> str:
+    """The certificate of a union of starts, from those of its members, proved again as a whole."""
+    from certbound.checker import check_data, parse
+    from certbound.safety.certificate import problem_data, united
+
+    members = [parse(proved_certificate(one.problem, one, spent)) for one in verdict.members if one.problem is not None]
+    text = json.dumps(united(problem, members), separators=(",", ":")) + "\n"
+    poll("checking the certificate")
+    begun = time.perf_counter()
+    report = check_data(parse(text), problem_data(problem), allow_assumptions=True)
+    spent.append(time.perf_counter() - begun)
+    if not report.valid:
+        raise CertificateError(f"no certificate could be proved again by the checker: {report.reason}")
+    return text
 
 
 def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[str | None, str, str]:

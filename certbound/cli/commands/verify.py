@@ -155,7 +155,10 @@ def _limits(verdict: Verdict, cells: int | None, clock: Clock) -> dict[str, Any]
 def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | None, plot: Path | None) -> None:
     if plot is None and report is None:
         return
-    title = f"{name_text(problem.name)}: {verdict.status}, P(exit) <= {log10_text(verdict.log10_delta)}"
+    if verdict.reach is not None and verdict.members:  # the picture is of the worst member
+        verdict = verdict.worst
+        problem = verdict.problem or problem
+    title = f"{name_text(problem.name)}: {verdict.status}, P({problem.failing}) <= {log10_text(verdict.log10_delta)}"
     with spinner("looking for what can be drawn"):
         shown = (
             values_of(problem, verdict)
@@ -212,7 +215,7 @@ def _print(problem: Problem, result: dict[str, Any]) -> None:
     unit = "s" if problem.system.time == "continuous" else "steps"
     print_status(screen, result["status"])
     screen.print(
-        f"{name_text(problem.name)}: P(leaving within {problem.horizon:g} {unit}) <= "
+        f"{name_text(problem.name)}: P({problem.failing} within {problem.horizon:g} {unit}) <= "
         f"{log10_text(result['log10_delta'])}{at_least_text(result['log10_lower'])}, asked {result['delta']!r}",
         markup=False,
     )

@@ -15,7 +15,7 @@ from certbound.checks import nearest
 from certbound.problem import sets
 from certbound.problem.files.parser import CONSTANTS, constant, is_function, parse
 from certbound.problem.files.plans import read_plan
-from certbound.problem.files.schema import Constraint, Specification, Start
+from certbound.problem.files.schema import Constraint, Cost, Part, PolygonTable, Specification, Start
 from certbound.problem.model import OPERATIONS, Graph, Tape
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
@@ -46,7 +46,7 @@ class _Reader:
         self.states = checked_names("states", spec.states, RESERVED)
         self.inputs = checked_names("inputs", list(spec.inputs), {*RESERVED, *self.states})
         taken = {*RESERVED, *self.states, *self.inputs}
-        self.disturbances = checked_names("disturbances", list(spec.disturbances), taken)
+        self.disturbances = checked_names("disturbances", [*spec.disturbances, *spec.uncertain], taken)
         taken |= set(self.disturbances)
         self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
         self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
@@ -55,16 +55,18 @@ class _Reader:
     def problem(self, source: Mapping[str, Any] | None) -> Problem:
         spec = self.spec
         system = self.system()
-        safe = [self.constraint(sets.Inside, entry, f"stay.{k}") for k, entry in enumerate(spec.stay)]
+        safe = [one for k, entry in enumerate(spec.stay) for one in self.stays(entry, f"stay.{k}")]
         safe += [self.constraint(sets.Outside, entry, f"avoid.{k}") for k, entry in enumerate(spec.avoid)]
+        targets = [self.constraint(sets.Reach, entry, f"reach.{k}") for k, entry in enumerate(spec.reach)]
         return Problem(
             system,
-            initial=self.start(spec.initial),
-            safe=safe,
+            initial=self.starts(spec.initial),
+            safe=safe, unknown=list(spec.uncertain),
+            reach=targets[0] if targets else None,
             horizon=self.number(spec.horizon, "horizon"),
             delta=self.number(spec.delta, "delta"),
             plan=self.plan(),
-            cost=None if spec.cost is None else (self.weight("Q"), self.weight("R")),
+            cost=None if spec.cost is None else self.weights(spec.cost),
             domain=None if spec.domain is None else self.box(spec.domain.box, "domain.box", np.inf),
             name=spec.name,
             parameters=self.parameters,
@@ -151,7 +153,7 @@ class _Reader:
         options: dict[str, Any] = {
             "states": self.states,
             "inputs": self.signal(spec.inputs, "inputs"),
-            "disturbance": self.signal(spec.disturbances, "disturbances"),
+            "disturbance": self.signal({**spec.disturbances, **spec.uncertain}, "disturbances"),
             "input_names": self.inputs or None,
             "disturbance_names": self.disturbances or None,
         }
@@ -216,6 +218,9 @@ class _Reader:
             )
         build, entries = LAWS[table.law], dict(table.model_extra or {})
         flags = {key: entries.pop(key) for key in list(entries) if any(key in law.flags for law in LAWS.values())}
+        tables = {key: self.array(entries.pop(key), f"noise.{key}") for key in build.tables if key in entries}
+        if not entries and build.tables:
+            entries = {build.levels[0]: 1.0}
         if len(entries) != 1 or not entries.keys() <= set(build.levels):
             raise ValueError(
                 f"`noise` with law {table.law!r} needs exactly one of {', '.join(build.levels)}; "
@@ -224,7 +229,7 @@ class _Reader:
         for flag in flags.keys() - set(build.flags):
             raise ValueError(f"`noise.{flag}` must be omitted for law {table.law!r}.")
         level = {key: self.array(value, f"noise.{key}") for key, value in entries.items()}
-        result: dict[str, Any] = {"noise": build(**level, **flags)}
+        result: dict[str, Any] = {"noise": build(**level, **tables, **flags)}
         if table.matrix is not None:
             result["noise_matrix"] = self.matrix(table.matrix, "noise.matrix")
         return result
@@ -253,8 +258,8 @@ class _Reader:
             raise ValueError(f"`plan.file` must be a file in the problem file's folder, got {value!r}.")
         return self.folder / path
 
-    def weight(self, name: str) -> Array:
-        return self.matrix(getattr(self.spec.cost, name), f"cost.{name}")
+    def weights(self, cost: Cost) -> tuple[Array, Array]:
+        return self.matrix(cost.Q, "cost.Q"), self.matrix(cost.R, "cost.R")
 
     def place(self, table: Any, where: str) -> tuple[Any, tuple[int, ...] | None]:
         """A centre (a tape where it moves), and the coordinates that it is in."""
@@ -278,25 +283,33 @@ class _Reader:
             low[index], high[index] = pair
         return sets.Box(low, high, center=center)
 
-    def start(self, table: Start) -> Any:
+    def starts(self, tables: Start | list[Start]) -> Any:
+        if isinstance(tables, Start):
+            return self.start(tables, "initial")
+        found = [self.start(table, f"initial.{k}") for k, table in enumerate(tables)]
+        points = [sets.Box(start, start) if isinstance(start, list) else start for start in found]
+        return points if len(points) > 1 else points[0]
+
+    def start(self, table: Start, where: str) -> Any:
+        where = f"{where}.{table.chosen}"
         match table.chosen:
             case "point":
-                values, coordinates = self.by_state(table.point, "initial.point")
-                return self.array(self._ordered(values, coordinates, "initial.point"), "initial.point")
+                values, coordinates = self.by_state(table.point, where)
+                return self.array(self._ordered(values, coordinates, where), where)
             case "box":
-                return self.box(table.box, "initial.box", None)
+                return self.box(table.box, where, None)
             case "gaussian":
                 assert table.gaussian is not None
-                mean = self.array(table.gaussian.mean, "initial.gaussian.mean")
-                covariance = self.matrix(table.gaussian.covariance, "initial.gaussian.covariance")
+                mean = self.array(table.gaussian.mean, f"{where}.mean")
+                covariance = self.matrix(table.gaussian.covariance, f"{where}.covariance")
                 return sets.GaussianStart(mean, covariance)
-        region = self.shape(getattr(table, table.chosen), table.chosen, f"initial.{table.chosen}")
+        region = self.shape(getattr(table, table.chosen), table.chosen, where)
         if region.moving:
-            raise ValueError(f"`initial.{table.chosen}` must not move with t.")
+            raise ValueError(f"`{where}` must not move with t.")
         if region.coordinates is not None:
             order = np.argsort(region.coordinates)
             if len(order) != len(self.states):
-                raise ValueError(f"`initial.{table.chosen}` must give every state.")
+                raise ValueError(f"`{where}` must give every state.")
             shape = {} if table.ellipsoid is None else {"shape": region.shape[np.ix_(order, order)]}
             return replace(region, center=region.center[order], coordinates=None, **shape)
         return region
@@ -327,11 +340,40 @@ class _Reader:
                 fields[name] = self.number(value, place)
         return _SHAPES[kind](**fields)
 
+    def stays(self, table: Constraint, where: str) -> list[Any]:
+        """Staying in an intersection is staying in each of its parts."""
+        during = None if table.during is None else self.array(table.during, f"{where}.during")
+        return [sets.Inside(part, during=during, label=table.label) for part in self.parts(table, where)]
+
     def constraint(self, kind: Callable[..., Any], table: Constraint, where: str) -> Any:
         during = None if table.during is None else self.array(table.during, f"{where}.during")
-        return kind(self.region(table, f"{where}.{table.chosen}"), during=during, label=table.label)
+        whole, outward = table.all is not None, kind is sets.Outside
+        parts = self.parts(table, where, outward=outward)
+        region = sets.intersection(parts, dimension=len(self.states), outward=outward) if whole else parts[0]
+        return kind(region, during=during, label=table.label)
 
-    def region(self, table: Constraint, where: str) -> Any:
+    def parts(self, table: Constraint, where: str, *, outward: bool = False) -> list[Any]:
+        if table.all is None:
+            return [self.region(table, f"{where}.{table.chosen}", outward=outward)]
+        found = [(f"{where}.all.{k}.{part.chosen}", part) for k, part in enumerate(table.all)]
+        return [self.region(part, place, outward=outward) for place, part in found]
+
+    def polygon(self, table: PolygonTable, where: str, *, outward: bool) -> sets.Polytope:
+        vertices: Any = table.vertices
+        names = list(vertices) if isinstance(vertices, dict) else self.states
+        if len(names) != 2 or not set(names) <= set(self.states):
+            raise ValueError(f"`{where}.vertices` must give two of the states {', '.join(self.states)} by name.")
+        rows = list(vertices.values()) if isinstance(vertices, dict) else vertices
+        if len({len(row) for row in rows}) > 1:
+            raise ValueError(f"`{where}.vertices` must have rows of equal length.")
+        corners = self.matrix(rows, f"{where}.vertices")
+        places = [self.states.index(name) for name in names]
+        points = corners.T if isinstance(vertices, dict) else corners
+        return sets.polygon(points, places=places, dimension=len(self.states), outward=outward)
+
+    def region(self, table: Part | Constraint, where: str, *, outward: bool = False) -> Any:
+        if table.polygon is not None:
+            return self.polygon(table.polygon, where, outward=outward)
         if table.box is not None:
             center = None
             if table.center is not None:

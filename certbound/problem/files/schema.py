@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from certbound.checks import nearest
 from certbound.problem.noise import LAWS
@@ -80,6 +80,13 @@ class PolytopeTable(_Table):
     b: Vector
 
 
+class PolygonTable(_Table):
+    """A convex polygon by its corners, in two states: rows of two, or a list for each state."""
+
+    title: ClassVar[str] = "polygon"
+    vertices: dict[str, Vector] | Matrix
+
+
 class GaussianTable(_Table):
     """A random start."""
 
@@ -126,25 +133,46 @@ class Start(_Choice):
     gaussian: GaussianTable | None = None
 
 
-class Constraint(_Choice):
-    """One region to stay in or to avoid; ``center`` moves a box."""
+_ONE, _SEVERAL = "[one]", "[several]"  # brackets: `explain` leaves them out
+Starts = Annotated[
+    Annotated[Start, Tag(_ONE)] | Annotated[list[Start], Field(min_length=1), Tag(_SEVERAL)],
+    Discriminator(lambda value: _SEVERAL if isinstance(value, list) else _ONE),
+]
 
-    title: ClassVar[str] = "[[stay]] or [[avoid]]"
-    choices: ClassVar[tuple[str, ...]] = ("box", "ball", "ellipsoid", "halfspace", "polytope")
+
+class _Shapes(_Choice):
+    """One region; ``center`` moves a box."""
+
+    choices: ClassVar[tuple[str, ...]] = ("box", "ball", "ellipsoid", "halfspace", "polytope", "polygon")
     box: Intervals | None = None
     ball: BallTable | None = None
     ellipsoid: EllipsoidTable | None = None
     halfspace: HalfSpaceTable | None = None
     polytope: PolytopeTable | None = None
+    polygon: PolygonTable | None = None
     center: Place | None = None
-    during: Pair | None = None
-    label: str | None = None
 
     @model_validator(mode="after")
     def _center_of_box(self) -> Any:
         if self.center is not None and self.box is None:
             raise ValueError("`center` beside the region moves a box; a ball has one of its own")
         return self
+
+
+class Part(_Shapes):
+    """One of the sets whose intersection is meant."""
+
+    title: ClassVar[str] = "a part of all"
+
+
+class Constraint(_Shapes):
+    """One region to stay in, to avoid or to reach, or the intersection of several."""
+
+    title: ClassVar[str] = "[[stay]], [[avoid]] or [[reach]]"
+    choices: ClassVar[tuple[str, ...]] = (*_Shapes.choices, "all")
+    all: Annotated[list[Part], Field(min_length=1)] | None = None
+    during: Pair | None = None
+    label: str | None = None
 
 
 class Cost(_Table):
@@ -161,7 +189,7 @@ class Noise(_Table):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Matrix | Number | Vector | bool]
     title: ClassVar[str] = "[noise]"
-    more_keys = staticmethod(lambda: [key for law in LAWS.values() for key in (*law.levels, *law.flags)])
+    more_keys = staticmethod(lambda: [key for law in LAWS.values() for key in (*law.levels, *law.flags, *law.tables)])
     diffusion: Matrix | Number | Vector | None = None
     law: str | None = None
     matrix: Matrix | Number | Vector | None = None
@@ -174,19 +202,29 @@ class Specification(_Table):
     horizon: Number
     states: Annotated[list[str], Field(min_length=1)]
     dynamics: dict[str, Any]
-    initial: Start
+    initial: Starts
     name: str = "problem"
     delta: Number = 1e-3
     parameters: dict[str, Annotated[float, BeforeValidator(_no_boolean)]] = {}
     inputs: dict[str, Pair] = {}
     disturbances: dict[str, Pair] = {}
+    uncertain: dict[str, Pair] = {}
     definitions: dict[str, Number] = {}
     plan: dict[str, Number] | None = None
     cost: Cost | None = None
     noise: Noise | None = None
     stay: list[Constraint] = []
     avoid: list[Constraint] = []
+    reach: Annotated[list[Constraint], Field(max_length=1)] = []
     domain: DomainTable | None = None
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON schema of problem files, for editors; what values mean is checked when a file is read."""
+    schema: dict[str, Any] = Specification.model_json_schema()
+    schema["$defs"]["Noise"]["properties"] |= {key: {} for key in Noise.more_keys()}
+    schema["$defs"]["Noise"]["additionalProperties"] = False
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "certbound problem"}
 
 
 def explain(error: ValidationError) -> str:

@@ -63,6 +63,8 @@ class _Writer:
         problem, system = self.problem, self.system
         dynamics = dict(zip(self.states, self.texts(system.dynamics)))
         noise, plan, cost = self.noise(), self.plan(), problem.cost
+        bounded = self.signal(system.disturbance, system.disturbance_names)
+        starts = [self.start(member) for member in problem.starts]
         stay = [self.constraint(c) for c in problem.safe if not c.outside]
         avoid = [self.constraint(c) for c in problem.safe if c.outside]
         return {
@@ -72,16 +74,18 @@ class _Writer:
             "delta": problem.delta,
             "states": list(self.states),
             "inputs": self.signal(system.inputs, system.input_names),
-            "disturbances": self.signal(system.disturbance, system.disturbance_names),
+            "disturbances": {name: ends for name, ends in bounded.items() if name not in problem.unknown},
+            "uncertain": {name: ends for name, ends in bounded.items() if name in problem.unknown},
             "definitions": self.definitions,
             "dynamics": dynamics,
             "plan": plan,
             "cost": cost and {"Q": _rows(cost[0]), "R": _rows(cost[1])},
             "noise": noise,
-            "initial": self.start(),
+            "initial": starts[0] if len(starts) == 1 else starts,
             "domain": None if problem.domain is None else {"box": self.intervals(problem.domain)},
             "stay": stay,
             "avoid": avoid,
+            "reach": [] if problem.reach is None else [self.constraint(problem.reach)],
         }
 
     @staticmethod
@@ -144,19 +148,19 @@ class _Writer:
         usual = type(constraint)(constraint.region, constraint.during).named(self.states).label
         return table if constraint.label == usual else table | {"label": constraint.label}
 
-    def start(self) -> Mapping[str, Any]:
-        data = self.problem.initial.data(Start.choices)
+    def start(self, start: Any) -> Mapping[str, Any]:
+        data = start.data(Start.choices)
         match data["kind"]:
             case "gaussian":
                 return {"gaussian": {"mean": data["mean"].tolist(), "covariance": _rows(data["covariance"])}}
-            case "box" if self.problem.fixed_start:
+            case "box" if start.is_point:
                 return {"point": data["low"].tolist()}
             case "box":
                 return {"box": [[low, high] for low, high in zip(data["low"].tolist(), data["high"].tolist())]}
             case "polytope":
-                name = type(self.problem.initial).__name__
+                name = type(start).__name__
                 raise ValueError(f"a {name} cannot be written as a start; use a Box, Ball or Ellipsoid.")
-        return self.region(self.problem.initial)
+        return self.region(start)
 
 
 def _rows(matrix: Any) -> list[list[float]]:

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
+from certbound.problem.sets.constraints import GaussianStart, Inside, Outside, Reach
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
-from certbound.problem.sets.initial import check_start
+from certbound.problem.sets.initial import check_start, check_target
+from certbound.problem.sets.polytopes import intersection, polygon
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
+from certbound.problem.sets.unions import StartUnion
 
 __all__ = [
     "Ball",
     "Box",
     "check_start",
+    "check_target",
     "clearance",
     "Ellipsoid",
     "Faces",
     "GaussianStart",
     "HalfSpace",
     "Inside",
+    "intersection",
     "Outside",
+    "polygon",
     "Polytope",
     "Quadratic",
+    "Reach",
     "Region",
+    "StartUnion",
 ]

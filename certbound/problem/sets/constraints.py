@@ -72,6 +72,31 @@ class Outside(Inside):
 
 
 @dataclass(frozen=True, eq=False)
+class Reach(Inside):
+    """The state enters a region: the target of a problem, given as its ``reach``.
+
+    A path fails if it breaks a constraint before it is in the target, or is never in it; what comes after does not
+    count.
+
+    Parameters
+    ----------
+    region
+        As for ``Inside``.
+    during : (float, float), optional
+        When the target counts; the whole horizon when omitted, and (T, T) is one time.
+    label : str, optional
+        Short text for humans.
+    """
+
+    word: ClassVar[str] = "reach"
+
+    def named(self, states: tuple[str, ...]) -> Any:
+        if self.label is not None:
+            return self
+        return replace(self, label=f"reach {self.region.describe(states, 'inside').removeprefix('inside ')}")
+
+
+@dataclass(frozen=True, eq=False)
 class GaussianStart:
     """A random start X_0 ~ N(mean, covariance), independent of the noise.
 

@@ -30,6 +30,24 @@ def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside]) 
             )
 
 
+def check_target(target: Region, constraints: Sequence[Inside], dimension: int) -> None:
+    """Refuse a target that surely lies outside of a constraint that always holds, with a ValueError that names it."""
+    for constraint in constraints:
+        form, region = constraint.region.form, constraint.region
+        if not isinstance(form, Faces) or constraint.during is not None or region.moving or target.moving:
+            continue
+        rows = region.lifted(form.normals, dimension)
+        bounds = form.bounds + form.normals @ region.center_at()
+        slack = _SLACK * (1 + np.abs(bounds))
+        apart = -target.support(-rows) > bounds + slack
+        hidden = target.support(rows) < bounds - slack
+        if np.all(hidden) if constraint.outside else np.any(apart):
+            raise ValueError(
+                f"`reach` must meet the safe set, but the target lies wholly where '{constraint.label}' is broken; "
+                "move the target or change the constraint."
+            )
+
+
 def _fault(initial: Region | GaussianStart, center: Array, constraint: Inside) -> str:
     size = _size(initial, constraint.region)
     if _misses(center, constraint, size):

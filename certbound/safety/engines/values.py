@@ -6,6 +6,7 @@ import math
 
 from certbound.display import rounded
 from certbound.errors import EnclosureError, InfeasibleError
+from certbound.problem.goals import until
 from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
@@ -29,14 +30,33 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         return EngineAnswer(applicable=False, method="values", reason="left out, since another engine has answered.")
     limit = max(min(_SECONDS if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
     try:
-        if serves(problem):
+        if problem.reach is None and serves(problem):
             return _continuous(bound_exits_by_steps(problem, seconds=limit))
         if not isinstance(problem.system, DiscreteSystem):
-            return _continuous(bound_exits(problem, seconds=limit, delta=problem.delta))
-        found = bound_failure(problem, seconds=limit, delta=problem.delta)
+            return _continuous(_exits(problem, limit))
+        found = _failure(problem, limit)
     except (InfeasibleError, EnclosureError) as error:
         return EngineAnswer(applicable=False, method="values", reason=str(error))
     return _answer(problem, found)
+
+
+def _failure(problem: Problem, limit: float) -> FailureBounds:
+    target = problem.reach
+    if target is None:
+        return bound_failure(problem, seconds=limit, delta=problem.delta)
+    first, last = target.during or (0, problem.horizon)
+    plain = until(problem, int(last))
+    return bound_failure(plain, target=target.region, since=int(first), seconds=limit, delta=problem.delta)
+
+
+def _exits(problem: Problem, limit: float) -> ExitBounds:
+    target = problem.reach
+    if target is None:
+        return bound_exits(problem, seconds=limit, delta=problem.delta)
+    first, last = target.during or (0.0, float(problem.horizon))
+    if first > 0:
+        raise InfeasibleError("value functions in continuous time need a target that counts from the beginning.")
+    return bound_exits(until(problem, last), target=target.region, seconds=limit)
 
 
 def _continuous(found: ExitBounds) -> EngineAnswer:

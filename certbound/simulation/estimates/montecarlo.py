@@ -15,7 +15,7 @@ from certbound.simulation.checkpoint import seed_of
 from certbound.simulation.estimates.preparation import Setting, prepare
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
 from certbound.simulation.executors import Progress, run_work
-from certbound.simulation.gap_tests import barriers_of, tables_of
+from certbound.simulation.gap_tests import barriers_of, goal_of, tables_of
 from certbound.simulation.kernel_source import kernel_source
 from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
@@ -25,7 +25,7 @@ _TIME_BINS = 200
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class ExitCounts:
-    """How many simulated paths left the safe set or the domain.
+    """How many simulated paths left the safe set or the domain; with a target, before they were in it, or never were.
 
     Parameters
     ----------
@@ -84,6 +84,9 @@ def simulate_exits(
 ) -> ExitCounts:
     """Estimate the probability that a path leaves the safe set, or the domain, within the horizon.
 
+    Where the problem has a target: before it has entered that, or that it never enters it. Between two steps of
+    continuous time entering is looked for as leaving is, by a bridge.
+
     Parameters
     ----------
     problem : Problem
@@ -129,11 +132,12 @@ def simulate_exits(
     """
     paths, confidence = check_count("paths", paths), check_confidence(confidence)
     setting = prepare(problem, steps, scenario)
-    barriers = barriers_of(problem, setting.times)
+    barriers, goal = barriers_of(problem, setting.times), goal_of(problem, setting.times)
+    rows = barriers if goal is None else [*barriers, goal]
     work = setting.work(
-        kernel_source(setting.model, Task(kind="exits", barriers=barriers)),
-        **tables_of(barriers),
-        counts_shape=(len(barriers), 1 + min(setting.steps, _TIME_BINS)),
+        kernel_source(setting.model, Task(kind="exits", barriers=barriers, goal=goal)),
+        **tables_of(rows),
+        counts_shape=(len(rows), 1 + min(setting.steps, _TIME_BINS)),
         paths=paths,
         entropy=seed_of(rng, checkpoint),
     )
@@ -142,7 +146,7 @@ def simulate_exits(
     exits = int(counts.sum())
     lower, upper = bound_binomial(exits, paths, confidence)
     by_constraint: dict[str, int] = {}
-    for barrier, count in zip(barriers, counts.sum(axis=1)):
+    for barrier, count in zip(rows, counts.sum(axis=1)):
         by_constraint[barrier.label] = by_constraint.get(barrier.label, 0) + int(count)
     return ExitCounts(
         paths=paths,

@@ -93,7 +93,7 @@ def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = 
     if not isinstance(scenario, Scenario):
         raise TypeError(f"`scenario` must be a certbound.simulation.stepping.Scenario, got {scenario!r}.")
     count = _steps(problem, steps)
-    columns = 2 + 2 * problem.system.dimension + len(problem.closed_loop.inputs) + 4 * len(problem.safe)
+    columns = 2 + 2 * problem.system.dimension + len(problem.closed_loop.inputs) + 4 * (len(problem.safe) + 1)
     fit = MEMORY_LIMIT // (8 * columns)
     if count > fit:
         raise ValueError(

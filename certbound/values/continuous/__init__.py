@@ -3,7 +3,7 @@
 ``hypotheses`` says which function proves which hypothesis.
 """
 
-from certbound.values.continuous.exits import ExitBounds, bound_exits, chart_exits
+from certbound.values.continuous.exits import ExitBounds, bound_exits, chart_exits, chart_slabs_of
 from certbound.values.continuous.room import safe_room, starts_of
 
-__all__ = ["ExitBounds", "bound_exits", "chart_exits", "safe_room", "starts_of"]
+__all__ = ["ExitBounds", "bound_exits", "chart_exits", "chart_slabs_of", "safe_room", "starts_of"]

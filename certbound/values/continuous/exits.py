@@ -62,7 +62,8 @@ def bound_exits(
         Continuous time, one or two states, noise of full rank. In one state any limits, windows, moving sets, obstacles
         and a random start; in two a bounded safe box over the whole horizon.
     target : region, optional
-        Not served yet.
+        In one state: then the bounds are those of the probability of breaking a constraint before the target is
+        entered, or of not entering it by the horizon.
     seconds : float
         How long to refine; the first attempt is finished in any case. In one state seconds stand for so many
         patches of work, so that the bounds do not depend on the machine or its load.
@@ -94,7 +95,13 @@ def bound_exits(
     begin = time.perf_counter()
     _check(problem, target, seconds)
     model = _model(problem)
-    if problem.system.dimension == 1:
+    proposed: Sequence[tuple[Surface, Payment]] = ()
+    if target is not None:
+        from certbound.values.continuous.line import bound_arrival
+
+        most, rest, words = bound_arrival(problem, model, target)
+        upper, least = most, None if rest == -math.inf else rest
+    elif problem.system.dimension == 1:
         from certbound.values.continuous.line import bound_line
 
         upper, least, words, proposed = bound_line(problem, model, seconds, lower)
@@ -163,6 +170,37 @@ def chart_exits(
     return charts
 
 
+def chart_slabs_of(problem: Problem, *, levels: Sequence[float], slabs: int, last: float) -> Charts:
+    """Charts as `chart_exits` makes them, of one state, at the ends of slabs of time.
+
+    Parameters
+    ----------
+    problem : Problem
+        One state; its model must not depend on time.
+    levels : sequence of float
+        log10 of probabilities at which the bounds should be sharp.
+    slabs : int
+        No slab is longer than one of so many equal ones.
+    last : float
+        Time after which no chart is made.
+
+    Returns
+    -------
+    Charts
+
+    Raises
+    ------
+    InfeasibleError
+        The theorem does not apply; the message says why.
+    EnclosureError
+        The model is undefined somewhere in the safe set.
+    """
+    from certbound.values.continuous.line import chart_slabs
+
+    _check(problem, None, 1.0)
+    return chart_slabs(problem, _model(problem), [_LN10 * level for level in levels], slabs, last)
+
+
 def _check(problem: Problem, target: Any, seconds: float) -> None:
     if not isinstance(problem, Problem):
         raise TypeError(f"`problem` must be a Problem, got {problem!r}.")
@@ -174,8 +212,8 @@ def _check(problem: Problem, target: Any, seconds: float) -> None:
         raise InfeasibleError(
             f"value functions in continuous time serve one or two states, the problem has {problem.system.dimension}."
         )
-    if target is not None:
-        raise InfeasibleError("value functions in continuous time do not serve targets yet.")
+    if target is not None and problem.system.dimension > 1:
+        raise InfeasibleError("value functions in continuous time serve targets in one state only.")
     if problem.input_sequence is not None:
         raise InfeasibleError("value functions in continuous time need a feedback law; the plan is an array.")
 

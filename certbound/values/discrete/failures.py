@@ -78,6 +78,7 @@ def bound_failure(
     problem: Problem,
     *,
     target: Region | None = None,
+    since: int = 0,
     ratio: float = 1.05,
     delta: float | None = None,
     seconds: float = 20.0,
@@ -94,6 +95,8 @@ def bound_failure(
         In discrete time, with at most three states and Gaussian noise on each.
     target : Region, optional
         Set that ends the danger.
+    since : int
+        First step at which it does.
     ratio : float
         Stop once upper <= ratio * lower.
     delta : float, optional
@@ -108,7 +111,7 @@ def bound_failure(
     Inapplicable
         If value functions do not fit the problem; the message says why.
     """
-    work = _Work(problem, target, parts)
+    work = _Work(problem, target, parts, since)
     begun = time.perf_counter()
     upper, lower, spent = 1.0, 0.0, 0.0
     tried: list[tuple[float, float, float]] = []
@@ -142,13 +145,9 @@ def bound_failure(
         settled = spent > _PATIENCE and _settled(upper, lower, delta)
         if upper <= ratio * lower or settled or upper < (_UNIFORM_FLOOR if work.shocks.uniform else _FLOOR):
             break
+    seconds = time.perf_counter() - begun
     return FailureBounds(
-        upper=upper,
-        lower=lower,
-        cells=cells,
-        share=tried[-1][0],
-        seconds=time.perf_counter() - begun,
-        tried=tuple(tried),
+        upper=upper, lower=lower, cells=cells, share=tried[-1][0], seconds=seconds, tried=tuple(tried)
     )
 
 
@@ -200,14 +199,14 @@ class _Work:
         "deviations of the noise wide. Use another engine, which is at its best there."
     )
 
-    def __init__(self, problem: Problem, target: Region | None, parts: int) -> None:
+    def __init__(self, problem: Problem, target: Region | None, parts: int, since: int = 0) -> None:
         system = problem.system
         if not isinstance(system, DiscreteSystem):
             raise Inapplicable("this engine's backward induction needs discrete time.")
         if system.dimension > MOST_STATES:
             raise Inapplicable(f"value functions on grids take at most {MOST_STATES} states, not {system.dimension}.")
-        self.problem, self.target, self.n = problem, target, system.dimension
-        self.horizon = int(problem.horizon)
+        self.problem, self.target, self.n, self.since = problem, target, system.dimension, since
+        self.horizon, self.ending = int(problem.horizon), target if since == 0 else None
         self.shocks = shocks_of(system.noise, system.noise_matrix)
         self.dynamics = Dynamics(problem, parts)
         self.boxes: Boxes = boxes_of(problem, self.shocks, self.dynamics)
@@ -329,7 +328,7 @@ class _Work:
         return Charts(upper=tuple(upper[::-1]), lower=tuple(lower[::-1]))
 
     def _zones(self, grids: list[Grid], t: int) -> Zones:
-        return zones_of(grids[t], active_at(self.problem.constraints, t), self.target, t)
+        return zones_of(grids[t], active_at(self.problem.constraints, t), self.target, t, ends=t >= self.since)
 
     def _transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
         step = self.dynamics.step(t, grid)
@@ -358,6 +357,10 @@ class _Work:
         cells = grid.cells()
         meets = ~contains(region, cells, 0)[1]
         safe, _ = respected(active_at(self.problem.constraints, 0), cells, 0)
+        if self.ending is not None:
+            meets &= ~(contains(self.ending, cells, 0)[0] & safe)
+        if not meets.any():
+            return 0.0, 0.0
         if not np.all(safe[meets]):
             upper = 1.0
         else:
@@ -367,8 +370,8 @@ class _Work:
         field: Any = transition.tables.field(below, order=0)
         values = np.maximum.reduce([at - error for at, error in transition.at_nodes(field)])
         inside = contains(region, Interval.point(grid.nodes()), 0)[0]
-        if self.target is not None:
-            inside &= contains(self.target, Interval.point(grid.nodes()), 0)[1]
+        if self.ending is not None:
+            inside &= contains(self.ending, Interval.point(grid.nodes()), 0)[1]
         values = values.ravel()[inside]
         return upper, float(values.max()) if len(values) else 0.0
 

@@ -40,13 +40,18 @@ class Zones:
     has_target: bool
 
 
-def zones_of(grid: Grid, constraints: Sequence[Inside], target: Region | None, step: int) -> Zones:
-    """The zones of a grid at a step, given the constraints active then; faces of cells do not count."""
+def zones_of(
+    grid: Grid, constraints: Sequence[Inside], target: Region | None, step: int, *, ends: bool = True
+) -> Zones:
+    """The zones of a grid at a step, given the constraints active then; faces of cells do not count.
+
+    A target that does not end the danger yet (not ``ends``) has no cell.
+    """
     cells = grid.cells()
     safe, unsafe = respected(constraints, cells, step, interiors=True)
     done = np.zeros(len(cells), dtype=bool)
     undone = ~done
-    if target is not None:
+    if target is not None and ends:
         done, undone = contains(target, cells, step, interiors=True)
     masks = (mask.reshape(grid.shape) for mask in (safe, unsafe, done, undone))
     return Zones(**dict(zip(("safe", "unsafe", "done", "undone"), masks)), has_target=target is not None)

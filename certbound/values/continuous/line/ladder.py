@@ -18,7 +18,14 @@ from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import Link, prove_above, prove_below, spans
 from certbound.values.continuous.line.moved_model import model_on
 from certbound.values.continuous.line.phases import Gate, Phase, check_room, pieces
-from certbound.values.continuous.line.profiles import End, propose_above, propose_below, shifted, values_of
+from certbound.values.continuous.line.profiles import (
+    End,
+    propose_above,
+    propose_arrival,
+    propose_below,
+    shifted,
+    values_of,
+)
 from certbound.values.continuous.line.reach import cuts_of
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.proposal import Line, Sketch, sketch
@@ -104,7 +111,7 @@ def room_of(
     phases, gates = pieces(problem, cuts, inner=inner)
     check_room(phases)
     models = [model_on(phase, model) for phase in phases]
-    lines = [_line(phase, one, start) for phase, one in zip(phases, models)]
+    lines = [line_of(phase, one, start) for phase, one in zip(phases, models)]
     return Room(phases=phases, gates=gates, models=models, lines=lines)
 
 
@@ -120,7 +127,7 @@ def _leak(room: Room, model: Model, cuts: tuple[float, float], start: Start) -> 
     phase = Phase(start=0.0, end=max(ends), low=cuts[0], high=cuts[1], closed=(True, True))
     alone = Room(
         phases=[phase], gates=[Gate(time=phase.end, low=-math.inf, high=math.inf)], models=[model],
-        lines=[_line(phase, model, start)],
+        lines=[line_of(phase, model, start)],
     )  # fmt: skip
     rough = sketches(alone)
     fineness, tolerance, lead = LADDER[0]
@@ -136,7 +143,8 @@ def _less(lower: float | None, leak: float) -> float | None:
     return lower + math.log(left) - 1e-12 * (1 + abs(lower)) if left > 1e-3 else None
 
 
-def _line(phase: Phase, model: Model, start: Start) -> Line:
+def line_of(phase: Phase, model: Model, start: Start) -> Line:
+    """The line of a phase, in plain floats."""
     drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
     corners = [[float(value.mid) for value in branch] for branch in model.branches]
 
@@ -271,9 +279,10 @@ def surfaces_above(
 
 
 def surfaces_below(
-    room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
+    room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float],
+    floor: float | None = None,
 ) -> list[Link] | None:
-    """Surfaces for the lower bound."""
+    """Surfaces for the lower bound; V at the horizon and where the line is cut is ``floor``, if that is given."""
     share, fineness, tolerance, sharpness = effort
     links: list[Link] = []
     for k in reversed(range(len(room.phases))):
@@ -284,12 +293,24 @@ def surfaces_below(
             far = (far[0] and phase.closed[0], far[1] and phase.closed[1])
         surface = propose_below(
             line, _end(room, k, links[0].surface if links else None), rough[k], 2 * share * line.horizon, sharpness,
-            phase.closed, far, fineness=fineness, tolerance=tolerance,
+            phase.closed, far, fineness=fineness, tolerance=tolerance, floor=floor,
         )  # fmt: skip
         if surface is None:
             return None
         links.insert(0, _link(room, k, _placed(surface, phase)))
     return links
+
+
+def surface_of_arrival(
+    room: Room, side: int, rough: list[Sketch], effort: tuple[float, float, float, float], floor: float
+) -> list[Link] | None:
+    """A surface for the upper bound of leaving by one face only; see `propose_arrival`."""
+    share, fineness, tolerance, _ = effort
+    line = room.lines[0]
+    surface = propose_arrival(
+        line, side, rough[0], share * line.horizon, floor, fineness=fineness, tolerance=tolerance
+    )
+    return None if surface is None else [_link(room, 0, _placed(surface, room.phases[0]))]
 
 
 def _link(room: Room, k: int, surface: Surface) -> Link:

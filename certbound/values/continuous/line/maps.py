@@ -14,7 +14,7 @@ from certbound.problem.problem import Problem
 from certbound.values.charts import Chart, Charts
 from certbound.values.continuous.hypotheses import Model, chart_above, chart_below, check_noise
 from certbound.values.continuous.line import ladder
-from certbound.values.continuous.line.initial_law import start_of
+from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import spans
 from certbound.values.continuous.line.reach import cuts_of
 
@@ -29,16 +29,7 @@ def chart_line(problem: Problem, model: Model, levels: list[float], times: int, 
     InfeasibleError
         Limits that move, come or go, or are missing, or noise that vanishes.
     """
-    start = start_of(problem)
-    cuts = cuts_of(problem, model, start)
-    inner, outer = (ladder.room_of(problem, model, cuts, start, inner=side) for side in (True, False))
-    if any(_changing(room) for room in (inner, outer)) or start.random:
-        raise InfeasibleError(
-            "maps of value functions serve limits on both sides that stand still over the whole horizon, and a set of "
-            "starts."
-        )
-    phase = outer.phases[0]
-    check_noise(outer.models[0], (phase.start, phase.end), [(phase.low, phase.high)])
+    inner, outer, start = _rooms(problem, model)
     rough = ladder.sketches(inner)
     least = max(levels[0], float(rough[0].values.min()))
     levels = sorted({max(level, least) for level in levels})
@@ -61,6 +52,54 @@ def chart_line(problem: Problem, model: Model, levels: list[float], times: int, 
         surface = links[0].surface
         below = _at_times(model, surface.times, times, 1, partial(chart_below, surface, model, levels))
     return Charts(upper=tuple(above), lower=tuple(below))
+
+
+def chart_slabs(problem: Problem, model: Model, levels: list[float], slabs: int, last: float) -> Charts:
+    """Charts at the ends of slabs up to the time ``last``, of one surface above and one below.
+
+    No slab is longer than one of ``slabs`` equal ones.
+
+    Where the model does not depend on time, the chart at t is that of P(leaving by the horizon minus t).
+
+    Raises
+    ------
+    InfeasibleError
+        As `chart_line`; also where the model depends on time.
+    """
+    if not model.autonomous:
+        raise InfeasibleError("exit times at all horizons at once need a model that does not depend on time.")
+    inner, outer, start = _rooms(problem, model)
+    rough = ladder.sketches(inner)
+    levels = sorted({max(level, float(rough[0].values.min())) for level in levels})
+    rough = [dataclasses.replace(rough[0], level=levels[0])]
+    _, (fineness, tolerance, lead), *_ = ladder.LADDER
+    share, longest = lead / max(rough[0].growth, 1.0), float(problem.horizon) / slabs
+    above = ladder.surfaces_above(inner, start, rough, (share, fineness, tolerance, lead))
+    below = ladder.surfaces_below(outer, start, rough, (share, fineness, 0.5 * tolerance, lead))
+    upper: list[Chart] = []
+    lower: list[Chart] = []
+    if above is not None and spans(above, upper=True):
+        surface = above[0].surface.refined(longest)
+        upper = chart_above(surface, model, levels, np.flatnonzero(surface.times[:-1] <= last).tolist())
+    if below is not None and spans(below, upper=False):
+        surface = below[0].surface.refined(longest)
+        lower = chart_below(surface, model, levels, np.flatnonzero(surface.times[:-1] <= last).tolist())
+    return Charts(upper=tuple(upper), lower=tuple(lower))
+
+
+def _rooms(problem: Problem, model: Model) -> tuple[ladder.Room, ladder.Room, Start]:
+    """The room for upper bounds, that for lower ones, and the start; refused where limits change."""
+    start = start_of(problem)
+    cuts = cuts_of(problem, model, start)
+    inner, outer = (ladder.room_of(problem, model, cuts, start, inner=side) for side in (True, False))
+    if any(_changing(room) for room in (inner, outer)) or start.random:
+        raise InfeasibleError(
+            "maps of value functions serve limits on both sides that stand still over the whole horizon, and a set of "
+            "starts."
+        )
+    phase = outer.phases[0]
+    check_noise(outer.models[0], (phase.start, phase.end), [(phase.low, phase.high)])
+    return inner, outer, start
 
 
 def _changing(room: ladder.Room) -> bool:

@@ -80,13 +80,19 @@ def propose_above(
 
 def propose_below(
     line: Line, end: End, rough: Sketch, lead: float, sharpness: float, closed: tuple[bool, bool],
-    far: tuple[bool, bool], *, fineness: float, tolerance: float,
+    far: tuple[bool, bool], *, fineness: float, tolerance: float, floor: float | None = None,
 ) -> Surface | None:
-    """V <= 0; at the horizon and on cut faces a small share of P, on faces 0 after a rise, V' = 0 on far ones."""
-    top = rough.level + float(np.log(_SHARE))
+    """V <= 0; on faces 0 after a rise, V' = 0 on far ones; at the horizon and on cut faces a small share of P at most.
+
+    With a ``floor`` it is just that there.
+    """
+    top = rough.level + float(np.log(_SHARE)) if floor is None else floor
     steep = _gate_slopes(line, end, rough, sharpness, _SHARPER)
     rates = [rise(line, side, -2 * top / lead) for side in (0, 1)]
-    profile = _profile_below(line, end, far, top, rates, steep)
+    def flat(y: Array) -> Array:
+        return np.full(len(y), top)
+
+    profile = flat if floor is not None else _profile_below(line, end, far, top, rates, steep)
     at_faces = profile(np.array([line.low, line.high]))
     target = np.where(closed, 0.0, top)
     rising = np.array(closed) & (at_faces < -1e-9)
@@ -101,6 +107,22 @@ def propose_below(
     boundary = Boundary(profile=profile, faces=faces, step=_first_step(line, end, steep, lead), free=far)
     slopes = [None if far[k] else rates[k] for k in (0, 1)]
     nodes = spread(line, _marks(line, end, slopes, steep), rough, fineness)
+    return propose(line, nodes, boundary, tolerance=tolerance, level=rough.level)
+
+
+def propose_arrival(
+    line: Line, side: int, rough: Sketch, lead: float, floor: float, *, fineness: float, tolerance: float
+) -> Surface | None:
+    """V = 0 on one face at all times, and ``floor`` on the other one and at the horizon, but for a layer."""
+    (rate, bend), least = layer(line, side, lead), float(np.exp(floor))
+
+    def profile(y: Array) -> Array:
+        away = rate * np.maximum(_inward(y, (line.low, line.high), side), 0.0)
+        return np.asarray(np.log(least + (1 - least) * (1 + bend * away) * np.exp(-away)))
+
+    ends, zero = profile(np.array([line.low, line.high])), np.zeros(2)
+    boundary = Boundary(profile=profile, faces=lambda tau: (ends, zero), step=0.02 * lead)
+    nodes = spread(line, [(line.low if side == 0 else line.high, rate)], rough, fineness)
     return propose(line, nodes, boundary, tolerance=tolerance, level=rough.level)
 
 

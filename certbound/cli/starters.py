@@ -1,0 +1,142 @@
+"""Problem files to start from, one for each feature; NAME and FILE stand for the problem's name and its file."""
+
+from __future__ import annotations
+
+STARTERS = {
+    "pendulum": """\
+# A certbound problem: a noisy system, where it starts, where it must stay, for how long, and how surely.
+# Check it with:  certbound verify FILE
+name = "NAME"
+time = "continuous"        # or "discrete": [dynamics] then gives the next state, and [noise] has a law
+horizon = 4.0              # seconds (steps in discrete time)
+delta = 1e-3               # allowed probability of leaving the safe set at any time up to the horizon
+states = ["angle", "speed"]
+
+[parameters]               # numbers used below; change them with  --set damping=0.8
+gravity = 9.81
+length = 1.0
+damping = 0.5
+sigma = 0.05
+
+[disturbances]             # bounded, unknown, may depend on the past: name = [low, high]
+push = [-0.02, 0.02]
+
+[dynamics]                 # d(state)/dt: t + - * / **, sin cos tan tanh exp log sqrt abs min max ..., pi
+angle = "speed"
+speed = "-gravity/length*sin(angle) - damping*speed + push"
+
+[noise]                    # g of  dx = f dt + g dW, one row a state
+diffusion = [[0], ["sigma"]]
+
+[initial]                  # exactly one of point, box, ball, gaussian
+box = [[0.25, 0.35], [-0.05, 0.05]]
+
+[[stay]]                   # the state stays inside each [[stay]] ...
+box = { angle = [-1.0, 1.0] }
+
+[[stay]]
+halfspace = { normal = { speed = 1 }, bound = 4 }   # speed <= 4
+
+[[avoid]]                  # ... and outside each [[avoid]]
+ball = { center = { angle = 0.9, speed = 2.5 }, radius = 0.3 }
+during = [0, 2]            # seconds; leave it out for the whole horizon
+""",
+    "union": """\
+# Several starts: every [[initial]] counts, and the verdict is that of the worst one.
+name = "NAME"
+time = "discrete"
+horizon = 10
+delta = 1e-3
+states = ["x1", "x2"]
+
+[dynamics]                 # the next state
+x1 = "x1 + 0.1*x2"
+x2 = "x2 + 0.1*(x1**3/3 - x1 - x2)"
+
+[noise]
+law = "gaussian"
+std = 0.01
+
+[[initial]]
+ball = { center = [1.5, 0], radius = 0.2 }
+
+[[initial]]
+box = [[-1.4, -1.2], [-0.5, 0.1]]
+
+[[avoid]]
+ball = { center = [-1, -1], radius = 0.4 }
+""",
+    "target": """\
+# A target: a path fails if it breaks a constraint before it is there, or is not there in time.
+name = "NAME"
+time = "discrete"
+horizon = 12
+delta = 0.01
+states = ["x"]
+
+[dynamics]
+x = "0.7*x"
+
+[noise]
+law = "gaussian"
+std = 0.1
+
+[initial]
+point = [0.8]
+
+[[stay]]
+box = { x = [-1, 1] }
+
+[[reach]]
+box = { x = [-0.2, 0.2] }
+# during = [4, 12]         # when the target counts; the whole horizon without it
+""",
+    "polygon": """\
+# Obstacles from corners, and as intersections.
+name = "NAME"
+time = "continuous"
+horizon = 3.0
+delta = 1e-3
+states = ["px", "py"]
+
+[dynamics]
+px = "1"
+py = "-py"
+
+[noise]
+diffusion = [[0.03, 0], [0, 0.03]]
+
+[initial]
+point = [0, 0]
+
+[[avoid]]
+polygon = { vertices = [[1, 0.4], [2, 0.4], [1.5, 1]] }
+
+[[avoid]]                  # the part of a box below a line
+all = [ { box = { px = [0.5, 2], py = [-2, -0.3] } }, { halfspace = { normal = { px = -1, py = 1 }, bound = -1 } } ]
+""",
+    "packets": """\
+# Noise by a table of values: a correction that gets lost one time in ten, which leaves the mean to [dynamics].
+name = "NAME"
+time = "discrete"
+horizon = 20
+delta = 0.05
+states = ["x"]
+
+[dynamics]
+x = "0.7*x"
+
+[noise]
+law = "discrete"           # or histogram (edges, probabilities), triangular, uniform, gaussian, ...
+values = [-0.9, 0.1]
+probabilities = [0.1, 0.9]
+scale = 0.2
+
+[initial]
+point = [0]
+
+[[stay]]
+box = { x = [-1.2, 1.2] }
+""",
+}
+"""By the name that ``certbound new --example`` takes."""

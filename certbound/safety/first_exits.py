@@ -1,0 +1,281 @@
+"""First-exit times of one state: P(exit before s) for every s up to the horizon from above and below, and the mean.
+
+Where neither the model nor what it must respect depends on time, P(exit before s | X_0 = x) is the value function of
+the horizon T at time T - s. One value function is proved for T and, since short times lie at the end of its grid, one
+each for T/2, T/4, ..., which are read for the times above the next one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.checks import vector
+from certbound.display import Shown, rounded
+from certbound.errors import EngineError, InfeasibleError, contained
+from certbound.problem.model import sources
+from certbound.problem.problem import Problem
+from certbound.problem.systems import ContinuousSystem
+from certbound.rigor.intervals import Interval
+from certbound.values.charts import Chart
+from certbound.values.continuous import chart_slabs_of
+from certbound.values.discrete import chart_failures
+from certbound.watch import poll
+
+_LEVELS = (1e-5, 1e-2, 0.3, 0.9)
+"""Probabilities at which the bounds are sharp."""
+_SLABS = 160
+_FEWER = 2.0  # ratio of a horizon to the next shorter one
+_SHORTEST = 8  # horizons
+_RARE = -6.0  # log10 of a probability below which no shorter horizon is looked at
+_SHARE = 0.004  # cells of discrete time, as `FailureBounds` has them
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class ExitTimes(Shown):
+    """When a path leaves its safe set: lower <= P(exit before s from the worst start) <= upper, proved.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is asked.
+    times : ndarray, shape (K,)
+        Rising times s in [0, T]; steps in discrete time.
+    lower, upper : ndarray, shape (K,)
+        Bounds of the probability, both rising with s.
+    mean_lower : float
+        The mean time of leaving is at least this, from every start and under every disturbance.
+    mean_upper : float or None
+        It is at most this from every start; None where nothing was proved (a horizon that is too short).
+    """
+
+    problem: Problem
+    times: Array
+    lower: Array
+    upper: Array
+    mean_lower: float
+    mean_upper: float | None
+
+    def at(self, s: float) -> tuple[float, float]:
+        """Bounds at any time up to the horizon, by the times beside it.
+
+        Raises
+        ------
+        ValueError
+            If the time lies outside [0, T].
+        """
+        if not 0 <= s <= float(self.problem.horizon):
+            raise ValueError(f"`s` must lie in [0, {float(self.problem.horizon):g}], got {s!r}.")
+        before = int(np.searchsorted(self.times, s, side="right")) - 1
+        after = int(np.searchsorted(self.times, s))
+        low = float(self.lower[before]) if before >= 0 else 0.0
+        return low, float(self.upper[after]) if after < len(self.times) else 1.0
+
+    def summary(self) -> str:
+        """The end of the curves and the mean, in one line."""
+        unit = "s" if self.problem.system.time == "continuous" else "steps"
+        low, high = _ends_text(self.lower[-1], self.upper[-1])
+        most = "" if self.mean_upper is None else f" ... {rounded(self.mean_upper, up=True, digits=5)}"
+        least = rounded(self.mean_lower, up=False, digits=5)
+        return (
+            f"P(exit within {self.problem.horizon:g} {unit}) in [{low}, {high}], "
+            f"mean exit time {least + most if most else 'at least ' + least} {unit}"
+        )
+
+    def rows(self) -> list[tuple[str, str]]:
+        """A few times with their bounds."""
+        found = []
+        for k in np.unique(np.linspace(0, len(self.times) - 1, 6).round().astype(int))[1:]:
+            low, high = _ends_text(self.lower[k], self.upper[k])
+            found.append((f"before {self.times[k]:.4g}", f"{low} ... {high}"))
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """``times``, ``lower``, ``upper``, ``mean_lower`` and ``mean_upper``."""
+        found: dict[str, Any] = {name: getattr(self, name).tolist() for name in ("times", "lower", "upper")}
+        return found | {"mean_lower": self.mean_lower, "mean_upper": self.mean_upper}
+
+    def to_columns(self) -> dict[str, Array]:
+        """Times and both curves, as ``pandas.DataFrame`` takes them."""
+        return {"time": self.times, "lower": self.lower, "upper": self.upper}
+
+
+def _ends_text(low: float, high: float) -> tuple[str, str]:
+    return rounded(float(low), up=False, digits=4), rounded(float(high), up=True, digits=4)
+
+
+def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> ExitTimes:
+    """Bound P(exit before s) for every s <= T from above and below, and the mean time of leaving.
+
+    Parameters
+    ----------
+    problem : Problem
+        One state, limits on both sides that stand still over the whole horizon, a model that does not depend on time,
+        and a set of starts.
+    times : sequence of float, optional
+        Where the curves are wanted; those of the value functions when omitted.
+
+    Returns
+    -------
+    ExitTimes
+
+    Raises
+    ------
+    InfeasibleError
+        If the problem is none of these, or nothing was proved; the message says why.
+    ValueError
+        If a time lies outside [0, T].
+
+    Examples
+    --------
+    >>> import certbound as cb
+    >>> system = cb.DiscreteSystem(lambda x: 0.9 * x, states=["x"], noise=cb.Gaussian(std=0.3))
+    >>> problem = cb.Problem(system, initial=[0.2], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=60)
+    >>> found = bound_exit_times(problem)
+    >>> low, high = found.at(20)  # 0.555
+    >>> 0.554 < low < high < 0.556
+    True
+
+    Source: Thm K8 of theory, one state.
+    """
+    _check(problem)
+    try:
+        with contained("values"):
+            upper, lower, share = (_continuous if isinstance(problem.system, ContinuousSystem) else _discrete)(problem)
+    except EngineError as error:
+        raise InfeasibleError(f"exit times could not be bounded: {error}") from error
+    grid = np.unique([s for s, *_ in (*upper, *lower)] + [0.0])
+    above = _above(upper, grid)
+    below, least = (_below(lower, grid, k) for k in (1, 2))
+    mean_lower, mean_upper = _means(problem, grid, above, least, share)
+    found = ExitTimes(
+        problem=problem, times=grid, lower=below, upper=above, mean_lower=mean_lower, mean_upper=mean_upper
+    )
+    if times is None:
+        return found
+    asked = np.unique(vector("times", times))
+    ends = np.array([found.at(float(s)) for s in asked])
+    return ExitTimes(
+        problem=problem, times=asked, lower=ends[:, 0], upper=ends[:, 1], mean_lower=mean_lower, mean_upper=mean_upper
+    )
+
+
+Curve = list[tuple[float, float, float]]
+"""(s, bound from the worst start, bound that holds for every start)."""
+
+
+def _check(problem: Problem) -> None:
+    if problem.system.dimension != 1:
+        raise InfeasibleError(f"exit times are bounded in one state, the problem has {problem.system.dimension}.")
+    if len(problem.starts) > 1 or problem.initial.random:
+        raise InfeasibleError("exit times need one set of starts; take the members of a union one by one.")
+    if problem.unknown:
+        raise InfeasibleError("exit times have no bounds for unknown constants; give them values.")
+    window = (0.0, float(problem.horizon))
+    for constraint in problem.constraints:
+        if constraint.region.moving or constraint.during not in (None, window):
+            raise InfeasibleError(f"exit times need limits that always hold and stand still, not '{constraint.label}'.")
+
+
+def _continuous(problem: Problem) -> tuple[Curve, Curve, float]:
+    """Upper and lower bounds by s, and the least probability over all states of leaving within T."""
+    upper: Curve = []
+    lower: Curve = []
+    share, horizon = 0.0, float(problem.horizon)
+    for k in range(_SHORTEST):
+        poll(f"exit times up to {horizon:g}")
+        shorter, levels = horizon / _FEWER if k + 1 < _SHORTEST else 0.0, [math.log10(p) for p in _LEVELS]
+        plain = problem.replace(horizon=horizon)
+        charts = chart_slabs_of(plain, levels=levels, slabs=_SLABS, last=horizon - shorter)
+        upper += _read(problem, charts.upper, horizon, up=True)
+        lower += _read(problem, charts.lower, horizon, up=False)
+        if k == 0 and charts.lower:
+            share = 10.0 ** float(charts.lower[0].log10.min())
+        if not charts.upper or math.log10(max(upper[-1][1], 1e-300)) < _RARE:
+            break
+        horizon = shorter
+    if not upper:
+        raise InfeasibleError("no value function over the whole safe set could be proved.")
+    return upper, lower, share
+
+
+def _discrete(problem: Problem) -> tuple[Curve, Curve, float]:
+    tape, rows = problem.closed_loop, problem.input_sequence
+    found = sources(tape)
+    clock = any(0 in slots for slots in found)
+    if clock or (rows is not None and np.any(rows != rows[0])):
+        raise InfeasibleError("exit times at all horizons at once need a model that does not depend on time.")
+    charts = chart_failures(problem, share=_SHARE, times=int(problem.horizon))
+    upper = _read(problem, charts.upper, problem.horizon, up=True)
+    lower = _read(problem, charts.lower, problem.horizon, up=False)
+    share = 10.0 ** float(charts.lower[0].log10.min()) if charts.lower else 0.0
+    return upper, lower, share
+
+
+def _read(problem: Problem, charts: Sequence[Chart], horizon: float, *, up: bool) -> Curve:
+    """(s, worst, every start) of charts."""
+    around = problem.initial.hull()
+    low, high = float(around.lo[0]), float(around.hi[0])
+    found = []
+    for chart in charts:
+        axis = chart.axes[0]
+        if low < high:
+            met = (axis[:-1] < high) & (axis[1:] > low)
+            ends = chart.log10[met]
+            whole = bool(axis[0] <= low and high <= axis[-1] and len(ends))
+            most, least = (float(ends.max()), float(ends.min())) if whole else (0.0, -np.inf)
+        else:
+            most = least = float(chart.at(np.array([[low]]), up=up)[0])
+        s = float(horizon) - chart.time
+        gap = Fraction(s) - (Fraction(float(horizon)) - Fraction(chart.time))
+        if gap > 0 if up else gap < 0:
+            s = float(np.nextafter(s, -np.inf if up else np.inf))
+        found.append((s, _power(most, up=up), _power(least, up=up)))
+    return found
+
+
+def _power(log10: float, *, up: bool) -> float:
+    """10**log10 rounded up or down, in [0, 1]."""
+    value = float(10.0**log10)
+    return min(max(value * (1 + (1e-12 if up else -1e-12)), 0.0), 1.0)
+
+
+def _above(curve: Curve, grid: Array) -> Array:
+    """The smallest bound at each time or a later one: 1 where there is none."""
+    found = np.ones(len(grid))
+    for s, value, _ in curve:
+        found[grid <= s] = np.minimum(found[grid <= s], value)
+    return found
+
+
+def _below(curve: Curve, grid: Array, place: int) -> Array:
+    """The largest bound at each time or an earlier one: 0 where there is none."""
+    found = np.zeros(len(grid))
+    for row in curve:
+        found[grid >= row[0]] = np.maximum(found[grid >= row[0]], row[place])
+    return found
+
+
+def _means(problem: Problem, grid: Array, above: Array, least: Array, share: float) -> tuple[float, float | None]:
+    """Bounds of the mean time of leaving: the integral of P(not left) up to T, and what may come after.
+
+    From any state, leaving within T has at least the probability ``share``, so that the mean time that a path which
+    has not left still takes is at most T/share.
+    """
+    steps = Interval.point(np.diff(grid))
+    discrete = problem.system.time == "discrete"
+    # in discrete time the exit step exceeds s on all of [s, s + 1)
+    kept = (1 - above[1:]) * (1 - 1e-12) if not discrete else (1 - above[:-1]) * (1 - 1e-12)
+    low = float((steps * Interval.point(np.maximum(kept, 0.0))).sum().lo)
+    if problem.system.disturbance is not None or not share > 0:
+        return low, None
+    still = (1 - least) * (1 + 1e-12)
+    inside = float((steps * Interval.point(still[:-1])).sum().hi)
+    tail = float(still[-1]) * float(problem.horizon) / share
+    return low, (inside + tail) * (1 + 1e-12)

@@ -1,0 +1,138 @@
+"""Targets of one state: the probability of getting there in time, before a limit on the other side, from both sides.
+
+Between the limit and the target's face a path that leaves by the face has arrived, and one that leaves by the limit has
+failed, as has one that is still there at the horizon. With P the probability of arriving, w + (1 - w) P is 1 on the
+face and w on the limit and at the horizon: V is proposed as its logarithm, for either bound with a layer in the corner
+of face and horizon. Below, e^V <= w has to hold on the limit and at the horizon; above, V >= 0 on the face and e^V >= w
+elsewhere: what ends there counts at least w, which is subtracted.
+
+Where neither model nor limits depend on time, and nothing disturbs, the start that is farthest from the target is the
+worst: from there a path passes every other one, with less time left.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from certbound.errors import InfeasibleError
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Outside, Region
+from certbound.values.continuous.hypotheses import NEGLIGIBLE, Model, Need, check_noise, examine, patched_of, up
+from certbound.values.continuous.line import ladder
+from certbound.values.continuous.line.initial_law import Start, start_of
+from certbound.values.continuous.line.linked import Link, prove_below, spans
+from certbound.values.continuous.line.phases import Phase, limits_of
+from certbound.values.continuous.line.reach import cuts_of
+from certbound.values.continuous.payment import pay_upper
+from certbound.watch import OutOfTime
+
+_RUNGS = 3
+_FLOOR = math.log(0.3)
+"""V at the limit and at the horizon: with w = e^V there, V is log(w + (1 - w) P), and w is subtracted at last."""
+
+
+def bound_arrival(problem: Problem, model: Model, target: Region) -> tuple[float, float, str]:
+    """Natural logarithms of an upper and a lower bound of P(failing) from the worst start (0, -inf: none), and words.
+
+    ``problem`` has no target; the arrival has to be within its horizon.
+
+    Raises
+    ------
+    InfeasibleError
+        Models, limits or targets that depend on time, disturbances, random starts, starts that are not on one side of
+        the target, or a limit between them and it.
+    """
+    side, start = _placed(problem, model, target)
+    aux = problem.replace(safe=[*problem.safe, Outside(target, label="the target")])
+    cuts = cuts_of(aux, model, start)
+    inner, outer = (ladder.room_of(aux, model, cuts, start, inner=way) for way in (True, False))
+    if not ladder.is_plain(inner) or not ladder.is_plain(outer):
+        raise InfeasibleError("value functions in continuous time need limits that stand still for a target.")
+    _check_face(problem, outer.phases[0], side)
+    small = inner.phases[0]
+    wide = outer.phases[0]
+    check_noise(outer.models[0], (wide.start, wide.end), [(wide.low, wide.high)])
+    # below, the limit is rounded inward and the face into the target; above the other way round
+    late = _between(outer, (small.low, wide.high) if side == 1 else (wide.low, small.high), side, model, start)
+    early = _between(outer, (wide.low, small.high) if side == 1 else (small.low, wide.high), side, model, start)
+    limited = wide.closed[1 - side]  # a path that passes a mere cut may come back and arrive
+    least, most, done = _bounds(early if limited else None, late, start, side)
+    found = ", ".join(done) or "none came to an end"
+    words = f"value function in one state for arriving, cells x slabs of time: {found}"
+    return complement(least, up=True), complement(most, up=False), words
+
+
+def _placed(problem: Problem, model: Model, target: Region) -> tuple[int, Start]:
+    """The side of the starts on which the target lies, and the worst of them."""
+    if not model.autonomous or target.moving or any(c.during is not None for c in problem.constraints):
+        raise InfeasibleError("value functions in continuous time need a target, limits and a model without time.")
+    if problem.system.disturbance is not None:
+        raise InfeasibleError("value functions in continuous time do not serve targets under disturbances.")
+    if problem.initial.random:
+        raise InfeasibleError("value functions in continuous time need a set of starts for a target.")
+    start, around = start_of(problem), target.hull()
+    if start.high < around.lo[0]:
+        return 1, Start(low=start.low, high=start.low)
+    if start.low > around.hi[0]:
+        return 0, Start(low=start.high, high=start.high)
+    raise InfeasibleError("value functions in continuous time need starts on one side of the target.")
+
+
+def _check_face(problem: Problem, phase: Phase, side: int) -> None:
+    """Refuse a limit between the starts and the target's face, or on it."""
+    places = [limit.offset for limit, _ in limits_of(problem, inner=True) if limit.side == side]
+    if any(place <= phase.high if side == 1 else place >= phase.low for place in places):
+        raise InfeasibleError("value functions in continuous time need limits that lie beyond the target's face.")
+
+
+def _between(
+    room: ladder.Room, ends: tuple[float, float], side: int, model: Model, start: Start
+) -> ladder.Room:
+    phase = dataclasses.replace(room.phases[0], low=ends[0], high=ends[1], closed=(side == 0, side == 1))
+    return dataclasses.replace(room, phases=[phase], lines=[ladder.line_of(phase, model, start)])
+
+
+def _bounds(early: ladder.Room | None, late: ladder.Room, start: Start, side: int) -> tuple[float, float, list[str]]:
+    """Natural logarithms of bounds of P(arriving): at least, at most."""
+    rough = ladder.sketches(late)
+    least, most, done = -math.inf, 0.0, list[str]()
+    for fineness, tolerance, lead in ladder.LADDER[:_RUNGS]:
+        share = lead / max(rough[0].growth, 1.0)
+        try:
+            links = early and ladder.surface_of_arrival(early, side, rough, (share, fineness, tolerance, lead), _FLOOR)
+            if links and spans(links, upper=True):
+                most = min(most, _prove_above(links[0], start, side))
+            links = ladder.surfaces_below(late, start, rough, (share, fineness, 0.5 * tolerance, lead), _FLOOR)
+            if links is not None and spans(links, upper=False):
+                payment = prove_below(links, start)
+                done.append(f"{links[0].surface.cells[0]} x {links[0].surface.slabs}")
+                least = max(least, -math.inf if payment is None else payment.log)
+        except OutOfTime:
+            if not done:
+                raise
+            break
+    return least, most, done
+
+
+def _prove_above(link: Link, start: Start, side: int) -> float:
+    """An upper bound of log P(arriving), whatever the surface is: V >= 0 on the face, and w = exp(inf V) elsewhere."""
+    surface = link.surface
+    for _ in range(3):
+        missing = -surface.face_range(0, side)[0]
+        surface = surface.raised(up(missing)) if missing > 0 else surface
+    if surface.face_range(0, side)[0] < 0:
+        return 0.0
+    level = up(start.highest(surface, link.phase))
+    need = Need(spare=NEGLIGIBLE / (link.phase.end - link.phase.start), start=level, top=0.0)
+    proof = examine(surface, link.model, need, upper=True)
+    floor = min(float(surface.range_at(-1)[0].min()), surface.face_range(0, 1 - side)[0])
+    parts = patched_of(proof, proof.ranges.residual_high, need, surface.steps)
+    return pay_upper(parts, level, floor - 1e-15 * (1 + abs(floor))).log
+
+
+def complement(log: float, *, up: bool) -> float:
+    """log(1 - e^log), rounded up or down."""
+    rest = -math.expm1(log) if log > -math.inf else 1.0
+    rest = rest * (1 + 1e-13) + 1e-300 if up else rest * (1 - 1e-13)
+    return min(math.log(rest), 0.0) + (1e-14 if up and rest < 1 else 0.0) if rest > 0 else -math.inf

@@ -1,0 +1,149 @@
+"""Curves of exit times: closed forms in continuous time, NumPy's own chain in discrete time, means, refusals."""
+
+import json
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.cli.app import run
+from certbound.errors import InfeasibleError
+from certbound.problem.files import save
+from certbound.safety import first_exits
+
+
+def brownian(horizon=2.0, drift=0.0, start=0.0):
+    system = cb.ContinuousSystem(lambda x: 0 * x + drift, states=["x"], diffusion=[[1.0]])
+    safe = [cb.Inside(cb.Box([-1.0], [1.0]))]
+    return cb.Problem(system, initial=[start], safe=safe, horizon=horizon, name="brownian")
+
+
+def survival(s, drift, start):
+    """P(a Brownian motion with drift has not left (-1, 1) by s), by its eigenfunctions."""
+    k = np.arange(1, 400)[:, None]
+    rate, y = (k * np.pi / 2) ** 2 / 2 + drift**2 / 2, start + 1
+    ends = k * np.pi / 2 * (np.exp(-drift) - (-1.0) ** k * np.exp(drift)) / (drift**2 + (k * np.pi / 2) ** 2)
+    return np.sum(np.exp(-drift * start) * np.sin(k * np.pi * y / 2) * np.exp(-rate * s) * ends, axis=0)
+
+
+@pytest.fixture(scope="module")
+def found():
+    """From the one horizon alone, without those for short times."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(first_exits, "_SHORTEST", 1)
+        patch.setattr(first_exits, "_SLABS", 80)
+        return cb.bound_exit_times(brownian())
+
+
+@pytest.mark.slow
+def test_short_times_are_bounded_closely_too():
+    found = cb.bound_exit_times(brownian(8.0))
+    truth = 1 - survival(np.maximum(found.times, 1e-3), 0.0, 0.0)
+    assert np.max(found.upper - truth) < 0.015
+    assert np.max(truth - found.lower) < 0.015
+    assert 0.96 < found.mean_lower < 1 < found.mean_upper < 1.05
+
+
+def test_the_curves_hold_the_closed_form_closely(found):
+    times = found.times[found.times > 0.02]
+    truth = 1 - survival(times, 0.0, 0.0)
+    lower, upper = (np.array([found.at(float(s))[k] for s in times]) for k in (0, 1))
+    assert np.all(lower <= truth + 1e-12)
+    assert np.all(truth <= upper + 1e-12)
+    late = times > 1.0
+    assert np.max(upper[late] / truth[late]) < 1.03
+    assert np.min(lower[late] / truth[late]) > 0.97
+
+
+def test_the_curves_rise_and_are_read_between_their_times(found):
+    assert np.all(np.diff(found.lower) >= 0)
+    assert np.all(np.diff(found.upper) >= 0)
+    low, high = found.at(1.2345)
+    assert low < 1 - survival(np.array([1.2345]), 0.0, 0.0)[0] < high
+    assert found.at(0.0)[0] == 0.0
+    with pytest.raises(ValueError, match=r"`s` must lie in \[0, 2\], got 3"):
+        found.at(3.0)
+
+
+def test_the_mean_is_bounded_from_both_sides(found):
+    assert found.mean_lower < 1 < found.mean_upper
+    assert "mean exit time" in found.summary()
+    # P(left within 2) is .89 at least from anywhere: what is still to come is little
+    assert found.mean_upper < 1.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("drift", "start"), [(0.5, 0.0), (-1.0, 0.3)])
+def test_drift_and_another_start(drift, start):
+    found = cb.bound_exit_times(brownian(8.0, drift, start), times=[0.2, 0.5, 1.0, 2.0, 4.0])
+    truth = 1 - survival(found.times, drift, start)
+    assert np.all((found.lower <= truth) & (truth <= found.upper))
+    assert np.max(found.upper / truth) < 1.05
+    y, m = start + 1, drift
+    mean = (2 * (1 - np.exp(-2 * m * y)) / (1 - np.exp(-4 * m)) - y) / m
+    assert 0.95 * mean < found.mean_lower < mean < found.mean_upper < 1.06 * mean
+
+
+def test_discrete_time_holds_a_chain_of_its_own():
+    system = cb.DiscreteSystem(lambda x: 0.9 * x, states=["x"], noise=cb.Gaussian(std=0.4))
+    problem = cb.Problem(system, initial=[0.2], safe=[cb.Inside(cb.Box([-1.0], [1.0]))], horizon=120)
+    found = cb.bound_exit_times(problem)
+    rng, x = np.random.default_rng(0), np.full(100_000, 0.2)
+    alive, when = np.ones(len(x), dtype=bool), np.zeros(len(x))
+    for k in range(1, 2000):
+        when[alive] = k
+        x = 0.9 * x + 0.4 * rng.standard_normal(len(x))
+        alive &= np.abs(x) <= 1
+        if k in (1, 5, 20, 80):
+            low, high = found.at(k)
+            assert low - 0.005 < 1 - alive.mean() < high + 0.005
+            assert high - low < 1e-3
+    assert 0.95 * when.mean() < found.mean_lower < when.mean() * 1.01
+    assert 0.99 * when.mean() < found.mean_upper < 1.1 * when.mean()
+
+
+def test_every_start_of_a_set_counts():
+    system = cb.DiscreteSystem(lambda x: 0.9 * x, states=["x"], noise=cb.Gaussian(std=0.3))
+    safe = [cb.Inside(cb.Box([-1.0], [1.0]))]
+    whole = cb.bound_exit_times(cb.Problem(system, initial=cb.Box([0.1], [0.6]), safe=safe, horizon=60))
+    ends = [cb.bound_exit_times(cb.Problem(system, initial=[x], safe=safe, horizon=60)) for x in (0.1, 0.6)]
+    assert np.all(whole.upper >= ends[1].lower)
+    assert np.all(whole.lower <= ends[1].upper)
+    assert whole.lower[20] > ends[0].upper[20]  # the worst start
+    assert whole.mean_lower < ends[1].mean_upper  # the shortest mean
+    assert whole.mean_upper > ends[0].mean_lower  # the longest
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"safe": [cb.Inside(cb.Box([-1.0], [1.0]), during=(0, 1))]}, "limits that always hold and stand still"),
+        ({"initial": cb.GaussianStart([0.0], [[0.01]])}, "need one set of starts"),
+        ({"initial": [cb.Box([0.0], [0.1]), cb.Box([0.2], [0.3])]}, "need one set of starts"),
+        ({"reach": cb.Box([0.5], [0.6])}, "the problem has a target"),
+        ({"system": cb.ContinuousSystem(lambda t, x: 0 * x + t, states=["x"], diffusion=[[1.0]])}, "depend on time"),
+    ],
+)
+def test_what_is_not_served_says_so(changes, message):
+    with pytest.raises(InfeasibleError, match=message):
+        cb.bound_exit_times(brownian().replace(**changes))
+
+
+def test_two_states_are_refused():
+    system = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=np.eye(2))
+    safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    with pytest.raises(InfeasibleError, match="in one state, the problem has 2"):
+        cb.bound_exit_times(cb.Problem(system, initial=[0, 0], safe=safe, horizon=1))
+
+
+def test_the_command_prints_the_curves(tmp_path, capsys):
+    system = cb.DiscreteSystem(lambda x: 0.9 * x, states=["x"], noise=cb.Gaussian(std=0.4))
+    problem = cb.Problem(system, initial=[0.2], safe=[cb.Inside(cb.Box([-1.0], [1.0]))], horizon=30, name="walk")
+    save(problem, tmp_path / "walk.toml")
+    assert run(["exit-times", str(tmp_path / "walk.toml"), "--json", "--plot", str(tmp_path / "walk.png")]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert list(result) == ["times", "lower", "upper", "mean_lower", "mean_upper", "seconds"]
+    assert result["upper"][-1] > result["lower"][-1] > 0.5
+    assert (tmp_path / "walk.png").stat().st_size > 5000
+    assert run(["exit-times", str(tmp_path / "walk.toml")]) == 0
+    assert "mean exit time" in capsys.readouterr().out

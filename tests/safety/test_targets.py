@@ -1,0 +1,186 @@
+"""Problems with a target: bounds against simulation, the noise-free path that misses, certificates, and bad input."""
+
+import contextlib
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.checker import check_data, parse
+from certbound.cli.commands.check import proved_certificate
+from certbound.errors import CertificateError, InfeasibleError
+from certbound.problem.files import load, save
+from certbound.problem.goals import met_at, until
+from certbound.safety.certificate import problem_data
+
+WALL, TARGET = cb.Inside(cb.Box([-1.0], [1.0])), cb.Box([-0.2], [0.2])
+
+
+def walk(reach=TARGET, *, start=(0.8,), drift=0.7, std=0.1, horizon=6, delta=0.05, **more):
+    system = cb.DiscreteSystem(lambda x: drift * x, states=["x"], noise=cb.Gaussian(std=std))
+    more |= {"safe": [WALL], "reach": reach, "horizon": horizon, "delta": delta, "name": "walk"}
+    return cb.Problem(system, initial=start, **more)
+
+
+def failures(problem, paths=100_000):
+    """How many paths of NumPy's own fail, by what the definition says."""
+    rng, count = np.random.default_rng(1), np.zeros(paths, dtype=bool)
+    first, last = problem.reach.during or (0, problem.horizon)
+    x = np.full(paths, problem.initial.middle[0])
+    failed, done = np.zeros(paths, dtype=bool), count
+    for t in range(int(problem.horizon) + 1):
+        failed |= ~done & (np.abs(x) > 1)
+        if first <= t <= last:
+            done = done | (~failed & (np.abs(x) <= 0.2))
+        x = 0.7 * x + float(problem.system.noise.std[0]) * rng.standard_normal(paths)
+    return np.mean(~done)
+
+
+@pytest.mark.parametrize("during", [None, (3, 5), (0, 4), (5, 5)])
+def test_the_bounds_hold_what_a_simulation_of_its_own_finds(during):
+    problem = walk(cb.Reach(TARGET, during), std=0.2)
+    verdict = cb.verify_safety(problem, method="values")
+    truth = failures(problem)
+    error = 4 * np.sqrt(truth / 100_000)
+    assert 10**verdict.log10_lower <= truth + error
+    assert truth - error <= 10**verdict.log10_delta <= 1.05 * 10**verdict.log10_lower
+    counted = cb.simulate_exits(problem, paths=100_000, rng=2)
+    assert abs(counted.probability - truth) < 2 * error
+    assert sum(counted.by_constraint.values()) == counted.exits
+    assert list(counted.by_constraint)[-1].startswith("not in time: reach")
+
+
+def test_starts_in_the_target_have_not_failed():
+    inside = cb.verify_safety(walk(start=cb.Box([-0.2], [0.1])), method="values")
+    assert 10**inside.log10_delta < 1e-290
+    assert cb.simulate_exits(walk(start=(0.1,)), paths=100, rng=0).exits == 0
+    later = walk(cb.Reach(TARGET, (1, 6)), start=(0.1,), std=0.3)
+    assert cb.verify_safety(later, method="values").log10_lower > -3
+    assert cb.simulate_exits(later, paths=10_000, rng=0).exits > 0
+
+
+def test_a_wider_target_and_a_longer_time_are_never_worse():
+    bounds = [
+        cb.verify_safety(walk(reach, std=0.2, horizon=horizon), method="values").log10_delta
+        for reach, horizon in ((cb.Box([-0.1], [0.1]), 5), (TARGET, 5), (TARGET, 7))
+    ]
+    assert bounds[0] > bounds[1] > bounds[2]
+
+
+def test_other_engines_meet_the_target_at_one_time_and_prove_less():
+    problem = walk(std=0.05, horizon=8)
+    exact = cb.verify_safety(problem, method="values")
+    linear = cb.verify_safety(problem, method="linear")
+    assert exact.log10_lower < linear.log10_delta < -1.5
+    assert linear.log10_lower is None  # of one way of not failing no lower bound follows
+    assert "one way of not failing" in linear.reason
+
+
+def test_where_the_target_counts_at_one_time_the_problem_is_a_plain_one():
+    problem = walk(cb.Reach(TARGET, (6, 6)), std=0.1)
+    plain = met_at(problem, 6)
+    assert plain.reach is None
+    for method in ("values", "linear"):
+        mine, theirs = (cb.verify_safety(one, method=method) for one in (problem, plain))
+        assert (mine.log10_delta, mine.log10_lower) == (theirs.log10_delta, theirs.log10_lower)
+
+
+def test_what_is_asked_after_the_target_does_not_count():
+    late = cb.Inside(cb.Box([5.0], [6.0]), during=(6, 6))
+    half = cb.Inside(cb.Box([-0.9], [0.95]), during=(0, 4))
+    problem = walk(cb.Reach(TARGET, (5, 5))).replace(safe=[WALL, late, half])
+    kept = until(problem, 5).safe
+    assert [(c.label, c.during) for c in kept] == [("-1 <= x <= 1", None), ("-0.9 <= x <= 0.95", (0.0, 4))]
+    assert cb.verify_safety(problem, method="linear").log10_delta < 0
+
+
+@pytest.mark.parametrize("time", ["discrete", "continuous"])
+def test_a_noise_free_path_that_misses_is_unsafe(time):
+    if time == "discrete":
+        problem = walk(horizon=3)
+    else:
+        system = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=[[0.01]])
+        problem = cb.Problem(system, initial=[0.8], safe=[WALL], reach=TARGET, horizon=1.3)
+    verdict = cb.verify_safety(problem)
+    assert verdict.status == "UNSAFE_NOMINAL"
+    assert "does not 'reach -0.2 <= x <= 0.2' by" in verdict.reason
+    near = cb.verify_safety(problem.replace(reach=cb.Box([-0.2], [0.3]), delta=0.9))
+    assert near.status != "UNSAFE_NOMINAL"
+
+
+def test_a_path_that_breaks_a_constraint_first_misses_and_one_that_does_so_later_does_not():
+    system = cb.DiscreteSystem(lambda x: x + 0.3, states=["x"], noise=cb.Gaussian(std=1e-3))
+    problem = cb.Problem(system, initial=[0.0], safe=[WALL], reach=cb.Box([0.5], [0.7]), horizon=10)
+    assert cb.verify_safety(problem).status == "SAFE"  # at 0.6 after two steps, and out of the wall after four
+    gap = cb.Outside(cb.Box([0.2], [0.4]), during=(1, 10))
+    verdict = cb.verify_safety(problem.replace(safe=[WALL, gap]))
+    assert verdict.status == "UNSAFE_NOMINAL"
+    assert "before it is in the target" in verdict.reason
+
+
+def test_a_certificate_names_the_time_and_its_forged_twins_are_refused():
+    problem = walk(std=0.03, horizon=8)
+    verdict = cb.verify_safety(problem, method="linear")
+    text = proved_certificate(problem, verdict)
+    report = check_data(parse(text), problem_data(problem))
+    assert report.valid
+    assert "before it is in its target" in report.claim
+    for place, forged in (("time", (4.0).hex()), ("time", (9.0).hex()), ("time", (2.5).hex())):
+        data = parse(text)
+        data["proof"][place] = forged
+        _refused(data)
+    data = parse(text)
+    data["proof"], data["claim"]["method"] = data["proof"]["proof"], "linear"
+    _refused(data)
+    data = parse(text)
+    data["problem"]["reach"]["during"] = [(0.0).hex(), (2.0).hex()]
+    _refused(data)
+    assert not check_data(parse(text), problem_data(problem.replace(reach=cb.Box([-0.3], [0.2])))).valid
+    assert not check_data(parse(text), problem_data(problem.replace(reach=None))).valid
+
+
+def _refused(data):
+    with contextlib.suppress(CertificateError):
+        assert not check_data(data).valid
+
+
+def test_value_functions_of_targets_are_not_stated_in_certificates():
+    problem = walk(std=0.2, horizon=8)
+    with pytest.raises(CertificateError, match="certificates state that a target is met at one time"):
+        cb.verify_safety(problem, method="values").certificate_text(problem)
+
+
+def test_it_is_saved_and_loaded(tmp_path):
+    problem = walk(cb.Reach(cb.Ball([0.0], 0.2), (2, 5), "home"))
+    save(problem, tmp_path / "walk.toml")
+    assert problem_data(load(tmp_path / "walk.toml")) == problem_data(problem)
+    assert "[[reach]]" in (tmp_path / "walk.toml").read_text()
+
+
+def test_targets_that_cannot_be_met_are_refused():
+    with pytest.raises(ValueError, match="must meet the safe set, but the target lies wholly where '-1 <= x <= 1'"):
+        walk(cb.Box([1.2], [1.5]))
+    with pytest.raises(ValueError, match=r"lies wholly where 'outside -0.5 <= x <= 0.5'"):
+        walk().replace(safe=[cb.Outside(cb.Box([-0.5], [0.5]))])
+    with pytest.raises(ValueError, match="`reach` must have `during` within"):
+        walk(cb.Reach(TARGET, (2, 9)))
+    with pytest.raises(ValueError, match="a time after 0"):
+        walk(cb.Reach(TARGET, (0, 0)))
+    with pytest.raises(ValueError, match="whole steps"):
+        walk(cb.Reach(TARGET, (0, 2.5)))
+    with pytest.raises(TypeError, match="give it as `reach=`"):
+        walk().replace(safe=[cb.Reach(TARGET)])
+    with pytest.raises(TypeError, match=r"must be cb\.Reach or a set"):
+        walk(cb.Inside(TARGET))
+    with pytest.raises(ValueError, match=r"`reach` must have dimension 1"):
+        walk(cb.Box([0, 0], [1, 1]))
+
+
+def test_what_does_not_know_targets_says_so():
+    problem = walk()
+    with pytest.raises(InfeasibleError, match="the problem has a target"):
+        _ = problem.constraints
+    with pytest.raises(InfeasibleError, match="the problem has a target"):
+        cb.bound_metrics(problem)
+    with pytest.raises(InfeasibleError, match="the problem has a target"):
+        cb.verify_safety(problem, method="values").safe_starts()
