@@ -106,6 +106,7 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
+    "values.continuous": (7, "certificates state the surfaces of the search, and what these were paid with"),
     "values.discrete": (7, "kernels and interpolation of discrete time are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (23, "the one description of functions, which every room reads, differentiates and evaluates"),

@@ -27,6 +27,7 @@ STATED = "the stated constants hold"
 
 _ANY = "for every disturbance in its set, even one that sees coming noise"
 _BLIND = "for every disturbance in its set that does not see coming noise"
+_SOME = "for some disturbance in its set that reacts to the state and does not see coming noise"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -44,12 +45,16 @@ class Engine:
         supermartingales do not: foresight would spoil these.
     assumes : callable
         ``assumes(model, proof)`` to what the proof takes for granted, in words; None where nothing.
+    below : callable, optional
+        As ``prove``, to a lower bound of the probability from some start, for some disturbance that reacts to the
+        state.
     """
 
     words: str
     prove: Callable[[Model, object, Budget], arb]
     foresees: Callable[[Model], bool] = lambda model: False
     assumes: Callable[[Model, Mapping[str, object]], str | None] = lambda model, proof: None
+    below: Callable[[Model, object, Budget], arb] | None = None
 
 
 def engine_of(proof: object, method: str) -> str:
@@ -60,6 +65,16 @@ def engine_of(proof: object, method: str) -> str:
     if method != engine:
         raise CertificateError(f"`claim.method` must be \"{engine}\", the proof's engine, got {quoted(method)}.")
     return engine
+
+
+def proof_of(proof: Mapping[str, object], lower: bool) -> Callable[[Model, object, Budget], arb]:
+    """What proves a claim: of a lower bound where ``lower``, which the proof's ``side`` must say too."""
+    row, side = ENGINES[str(proof["engine"])], proof.get("side")
+    if side is not None and (side != "lower" or row.below is None):
+        raise CertificateError("`proof.side` must be \"lower\", in a proof by value functions, or be left out.")
+    if (side is not None) != lower:
+        raise CertificateError("`claim.log10_lower` must be there just where `proof.side` is \"lower\".")
+    return row.below if lower and row.below is not None else row.prove
 
 
 def assumptions(model: Model, proof: Mapping[str, object], named: Sequence[str]) -> list[str]:
@@ -91,14 +106,25 @@ def _stated(model: Model, proof: Mapping[str, object]) -> str | None:
 
 def claim(model: Model, engine: str, level: float, assumed: Sequence[str]) -> str:
     """The claim as one sentence."""
-    unit = "s" if model.continuous else "steps"
     start = "a normal start" if model.initial.covariance is not None else "every start in the initial set"
     whose = "" if not model.disturbance else f", {_ANY if ENGINES[engine].foresees(model) else _BLIND},"
     safe = "at most" if arb(level) <= arb(model.delta).log() / arb(10).log() else "more than"
+    return _sentence(model, f"{start}{whose}", f"at most 10^{rounded(level, up=True)} ({safe}", assumed)
+
+
+def claim_below(model: Model, level: float, assumed: Sequence[str]) -> str:
+    """The claim of a lower bound as one sentence."""
+    start = "a normal start" if model.initial.covariance is not None else "some start in the initial set"
+    whose = f", {_SOME}," if model.disturbance else ""
+    unsafe = "more than" if arb(level) > arb(model.delta).log() / arb(10).log() else "which need not be more than"
+    return _sentence(model, f"{start}{whose}", f"at least 10^{rounded(level, up=False)} ({unsafe}", assumed)
+
+
+def _sentence(model: Model, start: str, bound: str, assumed: Sequence[str]) -> str:
+    unit = "s" if model.continuous else "steps"
     words = (
-        f"from {start}{whose} the problem {quoted(model.name)} breaks one of its {len(model.constraints)} constraints "
-        f"within {plainly(model.horizon)} {unit} with probability at most 10^{rounded(level, up=True)} "
-        f"({safe} delta = {plainly(model.delta)})"
+        f"from {start} the problem {quoted(model.name)} breaks one of its {len(model.constraints)} constraints "
+        f"within {plainly(model.horizon)} {unit} with probability {bound} delta = {plainly(model.delta)})"
     )
     return words + "".join(f"; assuming that {item}" for item in assumed)
 
@@ -110,10 +136,16 @@ def _values(model: Model, proof: object, budget: Budget) -> arb:
     return check_values(model, proof, budget)
 
 
+def _values_below(model: Model, proof: object, budget: Budget) -> arb:
+    from certbound.checker.values import check_values_below
+
+    return check_values_below(model, proof, budget)
+
+
 ENGINES = {
     "linear": Engine(words="linear response (Thm K7)", prove=check_linear, foresees=_additive),
     "constants": Engine(words="contraction constants (Thms K2, K5)", prove=check_constants, assumes=_stated),
     "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
-    "values": Engine(words="the value function itself (Thm K8)", prove=_values),
+    "values": Engine(words="the value function itself (Thm K8)", prove=_values, below=_values_below),
 }
 """By the name that a proof gives: all that the checker knows of an engine."""

@@ -30,22 +30,23 @@ def certificate_text(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     return json.dumps(certificate_data(problem, verdict, attempt=attempt), separators=(",", ":")) + "\n"
 
 
-def restated(text: str, log10_proved: float) -> str:
-    """The certificate claiming what the checker proved of it, where that is less than it claimed.
+def restated(text: str, log10_proved: float, *, lower: bool = False) -> str:
+    """The certificate claiming what the checker proved of it, where that is less (``lower``: more) than it claimed.
 
     The writer leaves itself room, and its own bounds of the events are coarser in places than the checker's.
     """
-    data = json.loads(text)
-    claimed = float.fromhex(data["claim"]["log10_delta"])
-    proved = log10_proved + _ROUNDING * (1.0 + abs(log10_proved))
-    if not proved < claimed:
+    data, name = json.loads(text), "log10_lower" if lower else "log10_delta"
+    claimed = float.fromhex(data["claim"][name])
+    room = _ROUNDING * (1.0 + abs(log10_proved))
+    proved = log10_proved - room if lower else log10_proved + room
+    if not (proved > claimed if lower else proved < claimed):
         return text
-    data["claim"]["log10_delta"] = exact(proved)
+    data["claim"][name] = exact(proved)
     return json.dumps(data, separators=(",", ":")) + "\n"
 
 
 def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -> dict[str, Any]:
-    """The certificate of a verdict: P(some constraint is broken) <= 10**claim, with what proves it.
+    """The certificate of a verdict: P(some constraint is broken) <= 10**claim, with what proves it; >= where UNSAFE.
 
     The claim rests on inequalities that the checker knows, and may be weaker than the verdict's ``log10_delta``. Where
     it would be weaker than SAFE, other engines are tried.
@@ -64,6 +65,8 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
         If the verdict bounds no probability, or no proof of it can be stated.
     """
     refusals: list[str] = []
+    if verdict.status == "UNSAFE":
+        return _lower_data(problem, verdict, attempt)
     best: tuple[str, Proof] | None = None
     for name, answer in _answers(problem, verdict):
         try:
@@ -80,15 +83,34 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
             break
     if best is not None:
         name, (proof, log10, assumptions) = best
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "claim": {"log10_delta": exact(min(log10, 0.0)), "method": name, "assumptions": assumptions},
-            "problem": problem_data(problem),
-            "proof": proof,
-        }
+        claim = {"log10_delta": exact(min(log10, 0.0)), "method": name, "assumptions": assumptions}
+        return _whole(problem, claim, proof)
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
+
+
+def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, Any]:
+    """The certificate of UNSAFE: P(some constraint is broken) >= 10**claim from some start, for some disturbance."""
+    refusals: list[str] = []
+    found = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_lower is not None]
+    for name, answer in sorted(found, key=lambda item: -(item[1].log10_lower or 0.0)):
+        try:
+            write = ENGINES[name].write_below
+            if write is None:
+                raise CertificateError("certificates do not state the lower bounds of this engine.")
+            proof, log10, assumptions = write(problem, answer, attempt)
+        except CertificateError as error:
+            refusals.append(f"{name}: {error}")
+            continue
+        claim = {"log10_delta": exact(0.0), "log10_lower": exact(log10), "method": name, "assumptions": assumptions}
+        return _whole(problem, claim, proof)
+    why = " ".join(refusals) or verdict.reason
+    raise CertificateError(f"no lower bound was found that a certificate could state: {why}")
+
+
+def _whole(problem: Problem, claim: dict[str, Any], proof: dict[str, Any]) -> dict[str, Any]:
+    data = problem_data(problem)
+    return {"format": FORMAT, "version": VERSION, "claim": claim, "problem": data, "proof": proof}
 
 
 def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineAnswer]]:
@@ -194,7 +216,7 @@ def _initial(start: Any) -> dict[str, Any]:
     data = start.data(_KINDS)
     if data["kind"] == "polytope":  # by a box around it
         around = start.hull()
-        data = {"kind": "box", "low": around.lo, "high": around.hi}
+        data = {"kind": "box", "low": around.lo, "high": around.hi, "around": True}
     return {name: exact(value) for name, value in data.items() if value is not None}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -128,11 +129,32 @@ def leaving() -> cb.Problem:
     return cb.Problem(system, initial=cb.Box([-0.1], [0.2]), safe=safe, horizon=0.4, delta=0.5)
 
 
-def exit_certificate(problem: cb.Problem, seconds: float = 0.1) -> str:
+def exit_certificate(problem: cb.Problem, seconds: float = 0.1, *, lower: bool = False) -> str:
     """A certificate by a value function in continuous time from the first attempt alone."""
-    found = bound_exits(problem, seconds=seconds, lower=False)
-    answer = EngineAnswer(log10_delta=found.upper, method="values", details=found)
-    return certificate_text(problem, SimpleNamespace(status="UNKNOWN", reason="", answers={"values": answer}))
+    found = bound_exits(problem, seconds=seconds, lower=lower)
+    answer = EngineAnswer(log10_delta=found.upper, log10_lower=found.lower, method="values", details=found)
+    return side_of(problem, {"values": answer}, lower=lower)
+
+
+def side_of(problem: cb.Problem, answers: dict[str, EngineAnswer], *, lower: bool) -> str:
+    """The certificate of one of the two bounds, whatever the verdict is."""
+    status = "UNSAFE" if lower else "UNKNOWN"
+    return certificate_text(problem, SimpleNamespace(status=status, reason="", answers=answers))
+
+
+def started() -> cb.Problem:
+    """Discrete time, for value functions: a normal start."""
+    system = cb.DiscreteSystem(lambda x: 0.8 * x, states=["x"], noise=cb.Gaussian(std=0.2))
+    start = cb.GaussianStart([0.1], [[0.04]])
+    return cb.Problem(system, initial=start, safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3, delta=0.1)
+
+
+def drifting() -> cb.Problem:
+    """Continuous time, for value functions: a normal start, and no limit below."""
+    system = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=0.5)
+    start = cb.GaussianStart([0.1], [[0.02]])
+    safe = [cb.Inside(cb.HalfSpace([1.0], 1.0))]
+    return cb.Problem(system, initial=start, safe=safe, horizon=0.5, delta=0.1)
 
 
 @pytest.fixture(autouse=True)
@@ -170,3 +192,11 @@ def stirring() -> Case:
 @pytest.fixture(scope="session")
 def valuing() -> Case:
     return Case(valued(), "values")
+
+
+@pytest.fixture(scope="session")
+def valuing_below(valuing: Case) -> Case:
+    """The lower bound of the same verdict."""
+    case = copy.copy(valuing)
+    case.text = side_of(case.problem, dict(case.verdict.answers), lower=True)
+    return case

@@ -49,7 +49,8 @@ class Noise:
 class Initial:
     """The initial set: its box hull, and the covariance of a random start (None otherwise).
 
-    ``kind`` and the exact data stay for proofs that use a ball or an ellipsoid itself.
+    ``kind`` and the exact data stay for proofs that use a ball or an ellipsoid itself; ``around`` says that the set is
+    another one, inside the stated box.
     """
 
     kind: str
@@ -59,6 +60,7 @@ class Initial:
     centre: tuple[float, ...] = ()
     radius: float = 0.0
     shape: arb_mat | None = None
+    around: bool = False
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -241,12 +243,13 @@ def _initial(value: object, path: str, n: int, budget: Budget) -> Initial:
     kind = value.get("kind") if isinstance(value, dict) else None
     if not isinstance(kind, str) or kind not in kinds:
         raise CertificateError(f"`{path}.kind` must be one of {', '.join(kinds)}.")
-    record = Record(value, path, ("kind", *kinds[kind]))
+    record = Record(value, path, ("kind", *kinds[kind]), ("around",) if kind == "box" else ())
     if kind == "box":
         low, high = record.array("low", n), record.array("high", n)
         if any(a > b for a, b in zip(low, high)):
             raise CertificateError(f"`{path}.low` must not exceed `high`.")
-        return Initial(kind=kind, low=tuple(map(arb, low)), high=tuple(map(arb, high)))
+        around = record["around"] is not None and record.flag("around")
+        return Initial(kind=kind, low=tuple(map(arb, low)), high=tuple(map(arb, high)), around=around)
     centre = record.array("mean" if kind == "gaussian" else "center", n)
     points = [arb(x) for x in centre]
     if kind == "gaussian":

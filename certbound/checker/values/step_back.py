@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from flint import arb
+from flint import arb, arb_mat
 
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, StepSet
@@ -118,12 +118,20 @@ def _deviations(model: Model) -> list[arb]:
     """Standard deviations of the noise, which must move every state on its own."""
     if not model.noise.gaussian:
         raise Unproved("value functions are proved for normal noise only")
-    covariance = model.noise.covariance()
-    n = model.dimension
+    found, proxy = independent(model.noise.covariance(), "noise"), model.noise.proxy
+    m = proxy.nrows()
+    if any(not proxy[i, j].is_zero() for i in range(m) for j in range(m) if i != j):
+        return [x.union(x * (1 - arb(2) ** -38)) for x in found]  # it may have been raised, by 2^-39 of a variance
+    return found
+
+
+def independent(covariance: arb_mat, what: str) -> list[arb]:
+    """Standard deviations of a normal vector whose entries are independent."""
+    n = covariance.nrows()
     if any(not covariance[i, j].is_zero() for i in range(n) for j in range(n) if i != j):
-        raise Unproved("value functions are proved for noise only that is independent from state to state")
+        raise Unproved(f"value functions are proved for {what} only that is independent from state to state")
     if not all(covariance[i, i] > 0 for i in range(n)):
-        raise Unproved("value functions are proved only where every state has noise")
+        raise Unproved(f"value functions are proved only where every state of {what} varies")
     return [covariance[i, i].sqrt() for i in range(n)]
 
 
@@ -300,3 +308,10 @@ def highest(found: Batch) -> float:
     return float(np.where(np.isfinite(found.error), tops, 1.0).max())
 
 
+
+
+def lowest(found: Batch) -> float:
+    """At most the largest of the least values over the boxes."""
+    rest = np.abs(found.coefficients[1:]).sum(axis=0) * (1 + 1e-12) + 1e-300
+    bottoms = found.coefficients[0] - rest - np.abs(found.coefficients[0]) * 1e-12
+    return float(np.where(np.isfinite(found.error), bottoms, 0.0).max())
