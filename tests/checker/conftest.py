@@ -149,6 +149,16 @@ def started() -> cb.Problem:
     return cb.Problem(system, initial=start, safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3, delta=0.1)
 
 
+def shaken() -> cb.Problem:
+    """Discrete time, for value functions: uniform noise."""
+    system = cb.DiscreteSystem(
+        lambda x, d: [0.9 * x[0] + 0.1 * np.sin(2 * x[0]) + d[0]], states=["x"], disturbance=cb.Box([-0.02], [0.03]),
+        noise=cb.Uniform(halfwidth=0.3),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1], [1]))]
+    return cb.Problem(system, initial=cb.Box([0], [0.1]), safe=safe, horizon=5, delta=0.1)
+
+
 def drifting() -> cb.Problem:
     """Continuous time, for value functions: a normal start, and no limit below."""
     system = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=0.5)

@@ -31,6 +31,8 @@ _BASES |= {
     "valued below": _sharp(_below(conftest.valued)),
     "started": _sharp(_stated(conftest.started, "values")),
     "started below": _sharp(_below(conftest.started)),
+    "shaken": _sharp(_stated(conftest.shaken, "values")),
+    "shaken below": _sharp(_below(conftest.shaken)),
     "leaving below": _sharp(lambda: conftest.exit_certificate(conftest.leaving(), lower=True)),
     "drifting": _sharp(lambda: conftest.exit_certificate(conftest.drifting())),
     "drifting below": _sharp(lambda: conftest.exit_certificate(conftest.drifting(), lower=True)),
@@ -144,6 +146,48 @@ def _(data: Data) -> None:
             "kind": "halfspace", "normal": exact([1.0]), "bound": exact(0.5),
         }}
     )  # fmt: skip
+
+
+# ---- uniform noise -------------------------------------------------------------------------------------------
+
+_MEANS = "values/uniform_means.py"
+
+
+@forges("the mean is taken over uniform noise", "shaken", _MEANS, "halfwidth_of", MORE)
+def _(data: Data) -> None:
+    _scale(data["problem"]["noise"], "values", 1.001)
+
+
+@forges("the mean is taken over uniform noise from below", "shaken below", _MEANS, "halfwidth_of", LESS)
+def _(data: Data) -> None:
+    _scale(data["problem"]["noise"], "values", 0.999)
+
+
+@forges("uniform noise is a single number", "shaken", _MEANS, "halfwidth_of", "single uniform number")
+def _(data: Data) -> None:
+    data["problem"]["noise"] |= {"values": exact([0.3, 0.01]), "matrix": exact([[1.0, 1.0]])}
+
+
+@forges("uniform noise moves the state", "shaken", _MEANS, "halfwidth_of", "single uniform number")
+def _(data: Data) -> None:
+    data["problem"]["noise"]["matrix"] = exact([[0.0]])
+
+
+@forges("bounded noise is no uniform noise", "shaken", "values/step_back.py", "_deviations", "normal and uniform")
+def _(data: Data) -> None:
+    data["problem"]["noise"] |= {"law": "bounded", "independent": True}
+
+
+@forges("what a slope misses of a mean is added", "shaken", _MEANS, "UniformTransition.mean", MORE)
+def _(data: Data) -> None:
+    for grid in data["proof"]["grids"]:
+        del grid[0][3:-3:2]
+
+
+@forges("what a slope misses of a mean is taken off", "shaken below", _MEANS, "UniformTransition.mean", LESS)
+def _(data: Data) -> None:
+    for grid in data["proof"]["grids"]:
+        del grid[0][3:-3:2]
 
 
 # ---- from below, continuous time -----------------------------------------------------------------------------

@@ -31,18 +31,24 @@ class Noise:
     """The noise: ``diffusion`` is the matrix g (CT) or G (DT), or a tape over (t, states).
 
     ``proxy`` is the covariance (or variance proxy) of w in discrete time, the identity in continuous time.
-    ``gaussian`` says whether it is exactly normal.
+    ``gaussian`` says whether it is exactly normal; ``uniform`` holds the halfwidths of independent uniform entries.
     """
 
     diffusion: arb_mat | Tape
     proxy: arb_mat
     gaussian: bool
+    uniform: tuple[arb, ...] | None = None
+
+    def constant(self) -> arb_mat:
+        """A constant matrix; CertificateError of a tape."""
+        if isinstance(self.diffusion, Tape):
+            raise CertificateError("this proof needs a constant diffusion matrix.")
+        return self.diffusion
 
     def covariance(self) -> arb_mat:
         """g g^T, or G S G^T; a constant matrix only."""
-        if isinstance(self.diffusion, Tape):
-            raise CertificateError("this proof needs a constant diffusion matrix.")
-        return self.diffusion * self.proxy * self.diffusion.transpose()
+        matrix = self.constant()
+        return matrix * self.proxy * matrix.transpose()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -192,7 +198,8 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
     record = Record(value, path, ("law", "level", "values", "matrix", *law.flags))
     rows = _same_length(record.array("matrix", n, None), path)
     proxy = _proxy(record, law, len(rows[0]), budget)
-    return Noise(diffusion=matrix(rows), proxy=proxy, gaussian=law.gaussian)
+    widths = tuple(arb(number(x, path)) for x in record.items("values")) if law.uniform else None
+    return Noise(diffusion=matrix(rows), proxy=proxy, gaussian=law.gaussian, uniform=widths)
 
 
 def _same_length(rows: list[list[float]], path: str) -> list[list[float]]:

@@ -10,7 +10,7 @@ from flint import arb
 from certbound.checker.reading import Record, entries, numbers, wholes
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, StepSet, cells_of
-from certbound.checker.values.batches import above, below
+from certbound.checker.values.batches import Array, above, below
 from certbound.checker.values.crossing import Crossing
 from certbound.checker.values.normal_means import axis_table, mean_table
 from certbound.checker.values.passage import Passage
@@ -29,6 +29,7 @@ from certbound.checker.values.step_back import (
     lowest,
     zones,
 )
+from certbound.checker.values.uniform_means import UniformTransition
 from certbound.errors import CertificateError
 
 Side = tuple[arb, arb]
@@ -98,7 +99,7 @@ class _Discrete:
             key = (self.order[t], self.order[t + 1])
             if kept is None or kept[0] != key or not self.steps.steady:
                 low, high = self._grid(t).boxes()
-                kept = key, Transition(self.steps, t, low, high, self._grid(t + 1))
+                kept = key, self._transition(t, low, high, self._grid(t + 1))
             value = bounded(kept[1].apply(value), self._grid(t), self._zone(t), upper=self.above)
         found = self._over_law(value) if self.random else self._over_starts(value)
         return arb(min(max(found, 0.0), 1.0))
@@ -106,8 +107,12 @@ class _Discrete:
     def _over_starts(self, value: Values) -> float:
         low = np.array([[below(box[i][0]) for box in self.starts] for i in range(self.model.dimension)])
         high = np.array([[above(box[i][1]) for box in self.starts] for i in range(self.model.dimension)])
-        found = Transition(self.steps, 0, low, high, value.grid).apply(value)
+        found = self._transition(0, low, high, value.grid).apply(value)
         return highest(found) if self.above else lowest(found)
+
+    def _transition(self, step: int, low: Array, high: Array, after: Grid) -> Transition:
+        kind = Transition if self.model.noise.uniform is None else UniformTransition
+        return kind(self.steps, step, low, high, after)
 
     def _over_law(self, value: Values) -> float:
         """The mean over a normal start."""

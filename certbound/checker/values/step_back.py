@@ -17,6 +17,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from flint import arb, arb_mat
@@ -31,7 +32,6 @@ from certbound.checker.values.normal_means import (
     ORDER,
     PER_DEVIATION,
     AxisTable,
-    MeanTable,
     axis_table,
     mean_table,
 )
@@ -85,7 +85,7 @@ class Steps:
 
     def __init__(self, model: Model, parts: int, budget: Budget, *, upper: bool) -> None:
         self.model, self.budget, self.upper = model, budget, upper
-        self.deviations = _deviations(model)
+        self.deviations = [] if model.noise.uniform is not None else _deviations(model)
         self.terms = terms(model.dimension + len(model.disturbance), DEGREE)
         self.disturbances = _parts(model.disturbance, parts, upper)
         clock = any(node.op == "input" and node.args[0] == 0 for node in model.dynamics.nodes)
@@ -117,7 +117,7 @@ class Steps:
 def _deviations(model: Model) -> list[arb]:
     """Standard deviations of the noise, which must move every state on its own."""
     if not model.noise.gaussian:
-        raise Unproved("value functions are proved for normal noise only")
+        raise Unproved("value functions are proved for normal and uniform noise only")
     found, proxy = independent(model.noise.covariance(), "noise"), model.noise.proxy
     m = proxy.nrows()
     if any(not proxy[i, j].is_zero() for i in range(m) for j in range(m) if i != j):
@@ -174,7 +174,7 @@ class Transition:
 
     def apply(self, value: Values) -> Batch:
         """A bound of sup over d of E U(f + w) on every box, the constant terms included; unknown where none is."""
-        table = mean_table(self.axes, value.pieces(), self.steps.budget)
+        table = self.table(value)
         best: Batch | None = None
         for images in self.images:
             found = _without(self._means(images, table), self.n, upper=self.steps.upper)
@@ -182,14 +182,18 @@ class Transition:
         assert best is not None
         return best
 
-    def _means(self, images: list[Batch], table: MeanTable) -> Batch:
+    def table(self, value: Values) -> Any:
+        """What the mean after the noise is computed from."""
+        return mean_table(self.axes, value.pieces(), self.steps.budget)
+
+    def _means(self, images: list[Batch], table: Any) -> Batch:
         chunks = []
         for start in range(0, len(images[0].error), _CHUNK):
             self.steps.budget.check()
-            chunks.append(self._mean([image.take(slice(start, start + _CHUNK)) for image in images], table))
+            chunks.append(self.mean([image.take(slice(start, start + _CHUNK)) for image in images], table))
         return tm.joined(chunks)
 
-    def _mean(self, images: list[Batch], table: MeanTable) -> Batch:
+    def mean(self, images: list[Batch], table: Any) -> Batch:
         """Taylor models of h(f)."""
         which, places, shifts = self.steps.terms, [], []
         square = np.zeros(images[0].error.shape)

@@ -20,6 +20,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.errors import CertificateError, InfeasibleError
 from certbound.problem.model import compile_numpy
+from certbound.problem.noise import Law
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside
 from certbound.problem.systems import DiscreteSystem
@@ -30,6 +31,7 @@ from certbound.values.grids import Grid
 from certbound.values.sets import active_at
 
 _SHARES = {1: (0.42, 0.3, 0.2), 2: (0.55, 0.4, 0.28)}
+_UNIFORM_SHARES = (0.03, 0.01, 0.004)
 _ROOMS = (0.05, 0.15, 0.5)
 _PARTS = (12, 24, 48)  # of one disturbance; of several, their product
 _COARSE = (0.04, 0.01, 0.0)  # of log P, for a smaller file
@@ -81,9 +83,9 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
 
 
 def _grids(problem: Problem, effort: int) -> list[Grid]:
-    _refuse(problem)
+    law, shares = _law_of(problem), _SHARES[problem.system.dimension]
     try:
-        return step_grids(problem, _SHARES[problem.system.dimension][effort])
+        return step_grids(problem, (shares if law.gaussian else _UNIFORM_SHARES)[effort])
     except InfeasibleError as error:
         raise CertificateError(str(error)) from error
 
@@ -254,12 +256,16 @@ def _some_starts(problem: Problem) -> list[Array]:
     return list(center + (1 - 1e-9) * (rows / sizes) @ factor.T)
 
 
-def _refuse(problem: Problem) -> None:
-    system, law = problem.system, getattr(problem.system, "noise", None)
+def _law_of(problem: Problem) -> Law:
+    """The law of the noise, which the checker must know."""
+    system = problem.system
     if system.dimension > max(_SHARES):
         raise CertificateError(f"the checker knows value functions of at most {max(_SHARES)} states.")
-    if not isinstance(system, DiscreteSystem) or law is None or not law.gaussian:
-        raise CertificateError("the checker knows value functions for normal noise only.")
+    if not isinstance(system, DiscreteSystem) or not (system.noise.gaussian or system.noise.uniform):
+        raise CertificateError("the checker knows value functions for normal and uniform noise only.")
+    if system.noise.uniform and system.dimension > 1:
+        raise CertificateError("the checker knows value functions for uniform noise in one state only.")
+    return system.noise
 
 
 def _splits(problem: Problem, axes: tuple[Array, ...]) -> list[Any]:

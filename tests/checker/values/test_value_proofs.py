@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import zlib
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,20 +18,26 @@ from scipy.stats import norm
 
 import certbound as cb
 from certbound.checker import check_data, parse
-from certbound.checker.report import Budget
+from certbound.checker.reading import Record
+from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import read_model
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batch_tapes import run
+from certbound.checker.values.crossing import _full_rank
 from certbound.checker.values.hermite import Surface
 from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
 from certbound.checker.values.packed import unpacked
-from certbound.checker.values.passage import Passage
+from certbound.checker.values.passage import Levels, Passage
+from certbound.checker.values.starting import starts_of
+from certbound.checker.values.step_back import Grid, Steps, Values
+from certbound.checker.values.uniform_means import UniformTransition
 from certbound.errors import CertificateError
 from certbound.problem.model import trace
-from certbound.safety.answers import exact
-from certbound.safety.certificate import certificate_text, problem_data
+from certbound.safety.answers import EngineAnswer, exact
+from certbound.safety.certificate import _initial, certificate_text, problem_data
+from certbound.safety.certificates import values_proof_below
 from certbound.safety.verification import verify_safety
-from tests.checker.conftest import exit_certificate, leaving, valued
+from tests.checker.conftest import exit_certificate, leaving, shaken, side_of, started, valued, valued_plane
 from tests.checker.forgeries import repacked, text
 from tests.checker.mutations import rejected
 
@@ -107,6 +114,38 @@ def test_means_after_the_noise_agree_with_quadrature() -> None:
     assert found.missing(np.array([2.0]))[0] == math.inf
 
 
+def test_means_after_uniform_noise_hold_everywhere_on_the_images() -> None:
+    """U jumps between cells; x+ = .7 x + .2 sin(3 x) + w, w uniform on [-.3, .3]."""
+    system = cb.DiscreteSystem(
+        lambda x: [0.7 * x[0] + 0.2 * np.sin(3 * x[0])], states=["x"], noise=cb.Uniform(halfwidth=0.3)
+    )
+    problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=2, delta=0.5)
+    model = read_model(json.loads(json.dumps(problem_data(problem))), Budget(60.0))
+    rng = np.random.default_rng(7)
+    grid = Grid((np.array([-1.0, -0.7, -0.2, 0.05, 0.1, 0.6, 1.1]),))
+    value = Values(grid, rng.normal(size=(5, 6)), 1.5)
+    places = np.sort(rng.uniform(-1.6, 1.6, 40))
+    low, high = places, places + rng.choice([0.0, 0.01, 0.3], 40)
+    transition = UniformTransition(Steps(model, 1, Budget(60.0), upper=True), 0, low[None], high[None], grid)
+    found = transition.mean(transition.images[0], transition.table(value))
+
+    def u(y: np.ndarray) -> np.ndarray:
+        k = np.searchsorted(grid.edges[0], y)
+        inside = (k > 0) & (k < 7)
+        k = np.clip(k, 1, 6)
+        left, right = grid.edges[0][k - 1], grid.edges[0][k]
+        xi = (2 * y - left - right) / (right - left)
+        return np.where(inside, sum(value.coefficients[i, k - 1] * xi**i for i in range(5)), 1.5)
+
+    offsets = (np.arange(40_000) + 0.5) / 20_000 - 1
+    for xi in (-1.0, -0.4, 0.0, 0.7, 1.0):
+        x = (low + high) / 2 + xi * (high - low) / 2
+        truth = np.array([u(0.7 * p + 0.2 * np.sin(3 * p) + 0.3 * offsets).mean() for p in x])
+        wrong = np.abs(value_of(found, np.array([xi])) - truth)
+        assert (wrong <= found.error + 1e-3).all()
+        assert (wrong[low == high] <= 1e-3).all()
+
+
 def test_patches_have_the_stated_derivatives() -> None:
     """V = exp(t) sin(x) cos(2 y), whose data are known: values, slopes and bends come out, and meet across nodes."""
     times, axes = np.array([0.0, 0.1, 0.25]), (np.array([0.0, 0.1, 0.3]), np.array([-0.2, 0.0, 0.1]))
@@ -171,6 +210,76 @@ def test_a_surface_in_two_states_starts_from_its_own_cells_only() -> None:
         assert passage._at_start() == pytest.approx(-3 + 0.4**2 + 0.35**2, abs=1e-9)
         assert passage._missing() == pytest.approx(2.0, abs=1e-9)
         assert passage._at_end() == pytest.approx(-3.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("make", [valued, shaken, started, valued_plane])
+def test_the_two_bounds_of_a_probability_enclose_a_simulation(make: Any) -> None:
+    problem = make()
+    answers = dict(verify_safety(problem, method="values").answers)
+    most = check_data(parse(side_of(problem, answers, lower=False)), problem_data(problem))
+    least = check_data(parse(side_of(problem, answers, lower=True)), problem_data(problem))
+    assert most.valid, most.reason
+    assert least.valid, least.reason
+    assert least.log10_lower_proved < most.log10_proved < least.log10_lower_proved + 0.08
+    assert least.log10_proved is None
+    assert least.log10_delta == 0.0
+    assert "some" in least.claim or "normal start" in least.claim
+    if problem.system.disturbance is None:
+        found = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(4), confidence=0.999)
+        assert 10**least.log10_lower_proved <= found.upper
+        assert found.lower <= 10**most.log10_proved
+
+
+def test_levels_from_below_are_held_to_the_largest_slope_that_is_due() -> None:
+    """(1 + q)(3 - q) is 3 at q = 0 and at q = 2, and 4 in between; from above (1 - q)(m - q) is convex."""
+    with pytest.raises(Unproved, match="q was not shown"):
+        Levels([-0.6, 0.0], [3.0], [0.0, 2.0], upper=False)
+    assert Levels([-0.49, 0.0], [3.0], [0.0, 2.0], upper=False).m == [3.0]
+    with pytest.raises(CertificateError, match="stay below 1"):
+        Levels([-0.49, 0.0], [3.0], [0.0, 2.0])
+
+
+def test_feedback_disturbances_need_noise_of_full_rank() -> None:
+    which = tm.terms(1, 2)
+
+    def number(value: float) -> tm.Batch:
+        return tm.fixed(which, np.array([value]))
+
+    assert _full_rank([[number(1.0)]]).all()
+    assert not _full_rank([[number(0.0)]]).any()
+    assert _full_rank([[number(1.0), number(0.9)], [number(0.9), number(1.0)]]).all()
+    assert not _full_rank([[number(1.0), number(1.0)], [number(1.0), number(1.0)]]).any()
+
+
+@pytest.mark.parametrize(
+    ("initial", "point", "inside"),
+    [
+        (cb.Box([0, 0], [1, 1]), [1.0, 0.5], True), (cb.Box([0, 0], [1, 1]), [1.0, 1.5], False),
+        (cb.Ball([1, 0], 0.5), [1.3, 0.39], True), (cb.Ball([1, 0], 0.5), [1.3, 0.41], False),
+        (cb.Ellipsoid([0, 0], [[4, 0], [0, 1]]), [1.9, 0.3], True),
+        (cb.Ellipsoid([0, 0], [[4, 0], [0, 1]]), [0.3, 1.01], False),
+    ],
+)  # fmt: skip
+def test_starts_of_lower_bounds_lie_in_the_set_itself(initial: Any, point: list[float], inside: bool) -> None:
+    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=2, noise=cb.Gaussian(std=0.1))
+    problem = cb.Problem(system, initial=initial, safe=[cb.Inside(cb.Box([-3, -3], [3, 3]))], horizon=2, delta=0.5)
+    model = read_model(json.loads(json.dumps(problem_data(problem))), Budget(60.0))
+    record = Record({"starts": exact([point])}, "proof", ["starts"])
+    if inside:
+        assert len(starts_of(model, record)) == 1
+    else:
+        with pytest.raises(Unproved, match="initial set"):
+            starts_of(model, record)
+
+
+def test_starts_that_are_stated_by_a_box_around_them_have_no_certificate_from_below() -> None:
+    around = SimpleNamespace(
+        random=False, data=lambda kinds: {"kind": "polytope"}, hull=lambda: SimpleNamespace(lo=[0.0], hi=[1.0])
+    )
+    assert _initial(around) == {"kind": "box", "low": exact([0.0]), "high": exact([1.0]), "around": True}
+    answer = EngineAnswer(log10_delta=-0.5, log10_lower=-1.0)
+    with pytest.raises(CertificateError, match="a box, a ball or an ellipsoid"):
+        values_proof_below(SimpleNamespace(initial=around), answer)
 
 
 # ---- files made to fool --------------------------------------------------------------------------------------
