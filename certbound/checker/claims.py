@@ -136,6 +136,12 @@ def _values(model: Model, proof: object, budget: Budget) -> arb:
     return check_values(model, proof, budget)
 
 
+def _quadratic(model: Model, proof: object, budget: Budget) -> arb:
+    from certbound.checker.values import check_quadratic
+
+    return check_quadratic(model, proof, budget)
+
+
 def _values_below(model: Model, proof: object, budget: Budget) -> arb:
     from certbound.checker.values import check_values_below
 
@@ -147,5 +153,6 @@ ENGINES = {
     "constants": Engine(words="contraction constants (Thms K2, K5)", prove=check_constants, assumes=_stated),
     "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
     "values": Engine(words="the value function itself (Thm K8)", prove=_values, below=_values_below),
+    "quadratic": Engine(words="quadratic value bounds (Thm K9)", prove=_quadratic),
 }
 """By the name that a proof gives: all that the checker knows of an engine."""

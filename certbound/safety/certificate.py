@@ -156,7 +156,7 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "plan": None if rows is None else exact(rows if continuous else rows[: int(problem.horizon)]),
         "disturbance_set": [] if box is None else _ranges(zip(box.low, box.high)),
         "noise": _noise(system),
-        "initial": _initial(problem.initial),
+        "initial": initial_data(problem.initial),
         "constraints": [
             {
                 "kind": constraint.word,
@@ -212,7 +212,7 @@ def _noise(system: Any) -> dict[str, Any]:
 _KINDS = ("box", "ball", "ellipsoid", "halfspace", "polytope")  # those that the checker has a row for
 
 
-def _initial(start: Any) -> dict[str, Any]:
+def initial_data(start: Any) -> dict[str, Any]:
     data = start.data(_KINDS)
     if data["kind"] == "polytope":  # by a box around it
         around = start.hull()

@@ -13,6 +13,7 @@ from certbound.safety.answers import EngineAnswer, Proof
 from certbound.safety.certificates import (
     barrier_proof,
     constants_proof,
+    quadratic_proof,
     response_proof,
     values_proof,
     values_proof_below,
@@ -119,6 +120,7 @@ ENGINES: dict[str, Engine] = {
             when="while nothing else has proved SAFE; says most in three to ten states where the noise is too "
             "large for a linearisation",
             prove=quadratic_engine,
+            write=quadratic_proof,
             reserve=True,
             dear=True,
         ),

@@ -14,6 +14,7 @@ from flint import ctx
 
 import certbound as cb
 from certbound.checker import parse
+from certbound.quadratic import bound_quadratic
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
@@ -140,6 +141,27 @@ def side_of(problem: cb.Problem, answers: dict[str, EngineAnswer], *, lower: boo
     """The certificate of one of the two bounds, whatever the verdict is."""
     status = "UNSAFE" if lower else "UNKNOWN"
     return certificate_text(problem, SimpleNamespace(status=status, reason="", answers=answers))
+
+
+def squared() -> cb.Problem:
+    """Continuous time, for quadratic bounds: a cubic, noise that grows, a disturbance, an obstacle, an oblique face."""
+    system = cb.ContinuousSystem(
+        lambda x, d: [-x[0] + 0.3 * x[1] - 0.1 * x[1] ** 2 + d[0], -x[1] - 0.5 * x[0] * x[1] - 0.2 * x[0] ** 3],
+        states=["x", "y"], disturbance=cb.Box([-0.1], [0.1]),
+        diffusion=lambda t, x: [[0.1 + 0.05 * x[0], 0.0], [0.0, 0.15]],
+    )  # fmt: skip
+    safe = [
+        cb.Inside(cb.Box([-1, -1], [1, 1])), cb.Outside(cb.Ball([0.6, 0.6], 0.15)),
+        cb.Inside(cb.HalfSpace([1.0, 1.0], 1.2)),
+    ]  # fmt: skip
+    return cb.Problem(system, initial=cb.Ball([0, 0], 0.05), safe=safe, horizon=0.5, delta=0.1)
+
+
+def quadratic_certificate(problem: cb.Problem) -> str:
+    """A certificate by quadratic value bounds from the first attempt at every wall."""
+    found = bound_quadratic(problem, target=0.5, seconds=60.0)
+    answer = EngineAnswer(log10_delta=found.upper, method="quadratic", details=found)
+    return side_of(problem, {"quadratic": answer}, lower=False)
 
 
 def started() -> cb.Problem:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import zlib
 from collections.abc import Callable
 
 import numpy as np
@@ -33,6 +35,7 @@ _BASES |= {
     "started below": _sharp(_below(conftest.started)),
     "shaken": _sharp(_stated(conftest.shaken, "values")),
     "shaken below": _sharp(_below(conftest.shaken)),
+    "squared": _sharp(lambda: conftest.quadratic_certificate(conftest.squared())),
     "leaving below": _sharp(lambda: conftest.exit_certificate(conftest.leaving(), lower=True)),
     "drifting": _sharp(lambda: conftest.exit_certificate(conftest.drifting())),
     "drifting below": _sharp(lambda: conftest.exit_certificate(conftest.drifting(), lower=True)),
@@ -73,7 +76,7 @@ def _(data: Data) -> None:
     data["proof"]["side"] = "lower"
 
 
-@forges("a start from below lies in the initial set", "valued below", "values/starting.py", "starts_of", "initial set")
+@forges("a start from below lies in its set", "valued below", "statement/partition.py", "starts_of", "initial set")
 def _(data: Data) -> None:
     data["problem"]["initial"]["high"] = exact([0.19])
 
@@ -277,3 +280,145 @@ def _(data: Data) -> None:
 def _(data: Data) -> None:
     data["proof"]["pieces"] = 19_999
     _lower(data, 0.0)
+
+
+# ---- quadratic value bounds ----------------------------------------------------------------------------------
+
+_FORMS, _WHERE, _FLOW = "values/quadratic.py", "values/walls.py", "values/second_order.py"
+GROWTH = "growth of a quadratic bound was not shown"
+
+
+def _wall(data: Data) -> Data:
+    """The wall that counts most: the upper side of x."""
+    found: Data = next(wall for wall in data["proof"]["walls"] if wall["wall"] == [-1, 1])
+    return found
+
+
+@forges("a quadratic bound grows no faster than stated", "squared", _FORMS, "_Value._on_cell", GROWTH)
+def _(data: Data) -> None:
+    _scale(_wall(data), "lam", 0.0)
+
+
+@forges("the growth is not negative", "squared", _FORMS, "_Value._read", "must not be negative")
+def _(data: Data) -> None:
+    _wall(data)["lam"][0] = exact(-1.0)
+
+
+@forges("a quadratic bound is at least 0 on its wall", "squared", _FORMS, "_Value._on_wall", "at least 0 on its wall")
+def _(data: Data) -> None:
+    for rows in _wall(data)["matrices"]:
+        rows[2][2] = exact(float.fromhex(rows[2][2]) - 0.2)
+
+
+@forges("no wall is left out", "squared", _FORMS, "check_quadratic", "all that paths can leave")
+def _(data: Data) -> None:
+    data["proof"]["walls"].remove(_wall(data))
+
+
+@forges("a wall is one of the problem's", "squared", _FORMS, "_Value", "is no wall")
+def _(data: Data) -> None:
+    _wall(data)["wall"] = [0, 0]
+
+
+@forges("weights are not negative", "squared", _FORMS, "_Value._read", "negative weight")
+def _(data: Data) -> None:
+    _wall(data)["wall_weights"][0][0] = exact(-0.5)
+
+
+@forges("the cells cover the working box", "squared", _FORMS, "_Value._cells", "rise from -1 to 1")
+def _(data: Data) -> None:
+    _wall(data)["cuts"][0][0] = exact(-0.9)
+
+
+@forges("the pieces of a quadratic bound cover the horizon", "squared", _FORMS, "_Value", "do not cover the horizon")
+def _(data: Data) -> None:
+    data["problem"]["horizon"] = exact(0.6)
+
+
+@forges("the terms that a splitting moves cancel", "squared", _FORMS, "splitting", GROWTH)
+def _(data: Data) -> None:
+    words = zlib.decompress(base64.b64decode(_wall(data)["moves"])).decode().split(" ")
+    changed = " ".join((float.fromhex(word) + 0.5).hex() for word in words)
+    _wall(data)["moves"] = base64.b64encode(zlib.compress(changed.encode())).decode()
+
+
+@forges("the starts of a quadratic bound count all", "squared", _FORMS, "_over_ball", MORE)
+def _(data: Data) -> None:
+    data["problem"]["initial"]["radius"] = exact(0.051)
+
+
+@forges("a quadratic bound holds for the noise of the problem", "squared", _FORMS, "_Value._spread", GROWTH)
+def _(data: Data) -> None:
+    nodes = data["problem"]["noise"]["diffusion"]["nodes"]
+    nodes[nodes.index(["const", exact(0.1)])][1] = exact(0.11)
+
+
+@forges("a quadratic bound holds for every disturbance", "squared", _FORMS, "_Value._drift", GROWTH)
+def _(data: Data) -> None:
+    data["problem"]["disturbance_set"] = [exact([-0.12, 0.12])]
+
+
+@forges("what is missing of the drift is paid for", "squared", _FLOW, "Flow.over", GROWTH)
+def _(data: Data) -> None:
+    nodes = data["problem"]["dynamics"]["nodes"]
+    nodes[nodes.index(["const", exact(0.2)])][1] = exact(1.0)
+
+
+@forges("second-order terms meet coordinates that are held", "squared", _FLOW, "Flow.held", "every second-order term")
+def _(data: Data) -> None:
+    for wall in data["proof"]["walls"]:
+        wall |= {"held": [], "cuts": []}
+
+
+@forges("quadratic bounds need a diffusion that is affine", "squared", _FLOW, "Flow", "affine in the states")
+def _(data: Data) -> None:
+    nodes = data["problem"]["noise"]["diffusion"]["nodes"]
+    product = next(node for node in nodes if node[0] == "mul")
+    product[1:] = [max(product[1:])] * 2
+    product[1:] = [nodes.index(["input", 1])] * 2
+
+
+@forges("quadratic bounds need a smooth model", "squared", _FLOW, "Flow._refuse", "does not treat")
+def _(data: Data) -> None:
+    dynamics = data["problem"]["dynamics"]
+    nodes, outputs = dynamics["nodes"], dynamics["outputs"]
+    nodes += [["floor", nodes.index(["input", 1])], ["add", outputs[0], len(nodes)]]
+    outputs[0] = len(nodes) - 1
+
+
+@forges("quadratic bounds need a model at rest", "squared", _FLOW, "Flow._refuse", "changes with time")
+def _(data: Data) -> None:
+    nodes = data["problem"]["dynamics"]["nodes"]
+    nodes[nodes.index(["input", 3])] = ["input", 0]
+
+
+@forges("the working box lies in the safe set", "squared", _WHERE, "Surroundings._faces", "was not shown to keep")
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["region"]["high"] = exact([0.3, 1.0])
+
+
+@forges("an obstacle is a wall where it is", "squared", _WHERE, "Surroundings._ball", "at least 0 on its wall")
+def _(data: Data) -> None:
+    data["problem"]["constraints"][1]["region"]["center"] = exact([0.3, 0.3])
+
+
+@forges("the starts of a quadratic bound lie in its box", "squared", _WHERE, "Surroundings._start", "working box")
+def _(data: Data) -> None:
+    data["problem"]["initial"]["radius"] = exact(2.0)
+
+
+@forges("the starts keep what is no side", "squared", _WHERE, "Surroundings._check_start", "not shown to keep")
+def _(data: Data) -> None:
+    data["problem"]["initial"]["radius"] = exact(0.8)
+
+
+@forges("quadratic bounds treat no window", "squared", _WHERE, "Surroundings", "has a window")
+def _(data: Data) -> None:
+    data["problem"]["constraints"][1]["during"] = exact([0.0, 0.3])
+
+
+@forges("quadratic bounds need bounded starts", "squared", _WHERE, "Surroundings._start", "bounded initial set")
+def _(data: Data) -> None:
+    data["problem"]["initial"] = {
+        "kind": "gaussian", "mean": exact([0.0, 0.0]), "covariance": exact([[1e-4, 0.0], [0.0, 1e-4]])
+    }  # fmt: skip

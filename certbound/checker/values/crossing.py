@@ -27,12 +27,11 @@ import numpy as np
 from flint import arb
 
 from certbound.checker.report import Unproved
-from certbound.checker.statement import SafeSet
+from certbound.checker.statement import SafeSet, starts_of
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batches import Array, Batch, Mask, Terms, above, below, terms
 from certbound.checker.values.hermite import Patches
 from certbound.checker.values.passage import Passage
-from certbound.checker.values.starting import starts_of
 
 
 class Crossing(Passage):
@@ -137,7 +136,7 @@ class Crossing(Passage):
             found = self._balance(patches, inputs + pushed, squares, 1 + m, (1 + m) * 2.0**-52).sharp_ends()[0]
             best = np.where(np.isfinite(found), np.maximum(best, found), best)
         if len(corners) > 1:
-            best = np.where(_full_rank(squares), best, -np.inf)
+            best = np.where(has_full_rank(squares), best, -np.inf)
         reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
         need = (-best - eps * reach * (1 - 1e-12)) * (1 + 1e-12)
         return np.where(np.isfinite(best), np.maximum(need, 0.0), np.inf)
@@ -148,7 +147,7 @@ def _most(values: Array) -> float:
     return float(np.where(np.isnan(values), np.inf, values).max())
 
 
-def _full_rank(squares: list[list[Batch]]) -> Mask:
+def has_full_rank(squares: list[list[Batch]]) -> Mask:
     """Where g g^T is positive definite."""
     good = np.asarray(squares[0][0].ends()[0] > 0)
     if len(squares) == 2:

@@ -9,12 +9,11 @@ from flint import arb
 
 from certbound.checker.reading import Record, entries, numbers, wholes
 from certbound.checker.report import Budget, Unproved
-from certbound.checker.statement import Model, StepSet, cells_of
+from certbound.checker.statement import Model, StepSet, cells_of, starts_of
 from certbound.checker.values.batches import Array, above, below
 from certbound.checker.values.crossing import Crossing
 from certbound.checker.values.normal_means import axis_table, mean_table
 from certbound.checker.values.passage import Passage
-from certbound.checker.values.starting import starts_of
 from certbound.checker.values.step_back import (
     DEGREE,
     Grid,

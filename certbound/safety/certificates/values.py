@@ -6,10 +6,8 @@ polynomials of a higher degree than the engine's, so that its cells may be large
 
 from __future__ import annotations
 
-import base64
 import itertools
 import math
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,6 +23,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import EngineAnswer, Proof, exact
+from certbound.safety.certificates.parts import packed
 from certbound.values.continuous import ExitBounds, Payment, Surface
 from certbound.values.discrete import step_grids
 from certbound.values.grids import Grid
@@ -165,8 +164,7 @@ def _packed(numbers: Array, bits: tuple[int, ...]) -> str:
         order += np.arange(3).reshape([3 if k == axis else 1 for k in range(numbers.ndim)])
     step = np.frexp(numbers)[1] - np.asarray(bits)[np.minimum(order, len(bits) - 1)]
     rounded = np.ldexp(np.rint(np.ldexp(numbers, -step)), step)
-    words = " ".join(value.hex() for value in rounded.ravel().tolist())
-    return base64.b64encode(zlib.compress(words.encode("ascii"), 9)).decode("ascii")
+    return packed(rounded)
 
 
 def _parts(problem: Problem, most: int) -> int:

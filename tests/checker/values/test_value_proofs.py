@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb
+from flint import arb, arb_mat
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -20,24 +20,37 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.checker.reading import Record
 from certbound.checker.report import Budget, Unproved
-from certbound.checker.statement import read_model
+from certbound.checker.statement import read_model, starts_of
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batch_tapes import run
-from certbound.checker.values.crossing import _full_rank
+from certbound.checker.values.crossing import has_full_rank
 from certbound.checker.values.hermite import Surface
 from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
 from certbound.checker.values.packed import unpacked
 from certbound.checker.values.passage import Levels, Passage
-from certbound.checker.values.starting import starts_of
+from certbound.checker.values.quadratic import splitting
+from certbound.checker.values.second_order import Flow
 from certbound.checker.values.step_back import Grid, Steps, Values
 from certbound.checker.values.uniform_means import UniformTransition
 from certbound.errors import CertificateError
 from certbound.problem.model import trace
+from certbound.quadratic import bound_quadratic
+from certbound.quadratic.form_matrices import splitting as enclosed_splitting
 from certbound.safety.answers import EngineAnswer, exact
-from certbound.safety.certificate import _initial, certificate_text, problem_data
+from certbound.safety.certificate import certificate_text, initial_data, problem_data
 from certbound.safety.certificates import values_proof_below
 from certbound.safety.verification import verify_safety
-from tests.checker.conftest import exit_certificate, leaving, shaken, side_of, started, valued, valued_plane
+from tests.checker.conftest import (
+    exit_certificate,
+    leaving,
+    quadratic_certificate,
+    shaken,
+    side_of,
+    squared,
+    started,
+    valued,
+    valued_plane,
+)
 from tests.checker.forgeries import repacked, text
 from tests.checker.mutations import rejected
 
@@ -239,16 +252,16 @@ def test_levels_from_below_are_held_to_the_largest_slope_that_is_due() -> None:
         Levels([-0.49, 0.0], [3.0], [0.0, 2.0])
 
 
-def test_feedback_disturbances_need_noise_of_full_rank() -> None:
+def test_feedback_disturbances_need_noise_ofhas_full_rank() -> None:
     which = tm.terms(1, 2)
 
     def number(value: float) -> tm.Batch:
         return tm.fixed(which, np.array([value]))
 
-    assert _full_rank([[number(1.0)]]).all()
-    assert not _full_rank([[number(0.0)]]).any()
-    assert _full_rank([[number(1.0), number(0.9)], [number(0.9), number(1.0)]]).all()
-    assert not _full_rank([[number(1.0), number(1.0)], [number(1.0), number(1.0)]]).any()
+    assert has_full_rank([[number(1.0)]]).all()
+    assert not has_full_rank([[number(0.0)]]).any()
+    assert has_full_rank([[number(1.0), number(0.9)], [number(0.9), number(1.0)]]).all()
+    assert not has_full_rank([[number(1.0), number(1.0)], [number(1.0), number(1.0)]]).any()
 
 
 @pytest.mark.parametrize(
@@ -276,10 +289,52 @@ def test_starts_that_are_stated_by_a_box_around_them_have_no_certificate_from_be
     around = SimpleNamespace(
         random=False, data=lambda kinds: {"kind": "polytope"}, hull=lambda: SimpleNamespace(lo=[0.0], hi=[1.0])
     )
-    assert _initial(around) == {"kind": "box", "low": exact([0.0]), "high": exact([1.0]), "around": True}
+    assert initial_data(around) == {"kind": "box", "low": exact([0.0]), "high": exact([1.0]), "around": True}
     answer = EngineAnswer(log10_delta=-0.5, log10_lower=-1.0)
     with pytest.raises(CertificateError, match="a box, a ball or an ellipsoid"):
         values_proof_below(SimpleNamespace(initial=around), answer)
+
+
+def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:
+    problem = squared()
+    data = parse(quadratic_certificate(problem))
+    report = check_data(data, json.loads(json.dumps(problem_data(problem))))
+    assert report.valid, report.reason
+    assert data["claim"]["method"] == "quadratic"
+    found = bound_quadratic(problem, target=0.5, seconds=60.0).upper
+    assert found - 1e-6 <= report.log10_proved < found + 0.1
+
+
+def test_a_splitting_is_nothing_on_its_own_states() -> None:
+    rng, n, held = np.random.default_rng(5), 3, [0, 2]
+    pairs = splitting(n, held)
+    assert len(pairs) == len(enclosed_splitting(n, held))
+    z = np.append(rng.normal(size=n), 1.0)
+    for first, other in pairs:
+        values = [z[held[a]] * z[i] * z[j] for a, i, j in (first, other)]
+        assert values[0] == pytest.approx(values[1])
+
+
+@pytest.mark.parametrize("place", range(8))
+def test_the_drift_lies_between_its_corners(place: int) -> None:
+    """A z at a point of a cell, held values and disturbance interpolated, is f but for the remainder."""
+    model = read_model(json.loads(json.dumps(problem_data(squared()))), Budget(60.0))
+    flow, rng = Flow(model, Budget(60.0)), np.random.default_rng(place)
+    center, width = [arb(0.1), arb(-0.2)], [arb(0.7), arb(0.9)]
+    ends = np.sort(rng.uniform(-1, 1, (2, 2)), axis=1)
+    low, high = [arb(a) for a, _ in ends], [arb(b) for _, b in ends]
+    local = flow.over(low, high, [0, 1], center, width)
+    xi, d = [rng.uniform(a, b) for a, b in ends], rng.uniform(-0.1, 0.1)
+    x = [0.1 + 0.7 * xi[0], -0.2 + 0.9 * xi[1]]
+    truth = [(-x[0] + 0.3 * x[1] - 0.1 * x[1] ** 2 + d) / 0.7,
+             (-x[1] - 0.5 * x[0] * x[1] - 0.2 * x[0] ** 3) / 0.9]  # fmt: skip
+    matrix = local.base + local.pushed[0] * arb(d / 0.1)
+    for a in (0, 1):
+        matrix = matrix + local.along[a] * (arb(xi[a]) - (low[a] + high[a]) / 2)
+    found = (matrix * arb_mat(3, 1, [*map(arb, xi), arb(1)])).entries()
+    for value, exact_one, rest in zip(found, truth, local.rest):
+        assert abs(float(value.mid()) - exact_one) <= float(rest) + 1e-12
+    assert float(local.rest[0]) < 1e-15
 
 
 # ---- files made to fool --------------------------------------------------------------------------------------
