@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
 from certbound.values.continuous import bound_exits
+from certbound.values.continuous.line import ladder
 
 
 class Case:
@@ -131,8 +133,9 @@ def leaving() -> cb.Problem:
 
 
 def exit_certificate(problem: cb.Problem, seconds: float = 0.1, *, lower: bool = False) -> str:
-    """A certificate by a value function in continuous time from the first attempt alone."""
-    found = bound_exits(problem, seconds=seconds, lower=lower)
+    """A certificate by a value function in continuous time from one attempt, coarser than usual, for short checks."""
+    with patch.object(ladder, "LADDER", ((2.5, 1e-3, 0.03),)):
+        found = bound_exits(problem, seconds=seconds, lower=lower)
     answer = EngineAnswer(log10_delta=found.upper, log10_lower=found.lower, method="values", details=found)
     return side_of(problem, {"values": answer}, lower=lower)
 
@@ -224,6 +227,14 @@ def stirring() -> Case:
 @pytest.fixture(scope="session")
 def valuing() -> Case:
     return Case(valued(), "values")
+
+
+@pytest.fixture(scope="session")
+def squaring() -> SimpleNamespace:
+    """Quadratic value bounds."""
+    problem = squared()
+    text, given = quadratic_certificate(problem), json.loads(json.dumps(problem_data(problem)))
+    return SimpleNamespace(problem=problem, text=text, data=parse(text), given=given)
 
 
 @pytest.fixture(scope="session")

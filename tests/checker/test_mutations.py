@@ -77,7 +77,9 @@ def anything_anywhere(data: Any, rng: random.Random) -> str | None:
 
 
 @pytest.mark.parametrize(
-    ("name", "count"), [("stepping", 120), ("contracting", 8), ("springing", 40), ("stirring", 30), ("valuing", 20)]
+    ("name", "count"),
+    [("stepping", 120), ("contracting", 8), ("springing", 40), ("stirring", 30), ("valuing", 20), ("valuing_below", 20),
+     ("squaring", 30)],
 )
 def test_anything_anywhere_ends_in_a_report_or_a_refusal(
     name: str, count: int, request: pytest.FixtureRequest

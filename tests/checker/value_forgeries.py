@@ -342,7 +342,7 @@ def _(data: Data) -> None:
     _wall(data)["moves"] = base64.b64encode(zlib.compress(changed.encode())).decode()
 
 
-@forges("the starts of a quadratic bound count all", "squared", _FORMS, "_over_ball", MORE)
+@forges("the starts of a quadratic bound count all", "squared", _FORMS, "_at_corners", MORE)
 def _(data: Data) -> None:
     data["problem"]["initial"]["radius"] = exact(0.051)
 
@@ -409,7 +409,7 @@ def _(data: Data) -> None:
 
 @forges("the starts keep what is no side", "squared", _WHERE, "Surroundings._check_start", "not shown to keep")
 def _(data: Data) -> None:
-    data["problem"]["initial"]["radius"] = exact(0.8)
+    data["problem"]["constraints"][1]["region"]["center"] = exact([0.1, 0.1])
 
 
 @forges("quadratic bounds treat no window", "squared", _WHERE, "Surroundings", "has a window")

@@ -9,6 +9,7 @@ import math
 import zlib
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from certbound.checker.reading import Record
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import read_model, starts_of
 from certbound.checker.values import batches as tm
+from certbound.checker.values import check_values_below, quadratic
 from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.crossing import has_full_rank
 from certbound.checker.values.hermite import Surface
@@ -39,6 +41,7 @@ from certbound.quadratic.form_matrices import splitting as enclosed_splitting
 from certbound.safety.answers import EngineAnswer, exact
 from certbound.safety.certificate import certificate_text, initial_data, problem_data
 from certbound.safety.certificates import values_proof_below
+from certbound.safety.certificates.parts import packed
 from certbound.safety.verification import verify_safety
 from tests.checker.conftest import (
     exit_certificate,
@@ -208,10 +211,6 @@ def test_a_surface_in_two_states_starts_from_its_own_cells_only() -> None:
     flat = np.stack([np.ones(5), np.zeros(5), np.zeros(5)], axis=1)
     values = -np.einsum("ia,jb->iajb", flat, flat) * 3
     values += np.einsum("ia,jb->iajb", square, flat) + np.einsum("ia,jb->iajb", flat, square)
-    def packed(numbers: np.ndarray) -> str:
-        words = " ".join(float(x).hex() for x in numbers.ravel())
-        return base64.b64encode(zlib.compress(words.encode())).decode()
-
     proof = {
         "engine": "values", "axes": [exact(axis), exact(axis)], "times": exact([0.0, 0.1]),
         "values": packed(np.stack([values, values])), "rates": packed(np.zeros((2, 5, 3, 5, 3))),
@@ -250,6 +249,31 @@ def test_levels_from_below_are_held_to_the_largest_slope_that_is_due() -> None:
     assert Levels([-0.49, 0.0], [3.0], [0.0, 2.0], upper=False).m == [3.0]
     with pytest.raises(CertificateError, match="stay below 1"):
         Levels([-0.49, 0.0], [3.0], [0.0, 2.0])
+
+
+def flat_below(level: float, *, high: float, end: float | None = None) -> arb:
+    """What V = level follows below (x' = .4 dW from 0, safe within 1 and beyond -high), ``end`` being V at the end."""
+    system = cb.ContinuousSystem(lambda x: 0 * x, states=1, diffusion=0.4)
+    safe = [cb.Inside(cb.Box([-high], [1]))]
+    problem = cb.Problem(system, initial=[0], safe=safe, horizon=0.5, delta=0.5)
+    axis = np.array([-2.0, 0.0, 1.01])
+    values = np.zeros((2, 3, 3))
+    values[:, :, 0] = level
+    values[1, :, 0] = level if end is None else end
+    proof = {
+        "engine": "values", "axes": [exact(axis)], "times": exact([0.0, 0.5]), "values": packed(values),
+        "rates": packed(np.zeros((2, 3, 3))), "edges": exact([0.0]), "m": [], "q": exact([0.0]), "lam": exact([0.0]),
+        "eps": exact([0.0]), "side": "lower", "starts": exact([[0.0]]),
+    }  # fmt: skip
+    model = read_model(json.loads(json.dumps(problem_data(problem))), Budget(60.0))
+    return check_values_below(model, json.loads(json.dumps(proof)), Budget(60.0))
+
+
+def test_what_v_is_at_the_end_and_on_harmless_sides_is_taken_off_from_below() -> None:
+    assert flat_below(-1.0, high=1.5) == 0  # exp(-1) - exp(-1) at the end
+    assert flat_below(-1.0, high=3.0) == 0
+    falling = flat_below(-1.0, high=1.5, end=-3.0)  # V_t is -4 in the mean, at most 6 in size: lam pays for it
+    assert falling == 0 or falling < math.exp(-1.0)
 
 
 def test_feedback_disturbances_need_noise_ofhas_full_rank() -> None:
@@ -303,6 +327,24 @@ def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:
     assert data["claim"]["method"] == "quadratic"
     found = bound_quadratic(problem, target=0.5, seconds=60.0).upper
     assert found - 1e-6 <= report.log10_proved < found + 0.1
+
+
+def test_a_ball_of_starts_has_a_bound_of_its_own() -> None:
+    """Against V at points of the ball; its corners, which lie outside, are left aside."""
+    problem = squared()
+    data = parse(quadratic_certificate(problem))
+    with patch.object(quadratic, "_at_corners", lambda *_: arb(1)):
+        found = check_data(data).log10_proved
+    assert found is not None
+    center, width = (np.array([float.fromhex(x) for x in data["proof"][name]]) for name in ("center", "width"))
+    turns = np.linspace(0, 2 * np.pi, 41)
+    points = 0.05 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    z = np.hstack([(points - center) / width, np.ones((41, 1))])
+    total = np.zeros(41)
+    for wall in data["proof"]["walls"]:
+        first = np.array([[float.fromhex(x) for x in row] for row in wall["matrices"][0]])
+        total += np.exp(np.einsum("pi,ij,pj->p", z, first, z) / 2)
+    assert math.log10(total.max()) <= found < math.log10(total.max()) + 0.5
 
 
 def test_a_splitting_is_nothing_on_its_own_states() -> None:
