@@ -122,6 +122,16 @@ def valued_plane() -> cb.Problem:
     return cb.Problem(system, initial=[0.1, 0.0], safe=safe, horizon=3, delta=0.1)
 
 
+def valued_space() -> cb.Problem:
+    """The same in three states."""
+    system = cb.DiscreteSystem(
+        lambda x: [0.8 * x[0] + 0.1 * x[1], 0.8 * x[1] - 0.1 * x[0] * x[2], 0.7 * x[2]], states=3,
+        noise=cb.Gaussian(std=[0.3, 0.25, 0.3]),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1, -1, -1], [1, 1, 1]))]
+    return cb.Problem(system, initial=[0.1, 0.0, 0.0], safe=safe, horizon=2, delta=0.1)
+
+
 def leaving() -> cb.Problem:
     """Continuous time, for value functions: a wave, noise that grows with the state, a disturbance."""
     system = cb.ContinuousSystem(

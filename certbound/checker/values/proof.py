@@ -33,7 +33,7 @@ from certbound.errors import CertificateError
 
 Side = tuple[arb, arb]
 
-MOST_STATES = 2
+MOST_STATES = 3
 MOST_CELLS = 100_000
 MOST_PARTS = 4096
 MOST_STEPS = 2_000

@@ -212,13 +212,17 @@ class Transition:
 
     def _polynomial(self, shifts: list[Batch], parts: dict[tuple[int, ...], Array]) -> Batch:
         """sum over a of D_a v^a, by Horner's scheme in one state after the other."""
-        which = self.steps.terms
-        if self.n == 1:
-            return _horner(which, shifts[0], [parts[a,] for a in range(ORDER)])
+        return self._nested(shifts, parts, ())
+
+    def _nested(self, shifts: list[Batch], parts: dict[tuple[int, ...], Array], last: tuple[int, ...]) -> Batch:
+        """The part of the sum that has the powers ``last`` of the last states, without these."""
+        place, orders = self.n - 1 - len(last), ORDER - sum(last)
+        if place == 0:
+            return _horner(self.steps.terms, shifts[0], [parts[(a, *last)] for a in range(orders)])
         total: Batch | None = None
-        for b in reversed(range(ORDER)):
-            inner = _horner(which, shifts[0], [parts[a, b] for a in range(ORDER - b)])
-            total = inner if total is None else tm.add(tm.mul(total, shifts[1]), inner)
+        for b in reversed(range(orders)):
+            inner = self._nested(shifts, parts, (b, *last))
+            total = inner if total is None else tm.add(tm.mul(total, shifts[place]), inner)
         assert total is not None
         return total
 

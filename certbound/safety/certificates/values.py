@@ -29,7 +29,7 @@ from certbound.values.discrete import step_grids
 from certbound.values.grids import Grid
 from certbound.values.sets import active_at
 
-_SHARES = {1: (0.42, 0.3, 0.2), 2: (0.55, 0.4, 0.28)}
+_SHARES = {1: (0.42, 0.3, 0.2), 2: (0.55, 0.4, 0.28), 3: (0.8, 0.6, 0.45)}
 _UNIFORM_SHARES = (0.03, 0.01, 0.004)
 _ROOMS = (0.05, 0.15, 0.5)
 _PARTS = (12, 24, 48)  # of one disturbance; of several, their product
@@ -269,7 +269,7 @@ def _law_of(problem: Problem) -> Law:
 def _splits(problem: Problem, axes: tuple[Array, ...]) -> list[Any]:
     """Edges of cells that cover the starts, half as wide as those of the grid."""
     around = problem.initial.hull()
-    most = 64 if len(axes) == 1 else 12
+    most = {1: 64, 2: 12, 3: 6}[len(axes)]
     found = []
     for low, high, edges in zip(around.lo, around.hi, axes):
         inside = int(np.sum((edges > low) & (edges < high)))

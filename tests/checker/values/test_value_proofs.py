@@ -53,6 +53,7 @@ from tests.checker.conftest import (
     started,
     valued,
     valued_plane,
+    valued_space,
 )
 from tests.checker.forgeries import repacked, text
 from tests.checker.mutations import rejected
@@ -128,6 +129,25 @@ def test_means_after_the_noise_agree_with_quadrature() -> None:
             assert abs(taylor - mean(m + v * deviation)) <= allowed + 1e-10
     assert float(found.missing(np.array([0.2]))[0]) < 1e-5
     assert found.missing(np.array([2.0]))[0] == math.inf
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_tables_of_means_are_the_sums_of_products_that_they_stand_for(n: int) -> None:
+    rng, degree = np.random.default_rng(n), 2
+    edges = [np.sort(rng.uniform(-1, 1, 3 + i)) for i in range(n)]
+    tables = [axis_table(np.array([-0.3, 0.4, 0.9])[: 3 - i], edges[i], arb(0.3 + 0.1 * i), degree, Budget(60.0))
+              for i in range(n)]  # fmt: skip
+    pieces = rng.normal(size=(degree + 1,) * n + tuple(len(row) + 1 for row in edges))
+    found = mean_table(tables, pieces, Budget(60.0))
+    assert len(found.derivatives) == math.comb(ORDER - 1 + n, n)
+    for orders in [(0,) * n, (ORDER - 1, *(0,) * (n - 1)), (*(0,) * (n - 1), 3), tuple(range(1, n + 1))]:
+        given: list[Any] = [pieces, list(range(2 * n))]
+        for i, (order, table) in enumerate(zip(orders, tables)):
+            given += [table.integrals[order], [i, 2 * n + i, n + i]]
+        truth = np.einsum(*given, list(range(2 * n, 3 * n)))
+        allowed = found.dominant * found.missing(np.zeros(1)) + found.far
+        assert found.derivatives[orders].shape == truth.shape
+        assert (np.abs(found.derivatives[orders] - truth) <= allowed + 1e-12).all()
 
 
 def test_means_after_uniform_noise_hold_everywhere_on_the_images() -> None:
@@ -224,7 +244,9 @@ def test_a_surface_in_two_states_starts_from_its_own_cells_only() -> None:
         assert passage._at_end() == pytest.approx(-3.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("make", [valued, shaken, started, valued_plane])
+@pytest.mark.parametrize(
+    "make", [valued, shaken, started, valued_plane, pytest.param(valued_space, marks=pytest.mark.slow)]
+)
 def test_the_two_bounds_of_a_probability_enclose_a_simulation(make: Any) -> None:
     problem = make()
     answers = dict(verify_safety(problem, method="values").answers)
@@ -232,7 +254,7 @@ def test_the_two_bounds_of_a_probability_enclose_a_simulation(make: Any) -> None
     least = check_data(parse(side_of(problem, answers, lower=True)), problem_data(problem))
     assert most.valid, most.reason
     assert least.valid, least.reason
-    assert least.log10_lower_proved < most.log10_proved < least.log10_lower_proved + 0.08
+    assert least.log10_lower_proved < most.log10_proved < least.log10_lower_proved + 0.1
     assert least.log10_proved is None
     assert least.log10_delta == 0.0
     assert "some" in least.claim or "normal start" in least.claim
