@@ -109,7 +109,7 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
-    "values.continuous": (6, "bounds and charts, the latter at chosen times or at the ends of slabs"),
+    "values.continuous": (8, "bounds, charts, and the surfaces that certificates state, with what these were paid with"),
     "values.discrete": (7, "kernels and interpolation of discrete time are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (23, "the one description of functions, which every room reads, differentiates and evaluates"),
@@ -120,12 +120,13 @@ MANY_DOORS = {
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
     "problem.sets": (18, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
-    "checker.statement": (12, "what a certificate states is read once and asked by four proofs"),
+    "checker.statement": (12, "what a certificate states is read once and asked by five proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
     "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (7, "to and from each library"),
+    "safety.certificates": (6, "a writer an engine, and one for each side where an engine has two"),
     "safety.engines": (10, "the engines, and the rooms that their certificates restate"),
     "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),
     "reach.sets": (7, "tubes, requirements, and directions for the certificate"),

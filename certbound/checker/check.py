@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from flint import arb, ctx
 
-from certbound.checker.claims import assumptions, claim, engine_of, prove, words_of
+from certbound.checker.claims import assumptions, check_side, claim, claim_below, engine_of, prove, words_of
 from certbound.checker.reading import Record, read, text
 from certbound.checker.report import Budget, Report, Unproved
 from certbound.checker.statement import first_difference, read_model
@@ -68,10 +69,8 @@ def check_data(
         raise CertificateError(f"`certificate.format` must be \"{FORMAT}\".")
     if record["version"] != VERSION:
         raise CertificateError(f"`certificate.version` must be {VERSION}; use the certbound that wrote the file.")
-    stated = Record(record["claim"], "claim", ("log10_delta", "method", "assumptions"))
-    method, level = stated.text("method", 100), stated.number("log10_delta")
-    if not level <= 0:
-        raise CertificateError(f"`claim.log10_delta` must not be positive, got {level:g}.")
+    stated = Record(record["claim"], "claim", ("log10_delta", "method", "assumptions"), ("log10_lower",))
+    method, level, least = stated.text("method", 100), *_levels(stated)
     named = [text(item, "claim.assumptions", 1000) for item in stated.items("assumptions", 0, 20)]
     with ctx.workprec(PRECISION):
         try:
@@ -81,26 +80,50 @@ def check_data(
         proof = record["proof"]
         engine_of(proof, method)
         assumed = tuple(assumptions(model, proof, named))
-        words = claim(model, proof, level, assumed)
+        check_side(model, proof, least is not None)
+        words = claim(model, proof, level, assumed) if least is None else claim_below(model, least, assumed)
+        answer = partial(_report, claim=words, level=level, least=least, assumed=assumed)
         proved = None
         try:
             if problem is not None:
                 difference = first_difference(record["problem"], problem)
                 if difference:
                     raise Unproved(f"the certificate speaks of another problem: {difference}")
-            proved = prove(model, proof, budget)
-            _compare(proved, level)
+            proved = prove(model, proof, budget, lower=least is not None)
+            (_compare if least is None else _compare_below)(proved, level if least is None else least)
         except Unproved as error:
-            return Report(
-                valid=False, claim=words, reason=f"{error}.", seconds=budget.elapsed, log10_delta=level,
-                log10_proved=None if proved is None else _log10(proved), assumptions=assumed,
-            )  # fmt: skip
-        return Report(
-            valid=allow_assumptions or not assumed, proved=True, claim=words,
-            reason=_reason(words_of(model, proof), _log10(proved), problem is not None, assumed),
-            seconds=budget.elapsed,
-            log10_delta=level, log10_proved=_log10(proved), assumptions=assumed,
-        )  # fmt: skip
+            return answer(valid=False, reason=f"{error}.", seconds=budget.elapsed, found=proved)
+        reason = _reason(words_of(model, proof), proved, least is not None, problem is not None, assumed)
+        return answer(valid=allow_assumptions or not assumed, reason=reason, seconds=budget.elapsed, found=proved,
+                      proved=True)  # fmt: skip
+
+
+def _levels(stated: Record) -> tuple[float, float | None]:
+    """The claimed upper bound, and the lower one of a certificate that claims one, and then nothing else."""
+    level = stated.number("log10_delta")
+    if not level <= 0:
+        raise CertificateError(f"`claim.log10_delta` must not be positive, got {level:g}.")
+    if stated["log10_lower"] is None:
+        return level, None
+    least = stated.number("log10_lower")
+    if not least <= 0:
+        raise CertificateError(f"`claim.log10_lower` must not be positive, got {least:g}.")
+    if level != 0:
+        raise CertificateError(f"`claim.log10_delta` must be 0 where a lower bound is claimed, got {level:g}.")
+    return level, least
+
+
+def _report(
+    *, valid: bool, reason: str, seconds: float, found: arb | None, claim: str, level: float, least: float | None,
+    assumed: tuple[str, ...], proved: bool = False,
+) -> Report:  # fmt: skip
+    """The answer, with what the checker arrived at."""
+    most = None if found is None or least is not None else _log10(found)
+    return Report(
+        valid=valid, reason=reason, seconds=seconds, claim=claim, log10_delta=level, log10_lower=least,
+        assumptions=assumed, proved=proved, log10_proved=most,
+        log10_lower_proved=None if found is None or least is None else _log10_below(found),
+    )  # fmt: skip
 
 
 def _compare(proved: arb, level: float) -> None:
@@ -112,6 +135,15 @@ def _compare(proved: arb, level: float) -> None:
     raise Unproved(f"the probability that follows is at most 10^{rounded(found, up=True)}, {claimed}")
 
 
+def _compare_below(proved: arb, level: float) -> None:
+    if proved > 0 and proved.log() >= arb(level) * arb(10).log():
+        return
+    found, claimed = _log10_below(proved), f"which is less than the claimed 10^{plainly(level)}"
+    if found is None:
+        raise Unproved(f"what follows is no bound above 0, {claimed}")
+    raise Unproved(f"the probability that follows is at least 10^{rounded(found, up=False)}, {claimed}")
+
+
 def _log10(value: arb) -> float:
     """log10 rounded up; -1e12 stands for 0."""
     if value.is_zero():
@@ -120,9 +152,21 @@ def _log10(value: arb) -> float:
     return min(math.nextafter(float(top), math.inf), 0.0) if top.is_finite() else 0.0
 
 
-def _reason(engines: str, proved: float, compared: bool, assumed: Sequence[str]) -> str:
+def _log10_below(value: arb) -> float | None:
+    """log10 rounded down; None of what may be 0."""
+    if not value > 0:
+        return None
+    return min(math.nextafter(float((value.log() / arb(10).log()).lower()), -math.inf), 0.0)
+
+
+def _reason(engines: str, proved: arb, lower: bool, compared: bool, assumed: Sequence[str]) -> str:
     same = ", and the certificate speaks of the given problem" if compared else ""
-    found = f"the probability is at most 10^{rounded(proved, up=True)}"
-    bound = "no noise can break them" if proved <= -1e12 else found
+    least = _log10_below(proved) if lower else None
+    if least is not None:
+        bound = f"the probability is at least 10^{rounded(least, up=False)}"
+    else:
+        most = _log10(proved)
+        found = f"the probability is at most 10^{rounded(most, up=True)}"
+        bound = "no noise can break them" if most <= -1e12 else found
     but = "but what the claim assumes " if assumed else ""
     return f"every inequality {but}was proved again in ball arithmetic, by {engines}: {bound}{same}"

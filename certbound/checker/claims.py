@@ -33,6 +33,7 @@ STATED = "the stated constants hold"
 
 _ANY = "for every disturbance in its set, even one that sees coming noise"
 _BLIND = "for every disturbance in its set that does not see coming noise"
+_SOME = "for some disturbance in its set that reacts to the state and does not see coming noise"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,12 +51,16 @@ class Engine:
         supermartingales do not: foresight would spoil these.
     assumes : callable
         ``assumes(model, proof)`` to what the proof takes for granted, in words; None where nothing.
+    below : callable, optional
+        As ``prove``, to a lower bound of the probability from some start, for some disturbance that reacts to the
+        state.
     """
 
     words: str
     prove: Callable[[Model, object, Budget], arb]
     foresees: Callable[[Model], bool] = lambda model: False
     assumes: Callable[[Model, Mapping[str, object]], str | None] = lambda model, proof: None
+    below: Callable[[Model, object, Budget], arb] | None = None
 
 
 def engine_of(proof: object, method: str) -> str:
@@ -93,12 +98,29 @@ def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[s
         yield _named(proof, path, tuple(ENGINES)), model, proof  # type: ignore[misc]  # a mapping: it names an engine
 
 
-def prove(model: Model, proof: object, budget: Budget) -> arb:
-    """The probability that a proof bounds; where the start is a union, the largest of its members'."""
+def check_side(model: Model, proof: object, lower: bool) -> None:
+    """Lower bounds are proved of one start and without a target, and say so in ``side``; others must not.
+
+    CertificateError where a proof says one thing and the claim another.
+    """
+    if lower and (model.members or model.target is not None):
+        raise CertificateError("`claim.log10_lower` must not be there for a union of starts, or beside a target.")
+    for engine, _, part in _parts(model, proof):
+        side = part.get("side")
+        if side is not None and (side != "lower" or ENGINES[engine].below is None):
+            raise CertificateError("`proof.side` must be \"lower\", in a proof by value functions, or be left out.")
+        if (side is not None) != lower:
+            raise CertificateError("`claim.log10_lower` must be there just where `proof.side` is \"lower\".")
+
+
+def prove(model: Model, proof: object, budget: Budget, *, lower: bool = False) -> arb:
+    """The probability that a proof bounds, from above or below; where the start is a union, the largest of all."""
+    check_side(model, proof, lower)
     found = arb(0)
     for engine, one, part in _parts(model, proof):
-        bound = ENGINES[engine].prove(one, part, budget)
-        if not bound.is_finite():
+        row = ENGINES[engine]
+        bound = (row.below if lower and row.below is not None else row.prove)(one, part, budget)
+        if not bound.is_finite() or lower:
             return bound
         found = found.max(bound)
     return found
@@ -138,19 +160,30 @@ def _stated(model: Model, proof: Mapping[str, object]) -> str | None:
 
 def claim(model: Model, proof: object, level: float, assumed: Sequence[str]) -> str:
     """The claim as one sentence."""
-    unit = "s" if model.continuous else "steps"
     start = "a normal start" if model.initial.covariance is not None else "every start in the initial set"
     start += f" (a union of {len(model.members)})" if model.members else ""
     foresees = all(ENGINES[engine].foresees(one) for engine, one, _ in _parts(model, proof))
     whose = "" if not model.disturbance else f", {_ANY if foresees else _BLIND},"
     safe = "at most" if arb(level) <= arb(model.delta).log() / arb(10).log() else "more than"
+    return _sentence(model, f"{start}{whose}", f"at most 10^{rounded(level, up=True)} ({safe}", assumed)
+
+
+def claim_below(model: Model, level: float, assumed: Sequence[str]) -> str:
+    """The claim of a lower bound as one sentence."""
+    start = "a normal start" if model.initial.covariance is not None else "some start in the initial set"
+    whose = f", {_SOME}," if model.disturbance else ""
+    unsafe = "more than" if arb(level) > arb(model.delta).log() / arb(10).log() else "which need not be more than"
+    return _sentence(model, f"{start}{whose}", f"at least 10^{rounded(level, up=False)} ({unsafe}", assumed)
+
+
+def _sentence(model: Model, start: str, bound: str, assumed: Sequence[str]) -> str:
+    unit = "s" if model.continuous else "steps"
     kept = f"breaks one of its {len(model.constraints)} constraints"
     if model.target is not None:
         kept += f" before it is in its target ({quoted(model.target.label)}), or is not in it"
     words = (
-        f"from {start}{whose} the problem {quoted(model.name)} {kept} "
-        f"within {plainly(model.horizon)} {unit} with probability at most 10^{rounded(level, up=True)} "
-        f"({safe} delta = {plainly(model.delta)})"
+        f"from {start} the problem {quoted(model.name)} {kept} "
+        f"within {plainly(model.horizon)} {unit} with probability {bound} delta = {plainly(model.delta)})"
     )
     return words + "".join(f"; assuming that {item}" for item in assumed)
 
@@ -162,10 +195,23 @@ def _values(model: Model, proof: object, budget: Budget) -> arb:
     return check_values(model, proof, budget)
 
 
+def _quadratic(model: Model, proof: object, budget: Budget) -> arb:
+    from certbound.checker.values import check_quadratic
+
+    return check_quadratic(model, proof, budget)
+
+
+def _values_below(model: Model, proof: object, budget: Budget) -> arb:
+    from certbound.checker.values import check_values_below
+
+    return check_values_below(model, proof, budget)
+
+
 ENGINES = {
     "linear": Engine(words="linear response (Thm K7)", prove=check_linear, foresees=_additive),
     "constants": Engine(words="contraction constants (Thms K2, K5)", prove=check_constants, assumes=_stated),
     "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
-    "values": Engine(words="the value function itself (Thm K8)", prove=_values),
+    "values": Engine(words="the value function itself (Thm K8)", prove=_values, below=_values_below),
+    "quadratic": Engine(words="quadratic value bounds (Thm K9)", prove=_quadratic),
 }
 """By the name that a proof gives: all that the checker knows of an engine."""

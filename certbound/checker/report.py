@@ -35,6 +35,8 @@ class Report:
     seconds: float  # time taken
     log10_delta: float  # the claimed bound on log10 of the probability
     log10_proved: float | None = None  # the bound that the checker itself arrived at (None where it did not)
+    log10_lower: float | None = None  # the claimed lower bound, of a certificate that claims one (and no upper one)
+    log10_lower_proved: float | None = None  # the lower bound that the checker itself arrived at
     # what the proof takes for granted, derived from the proof itself, and what the file says besides
     assumptions: tuple[str, ...] = ()
     proved: bool = False  # whether every inequality was proved again but for the assumptions

@@ -58,6 +58,8 @@ class Cells:
         g g' over the cells.
     toll : Interval, shape (C,)
         What the remainders that are columns add to R besides.
+    large : tuple of int
+        States whose remainders are corners, in their order.
     """
 
     low: Array
@@ -69,6 +71,7 @@ class Cells:
     affine: Interval | None
     square: Interval
     toll: Interval
+    large: tuple[int, ...]
 
 
 class Dynamics:
@@ -150,6 +153,7 @@ class Dynamics:
         return Cells(
             low=low, high=high, held=self.held, values=np.array(values), drift=stack(drifts), spread=stack(spreads),
             affine=self._affine(cells), square=self._square(cells), toll=self._toll(worst, small, len(low)),
+            large=tuple(large),
         )  # fmt: skip
 
     def _toll(self, worst: Interval, small: Sequence[int], many: int) -> Interval:

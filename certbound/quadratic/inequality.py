@@ -44,12 +44,15 @@ class Proved:
         Bound of V(0, .) over the starts.
     proposal : Proposal
         What it is proved of.
+    rates : tuple of float
+        lam_k.
     """
 
     growth: float
     gap: float
     top: float
     proposal: Proposal
+    rates: tuple[float, ...] = ()
 
     @property
     def level(self) -> float:
@@ -63,14 +66,16 @@ def prove(setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cell
     ``cells`` holds those of each piece of time, which must cover the safe part of the working box.
     """
     growth: Interval = Interval.point(0.0)
+    rates = []
     for k, one in enumerate(cells):
         step = Interval.point(proposal.times[k + 1]) - Interval.point(proposal.times[k])
         worst = max(_excess(setting, proposal, k, side, one, step) for side in (0, 1))
         if not np.isfinite(worst):
             return Proved(growth=np.inf, gap=np.inf, top=np.inf, proposal=proposal)
         growth = growth + Interval.point(worst) * step
+        rates.append(worst)
     return Proved(growth=float(growth.hi), gap=_gap(setting, wall, proposal), top=_top(setting, proposal),
-                  proposal=proposal)  # fmt: skip
+                  proposal=proposal, rates=tuple(rates))  # fmt: skip
 
 
 def _excess(setting: Setting, proposal: Proposal, k: int, side: int, cells: Cells, step: Interval) -> float:

@@ -67,6 +67,8 @@ class Attempt:
     corners: Array | None = None
     seconds: float = 0.0
     gains: dict[int, float] = field(default_factory=dict)
+    held: tuple[int, ...] = ()
+    large: tuple[int, ...] = ()
 
     @property
     def level(self) -> float:
@@ -256,6 +258,7 @@ class Search:
             return False
         attempt.proved, attempt.corners = proved, corner_levels(self.setting, proved)
         attempt.pieces, attempt.slabs = pieces, slabs
+        attempt.held, attempt.large = cells[0].cells.held, cells[0].cells.large
         return True
 
 

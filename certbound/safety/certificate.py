@@ -32,22 +32,23 @@ def certificate_text(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     return json.dumps(certificate_data(problem, verdict, attempt=attempt), separators=(",", ":")) + "\n"
 
 
-def restated(text: str, log10_proved: float) -> str:
-    """The certificate claiming what the checker proved of it, where that is less than it claimed.
+def restated(text: str, log10_proved: float, *, lower: bool = False) -> str:
+    """The certificate claiming what the checker proved of it, where that is less (``lower``: more) than it claimed.
 
     The writer leaves itself room, and its own bounds of the events are coarser in places than the checker's.
     """
-    data = json.loads(text)
-    claimed = float.fromhex(data["claim"]["log10_delta"])
-    proved = log10_proved + _ROUNDING * (1.0 + abs(log10_proved))
-    if not proved < claimed:
+    data, name = json.loads(text), "log10_lower" if lower else "log10_delta"
+    claimed = float.fromhex(data["claim"][name])
+    room = _ROUNDING * (1.0 + abs(log10_proved))
+    proved = log10_proved - room if lower else log10_proved + room
+    if not (proved > claimed if lower else proved < claimed):
         return text
-    data["claim"]["log10_delta"] = exact(proved)
+    data["claim"][name] = exact(proved)
     return json.dumps(data, separators=(",", ":")) + "\n"
 
 
 def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -> dict[str, Any]:
-    """The certificate of a verdict: P(some constraint is broken) <= 10**claim, with what proves it.
+    """The certificate of a verdict: P(some constraint is broken) <= 10**claim, with what proves it; >= where UNSAFE.
 
     The claim rests on inequalities that the checker knows, and may be weaker than the verdict's ``log10_delta``. Where
     it would be weaker than SAFE, other engines are tried.
@@ -65,6 +66,8 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
+    if verdict.status == "UNSAFE":
+        return _lower_data(problem, verdict, attempt)
     members = [certificate_data(one.problem, one, attempt=attempt) for one in getattr(verdict, "members", ())]
     if members:
         return united(problem, members)
@@ -85,17 +88,9 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
             break
     if best is not None:
         name, (proof, log10, assumptions) = best
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "claim": {
-                "log10_delta": exact(min(log10, 0.0)),
-                "method": name if problem.reach is None else "reach",
-                "assumptions": assumptions,
-            },
-            "problem": problem_data(problem),
-            "proof": proof,
-        }
+        method = name if problem.reach is None else "reach"
+        claim = {"log10_delta": exact(min(log10, 0.0)), "method": method, "assumptions": assumptions}
+        return _whole(problem, claim, proof)
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
 
@@ -119,13 +114,34 @@ def united(problem: Problem, members: Sequence[Mapping[str, Any]]) -> dict[str, 
         raise CertificateError("no probability was bounded for every member of the initial union.")
     levels = [float.fromhex(member["claim"]["log10_delta"]) for member in members]
     assumed = dict.fromkeys(item for member in members for item in member["claim"]["assumptions"])
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "claim": {"log10_delta": exact(max(levels)), "method": "union", "assumptions": list(assumed)},
-        "problem": problem_data(problem),
-        "proof": {"engine": "union", "members": [member["proof"] for member in members]},
-    }
+    claim = {"log10_delta": exact(max(levels)), "method": "union", "assumptions": list(assumed)}
+    return _whole(problem, claim, {"engine": "union", "members": [member["proof"] for member in members]})
+
+
+def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, Any]:
+    """The certificate of UNSAFE: P(some constraint is broken) >= 10**claim from some start, for some disturbance."""
+    if problem.reach is not None or len(problem.starts) > 1:
+        raise CertificateError("certificates state no lower bounds where there is a target, or the start is a union.")
+    refusals: list[str] = []
+    found = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_lower is not None]
+    for name, answer in sorted(found, key=lambda item: -(item[1].log10_lower or 0.0)):
+        try:
+            write = ENGINES[name].write_below
+            if write is None:
+                raise CertificateError("certificates do not state the lower bounds of this engine.")
+            proof, log10, assumptions = write(problem, answer, attempt)
+        except CertificateError as error:
+            refusals.append(f"{name}: {error}")
+            continue
+        claim = {"log10_delta": exact(0.0), "log10_lower": exact(log10), "method": name, "assumptions": assumptions}
+        return _whole(problem, claim, proof)
+    why = " ".join(refusals) or verdict.reason
+    raise CertificateError(f"no lower bound was found that a certificate could state: {why}")
+
+
+def _whole(problem: Problem, claim: dict[str, Any], proof: dict[str, Any]) -> dict[str, Any]:
+    data = problem_data(problem)
+    return {"format": FORMAT, "version": VERSION, "claim": claim, "problem": data, "proof": proof}
 
 
 def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineAnswer]]:
@@ -173,7 +189,7 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "plan": None if rows is None else exact(rows if continuous else rows[: int(problem.horizon)]),
         "disturbance_set": [] if box is None else _ranges(zip(box.low, box.high)),
         "noise": _noise(system),
-        "initial": _initial(problem.initial),
+        "initial": initial_data(problem.initial),
         "constraints": [_constraint(constraint) for constraint in problem.safe],
         "domain": None if problem.domain is None else _ranges(zip(problem.domain.low, problem.domain.high)),
         **({} if problem.reach is None else {"reach": _constraint(problem.reach)}),
@@ -232,13 +248,13 @@ def _noise(system: Any) -> dict[str, Any]:
 _KINDS = ("box", "ball", "ellipsoid", "halfspace", "polytope")  # those that the checker has a row for
 
 
-def _initial(start: Any) -> dict[str, Any]:
+def initial_data(start: Any) -> dict[str, Any]:
     if isinstance(start, StartUnion):
-        return {"kind": "union", "members": [_initial(member) for member in start.members]}
+        return {"kind": "union", "members": [initial_data(member) for member in start.members]}
     data = start.data(_KINDS)
     if data["kind"] == "polytope":  # by a box around it
         around = start.hull()
-        data = {"kind": "box", "low": around.lo, "high": around.hi}
+        data = {"kind": "box", "low": around.lo, "high": around.hi, "around": True}
     return {name: exact(value) for name, value in data.items() if value is not None}
 
 

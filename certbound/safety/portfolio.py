@@ -10,7 +10,14 @@ from dataclasses import dataclass
 
 from certbound.problem.problem import Problem
 from certbound.safety.answers import EngineAnswer, Proof
-from certbound.safety.certificates import barrier_proof, constants_proof, response_proof, values_proof
+from certbound.safety.certificates import (
+    barrier_proof,
+    constants_proof,
+    quadratic_proof,
+    response_proof,
+    values_proof,
+    values_proof_below,
+)
 from certbound.safety.engines import (
     barrier_engine,
     constants_engine,
@@ -38,6 +45,8 @@ class Engine:
         that does neither loses what it has when the time is over.
     write : callable, optional
         ``write(problem, answer, attempt)`` to a proof that the checker knows; None: no certificate states it.
+    write_below : callable, optional
+        The same for its lower bound.
     methods : bool
         Whether it takes the tube methods (``kummer``, ``thm3``, ...) as names of its own.
     reserve : bool
@@ -57,6 +66,7 @@ class Engine:
     when: str
     prove: Callable[..., EngineAnswer]
     write: Callable[[Problem, EngineAnswer, int], Proof] | None = None
+    write_below: Callable[[Problem, EngineAnswer, int], Proof] | None = None
     methods: bool = False
     reserve: bool = False
     again: bool = False
@@ -102,6 +112,7 @@ ENGINES: dict[str, Engine] = {
             "UNSAFE",
             prove=values_engine,
             write=values_proof,
+            write_below=values_proof_below,
             reserve=True,
             dear=True,
             reaches=True,
@@ -113,6 +124,7 @@ ENGINES: dict[str, Engine] = {
             when="while nothing else has proved SAFE; says most in three to ten states where the noise is too "
             "large for a linearisation",
             prove=quadratic_engine,
+            write=quadratic_proof,
             reserve=True,
             dear=True,
         ),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,10 +15,12 @@ from flint import ctx
 
 import certbound as cb
 from certbound.checker import parse
+from certbound.quadratic import bound_quadratic
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
 from certbound.values.continuous import bound_exits
+from certbound.values.continuous.line import ladder
 
 
 class Case:
@@ -118,6 +122,16 @@ def valued_plane() -> cb.Problem:
     return cb.Problem(system, initial=[0.1, 0.0], safe=safe, horizon=3, delta=0.1)
 
 
+def valued_space() -> cb.Problem:
+    """The same in three states."""
+    system = cb.DiscreteSystem(
+        lambda x: [0.8 * x[0] + 0.1 * x[1], 0.8 * x[1] - 0.1 * x[0] * x[2], 0.7 * x[2]], states=3,
+        noise=cb.Gaussian(std=[0.3, 0.25, 0.3]),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1, -1, -1], [1, 1, 1]))]
+    return cb.Problem(system, initial=[0.1, 0.0, 0.0], safe=safe, horizon=2, delta=0.1)
+
+
 def leaving() -> cb.Problem:
     """Continuous time, for value functions: a wave, noise that grows with the state, a disturbance."""
     system = cb.ContinuousSystem(
@@ -128,11 +142,64 @@ def leaving() -> cb.Problem:
     return cb.Problem(system, initial=cb.Box([-0.1], [0.2]), safe=safe, horizon=0.4, delta=0.5)
 
 
-def exit_certificate(problem: cb.Problem, seconds: float = 0.1) -> str:
-    """A certificate by a value function in continuous time from the first attempt alone."""
-    found = bound_exits(problem, seconds=seconds, lower=False)
-    answer = EngineAnswer(log10_delta=found.upper, method="values", details=found)
-    return certificate_text(problem, SimpleNamespace(status="UNKNOWN", reason="", answers={"values": answer}))
+def exit_certificate(problem: cb.Problem, seconds: float = 0.1, *, lower: bool = False) -> str:
+    """A certificate by a value function in continuous time from one attempt, coarser than usual, for short checks."""
+    with patch.object(ladder, "LADDER", ((2.5, 1e-3, 0.03),)):
+        found = bound_exits(problem, seconds=seconds, lower=lower)
+    answer = EngineAnswer(log10_delta=found.upper, log10_lower=found.lower, method="values", details=found)
+    return side_of(problem, {"values": answer}, lower=lower)
+
+
+def side_of(problem: cb.Problem, answers: dict[str, EngineAnswer], *, lower: bool) -> str:
+    """The certificate of one of the two bounds, whatever the verdict is."""
+    status = "UNSAFE" if lower else "UNKNOWN"
+    return certificate_text(problem, SimpleNamespace(status=status, reason="", answers=answers))
+
+
+def squared() -> cb.Problem:
+    """Continuous time, for quadratic bounds: a cubic, noise that grows, a disturbance, an obstacle, an oblique face."""
+    system = cb.ContinuousSystem(
+        lambda x, d: [-x[0] + 0.3 * x[1] - 0.1 * x[1] ** 2 + d[0], -x[1] - 0.5 * x[0] * x[1] - 0.2 * x[0] ** 3],
+        states=["x", "y"], disturbance=cb.Box([-0.1], [0.1]),
+        diffusion=lambda t, x: [[0.1 + 0.05 * x[0], 0.0], [0.0, 0.15]],
+    )  # fmt: skip
+    safe = [
+        cb.Inside(cb.Box([-1, -1], [1, 1])), cb.Outside(cb.Ball([0.6, 0.6], 0.15)),
+        cb.Inside(cb.HalfSpace([1.0, 1.0], 1.2)),
+    ]  # fmt: skip
+    return cb.Problem(system, initial=cb.Ball([0, 0], 0.05), safe=safe, horizon=0.5, delta=0.1)
+
+
+def quadratic_certificate(problem: cb.Problem) -> str:
+    """A certificate by quadratic value bounds from the first attempt at every wall."""
+    found = bound_quadratic(problem, target=0.5, seconds=60.0)
+    answer = EngineAnswer(log10_delta=found.upper, method="quadratic", details=found)
+    return side_of(problem, {"quadratic": answer}, lower=False)
+
+
+def started() -> cb.Problem:
+    """Discrete time, for value functions: a normal start."""
+    system = cb.DiscreteSystem(lambda x: 0.8 * x, states=["x"], noise=cb.Gaussian(std=0.2))
+    start = cb.GaussianStart([0.1], [[0.04]])
+    return cb.Problem(system, initial=start, safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3, delta=0.1)
+
+
+def shaken() -> cb.Problem:
+    """Discrete time, for value functions: uniform noise."""
+    system = cb.DiscreteSystem(
+        lambda x, d: [0.9 * x[0] + 0.1 * np.sin(2 * x[0]) + d[0]], states=["x"], disturbance=cb.Box([-0.02], [0.03]),
+        noise=cb.Uniform(halfwidth=0.3),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1], [1]))]
+    return cb.Problem(system, initial=cb.Box([0], [0.1]), safe=safe, horizon=5, delta=0.1)
+
+
+def drifting() -> cb.Problem:
+    """Continuous time, for value functions: a normal start, and no limit below."""
+    system = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=0.5)
+    start = cb.GaussianStart([0.1], [[0.02]])
+    safe = [cb.Inside(cb.HalfSpace([1.0], 1.0))]
+    return cb.Problem(system, initial=start, safe=safe, horizon=0.5, delta=0.1)
 
 
 @pytest.fixture(autouse=True)
@@ -170,3 +237,19 @@ def stirring() -> Case:
 @pytest.fixture(scope="session")
 def valuing() -> Case:
     return Case(valued(), "values")
+
+
+@pytest.fixture(scope="session")
+def squaring() -> SimpleNamespace:
+    """Quadratic value bounds."""
+    problem = squared()
+    text, given = quadratic_certificate(problem), json.loads(json.dumps(problem_data(problem)))
+    return SimpleNamespace(problem=problem, text=text, data=parse(text), given=given)
+
+
+@pytest.fixture(scope="session")
+def valuing_below(valuing: Case) -> Case:
+    """The lower bound of the same verdict."""
+    case = copy.copy(valuing)
+    case.text = side_of(case.problem, dict(case.verdict.answers), lower=True)
+    return case

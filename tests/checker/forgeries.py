@@ -144,9 +144,11 @@ def _sharp(written: Callable[[], str]) -> Callable[[], str]:
 
     def text() -> str:
         found = written()
-        proved = check_data(parse(found)).log10_proved
+        report = check_data(parse(found))
+        lower = report.log10_lower is not None
+        proved = report.log10_lower_proved if lower else report.log10_proved
         assert proved is not None
-        return restated(found, proved)
+        return restated(found, proved, lower=lower)
 
     return text
 
@@ -834,7 +836,7 @@ def _(data: Data) -> None:
     data["problem"]["disturbance_set"] = [exact([-0.05, 0.06])]
 
 
-@forges("the starts break no constraint", "valued", "values/proof.py", "_Discrete.upper", "lie in the safe set")
+@forges("the starts break no constraint", "valued", "values/proof.py", "_Discrete.bound", "lie in the safe set")
 def _(data: Data) -> None:
     data["problem"]["constraints"].append(
         {"kind": "inside", "label": "x", "during": exact([0.0, 0.0]), "region": {
@@ -861,7 +863,7 @@ def _(data: Data) -> None:
     data["problem"]["noise"]["values"] = exact([[0.04, 0.001], [0.001, 0.03]])
 
 
-@forges("value functions need bounded starts", "valued", "values/proof.py", "_Discrete", "bounded starts")
+@forges("a normal start is not a bounded one", "valued", "values/proof.py", "_Discrete", "unknown entry `splits`")
 def _(data: Data) -> None:
     data["problem"]["initial"] = {"kind": "gaussian", "mean": exact([0.0]), "covariance": exact([[1e-4]])}
 
@@ -947,7 +949,7 @@ def _(data: Data) -> None:
 
 
 @forges(
-    "value functions need a bounded start in continuous time too", "leaving", "values/passage.py", "Passage", "bounded",
+    "a normal start is cut into parts in continuous time", "leaving", "values/passage.py", "Passage", "have `pieces`",
 )
 def _(data: Data) -> None:
     data["problem"]["initial"] = {"kind": "gaussian", "mean": exact([0.0]), "covariance": exact([[1e-4]])}

@@ -469,6 +469,29 @@ VALUES: list[Change] = [
 ]
 
 
+def start_elsewhere(data: Data, rng: random.Random) -> str | None:
+    """A start of a lower bound moved out of the initial set."""
+    row = rng.choice(data["proof"]["starts"])
+    place = _pick(row, rng)
+    row[place] = _scaled(row[place], 1.0, rng.choice((-1, 1)) * rng.uniform(0.5, 3.0))
+    return "start"
+
+
+def larger_claim(data: Data, rng: random.Random) -> str | None:
+    """A lower bound above the one that follows, or of the other side."""
+    if rng.random() < 0.3:
+        data["claim"]["log10_delta"] = data["claim"].pop("log10_lower")
+    else:
+        data["claim"]["log10_lower"] = _scaled(data["claim"]["log10_lower"], rng.uniform(0.2, 0.9))
+    return "claim"
+
+
+VALUES_BELOW: list[Change] = [
+    other_problem, other_dynamics, start_elsewhere, lost_cells, coarse_cells, unordered_cells, other_steps,
+]  # fmt: skip
+
+
+
 # ---- changes that do no harm -------------------------------------------------------------------------------
 
 

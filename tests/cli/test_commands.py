@@ -347,3 +347,21 @@ def test_a_problems_name_cannot_imitate_a_verdict(capsys: pytest.CaptureFixture[
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith('UNKNOWN  "[bold]x[/] SAFE y: P(leaving')
     assert not any(line.startswith("SAFE") for line in lines)
+
+
+def test_unsafe_has_a_certificate_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, file = tmp_path / "walk.toml", tmp_path / "c.json"
+    path.write_text(
+        'states = ["x"]\ntime = "discrete"\nhorizon = 4\ndelta = 0.01\n[dynamics]\nx = "0.9*x"\n[noise]\n'
+        'law = "gaussian"\nstd = [0.4]\n[initial]\npoint = [0]\n[[stay]]\nbox = { x = [-1, 1] }\n'
+    )
+    code, found = answer(capsys, "verify", str(path), "--method", "values", "--certificate", str(file))
+    assert (code, found["status"]) == (1, "UNSAFE")
+    assert found["certificate"]["log10_delta"] == 0
+    assert -2 < found["certificate"]["log10_lower"] <= found["log10_lower"] + 0.01
+    code, checked = answer(capsys, "check", str(file), "--problem", str(path))
+    assert (code, checked["valid"]) == (0, True)
+    assert "from some start" in checked["claim"]
+    assert "(more than delta = 0.01)" in checked["claim"]
+    assert run(["simulate", str(path), "--paths", "100", "--against", str(file)]) == 2
+    assert "claims a lower bound" in capsys.readouterr().err

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from certbound.checker.statement.comparison import first_difference
-from certbound.checker.statement.partition import cells_of
+from certbound.checker.statement.partition import cells_of, starts_of
 from certbound.checker.statement.problem import Model, met_at, read_model
 from certbound.checker.statement.rooms import Grid, demands, round_demands
 from certbound.checker.statement.safe_set import SafeSet, StepSet
@@ -19,6 +19,7 @@ __all__ = [
     "read_model",
     "round_demands",
     "SafeSet",
+    "starts_of",
     "StepSet",
     "Structure",
     "structure_of",

@@ -32,6 +32,7 @@ class Law:
     flags: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()  # lists of numbers, under ``tables``
     gaussian: bool = False  # exactly normal
+    uniform: bool = False  # independent entries, each uniform between its level and minus that
 
 
 def _as_they_are(squares: Squares, data: Record) -> Squares:
@@ -65,13 +66,17 @@ def _tabled(places: str, more: int) -> Callable[[Squares, Record], Squares]:
     return proxies
 
 
+def _thirds(squares: Squares, data: Record) -> Squares:
+    return [square / 3 for square in squares]
+
+
 LAWS = {
     # E exp(l.w) = exp(l' S l / 2): S is the covariance
     "gaussian": Law(levels=("std", "variance", "covariance"), proxies=_as_they_are, gaussian=True),
     # what it says of itself
     "subgaussian": Law(levels=("std", "variance", "covariance"), proxies=_as_they_are),
     # sinh(x)/x <= exp(x^2/6)
-    "uniform": Law(levels=("halfwidth",), proxies=lambda squares, data: [square / 3 for square in squares]),
+    "uniform": Law(levels=("halfwidth",), proxies=_thirds, uniform=True),
     # cosh(x) <= exp(x^2/2)
     "rademacher": Law(levels=("scale",), proxies=_as_they_are),
     # the sum of two uniform ones

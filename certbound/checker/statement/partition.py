@@ -1,4 +1,4 @@
-"""The initial set cut into cells: by a grid of edges, or by halving a box again and again."""
+"""The initial set cut into cells, by a grid of edges or by halving a box again and again; and points of it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from itertools import pairwise, product
 
 from flint import arb
 
+from certbound.checker.balls import cholesky, column
 from certbound.checker.reading import Record, number, numbers, whole
 from certbound.checker.report import Unproved
 from certbound.checker.statement.problem import Model
 from certbound.errors import CertificateError
 
 MOST_CELLS = 4096
+MOST_STARTS = 256
 
 
 def cells_of(model: Model, record: Record) -> list[list[tuple[arb, arb]]]:
@@ -62,3 +64,30 @@ def _cut(boxes: list[list[tuple[arb, arb]]], record: Record, dimension: int) -> 
     if left:
         raise CertificateError("`proof.cuts` must end every part in a cell.")
     return cells
+
+
+def starts_of(model: Model, record: Record) -> list[list[arb]]:
+    """The stated starts.
+
+    Raises
+    ------
+    Unproved
+        If one was not shown to lie in the initial set.
+    """
+    rows = record.items("starts", 1, MOST_STARTS)
+    points = [list(map(arb, numbers(row, f"proof.starts[{k}]", model.dimension))) for k, row in enumerate(rows)]
+    if not all(_is_inside(model, point) for point in points):
+        raise Unproved("a start was not shown to lie in the initial set")
+    return points
+
+
+def _is_inside(model: Model, point: list[arb]) -> bool:
+    initial = model.initial
+    if initial.kind == "box":
+        return all(low <= x <= high for low, x, high in zip(initial.low, point, initial.high))
+    away = [x - arb(c) for x, c in zip(point, initial.centre)]
+    if initial.shape is not None:
+        image = (cholesky(initial.shape).inv() * column(away)).entries()
+        return bool(sum((x * x for x in image), arb(0)) <= 1)
+    radius = arb(initial.radius)
+    return bool(sum((x * x for x in away), arb(0)) <= radius * radius)

@@ -31,25 +31,32 @@ class Noise:
     """The noise: ``diffusion`` is the matrix g (CT) or G (DT), or a tape over (t, states).
 
     ``proxy`` is the covariance (or variance proxy) of w in discrete time, the identity in continuous time.
-    ``gaussian`` says whether it is exactly normal.
+    ``gaussian`` says whether it is exactly normal; ``uniform`` holds the halfwidths of independent uniform entries.
     """
 
     diffusion: arb_mat | Tape
     proxy: arb_mat
     gaussian: bool
+    uniform: tuple[arb, ...] | None = None
+
+    def constant(self) -> arb_mat:
+        """A constant matrix; CertificateError of a tape."""
+        if isinstance(self.diffusion, Tape):
+            raise CertificateError("this proof needs a constant diffusion matrix.")
+        return self.diffusion
 
     def covariance(self) -> arb_mat:
         """g g^T, or G S G^T; a constant matrix only."""
-        if isinstance(self.diffusion, Tape):
-            raise CertificateError("this proof needs a constant diffusion matrix.")
-        return self.diffusion * self.proxy * self.diffusion.transpose()
+        matrix = self.constant()
+        return matrix * self.proxy * matrix.transpose()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Initial:
     """The initial set: its box hull, and the covariance of a random start (None otherwise).
 
-    ``kind`` and the exact data stay for proofs that use a ball or an ellipsoid itself.
+    ``kind`` and the exact data stay for proofs that use a ball or an ellipsoid itself; ``around`` says that the set is
+    another one, inside the stated box.
     """
 
     kind: str
@@ -59,6 +66,7 @@ class Initial:
     centre: tuple[float, ...] = ()
     radius: float = 0.0
     shape: arb_mat | None = None
+    around: bool = False
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -194,7 +202,8 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
     record = Record(value, path, ("law", "level", "values", "matrix", *law.flags, *tables))
     rows = _same_length(record.array("matrix", n, None), path)
     proxy = _proxy(record, law, len(rows[0]), budget)
-    return Noise(diffusion=matrix(rows), proxy=proxy, gaussian=law.gaussian)
+    widths = tuple(arb(number(x, path)) for x in record.items("values")) if law.uniform else None
+    return Noise(diffusion=matrix(rows), proxy=proxy, gaussian=law.gaussian, uniform=widths)
 
 
 def _same_length(rows: list[list[float]], path: str) -> list[list[float]]:
@@ -292,12 +301,13 @@ def _initial(value: object, path: str, n: int, budget: Budget) -> Initial:
     kind = value.get("kind") if isinstance(value, dict) else None
     if not isinstance(kind, str) or kind not in kinds:
         raise CertificateError(f"`{path}.kind` must be one of {', '.join(kinds)}.")
-    record = Record(value, path, ("kind", *kinds[kind]))
+    record = Record(value, path, ("kind", *kinds[kind]), ("around",) if kind == "box" else ())
     if kind == "box":
         low, high = record.array("low", n), record.array("high", n)
         if any(a > b for a, b in zip(low, high)):
             raise CertificateError(f"`{path}.low` must not exceed `high`.")
-        return Initial(kind=kind, low=tuple(map(arb, low)), high=tuple(map(arb, high)))
+        around = record["around"] is not None and record.flag("around")
+        return Initial(kind=kind, low=tuple(map(arb, low)), high=tuple(map(arb, high)), around=around)
     centre = record.array("mean" if kind == "gaussian" else "center", n)
     points = [arb(x) for x in centre]
     if kind == "gaussian":

@@ -116,10 +116,11 @@ class Part:
 class SafeSet:
     """The constraints of a model at rest.
 
-    One that has a window or moves, or a state that nothing bounds, is `Unproved`.
+    One that has a window or moves is `Unproved`, and, unless ``bounded`` is False, a state that nothing bounds; then
+    there is no ``hull``.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, *, bounded: bool = True) -> None:
         self.n = model.dimension
         self.shapes: list[_Shape] = []
         low: list[arb | None] = [None] * self.n
@@ -130,7 +131,7 @@ class SafeSet:
                 self.shapes.append(shape)
                 self._narrow(shape, low, high)
         self.hull: list[Side] = []
-        for j, (a, b) in enumerate(zip(low, high)):
+        for j, (a, b) in enumerate(zip(low, high) if bounded else ()):
             if a is None or b is None:
                 raise Unproved(f"no constraint that a barrier can use bounds {model.states[j]}")
             if not a <= b:

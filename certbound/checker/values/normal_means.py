@@ -182,7 +182,7 @@ def mean_table(axes: list[AxisTable], pieces: Array, budget: Budget) -> MeanTabl
     for axis, table in enumerate(axes):
         dominant = _along(table.weight, dominant, axis)
     budget.check()
-    derivatives = _on_line(axes[0], pieces) if n == 1 else _in_plane(axes[0], axes[1], pieces, budget)
+    derivatives = _in_space(axes, pieces, budget)
     most = float(sizes.max())
     return MeanTable(derivatives, np.asarray(dominant * _UP), _rounding(axes, pieces), 4 * _FAR * n * most * ORDER**n)
 
@@ -191,16 +191,41 @@ def _on_line(table: AxisTable, pieces: Array) -> dict[tuple[int, ...], Array]:
     return {(a,): sum(part @ row for part, row in zip(table.integrals[a], pieces)) for a in range(ORDER)}
 
 
-def _in_plane(one: AxisTable, two: AxisTable, pieces: Array, budget: Budget) -> dict[tuple[int, ...], Array]:
-    """The sums over the second state's cells first, which serve all derivatives by the first one."""
+def _in_space(axes: list[AxisTable], pieces: Array, budget: Budget) -> dict[tuple[int, ...], Array]:
+    """The sums over the last state's cells first, which serve all derivatives by the others; ``pieces`` as there."""
+    if len(axes) == 1:
+        return _on_line(axes[0], pieces)
     found: dict[tuple[int, ...], Array] = {}
-    degree = len(pieces) - 1
+    n, degree = len(axes), len(pieces) - 1
+    last = axes[-1].integrals
     for b in range(ORDER):
         budget.check()
-        inner = [sum(pieces[i, k] @ two.integrals[b, k].T for k in range(degree + 1 - i)) for i in range(degree + 1)]
-        for a in range(ORDER - b):
-            found[a, b] = sum(left @ part for left, part in zip(one.integrals[a], inner))
+        inner = sum(np.take(pieces, k, axis=n - 1) @ last[b, k].T for k in range(degree + 1))
+        # the powers and cells of the others, and the points of the last state as if they were a batch
+        for rest, part in _others(axes[:-1], np.asarray(inner), ORDER - b, budget).items():
+            found[(*rest, b)] = part
     return found
+
+
+def _others(axes: list[AxisTable], pieces: Array, order: int, budget: Budget) -> dict[tuple[int, ...], Array]:
+    """The same where an axis of points comes last, for derivatives of a total order below ``order``."""
+    n, found = len(axes), dict[tuple[int, ...], Array]()
+    axis, count = axes[-1].integrals, len(pieces)
+    for b in range(order):
+        budget.check()
+        moved = [np.moveaxis(np.take(pieces, k, axis=n - 1), 2 * n - 2, -1) @ axis[b, k].T for k in range(count)]
+        inner = np.moveaxis(np.asarray(sum(moved)), -1, 2 * n - 2)
+        if n == 1:
+            found[b,] = inner
+            continue
+        for rest, part in _others(axes[:-1], _with_batch(inner, n), order - b, budget).items():
+            found[(*rest, b)] = part.reshape(*part.shape[:-1], *inner.shape[-2:])
+    return found
+
+
+def _with_batch(array: Array, n: int) -> Array:
+    """The last two axes as one."""
+    return array.reshape(*array.shape[:-2], -1)
 
 
 def _rounding(axes: list[AxisTable], pieces: Array) -> float:

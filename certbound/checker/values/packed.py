@@ -34,7 +34,7 @@ def unpacked(value: object, path: str, shape: tuple[int, ...]) -> Array:
         raise CertificateError(f"`{path}` must be compressed text in base 64.") from error
     if not machine.eof or machine.unused_data or len(text) > count * LONGEST:
         raise CertificateError(f"`{path}` must hold {count} numbers, and nothing else.")
-    words = text.decode("ascii", "replace").split(" ")
+    words = text.decode("ascii", "replace").split(" ") if text else []
     if len(words) != count:
         raise CertificateError(f"`{path}` must hold {count} numbers, got {len(words)}.")
     if not all(_NUMBER.match(word) for word in words):

@@ -22,13 +22,14 @@ a closer look is worth its time.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from flint import arb
 
+from certbound.checker.balls import tail
 from certbound.checker.reading import Record, numbers
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, SafeSet
@@ -37,11 +38,15 @@ from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.batches import Array, Batch, Index, Terms, above, below, terms
 from certbound.checker.values.hermite import Patches, Surface
 from certbound.checker.values.packed import unpacked
+from certbound.checker.values.step_back import independent
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
 MOST_PATCHES = 400_000
 MOST_LEVELS = 200
+MOST_PARTS = 20_000
+_FAR = 40.0
+"""Standard deviations of a random start beyond the grid that are looked at from below."""
 _DEGREES = {1: (6, 8), 2: (6, 8, 10, 12)}
 """Of the Taylor models by the number of states: higher ones where lower ones do not show what the file states."""
 _ENTRIES = 4_000_000
@@ -50,21 +55,29 @@ _CHUNK = 4096
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """m between ``edges`` (rising, the last one 0) and q at them."""
+    """m between ``edges`` (rising, the last one 0) and q at them, for a bound from above or from below."""
 
     edges: list[float]
     m: list[float]
     q: list[float]
+    upper: bool = True
 
     def __post_init__(self) -> None:
-        edges, m, q = self.edges, self.m, self.q
+        edges, m, q, sign = self.edges, self.m, self.q, -1 if self.upper else 1
         if not (len(edges) == len(q) == len(m) + 1 and edges[-1] == 0 and all(a < b for a, b in pairwise(edges))):
             raise CertificateError("`proof.edges` must rise to 0, with one m less and as many q.")
-        if not all(rate >= 0 for rate in m) or q[0] != 0 or not all(0 <= value < 1 for value in q):
-            raise CertificateError("`proof.m` must not be negative, and `proof.q` must rise from 0 and stay below 1.")
+        if not all(rate >= 0 for rate in m) or q[0] != 0 or not all(value >= 0 for value in q):
+            raise CertificateError("`proof.m` must not be negative, and `proof.q` must rise from 0.")
+        if self.upper and not all(value < 1 for value in q):
+            raise CertificateError("`proof.q` must stay below 1.")
         for (a, b), (left, right), rate in zip(pairwise(edges), pairwise(q), m):
             slope = (arb(right) - left) / (arb(b) - a)
-            if not all(slope >= (1 - arb(end)) * (rate - arb(end)) for end in (left, right)):  # convex in q
+            # convex in q, or (from below) concave
+            due = [(1 + sign * arb(end)) * (rate - arb(end)) for end in (left, right)]
+            top = (arb(rate) - 1) / 2
+            if not self.upper and not (top <= min(left, right) or top >= max(left, right)):
+                due.append((1 + arb(rate)) ** 2 / 4)
+            if not all(slope >= least for least in due):
                 raise Unproved("q was not shown to grow as fast as its inequality asks")
 
     def least(self, low: Array, high: Array) -> Array:
@@ -85,24 +98,33 @@ class Levels:
 
 
 class Passage:
-    """The proof's numbers, and what follows from them."""
+    """The proof's numbers, and what follows from them for the upper bound."""
+
+    upper_side = True
 
     def __init__(self, model: Model, value: object, budget: Budget) -> None:
-        names = ("engine", "axes", "times", "values", "rates", "edges", "m", "q", "lam", "eps")
-        record = Record(value, "proof", names)
+        self.random = model.initial.covariance is not None
+        names = ["engine", "axes", "times", "values", "rates", "edges", "m", "q", "lam", "eps"]
+        names += ["pieces"] if self.random else []
+        names += [] if self.upper_side else ["side"] if self.random else ["side", "starts"]
+        record = self.record = Record(value, "proof", names)
         self.model, self.budget, n = model, budget, model.dimension
         if n not in _DEGREES:
             raise Unproved(f"value functions are proved for at most {max(_DEGREES)} states")
         if model.plan is not None:
             raise Unproved("this proof does not treat a plan with steps in time")
-        if model.initial.covariance is not None:
-            raise Unproved("value functions are proved for bounded starts only")
+        if self.random and n > 1:
+            raise Unproved("value functions are proved for random starts in one state only")
         self.surface = self._read(record)
-        self.levels = Levels(record.array("edges", None), record.array("m", None), record.array("q", None))
+        edges, m, q = (record.array(name, None) for name in ("edges", "m", "q"))
+        self.levels = Levels(edges, m, q, self.upper_side)
         slabs = len(self.surface.times) - 1
         self.stated, self.eps = np.array(record.array("lam", slabs)), np.array(record.array("eps", slabs))
         if len(self.levels.m) > MOST_LEVELS or not (self.eps >= 0).all():
             raise CertificateError(f"`proof.eps` must not be negative, nor `proof.m` have over {MOST_LEVELS} entries.")
+        self.pieces = record.whole("pieces", 1, MOST_PARTS) if self.random else 1
+        if self.random and self.pieces * self.surface.cells[0] > MOST_PARTS:
+            raise CertificateError(f"`proof.pieces` must cut the cells into at most {MOST_PARTS} parts.")
         self.degrees = _DEGREES[n]
         self.lift = 0.0
 
@@ -125,7 +147,7 @@ class Passage:
         """At least the probability of leaving."""
         self._check_box()
         self.lift = self._missing()
-        start = float(np.nextafter(self._at_start() + self.lift, np.inf))
+        start = self._middle() if self.random else self._at_start()
         if not start < 0:
             return arb(1)
         lam = self._payments(start)
@@ -136,7 +158,11 @@ class Passage:
             later += arb(float(lam[k])) * step
             total += arb(float(self.eps[k])) * step * later.exp()
         most = self.levels.above(arb(self.levels.edges[0]))
-        found = (later + v0 + self.levels.above(v0)).exp() + (v0 + most).exp() * total
+        if self.random:
+            found = self._mean(lambda _, high: arb.min((later + most + arb(high)).exp(), arb(1)), lambda *_: True)
+        else:
+            found = (later + v0 + self.levels.above(v0)).exp()
+        found += (v0 + most).exp() * total
         floor = arb.min(arb(self._at_end()), arb(-1)).exp()
         return arb.min((found - floor) / (1 - floor), arb(1)).upper()
 
@@ -144,10 +170,12 @@ class Passage:
         """The box of the grid lies in the safe set, and the starts in it."""
         sides = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in self.surface.axes]
         centre, radius = [(a + b) / 2 for a, b in sides], [(b - a) / 2 for a, b in sides]
-        if not SafeSet(self.model).holds(centre, radius):
+        if not SafeSet(self.model, bounded=False).holds(centre, radius):
             raise Unproved("the grid was not shown to lie in the safe set")
         initial = self.model.initial
-        if not all(low >= a and high <= b for (a, b), low, high in zip(sides, initial.low, initial.high)):
+        if not self.random and not all(
+            low >= a and high <= b for (a, b), low, high in zip(sides, initial.low, initial.high)
+        ):
             raise Unproved("the initial set was not shown to lie in the grid")
 
     def _missing(self) -> float:
@@ -157,22 +185,67 @@ class Passage:
             face = self.surface.face(axis, side)
             for first, last in self._chunks(face):
                 low, _ = face.patches(first, last).derivative(terms(n, 3 + 5 * (n - 1)), (0,) * n).sharp_ends()
-                least = min(least, float(low.min()))
+                least = min(least, float(np.where(np.isnan(low), -np.inf, low).min()))
         return -least
 
     def _at_start(self) -> float:
         """At least V(0, .) on the initial set."""
-        surface, n = self.surface.frozen(0), self.model.dimension
-        low = [below(x) for x in self.model.initial.low]
-        high = [above(x) for x in self.model.initial.high]
-        patches = surface.patches(0, 1)
+        initial = self.model.initial
+        _, high = self._over([below(x) for x in initial.low], [above(x) for x in initial.high])
+        return float(np.nextafter(high.max() + self.lift, np.inf))
+
+    def _over(self, low: Sequence[float], high: Sequence[float]) -> tuple[Array, Array]:
+        """Ends of V(0, .) on the parts of a box that meet the patches, before V is lifted."""
+        n = self.model.dimension
+        patches = self.surface.frozen(0).patches(0, 1)
         met = np.ones(patches.low.shape[1], dtype=bool)
         for i in range(n):
             met &= (patches.low[1 + i] <= high[i]) & (patches.high[1 + i] >= low[i])
         found = patches.take(np.flatnonzero(met))
-        whole = found.derivative(terms(n + 1, 5 * n), (0,) * (n + 1))
-        parts = [self._part(found, i, low[i], high[i], whole.terms) for i in range(n)]
-        return float(_substituted(whole, parts).sharp_ends()[1].max())
+        rows = [np.full(found.low.shape[1], value) for value in (*low, *high)]
+        return self._parts(found, rows[:n], rows[n:])
+
+    def _parts(self, patches: Patches, low: Sequence[Array], high: Sequence[Array]) -> tuple[Array, Array]:
+        """Ends of V on the part of every patch of a frozen surface that lies between ``low`` and ``high``."""
+        n = self.model.dimension
+        whole = patches.derivative(terms(n + 1, 5 * n), (0,) * (n + 1))
+        parts = [self._part(patches, i, low[i], high[i], whole.terms) for i in range(n)]
+        return _substituted(whole, parts).sharp_ends()
+
+    def _law(self) -> tuple[Array, Array, Array]:
+        """Edges of the parts of the cells of one state, and ends of V(0, .) on each, V being lifted."""
+        patches = self.surface.frozen(0).patches(0, 1)
+        a, b = patches.low[1], patches.high[1]
+        rows = np.stack([a, *(a + (b - a) * (k / self.pieces) for k in range(1, self.pieces)), b])
+        if not (np.diff(rows, axis=0) > 0).all():
+            raise Unproved("the parts of the cells are too small")
+        ends = [self._parts(patches, [low], [high]) for low, high in pairwise(rows)]
+        low, high = (np.stack([end[side] for end in ends]).T.ravel() for side in (0, 1))
+        edges = np.append(rows[:-1].T.ravel(), b[-1])
+        return edges, np.nextafter(low + self.lift, -np.inf), np.nextafter(high + self.lift, np.inf)
+
+    def _middle(self) -> float:
+        """About the logarithm of the mean of exp(V(0, .)) over a random start: any number would do."""
+        found = self._mean(lambda _, high: arb(min(high, 0.0)).exp(), lambda *_: self.upper_side)
+        return float(found.log().mid()) if found > 0 else -1e3
+
+    def _mean(self, weigh: Callable[[float, float], arb], beyond: Callable[[float, float], bool]) -> arb:
+        """The mean of a function of V's ends over a random start; what lies beyond the grid counts 1 where asked."""
+        centre, covariance = arb(self.model.initial.centre[0]), self.model.initial.covariance
+        assert covariance is not None
+        (spread,) = independent(covariance, "the start")
+        edges, low, high = self._law()
+        scale = spread * arb(2).sqrt()
+        tails = [((arb(float(x)) - centre) / scale).erfc() / 2 for x in edges]
+        total, far = arb(0), _FAR * float(spread.mid())
+        for k, (a, b) in enumerate(zip(low, high)):
+            total += arb.max(tails[k] - tails[k + 1], arb(0)) * weigh(float(a), float(b))
+        for end, mass, sign in ((edges[0], 1 - tails[0], -1), (edges[-1], tails[-1], 1)):
+            place = float(end) + sign * far
+            if beyond(float(end), place):
+                reach = tail((arb(place) - centre) * sign / spread)
+                total += mass if self.upper_side else arb.max(mass - reach, arb(0))
+        return total
 
     def _at_end(self) -> float:
         """At most V at the horizon."""
@@ -181,8 +254,8 @@ class Passage:
         low = patches.derivative(terms(n + 1, 5 + 3 * (n - 1)), (0,) * (n + 1)).sharp_ends()[0]
         return float(np.nextafter(low.min() + self.lift, -np.inf))
 
-    def _part(self, patches: Patches, i: int, low: float, high: float, which: Terms) -> Batch:
-        """xi of a state on the part of every patch that the initial set may meet."""
+    def _part(self, patches: Patches, i: int, low: Array, high: Array, which: Terms) -> Batch:
+        """xi of a state on the part of every patch between ``low`` and ``high``."""
         a, b = patches.low[1 + i], patches.high[1 + i]
         x = tm.variable(which, 1 + i, np.maximum(a, low), np.minimum(b, high))
         middle = tm.fixed(which, a / 2 + b / 2, (np.abs(a) + np.abs(b)) * 2.0**-51)
@@ -213,13 +286,17 @@ class Passage:
 
     def _needs(self, patches: Patches, slab: Index, start: float, degree: int) -> Array:
         """What every patch needs as lam, from Taylor models of some degree."""
-        which = terms(1 + self.model.dimension + len(self.model.disturbance), degree)
+        which = terms(self._variables(), degree)
         need, size = np.zeros(len(slab)), max(32, _ENTRIES // (degree + 1) ** which.variables)
         for first in range(0, len(slab), size):
             self.budget.check()
             part = slice(first, first + size)
             need[part] = self._need(patches.take(part), self.eps[slab[part]], start, which)
         return need
+
+    def _variables(self) -> int:
+        """Of the Taylor models: time, the states and the disturbances."""
+        return 1 + self.model.dimension + len(self.model.disturbance)
 
     def _need(self, patches: Patches, eps: Array, start: float, which: Terms) -> Array:
         low, high = patches.derivative(which, (0,) * (self.model.dimension + 1)).sharp_ends()
@@ -235,22 +312,30 @@ class Passage:
 
     def _residual(self, patches: Patches, m: Array, which: Terms) -> Batch:
         """R - m Q2, the disturbance being a variable."""
-        model, n = self.model, self.model.dimension
-        count = patches.low.shape[1]
-        inputs = [tm.variable(which, i, patches.low[i], patches.high[i]) for i in range(n + 1)]
+        count, inputs = patches.low.shape[1], self._inputs(patches, which)
         pushed = [
-            tm.variable(which, 1 + n + j, np.full(count, a), np.full(count, b))
-            for j, (a, b) in enumerate(model.disturbance)
+            tm.variable(which, len(inputs) + j, np.full(count, a), np.full(count, b))
+            for j, (a, b) in enumerate(self.model.disturbance)
         ]
+        return self._balance(patches, inputs + pushed, self._squares(inputs), 1 - m, (1 + m) * 2.0**-52)
+
+    def _inputs(self, patches: Patches, which: Terms) -> list[Batch]:
+        """Time and states."""
+        return [tm.variable(which, i, patches.low[i], patches.high[i]) for i in range(self.model.dimension + 1)]
+
+    def _balance(
+        self, patches: Patches, inputs: Sequence[Batch], a: list[list[Batch]], share: Array, off: Array
+    ) -> Batch:
+        """V_t + f . V_x + tr(a V_xx)/2 + a factor times Q2, which ``share`` misses by at most ``off``."""
+        which, n = inputs[0].terms, self.model.dimension
         slope = [patches.derivative(which, _order(n, i)) for i in range(n)]
         total = patches.derivative(which, (1,) + (0,) * n)
-        for rate, one in zip(run(model.dynamics, inputs + pushed), slope):
+        for rate, one in zip(run(self.model.dynamics, inputs), slope):
             total = tm.add(total, tm.mul(rate, one))
-        a = self._squares(inputs)
         for i, j in itertools.product(range(n), repeat=2):
             if j < i:
                 continue
-            energy = tm.scaled(tm.mul(slope[i], slope[j]), 1 - m, (1 + m) * 2.0**-52)
+            energy = tm.scaled(tm.mul(slope[i], slope[j]), share, off)
             inner = tm.add(patches.derivative(which, _order(n, i, j)), energy)
             total = tm.add(total, tm.mul(tm.scaled(a[i][j], 0.5 if i == j else 1.0), inner))
         return total

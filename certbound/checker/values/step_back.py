@@ -17,9 +17,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from flint import arb
+from flint import arb, arb_mat
 
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, StepSet
@@ -31,7 +32,6 @@ from certbound.checker.values.normal_means import (
     ORDER,
     PER_DEVIATION,
     AxisTable,
-    MeanTable,
     axis_table,
     mean_table,
 )
@@ -85,7 +85,7 @@ class Steps:
 
     def __init__(self, model: Model, parts: int, budget: Budget, *, upper: bool) -> None:
         self.model, self.budget, self.upper = model, budget, upper
-        self.deviations = _deviations(model)
+        self.deviations = [] if model.noise.uniform is not None else _deviations(model)
         self.terms = terms(model.dimension + len(model.disturbance), DEGREE)
         self.disturbances = _parts(model.disturbance, parts, upper)
         clock = any(node.op == "input" and node.args[0] == 0 for node in model.dynamics.nodes)
@@ -117,13 +117,21 @@ class Steps:
 def _deviations(model: Model) -> list[arb]:
     """Standard deviations of the noise, which must move every state on its own."""
     if not model.noise.gaussian:
-        raise Unproved("value functions are proved for normal noise only")
-    covariance = model.noise.covariance()
-    n = model.dimension
+        raise Unproved("value functions are proved for normal and uniform noise only")
+    found, proxy = independent(model.noise.covariance(), "noise"), model.noise.proxy
+    m = proxy.nrows()
+    if any(not proxy[i, j].is_zero() for i in range(m) for j in range(m) if i != j):
+        return [x.union(x * (1 - arb(2) ** -38)) for x in found]  # it may have been raised, by 2^-39 of a variance
+    return found
+
+
+def independent(covariance: arb_mat, what: str) -> list[arb]:
+    """Standard deviations of a normal vector whose entries are independent."""
+    n = covariance.nrows()
     if any(not covariance[i, j].is_zero() for i in range(n) for j in range(n) if i != j):
-        raise Unproved("value functions are proved for noise only that is independent from state to state")
+        raise Unproved(f"value functions are proved for {what} only that is independent from state to state")
     if not all(covariance[i, i] > 0 for i in range(n)):
-        raise Unproved("value functions are proved only where every state has noise")
+        raise Unproved(f"value functions are proved only where every state of {what} varies")
     return [covariance[i, i].sqrt() for i in range(n)]
 
 
@@ -166,7 +174,7 @@ class Transition:
 
     def apply(self, value: Values) -> Batch:
         """A bound of sup over d of E U(f + w) on every box, the constant terms included; unknown where none is."""
-        table = mean_table(self.axes, value.pieces(), self.steps.budget)
+        table = self.table(value)
         best: Batch | None = None
         for images in self.images:
             found = _without(self._means(images, table), self.n, upper=self.steps.upper)
@@ -174,14 +182,18 @@ class Transition:
         assert best is not None
         return best
 
-    def _means(self, images: list[Batch], table: MeanTable) -> Batch:
+    def table(self, value: Values) -> Any:
+        """What the mean after the noise is computed from."""
+        return mean_table(self.axes, value.pieces(), self.steps.budget)
+
+    def _means(self, images: list[Batch], table: Any) -> Batch:
         chunks = []
         for start in range(0, len(images[0].error), _CHUNK):
             self.steps.budget.check()
-            chunks.append(self._mean([image.take(slice(start, start + _CHUNK)) for image in images], table))
+            chunks.append(self.mean([image.take(slice(start, start + _CHUNK)) for image in images], table))
         return tm.joined(chunks)
 
-    def _mean(self, images: list[Batch], table: MeanTable) -> Batch:
+    def mean(self, images: list[Batch], table: Any) -> Batch:
         """Taylor models of h(f)."""
         which, places, shifts = self.steps.terms, [], []
         square = np.zeros(images[0].error.shape)
@@ -200,13 +212,17 @@ class Transition:
 
     def _polynomial(self, shifts: list[Batch], parts: dict[tuple[int, ...], Array]) -> Batch:
         """sum over a of D_a v^a, by Horner's scheme in one state after the other."""
-        which = self.steps.terms
-        if self.n == 1:
-            return _horner(which, shifts[0], [parts[a,] for a in range(ORDER)])
+        return self._nested(shifts, parts, ())
+
+    def _nested(self, shifts: list[Batch], parts: dict[tuple[int, ...], Array], last: tuple[int, ...]) -> Batch:
+        """The part of the sum that has the powers ``last`` of the last states, without these."""
+        place, orders = self.n - 1 - len(last), ORDER - sum(last)
+        if place == 0:
+            return _horner(self.steps.terms, shifts[0], [parts[(a, *last)] for a in range(orders)])
         total: Batch | None = None
-        for b in reversed(range(ORDER)):
-            inner = _horner(which, shifts[0], [parts[a, b] for a in range(ORDER - b)])
-            total = inner if total is None else tm.add(tm.mul(total, shifts[1]), inner)
+        for b in reversed(range(orders)):
+            inner = self._nested(shifts, parts, (b, *last))
+            total = inner if total is None else tm.add(tm.mul(total, shifts[place]), inner)
         assert total is not None
         return total
 
@@ -300,3 +316,10 @@ def highest(found: Batch) -> float:
     return float(np.where(np.isfinite(found.error), tops, 1.0).max())
 
 
+
+
+def lowest(found: Batch) -> float:
+    """At most the largest of the least values over the boxes."""
+    rest = np.abs(found.coefficients[1:]).sum(axis=0) * (1 + 1e-12) + 1e-300
+    bottoms = found.coefficients[0] - rest - np.abs(found.coefficients[0]) * 1e-12
+    return float(np.where(np.isfinite(found.error), bottoms, 0.0).max())

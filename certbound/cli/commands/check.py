@@ -151,6 +151,8 @@ def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[
         begun = time.perf_counter()
         report = check_data(data, problem_data(problem), allow_assumptions=True)
         checking.append(time.perf_counter() - begun)
+        if report.valid and report.log10_lower_proved is not None:
+            return restated(text, report.log10_lower_proved, lower=True), engine, ""
         if report.valid and report.log10_proved is not None:
             return restated(text, report.log10_proved), engine, ""
         reason = report.reason

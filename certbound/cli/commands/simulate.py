@@ -147,7 +147,10 @@ def _claimed(path: Path) -> float:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise InputError(f"`{path}` is no certificate: {error}", "give the file of verify --certificate") from error
-    for part in (content, content.get("claim") if isinstance(content, dict) else None):
+    claim = content.get("claim") if isinstance(content, dict) else None
+    if isinstance(claim, dict) and "log10_lower" in claim:
+        raise InputError(f"`{path}` claims a lower bound", "compare with a certificate of SAFE")
+    for part in (content, claim):
         value = part.get("log10_delta") if isinstance(part, dict) else None
         if isinstance(value, str):
             with contextlib.suppress(ValueError):

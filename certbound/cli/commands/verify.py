@@ -200,13 +200,19 @@ def _certify(problem: Problem, verdict: Verdict, path: Path, left: float | None)
         sys.stderr.write(f"certbound: no certificate was written: {reason}\n")
         return "", {"path": None, "log10_delta": None, "reason": reason}
     write_file(path, text)
-    from certbound.safety.answers import is_at_most
+    from certbound.safety.answers import is_at_most, is_more_than
 
-    proved, reason = float.fromhex(json.loads(text)["claim"]["log10_delta"]), ""
+    claim = json.loads(text)["claim"]
+    proved, reason = float.fromhex(claim["log10_delta"]), ""
     if verdict.status == "SAFE" and not is_at_most(min(proved, 0.0), problem.delta):
         reason = f"the certificate proves {log10_text(proved)}, not the {problem.delta:g} of the verdict"
         sys.stderr.write(f"certbound: {reason}\n")
-    spent = {"seconds": time.perf_counter() - started, "check_seconds": sum(checking)}
+    spent: dict[str, Any] = {"seconds": time.perf_counter() - started, "check_seconds": sum(checking)}
+    least = float.fromhex(claim["log10_lower"]) if "log10_lower" in claim else None
+    spent |= {} if least is None else {"log10_lower": least}
+    if least is not None and not is_more_than(least, problem.delta):
+        reason = f"the certificate proves only at least {log10_text(least)}, not more than the {problem.delta:g} asked"
+        sys.stderr.write(f"certbound: {reason}\n")
     return text, {"path": str(path), "log10_delta": proved, "reason": reason, **spent}
 
 

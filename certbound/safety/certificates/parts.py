@@ -1,10 +1,13 @@
-"""What writers of a proof share: a direction for every obstacle that asks for one."""
+"""What writers of a proof share: a direction for every obstacle that asks for one, and many numbers as one text."""
 
 from __future__ import annotations
 
+import base64
+import zlib
 from collections.abc import Callable
 from typing import Any
 
+from certbound.arrays import Array
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside
 
@@ -16,3 +19,9 @@ def separations(problem: Problem, stated: Callable[[int, Inside], Any]) -> list[
         for number, constraint in enumerate(problem.safe)
     ]
     return found if problem.domain is None else [*found, None]
+
+
+def packed(numbers: Array) -> str:
+    """Numbers as exact hexadecimal notation, compressed and in base 64."""
+    words = " ".join(value.hex() for value in numbers.ravel().tolist())
+    return base64.b64encode(zlib.compress(words.encode("ascii"), 9)).decode("ascii")

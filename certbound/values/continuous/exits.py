@@ -42,6 +42,8 @@ class ExitBounds:
     seconds : float
     proposed : tuple of (Surface, Payment)
         V of every upper bound that was better than those before, and what it was paid with.
+    proposed_below : tuple of (Surface, Payment)
+        The same of the lower bounds, one state.
     """
 
     upper: float
@@ -49,6 +51,7 @@ class ExitBounds:
     words: str
     seconds: float
     proposed: tuple[tuple[Surface, Payment], ...] = ()
+    proposed_below: tuple[tuple[Surface, Payment], ...] = ()
 
 
 def bound_exits(
@@ -96,6 +99,7 @@ def bound_exits(
     _check(problem, target, seconds)
     model = _model(problem)
     proposed: Sequence[tuple[Surface, Payment]] = ()
+    below: Sequence[tuple[Surface, Payment]] = ()
     if target is not None:
         from certbound.values.continuous.line import bound_arrival
 
@@ -104,7 +108,7 @@ def bound_exits(
     elif problem.system.dimension == 1:
         from certbound.values.continuous.line import bound_line
 
-        upper, least, words, proposed = bound_line(problem, model, seconds, lower)
+        upper, least, words, (proposed, below) = bound_line(problem, model, seconds, lower)
     else:
         from certbound.values.continuous.two_states import two_states
 
@@ -119,6 +123,7 @@ def bound_exits(
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),
+        proposed_below=tuple(below),
     )  # fmt: skip
 
 

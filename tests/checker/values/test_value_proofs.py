@@ -7,30 +7,54 @@ import itertools
 import json
 import math
 import zlib
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
-from flint import arb
+from flint import arb, arb_mat
 from scipy.integrate import quad
 from scipy.stats import norm
 
 import certbound as cb
 from certbound.checker import check_data, parse
-from certbound.checker.report import Budget
-from certbound.checker.statement import read_model
+from certbound.checker.reading import Record
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.statement import read_model, starts_of
 from certbound.checker.values import batches as tm
+from certbound.checker.values import check_values_below, quadratic
 from certbound.checker.values.batch_tapes import run
+from certbound.checker.values.crossing import has_full_rank
 from certbound.checker.values.hermite import Surface
 from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
 from certbound.checker.values.packed import unpacked
-from certbound.checker.values.passage import Passage
+from certbound.checker.values.passage import Levels, Passage
+from certbound.checker.values.quadratic import splitting
+from certbound.checker.values.second_order import Flow
+from certbound.checker.values.step_back import Grid, Steps, Values
+from certbound.checker.values.uniform_means import UniformTransition
 from certbound.errors import CertificateError
 from certbound.problem.model import trace
-from certbound.safety.answers import exact
-from certbound.safety.certificate import certificate_text, problem_data
+from certbound.quadratic import bound_quadratic
+from certbound.quadratic.form_matrices import splitting as enclosed_splitting
+from certbound.safety.answers import EngineAnswer, exact
+from certbound.safety.certificate import certificate_text, initial_data, problem_data
+from certbound.safety.certificates import values_proof_below
+from certbound.safety.certificates.parts import packed
 from certbound.safety.verification import verify_safety
-from tests.checker.conftest import exit_certificate, leaving, valued
+from tests.checker.conftest import (
+    exit_certificate,
+    leaving,
+    quadratic_certificate,
+    shaken,
+    side_of,
+    squared,
+    started,
+    valued,
+    valued_plane,
+    valued_space,
+)
 from tests.checker.forgeries import repacked, text
 from tests.checker.mutations import rejected
 
@@ -107,6 +131,57 @@ def test_means_after_the_noise_agree_with_quadrature() -> None:
     assert found.missing(np.array([2.0]))[0] == math.inf
 
 
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_tables_of_means_are_the_sums_of_products_that_they_stand_for(n: int) -> None:
+    rng, degree = np.random.default_rng(n), 2
+    edges = [np.sort(rng.uniform(-1, 1, 3 + i)) for i in range(n)]
+    tables = [axis_table(np.array([-0.3, 0.4, 0.9])[: 3 - i], edges[i], arb(0.3 + 0.1 * i), degree, Budget(60.0))
+              for i in range(n)]  # fmt: skip
+    pieces = rng.normal(size=(degree + 1,) * n + tuple(len(row) + 1 for row in edges))
+    found = mean_table(tables, pieces, Budget(60.0))
+    assert len(found.derivatives) == math.comb(ORDER - 1 + n, n)
+    for orders in [(0,) * n, (ORDER - 1, *(0,) * (n - 1)), (*(0,) * (n - 1), 3), tuple(range(1, n + 1))]:
+        given: list[Any] = [pieces, list(range(2 * n))]
+        for i, (order, table) in enumerate(zip(orders, tables)):
+            given += [table.integrals[order], [i, 2 * n + i, n + i]]
+        truth = np.einsum(*given, list(range(2 * n, 3 * n)))
+        allowed = found.dominant * found.missing(np.zeros(1)) + found.far
+        assert found.derivatives[orders].shape == truth.shape
+        assert (np.abs(found.derivatives[orders] - truth) <= allowed + 1e-12).all()
+
+
+def test_means_after_uniform_noise_hold_everywhere_on_the_images() -> None:
+    """U jumps between cells; x+ = .7 x + .2 sin(3 x) + w, w uniform on [-.3, .3]."""
+    system = cb.DiscreteSystem(
+        lambda x: [0.7 * x[0] + 0.2 * np.sin(3 * x[0])], states=["x"], noise=cb.Uniform(halfwidth=0.3)
+    )
+    problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=2, delta=0.5)
+    model = read_model(json.loads(json.dumps(problem_data(problem))), Budget(60.0))
+    rng = np.random.default_rng(7)
+    grid = Grid((np.array([-1.0, -0.7, -0.2, 0.05, 0.1, 0.6, 1.1]),))
+    value = Values(grid, rng.normal(size=(5, 6)), 1.5)
+    places = np.sort(rng.uniform(-1.6, 1.6, 40))
+    low, high = places, places + rng.choice([0.0, 0.01, 0.3], 40)
+    transition = UniformTransition(Steps(model, 1, Budget(60.0), upper=True), 0, low[None], high[None], grid)
+    found = transition.mean(transition.images[0], transition.table(value))
+
+    def u(y: np.ndarray) -> np.ndarray:
+        k = np.searchsorted(grid.edges[0], y)
+        inside = (k > 0) & (k < 7)
+        k = np.clip(k, 1, 6)
+        left, right = grid.edges[0][k - 1], grid.edges[0][k]
+        xi = (2 * y - left - right) / (right - left)
+        return np.where(inside, sum(value.coefficients[i, k - 1] * xi**i for i in range(5)), 1.5)
+
+    offsets = (np.arange(40_000) + 0.5) / 20_000 - 1
+    for xi in (-1.0, -0.4, 0.0, 0.7, 1.0):
+        x = (low + high) / 2 + xi * (high - low) / 2
+        truth = np.array([u(0.7 * p + 0.2 * np.sin(3 * p) + 0.3 * offsets).mean() for p in x])
+        wrong = np.abs(value_of(found, np.array([xi])) - truth)
+        assert (wrong <= found.error + 1e-3).all()
+        assert (wrong[low == high] <= 1e-3).all()
+
+
 def test_patches_have_the_stated_derivatives() -> None:
     """V = exp(t) sin(x) cos(2 y), whose data are known: values, slopes and bends come out, and meet across nodes."""
     times, axes = np.array([0.0, 0.1, 0.25]), (np.array([0.0, 0.1, 0.3]), np.array([-0.2, 0.0, 0.1]))
@@ -156,10 +231,6 @@ def test_a_surface_in_two_states_starts_from_its_own_cells_only() -> None:
     flat = np.stack([np.ones(5), np.zeros(5), np.zeros(5)], axis=1)
     values = -np.einsum("ia,jb->iajb", flat, flat) * 3
     values += np.einsum("ia,jb->iajb", square, flat) + np.einsum("ia,jb->iajb", flat, square)
-    def packed(numbers: np.ndarray) -> str:
-        words = " ".join(float(x).hex() for x in numbers.ravel())
-        return base64.b64encode(zlib.compress(words.encode())).decode()
-
     proof = {
         "engine": "values", "axes": [exact(axis), exact(axis)], "times": exact([0.0, 0.1]),
         "values": packed(np.stack([values, values])), "rates": packed(np.zeros((2, 5, 3, 5, 3))),
@@ -171,6 +242,163 @@ def test_a_surface_in_two_states_starts_from_its_own_cells_only() -> None:
         assert passage._at_start() == pytest.approx(-3 + 0.4**2 + 0.35**2, abs=1e-9)
         assert passage._missing() == pytest.approx(2.0, abs=1e-9)
         assert passage._at_end() == pytest.approx(-3.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "make", [valued, shaken, started, valued_plane, pytest.param(valued_space, marks=pytest.mark.slow)]
+)
+def test_the_two_bounds_of_a_probability_enclose_a_simulation(make: Any) -> None:
+    problem = make()
+    answers = dict(verify_safety(problem, method="values").answers)
+    most = check_data(parse(side_of(problem, answers, lower=False)), problem_data(problem))
+    least = check_data(parse(side_of(problem, answers, lower=True)), problem_data(problem))
+    assert most.valid, most.reason
+    assert least.valid, least.reason
+    assert least.log10_lower_proved < most.log10_proved < least.log10_lower_proved + 0.1
+    assert least.log10_proved is None
+    assert least.log10_delta == 0.0
+    assert "some" in least.claim or "normal start" in least.claim
+    if problem.system.disturbance is None:
+        found = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(4), confidence=0.999)
+        assert 10**least.log10_lower_proved <= found.upper
+        assert found.lower <= 10**most.log10_proved
+
+
+def test_levels_from_below_are_held_to_the_largest_slope_that_is_due() -> None:
+    """(1 + q)(3 - q) is 3 at q = 0 and at q = 2, and 4 in between; from above (1 - q)(m - q) is convex."""
+    with pytest.raises(Unproved, match="q was not shown"):
+        Levels([-0.6, 0.0], [3.0], [0.0, 2.0], upper=False)
+    assert Levels([-0.49, 0.0], [3.0], [0.0, 2.0], upper=False).m == [3.0]
+    with pytest.raises(CertificateError, match="stay below 1"):
+        Levels([-0.49, 0.0], [3.0], [0.0, 2.0])
+
+
+def flat_below(level: float, *, high: float, end: float | None = None) -> arb:
+    """What V = level follows below (x' = .4 dW from 0, safe within 1 and beyond -high), ``end`` being V at the end."""
+    system = cb.ContinuousSystem(lambda x: 0 * x, states=1, diffusion=0.4)
+    safe = [cb.Inside(cb.Box([-high], [1]))]
+    problem = cb.Problem(system, initial=[0], safe=safe, horizon=0.5, delta=0.5)
+    axis = np.array([-2.0, 0.0, 1.01])
+    values = np.zeros((2, 3, 3))
+    values[:, :, 0] = level
+    values[1, :, 0] = level if end is None else end
+    proof = {
+        "engine": "values", "axes": [exact(axis)], "times": exact([0.0, 0.5]), "values": packed(values),
+        "rates": packed(np.zeros((2, 3, 3))), "edges": exact([0.0]), "m": [], "q": exact([0.0]), "lam": exact([0.0]),
+        "eps": exact([0.0]), "side": "lower", "starts": exact([[0.0]]),
+    }  # fmt: skip
+    model = read_model(json.loads(json.dumps(problem_data(problem))), Budget(60.0))
+    return check_values_below(model, json.loads(json.dumps(proof)), Budget(60.0))
+
+
+def test_what_v_is_at_the_end_and_on_harmless_sides_is_taken_off_from_below() -> None:
+    assert flat_below(-1.0, high=1.5) == 0  # exp(-1) - exp(-1) at the end
+    assert flat_below(-1.0, high=3.0) == 0
+    falling = flat_below(-1.0, high=1.5, end=-3.0)  # V_t is -4 in the mean, at most 6 in size: lam pays for it
+    assert falling == 0 or falling < math.exp(-1.0)
+
+
+def test_feedback_disturbances_need_noise_ofhas_full_rank() -> None:
+    which = tm.terms(1, 2)
+
+    def number(value: float) -> tm.Batch:
+        return tm.fixed(which, np.array([value]))
+
+    assert has_full_rank([[number(1.0)]]).all()
+    assert not has_full_rank([[number(0.0)]]).any()
+    assert has_full_rank([[number(1.0), number(0.9)], [number(0.9), number(1.0)]]).all()
+    assert not has_full_rank([[number(1.0), number(1.0)], [number(1.0), number(1.0)]]).any()
+
+
+@pytest.mark.parametrize(
+    ("initial", "point", "inside"),
+    [
+        (cb.Box([0, 0], [1, 1]), [1.0, 0.5], True), (cb.Box([0, 0], [1, 1]), [1.0, 1.5], False),
+        (cb.Ball([1, 0], 0.5), [1.3, 0.39], True), (cb.Ball([1, 0], 0.5), [1.3, 0.41], False),
+        (cb.Ellipsoid([0, 0], [[4, 0], [0, 1]]), [1.9, 0.3], True),
+        (cb.Ellipsoid([0, 0], [[4, 0], [0, 1]]), [0.3, 1.01], False),
+    ],
+)  # fmt: skip
+def test_starts_of_lower_bounds_lie_in_the_set_itself(initial: Any, point: list[float], inside: bool) -> None:
+    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=2, noise=cb.Gaussian(std=0.1))
+    problem = cb.Problem(system, initial=initial, safe=[cb.Inside(cb.Box([-3, -3], [3, 3]))], horizon=2, delta=0.5)
+    model = read_model(json.loads(json.dumps(problem_data(problem))), Budget(60.0))
+    record = Record({"starts": exact([point])}, "proof", ["starts"])
+    if inside:
+        assert len(starts_of(model, record)) == 1
+    else:
+        with pytest.raises(Unproved, match="initial set"):
+            starts_of(model, record)
+
+
+def test_starts_that_are_stated_by_a_box_around_them_have_no_certificate_from_below() -> None:
+    around = SimpleNamespace(
+        random=False, data=lambda kinds: {"kind": "polytope"}, hull=lambda: SimpleNamespace(lo=[0.0], hi=[1.0])
+    )
+    assert initial_data(around) == {"kind": "box", "low": exact([0.0]), "high": exact([1.0]), "around": True}
+    answer = EngineAnswer(log10_delta=-0.5, log10_lower=-1.0)
+    with pytest.raises(CertificateError, match="a box, a ball or an ellipsoid"):
+        values_proof_below(SimpleNamespace(initial=around), answer)
+
+
+def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:
+    problem = squared()
+    data = parse(quadratic_certificate(problem))
+    report = check_data(data, json.loads(json.dumps(problem_data(problem))))
+    assert report.valid, report.reason
+    assert data["claim"]["method"] == "quadratic"
+    found = bound_quadratic(problem, target=0.5, seconds=60.0).upper
+    assert found - 1e-6 <= report.log10_proved < found + 0.1
+
+
+def test_a_ball_of_starts_has_a_bound_of_its_own() -> None:
+    """Against V at points of the ball; its corners, which lie outside, are left aside."""
+    problem = squared()
+    data = parse(quadratic_certificate(problem))
+    with patch.object(quadratic, "_at_corners", lambda *_: arb(1)):
+        found = check_data(data).log10_proved
+    assert found is not None
+    center, width = (np.array([float.fromhex(x) for x in data["proof"][name]]) for name in ("center", "width"))
+    turns = np.linspace(0, 2 * np.pi, 41)
+    points = 0.05 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    z = np.hstack([(points - center) / width, np.ones((41, 1))])
+    total = np.zeros(41)
+    for wall in data["proof"]["walls"]:
+        first = np.array([[float.fromhex(x) for x in row] for row in wall["matrices"][0]])
+        total += np.exp(np.einsum("pi,ij,pj->p", z, first, z) / 2)
+    assert math.log10(total.max()) <= found < math.log10(total.max()) + 0.5
+
+
+def test_a_splitting_is_nothing_on_its_own_states() -> None:
+    rng, n, held = np.random.default_rng(5), 3, [0, 2]
+    pairs = splitting(n, held)
+    assert len(pairs) == len(enclosed_splitting(n, held))
+    z = np.append(rng.normal(size=n), 1.0)
+    for first, other in pairs:
+        values = [z[held[a]] * z[i] * z[j] for a, i, j in (first, other)]
+        assert values[0] == pytest.approx(values[1])
+
+
+@pytest.mark.parametrize("place", range(8))
+def test_the_drift_lies_between_its_corners(place: int) -> None:
+    """A z at a point of a cell, held values and disturbance interpolated, is f but for the remainder."""
+    model = read_model(json.loads(json.dumps(problem_data(squared()))), Budget(60.0))
+    flow, rng = Flow(model, Budget(60.0)), np.random.default_rng(place)
+    center, width = [arb(0.1), arb(-0.2)], [arb(0.7), arb(0.9)]
+    ends = np.sort(rng.uniform(-1, 1, (2, 2)), axis=1)
+    low, high = [arb(a) for a, _ in ends], [arb(b) for _, b in ends]
+    local = flow.over(low, high, [0, 1], center, width)
+    xi, d = [rng.uniform(a, b) for a, b in ends], rng.uniform(-0.1, 0.1)
+    x = [0.1 + 0.7 * xi[0], -0.2 + 0.9 * xi[1]]
+    truth = [(-x[0] + 0.3 * x[1] - 0.1 * x[1] ** 2 + d) / 0.7,
+             (-x[1] - 0.5 * x[0] * x[1] - 0.2 * x[0] ** 3) / 0.9]  # fmt: skip
+    matrix = local.base + local.pushed[0] * arb(d / 0.1)
+    for a in (0, 1):
+        matrix = matrix + local.along[a] * (arb(xi[a]) - (low[a] + high[a]) / 2)
+    found = (matrix * arb_mat(3, 1, [*map(arb, xi), arb(1)])).entries()
+    for value, exact_one, rest in zip(found, truth, local.rest):
+        assert abs(float(value.mid()) - exact_one) <= float(rest) + 1e-12
+    assert float(local.rest[0]) < 1e-15
 
 
 # ---- files made to fool --------------------------------------------------------------------------------------

@@ -61,11 +61,15 @@ class _Found:
     done: list[str] = field(default_factory=list)
     work: float = 0.0
     proposed: list[tuple[Surface, Payment]] = field(default_factory=list)
+    below: list[tuple[Surface, Payment]] = field(default_factory=list)
+
+
+Proposals = tuple[list[tuple[Surface, Payment]], list[tuple[Surface, Payment]]]
 
 
 def bound_line(
     problem: Problem, model: Model, seconds: float, lower: bool
-) -> tuple[float, float | None, str, list[tuple[Surface, Payment]]]:
+) -> tuple[float, float | None, str, Proposals]:
     """Natural logarithms of an upper and a lower bound (None: there is none), words, and what certificates state.
 
     Raises
@@ -102,7 +106,7 @@ def bound_line(
             break
     found.lower = _less(found.lower, leak)
     words = f"value function in one state, cells x slabs of time: {', '.join(found.done) or 'none came to an end'}"
-    return found.upper, found.lower, words, found.proposed
+    return found.upper, found.lower, words, (found.proposed, found.below)
 
 
 def room_of(
@@ -230,7 +234,7 @@ def _raise_upper(
     found.work += _patches_in(links)
     payment = prove_above(links, start)
     gain = found.upper - payment.log
-    if gain > 0 and is_plain(room) and not start.random:
+    if gain > 0 and is_plain(room):
         found.proposed.append((raised_above(links[0].surface), payment))
     found.upper = min(found.upper, payment.log)
     return gain
@@ -254,6 +258,8 @@ def _raise_lower(
     if payment is None:
         return 0.0
     gain = math.inf if found.lower is None else payment.log - found.lower
+    if gain > 0 and is_plain(room):
+        found.below.append((links[0].surface, payment))
     found.lower = payment.log if found.lower is None else max(found.lower, payment.log)
     return gain
 

@@ -1,0 +1,156 @@
+"""Continuous time, from below: V of the file is proved to be, but for what is paid, below log of the probability.
+
+On a box of states, some of whose sides break a constraint, with R and Q2 as in `passage`:
+
+- V <= 0 on the box at all times (what it exceeds is taken off everywhere);
+- R >= -lam_k - eps_k exp(v0 - V) - m(V) Q2 in slab k, for one value of the disturbance on every patch, v0 being at most
+  V(0, .) at one of the stated starts;
+- m is a step function of the level, q is continuous and linear on every step, q = 0 below the lowest one, q >= 0, and
+  q' >= (1 + q)(m - q).
+
+Then w = exp(theta(V)), theta(V) = V - int_V^0 q, has w_t + L w >= -M (lam_k w + eps_k exp(v0)) with M = 1 + max q,
+since theta' = 1 + q is in [1, M], theta'' + theta'^2 - theta' >= m theta' and theta(V) <= V <= 0. With L the integral
+of lam,
+
+    P + (1 - P) W >= exp(theta(v0) - M L) - M exp(v0) sum_k eps_k h_k
+
+for the probability P of reaching such a side within T, W being at least exp(V) at T, and on the other sides. The
+disturbance is a feedback, piecewise constant in time and state: where it takes more than one value the noise is shown
+to have full rank, so that the equation with it has a (weak) solution.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from flint import arb
+
+from certbound.checker.report import Unproved
+from certbound.checker.statement import SafeSet, starts_of
+from certbound.checker.values import batches as tm
+from certbound.checker.values.batches import Array, Batch, Mask, Terms, above, below, terms
+from certbound.checker.values.hermite import Patches
+from certbound.checker.values.passage import Passage
+
+
+class Crossing(Passage):
+    """The proof's numbers, and what follows from them for the lower bound."""
+
+    upper_side = False
+
+    def lower(self) -> arb:
+        """At most the probability of leaving from one of the stated starts, or from a random one."""
+        highest = self._highest()
+        self.lift = -float(np.nextafter(highest, np.inf)) if not highest <= 0 else 0.0
+        start = self._level()
+        lam = self._payments(start)
+        times = [arb(float(t)) for t in self.surface.times]
+        steps = [b - a for a, b in itertools.pairwise(times)]
+        paid = sum((arb(float(rate)) * step for rate, step in zip(lam, steps)), arb(0))
+        rest = sum((arb(float(rate)) * step for rate, step in zip(self.eps, steps)), arb(0))
+        most = 1 + arb(max(self.levels.q))
+        if self.random:
+            growth = self.levels.above(arb(self.levels.edges[0]))
+            found = self._mean(lambda low, _: (arb(low) - growth - most * paid).exp(), self._certain)
+        else:
+            found = (arb(start) - self.levels.above(arb(start)) - most * paid).exp()
+        ceiling = max([self._at_end(), *(self._on(*side) for side in self._harmless_sides())])
+        if not ceiling < 0:
+            return arb(0)
+        kept = arb(ceiling).exp()
+        left = found - most * arb(start).exp() * rest
+        return arb.max((left - kept) / (1 - kept), arb(0)).lower()
+
+    def _level(self) -> float:
+        """At most V(0, .) at the best of the stated starts; of a random one, about what its mean comes to."""
+        if self.random:
+            return self._middle()
+        sides = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in self.surface.axes]
+        found = -np.inf
+        for point in starts_of(self.model, self.record):
+            if not all(a < x < b for (a, b), x in zip(sides, point)):
+                raise Unproved("a start was not shown to lie in the grid")
+            low, _ = self._over([below(x) for x in point], [above(x) for x in point])
+            found = max(found, float(low.max()))
+        return float(np.nextafter(found + self.lift, -np.inf))
+
+    def _harmless_sides(self) -> list[tuple[int, int]]:
+        """(state, end) of the sides of the grid that were not shown to break a constraint everywhere."""
+        safe, axes = SafeSet(self.model, bounded=False), self.surface.axes
+        sides = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in axes]
+        found = []
+        for number, end in itertools.product(range(len(axes)), (0, 1)):
+            face = [(side[end], side[end]) if k == number else side for k, side in enumerate(sides)]
+            if not safe.excludes([(a + b) / 2 for a, b in face], [(b - a) / 2 for a, b in face]):
+                found.append((number, end))
+        return found
+
+    def _certain(self, end: float, far: float) -> bool:
+        """Whether all starts between a side of the grid and far beyond it break a constraint."""
+        low, high = arb(min(end, far)), arb(max(end, far))
+        return SafeSet(self.model, bounded=False).excludes([(low + high) / 2], [(high - low) / 2])
+
+    def _highest(self) -> float:
+        """At least V, everywhere."""
+        n, highest = self.model.dimension, -np.inf
+        which = terms(1 + n, 3 + 5 * n)
+        for first, last in self._chunks(self.surface):
+            _, high = self.surface.patches(first, last).derivative(which, (0,) * (n + 1)).sharp_ends()
+            highest = max(highest, _most(high))
+        if not highest < np.inf:
+            raise Unproved("V was not shown to be bounded")
+        return highest
+
+    def _at_end(self) -> float:
+        """At least V at the horizon."""
+        n = self.model.dimension
+        patches = self.surface.frozen(-1).patches(0, 1)
+        high = patches.derivative(terms(n + 1, 5 + 3 * (n - 1)), (0,) * (n + 1)).sharp_ends()[1]
+        return float(np.nextafter(_most(high) + self.lift, np.inf))
+
+    def _on(self, axis: int, end: int) -> float:
+        """At least V on a side of the grid."""
+        n, face = self.model.dimension, self.surface.face(axis, end)
+        which = terms(n, 3 + 5 * (n - 1))
+        found = [
+            _most(face.patches(first, last).derivative(which, (0,) * n).sharp_ends()[1])
+            for first, last in self._chunks(face)
+        ]
+        return float(np.nextafter(max(found) + self.lift, np.inf))
+
+    def _variables(self) -> int:
+        """The disturbance takes fixed values."""
+        return 1 + self.model.dimension
+
+    def _need(self, patches: Patches, eps: Array, start: float, which: Terms) -> Array:
+        low, high = patches.derivative(which, (0,) * (self.model.dimension + 1)).sharp_ends()
+        low, high = np.nextafter(low + self.lift, -np.inf), np.nextafter(high + self.lift, np.inf)
+        m = self.levels.least(low, high)
+        inputs = self._inputs(patches, which)
+        squares = self._squares(inputs)
+        corners = list(itertools.product(*(sorted({a, b}) for a, b in self.model.disturbance)))
+        best = np.full(len(eps), -np.inf)
+        for corner in corners:
+            pushed = [tm.fixed(which, np.full(len(eps), value)) for value in corner]
+            found = self._balance(patches, inputs + pushed, squares, 1 + m, (1 + m) * 2.0**-52).sharp_ends()[0]
+            best = np.where(np.isfinite(found), np.maximum(best, found), best)
+        if len(corners) > 1:
+            best = np.where(has_full_rank(squares), best, -np.inf)
+        reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
+        need = (-best - eps * reach * (1 - 1e-12)) * (1 + 1e-12)
+        return np.where(np.isfinite(best), np.maximum(need, 0.0), np.inf)
+
+
+def _most(values: Array) -> float:
+    """The largest of some numbers; infinity where one is none."""
+    return float(np.where(np.isnan(values), np.inf, values).max())
+
+
+def has_full_rank(squares: list[list[Batch]]) -> Mask:
+    """Where g g^T is positive definite."""
+    good = np.asarray(squares[0][0].ends()[0] > 0)
+    if len(squares) == 2:
+        product = tm.mul(squares[0][0], squares[1][1])
+        good = good & (tm.sub(product, tm.mul(squares[0][1], squares[0][1])).ends()[0] > 0)
+    return good
