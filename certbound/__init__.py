@@ -46,6 +46,8 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.problem.systems import linear_system as linear_system
     from certbound.reach import bound_reach as bound_reach
     from certbound.reach.sets import ReachTube as ReachTube
+    from certbound.safety.sweeps import Sweep as Sweep
+    from certbound.safety.sweeps import sweep as sweep
     from certbound.safety.verdict import Verdict as Verdict
     from certbound.safety.verification import verify_safety as verify_safety
     from certbound.simulation.estimates import sample_paths as sample_paths
@@ -84,6 +86,7 @@ _HOME = {
     "reach": "bound_reach",
     "reach.sets": "ReachTube",
     "safety.verification": "verify_safety",
+    "safety.sweeps": "sweep Sweep",
     "safety.verdict": "Verdict",
     "synthesis.plans": "synthesize_plan",
     "synthesis.controllers": "simulate_closed_loop PredictiveController ConvexPlanner SafetyFilter",

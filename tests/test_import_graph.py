@@ -63,6 +63,7 @@ safety.certificate safety.falsification
 safety.verdict
 safety.decision
 safety
+safety.sweeps
 synthesis
 synthesis.plans
 synthesis.controllers

@@ -163,7 +163,7 @@ def _executor(address: str | None) -> Iterator[Any]:
     if address is None:
         yield None
         return
-    from certbound.simulation.executors import connect
+    from certbound.parallel import connect
 
     client = connect(address)
     try:
