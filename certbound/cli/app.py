@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from certbound._version import __version__
-from certbound.cli.commands import check, derive, doctor, new, problems, simulate, synthesize, tune, verify
+from certbound.cli.commands import check, derive, doctor, new, problems, simulate, sweep, synthesize, tune, verify
 from certbound.cli.messages import BAD_INPUT, INTERRUPTED, explain, write_error
 from certbound.cli.output import SETTINGS, logging_to_stderr
 
@@ -43,7 +43,7 @@ def _global_options(
         raise typer.Exit(BAD_INPUT)
 
 
-for _module in (verify, derive, tune, synthesize, simulate, check, problems, new, doctor):
+for _module in (verify, sweep, derive, tune, synthesize, simulate, check, problems, new, doctor):
     _name = _module.__name__.rpartition(".")[2]
     app.command(_name, epilog=_module.EXAMPLES)(getattr(_module, _name))
 
@@ -71,10 +71,10 @@ def _run(words: list[str], command: str) -> int:
         _log.debug("the command ended with an error", exc_info=True)
         return _report(error, command)
     if code == INTERRUPTED:
-        kept = "--checkpoint" in words
+        kept = next((word for word in ("--checkpoint", "--resume") if word in words), "")
         write_error(
             f"{command or 'the command'} was interrupted",
-            "it had no answer yet" + ("; what was counted is in the checkpoint" if kept else "; nothing was written"),
+            "it had no answer yet; " + (f"what was done is in the file of {kept}" if kept else "nothing was written"),
             "run it again to go on" if kept else f"run it again{_shorter(command)}",
         )
     return code if isinstance(code, int) else 0

@@ -15,12 +15,14 @@ from certbound.cli.clock import Clock, TimeLimitOption
 from certbound.cli.describe import attributes
 from certbound.cli.messages import InputError
 from certbound.cli.options import (
+    ClusterOption,
     HorizonOption,
     JsonOption,
     ProblemArgument,
     SeedOption,
     SetOption,
     check_writable,
+    cluster_at,
     examples,
     generator,
     integer,
@@ -52,7 +54,6 @@ StepOption = Annotated[float | None, option("--step", "H", "Time step in seconds
 ConfidenceOption = Annotated[float, typer.Option("--confidence", parser=number, metavar="C", help="Of the limits.")]
 RareOption = Annotated[bool, typer.Option("--rare", help="Importance splitting, for rare exits.")]
 CheckpointOption = Annotated[Path | None, option("--checkpoint", "FILE", "Keep finished work here, and go on from it.")]
-ClusterOption = Annotated[str | None, option("--cluster", "ADDRESS", "A dask scheduler, tcp://host:port.")]
 AgainstOption = Annotated[Path | None, option("--against", "CERT", "Does the simulation contradict this certificate?")]
 
 
@@ -83,7 +84,7 @@ def simulate(
     options: dict[str, Any] = {"paths": paths, "steps": _steps(subject, step), "confidence": confidence}
     if seed is not None or checkpoint is None:
         options["rng"] = rng
-    with _executor(cluster) as executor, _progress_bar(paths) as progress:
+    with cluster_at(cluster) as executor, _progress_bar(paths) as progress:
         options |= {"executor": executor, "progress": progress, "checkpoint": checkpoint}
         result = _within(Clock(time_limit), _rare if rare else _plain, subject, options)
     if claim is not None:
@@ -155,21 +156,6 @@ def _claimed(path: Path) -> float:
         if isinstance(value, (int, float)) and not isinstance(value, bool) and value <= 0:
             return float(value)
     raise InputError(f"`{path}` claims no probability (`log10_delta`)", "give the file of verify --certificate")
-
-
-@contextlib.contextmanager
-def _executor(address: str | None) -> Iterator[Any]:
-    """A dask client for the address, closed again; None for threads."""
-    if address is None:
-        yield None
-        return
-    from certbound.parallel import connect
-
-    client = connect(address)
-    try:
-        yield client
-    finally:
-        client.close()
 
 
 @contextlib.contextmanager
