@@ -144,7 +144,7 @@ def test_a_file_of_something_else_is_refused_and_left_alone(tmp_path: Path) -> N
 def test_a_killed_run_goes_on_with_the_same_table(tmp_path: Path) -> None:
     file, over = tmp_path / "r.jsonl", {"sigma": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]}
     script = (
-        "import sys, certbound as cb\ncb.sweep('ou', {}, method='linear', jobs=2, resume=sys.argv[1])".format(over)
+        f"import sys, certbound as cb\ncb.sweep('ou', {over}, method='linear', jobs=2, resume=sys.argv[1])"
     )
     process = subprocess.Popen([sys.executable, "-c", script, str(file)])
     deadline = time.monotonic() + 120
