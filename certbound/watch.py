@@ -165,13 +165,16 @@ class Watch:
         def stop(number: int, frame: FrameType | None) -> None:
             raise OutOfTime
 
-        before = signal.signal(signal.SIGALRM, stop)
-        signal.setitimer(signal.ITIMER_REAL, max(self.left, 0.0) + _GRACE * self.limit + _GRACE, _AGAIN)
+        before, began = signal.signal(signal.SIGALRM, stop), time.perf_counter()
+        alarm = max(self.left, 0.0) + _GRACE * self.limit + _GRACE
+        outer, again = signal.setitimer(signal.ITIMER_REAL, alarm, _AGAIN)
         try:
             yield
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, before)
+            if outer > 0:  # a timer of a watch around this one goes on
+                signal.setitimer(signal.ITIMER_REAL, max(outer - (time.perf_counter() - began), _GRACE), again)
 
     @contextlib.contextmanager
     def share(self, part: float) -> Iterator[None]:

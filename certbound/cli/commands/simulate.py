@@ -32,6 +32,8 @@ from certbound.cli.options import (
 )
 from certbound.cli.output import SETTINGS, animated, console, show, spinner
 from certbound.display import one_line, rounded
+from certbound.errors import SolverError
+from certbound.watch import OutOfTime
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
@@ -105,13 +107,17 @@ def _within(
     if clock.limit is None:
         return count(problem, options)
     asked = options["paths"]
-    number = min(asked, FIRST)
-    while True:
-        result = count(problem, options | {"paths": number})
-        affordable = int(0.8 * max(clock.left, 0.0) / max(result["seconds"], 1e-3) * number)
-        if number == asked or affordable < 2 * number:
-            return result | {"asked": asked}
-        number = min(asked, affordable, 30 * number)
+    number, result = min(asked, FIRST), dict[str, Any]()
+    with contextlib.suppress(OutOfTime), clock.running():
+        while True:
+            result = count(problem, options | {"paths": number}) | {"asked": asked}
+            affordable = int(0.8 * max(clock.left, 0.0) / max(result["seconds"], 1e-3) * number)
+            if number == asked or affordable < 2 * number:
+                break
+            number = min(asked, affordable, 30 * number)
+    if not result:
+        raise SolverError(f"no paths were simulated within {clock.limit:g} s; give a larger --time-limit")
+    return result
 
 
 def _steps(problem: Problem, step: float | None) -> int | None:
