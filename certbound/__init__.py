@@ -52,6 +52,8 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.reach import bound_reach as bound_reach
     from certbound.reach.sets import ReachTube as ReachTube
     from certbound.safety.first_exits import bound_exit_times as bound_exit_times
+    from certbound.safety.sweeps import Sweep as Sweep
+    from certbound.safety.sweeps import sweep as sweep
     from certbound.safety.verdict import Verdict as Verdict
     from certbound.safety.verification import verify_safety as verify_safety
     from certbound.simulation.estimates import sample_paths as sample_paths
@@ -91,6 +93,7 @@ _HOME = {
     "reach": "bound_reach",
     "reach.sets": "ReachTube",
     "safety.verification": "verify_safety",
+    "safety.sweeps": "sweep Sweep",
     "safety.verdict": "Verdict",
     "safety.first_exits": "bound_exit_times",
     "synthesis.plans": "synthesize_plan",

@@ -297,25 +297,24 @@ def log10_text(log10: float, *, ulps: int = 0) -> str:
 
     Examples
     --------
-    >>> log10_text(-3.0), log10_text(-49718.25), log10_text(-4.698), log10_text(-0.12), log10_text(0.0)
-    ('1e-3', '5.7e-49719', '2.1e-5', '0.76', '1')
+    >>> log10_text(-3.0), log10_text(-49718.25), log10_text(-4.698), log10_text(-1.2175), log10_text(-0.12)
+    ('1e-3', '5.7e-49719', '2.1e-5', '0.061', '0.76')
     >>> log10_text(-2.99999999), log10_text(-2.9999999999999996), log10_text(-2.9999999999999996, ulps=2)
     ('1.1e-3', '1.1e-3', '1e-3')
     """
     if log10 >= 0:
         return "1"
     value = _EXACT.subtract(Decimal(log10), Decimal(ulps * math.ulp(log10)))
-    small = value <= -2
-    exponent = math.floor(value) if small else -1
-    digits = _digits(_EXACT.subtract(value, Decimal(exponent - 1)), 10 if small else 1)
-    if not small:
-        return f"{digits / 100:g}"
+    exponent = math.floor(value)
+    digits = _digits(_EXACT.subtract(value, Decimal(exponent - 1)))
+    if value > -2:
+        return f"{digits / 10 ** (1 - exponent):g}"
     return f"1e{exponent + 1}" if digits >= 100 else f"{digits / 10:g}e{exponent}"
 
 
-def _digits(log10: Decimal, least: int) -> int:
-    """The least whole number, from ``least`` on, whose decimal logarithm is at least that."""
-    count = max(math.floor(math.pow(10.0, log10)) - 1, least)
+def _digits(log10: Decimal) -> int:
+    """The least whole number, from 10 on, whose decimal logarithm is at least that."""
+    count = max(math.floor(math.pow(10.0, log10)) - 1, 10)
     while _EXACT.log10(Decimal(count)) < log10:
         count += 1
     return count

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
 from types import FrameType
+from typing import Any
 
 _OFTEN = 0.25  # seconds between two reports that say nothing new
 _GRACE = 0.05  # of the limit, and seconds, after which a timer ends what does not poll
@@ -65,17 +66,19 @@ class Watch:
         Seconds from any beginning.
     jobs : int
         Processes that may work side by side.
+    executor : concurrent.futures.Executor or dask Client, optional
+        Who works instead.
     """
 
     def __init__(
         self, limit: float | None = None, *, progress: Callable[[Progress], object] | None = None,
-        clock: Callable[[], float] = time.perf_counter, jobs: int = 1,
+        clock: Callable[[], float] = time.perf_counter, jobs: int = 1, executor: Any = None,
     ) -> None:
         if limit is not None and not limit > 0:
             raise ValueError(f"`time_limit` must be a positive number of seconds, got {limit!r}.")
         if isinstance(jobs, bool) or int(jobs) != jobs or jobs < 1:
             raise ValueError(f"`jobs` must be a positive number of processes, got {jobs!r}.")
-        self.jobs = int(jobs)
+        self.jobs, self.executor = int(jobs), executor
         self.limit, self._progress, self._clock = limit, progress, clock
         self.started = clock()
         self._end = math.inf if limit is None else self.started + limit
@@ -162,13 +165,16 @@ class Watch:
         def stop(number: int, frame: FrameType | None) -> None:
             raise OutOfTime
 
-        before = signal.signal(signal.SIGALRM, stop)
-        signal.setitimer(signal.ITIMER_REAL, max(self.left, 0.0) + _GRACE * self.limit + _GRACE, _AGAIN)
+        before, began = signal.signal(signal.SIGALRM, stop), time.perf_counter()
+        alarm = max(self.left, 0.0) + _GRACE * self.limit + _GRACE
+        outer, again = signal.setitimer(signal.ITIMER_REAL, alarm, _AGAIN)
         try:
             yield
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, before)
+            if outer > 0:  # a timer of a watch around this one goes on
+                signal.setitimer(signal.ITIMER_REAL, max(outer - (time.perf_counter() - began), _GRACE), again)
 
     @contextlib.contextmanager
     def share(self, part: float) -> Iterator[None]:
@@ -232,6 +238,12 @@ def jobs_allowed() -> int:
     """Processes that may work side by side: one where nobody watches."""
     watch = _CURRENT.get()
     return 1 if watch is None else watch.jobs
+
+
+def executor_lent() -> Any:
+    """Whose executor works on parts of a proof, if any."""
+    watch = _CURRENT.get()
+    return None if watch is None else watch.executor
 
 
 def silenced() -> None:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.errors import EngineError
-from certbound.parallel import side_by_side
+from certbound.errors import EngineError, SolverError
+from certbound.parallel import LostError, side_by_side
 from certbound.watch import OutOfTime, Watch
 from tests.reach.linear.test_bisection import flattening
 
@@ -55,6 +60,57 @@ def test_two_jobs_give_the_same_answer_bit_for_bit() -> None:
     assert one.deviation is not None
     assert two.deviation is not None
     np.testing.assert_array_equal(one.deviation.extent, two.deviation.extent)
+
+
+def test_an_executor_gives_the_same_answer_bit_for_bit() -> None:
+    with ThreadPoolExecutor(2) as pool:
+        one, two = (cb.verify_safety(flattening(), method="linear", executor=lent) for lent in (None, pool))
+    assert one.log10_delta == two.log10_delta
+    assert one.deviation is not None
+    assert two.deviation is not None
+    np.testing.assert_array_equal(one.deviation.extent, two.deviation.extent)
+
+
+def test_an_executor_that_was_shut_down_is_named() -> None:
+    pool = ThreadPoolExecutor(1)
+    pool.shutdown()
+    with pytest.raises(SolverError, match="takes no more tasks"):
+        side_by_side([lambda: 1, lambda: 2], 1, pool)
+
+
+def test_an_executor_that_breaks_down_has_lost_a_part() -> None:
+    with ProcessPoolExecutor(1) as pool, pytest.raises(LostError, match="the worker of a part was lost"):
+        side_by_side([partial(os._exit, 3), partial(os._exit, 3)], 1, pool)
+
+
+def test_nobody_works_on_for_a_process_that_was_killed(tmp_path: Path) -> None:
+    script = (
+        "import os, sys, time\nfrom certbound.parallel import side_by_side\n"
+        "def work():\n    os.write(1, b'%d ' % os.getpid())\n    time.sleep(600)\n"
+        "side_by_side([work, work], 2)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    written = ""
+    while written.count(" ") < 2 and process.poll() is None:
+        written += process.stdout.read(1)
+    children = [int(word) for word in written.split()]
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    deadline = time.monotonic() + 20
+    assert len(children) == 2
+    while any(map(alive, children)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not any(map(alive, children))
+
+
+def alive(process: int) -> bool:
+    """Whether a process runs (one that ended and is not waited for does not)."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 @pytest.mark.parametrize("jobs", [0, -1, 1.5])

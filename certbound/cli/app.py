@@ -19,6 +19,7 @@ from certbound.cli.commands import (
     new,
     problems,
     simulate,
+    sweep,
     synthesize,
     tune,
     verify,
@@ -54,7 +55,7 @@ def _global_options(
         raise typer.Exit(BAD_INPUT)
 
 
-for _module in (verify, derive, tune, synthesize, simulate, exit_times, check, problems, new, doctor):
+for _module in (verify, sweep, derive, tune, synthesize, simulate, exit_times, check, problems, new, doctor):
     _name = _module.__name__.rpartition(".")[2]
     app.command(_name.replace("_", "-"), epilog=_module.EXAMPLES)(getattr(_module, _name))
 
@@ -82,10 +83,10 @@ def _run(words: list[str], command: str) -> int:
         _log.debug("the command ended with an error", exc_info=True)
         return _report(error, command)
     if code == INTERRUPTED:
-        kept = "--checkpoint" in words
+        kept = next((word for word in ("--checkpoint", "--resume") if word in words), "")
         write_error(
             f"{command or 'the command'} was interrupted",
-            "it had no answer yet" + ("; what was counted is in the checkpoint" if kept else "; nothing was written"),
+            "it had no answer yet; " + (f"what was done is in the file of {kept}" if kept else "nothing was written"),
             "run it again to go on" if kept else f"run it again{_shorter(command)}",
         )
     return code if isinstance(code, int) else 0

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from types import FrameType
+from collections.abc import Callable, Iterator
 from typing import Annotated
 
 import typer
 
-from certbound.cli.messages import InputError
 from certbound.cli.options import number, option
-from certbound.watch import OutOfTime
+from certbound.watch import OutOfTime, Progress, Watch
 
 
 def positive(text: str) -> float:
@@ -34,17 +30,21 @@ def positive(text: str) -> float:
 TimeLimitOption = Annotated[
     float | None, option("--time-limit", "SECONDS", "Stop searching then, and give the best answer so far.", positive)
 ]
+LimitOption = Annotated[
+    float | None, option("--time-limit", "SECONDS", "Give up then, where there is no answer yet.", positive)
+]
 VerdictLimitOption = Annotated[
     float | None, option("--time-limit", "SECONDS", "Stop then, with the best answer so far [60].", positive)
 ]
 
 
 class Clock:
-    """Time that is left of a limit; None is no limit."""
+    """Time that is left of a limit (None is no limit), and who hears of progress."""
 
-    def __init__(self, limit: float | None) -> None:
+    def __init__(self, limit: float | None, tell: Callable[[Progress], object] | None = None) -> None:
         self.limit = limit
         self.started = time.perf_counter()
+        self._tell = tell
 
     @property
     def left(self) -> float:
@@ -53,25 +53,8 @@ class Clock:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
-        """Raise ``OutOfTime`` in the block when the time is over (between two steps of Python).
-
-        InputError on systems without interval timers.
-        """
-        if self.limit is None:
-            yield
-            return
-        if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
-            raise InputError("`--time-limit` needs a system with interval timers", "leave it out")
+        """Raise ``OutOfTime`` in the block when the time is over, and tell what it is at."""
         if self.left <= 0:
             raise OutOfTime
-
-        def stop(number: int, frame: FrameType | None) -> None:
-            raise OutOfTime
-
-        before = signal.signal(signal.SIGALRM, stop)
-        signal.setitimer(signal.ITIMER_REAL, self.left)
-        try:
+        with Watch(None if self.limit is None else self.left, progress=self._tell).running():
             yield
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, before)

@@ -72,6 +72,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object 
 HorizonOption = Annotated[float | None, option("--horizon", "T", "Seconds, or steps.", number)]
 DeltaOption = Annotated[float | None, option("--delta", "D", "Allowed exit probability.", number)]
 SeedOption = Annotated[int | None, option("--seed", "S", "The same seed gives the same runs.", integer)]
+ClusterOption = Annotated[str | None, option("--cluster", "ADDRESS", "A dask scheduler, tcp://host:port.")]
 PlotOption = Annotated[Path | None, option("--plot", "FILE", "Draw tubes, sets and sample paths.")]
 
 
@@ -159,6 +160,21 @@ def check_writable(*paths: Path | None) -> None:
             raise InputError(f"the directory `{path.parent}` does not exist", f"run mkdir -p {path.parent}")
         if not os.access(path if path.exists() else path.parent, os.W_OK):
             raise InputError(f"`{path}` cannot be written", "choose another place, or change the permissions")
+
+
+@contextlib.contextmanager
+def cluster_at(address: str | None) -> Iterator[Any]:
+    """A dask client for the address, closed again; None without one."""
+    if address is None:
+        yield None
+        return
+    from certbound.parallel import connect
+
+    client = connect(address)
+    try:
+        yield client
+    finally:
+        client.close()
 
 
 def examples(*lines: str) -> str:

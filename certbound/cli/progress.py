@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 from certbound.cli.output import spinner
 from certbound.display import log10_text
-from certbound.watch import Progress, Watch
+from certbound.watch import Progress
 
 
 def line_of(found: Progress) -> str:
@@ -28,10 +28,3 @@ def progress(title: str, limit: float | None = None) -> Iterator[Callable[[Progr
     within = "" if limit is None else f" (at most {limit:g} s)"
     with spinner(f"{title}{within}") as change:
         yield lambda found: change(f"{title}{within}: {line_of(found)}")
-
-
-@contextlib.contextmanager
-def watched(title: str) -> Iterator[None]:
-    """Tell what the block's work is at, for work without a limit."""
-    with progress(title) as tell, Watch(progress=tell).running():
-        yield

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from certbound.plotting.picture import draw_scene
 from certbound.plotting.scene import Scene, noisy_reach
+from certbound.plotting.sweep_maps import draw_sweep
 from certbound.plotting.tubes import draw_tubes
 from certbound.plotting.value_maps import draw_values
 
-__all__ = ["Scene", "draw_scene", "draw_tubes", "draw_values", "noisy_reach"]
+__all__ = ["Scene", "draw_scene", "draw_sweep", "draw_tubes", "draw_values", "noisy_reach"]

@@ -10,12 +10,14 @@ import numpy as np
 from certbound.plotting.panels import draw_panel, panels_of
 from certbound.plotting.plane import draw_plane, plane_of
 from certbound.plotting.scene import BLUE, INK, OUTER, Scene, noisy_reach
+from certbound.plotting.sweep_maps import draw_sweep_into
 from certbound.plotting.value_maps import draw_curves, draw_map, slices_of
 from certbound.problem.problem import Problem
 from certbound.reach.sets import ReachTube
 from certbound.safety.answers import Deviation
 from certbound.safety.first_exits import ExitTimes
 from certbound.safety.starts import SafeStarts
+from certbound.safety.sweeps import Sweep
 from certbound.safety.verification import Verdict
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
@@ -104,6 +106,12 @@ def _exit_times(result: ExitTimes, axes: Axes) -> None:
               label="at least")  # fmt: skip
     axes.set(xlabel=_time(continuous), ylabel="P(exit before)", ylim=(0, 1.02), xlim=(0, float(result.problem.horizon)))
     axes.legend()
+    axes.set_title(result.summary(), fontsize="small")
+
+
+@draw.register(Sweep)
+def _sweep(result: Sweep, axes: Axes) -> None:
+    draw_sweep_into(axes, result)
     axes.set_title(result.summary(), fontsize="small")
 
 

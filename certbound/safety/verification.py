@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from certbound.problem.problem import Problem
 from certbound.safety.decision import decide
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def verify_safety(
     problem: Problem, method: str = "auto", cells: int | None = None, *, constants: Constants | None = None,
     time_limit: float | None = None, progress: Callable[[Progress], object] | None = None, smallest: bool = False,
-    explain: bool = False, jobs: int = 1,
+    explain: bool = False, jobs: int = 1, executor: Any = None,
 ) -> Verdict:
     """Prove that a problem's constraints are broken with probability at most delta, or say why not.
 
@@ -51,6 +51,8 @@ def verify_safety(
         Of what is not SAFE, find what would be: `Verdict.limits`.
     jobs : int
         Processes that prove cells of the initial set side by side; the answer is the same.
+    executor : concurrent.futures.Executor or dask Client, optional
+        Who proves cells instead, with the same answer.
 
     Returns
     -------
@@ -72,8 +74,8 @@ def verify_safety(
     >>> verify_safety(problem, method="constants").status
     'SAFE'
     """
-    own = time_limit is not None or progress is not None or jobs != 1
-    watch = Watch(time_limit, progress=progress, jobs=jobs) if own else current_watch() or Watch()
+    own = time_limit is not None or progress is not None or jobs != 1 or executor is not None
+    watch = Watch(time_limit, progress=progress, jobs=jobs, executor=executor) if own else current_watch() or Watch()
     verdict = decide(problem, method=method, cells=cells, constants=constants, watch=watch)
     with contextlib.suppress(OutOfTime), watch.running():
         if smallest and verdict.status == "SAFE":

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from certbound.errors import SolverError
+from certbound.parallel import lent
 from certbound.simulation.blocks import Tally, Work, run_blocks
 from certbound.simulation.checkpoint import Checkpoint
 
@@ -172,38 +173,12 @@ def _pool(executor: Any) -> Iterator[tuple[Executor, int]]:
             yield pool, width
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-    elif hasattr(executor, "get_executor"):  # a dask Client
-        with executor.get_executor(pure=False, retries=10) as pool:
-            yield pool, sum(executor.ncores().values()) or 1
-    elif hasattr(executor, "submit"):
-        yield executor, int(getattr(executor, "_max_workers", 8))
     else:
-        kind = type(executor).__name__
-        raise TypeError(f"`executor` must be a concurrent.futures.Executor or a dask Client, got a {kind}.")
+        with lent(executor) as taken:
+            yield taken
 
 
 def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def connect(address: str, timeout: float = 10.0) -> Any:
-    """A dask Client for a scheduler's address, such as ``tcp://host:8786``.
-
-    Raises
-    ------
-    ValueError
-        If dask is not installed, or no scheduler answers there.
-    """
-    try:
-        import distributed
-    except ImportError as error:
-        raise ValueError("a cluster needs dask; install it with: pip install 'certbound[cluster]'.") from error
-    try:
-        connect: Any = distributed.Client
-        return connect(address, timeout=timeout)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise ValueError(
-            f"`cluster` must be the address of a running dask scheduler, got {address!r} ({error})."
-        ) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pty
@@ -9,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ import pytest
 from certbound.cli.app import run
 from certbound.cli.clock import Clock
 from certbound.safety.portfolio import ENGINES
-from certbound.watch import OutOfTime, poll
+from certbound.watch import OutOfTime, Watch, poll
 
 
 def answer(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any]]:
@@ -114,6 +116,62 @@ def test_nothing_in_time_is_a_failure(
     assert len(lines) == 3
     assert "within 0.1 s" in lines[1]
     assert "--time-limit" in lines[2]
+
+
+def test_a_plan_and_a_check_are_given_up_in_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slowed(monkeypatch, "certbound.synthesis.plans", "synthesize_plan", lambda _: True)
+    assert run(["synthesize", "chain", "--time-limit", "0.1"]) == 3
+    assert "no plan was found and proved within 0.1 s" in capsys.readouterr().err
+    file = tmp_path / "c.json"
+    assert run(["verify", "ou", "--method", "kummer", "--certificate", str(file)]) == 0
+    capsys.readouterr()
+    slowed(monkeypatch, "certbound.checker", "check_data", lambda _: True)
+    code, found = answer(capsys, "check", str(file), "--time-limit", "0.1")
+    assert (code, found["valid"], found["outcome"]) == (1, False, "not proved")
+    assert "the time of 0.1 s was over" in found["reason"]
+
+
+def test_no_paths_in_time_is_a_failure_and_some_are_an_answer(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("simulate", "ou", "--step", "0.05", "--seed", "1", "--paths", "1e12")
+    slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda options: options["paths"] > 2000)
+    assert answer(capsys, *words, "--time-limit", "2")[1]["paths"] == 2000
+    slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda _: True)
+    assert run([*words, "--time-limit", "0.1"]) == 3
+    assert "no paths were simulated within 0.1 s" in capsys.readouterr().err
+
+
+def test_a_watch_within_a_watch_leaves_its_timer_running() -> None:
+    began = time.monotonic()
+
+    def work() -> None:
+        with Watch(0.3).running():
+            with Watch(10.0).running():
+                pass
+            time.sleep(20)
+
+    with pytest.raises(OutOfTime):
+        work()
+    assert time.monotonic() - began < 10
+
+
+def test_deriving_says_what_it_is_at(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from certbound.cli.commands import derive
+
+    heard: list[str] = []
+
+    @contextlib.contextmanager
+    def progress(title: str, limit: float | None = None) -> Iterator[Any]:
+        yield lambda found: heard.append(found.phase)
+
+    monkeypatch.setattr(derive, "progress", progress)
+    assert run(["derive", "ou"]) == 0
+    assert {"one metric for all constraints", "a metric for each constraint"} <= set(heard)
 
 
 def test_as_many_paths_are_simulated_as_fit(

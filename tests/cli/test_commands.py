@@ -213,6 +213,23 @@ def test_the_doctor_reports_every_dependency(capsys: pytest.CaptureFixture[str])
     assert {"python", "numpy", "python-flint", "rounding", "ball arithmetic", "solver", "verdict"} <= names
 
 
+def test_the_doctor_compiles_what_first_calls_would(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from certbound.cli.commands import doctor
+    from certbound.problem import library
+
+    monkeypatch.setattr(doctor, "_requirements", dict)
+    monkeypatch.setattr(library, "MODELS", {"ou": library.MODELS["ou"]})
+    monkeypatch.setattr(doctor, "_value_kernels", dict)
+    found = answer(capsys, "doctor", "--warm")[1]
+    details = {row["name"]: row["detail"] for row in found["checks"]}
+    assert details.keys() >= {"kernels: ou", "kernels: ou --rare"}
+    assert "compiled" in details["kernels: ou"]
+    again = answer(capsys, "doctor", "--warm")[1]
+    assert [row["detail"][:1] for row in again["checks"] if "kernels" in row["name"]] == ["0", "0"]
+
+
 def test_a_broken_installation_is_reported(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     from certbound.cli.commands import doctor
 

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from certbound.cli.clock import Clock, LimitOption
 from certbound.cli.describe import attributes
 from certbound.cli.messages import InputError
 from certbound.cli.options import DeltaOption, HorizonOption, JsonOption, SetOption, examples, load_problem, option
 from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.errors import CertificateError, EngineError, contained
-from certbound.watch import poll
+from certbound.watch import OutOfTime, poll
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
@@ -50,6 +51,7 @@ def check(
     delta: DeltaOption = None,
     horizon: HorizonOption = None,
     allow: AllowOption = False,
+    time_limit: LimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Prove every inequality of a certificate again, in ball arithmetic, from the file alone."""
@@ -58,16 +60,17 @@ def check(
     started = time.perf_counter()
     data = read(certificate)
     given = _stated(problem, pairs, delta, horizon)
-    with spinner(f"checking {certificate.name}"):
-        report = check_data(data, given, allow_assumptions=allow)
-    result = {
-        **attributes(report, "valid", "claim", "reason"),
-        "seconds": time.perf_counter() - started,
-        "outcome": report.outcome,
-        "assumptions": list(report.assumptions),
-    }
+    result: dict[str, Any] = {"valid": False, "claim": "", "reason": "", "outcome": "not proved", "assumptions": []}
+    try:
+        with spinner(f"checking {certificate.name}"), Clock(time_limit).running():
+            report = check_data(data, given, allow_assumptions=allow)
+            result |= attributes(report, "valid", "claim", "reason", "outcome")
+            result["assumptions"] = list(report.assumptions)
+    except OutOfTime:
+        result["reason"] = f"the time of {time_limit:g} s was over before everything was proved again"
+    result["seconds"] = time.perf_counter() - started
     show(result, as_json, lambda: _print(result))
-    raise typer.Exit(0 if report.valid else 1)
+    raise typer.Exit(0 if result["valid"] else 1)
 
 
 def _stated(

@@ -14,10 +14,10 @@ from certbound.cli.describe import describe_constants
 from certbound.cli.messages import computing
 from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, examples, load_problem
 from certbound.cli.output import SETTINGS, console, show
-from certbound.cli.progress import watched
+from certbound.cli.progress import progress
 from certbound.display import log10_text, name_text
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
-from certbound.watch import OutOfTime
+from certbound.watch import OutOfTime, poll
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -39,8 +39,11 @@ def derive(
     """Bound the contraction rate (or gain) and the noise, with a metric for each constraint."""
     subject = load_problem(problem, pairs, horizon=horizon)
     started = time.perf_counter()
-    with watched(f"bounding the constants of {name_text(subject.name)}"), computing("constants", subject):
-        constants, metrics, where = _bound(subject, Clock(time_limit))
+    with (
+        progress(f"bounding the constants of {name_text(subject.name)}", time_limit) as tell,
+        computing("constants", subject),
+    ):
+        constants, metrics, where = _bound(subject, Clock(time_limit, tell))
     seconds = time.perf_counter() - started
     result = {
         **describe_constants(constants),
@@ -61,7 +64,8 @@ def _bound(subject: Problem, clock: Clock) -> tuple[Constants, list[Constants], 
     With a limit, quick constants in the Euclidean norm come first, and are what is left when the time is over.
     """
     if clock.limit is None:
-        return _searched(subject)
+        with clock.running():
+            return _searched(subject)
     from certbound.constants.bounds import bound_constants
 
     found: tuple[Constants, list[Constants], str] | None = None
@@ -81,7 +85,9 @@ def _searched(subject: Problem) -> tuple[Constants, list[Constants], str]:
     from certbound.constants.metrics import bound_metrics
 
     try:
+        poll("one metric for all constraints")
         constants = bound_constants(subject)
+        poll("a metric for each constraint")
         where = constants.proof.domain if constants.proof is not None else "stated"
         return constants, list(bound_metrics(subject)), where
     except (EnclosureError, InfeasibleError) as error:
@@ -99,6 +105,7 @@ def _local(subject: Problem) -> tuple[Constants, str]:
     from certbound.rigor.intervals import Interval
 
     horizon = float(subject.horizon)
+    poll("along the reach tube, for no constants hold everywhere")
     try:
         reach = bound_reach(subject)
         odds = f"left with probability at most {log10_text(reach.log10_delta, ulps=2)}"

@@ -7,7 +7,8 @@ import importlib.util
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 import typer
 
@@ -15,19 +16,24 @@ from certbound.cli.messages import FAILED
 from certbound.cli.options import JsonOption, examples
 from certbound.cli.output import SETTINGS, console, show, spinner
 
-EXAMPLES = examples("certbound doctor", "certbound doctor --json")
+EXAMPLES = examples("certbound doctor", "certbound doctor --json", "certbound doctor --warm")
 EXTRAS = {"cluster": ["dask", "distributed"], "learn": ["sklearn"]}
+WarmOption = Annotated[
+    bool, typer.Option("--warm", help="Compile what first calls would, and keep it; say how many kernels that were.")
+]
 
 
-def doctor(as_json: JsonOption = False) -> None:
+def doctor(warm: WarmOption = False, as_json: JsonOption = False) -> None:
     """Check Python, every dependency, the rigorous arithmetic, a solver, and one whole verdict."""
     checks: list[tuple[str, Callable[[], str]]] = [("python", _python)]
     checks += [(name, _version_of(name)) for name in _requirements()]
     checks += [("rounding", _rounding), ("ball arithmetic", _balls), ("tracing", _tracing), ("solver", _solver)]
     checks += [("verdict", _verdict)]
+    checks += [(f"kernels: {name}", _compiling(work)) for name, work in _first_calls().items()] if warm else []
     rows = []
-    with spinner("checking the installation"):
+    with spinner("checking the installation") as tell:
         for name, check in checks:
+            tell(f"checking the installation: {name}")
             started = time.perf_counter()
             try:
                 detail, passed = check(), True
@@ -43,12 +49,13 @@ def doctor(as_json: JsonOption = False) -> None:
 def _print(rows: list[dict[str, Any]], healthy: bool) -> None:
     screen = console()
     if not SETTINGS.quiet:
+        width = 2 + max(14, *(len(row["name"]) for row in rows))
         for row in rows:
             mark = "[green]ok  [/]" if row["ok"] else "[red]FAIL[/]"
-            screen.print(f"{mark} {row['name']:<16}", end="")
+            screen.print(f"{mark} {row['name']:<{width}}", end="")
             screen.print(row["detail"], markup=False)
         present = [f"{name} ({'installed' if found else 'not installed'})" for name, found in _extras().items()]
-        screen.print(f"     {'extras':<16}{', '.join(present)}")
+        screen.print(f"     {'extras':<{width}}{', '.join(present)}")
     screen.print("certbound is ready" if healthy else "certbound is not able to work here: mend what failed above")
 
 
@@ -142,6 +149,60 @@ def _solver() -> str:
     if problem.status != cp.OPTIMAL or abs(problem.value - 4.0) > 1e-5:
         raise RuntimeError(f"Clarabel answered {problem.status}, {problem.value}")
     return "Clarabel solves a semidefinite program"
+
+
+def _first_calls() -> dict[str, Callable[[], object]]:
+    """Work that needs every kernel of value functions, and those of the bundled problems' simulations."""
+    from certbound.problem.files import load
+    from certbound.problem.library import MODELS
+    from certbound.simulation.estimates import simulate_exits, simulate_rare_exits
+
+    found = _value_kernels()
+    for name in MODELS:
+        problem = load(name)
+        found[name] = partial(simulate_exits, problem, paths=1, rng=1)
+        found[f"{name} --rare"] = partial(simulate_rare_exits, problem, paths=40, particles=20, rng=1)
+    return found
+
+
+def _value_kernels() -> dict[str, Callable[[], object]]:
+    import numpy as np
+
+    import certbound as cb
+
+    def leaving(diffusion: list[list[float]]) -> Callable[[], object]:
+        def drift(x: Any) -> Any:
+            return np.array([x[1], -x[0] - x[1]])
+
+        system = cb.ContinuousSystem(drift, states=2, diffusion=diffusion)
+        safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+        problem = cb.Problem(system, initial=[0.0, 0.0], safe=safe, horizon=0.2, delta=0.5)
+        return partial(cb.verify_safety, problem, method="values")
+
+    return {"values": leaving([[0.4, 0.0], [0.0, 0.4]]), "values, noise in one of two": leaving([[0.0], [0.4]])}
+
+
+def _compiling(work: Callable[[], object]) -> Callable[[], str]:
+    """A check that does some work, and counts the kernels that were compiled for it, or found compiled."""
+
+    def check() -> str:
+        before = _kernels()
+        work()
+        compiled, loaded = (after - start for after, start in zip(_kernels(), before))
+        return f"{compiled} compiled, {loaded} found compiled"
+
+    return check
+
+
+def _kernels() -> tuple[int, int]:
+    """How many kernels this process has compiled so far, and how many it has loaded from the cache."""
+    from numba.core.dispatcher import Dispatcher
+
+    modules = [module for name, module in list(sys.modules.items()) if name.startswith("certbound")]
+    kernels = {id(value): value for module in modules for value in vars(module).values()}
+    found = [value for value in kernels.values() if isinstance(value, Dispatcher)]
+    loaded = sum(sum(kernel.stats.cache_hits.values()) for kernel in found)
+    return sum(len(kernel.nopython_signatures) for kernel in found) - loaded, loaded
 
 
 def _verdict() -> str:

@@ -15,12 +15,14 @@ from certbound.cli.clock import Clock, TimeLimitOption
 from certbound.cli.describe import attributes
 from certbound.cli.messages import InputError
 from certbound.cli.options import (
+    ClusterOption,
     HorizonOption,
     JsonOption,
     ProblemArgument,
     SeedOption,
     SetOption,
     check_writable,
+    cluster_at,
     examples,
     generator,
     integer,
@@ -30,6 +32,8 @@ from certbound.cli.options import (
 )
 from certbound.cli.output import SETTINGS, animated, console, show, spinner
 from certbound.display import one_line, rounded
+from certbound.errors import SolverError
+from certbound.watch import OutOfTime
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
@@ -52,7 +56,6 @@ StepOption = Annotated[float | None, option("--step", "H", "Time step in seconds
 ConfidenceOption = Annotated[float, typer.Option("--confidence", parser=number, metavar="C", help="Of the limits.")]
 RareOption = Annotated[bool, typer.Option("--rare", help="Importance splitting, for rare exits.")]
 CheckpointOption = Annotated[Path | None, option("--checkpoint", "FILE", "Keep finished work here, and go on from it.")]
-ClusterOption = Annotated[str | None, option("--cluster", "ADDRESS", "A dask scheduler, tcp://host:port.")]
 AgainstOption = Annotated[Path | None, option("--against", "CERT", "Does the simulation contradict this certificate?")]
 
 
@@ -83,7 +86,7 @@ def simulate(
     options: dict[str, Any] = {"paths": paths, "steps": _steps(subject, step), "confidence": confidence}
     if seed is not None or checkpoint is None:
         options["rng"] = rng
-    with _executor(cluster) as executor, _progress_bar(paths) as progress:
+    with cluster_at(cluster) as executor, _progress_bar(paths) as progress:
         options |= {"executor": executor, "progress": progress, "checkpoint": checkpoint}
         result = _within(Clock(time_limit), _rare if rare else _plain, subject, options)
     if claim is not None:
@@ -104,13 +107,17 @@ def _within(
     if clock.limit is None:
         return count(problem, options)
     asked = options["paths"]
-    number = min(asked, FIRST)
-    while True:
-        result = count(problem, options | {"paths": number})
-        affordable = int(0.8 * max(clock.left, 0.0) / max(result["seconds"], 1e-3) * number)
-        if number == asked or affordable < 2 * number:
-            return result | {"asked": asked}
-        number = min(asked, affordable, 30 * number)
+    number, result = min(asked, FIRST), dict[str, Any]()
+    with contextlib.suppress(OutOfTime), clock.running():
+        while True:
+            result = count(problem, options | {"paths": number}) | {"asked": asked}
+            affordable = int(0.8 * max(clock.left, 0.0) / max(result["seconds"], 1e-3) * number)
+            if number == asked or affordable < 2 * number:
+                break
+            number = min(asked, affordable, 30 * number)
+    if not result:
+        raise SolverError(f"no paths were simulated within {clock.limit:g} s; give a larger --time-limit")
+    return result
 
 
 def _steps(problem: Problem, step: float | None) -> int | None:
@@ -158,21 +165,6 @@ def _claimed(path: Path) -> float:
         if isinstance(value, (int, float)) and not isinstance(value, bool) and value <= 0:
             return float(value)
     raise InputError(f"`{path}` claims no probability (`log10_delta`)", "give the file of verify --certificate")
-
-
-@contextlib.contextmanager
-def _executor(address: str | None) -> Iterator[Any]:
-    """A dask client for the address, closed again; None for threads."""
-    if address is None:
-        yield None
-        return
-    from certbound.simulation.executors import connect
-
-    client = connect(address)
-    try:
-        yield client
-    finally:
-        client.close()
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from certbound.cli.clock import Clock, LimitOption
 from certbound.cli.describe import attributes
 from certbound.cli.messages import InputError
 from certbound.cli.options import (
@@ -26,9 +27,12 @@ from certbound.cli.options import (
     number,
     option,
 )
-from certbound.cli.output import SETTINGS, console, print_status, show, spinner, write_file
+from certbound.cli.output import SETTINGS, console, print_status, show, write_file
 from certbound.cli.pictures import check_picture, scene_of, write_picture
+from certbound.cli.progress import progress
 from certbound.display import log10_text, name_text, one_line, plain
+from certbound.errors import SolverError
+from certbound.watch import OutOfTime, poll
 
 if TYPE_CHECKING:
     from certbound.synthesis.controllers import ClosedLoop
@@ -66,6 +70,7 @@ def synthesize(
     plan: PlanOption = None,
     plot: PlotOption = None,
     smallest_delta: SmallestOption = False,
+    time_limit: LimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find a plan of inputs under which the noisy system stays safe, and prove it."""
@@ -80,15 +85,18 @@ def synthesize(
     from certbound.synthesis.controllers import simulate_closed_loop
     from certbound.synthesis.plans import synthesize_plan
 
-    with spinner("planning") as tell:
-        result = synthesize_plan(
-            subject, method=method, epsilon=epsilon, terminal=terminal, feedback=gain, steps=steps,
-            find_delta=smallest_delta, progress=tell,
-        )  # fmt: skip
-        runs = None
-        if closed_loop is not None:
-            tell(f"{closed_loop} noisy runs")
-            runs = simulate_closed_loop(result, runs=closed_loop, rng=rng)
+    runs = None
+    try:
+        with progress("planning", time_limit) as tell, Clock(time_limit, tell).running():
+            result = synthesize_plan(
+                subject, method=method, epsilon=epsilon, terminal=terminal, feedback=gain, steps=steps,
+                find_delta=smallest_delta, progress=poll,
+            )  # fmt: skip
+            if closed_loop is not None:
+                poll(f"{closed_loop} noisy runs")
+                runs = simulate_closed_loop(result, runs=closed_loop, rng=rng)
+    except OutOfTime:
+        raise SolverError(f"no plan was found and proved within {time_limit:g} s; give a larger --time-limit") from None
     if plan is not None:
         write_file(plan, plan_text(result))
     if plot is not None:

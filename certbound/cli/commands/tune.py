@@ -27,9 +27,10 @@ from certbound.cli.options import (
 )
 from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.cli.pictures import check_picture, sampled, write_picture
+from certbound.cli.progress import progress
 from certbound.display import name_text
 from certbound.errors import SolverError
-from certbound.watch import OutOfTime
+from certbound.watch import OutOfTime, poll
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
@@ -61,11 +62,16 @@ def tune(
     rows: list[dict[str, Any]] = []
     tubes: dict[str, Tube] = {}
     constants: Constants | None = None
-    with contextlib.suppress(OutOfTime), Clock(time_limit).running(), computing("constants", subject):
+    with (
+        contextlib.suppress(OutOfTime),
+        progress(f"tuning tubes for {name_text(subject.name)}", time_limit) as tell,
+        Clock(time_limit, tell).running(),
+        computing("constants", subject),
+    ):
         from certbound.constants.bounds import bound_constants
 
-        with spinner(f"bounding the constants of {name_text(subject.name)}"):
-            constants = bound_constants(subject)
+        poll("constants")
+        constants = bound_constants(subject)
         for tube, row in _rows(constants, subject.horizon, subject.delta):
             rows.append(row)
             tubes.setdefault(row["method"], tube)
@@ -102,8 +108,8 @@ def _rows(constants: Constants, horizon: float, delta: float) -> Iterator[tuple[
     for method, fixed in asked:
         started = time.perf_counter()
         try:
-            with spinner(f"tuning {method}"):
-                tube = tune_tube(constants, horizon=horizon, delta=delta, method=method, **fixed)  # type: ignore[arg-type]  # floats by name
+            poll(f"the tube {method}")
+            tube = tune_tube(constants, horizon=horizon, delta=delta, method=method, **fixed)  # type: ignore[arg-type]  # floats by name
         except (ValueError, ArithmeticError) as error:
             _log.debug("%s does not apply: %s", method, error)
             continue

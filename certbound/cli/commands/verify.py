@@ -16,6 +16,7 @@ from certbound.cli.clock import Clock, VerdictLimitOption
 from certbound.cli.commands.check import proved_certificate
 from certbound.cli.describe import attributes, describe_constants, describe_deviation
 from certbound.cli.options import (
+    ClusterOption,
     DeltaOption,
     HorizonOption,
     JsonOption,
@@ -23,6 +24,7 @@ from certbound.cli.options import (
     ProblemArgument,
     SetOption,
     check_writable,
+    cluster_at,
     examples,
     integer,
     load_problem,
@@ -79,6 +81,7 @@ def verify(
     smallest: SmallestOption = False,
     time_limit: VerdictLimitOption = None,
     jobs: JobsOption = 1,
+    cluster: ClusterOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Decide whether the system stays safe but for a probability of delta, and prove it."""
@@ -87,12 +90,13 @@ def verify(
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
     started = time.perf_counter()
     clock = Clock(DEFAULT_LIMIT if time_limit is None else time_limit)
-    with progress(f"verifying {name_text(subject.name)}", clock.limit) as tell:
+    with cluster_at(cluster) as executor, progress(f"verifying {name_text(subject.name)}", clock.limit) as tell:
         from certbound.safety.verification import verify_safety
 
         verdict = verify_safety(
-            subject, method=method, cells=cells, time_limit=clock.limit, progress=tell, smallest=smallest, jobs=jobs
-        )
+            subject, method=method, cells=cells, time_limit=clock.limit, progress=tell, smallest=smallest, jobs=jobs,
+            executor=executor,
+        )  # fmt: skip
     seconds = time.perf_counter() - started
     result = _result(subject, verdict, seconds)
     if explain:

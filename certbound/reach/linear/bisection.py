@@ -9,8 +9,8 @@ Where even its middle alone, as a start, is out of reach, no halving helps.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from certbound.reach.linear.run import LinearRun
 from certbound.reach.linear.shares import Share
 from certbound.reach.nominal import Cells, initial_cells
 from certbound.rigor.intervals import Interval
-from certbound.watch import jobs_allowed, poll
+from certbound.watch import executor_lent, jobs_allowed, poll
 
 _DEPTH = 4  # halvings of every side
 _BATCH = 4  # cells that are proved side by side, should there be processes for it
@@ -131,21 +131,21 @@ def _side_by_side(
 ) -> dict[LinearRun, LinearAnswer | None]:
     """What is proved of cells; each begins with what the proof of another one has learnt."""
 
-    def task(run: LinearRun) -> Callable[[], Any]:
-        def work() -> Any:
-            run.learnt = learnt
-            found = _proved(run, target)
-            return None if found is None else (found.outcome, found.shown, run.learnt)
-
-        return work
-
     answers: dict[LinearRun, LinearAnswer | None] = {}
-    for run, found in zip(runs, side_by_side([task(run) for run in runs], jobs_allowed())):
+    tasks = [partial(_work, run, target, learnt) for run in runs]
+    for run, found in zip(runs, side_by_side(tasks, jobs_allowed(), executor_lent())):
         answers[run] = None
         if found is not None:
             outcome, shown, run.learnt = found
             answers[run] = LinearAnswer(run=run, outcome=outcome, shown=shown)
     return answers
+
+
+def _work(run: LinearRun, target: Share, learnt: tuple[Array, Array] | None) -> Any:
+    """What is proved of a cell, without the run: outcome, what is shown, what was learnt; None where it falls short."""
+    run.learnt = learnt
+    found = _proved(run, target)
+    return None if found is None else (found.outcome, found.shown, run.learnt)
 
 
 def _proved(run: LinearRun, target: Share) -> LinearAnswer | None:

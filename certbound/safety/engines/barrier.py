@@ -39,6 +39,7 @@ _MOST_STATES = 3
 _DEGREES = {1: (4, 6), 2: (4, 6), 3: (4,)}
 _COARSE, _FINE = {1: 51, 2: 21, 3: 7}, {1: 201, 2: 41, 3: 9}  # points along every side
 _ROUNDS = 3
+_BINDING = 0.2  # of the many points: how many enter the program in every round
 _FAR = 1 / 3  # share of the exponent asked for, from which on the next degree is worth its time
 _CLOSE = 0.1  # of log10: what is proved may be that far from what the program hoped for
 _BUDGET = 20_000
@@ -162,6 +163,7 @@ class _Work:
         exponents = np.array([e for e in itertools.product(range(degree + 1), repeat=self.n) if 0 < sum(e) <= degree])
         horizon, target = self.problem.horizon, math.log10(self.problem.delta)
         points = self._points(_COARSE[self.n])
+        fine: tuple[Array, Array, Array] | None = None
         best: Barrier | None = None
         for number in range(1 + _ROUNDS):
             poll(f"a polynomial of degree {degree}, round {number + 1}")
@@ -178,8 +180,15 @@ class _Work:
             vain = self.n == _MOST_STATES and (hoped > _FAR * target or (number > 1 and proved is None))
             if level <= target or vain or (number and level <= hoped + _CLOSE):
                 return best  # more points only raise what is hoped for, and in many states they take many seconds
-            more = self._points(_FINE[self.n]) if number == 0 and hoped <= _FAR * target else points
-            points = tuple(np.concatenate([have, tight]) for have, tight in zip(more, worst))  # type: ignore[assignment]  # as many as before
+            if number == 0 and hoped <= _FAR * target:
+                fine = self._points(_FINE[self.n])
+                points = points[0], fine[1], fine[2]
+            if fine is not None and len(fine[0]):  # of many points, those that bind: each takes its time in the program
+                height = self._generated(exponents, coefficients, fine[0])
+                binding = height >= np.quantile(height, 1 - _BINDING)
+                points = np.concatenate([points[0], fine[0][binding]]), *points[1:]
+                fine = fine[0][~binding], *fine[1:]
+            points = tuple(np.concatenate([have, tight]) for have, tight in zip(points, worst))  # type: ignore[assignment]  # as many as before
         return best
 
     def _points(self, count: int) -> tuple[Array, Array, Array]:
@@ -213,8 +222,8 @@ class _Work:
     def _uses_time(self) -> bool:
         tapes = [self.problem.closed_loop]
         tapes += [self.system.diffusion] if isinstance(self.system.diffusion, Tape) else []
-        used = {argument for tape in tapes for node in tape.nodes for argument in node.args}
-        return any(tape.inputs[0] == "t" and 0 in used for tape in tapes)
+        return any(tape.inputs[0] == "t" and node.op == "input" and node.args[0] == 0
+                   for tape in tapes for node in tape.nodes)  # fmt: skip
 
     def _gap(self, states: Array) -> Array:
         """The largest phi at points."""
@@ -227,18 +236,9 @@ class _Work:
         import cvxpy
 
         cp: Any = cvxpy
-        states = inner[:, 1 : self.n + 1]
-        drift = compile_numpy(self.problem.closed_loop)(*inner.T)
-        diffusion = self.system.diffusion
-        given = compile_numpy(diffusion)(*inner[:, : self.n + 1].T) if isinstance(diffusion, Tape) else diffusion
-        spread = np.broadcast_to(given, (len(inner), self.n, self.noises))
-        slopes = np.stack([self._monomials(exponents, states, (i,)) for i in range(self.n)])
-        linear = np.einsum("pi,ipk->pk", drift, slopes)
-        square = np.einsum("pij,pkj->pik", spread, spread)
-        for i, j in itertools.product(range(self.n), repeat=2):
-            linear = linear + 0.5 * square[:, i, j, None] * self._monomials(exponents, states, (i, j))
+        linear, roots = self._terms(exponents, inner)
         c, constant, top, growth = cp.Variable(len(exponents)), cp.Variable(), cp.Variable(), cp.Variable(nonneg=True)
-        quadratic = sum(cp.square(np.einsum("pi,ipk->pk", spread[:, :, j], slopes) @ c) for j in range(self.noises))
+        quadratic = sum(cp.square(root @ c) for root in roots)
         rows = [
             linear @ c + 0.5 * quadratic <= growth,
             self._monomials(exponents, initial, ()) @ c + constant <= top,
@@ -254,6 +254,26 @@ class _Work:
         if c.value is None or not np.isfinite(program.value) or program.value >= 0:
             return None, 0.0
         return np.append(np.asarray(c.value, dtype=float), float(constant.value)), float(program.value) / _LOG10
+
+    def _terms(self, exponents: Integers, inner: Array) -> tuple[Array, list[Array]]:
+        """The generator's expression at points, linear @ c + 1/2 sum_j (roots[j] @ c)^2: matrices (points, K)."""
+        states = inner[:, 1 : self.n + 1]
+        drift = compile_numpy(self.problem.closed_loop)(*inner.T)
+        diffusion = self.system.diffusion
+        given = compile_numpy(diffusion)(*inner[:, : self.n + 1].T) if isinstance(diffusion, Tape) else diffusion
+        spread = np.broadcast_to(given, (len(inner), self.n, self.noises))
+        slopes = np.stack([self._monomials(exponents, states, (i,)) for i in range(self.n)])
+        linear = np.einsum("pi,ipk->pk", drift, slopes)
+        square = np.einsum("pij,pkj->pik", spread, spread)
+        for i, j in itertools.product(range(self.n), repeat=2):
+            linear = linear + 0.5 * square[:, i, j, None] * self._monomials(exponents, states, (i, j))
+        return linear, [np.einsum("pi,ipk->pk", spread[:, :, j], slopes) for j in range(self.noises)]
+
+    def _generated(self, exponents: Integers, coefficients: Array, inner: Array) -> Array:
+        """The generator's expression of a polynomial (the constant last) at points."""
+        linear, roots = self._terms(exponents, inner)
+        c = coefficients[:-1]
+        return np.asarray(linear @ c + 0.5 * sum((root @ c) ** 2 for root in roots))
 
     def _monomials(self, exponents: Integers, states: Array, along: tuple[int, ...]) -> Array:
         """Monomials in the scaled states, differentiated along the given states: (points, K)."""

@@ -114,8 +114,8 @@ def test_malformed_input_is_refused(capsys, words, message):
 
 def test_a_scheduler_that_is_not_there_is_refused(capsys, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra `cluster` (dask[distributed])")
-    from certbound.simulation import executors
+    from certbound import parallel
 
-    monkeypatch.setattr(executors.connect, "__defaults__", (0.5,))
+    monkeypatch.setattr(parallel.connect, "__defaults__", (0.5,))
     message = refusal(capsys, "ou", "--paths", "10", "--cluster", "tcp://127.0.0.1:9")
     assert "must be the address of a running dask scheduler" in message

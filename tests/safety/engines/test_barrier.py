@@ -182,3 +182,26 @@ def test_a_target_far_out_of_reach_is_not_asked_for_again(monkeypatch: pytest.Mo
         asked[0] = hoped
         assert barrier_engine(problem).log10_delta == 0.0
         assert len(hopes) == rounds
+
+
+@pytest.mark.parametrize(("drift", "times"), [(lambda t, x: -x, 1), (lambda t, x: -(1 + 0.1 * t) * x, 3)])
+def test_points_are_taken_at_several_times_only_where_the_model_depends_on_it(drift: object, times: int) -> None:
+    system = cb.ContinuousSystem(drift, states=1, diffusion=[[0.3]])
+    problem = scalar().replace(system=system)
+    inner, _, _ = engine._Work(problem, system)._points(11)
+    assert len(inner) == 11 * times
+    assert len(np.unique(inner[:, 0])) == times
+
+
+def test_of_many_points_only_those_that_bind_enter_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    program = engine._Work._program
+
+    def counted(self: engine._Work, exponents: np.ndarray, inner: np.ndarray, *others: np.ndarray) -> object:
+        asked.append(len(inner))
+        return program(self, exponents, inner, *others)
+
+    monkeypatch.setattr(engine._Work, "_program", counted)
+    found = barrier_engine(oscillator(0.4))
+    assert found.log10_delta < -2
+    assert max(asked) < 0.8 * engine._FINE[2] ** 2

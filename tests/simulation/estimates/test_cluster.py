@@ -11,8 +11,8 @@ import pytest
 
 import certbound as cb
 from certbound.errors import SolverError
+from certbound.parallel import connect
 from certbound.simulation.estimates.montecarlo import simulate_exits
-from certbound.simulation.executors import connect
 
 distributed = pytest.importorskip("distributed", reason="needs the extra `cluster` (dask[distributed])")
 
