@@ -16,6 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+WIN, SMEAR = 5, 1.5
+DEPTH, WEAK = 1.5, 0.75
+CELLS = True
+COURANT = 1.5
+ZONE, CUT = .02, (4, 2)
 
 from certbound.arrays import Array
 from certbound.values.continuous.proposal import Splines, through
@@ -140,6 +146,7 @@ class _Solver:
         points = [one.points for one in self.splines]
         self.x, self.y = np.meshgrid(*points, indexing="ij")
         self.widths = np.meshgrid(*(np.gradient(one) for one in points), indexing="ij")
+        self.cells = np.meshgrid(*(np.interp(one, nodes, np.gradient(nodes)) for one, nodes in zip(points, self.nodes)), indexing="ij")
         self.edge = np.ones(self.x.shape, dtype=bool)
         self.edge[1:-1, 1:-1] = False
         self.fixed = self._model(0.0) if plane.autonomous else None
@@ -147,19 +154,18 @@ class _Solver:
 
     def _model(self, t: float) -> tuple[Array, Array, Array]:
         drift, square = self.plane.drift(t, self.x, self.y), self.plane.square(t, self.x, self.y)
-        weak = _weakened(self.plane, self.plan, drift[0], square, self.x, self.y)
-        return drift, square, weak
+        return drift, square, None
 
     def start(self) -> Array:
-        product = np.ones(self.x.shape)
+        none = np.zeros(self.x.shape)
         for axis, place in enumerate((self.x, self.y)):
             for side in (0, 1):
                 rate, bend, curve = self._layer(axis, side)
                 depth = rate * (place - self.plane.low[axis] if side == 0 else self.plane.high[axis] - place)
                 layer = (1 + bend * depth) * np.exp(0.5 * curve * depth**2 * np.exp(-depth) - depth)
-                product = product * (1 - layer)
-        least = math.exp(self.plan.floor)
-        value = np.log(least + (1 - least) * (1 - product))
+                with np.errstate(divide="ignore"):
+                    none += np.log1p(-np.minimum(layer, 1.0))
+        value = np.log(math.exp(self.plan.floor) - np.expm1(none))
         value[self.edge] = 0.0
         return value
 
@@ -175,13 +181,16 @@ class _Solver:
         return rate, bend, np.clip(2 * share - 1, 0.0, 2.0)
 
     def _right(self, tau: float, value: Array) -> tuple[Array, Array, Array, Array]:
-        drift, a, weak = self.fixed or self._model(self.plane.horizon - tau)
+        drift, a, _ = self.fixed or self._model(self.plane.horizon - tau)
+        weak = _weakened(self.plane, self.plan, drift[0], a, self.x, self.y, value)
         vx, vy = self.slope[0] @ value, value @ self.slope[1].T
         along_drift = drift[:, 0] * vx + drift[:, 1] * vy
         best = np.argmax(along_drift, axis=0) if len(drift) > 1 else np.zeros(value.shape, dtype=int)
         force = np.take_along_axis(drift, best[None, None], axis=0)[0]
         force = np.stack([np.where((w - f) * v > 0, w, f) for w, f, v in zip(weak, force, (vx, vy))])
-        bends = a[0, 0] * (self.bend[0] @ value) + a[1, 1] * (value @ self.bend[1].T)
+        bend = self.bend[0] @ value, value @ self.bend[1].T
+        more = self._smear(a, (vx, vy), bend)
+        bends = (a[0, 0] + more[0]) * bend[0] + (a[1, 1] + more[1]) * bend[1]
         if np.any(a[0, 1]):
             bends = bends + 2 * a[0, 1] * (vx @ self.slope[1].T)
         energy = a[0, 0] * vx * vx + 2 * a[0, 1] * vx * vy + a[1, 1] * vy * vy
@@ -190,7 +199,15 @@ class _Solver:
         rate[self.edge] = 0.0
         speed_x = force[0] + a[0, 0] * vx + a[0, 1] * vy
         speed_y = force[1] + a[1, 1] * vy + a[0, 1] * vx
-        return rate, speed_x, speed_y, a
+        return rate, speed_x, speed_y, a + np.stack([np.stack([more[0], 0*more[0]]),np.stack([0*more[0],more[1]])])
+
+    def _smear(self, a, slopes, bends):
+        found = []
+        for axis in (0, 1):
+            p = slopes[axis]
+            jump = maximum_filter1d(p, WIN, axis=axis, mode="nearest") - minimum_filter1d(p, WIN, axis=axis, mode="nearest")
+            found.append(np.where(bends[axis] > 0, a[axis, axis] * np.maximum(self.widths[axis] * jump / SMEAR - 1, 0.0), 0.0))
+        return found
 
     def _source(self, tau: float) -> Array:
         if self.source is None:
@@ -207,8 +224,8 @@ class _Solver:
     def steps(self, tau: float, value: Array, span: float) -> int:
         """How many steps a slab needs, so that nothing moves by more than a few cells in one."""
         _, speed_x, speed_y, _ = self._right(tau, value)
-        fastest = max(float(np.max(np.abs(v) / w)) for v, w in zip((speed_x, speed_y), self.widths))
-        return max(4, math.ceil(min(span * fastest / _COURANT, 1e6)) if math.isfinite(fastest) else 4)
+        fastest = max(float(np.max(np.abs(v) / w)) for v, w in zip((speed_x, speed_y), self.cells if CELLS else self.widths))
+        return max(4, math.ceil(min(span * fastest / COURANT, 1e6)) if math.isfinite(fastest) else 4)
 
     def _divided(self, right: Array, speeds: tuple[Array, Array], a: Array, step: float, fed: Array) -> Array:
         """(I - g h J_x)^-1 (I - g h J_y)^-1 (I - g h J_s)^-1 applied, J_s = -``fed`` being the source's part."""
@@ -283,17 +300,20 @@ def _layer_rate(plane: Plane, plan: Plan, axis: int, side: int) -> float:
     return float(np.max(np.maximum(1.3 * np.sqrt(2 / (a * plan.lead)), inward / (1.5 * a))))
 
 
-def _weakened(plane: Plane, plan: Plan, drift: Array, a: Array, x: Array, y: Array) -> Array:
+def _weakened(plane: Plane, plan: Plan, drift: Array, a: Array, x: Array, y: Array, value: Array) -> Array:
     """The drift with its inward part cut off near the faces, so that layers which no path crosses fit the grid."""
     result = []
     for axis, place in enumerate((x, y)):
         width = plane.high[axis] - plane.low[axis]
-        zone = 0.04 * width
-        most = 0.5 * a[axis, axis] * (6 - plan.floor) / zone
+        zone = ZONE * width * 44 / plan.cells
         weak = drift[axis] * np.ones(x.shape)
         for distance, sign in ((place - plane.low[axis], 1.0), (plane.high[axis] - place, -1.0)):
             share = np.clip(2 - distance / zone, 0.0, 1.0)
-            cut = sign * np.minimum(sign * weak, most)
+            line = distance[:, 0] if axis == 0 else distance[0]
+            beyond = np.take(value, [np.argmin(np.abs(line - DEPTH*zone))], axis=axis)
+            most = 0.5 * a[axis, axis] * (CUT[0] + CUT[1] * np.maximum(-beyond, 0)) / zone
+            cut = sign * np.minimum(np.minimum(sign * weak, WEAK * np.maximum(sign * weak, 0)), most)
+            cut = np.where(sign*weak>0, cut, weak)
             weak = np.where(distance < 2 * zone, share * cut + (1 - share) * weak, weak)
         result.append(weak)
     return np.stack(result)
