@@ -4,7 +4,15 @@ The equation of V = log u is that of `proposal`, with mixed second derivatives w
 handed in: V_tau = sup_d f.grad V + tr(a V'') / 2 + |g' grad V|^2 / 2 + s. Collocation with quintic splines along both
 axes. A step is ROS2 with an approximate factorisation, (I - g h J_x)(I - g h J_y), which keeps order 2 whatever the
 factorisation leaves out (Hundsdorfer and Verwer, Numerical Solution of Time-Dependent Advection-Diffusion-Reaction
-Equations, Sec. IV.5); g = 1/2 and steps of a few cells keep it stable at outflow.
+Equations, Sec. IV.5); g = 1/2 and steps of about a cell keep it stable at outflow.
+
+*Steep fronts.* Where noise is small V is close to a maximum over ways out: smooth, but with convex kinks as wide as one
+over the jump of grad V, less than a cell. Three things keep such V on the grid, each on the side that costs little. At
+T, V = -k d beside each face (d the distance): no floor, whose kink would travel through the grid, and slopes that no
+later parabola exceeds by much. At kinks that a cell cannot hold a is raised until it can (`_viscosity`): V'' > 0 there,
+so that V's own residual falls; and since what V tells travels into kinks, it changes near them alone. Beside faces the
+inward drift is weakened (`_weakened`), so that layers fit the cells: V rises towards the face, and the residual falls
+by what the drift lost times that slope.
 """
 
 from __future__ import annotations
@@ -17,11 +25,6 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
-WIN, SMEAR = 5, 1.5
-DEPTH, WEAK = 1.5, 0.75
-CELLS = True
-COURANT = 1.5
-ZONE, CUT = .02, (4, 2)
 
 from certbound.arrays import Array
 from certbound.values.continuous.proposal import Splines, through
@@ -31,9 +34,12 @@ from certbound.watch import poll
 Pair = tuple[float, float]
 
 _GAMMA = 0.5
-_COURANT = 3.0
+_COURANT = 1.5
 _GATE = 0.004  # a source weakens where V is above minus this, and ends at 0
 _MOST_STEPS = 40_000
+_BENT = 1.5  # jump of V' over five points, times a cell, above which a is raised
+_ZONE = 0.88  # of the width over the number of cells: how far from a face the inward drift is weakened
+_FALL = 0.8  # half of what V may fall by over the cell beside a face, where the drift is inward
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -53,13 +59,13 @@ class Plane:
 class Plan:
     """How a proposal is made: cells along each axis, the slabs' growth, and what it starts from.
 
-    At T there is a layer at each face, as if it had evolved for the time ``lead``, over V = ``floor``.
+    At T there is a layer at each face, as steep as if it had evolved for the time ``lead``; V >= ``floor``.
     """
 
     cells: int
     growth: float
     lead: float
-    floor: float
+    floor: float = -math.inf
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -145,29 +151,30 @@ class _Solver:
         self.bend = [one.dense[2] @ inverse for one, inverse in zip(self.splines, self.inverse)]
         points = [one.points for one in self.splines]
         self.x, self.y = np.meshgrid(*points, indexing="ij")
-        self.widths = np.meshgrid(*(np.gradient(one) for one in points), indexing="ij")
-        self.cells = np.meshgrid(*(np.interp(one, nodes, np.gradient(nodes)) for one, nodes in zip(points, self.nodes)), indexing="ij")
+        self.gaps = np.meshgrid(*(np.gradient(one) for one in points), indexing="ij")
+        widths = [np.interp(one, nodes, np.gradient(nodes)) for one, nodes in zip(points, self.nodes)]
+        self.widths = np.meshgrid(*widths, indexing="ij")
         self.edge = np.ones(self.x.shape, dtype=bool)
         self.edge[1:-1, 1:-1] = False
         self.fixed = self._model(0.0) if plane.autonomous else None
         self.source = None if source is None else (source.times, source.at(points))
 
-    def _model(self, t: float) -> tuple[Array, Array, Array]:
-        drift, square = self.plane.drift(t, self.x, self.y), self.plane.square(t, self.x, self.y)
-        return drift, square, None
+    def _model(self, t: float) -> tuple[Array, Array]:
+        return self.plane.drift(t, self.x, self.y), self.plane.square(t, self.x, self.y)
 
     def start(self) -> Array:
-        none = np.zeros(self.x.shape)
+        sides = []
         for axis, place in enumerate((self.x, self.y)):
             for side in (0, 1):
                 rate, bend, curve = self._layer(axis, side)
                 depth = rate * (place - self.plane.low[axis] if side == 0 else self.plane.high[axis] - place)
-                layer = (1 + bend * depth) * np.exp(0.5 * curve * depth**2 * np.exp(-depth) - depth)
-                with np.errstate(divide="ignore"):
-                    none += np.log1p(-np.minimum(layer, 1.0))
-        value = np.log(math.exp(self.plan.floor) - np.expm1(none))
+                sides.append(np.log1p(bend * depth) + 0.5 * curve * depth**2 * np.exp(-depth) - depth)
+        far = np.logaddexp.reduce(sides)
+        with np.errstate(divide="ignore"):  # 1 - the product of 1 - exp(side), which far from the faces is the sum
+            near = np.log(-np.expm1(np.sum([np.log1p(-np.exp(np.minimum(side, 0.0))) for side in sides], axis=0)))
+        value = np.logaddexp(np.where(far < -15, far, near), self.plan.floor)
         value[self.edge] = 0.0
-        return value
+        return np.asarray(value)
 
     def _layer(self, axis: int, side: int) -> tuple[float, Array, Array]:
         """k, c and b of the layer (1 + c k d) exp(b (k d)^2 exp(-k d) / 2 - k d); a u'' / 2 + f u' = 0 on the face."""
@@ -181,32 +188,33 @@ class _Solver:
         return rate, bend, np.clip(2 * share - 1, 0.0, 2.0)
 
     def _right(self, tau: float, value: Array) -> tuple[Array, Array, Array, Array]:
-        drift, a, _ = self.fixed or self._model(self.plane.horizon - tau)
-        weak = _weakened(self.plane, self.plan, drift[0], a, self.x, self.y, value)
+        drift, a = self.fixed or self._model(self.plane.horizon - tau)
+        weak = _weakened(self.plane, self.plan, drift[0], a, (self.x, self.y), value)
         vx, vy = self.slope[0] @ value, value @ self.slope[1].T
         along_drift = drift[:, 0] * vx + drift[:, 1] * vy
         best = np.argmax(along_drift, axis=0) if len(drift) > 1 else np.zeros(value.shape, dtype=int)
         force = np.take_along_axis(drift, best[None, None], axis=0)[0]
         force = np.stack([np.where((w - f) * v > 0, w, f) for w, f, v in zip(weak, force, (vx, vy))])
         bend = self.bend[0] @ value, value @ self.bend[1].T
-        more = self._smear(a, (vx, vy), bend)
-        bends = (a[0, 0] + more[0]) * bend[0] + (a[1, 1] + more[1]) * bend[1]
+        own, a = a, a + self._viscosity(a, (vx, vy), bend)
+        bends = a[0, 0] * bend[0] + a[1, 1] * bend[1]
         if np.any(a[0, 1]):
             bends = bends + 2 * a[0, 1] * (vx @ self.slope[1].T)
-        energy = a[0, 0] * vx * vx + 2 * a[0, 1] * vx * vy + a[1, 1] * vy * vy
+        energy = own[0, 0] * vx * vx + 2 * own[0, 1] * vx * vy + own[1, 1] * vy * vy
         rate = force[0] * vx + force[1] * vy + 0.5 * (bends + energy)
         rate = rate + self._source(tau) * np.clip(-value / _GATE, 0.0, 1.0)
         rate[self.edge] = 0.0
-        speed_x = force[0] + a[0, 0] * vx + a[0, 1] * vy
-        speed_y = force[1] + a[1, 1] * vy + a[0, 1] * vx
-        return rate, speed_x, speed_y, a + np.stack([np.stack([more[0], 0*more[0]]),np.stack([0*more[0],more[1]])])
+        speed_x = force[0] + own[0, 0] * vx + own[0, 1] * vy
+        speed_y = force[1] + own[1, 1] * vy + own[0, 1] * vx
+        return rate, speed_x, speed_y, a
 
-    def _smear(self, a, slopes, bends):
-        found = []
-        for axis in (0, 1):
-            p = slopes[axis]
-            jump = maximum_filter1d(p, WIN, axis=axis, mode="nearest") - minimum_filter1d(p, WIN, axis=axis, mode="nearest")
-            found.append(np.where(bends[axis] > 0, a[axis, axis] * np.maximum(self.widths[axis] * jump / SMEAR - 1, 0.0), 0.0))
+    def _viscosity(self, a: Array, slopes: tuple[Array, Array], bends: tuple[Array, Array]) -> Array:
+        """What is added to a (on its diagonal) where V has convex kinks along an axis that its cells cannot hold."""
+        found = np.zeros((2, 2, *self.x.shape))
+        for axis, (slope, bend) in enumerate(zip(slopes, bends)):
+            jump = maximum_filter1d(slope, 5, axis=axis) - minimum_filter1d(slope, 5, axis=axis)
+            more = a[axis, axis] * np.maximum(self.gaps[axis] * jump / _BENT - 1, 0.0)
+            found[axis, axis] = np.where(bend > 0, more, 0.0)
         return found
 
     def _source(self, tau: float) -> Array:
@@ -224,8 +232,8 @@ class _Solver:
     def steps(self, tau: float, value: Array, span: float) -> int:
         """How many steps a slab needs, so that nothing moves by more than a few cells in one."""
         _, speed_x, speed_y, _ = self._right(tau, value)
-        fastest = max(float(np.max(np.abs(v) / w)) for v, w in zip((speed_x, speed_y), self.cells if CELLS else self.widths))
-        return max(4, math.ceil(min(span * fastest / COURANT, 1e6)) if math.isfinite(fastest) else 4)
+        fastest = max(float(np.max(np.abs(v) / w)) for v, w in zip((speed_x, speed_y), self.widths))
+        return max(4, math.ceil(min(span * fastest / _COURANT, 1e6)) if math.isfinite(fastest) else 4)
 
     def _divided(self, right: Array, speeds: tuple[Array, Array], a: Array, step: float, fed: Array) -> Array:
         """(I - g h J_x)^-1 (I - g h J_y)^-1 (I - g h J_s)^-1 applied, J_s = -``fed`` being the source's part."""
@@ -300,21 +308,23 @@ def _layer_rate(plane: Plane, plan: Plan, axis: int, side: int) -> float:
     return float(np.max(np.maximum(1.3 * np.sqrt(2 / (a * plan.lead)), inward / (1.5 * a))))
 
 
-def _weakened(plane: Plane, plan: Plan, drift: Array, a: Array, x: Array, y: Array, value: Array) -> Array:
-    """The drift with its inward part cut off near the faces, so that layers which no path crosses fit the grid."""
+def _weakened(plane: Plane, plan: Plan, drift: Array, a: Array, places: tuple[Array, Array], value: Array) -> Array:
+    """The drift with its inward part cut near the faces, so that layers which hardly a path crosses fit the grid.
+
+    The layer falls from 0 to V beyond it; the drift that is left makes it about as thick as the zone.
+    """
     result = []
-    for axis, place in enumerate((x, y)):
+    for axis, place in enumerate(places):
         width = plane.high[axis] - plane.low[axis]
-        zone = ZONE * width * 44 / plan.cells
-        weak = drift[axis] * np.ones(x.shape)
+        zone = _ZONE * width / plan.cells
+        weak = drift[axis] * np.ones(place.shape)
         for distance, sign in ((place - plane.low[axis], 1.0), (plane.high[axis] - place, -1.0)):
             share = np.clip(2 - distance / zone, 0.0, 1.0)
             line = distance[:, 0] if axis == 0 else distance[0]
-            beyond = np.take(value, [np.argmin(np.abs(line - DEPTH*zone))], axis=axis)
-            most = 0.5 * a[axis, axis] * (CUT[0] + CUT[1] * np.maximum(-beyond, 0)) / zone
-            cut = sign * np.minimum(np.minimum(sign * weak, WEAK * np.maximum(sign * weak, 0)), most)
-            cut = np.where(sign*weak>0, cut, weak)
-            weak = np.where(distance < 2 * zone, share * cut + (1 - share) * weak, weak)
+            beyond = np.take(value, [np.argmin(np.abs(line - 1.5 * zone))], axis=axis)
+            steepest = _FALL / (5 * np.partition(line, 1)[1])  # Greville's first point is a fifth of the cell away
+            most = a[axis, axis] * np.minimum((2 + np.maximum(-beyond, 0.0)) / zone, steepest)
+            weak = weak - sign * share * np.maximum(sign * weak - most, 0.0)
         result.append(weak)
     return np.stack(result)
 

@@ -9,6 +9,7 @@ its way out. All this is proposal, the proof is that of `hypotheses`.
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from dataclasses import dataclass
 
@@ -57,11 +58,10 @@ def two_states(
     starts = starts_of(problem)
     inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
     patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
-    level = _rough_level(inner)
     upper, done = 0.0, []
     proposed: list[tuple[Surface, Payment]] = []
     for share in _SHARES:
-        plan = _plan(inner, level, share * patches)
+        plan = _plan(inner, share * patches)
         try:
             surface = _promising(inner, model, plan)
             if surface is not None:
@@ -77,35 +77,22 @@ def two_states(
     return upper, None, f"value function in two states, cells: {', '.join(done)}", proposed
 
 
-def _plan(plane: Plane, level: float, patches: float) -> Plan:
+def _plan(plane: Plane, patches: float) -> Plan:
     """The finest grid with about so many patches; slabs grow fewer as fast as cells do."""
     for cells in itertools.count(16):
-        plan = Plan(cells=cells, growth=min(6 / cells, 0.3), lead=0.32 / cells * plane.horizon, floor=level - 5)
+        plan = Plan(cells=cells, growth=min(6 / cells, 0.3), lead=0.32 / cells * plane.horizon)
         if cells**2 * len(slab_times(plane.horizon, plan)) > patches:
             break
     return plan
 
 
-def _rough_level(plane: Plane) -> float:
-    """log P from a coarse proposal; the floor is lowered until it does not matter."""
-    level = 0.0
-    for floor in (-8.0, -20.0, -45.0):
-        plan = Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon, floor=floor)
-        surface = propose_plane(plane, plan)
-        if surface is None:
-            continue
-        level = min(level, float(extreme_over(surface, plane.starts, upper=True)))
-        if level > floor + 2:
-            break
-    return level
-
-
 def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], seconds: float) -> list[Chart]:
     """Upper bounds from every cell at t = 0, sharp at the levels of log P; none where no proposal comes to an end."""
     plane = _plane(problem, model, room.inner_low, room.inner_high, starts_of(problem))
-    least = _rough_level(plane)
-    levels = sorted({max(level, least) for level in levels})
-    plan = _plan(plane, levels[0], _SHARES[0] * _RATE * seconds)
+    rough = propose_plane(plane, Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon))
+    least = -math.inf if rough is None else extreme_over(rough, plane.starts, upper=True)
+    levels = sorted({max(level, min(least, 0.0)) for level in levels})
+    plan = _plan(plane, _SHARES[0] * _RATE * seconds)
     surface = _promising(plane, model, plan, levels[-1])
     return [] if surface is None else chart_above(surface, model, levels, [0])
 
