@@ -39,7 +39,7 @@ _GATE = 0.004  # a source weakens where V is above minus this, and ends at 0
 _MOST_STEPS = 40_000
 _BENT = 1.5  # jump of V' over five points, times a cell, above which a is raised
 _ZONE = 0.88  # of the width over the number of cells: how far from a face the inward drift is weakened
-_FALL = 0.8  # half of what V may fall by over the cell beside a face, where the drift is inward
+_FALL = 0.5  # half of what V may fall by over the cell beside a face, where the drift is inward
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -9,7 +9,6 @@ its way out. All this is proposal, the proof is that of `hypotheses`.
 from __future__ import annotations
 
 import itertools
-import math
 import time
 from dataclasses import dataclass
 
@@ -58,10 +57,11 @@ def two_states(
     starts = starts_of(problem)
     inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
     patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
+    level = _rough_level(inner)
     upper, done = 0.0, []
     proposed: list[tuple[Surface, Payment]] = []
     for share in _SHARES:
-        plan = _plan(inner, share * patches)
+        plan = _plan(inner, level, share * patches)
         try:
             surface = _promising(inner, model, plan)
             if surface is not None:
@@ -77,22 +77,31 @@ def two_states(
     return upper, None, f"value function in two states, cells: {', '.join(done)}", proposed
 
 
-def _plan(plane: Plane, patches: float) -> Plan:
-    """The finest grid with about so many patches; slabs grow fewer as fast as cells do."""
+def _plan(plane: Plane, level: float, patches: float) -> Plan:
+    """The finest grid with about so many patches; slabs grow fewer as fast as cells do.
+
+    Where failing is rare (log P the ``level``) a longer lead costs little, and makes for fronts that are less steep.
+    """
+    share = 0.32 * min(max(-level / 3, 1.0), 3.0)
     for cells in itertools.count(16):
-        plan = Plan(cells=cells, growth=min(6 / cells, 0.3), lead=0.32 / cells * plane.horizon)
+        plan = Plan(cells=cells, growth=min(6 / cells, 0.3), lead=share / cells * plane.horizon)
         if cells**2 * len(slab_times(plane.horizon, plan)) > patches:
             break
     return plan
 
 
+def _rough_level(plane: Plane) -> float:
+    """log P from a coarse proposal; 0 where that breaks down."""
+    rough = propose_plane(plane, Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon))
+    return 0.0 if rough is None else min(0.0, float(extreme_over(rough, plane.starts, upper=True)))
+
+
 def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], seconds: float) -> list[Chart]:
     """Upper bounds from every cell at t = 0, sharp at the levels of log P; none where no proposal comes to an end."""
     plane = _plane(problem, model, room.inner_low, room.inner_high, starts_of(problem))
-    rough = propose_plane(plane, Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon))
-    least = -math.inf if rough is None else extreme_over(rough, plane.starts, upper=True)
-    levels = sorted({max(level, min(least, 0.0)) for level in levels})
-    plan = _plan(plane, _SHARES[0] * _RATE * seconds)
+    least = _rough_level(plane)
+    levels = sorted({max(level, least) for level in levels})
+    plan = _plan(plane, levels[0], _SHARES[0] * _RATE * seconds)
     surface = _promising(plane, model, plan, levels[-1])
     return [] if surface is None else chart_above(surface, model, levels, [0])
 
