@@ -60,7 +60,7 @@ def _(data: Data) -> None:
     _claim(data, -5.0)
 
 
-@forges("a proof from below proves no upper bound", "valued below", "claims.py", "check_side", "must be there just where")
+@forges("a proof from below proves no upper bound", "valued below", "claims.py", "check_side", "be there just where")
 def _(data: Data) -> None:
     _claim(data, float.fromhex(data["claim"].pop("log10_lower")) - 1.0)
 

@@ -16,7 +16,7 @@ import certbound as cb
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model.tracing import trace
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous import exits, hypotheses, two_states
+from certbound.values.continuous import exits, hypotheses, plane_proposal, two_states
 from certbound.values.continuous.coefficients import Cells, Reader, enclose, squared_diffusion
 from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
@@ -534,6 +534,40 @@ def test_nodes_are_bent_to_a_start_and_stay_where_a_start_lies_on_an_end():
     kept = through(nodes, (end, end))
     assert np.array_equal(kept, nodes)
     assert np.linalg.cond(Splines(kept).dense[0]) < 1e6
+
+
+def reversed_van_der_pol(sigma: float) -> two_states.Plane:
+    system = cb.ContinuousSystem(
+        lambda x: [-x[1], x[0] + (x[0] ** 2 - 1) * x[1]], states=2, diffusion=sigma * np.eye(2)
+    )
+    safe = [cb.Inside(cb.Box([-1.2, -1.2], [1.2, 1.2]))]
+    problem = cb.Problem(system, initial=cb.Box([-0.2, -0.2], [0.2, 0.2]), safe=safe, horizon=5)
+    room = safe_room(problem)
+    return two_states._plane(problem, exits._model(problem), room.inner_low, room.inner_high, starts_of(problem))
+
+
+def test_a_proposal_whose_fronts_are_steeper_than_its_cells_comes_to_an_end() -> None:
+    plane = reversed_van_der_pol(0.1)
+    surface = propose_plane(plane, Plan(cells=24, growth=0.3, lead=0.2))
+    assert surface is not None
+    assert surface.values[:, :, 0, :, 0].max() < 0.5
+    assert -41 < extreme_over(surface, plane.starts, upper=True) < -30  # -38.4, from far finer grids
+
+
+def test_drift_is_weakened_beside_faces_only_where_it_points_inward_and_cells_cannot_hold_its_layer() -> None:
+    calm, steep = reversed_van_der_pol(2.0), reversed_van_der_pol(0.1)
+    line = np.linspace(-1.2, 1.2, 41)
+    x, y = np.meshgrid(line, line, indexing="ij")
+    changes = []
+    for plane in (calm, steep):
+        drift, a = plane.drift(0.0, x, y)[0], plane.square(0.0, x, y)
+        weak = plane_proposal._weakened(plane, Plan(cells=40, growth=0.3, lead=0.2), drift, a, (x, y), 0 * x - 1.0)
+        changes.append(weak - drift)
+    assert not changes[0].any()
+    change, inward = changes[1], -np.sign(y)
+    assert np.all(change[1] * inward <= 0)
+    assert not change[1][:, 5:-5].any()
+    assert np.abs(change[1][:, [0, -1]]).max() > 0.5
 
 
 def test_a_proposal_of_two_states_that_does_not_span_the_horizon_proves_nothing(monkeypatch) -> None:

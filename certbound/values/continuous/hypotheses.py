@@ -42,7 +42,7 @@ from certbound.values.continuous.surface import Surface
 
 Found = TypeVar("Found")
 
-LIFTS = (0.0, 0.003, 0.01, 0.02, 0.035, 0.06, 0.1)
+LIFTS = (0.0, 0.003, 0.01, 0.02, 0.035, 0.06, 0.1, 0.16, 0.25)
 _NEAR = 40.0  # in units of what is granted without being looked at
 NEGLIGIBLE = 5e-4
 """lam and eps (in units of the bound), summed over the horizon, that are granted without being looked at."""

@@ -4,7 +4,15 @@ The equation of V = log u is that of `proposal`, with mixed second derivatives w
 handed in: V_tau = sup_d f.grad V + tr(a V'') / 2 + |g' grad V|^2 / 2 + s. Collocation with quintic splines along both
 axes. A step is ROS2 with an approximate factorisation, (I - g h J_x)(I - g h J_y), which keeps order 2 whatever the
 factorisation leaves out (Hundsdorfer and Verwer, Numerical Solution of Time-Dependent Advection-Diffusion-Reaction
-Equations, Sec. IV.5); g = 1/2 and steps of a few cells keep it stable at outflow.
+Equations, Sec. IV.5); g = 1/2 and steps of about a cell keep it stable at outflow.
+
+*Steep fronts.* Where noise is small V is close to a maximum over ways out: smooth, but with convex kinks as wide as one
+over the jump of grad V, less than a cell. Three things keep such V on the grid, each on the side that costs little. At
+T, V = -k d beside each face (d the distance): no floor, whose kink would travel through the grid, and slopes that no
+later parabola exceeds by much. At kinks that a cell cannot hold a is raised until it can (`_viscosity`): V'' > 0 there,
+so that V's own residual falls; and since what V tells travels into kinks, it changes near them alone. Beside faces the
+inward drift is weakened (`_weakened`), so that layers fit the cells: V rises towards the face, and the residual falls
+by what the drift lost times that slope.
 """
 
 from __future__ import annotations
@@ -16,6 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from certbound.arrays import Array
 from certbound.values.continuous.proposal import Splines, through
@@ -25,7 +34,7 @@ from certbound.watch import poll
 Pair = tuple[float, float]
 
 _GAMMA = 0.5
-_COURANT = 3.0
+_COURANT = 1.5
 _GATE = 0.004  # a source weakens where V is above minus this, and ends at 0
 _MOST_STEPS = 40_000
 _OUTSIDE = 12  # cells of the margin around the box, for lower bounds
@@ -33,6 +42,9 @@ _MARGIN = 4.0  # its width, in units of 1/k
 _DRAWN = 400.0  # how fast V is drawn there, in units of the speed at which it rises
 _STIFF = 20.0  # by how much that may exceed one over a step
 _DEEPER = 3.0  # below what V is on the faces at T, for lower bounds
+_BENT = 1.5  # jump of V' over five points, times a cell, above which a is raised
+_ZONE = 0.88  # of the width over the number of cells: how far from a face the inward drift is weakened
+_FALL = 0.5  # half of what V may fall by over the cell beside a face, where the drift is inward
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -52,14 +64,14 @@ class Plane:
 class Plan:
     """How a proposal is made: cells along each axis, the slabs' growth, and what it starts from.
 
-    At T there is a layer at each face, as if it had evolved for the time ``lead``, over V = ``floor``. For lower
-    bounds (``below``) V is ``floor`` everywhere at T, and rises to 0 on the faces within ``lead``.
+    At T there is a layer at each face, as steep as if it had evolved for the time ``lead``; V >= ``floor``. For lower
+    bounds (``below``) V is at most ``floor`` at T, and rises to 0 on the faces within ``lead``.
     """
 
     cells: int
     growth: float
     lead: float
-    floor: float
+    floor: float = -math.inf
     below: bool = False
 
 
@@ -146,7 +158,9 @@ class _Solver:
         self.bend = [one.dense[2] @ inverse for one, inverse in zip(self.splines, self.inverse)]
         points = [one.points for one in self.splines]
         self.x, self.y = np.meshgrid(*points, indexing="ij")
-        self.widths = np.meshgrid(*(np.gradient(one) for one in points), indexing="ij")
+        self.gaps = np.meshgrid(*(np.gradient(one) for one in points), indexing="ij")
+        widths = [np.interp(one, nodes, np.gradient(nodes)) for one, nodes in zip(points, self.nodes)]
+        self.widths = np.meshgrid(*widths, indexing="ij")
         self.edge = np.ones(self.x.shape, dtype=bool)
         self.edge[1:-1, 1:-1] = False
         self.fixed = self._model(0.0) if plane.autonomous else None
@@ -158,23 +172,22 @@ class _Solver:
     def _nodes(self, axis: int) -> Array:
         return _grid(self.plane, self.plan, axis)
 
-    def _model(self, t: float) -> tuple[Array, Array, Array | None]:
-        drift, square = self.plane.drift(t, self.x, self.y), self.plane.square(t, self.x, self.y)
-        weak = _weakened(self.plane, self.plan, drift[0], square, self.x, self.y)
-        return drift, square, weak
+    def _model(self, t: float) -> tuple[Array, Array]:
+        return self.plane.drift(t, self.x, self.y), self.plane.square(t, self.x, self.y)
 
     def start(self) -> Array:
-        product = np.ones(self.x.shape)
+        sides = []
         for axis, place in enumerate((self.x, self.y)):
             for side in (0, 1):
                 rate, bend, curve = self._layer(axis, side)
                 depth = rate * (place - self.plane.low[axis] if side == 0 else self.plane.high[axis] - place)
-                layer = (1 + bend * depth) * np.exp(0.5 * curve * depth**2 * np.exp(-depth) - depth)
-                product = product * (1 - layer)
-        least = math.exp(self.plan.floor)
-        value = np.log(least + (1 - least) * (1 - product))
+                sides.append(np.log1p(bend * depth) + 0.5 * curve * depth**2 * np.exp(-depth) - depth)
+        far = np.logaddexp.reduce(sides)
+        with np.errstate(divide="ignore"):  # 1 - the product of 1 - exp(side), which far from the faces is the sum
+            near = np.log(-np.expm1(np.sum([np.log1p(-np.exp(np.minimum(side, 0.0))) for side in sides], axis=0)))
+        value = np.logaddexp(np.where(far < -15, far, near), self.plan.floor)
         value[self.edge] = 0.0
-        return value
+        return np.asarray(value)
 
     def _layer(self, axis: int, side: int) -> tuple[float, Array, Array]:
         """k, c and b of the layer (1 + c k d) exp(b (k d)^2 exp(-k d) / 2 - k d); a u'' / 2 + f u' = 0 on the face."""
@@ -192,23 +205,29 @@ class _Solver:
         return 0.0, 0.0
 
     def _right(self, tau: float, value: Array) -> tuple[Array, Array, Array, Array]:
-        drift, a, weak = self.fixed or self._model(self.plane.horizon - tau)
+        drift, a = self.fixed or self._model(self.plane.horizon - tau)
         vx, vy = self.slope[0] @ value, value @ self.slope[1].T
         along_drift = drift[:, 0] * vx + drift[:, 1] * vy
         best = np.argmax(along_drift, axis=0) if len(drift) > 1 else np.zeros(value.shape, dtype=int)
         force = np.take_along_axis(drift, best[None, None], axis=0)[0]
-        if weak is not None:
-            force = np.stack([np.where((w - f) * v > 0, w, f) for w, f, v in zip(weak, force, (vx, vy))])
-        bends = a[0, 0] * (self.bend[0] @ value) + a[1, 1] * (value @ self.bend[1].T)
+        force = self._eased(force, a, (vx, vy), value)
+        bend = self.bend[0] @ value, value @ self.bend[1].T
+        own, a = a, a + self._viscosity(a, (vx, vy), bend)
+        bends = a[0, 0] * bend[0] + a[1, 1] * bend[1]
         if np.any(a[0, 1]):
             bends = bends + 2 * a[0, 1] * (vx @ self.slope[1].T)
-        energy = a[0, 0] * vx * vx + 2 * a[0, 1] * vx * vy + a[1, 1] * vy * vy
+        energy = own[0, 0] * vx * vx + 2 * own[0, 1] * vx * vy + own[1, 1] * vy * vy
         rate = force[0] * vx + force[1] * vy + 0.5 * (bends + energy)
         rate = rate + self._fed(tau, value)
         rate[self.edge] = self.face(tau)[1]
-        speed_x = force[0] + a[0, 0] * vx + a[0, 1] * vy
-        speed_y = force[1] + a[1, 1] * vy + a[0, 1] * vx
+        speed_x = force[0] + own[0, 0] * vx + own[0, 1] * vy
+        speed_y = force[1] + own[1, 1] * vy + own[0, 1] * vx
         return rate, speed_x, speed_y, a
+
+    def _eased(self, force: Array, a: Array, slopes: tuple[Array, Array], value: Array) -> Array:
+        """The drift, weakened beside faces where that makes V rise."""
+        weak = _weakened(self.plane, self.plan, force, a, (self.x, self.y), value)
+        return np.stack([np.where((w - f) * v > 0, w, f) for w, f, v in zip(weak, force, slopes)])
 
     def _fed(self, tau: float, value: Array) -> Array:
         return self._source(tau) * np.clip(-value / _GATE, 0.0, 1.0)
@@ -216,6 +235,15 @@ class _Solver:
     def _falls(self, tau: float, value: Array) -> Array:
         """How fast what the source gives falls with V."""
         return np.where((value < 0) & (value > -_GATE), self._source(tau) / _GATE, 0.0)
+
+    def _viscosity(self, a: Array, slopes: tuple[Array, Array], bends: tuple[Array, Array]) -> Array:
+        """What is added to a (on its diagonal) where V has convex kinks along an axis that its cells cannot hold."""
+        found = np.zeros((2, 2, *self.x.shape))
+        for axis, (slope, bend) in enumerate(zip(slopes, bends)):
+            jump = maximum_filter1d(slope, 5, axis=axis) - minimum_filter1d(slope, 5, axis=axis)
+            more = a[axis, axis] * np.maximum(self.gaps[axis] * jump / _BENT - 1, 0.0)
+            found[axis, axis] = np.where(bend > 0, more, 0.0)
+        return found
 
     def _source(self, tau: float) -> Array:
         if self.source is None:
@@ -300,9 +328,15 @@ class _SolverBelow(_Solver):
         out = [width * np.arange(1, _OUTSIDE + 1) / _OUTSIDE for width in wide]
         return np.concatenate([nodes[0] - out[0][::-1], nodes, nodes[-1] + out[1]])
 
-    def _model(self, t: float) -> tuple[Array, Array, Array | None]:
+    def _model(self, t: float) -> tuple[Array, Array]:
         x, y = (np.clip(p, low, high) for p, low, high in zip((self.x, self.y), self.plane.low, self.plane.high))
-        return self.plane.drift(t, x, y), self.plane.square(t, x, y), None
+        return self.plane.drift(t, x, y), self.plane.square(t, x, y)
+
+    def _eased(self, force: Array, a: Array, slopes: tuple[Array, Array], value: Array) -> Array:
+        return force
+
+    def _viscosity(self, a: Array, slopes: tuple[Array, Array], bends: tuple[Array, Array]) -> Array:
+        return np.zeros(a.shape)
 
     def start(self) -> Array:
         """V falls from the faces as steeply as it has to where it follows them, and ends a little deeper."""
@@ -385,18 +419,23 @@ def _rise(plane: Plane, plan: Plan, axis: int, side: int, x: Array, y: Array) ->
     return np.asarray((inward + np.sqrt(inward**2 - 4 * a * plan.floor / plan.lead)) / np.maximum(a, 1e-300))
 
 
-def _weakened(plane: Plane, plan: Plan, drift: Array, a: Array, x: Array, y: Array) -> Array:
-    """The drift with its inward part cut off near the faces, so that layers which no path crosses fit the grid."""
+def _weakened(plane: Plane, plan: Plan, drift: Array, a: Array, places: tuple[Array, Array], value: Array) -> Array:
+    """The drift with its inward part cut near the faces, so that layers which hardly a path crosses fit the grid.
+
+    The layer falls from 0 to V beyond it; the drift that is left makes it about as thick as the zone.
+    """
     result = []
-    for axis, place in enumerate((x, y)):
+    for axis, place in enumerate(places):
         width = plane.high[axis] - plane.low[axis]
-        zone = 0.04 * width
-        most = 0.5 * a[axis, axis] * (6 - plan.floor) / zone
-        weak = drift[axis] * np.ones(x.shape)
+        zone = _ZONE * width / plan.cells
+        weak = drift[axis] * np.ones(place.shape)
         for distance, sign in ((place - plane.low[axis], 1.0), (plane.high[axis] - place, -1.0)):
             share = np.clip(2 - distance / zone, 0.0, 1.0)
-            cut = sign * np.minimum(sign * weak, most)
-            weak = np.where(distance < 2 * zone, share * cut + (1 - share) * weak, weak)
+            line = distance[:, 0] if axis == 0 else distance[0]
+            beyond = np.take(value, [np.argmin(np.abs(line - 1.5 * zone))], axis=axis)
+            steepest = _FALL / (5 * np.partition(line, 1)[1])  # Greville's first point is a fifth of the cell away
+            most = a[axis, axis] * np.minimum((2 + np.maximum(-beyond, 0.0)) / zone, steepest)
+            weak = weak - sign * share * np.maximum(sign * weak - most, 0.0)
         result.append(weak)
     return np.stack(result)
 
