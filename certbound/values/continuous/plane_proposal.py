@@ -98,7 +98,12 @@ def _linear(nodes: Array, points: Array) -> Array:
 
 def propose_plane(plane: Plane, plan: Plan, source: Source | None = None) -> Surface | None:
     """V on a tensor grid; None where the integration breaks down or needs too many steps."""
-    solver = _Solver(plane, plan, source)
+    return integrated(Solver(plane, plan, source))
+
+
+def integrated(solver: Solver) -> Surface | None:
+    """What a solver makes of its start; None where that breaks down or needs too many steps."""
+    plane, plan = solver.plane, solver.plan
     times = slab_times(plane.horizon, plan)
     value, taken = solver.start(), 0
     values, first, last = [value], [], []
@@ -127,12 +132,12 @@ def slab_times(horizon: float, plan: Plan) -> Array:
     return np.array(times) * (horizon / times[-1])
 
 
-class _Solver:
+class Solver:
     """V at Greville's points of both axes, shape (count_x, count_y)."""
 
     def __init__(self, plane: Plane, plan: Plan, source: Source | None) -> None:
         self.plane, self.plan = plane, plan
-        self.nodes = [_grid(plane, plan, axis) for axis in (0, 1)]
+        self.nodes = [self.grid(axis) for axis in (0, 1)]
         self.splines = [Splines(nodes) for nodes in self.nodes]
         self.inverse = [np.linalg.inv(one.dense[0]) for one in self.splines]
         self.slope = [one.dense[1] @ inverse for one, inverse in zip(self.splines, self.inverse)]
@@ -144,6 +149,10 @@ class _Solver:
         self.edge[1:-1, 1:-1] = False
         self.fixed = self._model(0.0) if plane.autonomous else None
         self.source = None if source is None else (source.times, source.at(points))
+
+    def grid(self, axis: int) -> Array:
+        """The nodes along an axis."""
+        return spread_nodes(self.plane, self.plan, axis)
 
     def _model(self, t: float) -> tuple[Array, Array, Array]:
         drift, square = self.plane.drift(t, self.x, self.y), self.plane.square(t, self.x, self.y)
@@ -250,14 +259,16 @@ class _Solver:
         )  # fmt: skip
 
 
-def _grid(plane: Plane, plan: Plan, axis: int) -> Array:
+def spread_nodes(plane: Plane, plan: Plan, axis: int, more: Callable[[Array], Array] | None = None) -> Array:
+    """Nodes where the noise is small, and at the faces or as ``more`` weighs places; bent to the starts."""
     low, high = plane.low[axis], plane.high[axis]
     fine = np.linspace(low, high, 4001)
     density = 1 / _mean_deviation(plane, axis, fine)
     density = density / np.trapezoid(density, fine)
-    for side, distance in ((0, fine - low), (1, high - fine)):
+    for side, distance in ((0, fine - low), (1, high - fine)) if more is None else ():
         weight = 1 / (distance + 1 / _layer_rate(plane, plan, axis, side))
         density += 0.5 * weight / np.trapezoid(weight, fine)
+    density = density if more is None else density * more(fine)
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
     nodes = np.interp(np.linspace(0, total[-1], plan.cells + 1), total, fine)
     nodes[0], nodes[-1] = low, high
