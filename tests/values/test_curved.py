@@ -22,6 +22,7 @@ from certbound.values.continuous.curved.walls import Walls
 from certbound.values.continuous.hypotheses import Need, up
 from certbound.values.continuous.plane_proposal import Plan
 from certbound.values.continuous.surface import Surface
+from tests.values.random_problems import check
 from tests.values.test_continuous import hermite_values, random_surface, read, spoilt
 
 REGIONS = {
@@ -209,6 +210,12 @@ def test_noise_on_a_proposal_never_passes_the_truth_in_a_disc() -> None:
         assert proof.prove_within(replace(surface, **data), walls, model, problem.initial).log >= truth
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(8))
+def test_random_curved_problems_are_left_no_more_often_than_bounded(seed: int) -> None:
+    assert check("curved", seed, paths=200_000, seconds=5.0)[0] == ""
+
+
 def test_the_worst_point_of_a_ball_of_starts_counts_and_starts_at_a_wall_are_lost() -> None:
     _problem, _, walls, surface = disc_proposals()
     ball = cb.Ball([0.1, 0.05], 0.4)
@@ -232,6 +239,9 @@ def test_what_is_not_served_is_refused_in_words() -> None:
             bound_exits(in_disc(safe=[safe]))
     with pytest.raises(InfeasibleError, match="random start"):
         bound_exits(in_disc(initial=cb.GaussianStart([0.0, 0.0], 0.01 * np.eye(2))))
+    swing = cb.ContinuousSystem(lambda x: [x[1], -x[0]], states=2, diffusion=[[0.0], [0.3]])
+    with pytest.raises(InfeasibleError, match="need noise of full rank"):
+        bound_exits(in_disc(system=swing))
     with pytest.raises(InfeasibleError, match="serve boxes only"):
         exits.chart_exits(in_disc(), levels=[-1.0])
 

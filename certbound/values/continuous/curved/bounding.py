@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from certbound.arrays import Array, Index
+from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Region as Set
@@ -40,6 +42,8 @@ _VARIED = 1.0  # about how much V varies on a patch
 _SHARES = (0.1, 1.0)  # of the patches, for one grid after the other
 _STEEP = 1.0  # how far V falls at most over a cell at a wall, at the horizon
 _SAMPLES = (4, 5, 5)
+_RANK = 1e-9  # of the squared noise: a smaller share in some direction everywhere is none
+Squares = Callable[[float, Array, Array], Array]
 _ALIKE = 0.03  # of log P, which a smaller box may add to a rough guess
 
 
@@ -78,12 +82,24 @@ def _setting(problem: Problem, model: Model) -> tuple[Plane, Region, float]:
     found = []
     for near in (False, True):
         region = region_of(problem, drifts, squares, near=near)
+        _refuse_noiseless(squares, region, float(problem.horizon))
         plane = Plane(
             low=region.low, high=region.high, horizon=float(problem.horizon), drift=drifts, square=squares,
             starts=starts_of(problem), autonomous=model.autonomous,
         )  # fmt: skip
         found.append((plane, region, _rough_level(plane, region.walls)))
     return found[1] if found[1][2] < found[0][2] + _ALIKE else found[0]
+
+
+def _refuse_noiseless(squares: Squares, region: Region, horizon: float) -> None:
+    """The bound would hold, but no smooth V that is near the truth does."""
+    points = np.meshgrid(*(np.linspace(low, high, 9) for low, high in zip(region.low, region.high)), indexing="ij")
+    a = squares(horizon, *points) * np.ones((2, 2, 9, 9))
+    if np.all(a[0, 0] * a[1, 1] - a[0, 1] ** 2 <= _RANK * (a[0, 0] + a[1, 1]) ** 2):
+        raise InfeasibleError(
+            "value functions within curved limits or among obstacles need noise of full rank; here some direction has "
+            "none (noise in the velocities only, say): another engine's answer stands."
+        )
 
 
 def _plan(plane: Plane, level: float, patches: float) -> Plan:

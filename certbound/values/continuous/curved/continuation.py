@@ -73,6 +73,7 @@ class _Fenced(Solver):
         """A layer at the walls besides those at the faces, flat where a u'' / 2 + f u' is to vanish."""
         t, places = self.plane.horizon, (self.x[:, 0], self.y[0])
         slope = np.gradient(self.depth, *places)
+        slope = [part / np.maximum(np.hypot(*slope), 1e-9) for part in slope]
         bent = [np.gradient(part, *places) for part in slope]
         square, drift = self.plane.square(t, self.x, self.y), self.plane.drift(t, self.x, self.y)[0]
         pairs = [(i, j) for i in (0, 1) for j in (0, 1)]
