@@ -154,7 +154,7 @@ TWICE = {
     "normal": "tails of the normal distribution",
     "operations": "the table of the operations of a tape: the prover's, and the checker's own",
     "problem": "a safety problem",
-    "proof": "the proof of a whole certificate of one kind",
+    "proof": "the proof of a whole certificate of one kind; of one value function within curved limits",
     "quadratic": "quadratic forms in the checker's expansions; the engine of quadratic value bounds",
     "reach_tube": "the noise-free reach tube",
     "regions": "sets of states",

@@ -30,8 +30,9 @@ from certbound.values.continuous.hypotheses import (
     sampled_residual,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
-from certbound.values.continuous.plane_below import bound_plane_below, plan_below
-from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane, slab_times
+from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
+from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
+from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime

@@ -11,7 +11,7 @@ over the jump of grad V, less than a cell. Three things keep such V on the grid,
 T, V = -k d beside each face (d the distance): no floor, whose kink would travel through the grid, and slopes that no
 later parabola exceeds by much. At kinks that a cell cannot hold a is raised until it can (`_viscosity`): V'' > 0 there,
 so that V's own residual falls; and since what V tells travels into kinks, it changes near them alone. Beside faces the
-inward drift is weakened (`_weakened`), so that layers fit the cells: V rises towards the face, and the residual falls
+inward drift is weakened (`weakened`), so that layers fit the cells: V rises towards the face, and the residual falls
 by what the drift lost times that slope.
 """
 
@@ -19,105 +19,29 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from certbound.arrays import Array
-from certbound.values.continuous.proposal import Splines, through
+from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, layer_rate, slab_times, spread_nodes
+from certbound.values.continuous.proposal import Splines
 from certbound.values.continuous.surface import Surface
 from certbound.watch import poll
-
-Pair = tuple[float, float]
 
 _GAMMA = 0.5
 _COURANT = 1.5
 _GATE = 0.004  # a source weakens where V is above minus this, and ends at 0
 _MOST_STEPS = 40_000
-_OUTSIDE = 12  # cells of the margin around the box, for lower bounds
-_MARGIN = 4.0  # its width, in units of 1/k
-_DRAWN = 400.0  # how fast V is drawn there, in units of the speed at which it rises
-_STIFF = 20.0  # by how much that may exceed one over a step
-_DEEPER = 3.0  # below what V is on the faces at T, for lower bounds
 _BENT = 1.5  # jump of V' over five points, times a cell, above which a is raised
 _ZONE = 0.88  # of the width over the number of cells: how far from a face the inward drift is weakened
 _FALL = 0.5  # half of what V may fall by over the cell beside a face, where the drift is inward
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Plane:
-    """The problem in floats: drift (branches, 2, ...) and a (2, 2, ...) at (t, x, y), on a box."""
-
-    low: Pair
-    high: Pair
-    horizon: float
-    drift: Callable[[float, Array, Array], Array]
-    square: Callable[[float, Array, Array], Array]
-    starts: list[Pair]
-    autonomous: bool
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Plan:
-    """How a proposal is made: cells along each axis, the slabs' growth, and what it starts from.
-
-    At T there is a layer at each face, as steep as if it had evolved for the time ``lead``; V >= ``floor``. For lower
-    bounds (``below``) V is at most ``floor`` at T, and rises to 0 on the faces within ``lead``.
-    """
-
-    cells: int
-    growth: float
-    lead: float
-    floor: float = -math.inf
-    below: bool = False
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Source:
-    """What V's equation gets in addition, at the nodes of a surface: linear between them in t, x and y.
-
-    ``values`` has shape (K + 1, N_1 + 1, N_2 + 1), times forward.
-    """
-
-    times: Array
-    axes: tuple[Array, ...]
-    values: Array
-
-    @classmethod
-    def above(cls, surface: Surface, needed: Array) -> Source:
-        """At least ``needed`` (K, N_1, N_2), which must not be negative, on each patch: at nodes the largest around."""
-        slabs, rows, columns = needed.shape
-        values = np.zeros((slabs + 1, rows + 1, columns + 1))
-        for a, b, c in itertools.product((0, 1), repeat=3):
-            part = values[a : a + slabs, b : b + rows, c : c + columns]
-            np.maximum(part, needed, out=part)
-        return cls(times=surface.times, axes=surface.axes, values=values)
-
-    def plus(self, other: Source) -> Source:
-        """The sum of two sources on the same grid."""
-        return Source(times=self.times, axes=self.axes, values=self.values + other.values)
-
-    def at(self, points: list[Array]) -> Array:
-        """Values at the ends of the slabs and the products of points along the axes."""
-        x, y = (_linear(nodes, place) for nodes, place in zip(self.axes, points))
-        return np.asarray(np.einsum("pi,kij,qj->kpq", x, self.values, y, optimize=True))
-
-
-def _linear(nodes: Array, points: Array) -> Array:
-    left = np.clip(np.searchsorted(nodes, points) - 1, 0, len(nodes) - 2)
-    share = (points - nodes[left]) / (nodes[left + 1] - nodes[left])
-    matrix = np.zeros((len(points), len(nodes)))
-    matrix[np.arange(len(points)), left] = 1 - share
-    matrix[np.arange(len(points)), left + 1] = share
-    return matrix
-
-
-def propose_plane(plane: Plane, plan: Plan, source: Source | None = None) -> Surface | None:
-    """V on a tensor grid; None where the integration breaks down or needs too many steps."""
-    solver = (_SolverBelow if plan.below else _Solver)(plane, plan, source)
+def integrated(solver: Solver) -> Surface | None:
+    """What a solver makes of its start; None where that breaks down or needs too many steps."""
+    plane, plan = solver.plane, solver.plan
     times = slab_times(plane.horizon, plan)
     value, taken = solver.start(), 0
     values, first, last = [value], [], []
@@ -138,20 +62,12 @@ def propose_plane(plane: Plane, plan: Plan, source: Source | None = None) -> Sur
     return solver.surface(times, values, first, last)
 
 
-def slab_times(horizon: float, plan: Plan) -> Array:
-    """Ends of the slabs in time to go, short at first."""
-    times = [0.0]
-    while times[-1] < horizon:
-        times.append(times[-1] + min(plan.growth * (0.1 * plan.lead + times[-1]), horizon * plan.growth / 4))
-    return np.array(times) * (horizon / times[-1])
-
-
-class _Solver:
+class Solver:
     """V at Greville's points of both axes, shape (count_x, count_y)."""
 
     def __init__(self, plane: Plane, plan: Plan, source: Source | None) -> None:
         self.plane, self.plan = plane, plan
-        self.nodes = [self._nodes(axis) for axis in (0, 1)]
+        self.nodes = [self.grid(axis) for axis in (0, 1)]
         self.splines = [Splines(nodes) for nodes in self.nodes]
         self.inverse = [np.linalg.inv(one.dense[0]) for one in self.splines]
         self.slope = [one.dense[1] @ inverse for one, inverse in zip(self.splines, self.inverse)]
@@ -169,8 +85,9 @@ class _Solver:
             places = [np.clip(place, axis[0], axis[-1]) for place, axis in zip(points, source.axes)]
             self.source = source.times, source.at(places)
 
-    def _nodes(self, axis: int) -> Array:
-        return _grid(self.plane, self.plan, axis)
+    def grid(self, axis: int) -> Array:
+        """The nodes along an axis."""
+        return spread_nodes(self.plane, self.plan, axis)
 
     def _model(self, t: float) -> tuple[Array, Array]:
         return self.plane.drift(t, self.x, self.y), self.plane.square(t, self.x, self.y)
@@ -191,7 +108,7 @@ class _Solver:
 
     def _layer(self, axis: int, side: int) -> tuple[float, Array, Array]:
         """k, c and b of the layer (1 + c k d) exp(b (k d)^2 exp(-k d) / 2 - k d); a u'' / 2 + f u' = 0 on the face."""
-        rate = _layer_rate(self.plane, self.plan, axis, side)
+        rate = layer_rate(self.plane, self.plan, axis, side)
         place = [self.x, self.y]
         place[axis] = np.full(self.x.shape, self.plane.low[axis] if side == 0 else self.plane.high[axis])
         a = self.plane.square(self.plane.horizon, *place)[axis, axis]
@@ -226,7 +143,7 @@ class _Solver:
 
     def _eased(self, force: Array, a: Array, slopes: tuple[Array, Array], value: Array) -> Array:
         """The drift, weakened beside faces where that makes V rise."""
-        weak = _weakened(self.plane, self.plan, force, a, (self.x, self.y), value)
+        weak = weakened(self.plane, self.plan, force, a, (self.x, self.y), value)
         return np.stack([np.where((w - f) * v > 0, w, f) for w, f, v in zip(weak, force, slopes)])
 
     def _fed(self, tau: float, value: Array) -> Array:
@@ -306,120 +223,7 @@ class _Solver:
         )  # fmt: skip
 
 
-class _SolverBelow(_Solver):
-    """For lower bounds: a margin around the box, where V is drawn to what it should be on the faces at each time.
-
-    On the faces themselves V may be anything that is not positive. Were it given there, it would rise on two of them
-    at each corner, where V has no curvature then that could make it rise: a residual that nothing pays for.
-    """
-
-    def __init__(self, plane: Plane, plan: Plan, source: Source | None) -> None:
-        super().__init__(plane, plan, source)
-        shares = [
-            np.maximum(np.maximum((low - place) / (low - nodes[0]), (place - high) / (nodes[-1] - high)), 0.0)
-            for place, low, high, nodes in zip((self.x, self.y), plane.low, plane.high, self.nodes)
-        ]
-        drawn = np.minimum(shares[0] ** 2 + shares[1] ** 2, 1.0)
-        self.drawn = -_DRAWN * plan.floor / plan.lead * drawn
-
-    def _nodes(self, axis: int) -> Array:
-        nodes = _grid(self.plane, self.plan, axis)
-        wide = [_MARGIN / _layer_rate(self.plane, self.plan, axis, side) for side in (0, 1)]
-        out = [width * np.arange(1, _OUTSIDE + 1) / _OUTSIDE for width in wide]
-        return np.concatenate([nodes[0] - out[0][::-1], nodes, nodes[-1] + out[1]])
-
-    def _model(self, t: float) -> tuple[Array, Array]:
-        x, y = (np.clip(p, low, high) for p, low, high in zip((self.x, self.y), self.plane.low, self.plane.high))
-        return self.plane.drift(t, x, y), self.plane.square(t, x, y)
-
-    def _eased(self, force: Array, a: Array, slopes: tuple[Array, Array], value: Array) -> Array:
-        return force
-
-    def _viscosity(self, a: Array, slopes: tuple[Array, Array], bends: tuple[Array, Array]) -> Array:
-        return np.zeros(a.shape)
-
-    def start(self) -> Array:
-        """V falls from the faces as steeply as it has to where it follows them, and ends a little deeper."""
-        product = np.ones(self.x.shape)
-        for axis, place in enumerate((self.x, self.y)):
-            for side in (0, 1):
-                away = place - self.plane.low[axis] if side == 0 else self.plane.high[axis] - place
-                k = _rise(self.plane, self.plan, axis, side, self.x, self.y)
-                product = product * -np.expm1(-k * np.maximum(away, 0.0))
-        least = math.exp(-_DEEPER)
-        return np.asarray(self.plan.floor + np.log(least + (1 - least) * (1 - product)))
-
-    def face(self, tau: float) -> tuple[float, float]:
-        s, top = min(tau / self.plan.lead, 1.0), self.plan.floor
-        rise = s**3 * (10 - 15 * s + 6 * s * s)
-        return top * (1 - rise), -top * 30 * (s * (1 - s)) ** 2 / self.plan.lead
-
-    def _fed(self, tau: float, value: Array) -> Array:
-        return np.asarray(self.drawn * (self.face(tau)[0] - value) - self._source(tau))
-
-    def _falls(self, tau: float, value: Array) -> Array:
-        return np.asarray(self.drawn)
-
-    def steps(self, tau: float, value: Array, span: float) -> int:
-        return max(super().steps(tau, value, span), math.ceil(span * float(self.drawn.max()) / _STIFF))
-
-    def surface(self, times: Array, values: list[Array], first: list[Array], last: list[Array]) -> Surface:
-        """What lies in the box."""
-        whole = super().surface(times, values, first, last)
-        kept = slice(_OUTSIDE, -_OUTSIDE)
-        parts = [part[:, kept, :, kept] for part in (whole.values, whole.start_rates, whole.end_rates)]
-        return Surface(
-            axes=tuple(axis[kept] for axis in whole.axes), times=whole.times, values=parts[0], start_rates=parts[1],
-            end_rates=parts[2],
-        )  # fmt: skip
-
-
-def _grid(plane: Plane, plan: Plan, axis: int) -> Array:
-    low, high = plane.low[axis], plane.high[axis]
-    fine = np.linspace(low, high, 4001)
-    density = 1 / _mean_deviation(plane, axis, fine)
-    density = density / np.trapezoid(density, fine)
-    for side, distance in ((0, fine - low), (1, high - fine)):
-        weight = 1 / (distance + 1 / _layer_rate(plane, plan, axis, side))
-        density += 0.5 * weight / np.trapezoid(weight, fine)
-    total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
-    nodes = np.interp(np.linspace(0, total[-1], plan.cells + 1), total, fine)
-    nodes[0], nodes[-1] = low, high
-    return through(nodes, plane.starts[axis])
-
-
-def _mean_deviation(plane: Plane, axis: int, places: Array) -> Array:
-    """The root of a's diagonal along an axis, averaged over the other one, and kept from being too small."""
-    others = np.linspace(plane.low[1 - axis], plane.high[1 - axis], 17)
-    x, y = np.meshgrid(places, others, indexing="ij") if axis == 0 else np.meshgrid(others, places, indexing="ij")
-    square = plane.square(plane.horizon, x, y)[axis, axis] * np.ones(x.shape)
-    root = np.sqrt(np.maximum(square, 0.0)).mean(axis=1 - axis)
-    return np.asarray(np.maximum(root, 0.2 * root.max()))
-
-
-def _layer_rate(plane: Plane, plan: Plan, axis: int, side: int) -> float:
-    """The rate of the start profile at a face: the largest that a layer of age ``lead`` has along it."""
-    ends = [np.linspace(plane.low[k], plane.high[k], 33) for k in (0, 1)]
-    ends[axis] = np.array([plane.low[axis] if side == 0 else plane.high[axis]])
-    x, y = np.meshgrid(*ends, indexing="ij")
-    a = np.maximum(plane.square(plane.horizon, x, y)[axis, axis] * np.ones(x.shape), 1e-300)
-    if plan.below:
-        return float(np.max(_rise(plane, plan, axis, side, x, y)))
-    inward = np.max(plane.drift(plane.horizon, x, y)[:, axis] * (1 if side == 0 else -1), axis=0)
-    return float(np.max(np.maximum(1.3 * np.sqrt(2 / (a * plan.lead)), inward / (1.5 * a))))
-
-
-def _rise(plane: Plane, plan: Plan, axis: int, side: int, x: Array, y: Array) -> Array:
-    """k at a face, with a k^2 / 2 - f k = the speed at which V rises there."""
-    place = [x, y]
-    place[axis] = np.full(x.shape, plane.low[axis] if side == 0 else plane.high[axis])
-    a = plane.square(plane.horizon, *place)[axis, axis] * np.ones(x.shape)
-    drift = plane.drift(plane.horizon, *place)[:, axis] * (1 if side == 0 else -1)
-    inward = np.maximum(drift.min(axis=0), 0.0)
-    return np.asarray((inward + np.sqrt(inward**2 - 4 * a * plan.floor / plan.lead)) / np.maximum(a, 1e-300))
-
-
-def _weakened(plane: Plane, plan: Plan, drift: Array, a: Array, places: tuple[Array, Array], value: Array) -> Array:
+def weakened(plane: Plane, plan: Plan, drift: Array, a: Array, places: tuple[Array, Array], value: Array) -> Array:
     """The drift with its inward part cut near the faces, so that layers which hardly a path crosses fit the grid.
 
     The layer falls from 0 to V beyond it; the drift that is left makes it about as thick as the zone.
