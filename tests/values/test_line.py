@@ -66,6 +66,14 @@ def test_bounds_of_every_kind_of_limit_hold_and_are_close(name: str) -> None:
     assert found.lower is None or 10**found.lower <= most * 1.005
 
 
+def test_before_a_window_the_line_ends_where_the_drift_lets_no_path_pass() -> None:
+    """At the cut below, where noise in proportion to the state all but ends, no layer would fit the cells."""
+    window = cb.Inside(cb.Box([0.5], [1.8]), during=(0.5, 1))
+    asked = problem([window], (1.0,), f=lambda x: 0.5 * (1 - x), gain=lambda x: [[0.3 * x[0]]])
+    least, most = bracket(asked, 0.1, 6.0, 1000, 300)
+    assert least * 0.995 <= 10 ** bound_exits(asked, seconds=0.01, lower=False).upper <= 1.15 * most
+
+
 @pytest.mark.parametrize("seed", [3, pytest.param(13, marks=pytest.mark.slow)])
 def test_random_problems_lie_between_the_bounds(seed: int) -> None:
     assert check("line", seed, seconds=0.01, cells=1200)[0] == ""

@@ -272,7 +272,7 @@ def surfaces_above(
     links: list[Link] = []
     for k in reversed(range(len(room.phases))):
         line = room.lines[k]
-        if len(room.phases) == 1 and not start.random:
+        if k == 0 and not start.random:
             line = sealed(line, rough[0].level)[0]
         surface = propose_above(
             line, _end(room, k, links[0].surface if links else None), rough[k], share * line.horizon, sharpness,
