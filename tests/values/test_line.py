@@ -74,6 +74,12 @@ def test_before_a_window_the_line_ends_where_the_drift_lets_no_path_pass() -> No
     assert least * 0.995 <= 10 ** bound_exits(asked, seconds=0.01, lower=False).upper <= 1.15 * most
 
 
+def test_a_window_may_have_a_limit_on_one_side_alone() -> None:
+    asked = problem([cb.Inside(cb.Box([-0.6], [np.inf]), during=(0.3, 0.4)), cb.Inside(BOX, during=(0.8, 1))])
+    least, most = bracket(asked, -4.0, 4.0, 1000, 300)
+    assert least * 0.995 <= 10 ** bound_exits(asked, seconds=0.01, lower=False).upper <= 1.5 * most
+
+
 @pytest.mark.parametrize("seed", [3, pytest.param(13, marks=pytest.mark.slow)])
 def test_random_problems_lie_between_the_bounds(seed: int) -> None:
     assert check("line", seed, seconds=0.01, cells=1200)[0] == ""

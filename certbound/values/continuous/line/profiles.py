@@ -194,7 +194,7 @@ def _gate_slopes(line: Line, end: End, rough: Sketch, sharpness: float, jump: fl
     for side in (0, 1):
         place = np.array([line.low if side == 0 else line.high])
         spread_out = float(np.sqrt(line.square(line.horizon, place)[0] * line.horizon))
-        sharp = sharpness * (jump if _jump(line, end, side) else _SOFTER)
+        sharp = sharpness * (jump if _inside(line, end, side) and _jump(line, end, side) else _SOFTER)
         found.append(float(np.sqrt(2 * (1 - rough.level))) / (spread_out * sharp))
     return found
 
