@@ -20,6 +20,7 @@ from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.joins import Profile, missing_lower, missing_upper
 from certbound.values.continuous.line.linked import prove_above, prove_below, spans
 from certbound.values.continuous.line.phases import Gate, Phase, pieces
+from certbound.values.continuous.shapes import spread
 from certbound.values.continuous.surface import Surface
 from tests.values.line_truth import bracket
 from tests.values.random_problems import check
@@ -161,6 +162,16 @@ def _try_wrong(asked: cb.Problem, rng: np.random.Generator, tries: list[tuple[st
         assert prove_above(spoilt(above, rng, how, size), start).log >= math.log(least * 0.995)
         payment = prove_below(spoilt(below, rng, how, size), start)
         assert payment is None or payment.log <= math.log(most * 1.005)
+
+
+def test_a_slope_beyond_floats_gives_no_grid_and_no_surface() -> None:
+    asked = problem([cb.Inside(BOX)])
+    model, start = exits._model(asked), start_of(asked)
+    room = ladder.room_of(asked, model, ladder.cuts_of(asked, model, start), start, inner=True)
+    line, rough = room.lines[0], ladder.sketches(room)[0]
+    assert spread(line, [(line.low, 5.0)], rough, 1.0) is not None
+    for slope in (np.inf, np.nan):
+        assert spread(line, [(line.low, slope)], rough, 1.0) is None
 
 
 def test_a_chain_that_does_not_span_the_horizon_is_seen() -> None:

@@ -197,12 +197,14 @@ class Boundary:
 
 
 def propose(
-    line: Line, nodes: Array, boundary: Boundary, *, tolerance: float, level: float, most_steps: int = 4000
+    line: Line, nodes: Array | None, boundary: Boundary, *, tolerance: float, level: float, most_steps: int = 4000
 ) -> Surface | None:
-    """V on the given nodes; None where the integration breaks down.
+    """V on the given nodes; None where there are none, or the integration breaks down.
 
     Errors count little where V is far below ``level``, log P: the proof pays for those places in units of P.
     """
+    if nodes is None:
+        return None
     system = _Collocation(line, nodes, boundary)
     coefficients, tau = system.start(), 0.0
     step, smallest = boundary.step, 1e-9 * line.horizon

@@ -16,6 +16,7 @@ from certbound.arrays import Array
 from certbound.values.continuous.proposal import Line, Sketch, through
 
 _SPARE = 8.0
+_MOST_CELLS = 20_000.0
 _ROOM = 6.0  # how far below the answer V is to be known, as a logarithm
 _BACKGROUND = 0.3  # share of the cells that is spread evenly
 
@@ -81,8 +82,10 @@ def rise(line: Line, side: int, speed: float) -> float:
     return (inward + float(np.sqrt(max(inward, 0.0) ** 2 + 2 * a * max(speed, 1e-9)))) / a
 
 
-def spread(line: Line, marks: Sequence[tuple[float, float]], rough: Sketch, fineness: float) -> Array:
+def spread(line: Line, marks: Sequence[tuple[float, float]], rough: Sketch, fineness: float) -> Array | None:
     """Nodes in proportion to the lengths over which V bends, 1/sqrt(a V''), wherever it is not far below the answer.
+
+    None where that needs too many, or a slope is beyond floats.
 
     Beside a mark (place, k) V is a line of slope k that turns into a parabola at the distance a k tau: sqrt(k / d)
     bends a length; and where the parabola is above log P - 6, at most sqrt(2 L) / d, L = 6 - log P. At t = 0 the sketch
@@ -100,10 +103,13 @@ def spread(line: Line, marks: Sequence[tuple[float, float]], rough: Sketch, fine
     for place, rate in marks:
         slope = rate / float(np.interp(place, fine, scale))
         distance = np.abs(way - np.interp(place, fine, way))
-        near, later = np.sqrt(slope / (distance + 1 / slope)), np.sqrt(2 * depth) / np.maximum(distance, 1e-12)
+        with np.errstate(all="ignore"):
+            near, later = np.sqrt(slope / (distance + 1 / slope)), np.sqrt(2 * depth) / np.maximum(distance, 1e-12)
         density = density + np.minimum(near, later)
     density = density + (_BACKGROUND * np.trapezoid(density, way) + 4) / way[-1]
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(way))])
+    if not fineness * total[-1] <= _MOST_CELLS:
+        return None
     nodes = np.interp(np.linspace(0, total[-1], int(np.ceil(fineness * total[-1])) + 1), total, fine)
     nodes[0], nodes[-1] = line.low, line.high
     return through(nodes, line.starts)
