@@ -6,7 +6,9 @@ is A(s, d, e) z, affine in each of s, d, e: its values at the cell's corners con
 z' D(s) z = 0 for the free splittings D of `splitting`. The diffusion is likewise affine in each of s where it is
 polynomial of that kind; what is left of it goes into columns of its own:
     |(G + E)' p|^2 <= (1 + a)|G' p|^2 + (1 + 1/a) (sum_i rho_i) sum_i rho_i p_i^2,   |E_i.| <= rho_i.
-Small remainders, and all beyond a few, are no corners but columns too: r |p| <= r q/2 + (r/q) p^2/2 for any q > 0.
+Small remainders, and all beyond a few, are no corners but columns too: where |e| <= sum_b r_b |eta_b| with eta_b the
+coordinate b of the cell scaled to [-1, 1] (and eta = 1 for what is left), |e p| <= sum_b r_b (q eta_b^2 + p^2/q)/2 for any
+q > 0. So a remainder that vanishes with a coordinate costs nothing near its zero.
 """
 
 from __future__ import annotations
@@ -57,7 +59,9 @@ class Cells:
     square : Interval, shape (C, n, n)
         g g' over the cells.
     toll : Interval, shape (C,)
-        What the remainders that are columns add to R besides.
+        What the remainders that are columns add to R besides, and
+    bend : Interval, shape (C, n + 1, n + 1)
+        the part of it that depends on the place, as forms.
     """
 
     low: Array
@@ -69,6 +73,7 @@ class Cells:
     affine: Interval | None
     square: Interval
     toll: Interval
+    bend: Interval
 
 
 class Dynamics:
@@ -109,7 +114,7 @@ class Dynamics:
     def remainder(self, low: Array, high: Array) -> float:
         """The largest remainder of the drift over cells at time 0, in working boxes within the horizon."""
         cells = _Boxes(low, high, Interval.point(0.0), self.setting, self.disturbed)
-        return float(np.max(self._drift_parts(cells)[-1].hi)) * self.horizon
+        return float(np.max(self._drift_parts(cells)[-1].sum(axis=-1).hi)) * self.horizon
 
     def over(self, low: Array, high: Array, start: float, end: float) -> Cells:
         """The cells [low, high], shape (C, n), of the working box during [start, end].
@@ -122,7 +127,8 @@ class Dynamics:
             The model is undefined somewhere in a cell.
         """
         cells = _Boxes(low, high, Interval(start, end), self.setting, self.disturbed)
-        base, by_state, by_disturbance, rest = self._drift_parts(cells)
+        base, by_state, by_disturbance, shares = self._drift_parts(cells)
+        rest = shares.sum(axis=-1)
         plain = len(self.held) + len(self.disturbed)
         order = sorted(range(self.n), key=lambda i: -np.max(rest.hi[:, i]))
         room = max(int(np.log2(_FEW_CORNERS)) - plain, 0) if self.n <= _SMALL_DIMENSION else 0
@@ -149,13 +155,28 @@ class Dynamics:
             spreads.append(_with_small(noise(step), worst, small))
         return Cells(
             low=low, high=high, held=self.held, values=np.array(values), drift=stack(drifts), spread=stack(spreads),
-            affine=self._affine(cells), square=self._square(cells), toll=self._toll(worst, small, len(low)),
+            affine=self._affine(cells), square=self._square(cells), toll=self._toll(shares, small),
+            bend=self._bend(shares, small, low, high),
         )  # fmt: skip
 
-    def _toll(self, worst: Interval, small: Sequence[int], many: int) -> Interval:
-        """sum r q/2 over the remainders that are columns, the same for all cells."""
-        total = (Interval.point(worst.hi[list(small)]) * Interval.point(_SLOPE / 2)).sum() if small else 0.0
-        return Interval.point(np.zeros(many)) + total
+    def _toll(self, shares: Interval, small: Sequence[int]) -> Interval:
+        """sum r q/2 over what is constant of the remainders that are columns, shape (C,)."""
+        return Interval.point(shares.hi[:, list(small), self.n]).sum(axis=-1) * Interval.point(_SLOPE / 2)
+
+    def _bend(self, shares: Interval, small: Sequence[int], low: Array, high: Array) -> Interval:
+        """sum r_b (q/2) eta_b^2 over the rest of them, as forms over z."""
+        weight = Interval.point(shares.hi[:, list(small), : self.n]).sum(axis=1) * Interval.point(_SLOPE / 2)
+        total: Interval = Interval.point(np.zeros((len(low), self.n + 1, self.n + 1)))
+        ends = Interval.point(low), Interval.point(high)
+        middle, half = (ends[0] + ends[1]) * Interval.point(0.5), (ends[1] - ends[0]) * Interval.point(0.5)
+        for b in np.flatnonzero(weight.hi.max(axis=0) > 0):
+            lo, hi = np.zeros((2, len(low), self.n + 1))
+            slope, offset = Interval.point(1.0) / half[:, b], -(middle[:, b] / half[:, b])
+            lo[:, b], hi[:, b], lo[:, -1], hi[:, -1] = slope.lo, slope.hi, offset.lo, offset.hi
+            eta = Interval(lo, hi)
+            form = eta.reshape(len(low), -1, 1) * eta.reshape(len(low), 1, -1)
+            total = total + form * weight[:, b].reshape(-1, 1, 1)
+        return total
 
     def _with_rest(
         self, matrix: Interval, rest: Interval, signs: dict[int, float], small: Sequence[int]
@@ -170,14 +191,14 @@ class Dynamics:
         return matrix + Interval(lo, hi)
 
     def _drift_parts(self, cells: _Boxes) -> tuple[Interval, list[Interval], list[Interval], Interval]:
-        """A at the middle, its slopes along N and d, and bounds of the remainder (C, n)."""
+        """A at the middle, its slopes along N and d, and bounds of the remainder: r_b, shape (C, n, n + 1)."""
         n = self.n
         value, slope, curve = self.drift.at(cells)
         size = cells.size  # (C, q): half widths of xi and d
-        rest = Interval.point(np.zeros((len(cells.low), n)))
+        shares = _Shares(len(cells.low), n)
         value, first = self._noted(value, 0, size)
         slope, second = self._noted(slope, 1, size)
-        rest = rest + first + second
+        shares.add(n, first + second)
         base, owned = _linear(value, slope[..., :n], cells.middle), [_empty(cells, n) for _ in self.held]
         shaken = [_linear(slope[..., n + b], None, cells.middle) for b in range(len(self.disturbed))]
         for a, b in sorted(self.drift.pairs):
@@ -185,18 +206,18 @@ class Dynamics:
             factor = 1.0 if a != b else 0.5
             middle = Interval.point(both.mid)
             wide = Interval(np.zeros(both.shape), both.rad)
-            rest = rest + wide * Interval.point(factor) * (size[:, a] * size[:, b]).reshape(-1, 1)
+            owner, other = (a, b) if a in self.held or b >= n else (b, a)
+            along = min(a, n) if b >= n else other  # a product of disturbances has no place
+            shares.add(along, wide * Interval.point(factor) * (size[:, a] * size[:, b]).reshape(-1, 1))
             if b < n:
-                owner, other = (a, b) if a in self.held else (b, a)
                 place = self.held.index(owner)
                 owned[place] = owned[place] + _along(middle * Interval.point(factor), other, cells.middle)
             elif a < n:
                 shaken[b - n] = shaken[b - n] + _along(middle, a, cells.middle)
             else:  # a product of disturbances
-                rest = rest + Interval(np.zeros(both.shape), middle.mag) * Interval.point(factor) * (
-                    size[:, a] * size[:, b]
-                ).reshape(-1, 1)
-        return base, owned, shaken, rest
+                bent = Interval(np.zeros(both.shape), middle.mag) * Interval.point(factor)
+                shares.add(n, bent * (size[:, a] * size[:, b]).reshape(-1, 1))
+        return base, owned, shaken, shares.whole
 
     def _noted(self, part: Interval, order: int, size: Interval) -> tuple[Interval, Interval]:
         """A coefficient as a narrow one, and what its width (from the time) adds to the remainder (C, n)."""
@@ -264,6 +285,20 @@ class Dynamics:
         else:
             columns = self.noise.whole(cells).reshape(-1, n, m)
         return columns @ columns.T
+
+
+class _Shares:
+    """Bounds of the remainder's parts, by the coordinate with which each vanishes (the last: none)."""
+
+    def __init__(self, cells: int, n: int) -> None:
+        self.parts: list[Interval] = [Interval.point(np.zeros((cells, n)))] * (n + 1)
+
+    def add(self, place: int, bound: Interval) -> None:
+        self.parts[place] = self.parts[place] + bound
+
+    @property
+    def whole(self) -> Interval:
+        return Interval(np.stack([p.lo for p in self.parts], -1), np.stack([p.hi for p in self.parts], -1))
 
 
 class _Boxes:

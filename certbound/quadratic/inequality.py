@@ -23,7 +23,8 @@ from certbound.arrays import Array, Integers
 from certbound.quadratic.corners import Cells
 from certbound.quadratic.form_matrices import enclosed_side_forms, splitting
 from certbound.quadratic.setting import Setting, Wall
-from certbound.quadratic.wall_program import Proposal, start_frame
+from certbound.quadratic.wall_program import Proposal, slopes, start_frame
+from certbound.rigor.balls import precision, upper
 from certbound.rigor.definite import eigenvalue_lower
 from certbound.rigor.intervals import Interval, concatenate, matmul, stack
 
@@ -50,11 +51,13 @@ class Proved:
     gap: float
     top: float
     proposal: Proposal
+    paid: float = -np.inf
 
     @property
     def level(self) -> float:
         """Bound of the logarithm of the probability, for the worst start."""
-        return float((Interval.point(self.growth) + Interval.point(self.gap) + Interval.point(self.top)).hi)
+        grown = Interval.point(self.growth) + Interval.point(self.gap)
+        return float((grown + Interval.point(log_sum_upper([self.top, self.paid]))).hi)
 
 
 def prove(setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cells]) -> Proved:
@@ -65,12 +68,40 @@ def prove(setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cell
     growth: Interval = Interval.point(0.0)
     for k, one in enumerate(cells):
         step = Interval.point(proposal.times[k + 1]) - Interval.point(proposal.times[k])
-        worst = max(_excess(setting, proposal, k, side, one, step) for side in (0, 1))
+        worst = max(_excess(setting, proposal, k, side, one, step) for side in range(proposal.degree + 1))
         if not np.isfinite(worst):
             return Proved(growth=np.inf, gap=np.inf, top=np.inf, proposal=proposal)
         growth = growth + Interval.point(worst) * step
     return Proved(growth=float(growth.hi), gap=_gap(setting, wall, proposal), top=_top(setting, proposal),
-                  proposal=proposal)  # fmt: skip
+                  paid=_paid(proposal), proposal=proposal)  # fmt: skip
+
+
+def _paid(proposal: Proposal) -> float:
+    """A bound of the logarithm of what the floors cost, sum c_k h_k exp(v_k)."""
+    parts = []
+    for k in np.flatnonzero(proposal.rates > 0):
+        step = Interval.point(proposal.times[k + 1]) - Interval.point(proposal.times[k])
+        parts.append(log_upper(float((step * Interval.point(proposal.rates[k])).hi), float(proposal.floors[k])))
+    return log_sum_upper(parts)
+
+
+def log_upper(factor: float, level: float) -> float:
+    """Upper bound of log(factor) + level."""
+    from flint import arb
+    with precision():
+        return upper(arb(factor).log() + arb(level))
+
+
+def log_sum_upper(levels: Sequence[float]) -> float:
+    """Upper bound of log sum exp; -inf of none."""
+    from flint import arb
+
+    finite = [level for level in levels if level > -np.inf]
+    if not finite or not np.all(np.isfinite(finite)):
+        return float(np.inf if finite else -np.inf)
+    top = max(finite)
+    with precision():
+        return upper(sum(((arb(level) - arb(top)).exp() for level in finite), arb(0)).log() + arb(top))
 
 
 def _excess(setting: Setting, proposal: Proposal, k: int, side: int, cells: Cells, step: Interval) -> float:
@@ -86,13 +117,19 @@ def _slack_matrices(
 ) -> Interval:
     """M at every corner and cell, shape (V, C, n + 1, n + 1)."""
     half = Interval.point(0.5)
-    matrix = Interval.point(proposal.matrices[k + side])
-    slope = (Interval.point(proposal.matrices[k + 1]) - Interval.point(proposal.matrices[k])) / step
+    base = k * proposal.degree
+    matrix = Interval.point(proposal.matrices[base + side])
+    first, last, factor = slopes(proposal.degree)[side]
+    slope = Interval.point(proposal.matrices[base + last]) - Interval.point(proposal.matrices[base + first])
+    slope = slope * Interval.point(factor) / step
     product = matmul(matrix, cells.drift)
     total = (product + product.T) * half + slope * half + _trace(matrix, cells) * half
     border = matmul(matrix, cells.spread)
     total = total + matmul(border, border.T) * half
-    total = total + _split(proposal.moves[k, side], cells) + _last(cells.toll, setting.dimension)
+    total = total + _split(proposal.moves[k, side], cells) + _last(cells.toll, setting.dimension) + cells.bend
+    rate = Interval.point(proposal.rates[k])
+    floor = (Interval.point(1.0) + Interval.point(proposal.floors[k])) * rate
+    total = total + matrix * (rate * half) - _last(floor.reshape(1), setting.dimension)
     return -(total + _weighed(setting, proposal.weights[k, side], cells))
 
 
@@ -205,4 +242,6 @@ def corner_levels(setting: Setting, proved: Proved) -> Array | None:
     ends = np.where(bits == 1, start.high[wide], start.low[wide])
     y = Interval.point(np.hstack([ends, np.ones((len(ends), 1))]))
     at = (matmul(y, value) * y).sum(axis=-1) * Interval.point(0.5)
-    return np.asarray((at + lift + Interval.point(proved.growth) + Interval.point(proved.gap)).hi)
+    grown = Interval.point(proved.growth) + Interval.point(proved.gap)
+    levels = np.array([log_sum_upper([float(one), proved.paid]) for one in (at + lift).hi.ravel()])
+    return np.asarray((grown + Interval.point(levels)).hi)

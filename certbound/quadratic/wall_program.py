@@ -54,6 +54,15 @@ class Proposal:
     wall_rows: Array
     start_weights: Array
     level: float
+    degree: int
+    rates: Array
+    floors: Array
+
+
+DEG = 2
+def slopes(degree: int) -> list[tuple[int, int, float]]:
+    """At each control point of a piece: the slope in time is factor (last - first) / length, of two control points."""
+    return [(0, 1, 1.0), (0, 1, 1.0)] if degree == 1 else [(0, 1, 2.0), (0, 2, 1.0), (1, 2, 2.0)]
 
 
 def symmetric_basis(size: int) -> Array:
@@ -95,9 +104,12 @@ class StatedCells:
         main = -(product + product.transpose(1, 0, 2)) / 2 - self._trace(cells, c)
         sides = side_forms(cells.low[c], cells.high[c]).transpose(1, 2, 0)
         split = np.einsum("a,baij->ijb", cells.values[v, c], self.splits)
-        maps = [main, -basis / 2, basis / 2, -split, -np.concatenate([sides, self.forms], axis=2), -basis / 2]
-        constant = np.zeros((size, size))
-        constant[-1, -1] = -cells.toll.mid[c]
+        corner = np.zeros((size, size, 1))
+        corner[-1, -1] = 1.0
+        maps = [main, -basis / 2, basis / 2, -split, -np.concatenate([sides, self.forms], axis=2), -basis / 2,
+                -basis / 2, corner]  # fmt: skip
+        constant = -cells.bend.mid[c]
+        constant[-1, -1] -= cells.toll.mid[c]
         if cells.affine is None:
             radius = cells.square.rad[c][np.triu_indices(size - 1)]
             twice = np.where(np.equal(*np.triu_indices(size - 1)), 0.5, 1.0)
@@ -117,19 +129,20 @@ class StatedCells:
 
 
 def propose(
-    setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], *, seconds: float
+    setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], *, seconds: float,
+    rates: Array | None = None,
 ) -> Proposal | None:
     """What the program of a wall proposes; None where the solver failed.
 
     ``stated`` are the cells of each piece of time with their inequality.
     """
-    return _WallProgram(setting, wall, times, stated).solve(seconds)
+    return _WallProgram(setting, wall, times, stated, rates).solve(seconds)
 
 
 class _WallProgram:
     """The program of one wall, and where its variables are."""
 
-    def __init__(self, setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells]) -> None:
+    def __init__(self, setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], rates: Array | None) -> None:
         self.setting, self.wall, self.times, self.stated = setting, wall, times, stated
         cells = [one.cells for one in stated]
         self.cells = cells
@@ -137,7 +150,10 @@ class _WallProgram:
         self.basis = symmetric_basis(self.size)
         self.program = Program()
         count = self.basis.shape[2]
-        self.nodes = [self.program.variables(count) for _ in times]
+        self.degree = DEG
+        self.nodes = [self.program.variables(count) for _ in range(self.degree * (len(times) - 1) + 1)]
+        self.rates = np.zeros(len(times) - 1) if rates is None else rates
+        self.floors = self.program.variables(len(times) - 1)
         self.splits = splitting(setting.dimension, cells[0].held)
         self.forms = setting.inside.mid.transpose(1, 2, 0)
         self.squares: dict[tuple[int, int, int], Integers] = {}
@@ -149,7 +165,16 @@ class _WallProgram:
         self._generator()
         walls = [self._at_wall(node) for node in self.nodes]
         level, start = self._at_start()
-        found = self.program.minimise(int(level[0]), seconds=seconds)
+        whole = level
+        used = np.flatnonzero(self.rates)
+        if len(used):
+            weights = np.log(self.rates[used] * np.diff(self.times)[used])
+            whole = self.program.variables(1)
+            self.program.at_least(np.zeros(1), [Part(np.eye(1), whole), Part(-np.eye(1), level)])
+            for k in used:
+                self.program.at_least(np.array([-np.log(self.rates[k]*self.times[-1])]), [Part(np.eye(1), whole), Part(-np.eye(1), self.floors[k:k+1])])
+        for k in np.flatnonzero(self.rates == 0): self.program.at_least(np.zeros(1), [Part(np.eye(1), self.floors[k:k+1])])
+        found = self.program.minimise(int(whole[0]), seconds=seconds)
         if found is None:
             return None
         return Proposal(
@@ -161,6 +186,7 @@ class _WallProgram:
             wall_rows=found[np.array([nu for _, nu in walls], dtype=np.int64)],
             start_weights=np.maximum(found[np.asarray(start, dtype=np.int64)], 0.0),
             level=float(found[level[0]]),
+            degree=self.degree, rates=self.rates, floors=found[self.floors],
         )
 
     # ---- the inequality of the generator -----------------------------------------------------------------------
@@ -170,13 +196,16 @@ class _WallProgram:
             self.absolute = [self._absolutes(node) for node in self.nodes]
         for k, one in enumerate(self.stated):
             length = float(self.times[k + 1] - self.times[k])
-            blocks = [[_timed(block_, self.basis.shape[2], length) for block_ in row] for row in one.blocks]
-            ends = [self._piece(k, end, one, blocks) for end in (k, k + 1)]
+            ends = []
+            for place, (first, last, factor) in enumerate(slopes(self.degree)):
+                blocks = [[self._timed(one, block_, length / factor, float(self.rates[k])) for block_ in row] for row in one.blocks]
+                base = k * self.degree
+                ends.append(self._piece(k, base + place, (base + first, base + last), one, blocks))
             self.moves.append([moves for moves, _ in ends])
             self.weights.append([weights for _, weights in ends])
 
     def _piece(
-        self, k: int, end: int, one: StatedCells, blocks: list[list[Block]]
+        self, k: int, end: int, slope: tuple[int, int], one: StatedCells, blocks: list[list[Block]]
     ) -> tuple[list[Integers], list[list[Integers]]]:
         """State the inequality at one end of a piece, for all cells and corners: the places of D and mu."""
         program, many = self.program, len(one.cells.low)
@@ -186,10 +215,25 @@ class _WallProgram:
             weights.append([program.nonnegative(self.size - 1 + self.forms.shape[2]) for _ in range(many)])
             for c, stated in enumerate(row):
                 square = self._square(end, one, int(one.group[corner, c]))
-                parts = [self.nodes[end], self.nodes[k + 1], self.nodes[k], moves[c], weights[corner][c], square]
+                parts = [self.nodes[end], self.nodes[slope[1]], self.nodes[slope[0]], moves[c], weights[corner][c], square]
+                parts += [self.nodes[end], self.floors[k : k + 1]]
                 parts += [] if not self.absolute else [self.absolute[end]]  # type: ignore[list-item]
                 program.semidefinite(stated, np.concatenate(parts))
         return moves, weights
+
+    def _timed(self, one: StatedCells, stated: Block, length: float, rate: float) -> Block:
+        """The block with its slope in time divided by a length, and with the floor at a rate."""
+        count = self.basis.shape[2]
+        first = 4 * count + len(self.splits) + self.size - 1 + self.forms.shape[2]  # H(end), the floor
+        columns = stated.columns
+        scale = np.ones(len(columns))
+        scale[(columns >= count) & (columns < 3 * count)] = 1 / length
+        scale[(columns >= first) & (columns <= first + count)] = rate
+        constant = stated.constant.copy()
+        constant[-1] += rate
+        used = scale != 0
+        return stated._replace(rows=stated.rows[used], columns=columns[used], values=(stated.values * scale)[used],
+                               constant=constant)  # fmt: skip
 
     def _square(self, end: int, one: StatedCells, group: int) -> Integers:
         """Variables Y >= H G G' H at a time, the same for all corners with that diffusion."""
@@ -253,9 +297,3 @@ class _WallProgram:
         program.semidefinite(stated, np.concatenate([level, self.nodes[0], weights]))
         program.at_least(np.array([-_DEEPEST]), [Part(np.eye(1), level)])
         return level, weights
-
-
-def _timed(stated: Block, count: int, length: float) -> Block:
-    """The block with the slope in time, its second and third groups of ``count`` columns, divided by a length."""
-    slope = (stated.columns >= count) & (stated.columns < 3 * count)
-    return stated._replace(values=np.where(slope, stated.values / length, stated.values))
