@@ -73,16 +73,6 @@ class Program:
             self.entries.append((rows + self.height, part.columns[places], -part.map[rows, places]))
         self._state(constant, self.clarabel.NonnegativeConeT(len(constant)))
 
-    def log_sum(self, shifts: Array, columns: Integers) -> Integers:
-        """Place of a new variable at least log sum exp(shift + variable)."""
-        whole, shares = self.variables(1), self.variables(len(columns))
-        for shift, column, share in zip(shifts, columns, shares):  # exp(x) <= share at x = shift + variable - whole
-            for row, place, value in ((0, column, -1.0), (0, whole[0], 1.0), (2, share, -1.0)):
-                self.entries.append((np.array([row + self.height]), np.array([place]), np.array([value])))
-            self._state(np.array([shift, 1.0, 0.0]), self.clarabel.ExponentialConeT())
-        self.at_least(np.ones(1), [Part(-np.ones((1, len(shares))), shares)])
-        return whole
-
     def semidefinite(self, stated: Block, columns: Integers) -> None:
         """The block with its columns standing for the given variables."""
         self.entries.append((stated.rows + self.height, columns[stated.columns], -stated.values))

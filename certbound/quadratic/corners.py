@@ -1,14 +1,14 @@
 """The dynamics over cells of the working box as corners of linear maps.
 
-On a cell, f is its second-order Taylor polynomial about the middle plus a remainder |e_i| <= r_i (half the spread of
-the second derivatives over the cell). With the coordinates N that carry every second-order term held at a value s, it
-is A(s, d, e) z, affine in each of s, d, e: its values at the cell's corners contain it in their convex hull, and
+On a cell, f is its second-order Taylor polynomial about the middle plus a remainder e (half the spread of the second
+derivatives over the cell). With the coordinates N that carry every second-order term held at a value s, the polynomial
+is A(s, d) z, affine in each of s, d: its values at the cell's corners contain it in their convex hull, and
 z' D(s) z = 0 for the free splittings D of `splitting`. The diffusion is likewise affine in each of s where it is
 polynomial of that kind; what is left of it goes into columns of its own:
     |(G + E)' p|^2 <= (1 + a)|G' p|^2 + (1 + 1/a) (sum_i rho_i) sum_i rho_i p_i^2,   |E_i.| <= rho_i.
-Small remainders, and all beyond a few, are no corners but columns too: where |e| <= sum_b r_b |eta_b| with eta_b the
-coordinate b of the cell scaled to [-1, 1] (and eta = 1 for what is left), |e p| <= sum_b r_b (q eta_b^2 + p^2/q)/2 for any
-q > 0. So a remainder that vanishes with a coordinate costs nothing near its zero.
+Remainders are columns too: |e| <= sum_b r_b |eta_b|, with eta_b the coordinate b of the cell scaled to [-1, 1] and a last
+one equal to 1, gives |e p| <= sum_b r_b (q eta_b^2 + p^2/q)/2 for any q > 0: those that vanish with a coordinate cost
+nothing near its zero.
 """
 
 from __future__ import annotations
@@ -30,10 +30,6 @@ from certbound.rigor.intervals import Interval, sqrt, stack
 MOST_CORNERS = 256
 _EXACT = 1e-10
 """Remainders below this share of a working box a second are left to the proof, which pays for them."""
-_SMALL = 0.02
-"""Remainders below this share of a working box within the horizon are columns."""
-_FEW_CORNERS, _SMALL_DIMENSION = 16, 4
-"""Corners up to which remainders are some, and states up to which: beyond, columns and more slabs are cheaper."""
 _SLOPE = 8.0  # q: about |grad V|
 _SHARE = 0.02  # least a: the share by which the known part of the diffusion is enlarged where something is left
 
@@ -129,19 +125,15 @@ class Dynamics:
         cells = _Boxes(low, high, Interval(start, end), self.setting, self.disturbed)
         base, by_state, by_disturbance, shares = self._drift_parts(cells)
         rest = shares.sum(axis=-1)
-        plain = len(self.held) + len(self.disturbed)
-        order = sorted(range(self.n), key=lambda i: -np.max(rest.hi[:, i]))
-        room = max(int(np.log2(_FEW_CORNERS)) - plain, 0) if self.n <= _SMALL_DIMENSION else 0
-        large = [i for i in order[:room] if np.max(rest.hi[:, i]) * self.horizon > _SMALL]
-        small = [i for i in order if i not in large and np.max(rest.hi[:, i]) > _EXACT]
-        count = plain + len(large)
+        small = [i for i in range(self.n) if np.max(rest.hi[:, i]) > _EXACT]
+        count = len(self.held) + len(self.disturbed)
         if 2**count > MOST_CORNERS:
             raise InfeasibleError(f"the dynamics have {2**count} corners on a cell; at most {MOST_CORNERS} are served.")
         worst = Interval(np.zeros(self.n), np.max(rest.hi, axis=0))
         values, drifts, spreads = [], [], []
         noise = self._noise_parts(cells)
         for corner in itertools.product((0, 1), repeat=count):
-            held, shaken, extra = np.split(np.array(corner), [len(self.held), len(self.held) + len(self.disturbed)])
+            held, shaken = np.split(np.array(corner), [len(self.held)])
             at = np.where(held, high[:, self.held], low[:, self.held])
             step = [Interval.point(at[:, k]) - Interval.point(cells.middle[:, a]) for k, a in enumerate(self.held)]
             matrix = base
@@ -150,45 +142,40 @@ class Dynamics:
             signs = [2.0 * bit - 1.0 for bit in shaken]
             for part, sign, radius in zip(by_disturbance, signs, cells.sway):
                 matrix = matrix + part * (radius * Interval.point(sign))
-            drifts.append(self._with_rest(matrix, rest, dict(zip(large, 2.0 * extra - 1.0)), small))
+            drifts.append(self._widened(matrix, rest, small))
             values.append(at)
             spreads.append(_with_small(noise(step), worst, small))
         return Cells(
             low=low, high=high, held=self.held, values=np.array(values), drift=stack(drifts), spread=stack(spreads),
             affine=self._affine(cells), square=self._square(cells), toll=self._toll(shares, small),
-            bend=self._bend(shares, small, low, high),
+            bend=self._bend(shares, small, cells),
         )  # fmt: skip
 
     def _toll(self, shares: Interval, small: Sequence[int]) -> Interval:
         """sum r q/2 over what is constant of the remainders that are columns, shape (C,)."""
         return Interval.point(shares.hi[:, list(small), self.n]).sum(axis=-1) * Interval.point(_SLOPE / 2)
 
-    def _bend(self, shares: Interval, small: Sequence[int], low: Array, high: Array) -> Interval:
-        """sum r_b (q/2) eta_b^2 over the rest of them, as forms over z."""
-        weight = Interval.point(shares.hi[:, list(small), : self.n]).sum(axis=1) * Interval.point(_SLOPE / 2)
-        total: Interval = Interval.point(np.zeros((len(low), self.n + 1, self.n + 1)))
-        ends = Interval.point(low), Interval.point(high)
-        middle, half = (ends[0] + ends[1]) * Interval.point(0.5), (ends[1] - ends[0]) * Interval.point(0.5)
+    def _bend(self, shares: Interval, small: Sequence[int], cells: _Boxes) -> Interval:
+        """sum r_b (q/2) eta_b^2 over the rest of them, as forms over z, shape (C, n + 1, n + 1)."""
+        many, n = len(cells.low), self.n
+        weight = Interval.point(shares.hi[:, list(small), :n]).sum(axis=1) * Interval.point(_SLOPE / 2)
+        total: Interval = Interval.point(np.zeros((many, n + 1, n + 1)))
         for b in np.flatnonzero(weight.hi.max(axis=0) > 0):
-            lo, hi = np.zeros((2, len(low), self.n + 1))
-            slope, offset = Interval.point(1.0) / half[:, b], -(middle[:, b] / half[:, b])
-            lo[:, b], hi[:, b], lo[:, -1], hi[:, -1] = slope.lo, slope.hi, offset.lo, offset.hi
+            slope = Interval.point(1.0) / Interval.point(cells.size.hi[:, b])
+            offset = -(Interval.point(cells.middle[:, b]) * slope)
+            lo, hi = np.zeros((2, many, n + 1))
+            lo[:, b], hi[:, b], lo[:, n], hi[:, n] = slope.lo, slope.hi, offset.lo, offset.hi
             eta = Interval(lo, hi)
-            form = eta.reshape(len(low), -1, 1) * eta.reshape(len(low), 1, -1)
-            total = total + form * weight[:, b].reshape(-1, 1, 1)
+            square = eta.reshape(many, -1, 1) * eta.reshape(many, 1, -1)
+            total = total + square * weight[:, b].reshape(-1, 1, 1)
         return total
 
-    def _with_rest(
-        self, matrix: Interval, rest: Interval, signs: dict[int, float], small: Sequence[int]
-    ) -> Interval:
-        """The constant column moved by the remainders: by their end where it is a corner, else widened."""
-        lo, hi = np.zeros(matrix.shape), np.zeros(matrix.shape)
-        for i in range(self.n):
-            if i in small:
-                continue
-            lo[:, i, -1] = rest.hi[:, i] * signs[i] if i in signs else -rest.hi[:, i]
-            hi[:, i, -1] = rest.hi[:, i] * signs[i] if i in signs else rest.hi[:, i]
-        return matrix + Interval(lo, hi)
+    def _widened(self, matrix: Interval, rest: Interval, small: Sequence[int]) -> Interval:
+        """The constant column widened by the remainders that are no columns: those of rounding."""
+        wide = np.zeros(matrix.shape)
+        wide[:, : self.n, -1] = rest.hi
+        wide[:, list(small), -1] = 0.0
+        return matrix + Interval(-wide, wide)
 
     def _drift_parts(self, cells: _Boxes) -> tuple[Interval, list[Interval], list[Interval], Interval]:
         """A at the middle, its slopes along N and d, and bounds of the remainder: r_b, shape (C, n, n + 1)."""

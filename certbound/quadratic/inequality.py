@@ -1,8 +1,9 @@
 """What holds of a quadratic V, whatever proposed it.
 
-Let R = V_t + f.grad V + tr(g g' V'')/2 + |g' grad V|^2/2 on [0, T] x S with V = z' H(t) z / 2, H linear between its
-times. At fixed (t, x) and fixed values of f and g, R is convex in H: a bound at both ends of a piece, for every f and g
-that the cells allow, holds on all of it. At an end, the matrix
+Let R = V_t + f.grad V + tr(g g' V'')/2 + |g' grad V|^2/2 on [0, T] x S with V = z' H(t) z / 2, H a polynomial in Bernstein
+form between its times. At fixed (t, x) and fixed values of f and g, R is convex in (H, H'), and (H, H')(t) is a convex
+combination of control points: a bound there, for every f and g that the cells allow, holds on all of the piece. The
+matrix
 
     M = -(H' + H A + A' H + sum_c G_c' H G_c)/2 - D(s) - H G G' H/2 - sum mu_i B_i
 
@@ -24,7 +25,6 @@ from certbound.quadratic.corners import Cells
 from certbound.quadratic.form_matrices import enclosed_side_forms, splitting
 from certbound.quadratic.setting import Setting, Wall
 from certbound.quadratic.wall_program import Proposal, slopes, start_frame
-from certbound.rigor.balls import precision, upper
 from certbound.rigor.definite import eigenvalue_lower
 from certbound.rigor.intervals import Interval, concatenate, matmul, stack
 
@@ -33,7 +33,7 @@ _MOST_CORNERS = 10  # log2 of the corners of the starts that are looked at
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Proved:
-    """P(leaving through the wall from x) <= exp(growth + gap + V(0, x)) for every start x.
+    """P(leaving through the wall from x) <= exp(growth + gap + V(0, x)) for every start x, in the time looked at.
 
     Attributes
     ----------
@@ -51,13 +51,11 @@ class Proved:
     gap: float
     top: float
     proposal: Proposal
-    paid: float = -np.inf
 
     @property
     def level(self) -> float:
         """Bound of the logarithm of the probability, for the worst start."""
-        grown = Interval.point(self.growth) + Interval.point(self.gap)
-        return float((grown + Interval.point(log_sum_upper([self.top, self.paid]))).hi)
+        return float((Interval.point(self.growth) + Interval.point(self.gap) + Interval.point(self.top)).hi)
 
 
 def prove(setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cells]) -> Proved:
@@ -73,39 +71,11 @@ def prove(setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cell
             return Proved(growth=np.inf, gap=np.inf, top=np.inf, proposal=proposal)
         growth = growth + Interval.point(worst) * step
     return Proved(growth=float(growth.hi), gap=_gap(setting, wall, proposal), top=_top(setting, proposal),
-                  paid=_paid(proposal), proposal=proposal)  # fmt: skip
-
-
-def _paid(proposal: Proposal) -> float:
-    """A bound of the logarithm of what the floors cost, sum c_k h_k exp(v_k)."""
-    parts = []
-    for k in np.flatnonzero(proposal.rates > 0):
-        step = Interval.point(proposal.times[k + 1]) - Interval.point(proposal.times[k])
-        parts.append(log_upper(float((step * Interval.point(proposal.rates[k])).hi), float(proposal.floors[k])))
-    return log_sum_upper(parts)
-
-
-def log_upper(factor: float, level: float) -> float:
-    """Upper bound of log(factor) + level."""
-    from flint import arb
-    with precision():
-        return upper(arb(factor).log() + arb(level))
-
-
-def log_sum_upper(levels: Sequence[float]) -> float:
-    """Upper bound of log sum exp; -inf of none."""
-    from flint import arb
-
-    finite = [level for level in levels if level > -np.inf]
-    if not finite or not np.all(np.isfinite(finite)):
-        return float(np.inf if finite else -np.inf)
-    top = max(finite)
-    with precision():
-        return upper(sum(((arb(level) - arb(top)).exp() for level in finite), arb(0)).log() + arb(top))
+                  proposal=proposal)  # fmt: skip
 
 
 def _excess(setting: Setting, proposal: Proposal, k: int, side: int, cells: Cells, step: Interval) -> float:
-    """A bound of R at one end of a piece, over all cells."""
+    """A bound of R at one control point of a piece, over all cells."""
     matrix = _slack_matrices(setting, proposal, k, side, cells, step)
     short = np.maximum(-eigenvalue_lower(matrix), 0.0)  # (V, C)
     size = Interval.point(np.maximum(cells.low**2, cells.high**2) * (1 + 1e-15)).sum(axis=-1) + 1.0
@@ -117,19 +87,15 @@ def _slack_matrices(
 ) -> Interval:
     """M at every corner and cell, shape (V, C, n + 1, n + 1)."""
     half = Interval.point(0.5)
-    base = k * proposal.degree
+    base, (a, b, factor) = proposal.degree * k, slopes(proposal.degree)[side]
     matrix = Interval.point(proposal.matrices[base + side])
-    first, last, factor = slopes(proposal.degree)[side]
-    slope = Interval.point(proposal.matrices[base + last]) - Interval.point(proposal.matrices[base + first])
-    slope = slope * Interval.point(factor) / step
+    rise = Interval.point(proposal.matrices[base + b]) - Interval.point(proposal.matrices[base + a])
+    slope = rise * Interval.point(factor) / step
     product = matmul(matrix, cells.drift)
     total = (product + product.T) * half + slope * half + _trace(matrix, cells) * half
     border = matmul(matrix, cells.spread)
     total = total + matmul(border, border.T) * half
     total = total + _split(proposal.moves[k, side], cells) + _last(cells.toll, setting.dimension) + cells.bend
-    rate = Interval.point(proposal.rates[k])
-    floor = (Interval.point(1.0) + Interval.point(proposal.floors[k])) * rate
-    total = total + matrix * (rate * half) - _last(floor.reshape(1), setting.dimension)
     return -(total + _weighed(setting, proposal.weights[k, side], cells))
 
 
@@ -182,10 +148,11 @@ def _combined(weights: Array, forms: Interval) -> Interval:
 
 
 def _gap(setting: Setting, wall: Wall, proposal: Proposal) -> float:
-    """A bound of -V over the wall at the times of H, between which V is linear in time."""
+    """A bound of -V over the wall at the control points of the time looked at, of which V is a convex combination."""
     n, worst = setting.dimension, 0.0
     known = _known(-np.ones(n), np.ones(n), setting.inside, wall.forms)
-    for k, weights in enumerate(proposal.wall_weights):
+    for k in range(proposal.degree * proposal.first, len(proposal.matrices)):
+        weights = proposal.wall_weights[k]
         matrix = Interval.point(proposal.matrices[k]) * Interval.point(0.5) - _combined(weights, known)
         if wall.row is not None:
             outer = wall.row.reshape(-1, 1) * Interval.point(proposal.wall_rows[k]).reshape(1, -1)
@@ -242,6 +209,4 @@ def corner_levels(setting: Setting, proved: Proved) -> Array | None:
     ends = np.where(bits == 1, start.high[wide], start.low[wide])
     y = Interval.point(np.hstack([ends, np.ones((len(ends), 1))]))
     at = (matmul(y, value) * y).sum(axis=-1) * Interval.point(0.5)
-    grown = Interval.point(proved.growth) + Interval.point(proved.gap)
-    levels = np.array([log_sum_upper([float(one), proved.paid]) for one in (at + lift).hi.ravel()])
-    return np.asarray((grown + Interval.point(levels)).hi)
+    return np.asarray((at + lift + Interval.point(proved.growth) + Interval.point(proved.gap)).hi)

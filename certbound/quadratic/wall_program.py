@@ -1,9 +1,9 @@
 """The program of one wall: the least sup over the starts of V(0, .) among quadratic V that the theorem admits.
 
-V(t, x) = z' H(t) z / 2 with H piecewise linear in t. On every piece, at both its ends and at every corner (A, G) of
-every cell, with box forms B_i >= 0 on the cell,
+V(t, x) = z' H(t) z / 2 with H continuous and on every piece of time a polynomial of degree 1 or 2, in Bernstein form. At
+all its control points, and at every corner (A, G) of every cell, with box forms B_i >= 0 on the cell,
     -(H' + H A + A' H + sum_c G_c' H G_c)/2 - D(s) - H G G' H / 2 - sum_i mu_i B_i >= 0,   mu >= 0,
-which is linear in what is searched after a Schur complement; on the wall  H/2 - sum mu_i B_i - (row nu' + nu row')/2
+with H' the control point of the slope, which is linear in what is searched after a Schur complement; on the wall  H/2 - sum mu_i B_i - (row nu' + nu row')/2
 >= 0, and on the starts  rho - H(0)/2 - sum mu_i B_i >= 0. Everything here is in floating point and proves nothing.
 """
 
@@ -30,16 +30,20 @@ class Proposal:
     Attributes
     ----------
     times : ndarray, shape (K + 1,)
-    matrices : ndarray, shape (K + 1, n + 1, n + 1)
-        H at the times.
-    moves : ndarray, shape (K, 2, C, b)
-        Coefficients of the splitting at the two ends of each piece.
-    weights : ndarray, shape (K, 2, V, C, n + k)
+    degree : int
+        d, of H on a piece.
+    first : int
+        The piece with which the time begins at which the wall is looked at; it ends with the last.
+    matrices : ndarray, shape (d K + 1, n + 1, n + 1)
+        Control points of H: d k to d k + d are those of piece k, and every d-th is H at one of the times.
+    moves : ndarray, shape (K, d + 1, C, b)
+        Coefficients of the splitting at the control points of each piece.
+    weights : ndarray, shape (K, d + 1, V, C, n + k)
         mu of the cells' sides and of the inside forms.
-    wall_weights : ndarray, shape (K + 1, n + k + w)
-        mu on the wall: sides of the working box, inside forms, forms of the wall.
-    wall_rows : ndarray, shape (K + 1, n + 1)
-        nu.
+    wall_weights : ndarray, shape (d K + 1, n + k + w)
+        mu on the wall: sides of the working box, inside forms, forms of the wall; 0 before the piece ``first``.
+    wall_rows : ndarray, shape (d K + 1, n + 1)
+        nu, likewise.
     start_weights : ndarray, shape (n' + s,)
         mu of the wide sides of the starts, and of their forms.
     level : float
@@ -54,15 +58,13 @@ class Proposal:
     wall_rows: Array
     start_weights: Array
     level: float
-    degree: int
-    rates: Array
-    floors: Array
+    degree: int = 1
+    first: int = 0
 
 
-DEG = 2
-def slopes(degree: int) -> list[tuple[int, int, float]]:
-    """At each control point of a piece: the slope in time is factor (last - first) / length, of two control points."""
-    return [(0, 1, 1.0), (0, 1, 1.0)] if degree == 1 else [(0, 1, 2.0), (0, 2, 1.0), (1, 2, 2.0)]
+def slopes(degree: int) -> tuple[tuple[int, int, float], ...]:
+    """Of each control point of a piece: (a, b, c) such that c (H_b - H_a) / length is that of the slope in time."""
+    return ((0, 1, 1.0), (0, 1, 1.0)) if degree == 1 else ((0, 1, 2.0), (0, 2, 1.0), (1, 2, 2.0))
 
 
 def symmetric_basis(size: int) -> Array:
@@ -104,10 +106,7 @@ class StatedCells:
         main = -(product + product.transpose(1, 0, 2)) / 2 - self._trace(cells, c)
         sides = side_forms(cells.low[c], cells.high[c]).transpose(1, 2, 0)
         split = np.einsum("a,baij->ijb", cells.values[v, c], self.splits)
-        corner = np.zeros((size, size, 1))
-        corner[-1, -1] = 1.0
-        maps = [main, -basis / 2, basis / 2, -split, -np.concatenate([sides, self.forms], axis=2), -basis / 2,
-                -basis / 2, corner]  # fmt: skip
+        maps = [main, -basis / 2, basis / 2, -split, -np.concatenate([sides, self.forms], axis=2), -basis / 2]
         constant = -cells.bend.mid[c]
         constant[-1, -1] -= cells.toll.mid[c]
         if cells.affine is None:
@@ -129,31 +128,31 @@ class StatedCells:
 
 
 def propose(
-    setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], *, seconds: float,
-    rates: Array | None = None,
+    setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], *, seconds: float, degree: int = 2,
+    first: int = 0,
 ) -> Proposal | None:
     """What the program of a wall proposes; None where the solver failed.
 
-    ``stated`` are the cells of each piece of time with their inequality.
+    ``stated`` are the cells of each piece of time with their inequality; for ``degree`` and ``first`` see `Proposal`.
     """
-    return _WallProgram(setting, wall, times, stated, rates).solve(seconds)
+    return _WallProgram(setting, wall, times, stated, degree=degree, first=first).solve(seconds)
 
 
 class _WallProgram:
     """The program of one wall, and where its variables are."""
 
-    def __init__(self, setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], rates: Array | None) -> None:
+    def __init__(
+        self, setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], *, degree: int, first: int
+    ) -> None:
         self.setting, self.wall, self.times, self.stated = setting, wall, times, stated
+        self.degree, self.first = degree, first
         cells = [one.cells for one in stated]
         self.cells = cells
         self.size = setting.dimension + 1
         self.basis = symmetric_basis(self.size)
         self.program = Program()
         count = self.basis.shape[2]
-        self.degree = DEG
-        self.nodes = [self.program.variables(count) for _ in range(self.degree * (len(times) - 1) + 1)]
-        self.rates = np.zeros(len(times) - 1) if rates is None else rates
-        self.floors = self.program.variables(len(times) - 1)
+        self.nodes = [self.program.variables(count) for _ in range(degree * len(stated) + 1)]
         self.splits = splitting(setting.dimension, cells[0].held)
         self.forms = setting.inside.mid.transpose(1, 2, 0)
         self.squares: dict[tuple[int, int, int], Integers] = {}
@@ -163,18 +162,10 @@ class _WallProgram:
 
     def solve(self, seconds: float) -> Proposal | None:
         self._generator()
-        walls = [self._at_wall(node) for node in self.nodes]
+        before = self.degree * self.first
+        walls = [self._at_wall(node) for node in self.nodes[before:]]
         level, start = self._at_start()
-        whole = level
-        used = np.flatnonzero(self.rates)
-        if len(used):
-            weights = np.log(self.rates[used] * np.diff(self.times)[used])
-            whole = self.program.variables(1)
-            self.program.at_least(np.zeros(1), [Part(np.eye(1), whole), Part(-np.eye(1), level)])
-            for k in used:
-                self.program.at_least(np.array([-np.log(self.rates[k]*self.times[-1])]), [Part(np.eye(1), whole), Part(-np.eye(1), self.floors[k:k+1])])
-        for k in np.flatnonzero(self.rates == 0): self.program.at_least(np.zeros(1), [Part(np.eye(1), self.floors[k:k+1])])
-        found = self.program.minimise(int(whole[0]), seconds=seconds)
+        found = self.program.minimise(int(level[0]), seconds=seconds)
         if found is None:
             return None
         return Proposal(
@@ -182,11 +173,11 @@ class _WallProgram:
             matrices=np.array([self.basis @ found[node] for node in self.nodes]),
             moves=found[np.array(self.moves, dtype=np.int64)],
             weights=np.maximum(found[np.array(self.weights)], 0.0),
-            wall_weights=np.maximum(found[np.array([mu for mu, _ in walls])], 0.0),
-            wall_rows=found[np.array([nu for _, nu in walls], dtype=np.int64)],
+            wall_weights=_after(before, np.maximum(found[np.array([mu for mu, _ in walls])], 0.0)),
+            wall_rows=_after(before, found[np.array([nu for _, nu in walls], dtype=np.int64)]),
             start_weights=np.maximum(found[np.asarray(start, dtype=np.int64)], 0.0),
             level=float(found[level[0]]),
-            degree=self.degree, rates=self.rates, floors=found[self.floors],
+            degree=self.degree, first=self.first,
         )
 
     # ---- the inequality of the generator -----------------------------------------------------------------------
@@ -197,43 +188,28 @@ class _WallProgram:
         for k, one in enumerate(self.stated):
             length = float(self.times[k + 1] - self.times[k])
             ends = []
-            for place, (first, last, factor) in enumerate(slopes(self.degree)):
-                blocks = [[self._timed(one, block_, length / factor, float(self.rates[k])) for block_ in row] for row in one.blocks]
-                base = k * self.degree
-                ends.append(self._piece(k, base + place, (base + first, base + last), one, blocks))
+            for place, (a, b, factor) in enumerate(slopes(self.degree)):
+                blocks = [[_timed(stated, self.basis.shape[2], length / factor) for stated in row] for row in one.blocks]
+                base = self.degree * k
+                ends.append(self._piece(base + place, (base + a, base + b), one, blocks))
             self.moves.append([moves for moves, _ in ends])
             self.weights.append([weights for _, weights in ends])
 
     def _piece(
-        self, k: int, end: int, slope: tuple[int, int], one: StatedCells, blocks: list[list[Block]]
+        self, point: int, slope: tuple[int, int], one: StatedCells, blocks: list[list[Block]]
     ) -> tuple[list[Integers], list[list[Integers]]]:
-        """State the inequality at one end of a piece, for all cells and corners: the places of D and mu."""
+        """State the inequality at a control point, for all cells and corners: the places of D and mu."""
         program, many = self.program, len(one.cells.low)
         moves = [program.variables(len(self.splits)) for _ in range(many)]
         weights = []
         for corner, row in enumerate(blocks):
             weights.append([program.nonnegative(self.size - 1 + self.forms.shape[2]) for _ in range(many)])
             for c, stated in enumerate(row):
-                square = self._square(end, one, int(one.group[corner, c]))
-                parts = [self.nodes[end], self.nodes[slope[1]], self.nodes[slope[0]], moves[c], weights[corner][c], square]
-                parts += [self.nodes[end], self.floors[k : k + 1]]
-                parts += [] if not self.absolute else [self.absolute[end]]  # type: ignore[list-item]
+                square, (a, b) = self._square(point, one, int(one.group[corner, c])), slope
+                parts = [self.nodes[point], self.nodes[b], self.nodes[a], moves[c], weights[corner][c], square]
+                parts += [] if not self.absolute else [self.absolute[point]]  # type: ignore[list-item]
                 program.semidefinite(stated, np.concatenate(parts))
         return moves, weights
-
-    def _timed(self, one: StatedCells, stated: Block, length: float, rate: float) -> Block:
-        """The block with its slope in time divided by a length, and with the floor at a rate."""
-        count = self.basis.shape[2]
-        first = 4 * count + len(self.splits) + self.size - 1 + self.forms.shape[2]  # H(end), the floor
-        columns = stated.columns
-        scale = np.ones(len(columns))
-        scale[(columns >= count) & (columns < 3 * count)] = 1 / length
-        scale[(columns >= first) & (columns <= first + count)] = rate
-        constant = stated.constant.copy()
-        constant[-1] += rate
-        used = scale != 0
-        return stated._replace(rows=stated.rows[used], columns=columns[used], values=(stated.values * scale)[used],
-                               constant=constant)  # fmt: skip
 
     def _square(self, end: int, one: StatedCells, group: int) -> Integers:
         """Variables Y >= H G G' H at a time, the same for all corners with that diffusion."""
@@ -297,3 +273,14 @@ class _WallProgram:
         program.semidefinite(stated, np.concatenate([level, self.nodes[0], weights]))
         program.at_least(np.array([-_DEEPEST]), [Part(np.eye(1), level)])
         return level, weights
+
+
+def _after(count: int, values: Array) -> Array:
+    """The values after so many rows of zeros."""
+    return np.concatenate([np.zeros((count, *values.shape[1:])), values])
+
+
+def _timed(stated: Block, count: int, length: float) -> Block:
+    """The block with the slope in time, its second and third groups of ``count`` columns, divided by a length."""
+    slope = (stated.columns >= count) & (stated.columns < 3 * count)
+    return stated._replace(values=np.where(slope, stated.values / length, stated.values))
