@@ -274,6 +274,13 @@ class Dynamics:
         return columns @ columns.T
 
 
+def curved_axes(problem: Problem) -> set[int]:
+    """Coordinates on which the drift does not depend affinely, or the diffusion at all."""
+    n, diffusion = problem.system.dimension, diffusion_of(problem)
+    found = {a for pair in _Jet(problem.closed_loop, n).pairs for a in pair if a < n}
+    return found | (_Jet(diffusion, n).used if isinstance(diffusion, Tape) else set())
+
+
 class _Shares:
     """Bounds of the remainder's parts, by the coordinate with which each vanishes (the last: none)."""
 

@@ -58,8 +58,10 @@ class Proved:
         return float((Interval.point(self.growth) + Interval.point(self.gap) + Interval.point(self.top)).hi)
 
 
-def prove(setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cells]) -> Proved:
-    """The bound that a proposal gives; +inf in it where something is unbounded.
+def prove(
+    setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cells], *, others: Sequence[Wall] = ()
+) -> Proved:
+    """The bound that a proposal gives, of leaving through the wall or the others; +inf where something is unbounded.
 
     ``cells`` holds those of each piece of time, which must cover the safe part of the working box.
     """
@@ -70,8 +72,9 @@ def prove(setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cell
         if not np.isfinite(worst):
             return Proved(growth=np.inf, gap=np.inf, top=np.inf, proposal=proposal)
         growth = growth + Interval.point(worst) * step
-    return Proved(growth=float(growth.hi), gap=_gap(setting, wall, proposal), top=_top(setting, proposal),
-                  proposal=proposal)  # fmt: skip
+    known = zip((wall, *others), ((proposal.wall_weights, proposal.wall_rows), *proposal.others), strict=True)
+    gap = max(_gap(setting, one, proposal, *multipliers) for one, multipliers in known)
+    return Proved(growth=float(growth.hi), gap=gap, top=_top(setting, proposal), proposal=proposal)
 
 
 def _excess(setting: Setting, proposal: Proposal, k: int, side: int, cells: Cells, step: Interval) -> float:
@@ -147,15 +150,15 @@ def _combined(weights: Array, forms: Interval) -> Interval:
     return (positive * forms).sum(axis=0)
 
 
-def _gap(setting: Setting, wall: Wall, proposal: Proposal) -> float:
+def _gap(setting: Setting, wall: Wall, proposal: Proposal, wall_weights: Array, wall_rows: Array) -> float:
     """A bound of -V over the wall at the control points of the time looked at, of which V is a convex combination."""
     n, worst = setting.dimension, 0.0
     known = _known(-np.ones(n), np.ones(n), setting.inside, wall.forms)
     for k in range(proposal.degree * proposal.first, len(proposal.matrices)):
-        weights = proposal.wall_weights[k]
+        weights = wall_weights[k]
         matrix = Interval.point(proposal.matrices[k]) * Interval.point(0.5) - _combined(weights, known)
         if wall.row is not None:
-            outer = wall.row.reshape(-1, 1) * Interval.point(proposal.wall_rows[k]).reshape(1, -1)
+            outer = wall.row.reshape(-1, 1) * Interval.point(wall_rows[k]).reshape(1, -1)
             matrix = matrix - (outer + outer.T) * Interval.point(0.5)
         worst = max(worst, float(-eigenvalue_lower(matrix)))
     return float((Interval.point(worst) * Interval.point(float(n + 1))).hi) if np.isfinite(worst) else np.inf

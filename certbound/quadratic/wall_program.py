@@ -34,6 +34,8 @@ class Proposal:
         d, of H on a piece.
     first : int
         The piece with which the time begins at which the wall is looked at; it ends with the last.
+    others : tuple of (ndarray, ndarray)
+        ``wall_weights`` and ``wall_rows`` of further walls that the same V serves.
     matrices : ndarray, shape (d K + 1, n + 1, n + 1)
         Control points of H: d k to d k + d are those of piece k, and every d-th is H at one of the times.
     moves : ndarray, shape (K, d + 1, C, b)
@@ -60,6 +62,7 @@ class Proposal:
     level: float
     degree: int = 1
     first: int = 0
+    others: tuple[tuple[Array, Array], ...] = ()
 
 
 def slopes(degree: int) -> tuple[tuple[int, int, float], ...]:
@@ -129,22 +132,23 @@ class StatedCells:
 
 def propose(
     setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], *, seconds: float, degree: int = 2,
-    first: int = 0,
+    first: int = 0, others: Sequence[Wall] = (),
 ) -> Proposal | None:
-    """What the program of a wall proposes; None where the solver failed.
+    """What the program of a wall, and of others with the same V, proposes; None where the solver failed.
 
     ``stated`` are the cells of each piece of time with their inequality; for ``degree`` and ``first`` see `Proposal`.
     """
-    return _WallProgram(setting, wall, times, stated, degree=degree, first=first).solve(seconds)
+    return _WallProgram(setting, (wall, *others), times, stated, degree=degree, first=first).solve(seconds)
 
 
 class _WallProgram:
-    """The program of one wall, and where its variables are."""
+    """The program of one V, and where its variables are."""
 
     def __init__(
-        self, setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], *, degree: int, first: int
+        self, setting: Setting, walls: Sequence[Wall], times: Array, stated: Sequence[StatedCells], *, degree: int,
+        first: int,
     ) -> None:
-        self.setting, self.wall, self.times, self.stated = setting, wall, times, stated
+        self.setting, self.walls, self.times, self.stated = setting, walls, times, stated
         self.degree, self.first = degree, first
         cells = [one.cells for one in stated]
         self.cells = cells
@@ -163,18 +167,21 @@ class _WallProgram:
     def solve(self, seconds: float) -> Proposal | None:
         self._generator()
         before = self.degree * self.first
-        walls = [self._at_wall(node) for node in self.nodes[before:]]
+        places = [[self._at_wall(wall, node) for node in self.nodes[before:]] for wall in self.walls]
         level, start = self._at_start()
         found = self.program.minimise(int(level[0]), seconds=seconds)
         if found is None:
             return None
+        walls = [
+            (_after(before, np.maximum(found[np.array([mu for mu, _ in one])], 0.0)),
+             _after(before, found[np.array([nu for _, nu in one], dtype=np.int64)])) for one in places
+        ]  # fmt: skip
         return Proposal(
             times=self.times,
             matrices=np.array([self.basis @ found[node] for node in self.nodes]),
             moves=found[np.array(self.moves, dtype=np.int64)],
             weights=np.maximum(found[np.array(self.weights)], 0.0),
-            wall_weights=_after(before, np.maximum(found[np.array([mu for mu, _ in walls])], 0.0)),
-            wall_rows=_after(before, found[np.array([nu for _, nu in walls], dtype=np.int64)]),
+            wall_weights=walls[0][0], wall_rows=walls[0][1], others=tuple(walls[1:]),
             start_weights=np.maximum(found[np.asarray(start, dtype=np.int64)], 0.0),
             level=float(found[level[0]]),
             degree=self.degree, first=self.first,
@@ -241,16 +248,16 @@ class _WallProgram:
 
     # ---- wall and starts ---------------------------------------------------------------------------------------
 
-    def _at_wall(self, node: Integers) -> tuple[Integers, Integers]:
+    def _at_wall(self, wall: Wall, node: Integers) -> tuple[Integers, Integers]:
         n, program = self.size - 1, self.program
-        forms = self.wall.forms.mid.transpose(1, 2, 0)
+        forms = wall.forms.mid.transpose(1, 2, 0)
         sides = side_forms(-np.ones(n), np.ones(n)).transpose(1, 2, 0)
         known = np.concatenate([sides, self.forms, forms], axis=2)
         weights = program.nonnegative(known.shape[2])
         maps, columns = [self.basis / 2, -known], [node, weights]
-        rows = program.variables(self.size if self.wall.row is not None else 0)
-        if self.wall.row is not None:
-            row, eye = self.wall.row.mid, np.eye(self.size)
+        rows = program.variables(self.size if wall.row is not None else 0)
+        if wall.row is not None:
+            row, eye = wall.row.mid, np.eye(self.size)
             outer = np.einsum("i,jk->ijk", row, eye)
             maps.append(-(outer + outer.transpose(1, 0, 2)) / 2)
             columns.append(rows)
