@@ -75,11 +75,7 @@ class Attempt:
     def finer(self, option: int) -> list[Attempt]:
         """Not yet tried: walls by themselves, two windows, twice the pieces, or more slabs (two are seldom enough)."""
         if option == APART:
-            walls = (self.wall, *self.others)
-            own = tuple(wall for wall in walls if wall.own)
-            groups = [(wall,) for wall in walls if not wall.own]
-            groups += [own] if own and groups else [(wall,) for wall in own]
-            return [self._changed(walls=group) for group in groups]
+            return [self._changed(walls=group) for group in apart((self.wall, *self.others))]
         if option == SPLIT:
             start, end = self.during
             middle = (start + end) / 2
@@ -104,6 +100,13 @@ class Attempt:
     def blocks(self) -> int:
         """Matrix inequalities of its program."""
         return int(3 * (len(self.times[0]) - 1) * math.prod(self.slabs) * 2 ** len(self.slabs))
+
+
+def apart(walls: Sequence[Wall]) -> list[tuple[Wall, ...]]:
+    """Walls by themselves, but sides along which the model is affine as one at first, as they can be far."""
+    far = tuple(wall for wall in walls if wall.far)
+    alone = [(wall,) for wall in walls if not wall.far]
+    return alone + ([far] if alone and far else [(wall,) for wall in far])
 
 
 def total(attempts: Sequence[Attempt]) -> tuple[float, Array]:

@@ -91,7 +91,7 @@ class Program:
         objective[column] = 1.0
         settings = self.clarabel.DefaultSettings()
         settings.verbose, settings.max_iter, settings.time_limit = False, 80, float(seconds)
-        settings.tol_gap_rel, settings.tol_gap_abs, settings.tol_feas = 1e-4, 1e-4, 1e-8
+        settings.tol_gap_rel, settings.tol_gap_abs, settings.tol_feas = 1e-4, 1e-4, 1e-7
         settings.max_threads = 1
         settings.equilibrate_enable, settings.static_regularization_constant = False, 1e-7  # else it may break down
         nothing = sparse.csc_matrix((self.width, self.width))

@@ -6,7 +6,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,8 +14,8 @@ from certbound.arrays import Array
 from certbound.display import rounded
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.quadratic.attempts import APART, PIECES, SPLIT, Attempt, log10_up, log_sum, total
-from certbound.quadratic.corners import Dynamics
+from certbound.quadratic.attempts import APART, PIECES, SPLIT, Attempt, apart, log10_up, log_sum, total
+from certbound.quadratic.corners import Dynamics, curved_axes
 from certbound.quadratic.inequality import corner_levels, prove
 from certbound.quadratic.setting import Setting, Wall, make_setting, refuse
 from certbound.quadratic.surroundings import moved_sides, working_box
@@ -174,7 +174,9 @@ def _boxes(problem: Problem) -> list[tuple[Array, Array]]:
 
 def make_search(problem: Problem, low: Array, high: Array, *, together: bool = False) -> Search:
     """The search on the working box [low, high], its sides ``together`` at first; for errors see `bound_quadratic`."""
-    return Search(problem, make_setting(problem, low, high), together=together)
+    setting, curved = make_setting(problem, low, high), curved_axes(problem)
+    walls = tuple(replace(w, far=w.side is not None and w.side[0] not in curved) for w in setting.walls)
+    return Search(problem, replace(setting, walls=walls), together=together)
 
 
 class Search:
@@ -318,10 +320,10 @@ class Search:
 
 
 def _groups(setting: Setting, *, together: bool) -> list[tuple[Wall, ...]]:
-    """The walls, but sides of the working box as one, all or those of its own: few are worth programs of their own."""
-    sides = tuple(wall for wall in setting.walls if wall.side is not None and (wall.own or together))
-    alone = [wall for wall in setting.walls if wall not in sides]
-    return [(wall,) for wall in alone] + ([sides] if sides else [])
+    """The walls, but sides of the working box as one at first: few are worth programs of their own."""
+    sides = tuple(wall for wall in setting.walls if wall.side is not None)
+    alone = [(wall,) for wall in setting.walls if wall.side is None]
+    return alone + ([sides] if together and sides else apart(sides))
 
 
 def _grid(n: int, held: Sequence[int], slabs: Sequence[int]) -> tuple[Array, Array]:

@@ -39,12 +39,15 @@ class Wall:
         Quadratic forms that are at least 0 where paths can leave.
     own : bool
         Whether it is a side that the working box has of its own, inside the safe set.
+    far : bool
+        Whether it is a side along whose coordinate the model is affine.
     """
 
     label: str
     row: Interval | None
     forms: Interval
     own: bool = False
+    far: bool = False
 
     @property
     def side(self) -> tuple[int, int] | None:
