@@ -6,9 +6,9 @@ is A(s, d) z, affine in each of s, d: its values at the cell's corners contain i
 z' D(s) z = 0 for the free splittings D of `splitting`. The diffusion is likewise affine in each of s where it is
 polynomial of that kind; what is left of it goes into columns of its own:
     |(G + E)' p|^2 <= (1 + a)|G' p|^2 + (1 + 1/a) (sum_i rho_i) sum_i rho_i p_i^2,   |E_i.| <= rho_i.
-Remainders are columns too: |e| <= sum_b r_b |eta_b|, with eta_b the coordinate b of the cell scaled to [-1, 1] and a last
-one equal to 1, gives |e p| <= sum_b r_b (q eta_b^2 + p^2/q)/2 for any q > 0: those that vanish with a coordinate cost
-nothing near its zero.
+Remainders are columns too: |e| <= sum_b r_b |eta_b|, with eta_b the coordinate b of the cell scaled to [-1, 1] and a
+last one equal to 1, gives |e p| <= sum_b r_b (q eta_b^2 + p^2/q)/2 for any q > 0: a remainder that vanishes with a
+coordinate costs nothing near its zero.
 """
 
 from __future__ import annotations
@@ -24,14 +24,11 @@ from certbound.constants.enclosures import enclose
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, edged, is_zero, jacobian
 from certbound.problem.problem import Problem
+from certbound.quadratic.noise_columns import EXACT, SLOPE, padded, with_columns, with_small
 from certbound.quadratic.setting import Setting, diffusion_of
-from certbound.rigor.intervals import Interval, sqrt, stack
+from certbound.rigor.intervals import Interval, stack
 
 MOST_CORNERS = 256
-_EXACT = 1e-10
-"""Remainders below this share of a working box a second are left to the proof, which pays for them."""
-_SLOPE = 8.0  # q: about |grad V|
-_SHARE = 0.02  # least a: the share by which the known part of the diffusion is enlarged where something is left
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -125,7 +122,7 @@ class Dynamics:
         cells = _Boxes(low, high, Interval(start, end), self.setting, self.disturbed)
         base, by_state, by_disturbance, shares = self._drift_parts(cells)
         rest = shares.sum(axis=-1)
-        small = [i for i in range(self.n) if np.max(rest.hi[:, i]) > _EXACT]
+        small = [i for i in range(self.n) if np.max(rest.hi[:, i]) > EXACT]
         count = len(self.held) + len(self.disturbed)
         if 2**count > MOST_CORNERS:
             raise InfeasibleError(f"the dynamics have {2**count} corners on a cell; at most {MOST_CORNERS} are served.")
@@ -144,7 +141,7 @@ class Dynamics:
                 matrix = matrix + part * (radius * Interval.point(sign))
             drifts.append(self._widened(matrix, rest, small))
             values.append(at)
-            spreads.append(_with_small(noise(step), worst, small))
+            spreads.append(with_small(noise(step), worst, small))
         return Cells(
             low=low, high=high, held=self.held, values=np.array(values), drift=stack(drifts), spread=stack(spreads),
             affine=self._affine(cells), square=self._square(cells), toll=self._toll(shares, small),
@@ -153,12 +150,12 @@ class Dynamics:
 
     def _toll(self, shares: Interval, small: Sequence[int]) -> Interval:
         """sum r q/2 over what is constant of the remainders that are columns, shape (C,)."""
-        return Interval.point(shares.hi[:, list(small), self.n]).sum(axis=-1) * Interval.point(_SLOPE / 2)
+        return Interval.point(shares.hi[:, list(small), self.n]).sum(axis=-1) * Interval.point(SLOPE / 2)
 
     def _bend(self, shares: Interval, small: Sequence[int], cells: _Boxes) -> Interval:
         """sum r_b (q/2) eta_b^2 over the rest of them, as forms over z, shape (C, n + 1, n + 1)."""
         many, n = len(cells.low), self.n
-        weight = Interval.point(shares.hi[:, list(small), :n]).sum(axis=1) * Interval.point(_SLOPE / 2)
+        weight = Interval.point(shares.hi[:, list(small), :n]).sum(axis=1) * Interval.point(SLOPE / 2)
         total: Interval = Interval.point(np.zeros((many, n + 1, n + 1)))
         for b in np.flatnonzero(weight.hi.max(axis=0) > 0):
             slope = Interval.point(1.0) / Interval.point(cells.size.hi[:, b])
@@ -219,7 +216,7 @@ class Dynamics:
         n, m = self.n, self.noises
         width = Interval.point(self.setting.width).reshape(1, -1, 1)
         if self.noise is None:
-            fixed = _padded((self.constant.reshape(1, n, m) / width).broadcast_to((len(cells.low), n, m)))  # type: ignore[union-attr]
+            fixed = padded((self.constant.reshape(1, n, m) / width).broadcast_to((len(cells.low), n, m)))  # type: ignore[union-attr]
             return lambda step: fixed
         value, slope, curve = self.noise.at(cells)
         size = cells.size
@@ -241,7 +238,7 @@ class Dynamics:
                 total = total + slope[:, :, a] * step[k].reshape(-1, 1)
             for first, second, part in cross:
                 total = total + part * (step[first] * step[second]).reshape(-1, 1)
-            return _with_columns(total.reshape(-1, n, m), rest)
+            return with_columns(total.reshape(-1, n, m), rest)
 
         return columns
 
@@ -377,35 +374,3 @@ def _along(value: Interval, axis: int, middle: Array) -> Interval:
     last = -(value * Interval.point(middle[:, axis]).reshape(-1, 1))
     lo[:, :n, axis], hi[:, :n, axis], lo[:, :n, n], hi[:, :n, n] = value.lo, value.hi, last.lo, last.hi
     return Interval(lo, hi)
-
-
-def _padded(columns: Interval) -> Interval:
-    """A row of zeros below matrices of shape (C, n, m)."""
-    pad = [(0, 0), (0, 1), (0, 0)]
-    return Interval(np.pad(columns.lo, pad), np.pad(columns.hi, pad))
-
-
-def _with_columns(columns: Interval, rest: Interval) -> Interval:
-    """The columns enlarged, with others for what is left of them: rest (C, n) bounds the row sums of |E|."""
-    if np.max(rest.hi) < _EXACT:  # rounding: the proof pays for it
-        wide = Interval(-rest.hi, rest.hi).reshape(*rest.shape, 1)
-        return _padded(columns + wide)
-    n, loose = columns.shape[1], np.flatnonzero(np.max(rest.hi, axis=0) > 0)
-    total = rest.sum(axis=-1).hi
-    size = float(np.max(np.linalg.norm(columns.mid, axis=1)))
-    share = float(np.clip(np.max(total) / max(size, 1e-300), _SHARE, 1.0))
-    known = columns * sqrt(Interval.point(1.0) + Interval.point(share))
-    weight = (Interval.point(1.0) + Interval.point(1.0) / Interval.point(share)) * Interval.point(total)
-    side = sqrt(weight.reshape(-1, 1) * Interval.point(rest.hi))
-    others = side.reshape(-1, n, 1) * Interval.point(np.eye(n)[:, loose])
-    return _padded(Interval(np.concatenate([known.lo, others.lo], 2), np.concatenate([known.hi, others.hi], 2)))
-
-
-def _with_small(columns: Interval, worst: Interval, small: Sequence[int]) -> Interval:
-    """More columns sqrt(r_i / q) e_i."""
-    if not small:
-        return columns
-    batch, size, _ = columns.shape
-    more = np.zeros((batch, size, len(small)))
-    more[:, list(small), np.arange(len(small))] = (sqrt(Interval.point(worst.hi[list(small)] / _SLOPE))).hi
-    return Interval(np.concatenate([columns.lo, more], axis=2), np.concatenate([columns.hi, more], axis=2))

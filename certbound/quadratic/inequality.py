@@ -1,13 +1,13 @@
 """What holds of a quadratic V, whatever proposed it.
 
-Let R = V_t + f.grad V + tr(g g' V'')/2 + |g' grad V|^2/2 on [0, T] x S with V = z' H(t) z / 2, H a polynomial in Bernstein
-form between its times. At fixed (t, x) and fixed values of f and g, R is convex in (H, H'), and (H, H')(t) is a convex
-combination of control points: a bound there, for every f and g that the cells allow, holds on all of the piece. The
-matrix
+Let R = V_t + f.grad V + tr(g g' V'')/2 + |g' grad V|^2/2 on [0, T] x S with V = z' H(t) z / 2, H a polynomial in
+Bernstein form between its times. At fixed (t, x) and fixed values of f and g, R is convex in (H, H'), and (H, H')(t) is
+a convex combination of control points: a bound there, for every f and g that the cells allow, holds on all of the
+piece. The matrix
 
     M = -(H' + H A + A' H + sum_c G_c' H G_c)/2 - D(s) - H G G' H/2 - sum mu_i B_i
 
-is concave in G and affine in each of the held values, the disturbances and the remainders, so that M + e >= 0 at all
+is concave in G and affine in each of the held values and the disturbances, so that M + e >= 0 at all
 corners of a cell gives z' M z >= -e |z|^2 there, hence R <= e |z|^2 =: lam. The smallest eigenvalues are bounded from
 below in outward-rounded arithmetic; the multipliers only have to be at least 0 and the splittings to cancel, which they
 do by construction. The same is done on the wall, V >= -gap, and on the starts, V(0, .) <= top.

@@ -14,11 +14,11 @@ from certbound.arrays import Array
 from certbound.display import rounded
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.quadratic.attempts import APART, PIECES, SPLIT, Attempt, apart, log10_up, log_sum, total
 from certbound.quadratic.corners import Dynamics, curved_axes
 from certbound.quadratic.inequality import corner_levels, prove
 from certbound.quadratic.setting import Setting, Wall, make_setting, refuse
 from certbound.quadratic.surroundings import moved_sides, working_box
+from certbound.quadratic.wall_attempts import APART, PIECES, SPLIT, Attempt, apart, log10_up, log_sum, total
 from certbound.quadratic.wall_program import StatedCells, propose
 from certbound.watch import poll
 
@@ -223,9 +223,9 @@ class Search:
         level, parts = total(self.attempts)
         yield self._answer(level)
         place = len(self.attempts) - 1
-        if _log10(target) < level / math.log(10) < 0 and self.attempts[place].others:
-            if parts[place] >= level + math.log(_DONE) and self._refined(place, until):
-                yield self._answer(total(self.attempts)[0])
+        unsettled = _log10(target) < level / math.log(10) < 0 and self.attempts[place].others
+        if unsettled and parts[place] >= level + math.log(_DONE) and self._refined(place, until):
+            yield self._answer(total(self.attempts)[0])
 
     def run(self, target: float, share: float, found: Callable[[QuadraticBound], object]) -> None:
         """Refine the wall that counts most until the target or the time is reached; each better bound is told."""
@@ -267,7 +267,7 @@ class Search:
         options = [PIECES, SPLIT, *range(len(attempt.slabs))]
         if attempt.proved is None:  # windows are no cure
             options.remove(SPLIT)
-        if attempt.others:
+        if attempt.others and attempt.gains.get(APART, math.inf) > 0:
             options = [APART]
         hopes = {k: attempt.gains.get(k, self.gains.get(k, math.inf)) for k in options}
         children = {k: attempt.finer(k) for k in options}

@@ -1,9 +1,9 @@
 """The program of one wall: the least sup over the starts of V(0, .) among quadratic V that the theorem admits.
 
-V(t, x) = z' H(t) z / 2 with H continuous and on every piece of time a polynomial of degree 1 or 2, in Bernstein form. At
-all its control points, and at every corner (A, G) of every cell, with box forms B_i >= 0 on the cell,
+V(t, x) = z' H(t) z / 2 with H continuous and on every piece of time a polynomial of degree 1 or 2, in Bernstein form.
+At all its control points, H' that of the slope, at every corner (A, G) of every cell, with box forms B_i >= 0 there,
     -(H' + H A + A' H + sum_c G_c' H G_c)/2 - D(s) - H G G' H / 2 - sum_i mu_i B_i >= 0,   mu >= 0,
-with H' the control point of the slope, which is linear in what is searched after a Schur complement; on the wall  H/2 - sum mu_i B_i - (row nu' + nu row')/2
+which is linear in what is searched after a Schur complement; on the wall  H/2 - sum mu_i B_i - (row nu' + nu row')/2
 >= 0, and on the starts  rho - H(0)/2 - sum mu_i B_i >= 0. Everything here is in floating point and proves nothing.
 """
 
@@ -196,8 +196,8 @@ class _WallProgram:
             length = float(self.times[k + 1] - self.times[k])
             ends = []
             for place, (a, b, factor) in enumerate(slopes(self.degree)):
-                blocks = [[_timed(stated, self.basis.shape[2], length / factor) for stated in row] for row in one.blocks]
-                base = self.degree * k
+                base, count = self.degree * k, self.basis.shape[2]
+                blocks = [[_timed(stated, count, length / factor) for stated in row] for row in one.blocks]
                 ends.append(self._piece(base + place, (base + a, base + b), one, blocks))
             self.moves.append([moves for moves, _ in ends])
             self.weights.append([weights for _, weights in ends])

@@ -1,4 +1,4 @@
-"""One wall, or several, in one window of time: the best bound so far, how finely it was found, what may be finer, and their sum."""
+"""Bounds of leaving through one wall, or some, in one window of time: how finely they were found, and their sum."""
 
 from __future__ import annotations
 
