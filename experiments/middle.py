@@ -36,10 +36,10 @@ def quadrotor(noise: float) -> cb.Problem:
     vertical speed by .2 and the gust by .5.
     """
 
-    def dynamics(s: Array) -> list[object]:
-        x, z, th, vx, vz, w = s
+    def dynamics(x: Array) -> list[object]:
+        place, z, th, vx, vz, w = x
         lift = GRAVITY - 2.0 * z - 1.8 * vz
-        return [vx, vz, -4.0 * th + x + 1.4 * vx, -lift * np.sin(th) + w, lift * np.cos(th) - GRAVITY, -w]
+        return [vx, vz, -4.0 * th + place + 1.4 * vx, -lift * np.sin(th) + w, lift * np.cos(th) - GRAVITY, -w]
 
     shaken = noise * np.array([[0, 0, 0.1, 0, 0, 0], [0, 0, 0, 0, 0.2, 0], [0, 0, 0, 0, 0, 0.5]]).T
     system = cb.ContinuousSystem(dynamics, states=["x", "z", "th", "vx", "vz", "w"], diffusion=shaken)
@@ -52,13 +52,13 @@ def quadrotor(noise: float) -> cb.Problem:
 def platoon(noise: float) -> cb.Problem:
     """Three vehicles on springs, shaken by one noise in proportion to 1 - v; they must keep their order."""
 
-    def dynamics(s: Array) -> list[object]:
-        p1, v1, p2, v2, p3, v3 = s
+    def dynamics(x: Array) -> list[object]:
+        p1, v1, p2, v2, p3, v3 = x
         front, back = p2 - p1 - 0.5, 0.75 * (p3 - p2 - 0.7)
         return [v1, front - v1, v2, -p2 - v2 - front + back, v3, -back - v3]
 
-    def diffusion(s: Array) -> list[list[object]]:
-        return [[0.0] if k % 2 == 0 else [noise * (1 - s[k])] for k in range(6)]
+    def diffusion(x: Array) -> list[list[object]]:
+        return [[0.0] if k % 2 == 0 else [noise * (1 - x[k])] for k in range(6)]
 
     system = cb.ContinuousSystem(dynamics, states=["p1", "v1", "p2", "v2", "p3", "v3"], diffusion=diffusion)
     order = [cb.Inside(cb.HalfSpace(normal, 0.0)) for normal in ([1, 0, -1, 0, 0, 0], [0, 0, 1, 0, -1, 0])]
@@ -80,9 +80,9 @@ def cart_pole(noise: float) -> cb.Problem:
     """A pole of .2 kg and half a metre on a cart of 1 kg, held upright by LQR between limits of the cart."""
     mass, length, gain = 0.2, 0.5, balancing_gain()
 
-    def dynamics(s: Array) -> list[object]:
-        _, v, th, w = s
-        force = -sum(k * value for k, value in zip(gain, s))
+    def dynamics(x: Array) -> list[object]:
+        _, v, th, w = x
+        force = -sum(k * value for k, value in zip(gain, x))
         sine, cosine = np.sin(th), np.cos(th)
         heavy = 1.0 + mass * sine**2
         push = (force + mass * length * w**2 * sine - mass * GRAVITY * sine * cosine) / heavy
@@ -100,11 +100,11 @@ def flows(noise: float, count: int) -> cb.Problem:
     """Lorenz-like flows of three states, each drawn a little to the next."""
     n = 3 * count
 
-    def dynamics(s: Array) -> list[object]:
+    def dynamics(x: Array) -> list[object]:
         rows: list[object] = []
         for k in range(0, n, 3):
-            x, y, z = s[k], s[k + 1], s[k + 2]
-            rows += [2 * (y - x) + (0.1 * (s[(k + 3) % n] - x) if count > 1 else 0.0), x * (0.5 - z) - y, x * y - z]
+            a, b, c = x[k], x[k + 1], x[k + 2]
+            rows += [2 * (b - a) + (0.1 * (x[(k + 3) % n] - a) if count > 1 else 0.0), a * (0.5 - c) - b, a * b - c]
         return rows
 
     system = cb.ContinuousSystem(dynamics, states=n, diffusion=noise * np.eye(n))
@@ -117,7 +117,7 @@ CASES: dict[str, Callable[[], cb.Problem]] = {
     "quadrotor 1.2": lambda: quadrotor(1.2),
     "quadrotor 1.8": lambda: quadrotor(1.8),
     "platoon": lambda: platoon(0.1),
-    "cart-pole": lambda: cart_pole(0.86),  # at 1.07 about 5e-3 fail
+    "cart-pole": lambda: cart_pole(0.8),  # at 1 about 5e-3 of the paths fail
     "flow .35": lambda: flows(0.35, 1),
     "flow .44": lambda: flows(0.44, 1),
     "two flows .35": lambda: flows(0.35, 2),
