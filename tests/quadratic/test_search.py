@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -112,3 +114,32 @@ def test_better_bounds_are_told_and_the_end_of_the_time_is_kept() -> None:
     assert uppers
     assert all(later < earlier for earlier, later in itertools.pairwise([0.0, *uppers]))
     assert "wall" in watch.phase or "refining" in watch.phase
+
+
+def test_a_timer_does_not_break_the_solver_while_it_loads() -> None:
+    """An alarm in the middle of Clarabel's first solution waits until it is loaded; after it programs are solved."""
+    script = (
+        "import signal\n"
+        "from certbound.quadratic import conic\n"
+        "from certbound.watch import OutOfTime\n"
+        "real = conic.importlib.import_module\n"
+        "def stop(*_): raise OutOfTime\n"
+        "signal.signal(signal.SIGALRM, stop)\n"
+        "def slow(name):\n"
+        "    signal.raise_signal(signal.SIGALRM)\n"
+        "    return real(name)\n"
+        "conic.importlib.import_module = slow\n"
+        "try:\n"
+        "    conic.Program()\n"
+        "except OutOfTime:\n"
+        "    print('late')\n"
+        "conic.importlib.import_module = real\n"
+        "program = conic.Program()\n"
+        "import numpy as np\n"
+        "x = program.variables(1)\n"
+        "program.semidefinite(conic.block(-np.eye(2), [np.eye(2)[:, :, None]]), x)\n"
+        "program.minimise(0, seconds=5.0)\n"
+        "print('solved')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == ["late", "solved"]
