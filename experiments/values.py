@@ -84,6 +84,21 @@ def around_ball() -> cb.Problem:
     return cb.Problem(system, initial=[-0.3, -0.2], safe=safe, horizon=2)
 
 
+def in_ellipse() -> cb.Problem:
+    """A linear drift within an ellipse, from a ball."""
+    system = cb.ContinuousSystem(lambda x: [-x[0] + 0.5 * x[1], -x[1]], states=2, diffusion=0.35 * np.eye(2))
+    safe = [cb.Inside(cb.Ellipsoid([0, 0], [[1.2, 0.4], [0.4, 0.7]]))]
+    return cb.Problem(system, initial=cb.Ball([0.1, 0], 0.1), safe=safe, horizon=1.5)
+
+
+def half_disc() -> cb.Problem:
+    """A cubic oscillator with a noisy speed and a box around a half-disc (Jarmill, prob_unsafe): noise in one state."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -(x[0] + x[1] + 0.5 * x[0] ** 3)], states=["x1", "x2"], diffusion=[[0.0], [0.1]]
+    )
+    return cb.Problem(system, initial=[0.85, -0.75], safe=[cb.Outside(cb.Box([-1, -1.25], [0, -0.75]))], horizon=5)
+
+
 def lorenz() -> cb.Problem:
     """Three states with noise on each."""
     system = cb.ContinuousSystem(
@@ -108,6 +123,8 @@ CASES: tuple[Case, ...] = (
     Case(name="pendulum, torque 1.0", problem=lambda: swing(1.0), truth="paths", upper=1.3, lower=1.5),
     Case(name="cubic oscillator .5", problem=oscillator, truth="paths", upper=1.5, lower=None),
     Case(name="around a ball", problem=around_ball, truth="paths", upper=1.2, lower=1.5),
+    Case(name="in an ellipse", problem=in_ellipse, truth="paths", upper=1.3, lower=None),
+    Case(name="half-disc in its box", problem=half_disc, truth="paths", upper=1.3, lower=None),
     Case(name="Lorenz-like", problem=lorenz, truth="paths", upper=5.0, lower=None),
     *(Case(name=name, problem=make, truth="paths", upper=1.1, lower=1.1)
       for name, make in values_discrete.PROBLEMS.items()),

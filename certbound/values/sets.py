@@ -44,12 +44,12 @@ def contains(region: Region, boxes: Interval, step: int, *, interiors: bool = Fa
         case Quadratic() as form if form.even:
             square, limit = sq(y).sum(axis=-1), sq(Interval.point(form.radius))
         case Quadratic() as form:
-            square = (y * (_inverse(form.shape)[None] * y[:, None, :]).sum(axis=-1)).sum(axis=-1)
+            square = (y * (inverse_of(form.shape)[None] * y[:, None, :]).sum(axis=-1)).sum(axis=-1)
             limit = Interval.point(form.radius) * form.radius
     return np.asarray(square.hi <= limit.lo), np.asarray(square.lo > limit.hi)
 
 
-def _inverse(matrix: Array) -> Interval:
+def inverse_of(matrix: Array) -> Interval:
     """Enclosure of the inverse of a matrix of at most three rows, by cofactors."""
     n = len(matrix)
     entry = Interval.point(matrix)

@@ -60,17 +60,17 @@ def _(data: Data) -> None:
     _claim(data, -5.0)
 
 
-@forges("a proof from below proves no upper bound", "valued below", "claims.py", "proof_of", "must be there just where")
+@forges("a proof from below proves no upper bound", "valued below", "claims.py", "check_side", "be there just where")
 def _(data: Data) -> None:
     _claim(data, float.fromhex(data["claim"].pop("log10_lower")) - 1.0)
 
 
-@forges("a proof from above proves no lower bound", "valued", "claims.py", "proof_of", "must be there just where")
+@forges("a proof from above proves no lower bound", "valued", "claims.py", "check_side", "must be there just where")
 def _(data: Data) -> None:
     data["claim"] |= {"log10_delta": exact(0.0), "log10_lower": exact(-0.1)}
 
 
-@forges("only value functions bound from below", "still", "claims.py", "proof_of", "in a proof by value functions")
+@forges("only value functions bound from below", "still", "claims.py", "check_side", "in a proof by value functions")
 def _(data: Data) -> None:
     data["claim"] |= {"log10_delta": exact(0.0), "log10_lower": exact(-0.1)}
     data["proof"]["side"] = "lower"

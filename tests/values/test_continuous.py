@@ -16,15 +16,18 @@ import certbound as cb
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model.tracing import trace
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous import exits, hypotheses, two_states
+from certbound.values.continuous import exits, hypotheses
 from certbound.values.continuous.coefficients import Cells, Reader, enclose, squared_diffusion
 from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.line import ladder
 from certbound.values.continuous.line.initial_law import start_of
 from certbound.values.continuous.payment import BIN, Levels, Patched, pay_lower, pay_upper, repay
-from certbound.values.continuous.plane_below import bound_plane_below, plan_below
-from certbound.values.continuous.plane_proposal import Plan, Source, propose_plane
+from certbound.values.continuous.plane import two_sides
+from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
+from certbound.values.continuous.plane.plane_grids import Plan, Source
+from certbound.values.continuous.plane.plane_proposal import propose_plane
+from certbound.values.continuous.plane.solver import weakened
 from certbound.values.continuous.polynomials import basis_at, interpolation, node_product, nodes_of, to_bernstein
 from certbound.values.continuous.proposal import Splines, through
 from certbound.values.continuous.residual import bound_ranges
@@ -401,7 +404,7 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed() -> None:
     alone = exit_probability(lambda t, x: -x, lambda t, x: 0.8 + 0 * x, -1, 1, 1, 0.0)
     truth = math.log(1 - (1 - alone) ** 2)
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
-    plane = two_states._plane(problem, model, room.outer_low, room.outer_high, starts)
+    plane = two_sides._plane(problem, model, room.outer_low, room.outer_high, starts)
     plan = plan_below(plane, truth, 2500)
     bound = bound_plane_below(plane, model, plan, starts)
     assert bound is not None
@@ -416,11 +419,11 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed() -> None:
 def test_a_source_of_any_size_never_takes_a_bound_below_the_truth() -> None:
     problem = two_free_states()
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
-    plane = two_states._plane(problem, model, room.inner_low, room.inner_high, starts)
+    plane = two_sides._plane(problem, model, room.inner_low, room.inner_high, starts)
     plan = Plan(cells=10, growth=0.8, lead=0.05, floor=-7.0)
     first = propose_plane(plane, plan)
     assert first is not None
-    needed = Source.above(first, 1.1 * two_states._Sketch.of(first, model, starts).needed(-0.02))
+    needed = Source.above(first, 1.1 * two_sides._Sketch.of(first, model, starts).needed(-0.02))
     bounds = {}
     for size in (-1.0, 0.0, 1.0, 3.0):
         source = dataclasses.replace(needed, values=size * needed.values)
@@ -456,7 +459,7 @@ def test_noise_that_grows_with_the_state_costs_no_rounding_to_speak_of() -> None
 def test_a_source_is_at_least_what_is_needed_on_every_patch() -> None:
     problem = two_free_states()
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
-    plane = two_states._plane(problem, model, room.inner_low, room.inner_high, starts)
+    plane = two_sides._plane(problem, model, room.inner_low, room.inner_high, starts)
     surface = propose_plane(plane, Plan(cells=8, growth=0.8, lead=0.1, floor=-5.0))
     assert surface is not None
     needed = np.random.default_rng(0).uniform(0.0, 1.0, (surface.slabs, *surface.cells))
@@ -536,16 +539,50 @@ def test_nodes_are_bent_to_a_start_and_stay_where_a_start_lies_on_an_end():
     assert np.linalg.cond(Splines(kept).dense[0]) < 1e6
 
 
+def reversed_van_der_pol(sigma: float) -> two_sides.Plane:
+    system = cb.ContinuousSystem(
+        lambda x: [-x[1], x[0] + (x[0] ** 2 - 1) * x[1]], states=2, diffusion=sigma * np.eye(2)
+    )
+    safe = [cb.Inside(cb.Box([-1.2, -1.2], [1.2, 1.2]))]
+    problem = cb.Problem(system, initial=cb.Box([-0.2, -0.2], [0.2, 0.2]), safe=safe, horizon=5)
+    room = safe_room(problem)
+    return two_sides._plane(problem, exits._model(problem), room.inner_low, room.inner_high, starts_of(problem))
+
+
+def test_a_proposal_whose_fronts_are_steeper_than_its_cells_comes_to_an_end() -> None:
+    plane = reversed_van_der_pol(0.1)
+    surface = propose_plane(plane, Plan(cells=24, growth=0.3, lead=0.2))
+    assert surface is not None
+    assert surface.values[:, :, 0, :, 0].max() < 0.5
+    assert -41 < extreme_over(surface, plane.starts, upper=True) < -30  # -38.4, from far finer grids
+
+
+def test_drift_is_weakened_beside_faces_only_where_it_points_inward_and_cells_cannot_hold_its_layer() -> None:
+    calm, steep = reversed_van_der_pol(2.0), reversed_van_der_pol(0.1)
+    line = np.linspace(-1.2, 1.2, 41)
+    x, y = np.meshgrid(line, line, indexing="ij")
+    changes = []
+    for plane in (calm, steep):
+        drift, a = plane.drift(0.0, x, y)[0], plane.square(0.0, x, y)
+        weak = weakened(plane, Plan(cells=40, growth=0.3, lead=0.2), drift, a, (x, y), 0 * x - 1.0)
+        changes.append(weak - drift)
+    assert not changes[0].any()
+    change, inward = changes[1], -np.sign(y)
+    assert np.all(change[1] * inward <= 0)
+    assert not change[1][:, 5:-5].any()
+    assert np.abs(change[1][:, [0, -1]]).max() > 0.5
+
+
 def test_a_proposal_of_two_states_that_does_not_span_the_horizon_proves_nothing(monkeypatch) -> None:
     problem = two_free_states()
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
-    plane = two_states._plane(problem, model, room.inner_low, room.inner_high, starts)
-    plan, real = Plan(cells=8, growth=0.8, lead=0.1, floor=-5.0), two_states.propose_plane
+    plane = two_sides._plane(problem, model, room.inner_low, room.inner_high, starts)
+    plan, real = Plan(cells=8, growth=0.8, lead=0.1, floor=-5.0), two_sides.propose_plane
 
     def short(plane, plan, source=None):
         surface = real(plane, plan, source)
         return surface if source is None else dataclasses.replace(surface, times=0.5 * surface.times)
 
-    assert two_states._promising(plane, model, plan) is not None
-    monkeypatch.setattr(two_states, "propose_plane", short)
-    assert two_states._promising(plane, model, plan) is None
+    assert two_sides._promising(plane, model, plan) is not None
+    monkeypatch.setattr(two_sides, "propose_plane", short)
+    assert two_sides._promising(plane, model, plan) is None

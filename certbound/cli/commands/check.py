@@ -60,7 +60,9 @@ def check(
     started = time.perf_counter()
     data = read(certificate)
     given = _stated(problem, pairs, delta, horizon)
-    result: dict[str, Any] = {"valid": False, "claim": "", "reason": "", "outcome": "not proved", "assumptions": []}
+    result: dict[str, Any] = {
+        "valid": False, "claim": "", "reason": "", "seconds": 0.0, "outcome": "not proved", "assumptions": [],
+    }  # fmt: skip
     try:
         with spinner(f"checking {certificate.name}"), Clock(time_limit).running():
             report = check_data(data, given, allow_assumptions=allow)

@@ -19,6 +19,7 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Charts
 from certbound.values.continuous.coefficients import Reader, squared_diffusion
+from certbound.values.continuous.curved import bound_region, walled
 from certbound.values.continuous.hypotheses import Model, check_noise
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.room import safe_room
@@ -63,7 +64,7 @@ def bound_exits(
     ----------
     problem : Problem
         Continuous time, one or two states, noise of full rank. In one state any limits, windows, moving sets, obstacles
-        and a random start; in two a bounded safe box over the whole horizon.
+        and a random start; in two a bounded safe box, or any fixed limits and obstacles, over the whole horizon.
     target : region, optional
         In one state: then the bounds are those of the probability of breaking a constraint before the target is
         entered, or of not entering it by the horizon.
@@ -109,11 +110,13 @@ def bound_exits(
         from certbound.values.continuous.line import bound_line
 
         upper, least, words, (proposed, below) = bound_line(problem, model, seconds, lower)
+    elif walled(problem):
+        _refuse_random(problem)
+        upper, least, words, proposed = bound_region(problem, model, begin + seconds)
     else:
-        from certbound.values.continuous.two_states import two_states
+        from certbound.values.continuous.plane import two_states
 
-        if problem.initial.random:
-            raise InfeasibleError("value functions in two states do not serve a random start; use a set of starts.")
+        _refuse_random(problem)
         room = safe_room(problem)
         check_noise(model, (0.0, float(problem.horizon)), list(zip(room.inner_low, room.inner_high)))
         if lower:
@@ -165,7 +168,7 @@ def chart_exits(
 
         charts = chart_line(problem, model, logs, times, lower)
     else:
-        from certbound.values.continuous.two_states import chart_plane
+        from certbound.values.continuous.plane import chart_plane
 
         room = safe_room(problem)
         check_noise(model, (0.0, float(problem.horizon)), list(zip(room.inner_low, room.inner_high)))
@@ -204,6 +207,11 @@ def chart_slabs_of(problem: Problem, *, levels: Sequence[float], slabs: int, las
 
     _check(problem, None, 1.0)
     return chart_slabs(problem, _model(problem), [_LN10 * level for level in levels], slabs, last)
+
+
+def _refuse_random(problem: Problem) -> None:
+    if problem.initial.random:
+        raise InfeasibleError("value functions in two states do not serve a random start; use a set of starts.")
 
 
 def _check(problem: Problem, target: Any, seconds: float) -> None:

@@ -42,7 +42,7 @@ from certbound.values.continuous.surface import Surface
 
 Found = TypeVar("Found")
 
-LIFTS = (0.0, 0.003, 0.01, 0.02, 0.035, 0.06, 0.1)
+LIFTS = (0.0, 0.003, 0.01, 0.02, 0.035, 0.06, 0.1, 0.16, 0.25)
 _NEAR = 40.0  # in units of what is granted without being looked at
 NEGLIGIBLE = 5e-4
 """lam and eps (in units of the bound), summed over the horizon, that are granted without being looked at."""
@@ -121,7 +121,7 @@ def examine(surface: Surface, model: Model, need: Need, *, upper: bool) -> Proof
         )  # fmt: skip
         return ends[0] * per + kept, ranges
 
-    found = [one for one in _side_by_side(look, list(surface.chunks())) if one is not None]
+    found = [one for one in side_by_side(look, list(surface.chunks())) if one is not None]
     empty = np.empty(0)
     joined = {
         name: np.concatenate([empty, *(getattr(ranges, name) for _, ranges in found)])
@@ -131,7 +131,7 @@ def examine(surface: Surface, model: Model, need: Need, *, upper: bool) -> Proof
     return Proof(ranges=Ranges(**joined), slab=patch // per, cell=patch % per)
 
 
-def _side_by_side(look: Callable[[tuple[int, int]], Found], chunks: list[tuple[int, int]]) -> list[Found]:
+def side_by_side(look: Callable[[tuple[int, int]], Found], chunks: list[tuple[int, int]]) -> list[Found]:
     """Chunk by chunk on all cores, in order: the compiled kernel runs without the interpreter's lock."""
     with ThreadPoolExecutor(min(len(chunks), os.cpu_count() or 1)) as pool:
         return list(pool.map(look, chunks))
@@ -154,7 +154,7 @@ def sampled_residual(surface: Surface, model: Model, *, upper: bool = True) -> t
         excess = sample_in_plane(patches, drifts, squares, place, counts, upper=upper)
         return excess, value_range(patches)[0 if upper else 1]
 
-    found = _side_by_side(look, list(surface.chunks()))
+    found = side_by_side(look, list(surface.chunks()))
     shape = (surface.slabs, *surface.cells)
     excess, values = (np.concatenate(parts).reshape(shape) for parts in zip(*found))
     return excess, values
@@ -195,11 +195,11 @@ def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, fl
     start = up(extreme_over(surface, starts, upper=True))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
     proof = examine(surface, model, need, upper=True)
-    payment, lift = _cheapest(proof, need, surface, start)
+    payment, lift = cheapest(proof, need, surface, start)
     return replace(payment, lift=lift)
 
 
-def _cheapest(proof: Proof, need: Need, surface: Surface, start: float) -> tuple[Payment, float]:
+def cheapest(proof: Proof, need: Need, surface: Surface, start: float) -> tuple[Payment, float]:
     """The payment that bounds log P best where V(0, .) = ``start``, and by how much V was lifted for it."""
     floor = float(surface.range_at(-1)[0].min())
     best: tuple[Payment, float] | None = None
@@ -261,7 +261,7 @@ def chart_above(surface: Surface, model: Model, levels: Sequence[float], slabs: 
     surface = raised_above(surface)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=0.0)
     proof = examine(surface, model, need, upper=True)
-    paid = [_cheapest(proof, need, surface, level) for level in levels]
+    paid = [cheapest(proof, need, surface, level) for level in levels]
     charts = []
     for k in slabs:
         axes, values = (surface.axes, surface.range_at(k)[1]) if len(surface.axes) == 1 else surface.ceiling_at(k)

@@ -34,7 +34,7 @@ def safe_room(problem: Problem) -> Room:
     n = problem.system.dimension
     lows, highs = [[-np.inf] * n, [-np.inf] * n], [[np.inf] * n, [np.inf] * n]
     for constraint in problem.constraints:
-        _refuse_windows(constraint, problem)
+        refuse_windows(constraint, problem)
         for axis, side, inner, outer in _faces(constraint, problem):
             for place, value in enumerate((inner, outer)):
                 if side == 0:
@@ -55,7 +55,8 @@ def safe_room(problem: Problem) -> Room:
     return Room(inner_low=ends[0], outer_low=ends[1], inner_high=ends[2], outer_high=ends[3])
 
 
-def _refuse_windows(constraint: Inside, problem: Problem) -> None:
+def refuse_windows(constraint: Inside, problem: Problem) -> None:
+    """Refuse, in words, a constraint that moves or does not hold at all times."""
     if constraint.region.moving:
         raise InfeasibleError(f"value functions do not serve moving sets yet ('{constraint.label}').")
     if constraint.during is not None and constraint.during != (0.0, float(problem.horizon)):
@@ -67,10 +68,11 @@ def _faces(constraint: Inside, problem: Problem) -> list[tuple[int, int, float, 
     n, region = problem.system.dimension, constraint.region
     if n > 1 and (constraint.outside or region.form.round):
         raise InfeasibleError(f"value functions in two states serve boxes only, not '{constraint.label}'.")
-    return _beside(constraint, problem) if constraint.outside else _of_region(region, constraint.label)
+    return _beside(constraint, problem) if constraint.outside else faces_of(region, constraint.label)
 
 
-def _of_region(region: Region, label: str) -> list[tuple[int, int, float, float]]:
+def faces_of(region: Region, label: str) -> list[tuple[int, int, float, float]]:
+    """(state, side, inner place, outer place) of each face of a region whose faces lie along the coordinates."""
     center = region.center_at()
     if isinstance(region.form, Quadratic):  # in one state
         reach, middle = float(np.sqrt(region.form.matrix[0, 0])), float(center[0])
@@ -91,7 +93,7 @@ def _of_region(region: Region, label: str) -> list[tuple[int, int, float, float]
 
 def _beside(constraint: Inside, problem: Problem) -> list[tuple[int, int, float, float]]:
     """The face that an obstacle shows to the starts, in one state."""
-    faces = {side: (inner, outer) for _, side, inner, outer in _of_region(constraint.region, constraint.label)}
+    faces = {side: (inner, outer) for _, side, inner, outer in faces_of(constraint.region, constraint.label)}
     low, high = -np.inf, np.inf  # the obstacle's ends, as far as it has them
     if 0 in faces:
         low = min(faces[0])

@@ -11,9 +11,10 @@ from certbound.arrays import Array, Mask
 from certbound.values.semilagrangian.landings import along_q, at_nodes, over_cells
 from certbound.values.semilagrangian.local_steps import Base
 from certbound.values.semilagrangian.smoothers import REACH, WIDER, Across, Along, across, along
-from certbound.values.semilagrangian.smoothing import Lines, Rows, smoothed
+from certbound.values.semilagrangian.smoothing import Lines, smoothed
 
 _UP = 1 + 1e-9
+_NEGLECTED = 4e-22  # what smoothing does not see of a function of size 8, beyond `REACH` standard deviations
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -57,7 +58,7 @@ class Band:
     reach: Array
     prices: Array
     live: Mask
-    error: float
+    beyond: float
 
 
 def band_of(frame: Frame, first: int, last: int, base: Base, excess: Array, live: Mask, follow: float) -> Band:
@@ -92,12 +93,35 @@ def band_of(frame: Frame, first: int, last: int, base: Base, excess: Array, live
         live = np.zeros_like(live)
         factor = 0.0
     drift = frame.drift[:, first:last] * factor
-    prices = np.stack([excess[2] / 2, excess[1], excess[0] / 2, drift[0], drift[1]]) * _UP
-    error = 300 * (one.error + two.error + 1e-13)
+    error = one.error + two.error + 1e-13 + 8e-16 * (len(frame.y[lines]) + 2 * len(frame.q))
+    rounding = error * _amplified(frame, slice(first, last), frame.y[lines], mesh, sigma)
+    prices = np.stack([excess[2] / 2, excess[1], excess[0] / 2, drift[0], drift[1], rounding]) * _UP
     return Band(
         first=first, last=last, rows=rows, lines=lines, one=one, two=two, reach=reach, prices=prices, live=live,
-        error=error,
+        beyond=_NEGLECTED / error,
     )  # fmt: skip
+
+
+def _amplified(frame: Frame, cells: slice, lines: Array, mesh: Array, sigma: tuple[float, float]) -> Array:
+    """Lambda of "Rounding" (docs/values.md), K8-SL: by how much errors of the kernels' entries grow, cell by cell."""
+    least, fine = float(np.diff(lines).min()), float(np.diff(frame.q).min())
+    widest = float(np.diff(frame.q).max())
+    ratio = max(1.0, float(np.diff(mesh).max()) / least)
+    nodes = slice(cells.start, cells.stop + 1)
+    d, e = np.diff(frame.y)[cells, None], np.diff(frame.q)
+    slopes, bends = np.abs(frame.slopes[:, cells]), frame.bends[:, cells]
+    image, radius = frame.image[:, nodes], frame.radius[:, nodes]
+    around = np.abs(np.diff(image, axis=2)) + radius[..., 1:] + radius[..., :-1]
+    sides = np.maximum(around[:, 1:], around[:, :-1]) + bends[2:] * e**2
+    step = [np.maximum(np.maximum(slopes[2 * k], slopes[2 * k + 1]) * d, sides[k]) for k in (0, 1)]
+    turn = [np.maximum(bends[k] * d**2, bends[2 + k] * e**2) for k in (0, 1)]
+    loose = radius[0].max() / least + radius[1].max() / fine
+    up, across = step[0] / least, step[1] / sigma[1]
+    bow = turn[0] / least
+    found = 60 + 120 * loose + 8 * across**2 + 30 * up * across + 440 * ratio * up * (1 + 2 * up + bow)
+    found = found + 23 * bow * (1 + widest / sigma[1]) + 90 * ratio * turn[1] * widest / fine**2 + 110 * ratio**2
+    found = found + 60 * ratio * (sigma[1] / fine) ** 2 + (sigma[0] / least + sigma[1] / fine) ** 2
+    return np.asarray(2 * found * _UP)
 
 
 def _far_from_ends(
@@ -156,17 +180,13 @@ def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array])
         image, radius, band.live, frame.bends[2:, cells], dq, rows, frame.q, tables, found.bend, found.kinks
     )
     wide = np.stack([found.bent, found.mixed, found.bowed])
-    close = np.stack([found.lean_y, found.lean_q, found.lift, _dominated(found, band.error)])
+    close = np.stack([found.lean_y, found.lean_q, found.lift, found.near + band.beyond])
     payment = over_cells(
         image, radius, band.live, frame.slopes[:, cells], frame.bends[:, cells], (np.diff(frame.y)[cells], dq), rows,
         frame.q, tables, found.bend, found.kinks, band.reach, band.prices, wide, close,
     )  # fmt: skip
     payment += np.maximum(extra[:-1], extra[1:])
     return nodal, bend, payment * _UP
-
-
-def _dominated(found: Rows, error: float) -> Array:
-    return np.asarray(found.near * error + 1e-20)
 
 
 def _touched(live: Mask) -> Mask:

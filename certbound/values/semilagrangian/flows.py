@@ -21,6 +21,7 @@ from certbound.problem.model import JUMPS, OPERATIONS, Graph, Tape, jacobian
 from certbound.rigor.intervals import Interval
 from certbound.rigor.series import ZERO, Series
 from certbound.values.discrete import evaluate
+from certbound.watch import poll
 
 Box = list[Interval]
 
@@ -154,6 +155,7 @@ def _coefficients(tape: Tape, start: Sequence[Interval], order: int) -> list[Ser
     """x_0 ... x_order of the solution, from x_{k+1} = [f(x)]_k / (k + 1)."""
     found: list[Series] = [[value] for value in start]
     for k in range(order):
+        poll("the flow over a step")
         rates = series_along(tape, [[ZERO], *found], k)
         for series, rate in zip(found, rates):
             coefficient = rate[k] if k < len(rate) else ZERO
@@ -169,6 +171,7 @@ def _sweep(tape: Tape, start: Sequence[Interval], step: float) -> tuple[Box, Mas
     known = np.zeros(shape, dtype=bool)
     result = [Interval(value.lo.copy(), value.hi.copy()) for value in box]
     for _ in range(_ROUNDS):
+        poll("the flow over a step")
         rates, undefined, jumps = evaluate(tape, [Interval.point(np.zeros(shape)), *box])
         finite = np.isfinite(rates.lo).all(axis=1) & np.isfinite(rates.hi).all(axis=1)
         good = finite & ~undefined & ~jumps

@@ -157,9 +157,9 @@ def over_cells(
         Widths along y and q.
     reach : (cells, nq - 1)
         How far the covariance's excess is followed along y.
-    prices : (5, cells, nq - 1)
-        Of ``wide`` (three: bent, mixed, bowed) and of the first two of ``close`` (lean_y, lean_q, then lift and near,
-        which cost themselves).
+    prices : (6, cells, nq - 1)
+        Of ``wide`` (three: bent, mixed, bowed), and of ``close`` but for its third: lean_y, lean_q, lift (which costs
+        itself), near.
     """
     found = np.zeros(live.shape)
     rates = np.empty(6)
@@ -184,7 +184,7 @@ def over_cells(
             share = 1.0 if rates[0] <= 0.0 <= rates[1] else 0.25
             total = max(_density(window, tables, rates, bend), 0.0) / 8
             total += share * longest * _kinked(window, kinks, mesh, longest)
-            total += _largest(window, close[2]) + _largest(window, close[3])
+            total += _largest(window, close[2]) + prices[5, i, j] * _largest(window, close[3])
             total += prices[3, i, j] * _largest(window, close[0]) + prices[4, i, j] * _largest(window, close[1])
             window = _window(mesh, q, ends[0] - reach[i, j], ends[1] + reach[i, j], ends[2], ends[3])
             for part in range(3):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,30 +13,31 @@ from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.values.continuous import ExitBounds
 from certbound.values.semilagrangian.backward import back, highest, limited
-from certbound.values.semilagrangian.groundwork import Layout, Plan, layout_of
+from certbound.values.semilagrangian.groundwork import Layout, Plan, layout_of, nodes_of
 from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
+from certbound.watch import OutOfTime, poll
 
-_RARE = 16
+_RARE = 32
 """Rare events a step, each of probability ``Plan.spare``, that are paid for; see the package."""
-_TALLEST = 3.0  # the payment for rare events takes U to be at most 4
+_TALLEST = 6.0  # the payment for rare events takes U to be at most 8
 _SHARE = 1e-3
-_TURNS = (0.2, 0.13, 0.1, 0.08)
-"""Lengths of the steps that are tried, relative to the time in which the flow turns by one radian."""
-_CELLS = ((0.7, 0.005, 0.33), (0.5, 0.0025, 0.25), (0.45, 0.002, 0.22), (0.4, 0.0016, 0.2))
+_PLANS = (
+    (0.2, (0.7, 0.005, 0.33)), (0.16, (0.6, 0.0035, 0.3)), (0.13, (0.5, 0.0025, 0.25)), (0.1, (0.45, 0.002, 0.22)),
+    (0.08, (0.4, 0.0016, 0.2)),
+)  # fmt: skip
+"""Lengths of the steps, relative to the time in which the flow turns by one radian, and cells, finer and finer.
+
+Shorter steps ask for smaller cells, since every step pays for its interpolation.
+"""
+_FIRST = 0.25  # share of the work that a first look may take, which tells how rare failing is
+_SPARE = 1e-13
+_RATE = 900_000
+"""Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes."""
+_PREPARED = 20
 _LEAST, _MOST = 8, 2000
 
 Cells = tuple[float, float, float]
-
-
-@dataclass(slots=True)
-class _Found:
-    """The best bound so far, what was done, and what it cost."""
-
-    upper: float = 1.0
-    done: list[str] = field(default_factory=list)
-    work: float = 0.0
-    spent: float = 0.0
 
 
 def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBounds:
@@ -49,7 +48,8 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     problem : Problem
         Two states in continuous time, constant noise in one of them, a bounded safe box, no time in the model.
     seconds : float
-        Processor time after which refining stops; the first attempt is finished in any case.
+        About what may be spent, as a number of nodes and steps: bounds do not depend on the clock. The coarsest grid
+        is finished in any case.
 
     Raises
     ------
@@ -69,45 +69,47 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
         raise ValueError(f"`seconds` must be positive, got {seconds!r}.")
     begin = time.process_time()
     setting = setting_of(problem)
-    turn, found = _turn(setting), _Found()
-    spare, failed = 1e-9, None
-    for ratio, cells in _plans(setting, turn, found, begin + seconds):
-        count = min(max(_LEAST, math.ceil(setting.horizon / (ratio * turn))), _MOST)
-        plan = Plan(count=count, fine=cells[0], wide=cells[1], cell=cells[2], spare=min(spare, 0.01 / (_RARE * count)))
-        start = time.process_time()
+    turn = _turn(setting)
+    best, failed, done, spare = 1.0, None, [], _SPARE
+    for ratio, cells in _affordable(setting, turn, _RATE * round(seconds, 1)):
+        plan = _plan(setting, turn, ratio, cells, spare)
         try:
-            bound = bound_by_steps(setting, plan)
+            best = min(best, bound_by_steps(setting, plan))
         except InfeasibleError as error:  # shorter steps may do
             failed = error
             continue
-        found.work, found.spent = _work(setting, turn, ratio, cells), time.process_time() - start
-        found.done.append(f"{count} steps")
-        found.upper = min(found.upper, bound)
-        spare = max(_SHARE * found.upper / (_RARE * count), 1e-200)
-    if failed is not None and not found.done:
+        except OutOfTime:
+            if not best < 1:
+                raise
+            break
+        done.append(f"{plan.count} steps")
+        spare = max(min(_SHARE * best / (_RARE * plan.count), _SPARE), 1e-200)
+    if failed is not None and not done:
         raise failed
-    words = f"value function along the flow, {', '.join(found.done)}"
-    upper = min(0.0, math.log10(found.upper) * (1 - 1e-15) + 1e-15)
+    words = f"value function along the flow, {', '.join(done)}"
+    upper = min(0.0, math.log10(best) * (1 - 1e-15) + 1e-15)
     return ExitBounds(upper=upper, lower=None, words=words, seconds=time.process_time() - begin)
 
 
-def _plans(setting: Setting, turn: float, found: _Found, deadline: float) -> Iterator[tuple[float, Cells]]:
-    """The coarsest plan, and then the finest one that the time will do for."""
-    yield _TURNS[0], _CELLS[0]
-    if not found.work:
-        yield _TURNS[1], _CELLS[1]
-        return
-    left = deadline - time.process_time()
-    for ratio, cells in zip(_TURNS[:0:-1], _CELLS[:0:-1]):
-        if found.spent * _work(setting, turn, ratio, cells) / found.work < left:
-            yield ratio, cells
-            return
+def _plan(setting: Setting, turn: float, ratio: float, cells: Cells, spare: float) -> Plan:
+    count = min(max(_LEAST, math.ceil(setting.horizon / (ratio * turn))), _MOST)
+    return Plan(count=count, fine=cells[0], wide=cells[1], cell=cells[2], spare=min(spare, 0.01 / (_RARE * count)))
 
 
-def _work(setting: Setting, turn: float, ratio: float, cells: Cells) -> float:
-    """About in proportion to the time that a plan takes."""
-    steps = setting.horizon / (ratio * turn)
-    return float((25 + steps) / cells[2] * ratio**-0.5)  # the preparation takes about as long as 25 steps
+def _affordable(setting: Setting, turn: float, work: float) -> list[tuple[float, Cells]]:
+    """The finest of the plans whose nodes times steps are at most ``work``, after the coarsest if that costs little."""
+    chosen, first = _PLANS[0], math.inf
+    for ratio, cells in _PLANS:
+        plan = _plan(setting, turn, ratio, cells, _SPARE)
+        try:
+            needed = nodes_of(setting, plan) * (plan.count + _PREPARED)
+        except InfeasibleError:  # shorter steps may do
+            continue
+        first = min(first, needed)
+        if needed > work:
+            break
+        chosen = ratio, cells
+    return [_PLANS[0], chosen] if chosen != _PLANS[0] and first < _FIRST * work else [chosen]
 
 
 def bound_by_steps(setting: Setting, plan: Plan) -> float:
@@ -115,6 +117,7 @@ def bound_by_steps(setting: Setting, plan: Plan) -> float:
     layout = layout_of(setting, plan)
     value = terminal(layout)
     for _ in range(plan.count):
+        poll("a value function along the flow")
         value = back(layout.frame, layout.bands, layout.bounds, value)
         if value.nodal.max() > _TALLEST:
             return 1.0

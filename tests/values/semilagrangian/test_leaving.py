@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -13,10 +14,11 @@ from scipy.special import ndtr
 import certbound as cb
 from certbound.problem.model import compile_numpy
 from certbound.safety.engines import values
-from certbound.values.semilagrangian import bound_exits_by_steps
+from certbound.values.semilagrangian import bound_exits_by_steps, leaving
 from certbound.values.semilagrangian.groundwork import Plan
 from certbound.values.semilagrangian.leaving import bound_by_steps
 from certbound.values.semilagrangian.noisy_axis import setting_of
+from certbound.watch import OutOfTime, Watch
 
 COARSE = Plan(count=20, fine=1.0, wide=0.012, cell=0.4, spare=1e-7)
 
@@ -109,3 +111,19 @@ def test_bad_arguments_are_named() -> None:
     )
     with pytest.raises(cb.InfeasibleError, match="neither disturbances nor plans"):
         bound_exits_by_steps(problem.replace(system=disturbed))
+
+
+def test_more_work_buys_finer_plans_and_the_clock_is_not_asked() -> None:
+    setting = setting_of(mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.5, (0.1, 0.0)))
+    turn = leaving._turn(setting)
+    assert leaving._affordable(setting, turn, 1.0) == [leaving._PLANS[0]]
+    first, chosen = leaving._affordable(setting, turn, 7.3e6)
+    assert first == leaving._PLANS[0]
+    assert chosen in leaving._PLANS[1:-1]
+
+
+def test_the_steps_end_when_the_time_is_over() -> None:
+    setting = setting_of(mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.5, (0.1, 0.0)))
+    ticks = itertools.count()
+    with pytest.raises(OutOfTime), Watch(limit=3.0, clock=lambda: next(ticks)).running():
+        bound_by_steps(setting, COARSE)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.sparse import csr_array
 from scipy.special import ndtr
 
 import certbound as cb
@@ -16,7 +17,7 @@ from certbound.problem.model import compile_numpy
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import KAPPA
 from certbound.values.semilagrangian.backward import Bounds, back, limited
-from certbound.values.semilagrangian.bands import Frame
+from certbound.values.semilagrangian.bands import Band, Frame, through
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
 from certbound.values.semilagrangian.groundwork import Plan, layout_of
 from certbound.values.semilagrangian.noisy_axis import serves, setting_of
@@ -191,6 +192,51 @@ def step_law(setting, clock, x, rng, count: int):
         f = drift(0.0, p + d / 2 * q, q)
         p, q = p + d * (q + noise / 2) + d * d / 2 * f[..., 1], q + d * f[..., 1] + noise
     return p - clock.shear * q, q
+
+
+def spoiled(matrix, mass, size: float, rng):
+    """A matrix whose entries are off by ``size`` times the mass, which is what a kernel's error means."""
+    dense, wide = (part.toarray() if hasattr(part, "toarray") else part for part in (matrix, mass))
+    near = np.zeros(dense.shape)
+    rows, columns = min(len(wide), len(near)), min(wide.shape[1], near.shape[1])
+    near[:rows, :columns] = wide[:rows, :columns]
+    return dense + size * near * rng.choice([-1.0, 1.0], near.shape)
+
+
+def spoiled_band(band: Band, q, size: float, rng) -> Band:
+    """All kernels of a band off by ``size`` in their own units."""
+    one, two = band.one, band.two
+    names = ("rows", "cells", "spread")
+    one = replace(one, **{name: csr_array(spoiled(getattr(one, name), one.mass, size, rng)) for name in names})
+    sigma = 1 / (math.sqrt(2 * math.pi) * two.sup[0].max())
+    sizes = [size * sigma**-order for order in range(3)]
+    eighth = np.diff(q) ** 2 / 8
+    values = tuple(spoiled(matrix, two.mass, off, rng) for matrix, off in zip(two.values, sizes))
+    parabolas = tuple(
+        matrix + (spoiled(0 * matrix, two.mass, off, rng)) * eighth for matrix, off in zip(two.parabolas, sizes)
+    )
+    return replace(band, one=one, two=replace(two, values=values, parabolas=parabolas))
+
+
+def test_kernels_that_are_off_change_a_step_by_less_than_what_is_paid_for_rounding(rng) -> None:
+    _, layout = frame_and_bands(mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1], 0.5, [0, -1.5], [1.6, 1.5]))
+    frame = layout.frame
+    shape = frame.y.size, frame.q.size
+    value = Lines(nodal=rng.uniform(0, 1, shape), bend=rng.uniform(-20, 20, (shape[0], shape[1] - 1)))
+    flat, size, shares = np.zeros((shape[0] - 1, shape[1] - 1)), 1e-7, []
+    for band in layout.bands[:2]:
+        error = band.one.error + band.two.error + 1e-13 + 8e-16 * (band.lines.stop - band.lines.start + 2 * shape[1])
+        price = band.prices[5] * 2 * size / error
+        free = replace(band, prices=np.concatenate([band.prices[:5], 0 * band.prices[5:]]))
+        paid = replace(band, prices=np.concatenate([band.prices[:5], price[None]]))
+        looks = (free, spoiled_band(free, frame.q, size, rng), paid)
+        exact, wrong, allowed = (through(one, frame, value, (flat, flat)) for one in looks)
+        bent = np.abs(wrong[1] - exact[1]) * np.diff(frame.q) ** 2 / 8
+        change = np.abs(wrong[0] - exact[0])[:-1, :-1] + np.abs(wrong[2] - exact[2]) + np.maximum(bent[1:], bent[:-1])
+        room = allowed[2] - exact[2]
+        assert np.all(change[band.live] <= room[band.live])
+        shares.append(float((change[band.live] / room[band.live]).max()))
+    assert max(shares) > 1e-6  # it is not paid a million times
 
 
 @pytest.mark.parametrize("force", [lambda x: -x[0] - 0.5 * x[1], lambda x: x[0] - x[0] ** 3 - 0.5 * x[1]])

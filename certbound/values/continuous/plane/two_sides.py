@@ -30,8 +30,9 @@ from certbound.values.continuous.hypotheses import (
     sampled_residual,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
-from certbound.values.continuous.plane_below import bound_plane_below, plan_below
-from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane, slab_times
+from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
+from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
+from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
@@ -88,26 +89,22 @@ def two_states(
 
 
 def _plan(plane: Plane, level: float, patches: float) -> Plan:
-    """The finest grid with about so many patches; slabs grow fewer as fast as cells do."""
+    """The finest grid with about so many patches; slabs grow fewer as fast as cells do.
+
+    Where failing is rare (log P the ``level``) a longer lead costs little, and makes for fronts that are less steep.
+    """
+    share = 0.32 * min(max(-level / 3, 1.0), 3.0)
     for cells in itertools.count(16):
-        plan = Plan(cells=cells, growth=min(6 / cells, 0.3), lead=0.32 / cells * plane.horizon, floor=level - 5)
+        plan = Plan(cells=cells, growth=min(6 / cells, 0.3), lead=share / cells * plane.horizon)
         if cells**2 * len(slab_times(plane.horizon, plan)) > patches:
             break
     return plan
 
 
 def _rough_level(plane: Plane) -> float:
-    """log P from a coarse proposal; the floor is lowered until it does not matter."""
-    level = 0.0
-    for floor in (-8.0, -20.0, -45.0):
-        plan = Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon, floor=floor)
-        surface = propose_plane(plane, plan)
-        if surface is None:
-            continue
-        level = min(level, float(extreme_over(surface, plane.starts, upper=True)))
-        if level > floor + 2:
-            break
-    return level
+    """log P from a coarse proposal; 0 where that breaks down."""
+    rough = propose_plane(plane, Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon))
+    return 0.0 if rough is None else min(0.0, float(extreme_over(rough, plane.starts, upper=True)))
 
 
 def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], seconds: float) -> list[Chart]:

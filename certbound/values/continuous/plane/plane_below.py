@@ -1,6 +1,6 @@
 """Two states, the lower bound: V rises from a small share of P at T, and is drawn to 0 in a margin around the box.
 
-As in `two_states`, what a proof of a first proposal would have to pay is handed to the next one, here as something
+As in `two_sides`, what a proof of a first proposal would have to pay is handed to the next one, here as something
 that V loses. The proof is that of `hypotheses`, on the part of the surface that lies in the box.
 """
 
@@ -14,7 +14,8 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.values.continuous.hypotheses import Model, covers, extreme_over, prove_lower, sampled_residual
-from certbound.values.continuous.plane_proposal import Pair, Plan, Plane, Source, propose_plane, slab_times
+from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
+from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.surface import Surface
 
 _SHARE = 0.005  # of P: what V starts from, which is subtracted at last

@@ -1,0 +1,10 @@
+"""Two states among curved limits and obstacles: upper bounds (docs/values.md, "Curved limits and obstacles").
+
+From the bottom: ``boundaries`` (what is safe, in outward-rounded arithmetic), ``region`` (a box around it), ``cuts``
+(the cells and parts of cells that it meets), ``proof``, ``continuation`` (proposals), ``bounding``.
+"""
+
+from certbound.values.continuous.curved.bounding import bound_region
+from certbound.values.continuous.curved.region import walled
+
+__all__ = ["bound_region", "walled"]

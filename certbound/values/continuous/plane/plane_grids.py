@@ -1,0 +1,139 @@
+"""What a proposal in two states is made from: the problem in floats, a plan, a source, and where its nodes lie."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.values.continuous.proposal import through
+from certbound.values.continuous.surface import Surface
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Plane:
+    """The problem in floats: drift (branches, 2, ...) and a (2, 2, ...) at (t, x, y), on a box."""
+
+    low: Pair
+    high: Pair
+    horizon: float
+    drift: Callable[[float, Array, Array], Array]
+    square: Callable[[float, Array, Array], Array]
+    starts: list[Pair]
+    autonomous: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Plan:
+    """How a proposal is made: cells along each axis, the slabs' growth, and what it starts from.
+
+    At T there is a layer at each face, as steep as if it had evolved for the time ``lead``; V >= ``floor``. For lower
+    bounds (``below``) V is at most ``floor`` at T, and rises to 0 on the faces within ``lead``.
+    """
+
+    cells: int
+    growth: float
+    lead: float
+    floor: float = -math.inf
+    below: bool = False
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Source:
+    """What V's equation gets in addition, at the nodes of a surface: linear between them in t, x and y.
+
+    ``values`` has shape (K + 1, N_1 + 1, N_2 + 1), times forward.
+    """
+
+    times: Array
+    axes: tuple[Array, ...]
+    values: Array
+
+    @classmethod
+    def above(cls, surface: Surface, needed: Array) -> Source:
+        """At least ``needed`` (K, N_1, N_2), which must not be negative, on each patch: at nodes the largest around."""
+        slabs, rows, columns = needed.shape
+        values = np.zeros((slabs + 1, rows + 1, columns + 1))
+        for a, b, c in itertools.product((0, 1), repeat=3):
+            part = values[a : a + slabs, b : b + rows, c : c + columns]
+            np.maximum(part, needed, out=part)
+        return cls(times=surface.times, axes=surface.axes, values=values)
+
+    def plus(self, other: Source) -> Source:
+        """The sum of two sources on the same grid."""
+        return Source(times=self.times, axes=self.axes, values=self.values + other.values)
+
+    def at(self, points: list[Array]) -> Array:
+        """Values at the ends of the slabs and the products of points along the axes."""
+        x, y = (_linear(nodes, place) for nodes, place in zip(self.axes, points))
+        return np.asarray(np.einsum("pi,kij,qj->kpq", x, self.values, y, optimize=True))
+
+
+def _linear(nodes: Array, points: Array) -> Array:
+    left = np.clip(np.searchsorted(nodes, points) - 1, 0, len(nodes) - 2)
+    share = (points - nodes[left]) / (nodes[left + 1] - nodes[left])
+    matrix = np.zeros((len(points), len(nodes)))
+    matrix[np.arange(len(points)), left] = 1 - share
+    matrix[np.arange(len(points)), left + 1] = share
+    return matrix
+
+
+def slab_times(horizon: float, plan: Plan) -> Array:
+    """Ends of the slabs in time to go, short at first."""
+    times = [0.0]
+    while times[-1] < horizon:
+        times.append(times[-1] + min(plan.growth * (0.1 * plan.lead + times[-1]), horizon * plan.growth / 4))
+    return np.array(times) * (horizon / times[-1])
+
+
+def spread_nodes(plane: Plane, plan: Plan, axis: int, more: Callable[[Array], Array] | None = None) -> Array:
+    """Nodes where the noise is small, and at the faces or as ``more`` weighs places; bent to the starts."""
+    low, high = plane.low[axis], plane.high[axis]
+    fine = np.linspace(low, high, 4001)
+    density = 1 / _mean_deviation(plane, axis, fine)
+    density = density / np.trapezoid(density, fine)
+    for side, distance in ((0, fine - low), (1, high - fine)) if more is None else ():
+        weight = 1 / (distance + 1 / layer_rate(plane, plan, axis, side))
+        density += 0.5 * weight / np.trapezoid(weight, fine)
+    density = density if more is None else density * more(fine)
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+    nodes = np.interp(np.linspace(0, total[-1], plan.cells + 1), total, fine)
+    nodes[0], nodes[-1] = low, high
+    return through(nodes, plane.starts[axis])
+
+
+def _mean_deviation(plane: Plane, axis: int, places: Array) -> Array:
+    """The root of a's diagonal along an axis, averaged over the other one, and kept from being too small."""
+    others = np.linspace(plane.low[1 - axis], plane.high[1 - axis], 17)
+    x, y = np.meshgrid(places, others, indexing="ij") if axis == 0 else np.meshgrid(others, places, indexing="ij")
+    square = plane.square(plane.horizon, x, y)[axis, axis] * np.ones(x.shape)
+    root = np.sqrt(np.maximum(square, 0.0)).mean(axis=1 - axis)
+    return np.asarray(np.maximum(root, 0.2 * root.max()))
+
+
+def layer_rate(plane: Plane, plan: Plan, axis: int, side: int) -> float:
+    """The rate of the start profile at a face: the largest that a layer of age ``lead`` has along it."""
+    ends = [np.linspace(plane.low[k], plane.high[k], 33) for k in (0, 1)]
+    ends[axis] = np.array([plane.low[axis] if side == 0 else plane.high[axis]])
+    x, y = np.meshgrid(*ends, indexing="ij")
+    a = np.maximum(plane.square(plane.horizon, x, y)[axis, axis] * np.ones(x.shape), 1e-300)
+    if plan.below:
+        return float(np.max(rise(plane, plan, axis, side, x, y)))
+    inward = np.max(plane.drift(plane.horizon, x, y)[:, axis] * (1 if side == 0 else -1), axis=0)
+    return float(np.max(np.maximum(1.3 * np.sqrt(2 / (a * plan.lead)), inward / (1.5 * a))))
+
+
+def rise(plane: Plane, plan: Plan, axis: int, side: int, x: Array, y: Array) -> Array:
+    """k at a face, with a k^2 / 2 - f k = the speed at which V rises there."""
+    place = [x, y]
+    place[axis] = np.full(x.shape, plane.low[axis] if side == 0 else plane.high[axis])
+    a = plane.square(plane.horizon, *place)[axis, axis] * np.ones(x.shape)
+    drift = plane.drift(plane.horizon, *place)[:, axis] * (1 if side == 0 else -1)
+    inward = np.maximum(drift.min(axis=0), 0.0)
+    return np.asarray((inward + np.sqrt(inward**2 - 4 * a * plan.floor / plan.lead)) / np.maximum(a, 1e-300))
