@@ -11,8 +11,8 @@ with forms B_i >= 0 on the cell and z' D(s) z = 0: where M + lam/|z|^2 is positi
 of f_i is at most sum_b r_ib |eta_b| (`Local`), for which sum_ib r_ib (q eta_b^2 + p_i^2/q)/2 pays, p = H z: E holds the
 first part, and G, besides the columns of g, sqrt(sum_b r_ib/q) e_i. In the same way V >= -gap on the walls that V is
 for, in its window of time. Then P(leaving) <= the sum of exp(sum_k lam_k h_k + gap + V(0, x)), over V whose windows
-cover the horizon at every wall. Its supremum over a box of starts is that over its corners once every V(0, .) has been made
-convex; of a ball each V has its own.
+cover the horizon at every wall. Its supremum over a box of starts is that over its corners once every V(0, .) has been
+made convex; of a ball each V has its own.
 """
 
 from __future__ import annotations

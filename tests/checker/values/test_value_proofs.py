@@ -30,7 +30,7 @@ from certbound.checker.values.hermite import Surface
 from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
 from certbound.checker.values.packed import unpacked
 from certbound.checker.values.passage import Levels, Passage
-from certbound.checker.values.quadratic import splitting
+from certbound.checker.values.quadratic import _missing, splitting
 from certbound.checker.values.second_order import Flow
 from certbound.checker.values.step_back import Grid, Steps, Values
 from certbound.checker.values.uniform_means import UniformTransition
@@ -363,7 +363,7 @@ def test_a_ball_of_starts_has_a_bound_of_its_own() -> None:
     points = 0.05 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
     z = np.hstack([(points - center) / width, np.ones((41, 1))])
     total = np.zeros(41)
-    for wall in data["proof"]["walls"]:
+    for wall in data["proof"]["bounds"]:
         first = np.array([[float.fromhex(x) for x in row] for row in wall["matrices"][0]])
         total += np.exp(np.einsum("pi,ij,pj->p", z, first, z) / 2)
     assert math.log10(total.max()) <= found < math.log10(total.max()) + 0.5
@@ -396,9 +396,18 @@ def test_the_drift_lies_between_its_corners(place: int) -> None:
     for a in (0, 1):
         matrix = matrix + local.along[a] * (arb(xi[a]) - (low[a] + high[a]) / 2)
     found = (matrix * arb_mat(3, 1, [*map(arb, xi), arb(1)])).entries()
+    size = [float(part) for part in local.size]
+    assert np.allclose(size, (ends[:, 1] - ends[:, 0]) / 2)
+    eta = [*(np.abs(np.subtract(xi, [float(part) for part in local.middle])) / size), 1.0]
     for value, exact_one, rest in zip(found, truth, local.rest):
-        assert abs(float(value.mid()) - exact_one) <= float(rest) + 1e-12
-    assert float(local.rest[0]) < 1e-15
+        assert abs(float(value.mid()) - exact_one) <= np.dot([float(part) for part in rest], eta) + 1e-12
+    assert max(map(float, local.rest[0])) < 1e-15
+    assert float(local.rest[1][2]) < 1e-15 < float(local.rest[1][0])
+    paid = _missing(local)
+    z = [*map(arb, xi), arb(1)]
+    form = float(sum(z[i] * paid[i, j] * z[j] for i in range(3) for j in range(3)).mid())
+    weights = [sum(float(row[b]) for row in local.rest) for b in range(3)]
+    assert form == pytest.approx(4 * np.dot(weights, np.square(eta)), rel=1e-9, abs=1e-12)
 
 
 # ---- files made to fool --------------------------------------------------------------------------------------
