@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,8 @@ from certbound.checker.statement import Model
 from certbound.problem.model import JUMPS, Tape
 
 Pair = tuple[int, int]
+_MOST_PARTS = 64
+_MOST_CUTS = 8
 _KINKED = {"abs", "min", "max", "hypot", "atan2", "fmod", "copysign"}
 
 
@@ -144,7 +147,7 @@ class Flow:
         asked = [*self.outputs, *(node for row in self.slopes for node in row)]
         self._run([*asked, *self.noise], all_)  # all of it is defined
         values = self._run(asked, here)
-        bends = dict(zip(self.bends, self._run(list(self.bends.values()), all_)))
+        bends = dict(zip(self.bends, self._ranges(all_)))
         base = [[arb(0)] * (n + 1) for _ in range(n + 1)]
         along = {a: [[arb(0)] * (n + 1) for _ in range(n + 1)] for a in held}
         pushed = [[[arb(0)] * (n + 1) for _ in range(n + 1)] for _ in range(q - n)]
@@ -170,6 +173,25 @@ class Flow:
         return Local(base=matrix(base), along={a: matrix(rows) for a, rows in along.items()},
                      pushed=[matrix(rows) for rows in pushed], rest=[[x.upper() for x in row] for row in rest],
                      middle=middle, size=size[:n])  # fmt: skip
+
+    def _ranges(self, box: Sequence[arb]) -> list[arb]:
+        """The second derivatives over a box, in parts: balls say more of small ones."""
+        nodes = list(self.bends.values())
+        used = [self.graph.node(index) for index in self.graph.reachable(nodes)]
+        places = sorted({args[0] for op, args, _ in used if op == "input"})
+        cuts = _MOST_CUTS
+        while cuts > 1 and cuts ** len(places) > _MOST_PARTS:
+            cuts -= 1
+        found: list[arb] = []
+        for part in itertools.product(range(cuts), repeat=len(places)):
+            self.budget.check()
+            inputs = list(box)
+            for place, k in zip(places, part):
+                low, high = box[place].lower(), box[place].upper()
+                inputs[place] = (low + (high - low) * k / cuts).union(low + (high - low) * (k + 1) / cuts)
+            values = self._run(nodes, inputs)
+            found = [a.union(b) for a, b in zip(found, values)] if found else values
+        return found
 
     def _run(self, nodes: list[int], inputs: Sequence[arb]) -> list[arb]:
         if not nodes:
