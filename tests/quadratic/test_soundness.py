@@ -14,6 +14,7 @@ from certbound.quadratic import bound_quadratic, refinement
 from certbound.quadratic.inequality import prove
 from certbound.quadratic.wall_attempts import Attempt, total
 from certbound.quadratic.wall_program import Proposal, propose
+from tests.values.random_systems import quadratic
 
 
 def random_problem(seed: int) -> cb.Problem:
@@ -46,6 +47,14 @@ def test_the_bound_is_above_the_frequency_of_failures(seed: int) -> None:
     found = bound_quadratic(problem, target=1.0, seconds=20.0)  # one pass over the walls
     seen = cb.simulate_exits(problem, paths=4000, rng=np.random.default_rng(seed))
     assert seen.lower <= 10**found.upper < 1
+
+
+def test_cells_that_are_curved_at_some_times_only_have_the_same_corners() -> None:
+    """Drift and noise of this one change with time: on some pieces a remainder is 0."""
+    problem = quadratic(np.random.default_rng([7, 13]))
+    found = bound_quadratic(problem, target=1e-6, seconds=10.0)
+    seen = cb.simulate_exits(problem, paths=1000, rng=np.random.default_rng(1))
+    assert seen.lower <= 10**found.upper <= 1
 
 
 def spoilt(proposal: Proposal, rng: np.random.Generator, size: float) -> Proposal:

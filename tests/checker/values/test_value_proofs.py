@@ -351,6 +351,25 @@ def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:
     assert found - 1e-6 <= report.log10_proved < found + 0.1
 
 
+def test_what_is_missing_of_a_curved_drift_is_proved_again_without_more_room() -> None:
+    """A sine and a product with a square, over cells: the checker's enclosures are others than the engine's."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -2 * np.sin(x[0]) - x[1] + 0.3 * x[1] * x[2] ** 2, -x[2]], states=3,
+        diffusion=[[0.05, 0, 0], [0, 0.3, 0], [0, 0, 0.3]],
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1.2, -1.5, -1.2], [1.2, 1.5, 1.2]))]
+    problem = cb.Problem(system, initial=cb.Box([-0.1] * 3, [0.1] * 3), safe=safe, horizon=1.0, delta=0.5)
+    found = bound_quadratic(problem, target=0.5, seconds=60.0)
+    for item in found.walls:
+        assert item.proved is not None
+        assert item.proved.proposal.degree == 2
+    data = parse(quadratic_certificate(problem))
+    report = check_data(data, json.loads(json.dumps(problem_data(problem))))
+    assert report.valid, report.reason
+    assert found.upper - 1e-6 <= report.log10_proved < found.upper + 0.1 < 0
+    assert any(len(edges) > 2 for one in data["proof"]["bounds"] for edges in one["cuts"])
+
+
 def test_a_ball_of_starts_has_a_bound_of_its_own() -> None:
     """Against V at points of the ball; its corners, which lie outside, are left aside."""
     problem = squared()
