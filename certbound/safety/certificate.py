@@ -66,11 +66,11 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
-    if verdict.status == "UNSAFE":
+    members = getattr(verdict, "members", ())
+    if verdict.status == "UNSAFE" or any(one.status == "UNSAFE" for one in members):
         return _lower_data(problem, verdict, attempt)
-    members = [certificate_data(one.problem, one, attempt=attempt) for one in getattr(verdict, "members", ())]
     if members:
-        return united(problem, members)
+        return united(problem, [certificate_data(one.problem, one, attempt=attempt) for one in members])
     refusals: list[str] = []
     best: tuple[str, Proof] | None = None
     for name, answer in _answers(problem, verdict):
@@ -121,7 +121,10 @@ def united(problem: Problem, members: Sequence[Mapping[str, Any]]) -> dict[str, 
 def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, Any]:
     """The certificate of UNSAFE: P(some constraint is broken) >= 10**claim from some start, for some disturbance."""
     if problem.reach is not None or len(problem.starts) > 1:
-        raise CertificateError("certificates state no lower bounds where there is a target, or the start is a union.")
+        raise CertificateError(
+            "certificates state no lower bounds where there is a target, or the start is a union: verify by itself the "
+            "member that is UNSAFE."
+        )
     refusals: list[str] = []
     found = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_lower is not None]
     for name, answer in sorted(found, key=lambda item: -(item[1].log10_lower or 0.0)):

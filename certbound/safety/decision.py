@@ -16,12 +16,12 @@ from certbound.errors import EngineError, contained
 from certbound.problem.goals import met_at
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
-from certbound.safety.answers import EngineAnswer, Request
+from certbound.safety.answers import EngineAnswer, Request, is_more_than
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import best_time, find_miss, window_of
 from certbound.safety.portfolio import ENGINES, engine_named
-from certbound.safety.verdict import Verdict, is_safe, stopped, unsafe, verdict_of
+from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
 
@@ -86,6 +86,12 @@ class _Search:
         """Whether SAFE is proved."""
         return any(is_safe(answer, self.problem) for answer in (*self.answers.values(), *self.sketches.values()))
 
+    def spared(self, name: str) -> bool:
+        """Whether an engine may be quick: not where it alone could prove UNSAFE of what is near the truth."""
+        below = best_lower(self.answers)
+        refuted = below is not None and is_more_than(below, self.problem.delta)
+        return self.settled and (self.safe or refuted or ENGINES[name].write_below is None)
+
     def violation(self) -> Violation | None:
         """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
         self.watch.engine = "noise-free"
@@ -129,7 +135,7 @@ class _Search:
             self._in_turn(names[1:])
 
     def _turn_of(self, name: str) -> None:
-        quick = self.settled
+        quick = self.spared(name)
         if quick and self.problem.system.dimension > _LARGE:
             return
         if quick and name in self.sketches:

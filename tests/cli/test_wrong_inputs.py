@@ -117,7 +117,7 @@ FILES = {
     "a level by a wrong name": (change("std = 0.1", "stdev = 0.1", STEPS), "stdev", "std"),
     "a level that is given twice": (change("std = 0.1", "std = 0.1\nvariance = 0.01", STEPS), "variance", ""),
     "a bare noise level": (change("std = 0.1", "sigma = 0.1", STEPS), "sigma", ""),
-    "a law that does not exist": (change('"gaussian"', '"laplace"', STEPS), "noise.law", "gaussian"),
+    "a law that does not exist": (change('"gaussian"', '"cauchy"', STEPS), "noise.law", "gaussian"),
     "a covariance of the wrong size": (change("std = 0.1", "covariance = [[1, 0], [0, 1]]", STEPS), "covariance", "1"),
     "half a step": (change("horizon = 5", "horizon = 2.5", STEPS), "horizon", ""),
     "a negative horizon": (change("horizon = 1.0", "horizon = -1"), "horizon", ""),

@@ -203,3 +203,14 @@ def test_a_row_that_does_not_poll_is_ended_by_a_timer_that_leaves_no_trace(monke
     assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", -1.0)
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
     assert signal.getsignal(signal.SIGALRM) is before
+
+
+def test_an_upper_bound_near_the_truth_that_is_too_large_is_answered_from_below() -> None:
+    """Linear response of a linear Gaussian problem ends the search for smaller bounds, not that for larger ones."""
+    system = cb.linear_system([[0.5]], noise=cb.Gaussian(std=0.4))
+    found = cb.verify_safety(problem().replace(system=system))
+    assert found.answers["linear"].conclusive
+    assert found.status == "UNSAFE"
+    assert found.log10_lower is not None
+    assert -3 < found.log10_lower <= found.log10_delta
+    assert not cb.verify_safety(problem()).answers["values"].applicable  # what is SAFE needs no more

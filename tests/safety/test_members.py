@@ -9,7 +9,7 @@ from certbound.cli.commands.check import proved_certificate
 from certbound.errors import CertificateError, InfeasibleError
 from certbound.problem.files import load, save
 from certbound.problem.sets import StartUnion
-from certbound.safety.certificate import problem_data
+from certbound.safety.certificate import certificate_data, problem_data
 
 
 def walk(*starts, delta=0.2):
@@ -137,3 +137,11 @@ def test_safe_starts_hold_a_union_only_if_they_hold_every_member():
     for starts, held in (((LEFT, RIGHT), True), ((RIGHT, NEAR), False)):
         found = cb.verify_safety(walk(*starts, delta=0.01), method="values").safe_starts()
         assert found.holds_initial is held
+
+
+def test_what_is_unsafe_from_one_member_is_not_stated_of_the_union():
+    problem = walk(RIGHT, NEAR, delta=1e-6)
+    verdict = cb.verify_safety(problem, method="values")
+    assert verdict.status == "UNSAFE"
+    with pytest.raises(CertificateError, match="verify by itself the member"):
+        certificate_data(problem, verdict)

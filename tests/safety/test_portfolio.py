@@ -67,7 +67,7 @@ def test_a_bound_holds_and_is_certified_and_grows_with_what_it_must(engine: str,
     assert report.valid, report.reason
 
 
-@pytest.mark.parametrize("name", ["logistic", "relaxation"])
+@pytest.mark.parametrize("name", ["logistic", pytest.param("relaxation", marks=pytest.mark.slow)])
 def test_two_engines_agree_from_both_sides(name: str) -> None:
     problem = ZOO[name](1.0, 1.0)
     verdict = verify_safety(problem, method="values")

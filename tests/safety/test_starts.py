@@ -63,7 +63,9 @@ def starts_of(problem: Problem, **options: bool) -> SafeStarts:
     return bound_safe_starts(problem, {}, **options)
 
 
-@pytest.mark.parametrize("make", [logistic, disc, well, pytest.param(swirl, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "make", [logistic, disc, *(pytest.param(make, marks=pytest.mark.slow) for make in (well, swirl))]
+)
 def test_from_every_safe_start_simulation_fails_no_more_often_than_delta(make: Make) -> None:
     problem = make()
     found = starts_of(problem, pictured=make is well)
@@ -105,6 +107,7 @@ def test_a_verdict_offers_them_and_covers_its_own_start_when_it_is_safe() -> Non
     assert verdict.safe_starts(1e-2).measure > found.measure
 
 
+@pytest.mark.slow
 def test_a_wider_delta_gives_a_larger_set_in_continuous_time() -> None:
     tight, wide = starts_of(well()), starts_of(well().replace(delta=0.1))
     inside = tight.boxes[:, 0].ravel()
@@ -160,7 +163,7 @@ def test_what_cannot_be_had_is_said_with_the_cure() -> None:
         starts_of(space)
 
 
-@pytest.mark.parametrize("make", [logistic, disc])
+@pytest.mark.parametrize("make", [logistic, pytest.param(disc, marks=pytest.mark.slow)])
 def test_pictures_and_report_show_the_set(make: Make) -> None:
     problem = make()
     found = starts_of(problem, pictured=True)

@@ -20,7 +20,7 @@ def refuted(index, paths, *, slow=False, shrink=1.0):
     ]
 
 
-@pytest.mark.parametrize("index", [2, 6, 9])
+@pytest.mark.parametrize("index", [pytest.param(2, marks=pytest.mark.slow), 6, 9])
 def test_a_few_cases_hold(index):
     assert refuted(index, 4_000) == []
 

@@ -47,6 +47,7 @@ def test_bounds_hold_a_simulation_and_are_close():
     assert counted.lower < upper < 1.1 * lower
 
 
+@pytest.mark.slow
 def test_the_worst_start_is_the_farthest_one_on_either_side():
     far = bounds(flow())[:2]
     assert bounds(flow(cb.Box([0.5], [0.8])))[:2] == far

@@ -271,7 +271,7 @@ def test_both_bounds_are_near_the_truth(f, g, low, high, horizon, start) -> None
     assert truth - math.log10(1.25) < found.lower <= truth + 1e-4
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [0, 5, 7, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3, 4, 6))])
 def test_random_problems_lie_between_the_bounds(seed: int) -> None:
     rng = np.random.default_rng(seed)
     a, b, c, d = rng.normal(size=4) * [0.5, 1.0, 0.5, 0.5]
@@ -358,6 +358,7 @@ def test_a_lower_bound_is_proved_of_a_function_that_is_nowhere_positive(monkeypa
     assert max(seen) <= 0.0
 
 
+@pytest.mark.slow
 def test_scaled_and_bent_proposals_never_pass_the_truth() -> None:
     model, starts, upper, lower = proposals()
     truth = math.log(max(well_truth(10.0, x) for x in WELL[5]))

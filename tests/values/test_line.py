@@ -52,7 +52,10 @@ CASES: dict[str, tuple[cb.Problem, float, float]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if "instant" in n else n for n in CASES])
+LONG = ("an instant", "a window that begins late", "an obstacle comes")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in CASES])
 def test_bounds_of_every_kind_of_limit_hold_and_are_close(name: str) -> None:
     asked, above, below = CASES[name]
     found = bound_exits(asked, seconds=0.01)
@@ -63,7 +66,7 @@ def test_bounds_of_every_kind_of_limit_hold_and_are_close(name: str) -> None:
     assert found.lower is None or 10**found.lower <= most * 1.005
 
 
-@pytest.mark.parametrize("seed", [3, 13])
+@pytest.mark.parametrize("seed", [3, pytest.param(13, marks=pytest.mark.slow)])
 def test_random_problems_lie_between_the_bounds(seed: int) -> None:
     assert check("line", seed, seconds=0.01, cells=1200)[0] == ""
 
@@ -119,7 +122,9 @@ WRONG = [("noise", 1e-6), ("noise", 1e-2), ("scaled", -0.05), ("scaled", 0.05), 
          ("steep", 0.05)]  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "tries"), [("a random start", WRONG), ("a window that begins late", WRONG[1:4])])
+@pytest.mark.parametrize(("name", "tries"), [
+    ("a random start", WRONG), pytest.param("a window that begins late", WRONG[1:4], marks=pytest.mark.slow),
+])
 def test_a_wrong_proposal_never_passes_the_truth(name: str, tries: list[tuple[str, float]]) -> None:
     _try_wrong(CASES[name][0], np.random.default_rng(0), tries)
 

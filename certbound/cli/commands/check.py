@@ -96,7 +96,7 @@ def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float]
     probability, or the checker did not prove what was written. ``checking`` takes the seconds of every check.
     """
     spent = [] if checking is None else checking
-    if verdict.members:
+    if verdict.members and not any(member.status == "UNSAFE" for member in verdict.members):
         return _united(problem, verdict, spent)
     left, reasons = dict(verdict.answers), list[str]()
     while left:
