@@ -61,10 +61,12 @@ def check_quadratic(model: Model, value: object, budget: Budget) -> arb:
         raise Unproved("this proof does not treat a plan with steps in time")
     flow = Flow(model, budget)
     around = Surroundings(model, record, flow)
-    stated = [
-        _Value(around, flow, item, f"proof.bounds[{k}]", budget)
-        for k, item in enumerate(record.items("bounds", 0, _MOST_BOUNDS))
-    ]
+    stated: list[_Value] = []
+    for k, item in enumerate(record.items("bounds", 0, _MOST_BOUNDS)):
+        budget.check()
+        stated.append(_Value(around, flow, item, f"proof.bounds[{k}]", budget))
+        if sum(one.moves.size + one.weights.size for one in stated) > MOST_NUMBERS:
+            raise CertificateError(f"`proof.bounds` must hold at most {MOST_NUMBERS} multipliers.")
     _check_covered(around, stated)
     for one in stated:
         one.prove()
@@ -244,7 +246,7 @@ class _Value:
         here = self.matrices[self.degree * k + side]
         reach = sum((arb.max(a * a, b * b) for a, b in zip(low, high)), arb(1))
         shift = identity(self.n + 1) * (self.lam[k] / reach)
-        missing = _missing(local)
+        missing = missing_form(local)
         extra = [(sum(row, arb(0)) / _STEEP).sqrt() for row in local.rest]
         splits = self._splits(self.moves[k, side, c])
         for number, bits in enumerate(itertools.product((0, 1), repeat=self.corners)):
@@ -325,7 +327,7 @@ class _Value:
                 raise Unproved("a quadratic bound was not shown to be at least 0 on its wall")
 
 
-def _missing(local: Local) -> arb_mat:
+def missing_form(local: Local) -> arb_mat:
     """E: sum_b (sum_i r_ib) (q/2) eta_b^2 over a cell, as a form over z."""
     n = len(local.rest)
     rows = [[arb(0)] * (n + 1) for _ in range(n + 1)]

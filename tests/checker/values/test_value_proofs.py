@@ -30,7 +30,7 @@ from certbound.checker.values.hermite import Surface
 from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
 from certbound.checker.values.packed import unpacked
 from certbound.checker.values.passage import Levels, Passage
-from certbound.checker.values.quadratic import _missing, splitting
+from certbound.checker.values.quadratic import missing_form, splitting
 from certbound.checker.values.second_order import Flow
 from certbound.checker.values.step_back import Grid, Steps, Values
 from certbound.checker.values.uniform_means import UniformTransition
@@ -351,6 +351,17 @@ def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:
     assert found - 1e-6 <= report.log10_proved < found + 0.1
 
 
+def test_many_quadratic_bounds_are_not_all_unpacked() -> None:
+    data = parse(quadratic_certificate(squared()))
+    with patch.object(quadratic, "MOST_NUMBERS", 3000), patch.object(quadratic, "_Value", wraps=quadratic._Value) as made:
+        assert check_data(data).valid
+        before = made.call_count
+        data["proof"]["bounds"] = [data["proof"]["bounds"][0]] * 50
+        with pytest.raises(CertificateError, match=r"`proof.bounds` must hold at most 3000 multipliers"):
+            check_data(data)
+    assert made.call_count < before + 40
+
+
 def test_what_is_missing_of_a_curved_drift_is_proved_again_without_more_room() -> None:
     """A sine and a product with a square, over cells: the checker's enclosures are others than the engine's."""
     system = cb.ContinuousSystem(
@@ -422,7 +433,7 @@ def test_the_drift_lies_between_its_corners(place: int) -> None:
         assert abs(float(value.mid()) - exact_one) <= np.dot([float(part) for part in rest], eta) + 1e-12
     assert max(map(float, local.rest[0])) < 1e-15
     assert float(local.rest[1][2]) < 1e-15 < float(local.rest[1][0])
-    paid = _missing(local)
+    paid = missing_form(local)
     z = [*map(arb, xi), arb(1)]
     form = float(sum(z[i] * paid[i, j] * z[j] for i in range(3) for j in range(3)).mid())
     weights = [sum(float(row[b]) for row in local.rest) for b in range(3)]
