@@ -353,7 +353,8 @@ def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:
 
 def test_many_quadratic_bounds_are_not_all_unpacked() -> None:
     data = parse(quadratic_certificate(squared()))
-    with patch.object(quadratic, "MOST_NUMBERS", 3000), patch.object(quadratic, "_Value", wraps=quadratic._Value) as made:
+    counted = patch.object(quadratic, "_Value", wraps=quadratic._Value)
+    with patch.object(quadratic, "MOST_NUMBERS", 3000), counted as made:
         assert check_data(data).valid
         before = made.call_count
         data["proof"]["bounds"] = [data["proof"]["bounds"][0]] * 50
