@@ -6,7 +6,9 @@ Everything is handed to Clarabel as it stands. What comes back is a proposal; a 
 from __future__ import annotations
 
 import importlib
+import signal
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,11 +46,29 @@ def block(constant: Array, maps: Sequence[Array]) -> Block:
     return Block(size, rows, columns, joined[rows, columns], constant[place[0], place[1]] * scale)
 
 
+@cache
+def _solver_module() -> Any:
+    """Clarabel with everything loaded: a timer that interrupts its first solution would leave it broken for good."""
+    alarms = {signal.SIGALRM} if hasattr(signal, "SIGALRM") else set()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, alarms) if alarms else set()
+    try:
+        clarabel = importlib.import_module("clarabel")
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        eye, one = sparse.csc_matrix(np.eye(3)), np.array([1.0, 0.0, 1.0])
+        cone = clarabel.PSDTriangleConeT(2)
+        clarabel.DefaultSolver(sparse.csc_matrix((3, 3)), one, -eye, one, [cone], settings).solve()
+    finally:
+        if alarms:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return clarabel
+
+
 class Program:
     """minimise one variable, subject to matrix and scalar inequalities."""
 
     def __init__(self) -> None:
-        self.clarabel: Any = importlib.import_module("clarabel")
+        self.clarabel: Any = _solver_module()
         self.width, self.height = 0, 0
         self.cones: list[Any] = []
         self.entries: list[tuple[Integers, Integers, Array]] = []
@@ -91,7 +111,7 @@ class Program:
         objective[column] = 1.0
         settings = self.clarabel.DefaultSettings()
         settings.verbose, settings.max_iter, settings.time_limit = False, 80, float(seconds)
-        settings.tol_gap_rel, settings.tol_gap_abs, settings.tol_feas = 1e-4, 1e-4, 1e-8
+        settings.tol_gap_rel, settings.tol_gap_abs, settings.tol_feas = 1e-4, 1e-4, 1e-7
         settings.max_threads = 1
         settings.equilibrate_enable, settings.static_regularization_constant = False, 1e-7  # else it may break down
         nothing = sparse.csc_matrix((self.width, self.width))

@@ -1,12 +1,14 @@
 """The dynamics over cells of the working box as corners of linear maps.
 
-On a cell, f is its second-order Taylor polynomial about the middle plus a remainder |e_i| <= r_i (half the spread of
-the second derivatives over the cell). With the coordinates N that carry every second-order term held at a value s, it
-is A(s, d, e) z, affine in each of s, d, e: its values at the cell's corners contain it in their convex hull, and
+On a cell, f is its second-order Taylor polynomial about the middle plus a remainder e (half the spread of the second
+derivatives over the cell). With the coordinates N that carry every second-order term held at a value s, the polynomial
+is A(s, d) z, affine in each of s, d: its values at the cell's corners contain it in their convex hull, and
 z' D(s) z = 0 for the free splittings D of `splitting`. The diffusion is likewise affine in each of s where it is
 polynomial of that kind; what is left of it goes into columns of its own:
     |(G + E)' p|^2 <= (1 + a)|G' p|^2 + (1 + 1/a) (sum_i rho_i) sum_i rho_i p_i^2,   |E_i.| <= rho_i.
-Small remainders, and all beyond a few, are no corners but columns too: r |p| <= r q/2 + (r/q) p^2/2 for any q > 0.
+Remainders are columns too: |e| <= sum_b r_b |eta_b|, with eta_b the coordinate b of the cell scaled to [-1, 1] and a
+last one equal to 1, gives |e p| <= sum_b r_b (q eta_b^2 + p^2/q)/2 for any q > 0: a remainder that vanishes with a
+coordinate costs nothing near its zero.
 """
 
 from __future__ import annotations
@@ -22,18 +24,12 @@ from certbound.constants.enclosures import enclose
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, edged, is_zero, jacobian
 from certbound.problem.problem import Problem
+from certbound.quadratic.noise_columns import EXACT, SLOPE, padded, with_columns, with_small
 from certbound.quadratic.setting import Setting, diffusion_of
-from certbound.rigor.intervals import Interval, sqrt, stack
+from certbound.rigor.intervals import Interval, stack
 
 MOST_CORNERS = 256
-_EXACT = 1e-10
-"""Remainders below this share of a working box a second are left to the proof, which pays for them."""
-_SMALL = 0.02
-"""Remainders below this share of a working box within the horizon are columns."""
-_FEW_CORNERS, _SMALL_DIMENSION = 16, 4
-"""Corners up to which remainders are some, and states up to which: beyond, columns and more slabs are cheaper."""
-_SLOPE = 8.0  # q: about |grad V|
-_SHARE = 0.02  # least a: the share by which the known part of the diffusion is enlarged where something is left
+_ROOM = 1.01  # of remainders: a check by other enclosures of the second derivatives finds about the same
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -57,9 +53,9 @@ class Cells:
     square : Interval, shape (C, n, n)
         g g' over the cells.
     toll : Interval, shape (C,)
-        What the remainders that are columns add to R besides.
-    large : tuple of int
-        States whose remainders are corners, in their order.
+        What the remainders that are columns add to R besides, and
+    bend : Interval, shape (C, n + 1, n + 1)
+        the part of it that depends on the place, as forms.
     """
 
     low: Array
@@ -71,7 +67,7 @@ class Cells:
     affine: Interval | None
     square: Interval
     toll: Interval
-    large: tuple[int, ...]
+    bend: Interval
 
 
 class Dynamics:
@@ -112,7 +108,7 @@ class Dynamics:
     def remainder(self, low: Array, high: Array) -> float:
         """The largest remainder of the drift over cells at time 0, in working boxes within the horizon."""
         cells = _Boxes(low, high, Interval.point(0.0), self.setting, self.disturbed)
-        return float(np.max(self._drift_parts(cells)[-1].hi)) * self.horizon
+        return float(np.max(self._drift_parts(cells)[-1].sum(axis=-1).hi)) * self.horizon
 
     def over(self, low: Array, high: Array, start: float, end: float) -> Cells:
         """The cells [low, high], shape (C, n), of the working box during [start, end].
@@ -125,20 +121,17 @@ class Dynamics:
             The model is undefined somewhere in a cell.
         """
         cells = _Boxes(low, high, Interval(start, end), self.setting, self.disturbed)
-        base, by_state, by_disturbance, rest = self._drift_parts(cells)
-        plain = len(self.held) + len(self.disturbed)
-        order = sorted(range(self.n), key=lambda i: -np.max(rest.hi[:, i]))
-        room = max(int(np.log2(_FEW_CORNERS)) - plain, 0) if self.n <= _SMALL_DIMENSION else 0
-        large = [i for i in order[:room] if np.max(rest.hi[:, i]) * self.horizon > _SMALL]
-        small = [i for i in order if i not in large and np.max(rest.hi[:, i]) > _EXACT]
-        count = plain + len(large)
+        base, by_state, by_disturbance, shares = self._drift_parts(cells)
+        rest = shares.sum(axis=-1)
+        small = [i for i in range(self.n) if np.max(rest.hi[:, i]) > EXACT]
+        count = len(self.held) + len(self.disturbed)
         if 2**count > MOST_CORNERS:
             raise InfeasibleError(f"the dynamics have {2**count} corners on a cell; at most {MOST_CORNERS} are served.")
         worst = Interval(np.zeros(self.n), np.max(rest.hi, axis=0))
         values, drifts, spreads = [], [], []
         noise = self._noise_parts(cells)
         for corner in itertools.product((0, 1), repeat=count):
-            held, shaken, extra = np.split(np.array(corner), [len(self.held), len(self.held) + len(self.disturbed)])
+            held, shaken = np.split(np.array(corner), [len(self.held)])
             at = np.where(held, high[:, self.held], low[:, self.held])
             step = [Interval.point(at[:, k]) - Interval.point(cells.middle[:, a]) for k, a in enumerate(self.held)]
             matrix = base
@@ -147,41 +140,50 @@ class Dynamics:
             signs = [2.0 * bit - 1.0 for bit in shaken]
             for part, sign, radius in zip(by_disturbance, signs, cells.sway):
                 matrix = matrix + part * (radius * Interval.point(sign))
-            drifts.append(self._with_rest(matrix, rest, dict(zip(large, 2.0 * extra - 1.0)), small))
+            drifts.append(self._widened(matrix, rest, small))
             values.append(at)
-            spreads.append(_with_small(noise(step), worst, small))
+            spreads.append(with_small(noise(step), worst, small))
         return Cells(
             low=low, high=high, held=self.held, values=np.array(values), drift=stack(drifts), spread=stack(spreads),
-            affine=self._affine(cells), square=self._square(cells), toll=self._toll(worst, small, len(low)),
-            large=tuple(large),
+            affine=self._affine(cells), square=self._square(cells), toll=self._toll(shares, small),
+            bend=self._bend(shares, small, cells),
         )  # fmt: skip
 
-    def _toll(self, worst: Interval, small: Sequence[int], many: int) -> Interval:
-        """sum r q/2 over the remainders that are columns, the same for all cells."""
-        total = (Interval.point(worst.hi[list(small)]) * Interval.point(_SLOPE / 2)).sum() if small else 0.0
-        return Interval.point(np.zeros(many)) + total
+    def _toll(self, shares: Interval, small: Sequence[int]) -> Interval:
+        """sum r q/2 over what is constant of the remainders that are columns, shape (C,)."""
+        return Interval.point(shares.hi[:, list(small), self.n]).sum(axis=-1) * Interval.point(SLOPE / 2)
 
-    def _with_rest(
-        self, matrix: Interval, rest: Interval, signs: dict[int, float], small: Sequence[int]
-    ) -> Interval:
-        """The constant column moved by the remainders: by their end where it is a corner, else widened."""
-        lo, hi = np.zeros(matrix.shape), np.zeros(matrix.shape)
-        for i in range(self.n):
-            if i in small:
-                continue
-            lo[:, i, -1] = rest.hi[:, i] * signs[i] if i in signs else -rest.hi[:, i]
-            hi[:, i, -1] = rest.hi[:, i] * signs[i] if i in signs else rest.hi[:, i]
-        return matrix + Interval(lo, hi)
+    def _bend(self, shares: Interval, small: Sequence[int], cells: _Boxes) -> Interval:
+        """sum r_b (q/2) eta_b^2 over the rest of them, as forms over z, shape (C, n + 1, n + 1)."""
+        many, n = len(cells.low), self.n
+        weight = Interval.point(shares.hi[:, list(small), :n]).sum(axis=1) * Interval.point(SLOPE / 2)
+        total: Interval = Interval.point(np.zeros((many, n + 1, n + 1)))
+        for b in np.flatnonzero(weight.hi.max(axis=0) > 0):
+            slope = Interval.point(1.0) / Interval.point(cells.size.hi[:, b])
+            offset = -(Interval.point(cells.middle[:, b]) * slope)
+            lo, hi = np.zeros((2, many, n + 1))
+            lo[:, b], hi[:, b], lo[:, n], hi[:, n] = slope.lo, slope.hi, offset.lo, offset.hi
+            eta = Interval(lo, hi)
+            square = eta.reshape(many, -1, 1) * eta.reshape(many, 1, -1)
+            total = total + square * weight[:, b].reshape(-1, 1, 1)
+        return total
+
+    def _widened(self, matrix: Interval, rest: Interval, small: Sequence[int]) -> Interval:
+        """The constant column widened by the remainders that are no columns: those of rounding."""
+        wide = np.zeros(matrix.shape)
+        wide[:, : self.n, -1] = rest.hi
+        wide[:, list(small), -1] = 0.0
+        return matrix + Interval(-wide, wide)
 
     def _drift_parts(self, cells: _Boxes) -> tuple[Interval, list[Interval], list[Interval], Interval]:
-        """A at the middle, its slopes along N and d, and bounds of the remainder (C, n)."""
+        """A at the middle, its slopes along N and d, and bounds of the remainder: r_b, shape (C, n, n + 1)."""
         n = self.n
         value, slope, curve = self.drift.at(cells)
         size = cells.size  # (C, q): half widths of xi and d
-        rest = Interval.point(np.zeros((len(cells.low), n)))
+        shares = _Shares(len(cells.low), n)
         value, first = self._noted(value, 0, size)
         slope, second = self._noted(slope, 1, size)
-        rest = rest + first + second
+        shares.add(n, first + second)
         base, owned = _linear(value, slope[..., :n], cells.middle), [_empty(cells, n) for _ in self.held]
         shaken = [_linear(slope[..., n + b], None, cells.middle) for b in range(len(self.disturbed))]
         for a, b in sorted(self.drift.pairs):
@@ -189,18 +191,18 @@ class Dynamics:
             factor = 1.0 if a != b else 0.5
             middle = Interval.point(both.mid)
             wide = Interval(np.zeros(both.shape), both.rad)
-            rest = rest + wide * Interval.point(factor) * (size[:, a] * size[:, b]).reshape(-1, 1)
+            owner, other = (a, b) if a in self.held or b >= n else (b, a)
+            along = min(a, n) if b >= n else other  # a product of disturbances has no place
+            shares.add(along, wide * Interval.point(factor) * (size[:, a] * size[:, b]).reshape(-1, 1))
             if b < n:
-                owner, other = (a, b) if a in self.held else (b, a)
                 place = self.held.index(owner)
                 owned[place] = owned[place] + _along(middle * Interval.point(factor), other, cells.middle)
             elif a < n:
                 shaken[b - n] = shaken[b - n] + _along(middle, a, cells.middle)
             else:  # a product of disturbances
-                rest = rest + Interval(np.zeros(both.shape), middle.mag) * Interval.point(factor) * (
-                    size[:, a] * size[:, b]
-                ).reshape(-1, 1)
-        return base, owned, shaken, rest
+                bent = Interval(np.zeros(both.shape), middle.mag) * Interval.point(factor)
+                shares.add(n, bent * (size[:, a] * size[:, b]).reshape(-1, 1))
+        return base, owned, shaken, shares.whole
 
     def _noted(self, part: Interval, order: int, size: Interval) -> tuple[Interval, Interval]:
         """A coefficient as a narrow one, and what its width (from the time) adds to the remainder (C, n)."""
@@ -215,7 +217,7 @@ class Dynamics:
         n, m = self.n, self.noises
         width = Interval.point(self.setting.width).reshape(1, -1, 1)
         if self.noise is None:
-            fixed = _padded((self.constant.reshape(1, n, m) / width).broadcast_to((len(cells.low), n, m)))  # type: ignore[union-attr]
+            fixed = padded((self.constant.reshape(1, n, m) / width).broadcast_to((len(cells.low), n, m)))  # type: ignore[union-attr]
             return lambda step: fixed
         value, slope, curve = self.noise.at(cells)
         size = cells.size
@@ -237,7 +239,7 @@ class Dynamics:
                 total = total + slope[:, :, a] * step[k].reshape(-1, 1)
             for first, second, part in cross:
                 total = total + part * (step[first] * step[second]).reshape(-1, 1)
-            return _with_columns(total.reshape(-1, n, m), rest)
+            return with_columns(total.reshape(-1, n, m), rest)
 
         return columns
 
@@ -268,6 +270,27 @@ class Dynamics:
         else:
             columns = self.noise.whole(cells).reshape(-1, n, m)
         return columns @ columns.T
+
+
+def curved_axes(problem: Problem) -> set[int]:
+    """Coordinates on which the drift does not depend affinely, or the diffusion at all."""
+    n, diffusion = problem.system.dimension, diffusion_of(problem)
+    found = {a for pair in _Jet(problem.closed_loop, n).pairs for a in pair if a < n}
+    return found | (_Jet(diffusion, n).used if isinstance(diffusion, Tape) else set())
+
+
+class _Shares:
+    """Bounds of the remainder's parts, by the coordinate with which each vanishes (the last: none)."""
+
+    def __init__(self, cells: int, n: int) -> None:
+        self.parts: list[Interval] = [Interval.point(np.zeros((cells, n)))] * (n + 1)
+
+    def add(self, place: int, bound: Interval) -> None:
+        self.parts[place] = self.parts[place] + bound * Interval.point(_ROOM)
+
+    @property
+    def whole(self) -> Interval:
+        return Interval(np.stack([p.lo for p in self.parts], -1), np.stack([p.hi for p in self.parts], -1))
 
 
 class _Boxes:
@@ -352,35 +375,3 @@ def _along(value: Interval, axis: int, middle: Array) -> Interval:
     last = -(value * Interval.point(middle[:, axis]).reshape(-1, 1))
     lo[:, :n, axis], hi[:, :n, axis], lo[:, :n, n], hi[:, :n, n] = value.lo, value.hi, last.lo, last.hi
     return Interval(lo, hi)
-
-
-def _padded(columns: Interval) -> Interval:
-    """A row of zeros below matrices of shape (C, n, m)."""
-    pad = [(0, 0), (0, 1), (0, 0)]
-    return Interval(np.pad(columns.lo, pad), np.pad(columns.hi, pad))
-
-
-def _with_columns(columns: Interval, rest: Interval) -> Interval:
-    """The columns enlarged, with others for what is left of them: rest (C, n) bounds the row sums of |E|."""
-    if np.max(rest.hi) < _EXACT:  # rounding: the proof pays for it
-        wide = Interval(-rest.hi, rest.hi).reshape(*rest.shape, 1)
-        return _padded(columns + wide)
-    n, loose = columns.shape[1], np.flatnonzero(np.max(rest.hi, axis=0) > 0)
-    total = rest.sum(axis=-1).hi
-    size = float(np.max(np.linalg.norm(columns.mid, axis=1)))
-    share = float(np.clip(np.max(total) / max(size, 1e-300), _SHARE, 1.0))
-    known = columns * sqrt(Interval.point(1.0) + Interval.point(share))
-    weight = (Interval.point(1.0) + Interval.point(1.0) / Interval.point(share)) * Interval.point(total)
-    side = sqrt(weight.reshape(-1, 1) * Interval.point(rest.hi))
-    others = side.reshape(-1, n, 1) * Interval.point(np.eye(n)[:, loose])
-    return _padded(Interval(np.concatenate([known.lo, others.lo], 2), np.concatenate([known.hi, others.hi], 2)))
-
-
-def _with_small(columns: Interval, worst: Interval, small: Sequence[int]) -> Interval:
-    """More columns sqrt(r_i / q) e_i."""
-    if not small:
-        return columns
-    batch, size, _ = columns.shape
-    more = np.zeros((batch, size, len(small)))
-    more[:, list(small), np.arange(len(small))] = (sqrt(Interval.point(worst.hi[list(small)] / _SLOPE))).hi
-    return Interval(np.concatenate([columns.lo, more], axis=2), np.concatenate([columns.hi, more], axis=2))

@@ -1,12 +1,13 @@
 """What holds of a quadratic V, whatever proposed it.
 
-Let R = V_t + f.grad V + tr(g g' V'')/2 + |g' grad V|^2/2 on [0, T] x S with V = z' H(t) z / 2, H linear between its
-times. At fixed (t, x) and fixed values of f and g, R is convex in H: a bound at both ends of a piece, for every f and g
-that the cells allow, holds on all of it. At an end, the matrix
+Let R = V_t + f.grad V + tr(g g' V'')/2 + |g' grad V|^2/2 on [0, T] x S with V = z' H(t) z / 2, H a polynomial in
+Bernstein form between its times. At fixed (t, x) and fixed values of f and g, R is convex in (H, H'), and (H, H')(t) is
+a convex combination of control points: a bound there, for every f and g that the cells allow, holds on all of the
+piece. The matrix
 
     M = -(H' + H A + A' H + sum_c G_c' H G_c)/2 - D(s) - H G G' H/2 - sum mu_i B_i
 
-is concave in G and affine in each of the held values, the disturbances and the remainders, so that M + e >= 0 at all
+is concave in G and affine in each of the held values and the disturbances, so that M + e >= 0 at all
 corners of a cell gives z' M z >= -e |z|^2 there, hence R <= e |z|^2 =: lam. The smallest eigenvalues are bounded from
 below in outward-rounded arithmetic; the multipliers only have to be at least 0 and the splittings to cancel, which they
 do by construction. The same is done on the wall, V >= -gap, and on the starts, V(0, .) <= top.
@@ -23,7 +24,7 @@ from certbound.arrays import Array, Integers
 from certbound.quadratic.corners import Cells
 from certbound.quadratic.form_matrices import enclosed_side_forms, splitting
 from certbound.quadratic.setting import Setting, Wall
-from certbound.quadratic.wall_program import Proposal, start_frame
+from certbound.quadratic.wall_program import Proposal, slopes, start_frame
 from certbound.rigor.definite import eigenvalue_lower
 from certbound.rigor.intervals import Interval, concatenate, matmul, stack
 
@@ -32,7 +33,7 @@ _MOST_CORNERS = 10  # log2 of the corners of the starts that are looked at
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Proved:
-    """P(leaving through the wall from x) <= exp(growth + gap + V(0, x)) for every start x.
+    """P(leaving through the wall from x) <= exp(growth + gap + V(0, x)) for every start x, in the time looked at.
 
     Attributes
     ----------
@@ -46,6 +47,8 @@ class Proved:
         What it is proved of.
     rates : tuple of float
         lam_k.
+    held : tuple of int
+        Coordinates that are held at the corners of the cells.
     """
 
     growth: float
@@ -53,6 +56,7 @@ class Proved:
     top: float
     proposal: Proposal
     rates: tuple[float, ...] = ()
+    held: tuple[int, ...] = ()
 
     @property
     def level(self) -> float:
@@ -60,8 +64,10 @@ class Proved:
         return float((Interval.point(self.growth) + Interval.point(self.gap) + Interval.point(self.top)).hi)
 
 
-def prove(setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cells]) -> Proved:
-    """The bound that a proposal gives; +inf in it where something is unbounded.
+def prove(
+    setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cells], *, others: Sequence[Wall] = ()
+) -> Proved:
+    """The bound that a proposal gives, of leaving through the wall or the others; +inf where something is unbounded.
 
     ``cells`` holds those of each piece of time, which must cover the safe part of the working box.
     """
@@ -69,17 +75,19 @@ def prove(setting: Setting, wall: Wall, proposal: Proposal, cells: Sequence[Cell
     rates = []
     for k, one in enumerate(cells):
         step = Interval.point(proposal.times[k + 1]) - Interval.point(proposal.times[k])
-        worst = max(_excess(setting, proposal, k, side, one, step) for side in (0, 1))
+        worst = max(_excess(setting, proposal, k, side, one, step) for side in range(proposal.degree + 1))
         if not np.isfinite(worst):
             return Proved(growth=np.inf, gap=np.inf, top=np.inf, proposal=proposal)
         growth = growth + Interval.point(worst) * step
         rates.append(worst)
-    return Proved(growth=float(growth.hi), gap=_gap(setting, wall, proposal), top=_top(setting, proposal),
-                  proposal=proposal, rates=tuple(rates))  # fmt: skip
+    known = zip((wall, *others), ((proposal.wall_weights, proposal.wall_rows), *proposal.others), strict=True)
+    gap = max(_gap(setting, one, proposal, *multipliers) for one, multipliers in known)
+    return Proved(growth=float(growth.hi), gap=gap, top=_top(setting, proposal), proposal=proposal,
+                  rates=tuple(rates), held=cells[0].held)  # fmt: skip
 
 
 def _excess(setting: Setting, proposal: Proposal, k: int, side: int, cells: Cells, step: Interval) -> float:
-    """A bound of R at one end of a piece, over all cells."""
+    """A bound of R at one control point of a piece, over all cells."""
     matrix = _slack_matrices(setting, proposal, k, side, cells, step)
     short = np.maximum(-eigenvalue_lower(matrix), 0.0)  # (V, C)
     size = Interval.point(np.maximum(cells.low**2, cells.high**2) * (1 + 1e-15)).sum(axis=-1) + 1.0
@@ -91,13 +99,15 @@ def _slack_matrices(
 ) -> Interval:
     """M at every corner and cell, shape (V, C, n + 1, n + 1)."""
     half = Interval.point(0.5)
-    matrix = Interval.point(proposal.matrices[k + side])
-    slope = (Interval.point(proposal.matrices[k + 1]) - Interval.point(proposal.matrices[k])) / step
+    base, (a, b, factor) = proposal.degree * k, slopes(proposal.degree)[side]
+    matrix = Interval.point(proposal.matrices[base + side])
+    rise = Interval.point(proposal.matrices[base + b]) - Interval.point(proposal.matrices[base + a])
+    slope = rise * Interval.point(factor) / step
     product = matmul(matrix, cells.drift)
     total = (product + product.T) * half + slope * half + _trace(matrix, cells) * half
     border = matmul(matrix, cells.spread)
     total = total + matmul(border, border.T) * half
-    total = total + _split(proposal.moves[k, side], cells) + _last(cells.toll, setting.dimension)
+    total = total + _split(proposal.moves[k, side], cells) + _last(cells.toll, setting.dimension) + cells.bend
     return -(total + _weighed(setting, proposal.weights[k, side], cells))
 
 
@@ -149,14 +159,15 @@ def _combined(weights: Array, forms: Interval) -> Interval:
     return (positive * forms).sum(axis=0)
 
 
-def _gap(setting: Setting, wall: Wall, proposal: Proposal) -> float:
-    """A bound of -V over the wall at the times of H, between which V is linear in time."""
+def _gap(setting: Setting, wall: Wall, proposal: Proposal, wall_weights: Array, wall_rows: Array) -> float:
+    """A bound of -V over the wall at the control points of the time looked at, of which V is a convex combination."""
     n, worst = setting.dimension, 0.0
     known = _known(-np.ones(n), np.ones(n), setting.inside, wall.forms)
-    for k, weights in enumerate(proposal.wall_weights):
+    for k in range(proposal.degree * proposal.first, len(proposal.matrices)):
+        weights = wall_weights[k]
         matrix = Interval.point(proposal.matrices[k]) * Interval.point(0.5) - _combined(weights, known)
         if wall.row is not None:
-            outer = wall.row.reshape(-1, 1) * Interval.point(proposal.wall_rows[k]).reshape(1, -1)
+            outer = wall.row.reshape(-1, 1) * Interval.point(wall_rows[k]).reshape(1, -1)
             matrix = matrix - (outer + outer.T) * Interval.point(0.5)
         worst = max(worst, float(-eigenvalue_lower(matrix)))
     return float((Interval.point(worst) * Interval.point(float(n + 1))).hi) if np.isfinite(worst) else np.inf

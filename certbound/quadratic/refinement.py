@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,14 +14,14 @@ from certbound.arrays import Array
 from certbound.display import rounded
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.quadratic.corners import Dynamics
-from certbound.quadratic.inequality import Proved, corner_levels, prove
+from certbound.quadratic.corners import Dynamics, curved_axes
+from certbound.quadratic.inequality import corner_levels, prove
 from certbound.quadratic.setting import Setting, Wall, make_setting, refuse
-from certbound.quadratic.surroundings import working_box
+from certbound.quadratic.surroundings import moved_sides, working_box
+from certbound.quadratic.wall_attempts import APART, PIECES, SPLIT, Attempt, apart, log10_up, log_sum, total
 from certbound.quadratic.wall_program import StatedCells, propose
-from certbound.rigor.balls import precision, upper
+from certbound.watch import poll
 
-_PIECES = 8
 _MOST_STATES = 12
 _LOOSE = 0.1  # remainder, in working boxes within the horizon, that is small
 _FIRST_SLABS, _FEWER_SLABS, _SMALL_DIMENSION = 8, 4, 4  # at first, up to so many states and beyond
@@ -29,7 +29,9 @@ _MOST_BLOCKS = 12_000
 _MARGINS = (4.0, 7.0, 2.5)
 _GAIN = 0.03  # of a wall's logarithm: a refinement that gains less is not repeated
 _DONE = 1e-3  # share of the bound that a wall may have without being looked at again
-_SMALLEST = -300.0
+_LEAST = 1e-300
+_MOVES, _WORTH = 2, 0.1  # how often the box's sides are moved, and what log10 must gain by it to go on
+_RESCUES = 2  # refinements of a wall that proves nothing, before the working box is given up
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -46,7 +48,7 @@ class QuadraticBound:
     setting : Setting or None
         Working box and walls.
     walls : tuple of Attempt
-        What is proved at each wall.
+        What is proved at each wall, in one window of time or several that cover the horizon.
     """
 
     upper: float
@@ -56,27 +58,10 @@ class QuadraticBound:
     walls: tuple[Attempt, ...] = ()
 
 
-@dataclass(eq=False, kw_only=True, slots=True)
-class Attempt:
-    """The best bound of one wall so far, how finely it was found, and what refinements gained."""
-
-    wall: Wall
-    pieces: int = _PIECES
-    slabs: tuple[int, ...] = ()
-    proved: Proved | None = None
-    corners: Array | None = None
-    seconds: float = 0.0
-    gains: dict[int, float] = field(default_factory=dict)
-    held: tuple[int, ...] = ()
-    large: tuple[int, ...] = ()
-
-    @property
-    def level(self) -> float:
-        """Bound of log P for the worst start."""
-        return 0.0 if self.proved is None else min(self.proved.level, 0.0)
-
-
-def bound_quadratic(problem: Problem, *, target: float = 0.0, seconds: float = 20.0) -> QuadraticBound:
+def bound_quadratic(
+    problem: Problem, *, target: float = 0.0, seconds: float = 20.0,
+    found: Callable[[QuadraticBound], object] = lambda bound: None,
+) -> QuadraticBound:
     """Bound P(failing within T) by Theorem K9: one time-varying quadratic value bound a wall of the safe set.
 
     Parameters
@@ -87,6 +72,8 @@ def bound_quadratic(problem: Problem, *, target: float = 0.0, seconds: float = 2
         The refinement ends at a bound below this.
     seconds : float
         About what may be spent.
+    found : callable
+        Takes each better bound while the search goes on (it stands where a watch ends the search).
 
     Returns
     -------
@@ -107,33 +94,73 @@ def bound_quadratic(problem: Problem, *, target: float = 0.0, seconds: float = 2
     >>> bound_quadratic(problem, target=1e-3, seconds=5).upper < -3
     True
     """
-    begin = time.perf_counter()
     n = problem.system.dimension
     if n > _MOST_STATES:
         raise InfeasibleError(f"quadratic value bounds serve at most {_MOST_STATES} states, the problem has {n}.")
-    best: QuadraticBound | None = None
-    chosen: Search | None = None
-    failure: InfeasibleError | None = None
     refuse(problem)
-    for low, high in _boxes(problem):
-        left = begin + seconds - time.perf_counter()
-        if best is not None and (left <= seconds / 2 or best.upper <= _log10(target)):
-            break
+    return _Quest(problem, target, seconds, found).run()
+
+
+class _Quest:
+    """Working boxes one after the other: sides by the spread of paths, then moved to where they cost little."""
+
+    def __init__(
+        self, problem: Problem, target: float, seconds: float, found: Callable[[QuadraticBound], object]
+    ) -> None:
+        self.problem, self.target, self.found = problem, target, found
+        self.begin = time.perf_counter()
+        self.until = self.begin + seconds
+        self.best: QuadraticBound | None = None
+        self.chosen: Search | None = None
+        self.failure: InfeasibleError | None = None
+
+    def run(self) -> QuadraticBound:
+        seconds = self.until - self.begin
+        for low, high in _boxes(self.problem):
+            left = self.until - time.perf_counter()
+            if self.best is not None and (left <= seconds / 2 or self.best.upper < 0):
+                break
+            self._try(low, high, left)
+        if self.best is None or self.chosen is None:
+            raise self.failure or InfeasibleError("no working box was found.")
+        self._move()
+        if self.best.upper > _log10(self.target):
+            self.chosen.run(self.target, self.until - time.perf_counter(), self._note)
+        best = self.best
+        return QuadraticBound(upper=best.upper, words=best.words, seconds=time.perf_counter() - self.begin,
+                              setting=best.setting, walls=best.walls)  # fmt: skip
+
+    def _try(self, low: Array, high: Array, share: float, *, together: bool = True) -> Search | None:
+        """One pass over the walls of a working box; None where there can be none."""
         try:
-            search = make_search(problem, low, high)
+            search = make_search(self.problem, low, high, together=together)
         except InfeasibleError as error:
-            failure = error
-            continue
-        found = search.run(target, left / 2)
-        if best is None or found.upper < best.upper:
-            best, chosen = found, search
-        if not search.complete:
-            break
-    if best is None or chosen is None:
-        raise failure or InfeasibleError("no working box was found.")
-    best = chosen.run(target, begin + seconds - time.perf_counter())
-    return QuadraticBound(upper=best.upper, words=best.words, seconds=time.perf_counter() - begin,
-                          setting=best.setting, walls=best.walls)  # fmt: skip
+            self.failure = error
+            return None
+        for bound in search.first(self.target, share):
+            if self.best is None or bound.upper < self.best.upper:
+                self.chosen = search
+                self._note(bound)
+        return search
+
+    def _move(self) -> None:
+        """Move the sides of the working box to where leaving there costs a part of the whole."""
+        for _ in range(_MOVES):
+            if self.best is None or self.chosen is None or not _log10(self.target) < self.best.upper < 0:
+                return
+            search, before, left = self.chosen, self.best.upper, self.until - time.perf_counter()
+            box = moved_sides(self.problem, search.setting, *search.by_wall())
+            if box is None or left < 1.1 * sum(attempt.seconds for attempt in search.attempts):
+                return
+            self._try(*box, left, together=False)
+            if self.best.upper > before - _WORTH:
+                return
+
+    def _note(self, bound: QuadraticBound) -> None:
+        if self.best is None or bound.upper < self.best.upper:
+            self.best = bound
+            if bound.upper < 0:
+                self.found(bound)
 
 
 def _boxes(problem: Problem) -> list[tuple[Array, Array]]:
@@ -145,26 +172,25 @@ def _boxes(problem: Problem) -> list[tuple[Array, Array]]:
     return list(found.values())
 
 
-def make_search(problem: Problem, low: Array, high: Array) -> Search:
-    """The search on the working box [low, high]; for errors see `bound_quadratic`."""
-    return Search(problem, make_setting(problem, low, high))
+def make_search(problem: Problem, low: Array, high: Array, *, together: bool = False) -> Search:
+    """The search on the working box [low, high], its sides ``together`` at first; for errors see `bound_quadratic`."""
+    setting, curved = make_setting(problem, low, high), curved_axes(problem)
+    walls = tuple(replace(w, far=w.side is not None and w.side[0] not in curved) for w in setting.walls)
+    return Search(problem, replace(setting, walls=walls), together=together)
 
 
 class Search:
     """One working box: its walls, refined where the bound is made of."""
 
-    def __init__(self, problem: Problem, setting: Setting) -> None:
+    def __init__(self, problem: Problem, setting: Setting, *, together: bool) -> None:
         self.setting, self.horizon = setting, float(problem.horizon)
         self.dynamics = Dynamics(problem, setting)
-        self.kept: dict[tuple[int, ...], list[StatedCells]] = {}
-        self.gains: dict[int, float] = {}  # of more pieces, at the wall that had them last
+        self.kept: dict[tuple[object, ...], list[StatedCells]] = {}
+        self.gains: dict[int, float] = {}  # of pieces and windows, at the wall that was refined last
         slabs = self._first_slabs()
-        self.attempts = [Attempt(wall=wall, slabs=slabs) for wall in setting.walls]
-
-    @property
-    def complete(self) -> bool:
-        """Whether every wall was tried."""
-        return all(attempt.seconds > 0 for attempt in self.attempts)
+        whole = (0.0, self.horizon)
+        groups = _groups(setting, together=together)
+        self.attempts = [Attempt(wall=one[0], others=one[1:], slabs=slabs, during=whole) for one in groups]
 
     def _first_slabs(self) -> tuple[int, ...]:
         """Slabs that make the remainder small, as far as a few do: without them many a bound is 1."""
@@ -181,99 +207,123 @@ class Search:
             slabs, least = trials[int(np.argmin(values))], min(values)
         return tuple(slabs)
 
-    def run(self, target: float, share: float) -> QuadraticBound:
-        """Bound every wall, then refine the one that counts most until the target or the time is reached."""
+    def first(self, target: float, share: float) -> Iterator[QuadraticBound]:
+        """Bound every wall once, then the sides by themselves; a wall that proves nothing, even refined, ends it."""
         until = time.perf_counter() + share
-        for attempt in self.attempts:
-            if attempt.seconds == 0.0 and time.perf_counter() < until:
-                self._solve(attempt, attempt.pieces, attempt.slabs, until)
+        for place, attempt in enumerate(self.attempts):
+            poll(f"walls {place + 1} of {len(self.attempts)}")
+            if time.perf_counter() > until:
+                break
+            self._solve(attempt, until)
+            for _ in range(_RESCUES):
+                if self.attempts[place].level < 0 or not self._refined(place, until):
+                    break
+            if not self.attempts[place].level < 0:
+                break
+        level, parts = total(self.attempts)
+        yield self._answer(level)
+        place = len(self.attempts) - 1
+        unsettled = _log10(target) < level / math.log(10) < 0 and self.attempts[place].others
+        if unsettled and parts[place] >= level + math.log(_DONE) and self._refined(place, until):
+            yield self._answer(total(self.attempts)[0])
+
+    def run(self, target: float, share: float, found: Callable[[QuadraticBound], object]) -> None:
+        """Refine the wall that counts most until the target or the time is reached; each better bound is told."""
+        until = time.perf_counter() + share
+        level = parts = None
         while True:
             level, parts = total(self.attempts)
+            found(self._answer(level))
             if level / math.log(10) <= _log10(target) or time.perf_counter() > until:
-                break
-            if not self._refine(parts, level, until):
-                break
-        return self._answer(level)
+                return
+            order = [place for place in np.argsort(-parts) if parts[place] >= level + math.log(_DONE)]
+            if not any(self._refined(int(place), until) for place in order):
+                return
+
+    def by_wall(self) -> tuple[Array, float]:
+        """The logarithm of every wall's bound, and of their sum."""
+        walls = self.setting.walls
+        levels = []
+        for wall in walls:
+            levels.append(log_sum([one.level for one in self.attempts if wall in (one.wall, *one.others)]))
+        return np.array(levels), log_sum([one.level for one in self.attempts])
 
     def _answer(self, level: float) -> QuadraticBound:
-        finest = max(self.attempts, key=lambda attempt: attempt.pieces * math.prod(attempt.slabs), default=None)
-        where = "" if finest is None else f", up to {finest.pieces} pieces of time"
+        finest = max(self.attempts, key=lambda attempt: attempt.blocks, default=None)
+        where = "" if finest is None else f", up to {len(finest.times[0]) - 1} pieces of time"
         slabs = "" if finest is None or math.prod(finest.slabs) == 1 else f" and {math.prod(finest.slabs)} slabs"
-        upper_ = log10_up(level)
-        words = f"quadratic value bounds of {len(self.attempts)} walls{where}{slabs}"
-        worst = max(self.attempts, key=lambda attempt: attempt.level, default=None)
-        if worst is not None:
-            words += f"; the largest part is {rounded(math.exp(worst.level), up=True)} ({worst.wall.label})"
-        return QuadraticBound(upper=upper_, words=words, seconds=0.0, setting=self.setting, walls=tuple(self.attempts))
+        words = f"quadratic value bounds of {len(self.setting.walls)} walls{where}{slabs}"
+        if self.attempts:
+            levels, _ = self.by_wall()
+            worst = int(np.argmax(levels))
+            part = rounded(math.exp(levels[worst]), up=True)
+            words += f"; the largest part is {part} ({self.setting.walls[worst].label})"
+        return QuadraticBound(upper=log10_up(level), words=words, seconds=0.0, setting=self.setting,
+                              walls=tuple(self.attempts))  # fmt: skip
 
-    def _refine(self, parts: Array, level: float, until: float) -> bool:
-        """One refinement of the wall that counts most and may gain by it; False where none is left."""
-        for place in np.argsort(-parts):
-            if parts[place] < level + math.log(_DONE):
-                return False
-            attempt = self.attempts[place]
-            hopes = {k: attempt.gains.get(k, self.gains.get(k, math.inf)) for k in range(-1, len(attempt.slabs))}
-            sizes = {k: self._blocks(*_finer(attempt, k)) for k in hopes}
-            grown = {k: 1.3 * sizes[k] / self._blocks(attempt.pieces, attempt.slabs) for k in hopes}
-            left = until - time.perf_counter()
-            options = [k for k in hopes if hopes[k] > _GAIN and sizes[k] <= _MOST_BLOCKS]
-            options = [k for k in options if grown[k] * attempt.seconds < left]
-            if not options:
-                continue
-            option = max(options, key=lambda k: hopes[k] / grown[k])
-            before = attempt.level
-            worked = self._solve(attempt, *_finer(attempt, option), until)
-            attempt.gains[option] = before - attempt.level if worked else 0.0
-            if option < 0:  # which coordinate's slabs help differs from wall to wall
-                self.gains[option] = attempt.gains[option]
-            return True
-        return False
+    def _refined(self, place: int, until: float) -> bool:
+        """One refinement of an attempt that may gain by it and has the time; False where there is none."""
+        attempt = self.attempts[place]
+        options = [PIECES, SPLIT, *range(len(attempt.slabs))]
+        if attempt.proved is None:  # windows are no cure
+            options.remove(SPLIT)
+        if attempt.others and attempt.gains.get(APART, math.inf) > 0:
+            options = [APART]
+        hopes = {k: attempt.gains.get(k, self.gains.get(k, math.inf)) for k in options}
+        children = {k: attempt.finer(k) for k in options}
+        sizes = {k: sum(child.blocks for child in children[k]) for k in options}
+        grown = {k: 1.3 * sizes[k] / attempt.blocks for k in options}
+        left = until - time.perf_counter()
+        options = [k for k in options if hopes[k] > _GAIN and sizes[k] <= _MOST_BLOCKS]
+        options = [k for k in options if grown[k] * attempt.seconds < left]
+        if not options:
+            return False
+        option = max(options, key=lambda k: hopes[k] / grown[k])
+        poll(f"refining {attempt.wall.label}")
+        for child in children[option]:
+            self._solve(child, until)
+        gain = attempt.level - log_sum([child.level for child in children[option]])
+        attempt.gains[option] = max(gain, 0.0)
+        if option < 0:  # which coordinate's slabs help differs from wall to wall
+            self.gains[option] = max(gain, 0.0)
+        if gain > 0:
+            for child in children[option]:
+                child.gains = dict(attempt.gains)
+            self.attempts[place : place + 1] = children[option]
+        return True
 
-    def _blocks(self, pieces: int, slabs: tuple[int, ...]) -> int:
-        return int(2 * pieces * math.prod(slabs) * 2 ** len(slabs))
-
-    def cells(self, pieces: int, slabs: tuple[int, ...]) -> list[StatedCells]:
+    def cells(self, times: Array, slabs: tuple[int, ...]) -> list[StatedCells]:
         """The cells of every piece of time."""
-        key = (0 if self.dynamics.autonomous else pieces, *slabs)
+        pieces = len(times) - 1
+        key = slabs if self.dynamics.autonomous else (*slabs, times.tobytes())
         if key not in self.kept:
             low, high = _grid(self.setting.dimension, self.dynamics.held, slabs)
-            times = _times(self.horizon, pieces)
             spans = [(0.0, self.horizon)] if self.dynamics.autonomous else list(itertools.pairwise(times))
             cells = [self.dynamics.over(low, high, *span) for span in spans]
             self.kept[key] = [StatedCells(self.setting, one) for one in cells]
         found = self.kept[key]
         return found * pieces if self.dynamics.autonomous else found
 
-    def _solve(self, attempt: Attempt, pieces: int, slabs: tuple[int, ...], until: float) -> bool:
-        """Try finer pieces or slabs and keep what is better; whether anything was gained."""
+    def _solve(self, attempt: Attempt, until: float) -> None:
+        """Solve and prove what is to be tried."""
         begin = time.perf_counter()
-        cells, times = self.cells(pieces, slabs), _times(self.horizon, pieces)
+        times, first = attempt.times
+        cells = self.cells(times, attempt.slabs)
         left = max(until - begin, 1.0)
-        proposal = propose(self.setting, attempt.wall, times, cells, seconds=left)
-        proved = None
+        others = attempt.others
+        proposal = propose(self.setting, attempt.wall, times, cells, seconds=left, first=first, others=others)
         if proposal is not None:
-            proved = prove(self.setting, attempt.wall, proposal, [one.cells for one in cells])
+            known = [one.cells for one in cells]
+            attempt.proved = prove(self.setting, attempt.wall, proposal, known, others=others)
+            attempt.corners = corner_levels(self.setting, attempt.proved)
         attempt.seconds = time.perf_counter() - begin
-        if proved is None or not proved.level < attempt.level:
-            return False
-        attempt.proved, attempt.corners = proved, corner_levels(self.setting, proved)
-        attempt.pieces, attempt.slabs = pieces, slabs
-        attempt.held, attempt.large = cells[0].cells.held, cells[0].cells.large
-        return True
 
 
-def _finer(attempt: Attempt, option: int) -> tuple[int, tuple[int, ...]]:
-    """Twice as many pieces (option -1), or twice as many slabs of a held coordinate, of which two are seldom enough."""
-    if option < 0:
-        return 2 * attempt.pieces, attempt.slabs
-    factor = 4 if math.prod(attempt.slabs) == 1 and len(attempt.slabs) < 3 else 2
-    return attempt.pieces, tuple(factor * count if k == option else count for k, count in enumerate(attempt.slabs))
-
-
-def _times(horizon: float, pieces: int) -> Array:
-    times = np.linspace(0.0, horizon, pieces + 1)
-    times[-1] = horizon
-    return times
+def _groups(setting: Setting, *, together: bool) -> list[tuple[Wall, ...]]:
+    """The walls, but sides of the working box as one at first: few are worth programs of their own."""
+    sides = tuple(wall for wall in setting.walls if wall.side is not None)
+    alone = [(wall,) for wall in setting.walls if wall.side is None]
+    return alone + ([sides] if together and sides else apart(sides))
 
 
 def _grid(n: int, held: Sequence[int], slabs: Sequence[int]) -> tuple[Array, Array]:
@@ -284,39 +334,5 @@ def _grid(n: int, held: Sequence[int], slabs: Sequence[int]) -> tuple[Array, Arr
     return low, high
 
 
-def total(attempts: Sequence[Attempt]) -> tuple[float, Array]:
-    """log of the bound of P for the worst start, and what each wall contributes to it (logarithms).
-
-    The sum over the walls of the worst corner, or of each wall's own worst start.
-    """
-    worst = np.array([attempt.level for attempt in attempts])
-    if not len(attempts):
-        return -math.inf, worst
-    best = _log_sum(worst)
-    if all(attempt.corners is not None for attempt in attempts):
-        # as they are: cut off at the walls' own suprema they would no longer be the corners of convex functions
-        table = np.array([attempt.corners for attempt in attempts])
-        rough = table.max(axis=0) + np.log(np.exp(table - table.max(axis=0)).sum(axis=0))
-        level = max(_log_sum(column) for column in table.T)
-        if level < best:
-            return level, table[:, int(np.argmax(rough))]
-    return best, worst
-
-
-def _log_sum(levels: Array) -> float:
-    """Upper bound of log sum exp, at most 0."""
-    from flint import arb
-
-    with precision():
-        found = sum((arb(float(level)).exp() for level in levels), arb(0))
-        return min(0.0, upper(found.log()))
-
-
 def _log10(target: float) -> float:
-    return math.log10(max(target, 10**_SMALLEST))
-
-
-def log10_up(level: float) -> float:
-    """log10 of exp(level), rounded up, between -300 and 0."""
-    value = max(level / math.log(10), _SMALLEST)
-    return min(value + 1e-14 * abs(value) + 1e-15, 0.0)
+    return math.log10(max(target, _LEAST))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -37,11 +37,25 @@ class Wall:
         ``row . z`` is 0 on the wall and grows outward; None for an obstacle or a curved wall.
     forms : Interval, shape (k, n + 1, n + 1)
         Quadratic forms that are at least 0 where paths can leave.
+    own : bool
+        Whether it is a side that the working box has of its own, inside the safe set.
+    far : bool
+        Whether it is a side along whose coordinate the model is affine.
     """
 
     label: str
     row: Interval | None
     forms: Interval
+    own: bool = False
+    far: bool = False
+
+    @property
+    def side(self) -> tuple[int, int] | None:
+        """Axis and end (0: below, 1: above) of a side of the working box; None for other walls."""
+        axes = np.zeros(0) if self.row is None else np.flatnonzero(self.row.mag[:-1])
+        if self.row is None or len(axes) != 1 or abs(self.row.mid[axes[0]]) != 1 or self.row.mid[-1] != -1:
+            return None
+        return int(axes[0]), int(self.row.mid[axes[0]] > 0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -118,6 +132,7 @@ def make_setting(problem: Problem, low: Array, high: Array) -> Setting:
         Constraints of a kind that is not served, or a start outside the box.
     """
     refuse(problem)
+    safe = safe_sides(problem)
     center, width = _scaled(low, high)
     n = len(center)
     start = _start(problem, center, width)
@@ -135,7 +150,9 @@ def make_setting(problem: Problem, low: Array, high: Array) -> Setting:
             row = np.zeros(n + 1)
             row[axis], row[n] = sign, -1.0
             label = f"{problem.system.states[axis]} {'above' if sign > 0 else 'below'}"
-            walls.append(_flat(problem, center, width, Interval.point(row), label))
+            wall = _flat(problem, center, width, Interval.point(row), label)
+            gap = (high[axis] - safe[1][axis]) if sign > 0 else (safe[0][axis] - low[axis])
+            walls.append(None if wall is None else replace(wall, own=bool(gap < -1e-9 * width[axis])))
     return Setting(center=center, width=width, walls=tuple(w for w in walls if w is not None), inside=known,
                    start=start)  # fmt: skip
 

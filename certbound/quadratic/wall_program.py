@@ -1,7 +1,7 @@
 """The program of one wall: the least sup over the starts of V(0, .) among quadratic V that the theorem admits.
 
-V(t, x) = z' H(t) z / 2 with H piecewise linear in t. On every piece, at both its ends and at every corner (A, G) of
-every cell, with box forms B_i >= 0 on the cell,
+V(t, x) = z' H(t) z / 2 with H continuous and on every piece of time a polynomial of degree 1 or 2, in Bernstein form.
+At all its control points, H' that of the slope, at every corner (A, G) of every cell, with box forms B_i >= 0 there,
     -(H' + H A + A' H + sum_c G_c' H G_c)/2 - D(s) - H G G' H / 2 - sum_i mu_i B_i >= 0,   mu >= 0,
 which is linear in what is searched after a Schur complement; on the wall  H/2 - sum mu_i B_i - (row nu' + nu row')/2
 >= 0, and on the starts  rho - H(0)/2 - sum mu_i B_i >= 0. Everything here is in floating point and proves nothing.
@@ -30,16 +30,22 @@ class Proposal:
     Attributes
     ----------
     times : ndarray, shape (K + 1,)
-    matrices : ndarray, shape (K + 1, n + 1, n + 1)
-        H at the times.
-    moves : ndarray, shape (K, 2, C, b)
-        Coefficients of the splitting at the two ends of each piece.
-    weights : ndarray, shape (K, 2, V, C, n + k)
+    degree : int
+        d, of H on a piece.
+    first : int
+        The piece with which the time begins at which the wall is looked at; it ends with the last.
+    others : tuple of (ndarray, ndarray)
+        ``wall_weights`` and ``wall_rows`` of further walls that the same V serves.
+    matrices : ndarray, shape (d K + 1, n + 1, n + 1)
+        Control points of H: d k to d k + d are those of piece k, and every d-th is H at one of the times.
+    moves : ndarray, shape (K, d + 1, C, b)
+        Coefficients of the splitting at the control points of each piece.
+    weights : ndarray, shape (K, d + 1, V, C, n + k)
         mu of the cells' sides and of the inside forms.
-    wall_weights : ndarray, shape (K + 1, n + k + w)
-        mu on the wall: sides of the working box, inside forms, forms of the wall.
-    wall_rows : ndarray, shape (K + 1, n + 1)
-        nu.
+    wall_weights : ndarray, shape (d K + 1, n + k + w)
+        mu on the wall: sides of the working box, inside forms, forms of the wall; 0 before the piece ``first``.
+    wall_rows : ndarray, shape (d K + 1, n + 1)
+        nu, likewise.
     start_weights : ndarray, shape (n' + s,)
         mu of the wide sides of the starts, and of their forms.
     level : float
@@ -54,6 +60,14 @@ class Proposal:
     wall_rows: Array
     start_weights: Array
     level: float
+    degree: int = 1
+    first: int = 0
+    others: tuple[tuple[Array, Array], ...] = ()
+
+
+def slopes(degree: int) -> tuple[tuple[int, int, float], ...]:
+    """Of each control point of a piece: (a, b, c) such that c (H_b - H_a) / length is that of the slope in time."""
+    return ((0, 1, 1.0), (0, 1, 1.0)) if degree == 1 else ((0, 1, 2.0), (0, 2, 1.0), (1, 2, 2.0))
 
 
 def symmetric_basis(size: int) -> Array:
@@ -96,8 +110,8 @@ class StatedCells:
         sides = side_forms(cells.low[c], cells.high[c]).transpose(1, 2, 0)
         split = np.einsum("a,baij->ijb", cells.values[v, c], self.splits)
         maps = [main, -basis / 2, basis / 2, -split, -np.concatenate([sides, self.forms], axis=2), -basis / 2]
-        constant = np.zeros((size, size))
-        constant[-1, -1] = -cells.toll.mid[c]
+        constant = -cells.bend.mid[c]
+        constant[-1, -1] -= cells.toll.mid[c]
         if cells.affine is None:
             radius = cells.square.rad[c][np.triu_indices(size - 1)]
             twice = np.where(np.equal(*np.triu_indices(size - 1)), 0.5, 1.0)
@@ -117,27 +131,32 @@ class StatedCells:
 
 
 def propose(
-    setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], *, seconds: float
+    setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells], *, seconds: float, degree: int = 2,
+    first: int = 0, others: Sequence[Wall] = (),
 ) -> Proposal | None:
-    """What the program of a wall proposes; None where the solver failed.
+    """What the program of a wall, and of others with the same V, proposes; None where the solver failed.
 
-    ``stated`` are the cells of each piece of time with their inequality.
+    ``stated`` are the cells of each piece of time with their inequality; for ``degree`` and ``first`` see `Proposal`.
     """
-    return _WallProgram(setting, wall, times, stated).solve(seconds)
+    return _WallProgram(setting, (wall, *others), times, stated, degree=degree, first=first).solve(seconds)
 
 
 class _WallProgram:
-    """The program of one wall, and where its variables are."""
+    """The program of one V, and where its variables are."""
 
-    def __init__(self, setting: Setting, wall: Wall, times: Array, stated: Sequence[StatedCells]) -> None:
-        self.setting, self.wall, self.times, self.stated = setting, wall, times, stated
+    def __init__(
+        self, setting: Setting, walls: Sequence[Wall], times: Array, stated: Sequence[StatedCells], *, degree: int,
+        first: int,
+    ) -> None:
+        self.setting, self.walls, self.times, self.stated = setting, walls, times, stated
+        self.degree, self.first = degree, first
         cells = [one.cells for one in stated]
         self.cells = cells
         self.size = setting.dimension + 1
         self.basis = symmetric_basis(self.size)
         self.program = Program()
         count = self.basis.shape[2]
-        self.nodes = [self.program.variables(count) for _ in times]
+        self.nodes = [self.program.variables(count) for _ in range(degree * len(stated) + 1)]
         self.splits = splitting(setting.dimension, cells[0].held)
         self.forms = setting.inside.mid.transpose(1, 2, 0)
         self.squares: dict[tuple[int, int, int], Integers] = {}
@@ -147,20 +166,25 @@ class _WallProgram:
 
     def solve(self, seconds: float) -> Proposal | None:
         self._generator()
-        walls = [self._at_wall(node) for node in self.nodes]
+        before = self.degree * self.first
+        places = [[self._at_wall(wall, node) for node in self.nodes[before:]] for wall in self.walls]
         level, start = self._at_start()
         found = self.program.minimise(int(level[0]), seconds=seconds)
         if found is None:
             return None
+        walls = [
+            (_after(before, np.maximum(found[np.array([mu for mu, _ in one])], 0.0)),
+             _after(before, found[np.array([nu for _, nu in one], dtype=np.int64)])) for one in places
+        ]  # fmt: skip
         return Proposal(
             times=self.times,
             matrices=np.array([self.basis @ found[node] for node in self.nodes]),
             moves=found[np.array(self.moves, dtype=np.int64)],
             weights=np.maximum(found[np.array(self.weights)], 0.0),
-            wall_weights=np.maximum(found[np.array([mu for mu, _ in walls])], 0.0),
-            wall_rows=found[np.array([nu for _, nu in walls], dtype=np.int64)],
+            wall_weights=walls[0][0], wall_rows=walls[0][1], others=tuple(walls[1:]),
             start_weights=np.maximum(found[np.asarray(start, dtype=np.int64)], 0.0),
             level=float(found[level[0]]),
+            degree=self.degree, first=self.first,
         )
 
     # ---- the inequality of the generator -----------------------------------------------------------------------
@@ -170,24 +194,27 @@ class _WallProgram:
             self.absolute = [self._absolutes(node) for node in self.nodes]
         for k, one in enumerate(self.stated):
             length = float(self.times[k + 1] - self.times[k])
-            blocks = [[_timed(block_, self.basis.shape[2], length) for block_ in row] for row in one.blocks]
-            ends = [self._piece(k, end, one, blocks) for end in (k, k + 1)]
+            ends = []
+            for place, (a, b, factor) in enumerate(slopes(self.degree)):
+                base, count = self.degree * k, self.basis.shape[2]
+                blocks = [[_timed(stated, count, length / factor) for stated in row] for row in one.blocks]
+                ends.append(self._piece(base + place, (base + a, base + b), one, blocks))
             self.moves.append([moves for moves, _ in ends])
             self.weights.append([weights for _, weights in ends])
 
     def _piece(
-        self, k: int, end: int, one: StatedCells, blocks: list[list[Block]]
+        self, point: int, slope: tuple[int, int], one: StatedCells, blocks: list[list[Block]]
     ) -> tuple[list[Integers], list[list[Integers]]]:
-        """State the inequality at one end of a piece, for all cells and corners: the places of D and mu."""
+        """State the inequality at a control point, for all cells and corners: the places of D and mu."""
         program, many = self.program, len(one.cells.low)
         moves = [program.variables(len(self.splits)) for _ in range(many)]
         weights = []
         for corner, row in enumerate(blocks):
             weights.append([program.nonnegative(self.size - 1 + self.forms.shape[2]) for _ in range(many)])
             for c, stated in enumerate(row):
-                square = self._square(end, one, int(one.group[corner, c]))
-                parts = [self.nodes[end], self.nodes[k + 1], self.nodes[k], moves[c], weights[corner][c], square]
-                parts += [] if not self.absolute else [self.absolute[end]]  # type: ignore[list-item]
+                square, (a, b) = self._square(point, one, int(one.group[corner, c])), slope
+                parts = [self.nodes[point], self.nodes[b], self.nodes[a], moves[c], weights[corner][c], square]
+                parts += [] if not self.absolute else [self.absolute[point]]  # type: ignore[list-item]
                 program.semidefinite(stated, np.concatenate(parts))
         return moves, weights
 
@@ -221,16 +248,16 @@ class _WallProgram:
 
     # ---- wall and starts ---------------------------------------------------------------------------------------
 
-    def _at_wall(self, node: Integers) -> tuple[Integers, Integers]:
+    def _at_wall(self, wall: Wall, node: Integers) -> tuple[Integers, Integers]:
         n, program = self.size - 1, self.program
-        forms = self.wall.forms.mid.transpose(1, 2, 0)
+        forms = wall.forms.mid.transpose(1, 2, 0)
         sides = side_forms(-np.ones(n), np.ones(n)).transpose(1, 2, 0)
         known = np.concatenate([sides, self.forms, forms], axis=2)
         weights = program.nonnegative(known.shape[2])
         maps, columns = [self.basis / 2, -known], [node, weights]
-        rows = program.variables(self.size if self.wall.row is not None else 0)
-        if self.wall.row is not None:
-            row, eye = self.wall.row.mid, np.eye(self.size)
+        rows = program.variables(self.size if wall.row is not None else 0)
+        if wall.row is not None:
+            row, eye = wall.row.mid, np.eye(self.size)
             outer = np.einsum("i,jk->ijk", row, eye)
             maps.append(-(outer + outer.transpose(1, 0, 2)) / 2)
             columns.append(rows)
@@ -253,6 +280,11 @@ class _WallProgram:
         program.semidefinite(stated, np.concatenate([level, self.nodes[0], weights]))
         program.at_least(np.array([-_DEEPEST]), [Part(np.eye(1), level)])
         return level, weights
+
+
+def _after(count: int, values: Array) -> Array:
+    """The values after so many rows of zeros."""
+    return np.concatenate([np.zeros((count, *values.shape[1:])), values])
 
 
 def _timed(stated: Block, count: int, length: float) -> Block:

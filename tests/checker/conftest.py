@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
@@ -16,6 +18,8 @@ from flint import ctx
 import certbound as cb
 from certbound.checker import parse
 from certbound.quadratic import bound_quadratic
+from certbound.quadratic.refinement import Search
+from certbound.quadratic.wall_attempts import SPLIT, log10_up, total
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
@@ -170,9 +174,16 @@ def squared() -> cb.Problem:
     return cb.Problem(system, initial=cb.Ball([0, 0], 0.05), safe=safe, horizon=0.5, delta=0.1)
 
 
-def quadratic_certificate(problem: cb.Problem) -> str:
-    """A certificate by quadratic value bounds from the first attempt at every wall."""
+def quadratic_certificate(problem: cb.Problem, *, windows: bool = False) -> str:
+    """A certificate by quadratic value bounds from the first attempts, the last one (all sides) in two windows."""
     found = bound_quadratic(problem, target=0.5, seconds=60.0)
+    if windows:
+        search, *before, last = Search(problem, found.setting, together=False), *found.walls
+        parts = last.finer(SPLIT)
+        for part in parts:
+            search._solve(part, math.inf)
+        walls = (*before, *parts)
+        found = replace(found, upper=log10_up(total(walls)[0]), walls=walls)
     answer = EngineAnswer(log10_delta=found.upper, method="quadratic", details=found)
     return side_of(problem, {"quadratic": answer}, lower=False)
 
@@ -243,7 +254,7 @@ def valuing() -> Case:
 def squaring() -> SimpleNamespace:
     """Quadratic value bounds."""
     problem = squared()
-    text, given = quadratic_certificate(problem), json.loads(json.dumps(problem_data(problem)))
+    text, given = quadratic_certificate(problem, windows=True), json.loads(json.dumps(problem_data(problem)))
     return SimpleNamespace(problem=problem, text=text, data=parse(text), given=given)
 
 

@@ -35,7 +35,7 @@ _BASES |= {
     "started below": _sharp(_below(conftest.started)),
     "shaken": _sharp(_stated(conftest.shaken, "values")),
     "shaken below": _sharp(_below(conftest.shaken)),
-    "squared": _sharp(lambda: conftest.quadratic_certificate(conftest.squared())),
+    "squared": _sharp(lambda: conftest.quadratic_certificate(conftest.squared(), windows=True)),
     "leaving below": _sharp(lambda: conftest.exit_certificate(conftest.leaving(), lower=True)),
     "drifting": _sharp(lambda: conftest.exit_certificate(conftest.drifting())),
     "drifting below": _sharp(lambda: conftest.exit_certificate(conftest.drifting(), lower=True)),
@@ -288,15 +288,22 @@ _FORMS, _WHERE, _FLOW = "values/quadratic.py", "values/walls.py", "values/second
 GROWTH = "growth of a quadratic bound was not shown"
 
 
-def _wall(data: Data) -> Data:
-    """The wall that counts most: the upper side of x."""
-    found: Data = next(wall for wall in data["proof"]["walls"] if wall["wall"] == [-1, 1])
+def _windows(data: Data) -> list[Data]:
+    """The two windows of the bound for the four sides of the box."""
+    found: list[Data] = [one for one in data["proof"]["bounds"] if [-1, 1] in one["walls"]]
+    assert len(found) == 2
     return found
+
+
+def _wall(data: Data) -> Data:
+    return _windows(data)[0]
 
 
 @forges("a quadratic bound grows no faster than stated", "squared", _FORMS, "_Value._on_cell", GROWTH)
 def _(data: Data) -> None:
-    _scale(_wall(data), "lam", 0.0)
+    for k, rows in enumerate(_wall(data)["matrices"]):
+        rows[2][2] = exact(float.fromhex(rows[2][2]) + 0.1 * k)
+    _scale(_wall(data), "lam", 0.5)
 
 
 @forges("the growth is not negative", "squared", _FORMS, "_Value._read", "must not be negative")
@@ -310,19 +317,68 @@ def _(data: Data) -> None:
         rows[2][2] = exact(float.fromhex(rows[2][2]) - 0.2)
 
 
-@forges("no wall is left out", "squared", _FORMS, "check_quadratic", "all that paths can leave")
+@forges("a bound is at least 0 on all its walls", "squared", _FORMS, "_Value.prove", "at least 0 on its wall")
 def _(data: Data) -> None:
-    data["proof"]["walls"].remove(_wall(data))
+    """The lower side of x is left to the bound of the obstacle."""
+    obstacle = next(one for one in data["proof"]["bounds"] if one["walls"] == [[1, 0]])
+    for name in ("walls", "wall_weights", "wall_rows"):
+        side, _ = (one[name].pop(0) for one in _windows(data))
+        obstacle[name].append(side if name == "walls" else [side[0]] * len(obstacle[name][0]))
+    assert obstacle["walls"][1] == [-1, 0]
 
 
-@forges("a wall is one of the problem's", "squared", _FORMS, "_Value", "is no wall")
+@forges("a bound is at least 0 in all its window", "squared", _FORMS, "_Value._on_wall", "at least 0 on its wall")
 def _(data: Data) -> None:
-    _wall(data)["wall"] = [0, 0]
+    """The later window begins at 0, where V is low, at a rate of growth that pays for it."""
+    early, late = _windows(data)
+    data["proof"]["bounds"].remove(early)
+    more = late["degree"] * late["first"]
+    for name in ("wall_weights", "wall_rows"):
+        late[name] = [[rows[0]] * more + rows for rows in late[name]]
+    late["first"] = 0
+    late["matrices"][0][2][2] = exact(float.fromhex(late["matrices"][0][2][2]) - 40.0)
+    late["lam"][0] = exact(1000.0)
+
+
+@forges("the slope of a quadratic bound counts", "squared", _FORMS, "_Value.prove", GROWTH)
+def _(data: Data) -> None:
+    late = _windows(data)[1]
+    a, b = (float.fromhex(late["times"][place]) for place in (-2, -1))
+    late["times"][-2] = exact(a + 0.5 * (b - a))
+
+
+@forges("a quadratic bound is stated between its times", "squared", _FORMS, "_Value.prove", GROWTH)
+def _(data: Data) -> None:
+    late = _windows(data)[1]
+    assert late["degree"] == 2
+    assert late["first"] > 0
+    late["matrices"][1][2][2] = exact(float.fromhex(late["matrices"][1][2][2]) + 1.0)
+
+
+@forges("no wall is left out", "squared", _FORMS, "_check_covered", "all that paths can leave")
+def _(data: Data) -> None:
+    for one in _windows(data):
+        data["proof"]["bounds"].remove(one)
+
+
+@forges("the windows of a wall leave no gap", "squared", _FORMS, "_check_covered", "windows of a wall were not shown")
+def _(data: Data) -> None:
+    data["proof"]["bounds"].remove(_windows(data)[0])
+
+
+@forges("the windows of a wall reach the horizon", "squared", _FORMS, "_check_covered", "windows of a wall were not")
+def _(data: Data) -> None:
+    data["proof"]["bounds"].remove(_windows(data)[1])
+
+
+@forges("a wall is one of the problem's", "squared", _FORMS, "_Value._key", "is no wall")
+def _(data: Data) -> None:
+    _wall(data)["walls"][0] = [0, 0]
 
 
 @forges("weights are not negative", "squared", _FORMS, "_Value._read", "negative weight")
 def _(data: Data) -> None:
-    _wall(data)["wall_weights"][0][0] = exact(-0.5)
+    _wall(data)["wall_weights"][0][0][0] = exact(-0.5)
 
 
 @forges("the cells cover the working box", "squared", _FORMS, "_Value._cells", "rise from -1 to 1")
@@ -330,7 +386,12 @@ def _(data: Data) -> None:
     _wall(data)["cuts"][0][0] = exact(-0.9)
 
 
-@forges("the pieces of a quadratic bound cover the horizon", "squared", _FORMS, "_Value", "do not cover the horizon")
+@forges("the pieces of a quadratic bound begin at the start", "squared", _FORMS, "_Value", "begin at time 0")
+def _(data: Data) -> None:
+    _wall(data)["times"][0] = exact(1e-3)
+
+
+@forges("quadratic bounds cover the horizon", "squared", _FORMS, "_check_covered", "windows of a wall were not shown")
 def _(data: Data) -> None:
     data["problem"]["horizon"] = exact(0.6)
 
@@ -366,8 +427,8 @@ def _(data: Data) -> None:
 
 @forges("second-order terms meet coordinates that are held", "squared", _FLOW, "Flow.held", "every second-order term")
 def _(data: Data) -> None:
-    for wall in data["proof"]["walls"]:
-        wall |= {"held": [], "cuts": []}
+    for one in data["proof"]["bounds"]:
+        one |= {"held": [], "cuts": []}
 
 
 @forges("quadratic bounds need a diffusion that is affine", "squared", _FLOW, "Flow", "affine in the states")

@@ -9,7 +9,7 @@ import certbound as cb
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
-from certbound.quadratic.corners import Cells, Dynamics
+from certbound.quadratic.corners import Cells, Dynamics, curved_axes
 from certbound.quadratic.form_matrices import splitting
 from certbound.quadratic.setting import make_setting
 
@@ -58,7 +58,7 @@ def test_drift_and_diffusion_lie_among_the_corners(diffusion: object) -> None:
             f, g = drift(t, *x, d) / width, noise(t, *x) / width[:, None]
             along = np.array([q @ corner @ z for corner in cells.drift.mid[:, c]])
             square = np.array([np.sum((q @ columns) ** 2) for columns in cells.spread.mid[:, c]])
-            allowed = along + square / 2 + cells.toll.hi[c] + 1e-9
+            allowed = along + square / 2 + cells.toll.hi[c] + z @ cells.bend.hi[c] @ z + 1e-9
             assert p @ f + np.sum((g.T @ p) ** 2) / 2 <= allowed.max()
             assert cells.square.contains(np.array([g @ g.T] * 2))[c].all()
             if cells.affine is not None:
@@ -78,6 +78,20 @@ def test_curved_noise_lies_below_its_columns() -> None:
         g = noise(0.0, *setting.over(xi, xi).mid.T)[:, :, 0] / setting.width
         square = [np.sum((p @ columns[:3]) ** 2) for columns in cells.spread.mid[:, 0]]
         assert np.max((g @ p) ** 2) <= max(square) + 1e-12
+
+
+def test_remainders_that_vanish_with_a_coordinate_cost_nothing_where_it_does() -> None:
+    """y sin(x): on a cell about x = y = 0 all of the remainder vanishes there, and it is paid away from it."""
+    system = cb.ContinuousSystem(lambda x: [-x[0], x[1] * (np.sin(x[0]) - 1), -x[2]], states=3, diffusion=np.eye(3))
+    problem = cb.Problem(system, initial=[0, 0, 0], safe=[cb.Inside(cb.Box([-1] * 3, [1] * 3))], horizon=1.0)
+    dynamics = Dynamics(problem, make_setting(problem, -np.ones(3), np.ones(3)))
+    cells = dynamics.over(np.array([[-0.5, -1.0, -1.0]]), np.array([[0.5, 1.0, 1.0]]), 0.0, 1.0)
+    assert curved_axes(problem) == {0, 1}
+    assert cells.toll.hi[0] == 0
+    assert abs(cells.bend.hi[0, -1, -1]) < 1e-12
+    z = np.array([0.5, 1.0, 0.0, 1.0])
+    assert z @ cells.bend.mid[0] @ z > 0.01
+    assert cells.spread.shape[-1] == 4  # a column for the remainder of the second state
 
 
 def test_a_splitting_is_zero_where_its_coordinates_are_the_states() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ import certbound as cb
 from certbound.arrays import Array
 from certbound.quadratic import bound_quadratic, refinement
 from certbound.quadratic.inequality import prove
+from certbound.quadratic.wall_attempts import Attempt, total
 from certbound.quadratic.wall_program import Proposal, propose
+from tests.values.random_systems import quadratic
 
 
 def random_problem(seed: int) -> cb.Problem:
@@ -46,6 +49,14 @@ def test_the_bound_is_above_the_frequency_of_failures(seed: int) -> None:
     assert seen.lower <= 10**found.upper < 1
 
 
+def test_cells_that_are_curved_at_some_times_only_have_the_same_corners() -> None:
+    """Drift and noise of this one change with time: on some pieces a remainder is 0."""
+    problem = quadratic(np.random.default_rng([7, 13]))
+    found = bound_quadratic(problem, target=1e-6, seconds=10.0)
+    seen = cb.simulate_exits(problem, paths=1000, rng=np.random.default_rng(1))
+    assert seen.lower <= 10**found.upper <= 1
+
+
 def spoilt(proposal: Proposal, rng: np.random.Generator, size: float) -> Proposal:
     """The proposal with everything that the solver gave moved at random."""
 
@@ -70,11 +81,13 @@ class Known:
         problem = cb.Problem(system, initial=[0, 0, 0], safe=safe, horizon=1.0)
         search = refinement.make_search(problem, np.full(3, -1.0), np.full(3, 1.0))
         self.setting, self.wall = search.setting, search.setting.walls[1]
-        stated = search.cells(8, ())
+        times = np.linspace(0.0, 1.0, 9)
+        stated = search.cells(times, ())
         self.cells = [one.cells for one in stated]
-        found = propose(self.setting, self.wall, np.linspace(0.0, 1.0, 9), stated, seconds=10.0)
+        found = propose(self.setting, self.wall, times, stated, seconds=10.0)
         assert found is not None
         self.proposal = found
+        self.stated, self.times = stated, times
         one = cb.Problem(cb.ContinuousSystem(lambda x: -x, states=1, diffusion=0.6), initial=[0], horizon=1.0,
                          safe=[cb.Inside(cb.Box([-1], [1]))])  # fmt: skip
         seen = cb.simulate_exits(one, paths=20_000, rng=np.random.default_rng(1))
@@ -82,6 +95,12 @@ class Known:
 
     def level(self, proposal: Proposal) -> float:
         return prove(self.setting, self.wall, proposal, self.cells).level
+
+    def other(self, **changes: Any) -> Proposal:
+        """What the solver says of another degree, time, or number of walls."""
+        found = propose(self.setting, self.wall, self.times, self.stated, seconds=10.0, **changes)
+        assert found is not None
+        return found
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +116,51 @@ def test_an_honest_proposal_is_near_the_truth(known: Known) -> None:
 def test_a_wrong_proposal_is_never_believed(known: Known, size: float) -> None:
     for seed in range(10):
         assert known.level(spoilt(known.proposal, np.random.default_rng(seed), size)) > known.truth
+
+
+def test_degree_two_follows_the_function_more_closely(known: Known) -> None:
+    straight = known.other(degree=1)
+    assert known.truth < known.level(known.proposal) < known.level(straight) - 0.1
+    for seed in range(5):
+        assert known.level(spoilt(straight, np.random.default_rng(seed), 1e-2)) > known.truth
+
+
+def exits(begin: float) -> float:
+    """How often paths of x' = -x + noise leave [-1, 1]^3 through the first upper side from a time on."""
+    rng, x, left = np.random.default_rng(3), np.zeros((20_000, 3)), 0
+    for k in range(400):
+        x = x - 0.0025 * x + 0.6 * 0.05 * rng.standard_normal(x.shape)
+        left += int(np.sum(x[:, 0] > 1)) if 0.0025 * k >= begin else 0
+        x = x[np.all(np.abs(x) <= 1, axis=1)]
+    return left / 20_000
+
+
+def test_a_window_of_time_is_bounded_by_itself(known: Known) -> None:
+    late = known.other(first=4)
+    frequency = exits(0.5)
+    assert np.log(frequency) < known.level(late) < known.level(known.proposal)
+    assert not late.wall_weights[:8].any()
+    early = propose(known.setting, known.wall, known.times[:5], known.stated[:4], seconds=10.0)
+    assert early is not None
+    before = prove(known.setting, known.wall, early, known.cells[:4]).level
+    assert known.truth < np.log(np.exp(before) + np.exp(known.level(late)))
+    for seed in range(5):
+        assert known.level(spoilt(late, np.random.default_rng(seed), 1e-2)) > np.log(frequency)
+
+
+def test_one_function_serves_several_walls(known: Known) -> None:
+    others = [wall for wall in known.setting.walls if wall is not known.wall]
+    both = known.other(others=others)
+    found = prove(known.setting, known.wall, both, known.cells, others=others)
+    assert found.level > known.truth + np.log(6.0)
+    assert found.level < 0
+    with pytest.raises(ValueError, match="argument 2"):
+        prove(known.setting, known.wall, known.proposal, known.cells, others=others)
+    lower = both.matrices.copy()
+    lower[:, 2, -1] += 3.0  # V falls towards the last side that is served, and hardly elsewhere
+    lower[:, -1, 2] += 3.0
+    fallen = prove(known.setting, known.wall, replace(both, matrices=lower), known.cells, others=others)
+    assert fallen.gap > found.gap + 1
 
 
 def test_a_steeper_function_pays_for_its_growth(known: Known) -> None:
@@ -124,10 +188,10 @@ def test_the_worst_start_may_lie_between_the_corners_of_functions_that_are_cut_o
     first = replace(honest, growth=0.0, gap=0.0, top=-10.0)
     second = replace(honest, growth=0.0, gap=0.0, top=-9.0)
     attempts = [
-        refinement.Attempt(wall=known.wall, proved=first, corners=np.array([-20.0, 80.0])),
-        refinement.Attempt(wall=known.wall, proved=second, corners=np.array([-9.0, -20.0])),
+        Attempt(wall=known.wall, during=(0.0, 1.0), proved=first, corners=np.array([-20.0, 80.0])),
+        Attempt(wall=known.wall, during=(0.0, 1.0), proved=second, corners=np.array([-9.0, -20.0])),
     ]
-    level, _ = refinement.total(attempts)  # at a point between, both may nearly reach their suprema
+    level, _ = total(attempts)  # at a point between, both may nearly reach their suprema
     assert level >= np.log(np.exp(-10) + np.exp(-9)) - 1e-12
     attempts[0].corners = np.array([-20.0, -10.0])
-    assert refinement.total(attempts)[0] == pytest.approx(np.log(np.exp(-20) + np.exp(-9)), abs=1e-9)
+    assert total(attempts)[0] == pytest.approx(np.log(np.exp(-20) + np.exp(-9)), abs=1e-9)

@@ -1,15 +1,18 @@
 """The proof by quadratic value bounds (theory, Section 14): definite matrices, and nothing of what found them.
 
-For every wall V = z' H(t) z / 2 with H linear between stated times, and R = V_t + f . grad V + tr(g g' V'')/2
-+ |g' grad V|^2/2. At both ends of a piece, on every cell and at every corner (the ends of the held coordinates s, of
-the disturbances and of the remainders that are corners),
+For every wall, or some together, V = z' H(t) z / 2 with H a polynomial of degree 1 or 2 between stated times, by its
+control points in Bernstein form, and R = V_t + f . grad V + tr(g g' V'')/2 + |g' grad V|^2/2. At fixed t, x, f and g, R
+is convex in (H, H'), which is a convex combination of the control points and their slopes. At each of these, on every
+cell and at every corner (the ends of the held coordinates s and of the disturbances),
 
-    M = -(H' + H A + A' H + sum_c G_c' H G_c)/2 - D(s) - H G G' H/2 - toll - sum_i mu_i B_i,     mu >= 0,
+    M = -(H' + H A + A' H + sum_c G_c' H G_c)/2 - D(s) - H G G' H/2 - E - sum_i mu_i B_i,     mu >= 0,
 
-with forms B_i >= 0 on the cell and z' D(s) z = 0: where M + lam/|z|^2 is positive definite, R <= lam. G holds the
-columns of g, and sqrt(r_i/q) e_i for each remainder r_i that is no corner, whose toll is r_i q/2. In the same way
-V >= -gap on the wall. Then P(leaving) <= sum over the walls of exp(sum_k lam_k h_k + gap + V(0, x)), whose supremum
-over a box of starts is that over its corners once every V(0, .) has been made convex; of a ball each V has its own.
+with forms B_i >= 0 on the cell and z' D(s) z = 0: where M + lam/|z|^2 is positive definite, R <= lam. What is missing
+of f_i is at most sum_b r_ib |eta_b| (`Local`), for which sum_ib r_ib (q eta_b^2 + p_i^2/q)/2 pays, p = H z: E holds the
+first part, and G, besides the columns of g, sqrt(sum_b r_ib/q) e_i. In the same way V >= -gap on the walls that V is
+for, in its window of time. Then P(leaving) <= the sum of exp(sum_k lam_k h_k + gap + V(0, x)), over V whose windows
+cover the horizon at every wall. Its supremum over a box of starts is that over its corners once every V(0, .) has been
+made convex; of a ball each V has its own.
 """
 
 from __future__ import annotations
@@ -19,7 +22,6 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-import numpy as np
 from flint import arb, arb_mat
 
 from certbound.checker.balls import identity, is_positive_definite, largest_eigenvalue, matrix, upper
@@ -36,15 +38,20 @@ MOST_MATRICES = 500_000
 MOST_NUMBERS = 2_000_000
 _STEEP = arb(8)  # q
 _MOST_CORNERS = 10
+_MOST_WALLS = 100
+_MOST_BOUNDS = 1000
 _NAMES = (
-    "wall", "held", "large", "cuts", "times", "matrices", "moves", "weights", "wall_weights", "wall_rows", "lam", "gap",
+    "walls", "first", "degree", "held", "cuts", "times", "matrices", "moves", "weights", "wall_weights", "wall_rows",
+    "lam", "gap",
 )  # fmt: skip
+_SLOPES = {1: ((0, 1, 1), (0, 1, 1)), 2: ((0, 1, 2), (0, 2, 1), (1, 2, 2))}
+"""(a, b, c) of each control point of a piece: its slope is c (H_b - H_a) / length."""
 Place = tuple[int, int, int]
 
 
 def check_quadratic(model: Model, value: object, budget: Budget) -> arb:
     """Upper bound of the probability that a constraint is broken."""
-    record = Record(value, "proof", ("engine", "center", "width", "walls"))
+    record = Record(value, "proof", ("engine", "center", "width", "bounds"))
     n = model.dimension
     if not model.continuous:
         raise Unproved("quadratic value bounds prove nothing in discrete time")
@@ -54,15 +61,31 @@ def check_quadratic(model: Model, value: object, budget: Budget) -> arb:
         raise Unproved("this proof does not treat a plan with steps in time")
     flow = Flow(model, budget)
     around = Surroundings(model, record, flow)
-    stated: dict[Key, _Value] = {}
-    for k, item in enumerate(record.items("walls", 0, 2 * n + 1000)):
-        one = _Value(around, flow, item, f"proof.walls[{k}]", budget)
-        stated[one.key] = one
-    if set(stated) != set(around.walls):
-        raise Unproved("the walls were not shown to be all that paths can leave through")
-    for one in stated.values():
+    stated: list[_Value] = []
+    for k, item in enumerate(record.items("bounds", 0, _MOST_BOUNDS)):
+        budget.check()
+        stated.append(_Value(around, flow, item, f"proof.bounds[{k}]", budget))
+        if sum(one.moves.size + one.weights.size for one in stated) > MOST_NUMBERS:
+            raise CertificateError(f"`proof.bounds` must hold at most {MOST_NUMBERS} multipliers.")
+    _check_covered(around, stated)
+    for one in stated:
         one.prove()
-    return _worst(around, list(stated.values()))
+    return _worst(around, stated)
+
+
+def _check_covered(around: Surroundings, stated: Sequence[_Value]) -> None:
+    """Every wall that paths can leave through is looked at, at all times."""
+    for key in around.walls:
+        windows = sorted((one.window for one in stated if key in one.keys), key=lambda window: float(window[0]))
+        if not windows:
+            raise Unproved("the walls were not shown to be all that paths can leave through")
+        reached = arb(0)
+        for start, end in windows:
+            if not start <= reached:
+                raise Unproved("the windows of a wall were not shown to cover the horizon")
+            reached = arb.max(reached, end)
+        if not reached >= arb(around.model.horizon):
+            raise Unproved("the windows of a wall were not shown to cover the horizon")
 
 
 def _worst(around: Surroundings, walls: Sequence[_Value]) -> arb:
@@ -111,23 +134,31 @@ class _Value:
     def __init__(self, around: Surroundings, flow: Flow, value: object, path: str, budget: Budget) -> None:
         self.record = record = Record(value, path, _NAMES)
         self.around, self.flow, self.budget, self.n = around, flow, budget, around.n
-        self.held, self.large = (wholes(record[name], record.at(name), 0, self.n - 1) for name in ("held", "large"))
-        if any(a >= b for a, b in pairwise(self.held)) or len(set(self.large)) != len(self.large):
-            raise CertificateError(f"`{path}.held` must rise, and `large` must hold different states.")
+        self.held = wholes(record["held"], record.at("held"), 0, self.n - 1)
+        if any(a >= b for a, b in pairwise(self.held)):
+            raise CertificateError(f"`{path}.held` must rise.")
         flow.held(self.held)
-        pair = entries(record["wall"], record.at("wall"), 2, 2)
-        self.key = whole(pair[0], record.at("wall"), -self.n, 1000), whole(pair[1], record.at("wall"), 0, 100_000)
-        if self.key not in around.walls:
-            raise Unproved(f"`{record.at('wall')}` is no wall of the problem")
-        self.wall: Wall = around.walls[self.key]
+        self.degree = whole(record["degree"], record.at("degree"), 1, 2)
+        self.keys = [self._key(pair) for pair in entries(record["walls"], record.at("walls"), 1, _MOST_WALLS)]
+        self.walls = [around.walls[key] for key in self.keys]
         self.times = [arb(t) for t in record.array("times", None)]
-        horizon = arb(around.model.horizon)
         if len(self.times) < 2 or any(not a < b for a, b in pairwise(self.times)):
             raise CertificateError(f"`{record.at('times')}` must be two or more numbers that rise.")
-        if not (self.times[0] == 0 and self.times[-1] == horizon):
-            raise Unproved("the pieces do not cover the horizon")
+        if self.times[0] != 0:
+            raise Unproved("the pieces do not begin at time 0")
+        self.first = whole(record["first"], record.at("first"), 0, len(self.times) - 2)
+        self.window = self.times[self.first], self.times[-1]
         self.cells = self._cells()
         self._read()
+
+    def _key(self, value: object) -> Key:
+        """What a wall is."""
+        path = self.record.at("walls")
+        pair = entries(value, path, 2, 2)
+        key = whole(pair[0], path, -self.n, 1000), whole(pair[1], path, 0, 100_000)
+        if key not in self.around.walls:
+            raise Unproved(f"`{path}` holds what is no wall of the problem")
+        return key
 
     def _cells(self) -> list[tuple[list[arb], list[arb]]]:
         """Lower and upper ends of cells that cover [-1, 1]^n, cut along the coordinates that are held."""
@@ -139,8 +170,8 @@ class _Value:
                 raise CertificateError(f"`{path}` must rise from -1 to 1.")
             rows[a] = [arb(x) for x in edges]
             count *= len(edges) - 1
-        self.corners = len(self.held) + self.flow.q - self.n + len(self.large)
-        count *= 2 * (len(self.times) - 1)
+        self.corners = len(self.held) + self.flow.q - self.n
+        count *= (self.degree + 1) * (len(self.times) - 1)
         if self.corners > 20 or count << self.corners > MOST_MATRICES:
             raise CertificateError(f"`{path}` must make at most {MOST_MATRICES} matrices.")
         boxes = itertools.product(*(list(pairwise(row)) for row in rows))
@@ -148,29 +179,37 @@ class _Value:
 
     def _read(self) -> None:
         record, n = self.record, self.n
-        pieces, cells = len(self.times) - 1, len(self.cells)
+        pieces, cells, ends = len(self.times) - 1, len(self.cells), self.degree + 1
         self.splits = splitting(n, self.held)
         self.matrices = []
-        for k, rows in enumerate(record.array("matrices", pieces + 1, n + 1, n + 1)):
+        for k, rows in enumerate(record.array("matrices", self.degree * pieces + 1, n + 1, n + 1)):
             if any(rows[i][j] != rows[j][i] for i in range(n + 1) for j in range(i)):
                 raise CertificateError(f"`{record.at('matrices')}[{k}]` must be symmetric.")
             self.matrices.append(matrix(rows))
         forms = n + len(self.around.inside)
-        shapes = {"moves": (pieces, 2, cells, len(self.splits)),
-                  "weights": (pieces, 2, 1 << self.corners, cells, forms)}  # fmt: skip
+        shapes = {"moves": (pieces, ends, cells, len(self.splits)),
+                  "weights": (pieces, ends, 1 << self.corners, cells, forms)}  # fmt: skip
         if any(math.prod(shape) > MOST_NUMBERS for shape in shapes.values()):
             raise CertificateError(f"`{record.path}` must hold at most {MOST_NUMBERS} multipliers.")
         self.moves, self.weights = (unpacked(record[name], record.at(name), shapes[name]) for name in shapes)
-        self.wall_weights = np.array(record.array("wall_weights", pieces + 1, forms + len(self.wall.forms)))
-        size = 0 if self.wall.row is None else n + 1
-        self.wall_rows = record.array("wall_rows", pieces + 1, size)
-        if not ((self.weights >= 0).all() and (self.wall_weights >= 0).all()):
+        self.wall_weights, self.wall_rows = (self._on_walls(name, forms) for name in ("wall_weights", "wall_rows"))
+        if not ((self.weights >= 0).all() and all(mu >= 0 for rows in self.wall_weights for row in rows for mu in row)):
             raise CertificateError(f"`{record.path}` must not have a negative weight.")
         self.lam = [arb(x) for x in record.array("lam", pieces)]
         self.gap = arb(record.number("gap", least=0.0))
         if not all(rate >= 0 for rate in self.lam):
             raise CertificateError(f"`{record.at('lam')}` must not be negative.")
         self.growth = sum((rate * (b - a) for rate, (a, b) in zip(self.lam, pairwise(self.times))), arb(0))
+
+    def _on_walls(self, name: str, forms: int) -> list[list[list[float]]]:
+        """Numbers of every wall at every control point in the window."""
+        record, many = self.record, self.degree * (len(self.times) - 1 - self.first) + 1
+        found = []
+        for wall, value in zip(self.walls, entries(record[name], record.at(name), len(self.walls), len(self.walls))):
+            size = forms + len(wall.forms) if name == "wall_weights" else 0 if wall.row is None else self.n + 1
+            rows = entries(value, record.at(name), many, many)
+            found.append([numbers(row, record.at(name), size) for row in rows])
+        return found
 
     @property
     def paid(self) -> arb:
@@ -186,14 +225,16 @@ class _Value:
 
     def prove(self) -> None:
         """Everything that the wall's part of the bound rests on."""
-        self._on_wall()
+        for given in zip(self.walls, self.wall_weights, self.wall_rows, strict=True):
+            self._on_wall(*given)
         around = self.around
         gains = self.flow.gain(around.center, around.width)
         locals_ = [self.flow.over(low, high, self.held, around.center, around.width) for low, high in self.cells]
         steps = [b - a for a, b in pairwise(self.times)]
-        for k, side in itertools.product(range(len(steps)), (0, 1)):
-            slope = (self.matrices[k + 1] - self.matrices[k]) * (1 / steps[k])
-            here = self.matrices[k + side]
+        for k, (side, (a, b, factor)) in itertools.product(range(len(steps)), enumerate(_SLOPES[self.degree])):
+            at = self.degree * k
+            slope = (self.matrices[at + b] - self.matrices[at + a]) * (factor / steps[k])
+            here = self.matrices[at + side]
             trace = sum((g.transpose() * here * g for g in gains), slope)
             for c, local in enumerate(locals_):
                 self._on_cell((k, side, c), trace, local, gains)
@@ -202,53 +243,42 @@ class _Value:
         """M + lam/|z|^2 at all corners of a cell; ``known`` is the part of -2 M that is the same everywhere."""
         k, side, c = place
         low, high = self.cells[c]
-        here = self.matrices[k + side]
+        here = self.matrices[self.degree * k + side]
         reach = sum((arb.max(a * a, b * b) for a, b in zip(low, high)), arb(1))
         shift = identity(self.n + 1) * (self.lam[k] / reach)
-        small = [i for i in range(self.n) if i not in self.large]
-        toll = sum((local.rest[i] for i in small), arb(0)) * _STEEP / 2
-        extra = [(local.rest[i] / _STEEP).sqrt() for i in small]
+        missing = missing_form(local)
+        extra = [(sum(row, arb(0)) / _STEEP).sqrt() for row in local.rest]
         splits = self._splits(self.moves[k, side, c])
-        middle = [((a + b) / 2).mid() for a, b in zip(low, high)]
         for number, bits in enumerate(itertools.product((0, 1), repeat=self.corners)):
             self.budget.check()
             ends = [high[a] if bit else low[a] for a, bit in zip(self.held, bits)]
-            drift = self._drift(local, ends, middle, bits)
+            drift = self._drift(local, ends, bits)
             total = here * drift
             total = known + total + total.transpose()
-            spread = self._spread(gains, ends, small, extra)
+            spread = self._spread(gains, ends, extra)
             border = here * spread
             total = (total + border * border.transpose()) * arb(0.5)
-            total = total + sum((part * end for part, end in zip(splits, ends)), self._sides(place, number))
-            entry = total[self.n, self.n] + toll
-            total[self.n, self.n] = entry
+            total = total + sum((part * end for part, end in zip(splits, ends)), self._sides(place, number) + missing)
             if not is_positive_definite(shift - total):
                 raise Unproved("the growth of a quadratic bound was not shown to be as small as stated")
 
-    def _drift(self, local: Local, ends: Sequence[arb], middle: Sequence[arb], bits: Sequence[int]) -> arb_mat:
+    def _drift(self, local: Local, ends: Sequence[arb], bits: Sequence[int]) -> arb_mat:
         """A at a corner."""
         total = local.base
         for a, end in zip(self.held, ends):
-            total = total + local.along[a] * (end - middle[a])
-        count = len(self.held)
-        for part, bit in zip(local.pushed, bits[count:]):
+            total = total + local.along[a] * (end - local.middle[a])
+        for part, bit in zip(local.pushed, bits[len(self.held) :]):
             total = total + part * arb(2 * bit - 1)
-        if self.large:
-            total = arb_mat(total)
-            for i, bit in zip(self.large, bits[count + len(local.pushed) :]):
-                total[i, self.n] = total[i, self.n] + local.rest[i] * (2 * bit - 1)
         return total
 
-    def _spread(
-        self, gains: Sequence[arb_mat], ends: Sequence[arb], small: Sequence[int], extra: Sequence[arb]
-    ) -> arb_mat:
-        """Columns of g at a corner, and of the remainders that are none."""
+    def _spread(self, gains: Sequence[arb_mat], ends: Sequence[arb], extra: Sequence[arb]) -> arb_mat:
+        """Columns of g at a corner, and of the remainders."""
         z = [arb(0)] * self.n + [arb(1)]
         for a, end in zip(self.held, ends):
             z[a] = end
         point = arb_mat(self.n + 1, 1, z)
         columns = [(g * point).entries() for g in gains]
-        for i, x in zip(small, extra):
+        for i, x in enumerate(extra):
             columns.append([x if j == i else arb(0) for j in range(self.n + 1)])
         return matrix([list(row) for row in zip(*columns)])
 
@@ -280,20 +310,36 @@ class _Value:
             rows[n][n] -= mu * a * b
         return sum((form * arb(float(mu)) for form, mu in zip(self.around.inside, weights[n:])), matrix(rows))
 
-    def _on_wall(self) -> None:
-        """V >= -gap on the wall, at all times at which H is stated, and so between them."""
+    def _on_wall(self, wall: Wall, wall_weights: list[list[float]], wall_rows: list[list[float]]) -> None:
+        """V >= -gap on a wall, at all control points of H in the window, and so between them."""
         n, forms = self.n, self.n + len(self.around.inside)
         low, high = [arb(-1)] * n, [arb(1)] * n
         room = identity(n + 1) * (self.gap / (n + 1))
-        for here, weights, row in zip(self.matrices, self.wall_weights, self.wall_rows):
+        matrices = self.matrices[self.degree * self.first :]
+        for here, weights, row in zip(matrices, wall_weights, wall_rows, strict=True):
             total = here * arb(0.5) + room - self._weighed(weights[:forms], low, high)
-            for form, mu in zip(self.wall.forms, weights[forms:]):
+            for form, mu in zip(wall.forms, weights[forms:], strict=True):
                 total = total - form * arb(float(mu))
-            if self.wall.row is not None:
-                outer = arb_mat(n + 1, 1, self.wall.row) * arb_mat(1, n + 1, [arb(x) for x in row])
+            if wall.row is not None:
+                outer = arb_mat(n + 1, 1, wall.row) * arb_mat(1, n + 1, [arb(x) for x in row])
                 total = total - (outer + outer.transpose()) * arb(0.5)
             if not is_positive_definite(total, self.budget):
                 raise Unproved("a quadratic bound was not shown to be at least 0 on its wall")
+
+
+def missing_form(local: Local) -> arb_mat:
+    """E: sum_b (sum_i r_ib) (q/2) eta_b^2 over a cell, as a form over z."""
+    n = len(local.rest)
+    rows = [[arb(0)] * (n + 1) for _ in range(n + 1)]
+    for b in range(n):
+        weight = sum((row[b] for row in local.rest), arb(0)) * _STEEP / 2
+        slope, offset = 1 / local.size[b], -local.middle[b] / local.size[b]
+        rows[b][b] += weight * slope**2
+        rows[b][n] += weight * slope * offset
+        rows[n][b] += weight * slope * offset
+        rows[n][n] += weight * offset**2
+    rows[n][n] += sum((row[n] for row in local.rest), arb(0)) * _STEEP / 2
+    return matrix(rows)
 
 
 def splitting(n: int, held: Sequence[int]) -> list[tuple[Place, Place]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,21 +15,27 @@ from certbound.checker.statement import Model
 from certbound.problem.model import JUMPS, Tape
 
 Pair = tuple[int, int]
+_MOST_PARTS = 64
+_MOST_CUTS = 8
 _KINKED = {"abs", "min", "max", "hypot", "atan2", "fmod", "copysign"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Local:
-    """f on a cell: A(s, d, e) z about the middle.
+    """f on a cell: A(s, d) z about the middle, and a remainder.
 
     ``base`` is the linear part, ``along[a]`` what a step along the held coordinate a adds to it, ``pushed[b]`` what the
-    disturbance b at its upper end adds (minus that at its lower end), ``rest[i]`` bounds what is missing of f_i.
+    disturbance b at its upper end adds (minus that at its lower end), and what is missing of f_i is at most
+    sum_b rest[i][b] |eta_b|, eta_b the coordinate b of the cell scaled to [-1, 1] about ``middle`` by half widths
+    ``size``, and the last one equal to 1.
     """
 
     base: arb_mat
     along: dict[int, arb_mat]
     pushed: list[arb_mat]
-    rest: list[arb]
+    rest: list[list[arb]]
+    middle: list[arb]
+    size: list[arb]
 
 
 class Flow:
@@ -140,11 +147,11 @@ class Flow:
         asked = [*self.outputs, *(node for row in self.slopes for node in row)]
         self._run([*asked, *self.noise], all_)  # all of it is defined
         values = self._run(asked, here)
-        bends = dict(zip(self.bends, self._run(list(self.bends.values()), all_)))
+        bends = dict(zip(self.bends, self._ranges(all_)))
         base = [[arb(0)] * (n + 1) for _ in range(n + 1)]
         along = {a: [[arb(0)] * (n + 1) for _ in range(n + 1)] for a in held}
         pushed = [[[arb(0)] * (n + 1) for _ in range(n + 1)] for _ in range(q - n)]
-        rest = [arb(0)] * n
+        rest = [[arb(0)] * (n + 1) for _ in range(n)]
         for i in range(n):
             slope = [x * s / width[i] for x, s in zip(values[n + i * q : n + (i + 1) * q], scale)]
             _affine(base[i], values[i] / width[i], slope[:n], middle)
@@ -155,16 +162,36 @@ class Flow:
             known, missing = factor.mid(), arb(factor.rad()).upper()
             if a >= n:
                 known, missing = arb(0), abs(factor).upper()
-            rest[i] += missing * size[a] * size[b]
+            owner, other = (a, b) if a in along else (b, a)
+            rest[i][other if b < n else min(a, n)] += missing * size[a] * size[b]
             if b < n:
-                owner, other = (a, b) if a in along else (b, a)
                 along[owner][i][other] += known
                 along[owner][i][-1] -= known * middle[other]
             elif a < n:
                 pushed[b - n][i][a] += known * size[b]
                 pushed[b - n][i][-1] -= known * middle[a] * size[b]
         return Local(base=matrix(base), along={a: matrix(rows) for a, rows in along.items()},
-                     pushed=[matrix(rows) for rows in pushed], rest=[x.upper() for x in rest])  # fmt: skip
+                     pushed=[matrix(rows) for rows in pushed], rest=[[x.upper() for x in row] for row in rest],
+                     middle=middle, size=size[:n])  # fmt: skip
+
+    def _ranges(self, box: Sequence[arb]) -> list[arb]:
+        """The second derivatives over a box, in parts: balls say more of small ones."""
+        nodes = list(self.bends.values())
+        used = [self.graph.node(index) for index in self.graph.reachable(nodes)]
+        places = sorted({args[0] for op, args, _ in used if op == "input"})
+        cuts = _MOST_CUTS
+        while cuts > 1 and cuts ** len(places) > _MOST_PARTS:
+            cuts -= 1
+        found: list[arb] = []
+        for part in itertools.product(range(cuts), repeat=len(places)):
+            self.budget.check()
+            inputs = list(box)
+            for place, k in zip(places, part):
+                low, high = box[place].lower(), box[place].upper()
+                inputs[place] = (low + (high - low) * k / cuts).union(low + (high - low) * (k + 1) / cuts)
+            values = self._run(nodes, inputs)
+            found = [a.union(b) for a, b in zip(found, values)] if found else values
+        return found
 
     def _run(self, nodes: list[int], inputs: Sequence[arb]) -> list[arb]:
         if not nodes:

@@ -1,9 +1,10 @@
-"""Quadratic value bounds as data: the matrices H of every wall, and the multipliers with which they are proved."""
+"""Quadratic value bounds as data: the matrices H of every V, and the multipliers with which they are proved."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces
 from certbound.quadratic import QuadraticBound
+from certbound.quadratic.setting import Setting, Wall
+from certbound.quadratic.wall_attempts import Attempt
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.parts import packed
 
@@ -31,48 +34,50 @@ def quadratic_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
     if found is None or found.setting is None or not found.upper < 0:
         raise CertificateError("no quadratic value bound was found.")
     effort = min(attempt, len(_ROOMS) - 1)
-    walls = []
-    for key, item in zip(_keys(problem, found), found.walls, strict=True):
-        proved = item.proved
-        if proved is None or len(proved.rates) != item.pieces:
-            raise CertificateError(f"nothing was proved at the wall '{item.wall.label}'.")
-        wall, n = proved.proposal, problem.system.dimension
-        room = _ROOMS[effort] / float(problem.horizon)
-        walls.append({
-            "wall": key,
-            "held": [int(a) for a in item.held],
-            "large": [int(a) for a in item.large],
-            "cuts": exact([np.linspace(-1.0, 1.0, count + 1) for count in item.slabs]),
-            "times": exact(wall.times),
-            "matrices": exact(wall.matrices),
-            "moves": packed(_rounded(wall.moves)),
-            "weights": packed(_rounded(np.maximum(wall.weights, 0.0))),
-            "wall_weights": exact(np.maximum(wall.wall_weights, 0.0)),
-            "wall_rows": exact(wall.wall_rows.reshape(len(wall.times), -1) if item.wall.row is not None else
-                               np.zeros((len(wall.times), 0))),
-            "lam": exact([rate * (1 + 0.1 * effort) + room for rate in proved.rates]),
-            "gap": exact(float(proved.gap * (1 + 1e-3)) + _LEAST * (n + 1)),
-        })  # fmt: skip
-    if sum(len(wall[name]) for wall in walls for name in ("moves", "weights")) > _LONGEST:
+    room = _ROOMS[effort] / float(problem.horizon)
+    keys = _keys(problem, found.setting)
+    bounds = [_bound(item, keys, growth=1 + 0.1 * effort, room=room) for item in found.walls]
+    if sum(len(one[name]) for one in bounds for name in ("moves", "weights")) > _LONGEST:
         raise CertificateError(f"the multipliers take over {_LONGEST // 2**20} MiB: too much for a certificate.")
     center, width = exact(found.setting.center), exact(found.setting.width)
-    data = {"engine": "quadratic", "center": center, "width": width, "walls": walls}
+    data = {"engine": "quadratic", "center": center, "width": width, "bounds": bounds}
     return data, _claim(found.upper, problem.delta, _CLAIMS[effort]), []
 
 
-def _keys(problem: Problem, found: QuadraticBound) -> list[list[int]]:
+def _bound(item: Attempt, keys: dict[Wall, list[int]], *, growth: float, room: float) -> dict[str, Any]:
+    """What is stated of one V."""
+    proved = item.proved
+    if proved is None:
+        raise CertificateError(f"nothing was proved at the wall '{item.wall.label}'.")
+    found, walls = proved.proposal, (item.wall, *item.others)
+    n = found.matrices.shape[-1] - 1
+    given = ((found.wall_weights, found.wall_rows), *found.others)
+    before = found.degree * found.first
+    return {
+        "walls": [keys[wall] for wall in walls],
+        "first": int(found.first),
+        "degree": int(found.degree),
+        "held": [int(a) for a in proved.held],
+        "cuts": exact([np.linspace(-1.0, 1.0, count + 1) for count in item.slabs]),
+        "times": exact(found.times),
+        "matrices": exact(found.matrices),
+        "moves": packed(_rounded(found.moves)),
+        "weights": packed(_rounded(np.maximum(found.weights, 0.0))),
+        "wall_weights": [exact(np.maximum(weights[before:], 0.0)) for weights, _ in given],
+        "wall_rows": [exact(rows[before:] if wall.row is not None else np.zeros((len(rows) - before, 0)))
+                      for wall, (_, rows) in zip(walls, given, strict=True)],
+        "lam": exact([rate * growth + room for rate in proved.rates]),
+        "gap": exact(float(proved.gap * (1 + 1e-3)) + _LEAST * (n + 1)),
+    }  # fmt: skip
+
+
+def _keys(problem: Problem, setting: Setting) -> dict[Wall, list[int]]:
     """What each wall is for the checker: a constraint and a face, or a side of the working box."""
-    n = problem.system.dimension
-    keys: list[list[int]] = []
+    keys: dict[Wall, list[int]] = {}
     own = _constraint_walls(problem)
-    for item in found.walls:
-        row = None if item.wall.row is None else np.asarray(item.wall.row.mid)
-        if row is not None and np.count_nonzero(row[:n]) == 1:
-            axis = int(np.flatnonzero(row[:n])[0])
-            keys.append([-1 - axis, int(row[axis] > 0)])
-        else:
-            keys.append(next(own, [1000, 0]))
-    if next(own, None) is not None or [1000, 0] in keys:
+    for wall in setting.walls:
+        keys[wall] = next(own, [1000, 0]) if wall.side is None else [-1 - wall.side[0], wall.side[1]]
+    if next(own, None) is not None or [1000, 0] in keys.values():
         raise CertificateError("the checker does not know why some walls were left out.")
     return keys
 

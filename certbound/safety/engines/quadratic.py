@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.quadratic import bound_quadratic
+from certbound.quadratic import QuadraticBound, bound_quadratic
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.watch import seconds_left
 
@@ -25,7 +25,13 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
         return EngineAnswer(applicable=False, method="quadratic", reason=reason)
     try:
         limit = max(min(_SECONDS if asked.thorough else _SECONDS / 2, seconds_left()), _LEAST)
-        found = bound_quadratic(problem, target=problem.delta, seconds=limit)
+        best = bound_quadratic(
+            problem, target=problem.delta, seconds=limit, found=lambda bound: asked.found(_answer(bound))
+        )
     except (InfeasibleError, EnclosureError) as error:
         return EngineAnswer(applicable=False, method="quadratic", reason=str(error))
-    return EngineAnswer(log10_delta=found.upper, reason=found.words + ".", method="quadratic", details=found)
+    return _answer(best)
+
+
+def _answer(bound: QuadraticBound) -> EngineAnswer:
+    return EngineAnswer(log10_delta=bound.upper, reason=bound.words + ".", method="quadratic", details=bound)

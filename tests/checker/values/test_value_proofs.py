@@ -30,7 +30,7 @@ from certbound.checker.values.hermite import Surface
 from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
 from certbound.checker.values.packed import unpacked
 from certbound.checker.values.passage import Levels, Passage
-from certbound.checker.values.quadratic import splitting
+from certbound.checker.values.quadratic import missing_form, splitting
 from certbound.checker.values.second_order import Flow
 from certbound.checker.values.step_back import Grid, Steps, Values
 from certbound.checker.values.uniform_means import UniformTransition
@@ -351,6 +351,37 @@ def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:
     assert found - 1e-6 <= report.log10_proved < found + 0.1
 
 
+def test_many_quadratic_bounds_are_not_all_unpacked() -> None:
+    data = parse(quadratic_certificate(squared()))
+    counted = patch.object(quadratic, "_Value", wraps=quadratic._Value)
+    with patch.object(quadratic, "MOST_NUMBERS", 3000), counted as made:
+        assert check_data(data).valid
+        before = made.call_count
+        data["proof"]["bounds"] = [data["proof"]["bounds"][0]] * 50
+        with pytest.raises(CertificateError, match=r"`proof.bounds` must hold at most 3000 multipliers"):
+            check_data(data)
+    assert made.call_count < before + 40
+
+
+def test_what_is_missing_of_a_curved_drift_is_proved_again_without_more_room() -> None:
+    """A sine and a product with a square, over cells: the checker's enclosures are others than the engine's."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -2 * np.sin(x[0]) - x[1] + 0.3 * x[1] * x[2] ** 2, -x[2]], states=3,
+        diffusion=[[0.05, 0, 0], [0, 0.3, 0], [0, 0, 0.3]],
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1.2, -1.5, -1.2], [1.2, 1.5, 1.2]))]
+    problem = cb.Problem(system, initial=cb.Box([-0.1] * 3, [0.1] * 3), safe=safe, horizon=1.0, delta=0.5)
+    found = bound_quadratic(problem, target=0.5, seconds=60.0)
+    for item in found.walls:
+        assert item.proved is not None
+        assert item.proved.proposal.degree == 2
+    data = parse(quadratic_certificate(problem))
+    report = check_data(data, json.loads(json.dumps(problem_data(problem))))
+    assert report.valid, report.reason
+    assert found.upper - 1e-6 <= report.log10_proved < found.upper + 0.1 < 0
+    assert any(len(edges) > 2 for one in data["proof"]["bounds"] for edges in one["cuts"])
+
+
 def test_a_ball_of_starts_has_a_bound_of_its_own() -> None:
     """Against V at points of the ball; its corners, which lie outside, are left aside."""
     problem = squared()
@@ -363,7 +394,7 @@ def test_a_ball_of_starts_has_a_bound_of_its_own() -> None:
     points = 0.05 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
     z = np.hstack([(points - center) / width, np.ones((41, 1))])
     total = np.zeros(41)
-    for wall in data["proof"]["walls"]:
+    for wall in data["proof"]["bounds"]:
         first = np.array([[float.fromhex(x) for x in row] for row in wall["matrices"][0]])
         total += np.exp(np.einsum("pi,ij,pj->p", z, first, z) / 2)
     assert math.log10(total.max()) <= found < math.log10(total.max()) + 0.5
@@ -396,9 +427,18 @@ def test_the_drift_lies_between_its_corners(place: int) -> None:
     for a in (0, 1):
         matrix = matrix + local.along[a] * (arb(xi[a]) - (low[a] + high[a]) / 2)
     found = (matrix * arb_mat(3, 1, [*map(arb, xi), arb(1)])).entries()
+    size = [float(part) for part in local.size]
+    assert np.allclose(size, (ends[:, 1] - ends[:, 0]) / 2)
+    eta = [*(np.abs(np.subtract(xi, [float(part) for part in local.middle])) / size), 1.0]
     for value, exact_one, rest in zip(found, truth, local.rest):
-        assert abs(float(value.mid()) - exact_one) <= float(rest) + 1e-12
-    assert float(local.rest[0]) < 1e-15
+        assert abs(float(value.mid()) - exact_one) <= np.dot([float(part) for part in rest], eta) + 1e-12
+    assert max(map(float, local.rest[0])) < 1e-15
+    assert float(local.rest[1][2]) < 1e-15 < float(local.rest[1][0])
+    paid = missing_form(local)
+    z = [*map(arb, xi), arb(1)]
+    form = float(sum(z[i] * paid[i, j] * z[j] for i in range(3) for j in range(3)).mid())
+    weights = [sum(float(row[b]) for row in local.rest) for b in range(3)]
+    assert form == pytest.approx(4 * np.dot(weights, np.square(eta)), rel=1e-9, abs=1e-12)
 
 
 # ---- files made to fool --------------------------------------------------------------------------------------

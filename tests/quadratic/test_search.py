@@ -1,0 +1,145 @@
+"""Windows, groups of walls, sides that move, and time that ends."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.quadratic import QuadraticBound, bound_quadratic
+from certbound.quadratic.inequality import prove
+from certbound.quadratic.refinement import make_search
+from certbound.quadratic.surroundings import moved_sides, working_box
+from certbound.quadratic.wall_attempts import APART, PIECES, SPLIT, Attempt
+from certbound.quadratic.wall_program import propose
+from certbound.watch import OutOfTime, Watch
+
+
+def problem_of(horizon: float = 1.0, noise: float = 0.35) -> cb.Problem:
+    """A product drives the second of three states; the third has no limit."""
+    system = cb.ContinuousSystem(
+        lambda x: [-x[0] + 0.5 * x[2], 0.5 * x[0] * x[0] - x[1], -x[2]], states=["a", "b", "c"],
+        diffusion=noise * np.eye(3),
+    )  # fmt: skip
+    box = cb.Box([-1.2, -1.2, -np.inf], [1.2, 1.2, np.inf])
+    return cb.Problem(system, initial=cb.Box([-0.1] * 3, [0.1] * 3), safe=[cb.Inside(box)], horizon=horizon)
+
+
+def first_attempt(horizon: float = 1.0) -> Attempt:
+    problem = problem_of(horizon)
+    return make_search(problem, *working_box(problem, 4.0), together=True).attempts[0]
+
+
+def test_pieces_before_a_window_reach_back_to_the_start() -> None:
+    attempt = first_attempt(30.0)
+    assert attempt.times[1] == 0
+    late = attempt.finer(SPLIT)[1].finer(SPLIT)[1].finer(PIECES)[0]
+    times, first = late.times
+    assert (times[0], times[first], times[-1]) == (0.0, 22.5, 30.0)
+    assert np.all(np.diff(times) > 0)
+    assert np.all(np.diff(np.diff(times[: first + 1]))[1:] < 0)  # the longer the earlier, but for the first
+
+
+def test_windows_and_walls_of_what_is_finer_cover_what_was_there() -> None:
+    attempt = first_attempt()
+    labels = [wall.label for wall in (attempt.wall, *attempt.others)]
+    parts = attempt.finer(APART)
+    assert sorted(labels) == sorted(wall.label for part in parts for wall in (part.wall, *part.others))
+    assert [len(part.others) for part in parts] == [0] * 2 + [3]  # a is curved; b and c are far
+    halves = attempt.finer(SPLIT)
+    assert [half.during for half in halves] == [(0.0, 0.5), (0.5, 1.0)]
+
+
+def test_windows_pay_over_long_times() -> None:
+    """One exponential grows with the whole horizon; a sum over windows only with its length."""
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.33 * np.eye(2))
+    problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=16.0)
+    search = make_search(problem, -np.ones(2), np.ones(2))
+    whole = search.attempts[0]
+
+    def level(attempt: Attempt) -> float:
+        times, first = attempt.times
+        cells = search.cells(times, ())
+        found = propose(search.setting, attempt.wall, times, cells, seconds=10.0, first=first)
+        assert found is not None
+        return prove(search.setting, attempt.wall, found, [one.cells for one in cells]).level
+
+    halves = [part for half in whole.finer(SPLIT) for part in half.finer(SPLIT)]
+    parts = [part for half in halves for part in half.finer(SPLIT)]
+    bound = 4 * np.sum(np.exp([level(part) for part in parts]))
+    seen = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(0))
+    assert seen.lower <= bound < 4 * np.exp(level(whole)) / 2
+
+
+def test_a_search_refines_in_windows_that_cover_the_horizon() -> None:
+    problem = problem_of(6.0)
+    search = make_search(problem, *working_box(problem, 4.0))
+    assert all(bound.upper < 0 for bound in search.first(0.0, 20.0))
+    search.gains = {PIECES: 0.0}  # say that pieces are no use
+    for _ in range(2):
+        search._refined(0, np.inf)
+    windows = sorted(one.during for one in search.attempts if one.wall is search.attempts[0].wall)
+    assert len(windows) > 1
+    ends = [0.0, *itertools.chain.from_iterable(windows), 6.0]
+    assert ends[::2] == ends[1::2]
+
+
+def test_sides_move_to_where_they_cost_a_share() -> None:
+    problem = problem_of()
+    low, high = working_box(problem, 4.0)
+    setting = make_search(problem, low, high).setting
+    names = [wall.label for wall in setting.walls]
+    levels = np.full(len(names), -40.0)
+    moved = moved_sides(problem, setting, levels, -4.0)
+    assert moved is not None
+    assert (moved[0] >= low - 1e-12).all()
+    assert (moved[1] <= high + 1e-12).all()
+    assert moved[1][0] < high[0] - 0.2  # a has a square
+    assert moved[1][0] > 0.1  # beyond the starts
+    assert moved[1][1:] == pytest.approx(high[1:])  # the others are affine
+    assert moved_sides(problem, setting, np.full(len(names), -8.0), -4.5) is None
+
+
+def test_better_bounds_are_told_and_the_end_of_the_time_is_kept() -> None:
+    told: list[QuadraticBound] = []
+    now = iter(np.arange(0.0, 1e6, 0.5))
+    watch = Watch(14.0, clock=lambda: float(next(now)))
+    with pytest.raises(OutOfTime), watch.running():
+        bound_quadratic(problem_of(), target=0.0, seconds=60.0, found=told.append)
+    uppers = [bound.upper for bound in told]
+    assert uppers
+    assert all(later < earlier for earlier, later in itertools.pairwise([0.0, *uppers]))
+    assert "wall" in watch.phase or "refining" in watch.phase
+
+
+def test_a_timer_does_not_break_the_solver_while_it_loads() -> None:
+    """An alarm in the middle of Clarabel's first solution waits until it is loaded; after it programs are solved."""
+    script = (
+        "import signal\n"
+        "from certbound.quadratic import conic\n"
+        "from certbound.watch import OutOfTime\n"
+        "real = conic.importlib.import_module\n"
+        "def stop(*_): raise OutOfTime\n"
+        "signal.signal(signal.SIGALRM, stop)\n"
+        "def slow(name):\n"
+        "    signal.raise_signal(signal.SIGALRM)\n"
+        "    return real(name)\n"
+        "conic.importlib.import_module = slow\n"
+        "try:\n"
+        "    conic.Program()\n"
+        "except OutOfTime:\n"
+        "    print('late')\n"
+        "conic.importlib.import_module = real\n"
+        "program = conic.Program()\n"
+        "import numpy as np\n"
+        "x = program.variables(1)\n"
+        "program.semidefinite(conic.block(-np.eye(2), [np.eye(2)[:, :, None]]), x)\n"
+        "program.minimise(0, seconds=5.0)\n"
+        "print('solved')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == ["late", "solved"]
