@@ -415,6 +415,11 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed() -> None:
     for size, shift in ((0.0, -0.3), (0.0, 1.0), (1e-3, 0.0)):
         payment = prove_lower(spoilt(surface, rng, size).raised(shift), model, starts)
         assert payment is None or payment.log <= truth
+    early = dataclasses.replace(surface, times=0.3 * surface.times)  # what is true of T = 1, said of T = 0.3
+    soon = exit_probability(lambda t, x: -x, lambda t, x: 0.8 + 0 * x, -1, 1, 0.3, 0.0)
+    payment = prove_lower(early, model, starts)
+    assert extreme_over(early, starts, upper=False) > math.log(1 - (1 - soon) ** 2) + 0.1
+    assert payment is None or payment.log <= math.log(1 - (1 - soon) ** 2)
 
 
 def test_a_source_of_any_size_never_takes_a_bound_below_the_truth() -> None:
