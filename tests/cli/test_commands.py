@@ -75,7 +75,7 @@ def test_the_smallest_probability_goes_into_the_answer_and_the_certificate(
     code, checked = answer(capsys, "check", str(file), "--problem", "chain_rest")
     assert (code, checked["valid"]) == (0, True)
     assert "10^-6" in checked["claim"]
-    stopped = answer(capsys, "verify", "chain_rest", "--smallest", "--time-limit", "0.9")[1]
+    stopped = answer(capsys, "verify", "chain_rest", "--smallest", "--time-limit", "0.2")[1]
     assert stopped["log10_delta"] <= 0
 
 

@@ -161,8 +161,9 @@ class Splines:
         return band
 
     def times(self, band: Array, vector: Array) -> Array:
-        padded = np.concatenate([np.zeros(_BAND), vector, np.zeros(_BAND)])
-        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BAND + 1)
+        padded = np.zeros(len(vector) + 2 * _BAND)
+        padded[_BAND:-_BAND] = vector
+        windows = np.ndarray((len(vector), 2 * _BAND + 1), float, padded, strides=2 * padded.strides)
         return np.asarray(np.einsum("ij,ij->i", band, windows))
 
 

@@ -45,7 +45,7 @@ def test_streams_differ_between_blocks_seeds_and_from_the_generator_of_starts():
 
 
 def test_normal_variates_follow_the_normal_law():
-    sample = np.empty(2_000_000)
+    sample = np.empty(500_000)
     fill_normal(seed_stream(1, 0), sample)
     assert kstest(sample, "norm").pvalue > 1e-3
     moments = [np.mean(sample**k) for k in (1, 2, 3, 4, 6)]
