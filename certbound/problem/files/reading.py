@@ -16,7 +16,8 @@ from certbound.problem import sets
 from certbound.problem.files.parser import CONSTANTS, constant, is_function, parse
 from certbound.problem.files.plans import read_plan
 from certbound.problem.files.schema import Constraint, Cost, Part, PolygonTable, Specification, Start
-from certbound.problem.model import OPERATIONS, Graph, Tape
+from certbound.problem.model import OPERATIONS, Graph, Network, Tape
+from certbound.problem.networks import network
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
@@ -34,7 +35,7 @@ def read_problem(
 ) -> Problem:
     """Build the problem that a validated specification describes; ``source``, the raw content, is kept for saving.
 
-    ``plan.file`` is read from ``folder``; None forbids it. Errors (ValueError, TypeError) name the key, the rule and
+    ``plan.file`` and networks are read from ``folder``; None forbids it. Errors (ValueError, TypeError) name the key, the rule and
     the value.
     """
     return _Reader(spec, folder).problem(source)
@@ -50,7 +51,9 @@ class _Reader:
         taken |= set(self.disturbances)
         self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
         self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
-        checked_names("definitions", list(spec.definitions), taken | set(self.parameters))
+        taken |= set(self.parameters)
+        self.networks = self.read_networks(checked_names("networks", list(spec.networks), taken))
+        checked_names("definitions", list(spec.definitions), taken | set(self.networks))
 
     def problem(self, source: Mapping[str, Any] | None) -> Problem:
         spec = self.spec
@@ -72,6 +75,10 @@ class _Reader:
             parameters=self.parameters,
             source=source,
         )
+
+    def read_networks(self, names: Sequence[str]) -> dict[str, Network]:
+        paths = {name: self.file(self.spec.networks[name], f"networks.{name}") for name in names}
+        return {name: network(path, name=name).data for name, path in paths.items()}
 
     # numbers and functions
 
@@ -122,12 +129,11 @@ class _Reader:
         nodes = [self._node(text, graph, names, place) for text, place in zip(texts, where)]
         return graph.tape(nodes, shape)
 
-    @staticmethod
     def _node(
-        text: float | str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str
+        self, text: float | str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str
     ) -> int:
         try:
-            return parse(text, graph, names, where) if isinstance(text, str) else graph.const(text)
+            return parse(text, graph, names, where, self.networks) if isinstance(text, str) else graph.const(text)
         except _ForbiddenError as error:
             raise _ForbiddenError(f"`{where}`: {error}") from None
 
@@ -241,7 +247,7 @@ class _Reader:
         if table is None:
             return None
         if set(table) == {"file"} and "file" not in self.inputs:
-            return read_plan(self.plan_path(table["file"]), self.inputs)
+            return read_plan(self.file(table["file"], "plan.file"), self.inputs)
         for key in table:
             if key not in self.inputs:
                 raise ValueError(f"unknown key {key!r} in [plan]{nearest(key, [*self.inputs, 'file'])}")
@@ -252,10 +258,10 @@ class _Reader:
         texts = [table[name] for name in self.inputs]
         return self.function(texts, ("t", *self.states), where, (len(self.inputs),))
 
-    def plan_path(self, value: Any) -> Path:
+    def file(self, value: Any, where: str) -> Path:
         path = Path(str(value))
         if self.folder is None or path.is_absolute() or ".." in path.parts or not isinstance(value, str):
-            raise ValueError(f"`plan.file` must be a file in the problem file's folder, got {value!r}.")
+            raise ValueError(f"`{where}` must be a file in the problem file's folder, got {value!r}.")
         return self.folder / path
 
     def weights(self, cost: Cost) -> tuple[Array, Array]:

@@ -64,7 +64,7 @@ class Derivatives:
             low[fixed], high[fixed] = values.broadcast_to((1, len(fixed))).lo[0], values.hi.reshape(-1)
         varying = selected(first, entries, tape)
         # where the Jacobian has kinks its own nodes are kept: as jumps they tell on which boxes it is smooth
-        kinked = any(node.op == "kink" for node in varying.nodes)
+        kinked = any(node.op in ("kink", "bent") for node in varying.nodes)
         second = jacobian(varying, [0, *states])
         kept = [o for o in range(len(entries) * (n + 1)) if not is_zero(second, o)]
         slots_of = sources(varying)
