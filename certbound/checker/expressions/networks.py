@@ -16,7 +16,9 @@ from certbound.problem.model import Layer, Network, Part
 
 _ZERO = arb(0)
 Rows = list[list[arb]]
-_Layers = list[tuple[arb_mat, list[arb], Activation, Constants]]
+_Layers = list[tuple[arb_mat, arb_mat, list[arb], Activation, Constants]]
+_SMALL = 0.25
+"""A reach below which the second order is not worse than the first."""
 
 
 class Builder(Protocol):
@@ -30,9 +32,9 @@ class Builder(Protocol):
 
 @lru_cache(maxsize=16)
 def _matrices(network: Network) -> _Layers:
-    def read(layer: Layer) -> tuple[arb_mat, list[arb], Activation, Constants]:
-        weights = arb_mat([[arb(x) for x in row] for row in layer.weights])
-        return weights, [arb(x) for x in layer.bias], ACTIVATIONS[layer.activation], layer.constants
+    def read(layer: Layer) -> tuple[arb_mat, arb_mat, list[arb], Activation, Constants]:
+        weights, size = (arb_mat([[arb(f(x)) for x in row] for row in layer.weights]) for f in (float, abs))
+        return weights, size, [arb(x) for x in layer.bias], ACTIVATIONS[layer.activation], layer.constants
 
     return [read(layer) for layer in network.layers]
 
@@ -91,7 +93,7 @@ def _ranges(network: Network, args: Sequence[arb], order: int) -> tuple[list[arb
     pairs = [(i, j) for i in range(n) for j in range(i, n)] if order > 1 else []
     bends: dict[tuple[int, ...], list[arb]] = {pair: [_ZERO] * n for pair in pairs}
     edge = False
-    for weights, bias, row, constants in _matrices(network):
+    for weights, _, bias, row, constants in _matrices(network):
         centre, slopes = _affine(weights, bias, centre), weights * slopes
         values = [_met(x, c, slopes, i, radius) for i, (x, c) in enumerate(
             zip(_affine(weights, bias, values), centre))]  # fmt: skip
@@ -129,7 +131,7 @@ def series(part: Part, args: Sequence[ts.Series]) -> ts.Series:
     if part.by:
         raise Undecided
     rows: list[ts.Series] = [list(x) for x in args]
-    for weights, bias, row, constants in _matrices(part.network):
+    for weights, _, bias, row, constants in _matrices(part.network):
         moved = (weights * arb_mat(rows)).tolist()
         rows = [row.series([line_[0] + b, *line_[1:]], *constants) for line_, b in zip(moved, bias)]
     return rows[part.output]
@@ -161,6 +163,11 @@ class _Columns:
         self.linear = sorted({a for x in args for a in x.linear})
         self.squares = sorted({pair for x in args for pair in x.squares} | {
             (a, b) for i, a in enumerate(self.linear) for b in self.linear[i:]})  # fmt: skip
+        place = {a: 1 + k for k, a in enumerate(self.linear)}
+        self.bends = [
+            (number, place[a], place[b]) for number, (a, b) in enumerate(self.squares, 1 + len(self.linear))
+            if a in place and b in place
+        ]  # fmt: skip
         self.rows: Rows = [
             [x.value, *(x.linear.get(a, _ZERO) for a in self.linear),
              *(x.squares.get(pair, _ZERO) for pair in self.squares)] for x in args
@@ -178,10 +185,9 @@ class _Columns:
         self.symbols += len(new)
         self.errors = list(old)
 
-    def through(self, weights: arb_mat, bias: Sequence[arb]) -> None:
-        """W times everything, and the bias."""
+    def through(self, weights: arb_mat, size: arb_mat, bias: Sequence[arb]) -> None:
+        """W times everything (|W|, ``size``, times the errors), and the bias."""
         if not self.apart:
-            size = arb_mat([[abs(x) for x in row] for row in weights.tolist()])
             self.errors = (size * arb_mat([[x] for x in self.errors])).entries()
         self.rows = (weights * arb_mat(self.rows)).tolist()
         for row, b in zip(self.rows, bias):
@@ -226,16 +232,15 @@ class _Columns:
         value, first, half, third = row.expansion(own[0], whole)
         cross = two * (2 * one + two) + rest * (2 * (one + two) + rest)
         cubic = abs(half) * cross + abs(third) * reach * reach * reach / 6
-        slopes = row.slope(whole, *constants)
-        plain = arb(slopes.rad()) * reach  # to first order, by the mean value theorem
-        if not cubic.is_finite() or plain.upper() < cubic.upper():
-            middle = arb(slopes.mid())
-            return [value, *(middle * x for x in own[1:])], abs(middle) * error, plain.upper()
+        if not (reach < _SMALL and cubic.is_finite()):
+            slopes = row.slope(whole, *constants)
+            plain = (arb(slopes.rad()) * reach).upper()  # to first order, by the mean value theorem
+            if not cubic.is_finite() or plain < cubic:
+                middle = arb(slopes.mid())
+                return [value, *(middle * x for x in own[1:])], abs(middle) * error, plain
         found = [value, *(first * x for x in own[1:])]
-        for number, (a, b) in enumerate(self.squares, 1 + len(self.linear)):
-            if a in self.linear and b in self.linear:
-                x, y = own[1 + self.linear.index(a)], own[1 + self.linear.index(b)]
-                found[number] += half * x * y * (1 if a == b else 2)
+        for number, a, b in self.bends:
+            found[number] += half * own[a] * own[b] * (1 if a == b else 2)
         return found, abs(first) * error, cubic.upper()
 
     def models(self, weights: Sequence[float]) -> list[tm.Model]:
@@ -255,8 +260,8 @@ class _Columns:
 def _models(network: Network, args: Sequence[tm.Model]) -> list[tm.Model]:
     columns = _Columns(network, args)
     shares = [0.0] * len(columns.linear)
-    for number, (weights, bias, row, constants) in enumerate(_matrices(network)):
-        columns.through(weights, bias)
+    for number, (weights, size, bias, row, constants) in enumerate(_matrices(network)):
+        columns.through(weights, size, bias)
         if number == 0:
             shares = [sum(float(abs(own[1 + k]).mid()) for own in columns.rows) for k in range(len(shares))]
         columns.activated(row, constants)
