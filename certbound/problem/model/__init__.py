@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from certbound.problem.model.evaluation import compile_numpy, compile_scalar
     from certbound.problem.model.graph import Graph, substitute
     from certbound.problem.model.layers import Layer, Network, Part
+    from certbound.problem.model.network_rows import relaxed
     from certbound.problem.model.operations import (
         OPERATIONS,
         ROWS,
@@ -43,6 +44,7 @@ _HOME = {
     "evaluation": "compile_numpy compile_scalar",
     "graph": "Graph substitute",
     "calling": "call_network",
+    "network_rows": "relaxed",
     "layers": "Layer Network Part",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
@@ -71,6 +73,7 @@ __all__ = [
     "Node",
     "OPERATIONS",
     "Part",
+    "relaxed",
     "ROWS",
     "selected",
     "sources",

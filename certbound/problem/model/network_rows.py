@@ -81,6 +81,18 @@ def interval(*given: Any) -> Interval:
     return values[(part.output, *part.by)].reshape(shape)
 
 
+def relaxed(network: Network, args: Sequence[Interval]) -> tuple[Array, Array, Interval]:
+    """Planes around a network over boxes: the middles c (n, ...), slopes (p, n, ...) and rests (p, ...).
+
+    The network lies in slopes . (u - c) + rests; everything is unbounded where a box is.
+    """
+    shape = np.broadcast_shapes(*(x.shape for x in args))
+    box = stacked(args)
+    slopes, rests = ly.relax_network(weights_of(network), box)
+    p, n = slopes.shape[:2]
+    return box.mid.reshape((n, *shape)), slopes.reshape((p, n, *shape)), rests.reshape((p, *shape))
+
+
 def kinked(*given: Any) -> Mask:
     """Where a kink of the network lies in the box."""
     *args, part = given

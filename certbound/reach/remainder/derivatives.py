@@ -39,6 +39,7 @@ class Derivatives:
     second_index: list[tuple[int, int]] = field(init=False)
     sources: list[list[int]] = field(init=False)  # states that every such entry depends on
     kinked: bool = field(init=False)  # whether abs, min or max let the Jacobian jump
+    bent: bool = field(init=False)  # whether networks do, which have too many kinks to cut boxes at them
     timed: list[int] = field(init=False)  # outputs that depend on time explicitly
     # f, its varying entries, their derivatives, derivatives by time, and the one by the disturbance
     value: Tape = field(init=False)
@@ -87,6 +88,7 @@ class Derivatives:
             "sources": [sorted(slot - 1 for slot in found if 1 <= slot <= n) for found in slots_of],
             "second": watched(selected(second, kept, varying)) if kinked else selected(second, kept, tape),
             "kinked": kinked,
+            "bent": any(node.op == "bent" for node in tape.nodes),
             "time": by_time,
             "timed": timed,
             "time2": jacobian(by_time, [0]) if timed else by_time,
