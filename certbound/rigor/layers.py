@@ -106,7 +106,7 @@ def _joined(parts: Sequence[Interval]) -> Interval:
 def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclosure, list[tuple[Interval, Interval]]]:
     """The enclosure, and the arguments of every layer's activation at the centre and over the box, (width, M)."""
     n, count = box.shape
-    lost = ~((box.lo > -_FAR) & (box.hi < _FAR)).all(axis=0)
+    lost: Mask = np.asarray(~((box.lo > -_FAR) & (box.hi < _FAR)).all(axis=0))
     box = Interval(np.where(lost, 0.0, box.lo), np.where(lost, 0.0, box.hi))
     radius, pairs = box.rad, _columns(n) if order > 1 else []
     mid, rad = np.zeros((n, 2 + n + len(pairs), count)), np.zeros((n, 2 + n + len(pairs), count))
@@ -116,9 +116,9 @@ def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclos
     kinked, arguments = lost.copy(), []
     for layer in layers:
         mid, rad = _affine(layer, mid, rad)
-        bad = ~(np.isfinite(mid) & np.isfinite(rad)).all(axis=(0, 1))
+        bad = np.asarray(~(np.isfinite(mid) & np.isfinite(rad)).all(axis=(0, 1)))
         if bad.any():
-            lost = lost | bad
+            lost = np.asarray(lost | bad)
             mid, rad = np.where(bad, 0.0, mid), np.where(bad, 0.0, rad)
         whole = Interval.around(mid, rad)
         centre, slopes = whole[:, 0], whole[:, 2 : 2 + n]
@@ -129,16 +129,14 @@ def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclos
     whole = Interval.around(mid, rad)
     spread = (Interval(-radius, radius)[None] * whole[:, 2 : 2 + n]).sum(axis=1)
     value = _meet(whole[:, 1], whole[:, 0] + spread)
-    slopes = whole[:, 2 : 2 + n] if order else None
     bends = None
     if order > 1:
         place = np.zeros((n, n), dtype=int)
         for number, (i, j) in enumerate(pairs):
             place[i, j] = place[j, i] = 2 + n + number
         bends = _without(whole[:, place], lost)
-    found = Enclosure(
-        _without(value, lost), None if slopes is None else _without(slopes, lost), bends, kinked | lost
-    )
+    first = _without(whole[:, 2 : 2 + n], lost) if order else None
+    found = Enclosure(_without(value, lost), first, bends, np.asarray(kinked | lost))
     return found, arguments
 
 
@@ -207,7 +205,7 @@ def relax_network(layers: Sequence[Weights], box: Interval) -> tuple[Array, Inte
 @quiet
 def _relax(layers: Sequence[Weights], box: Interval) -> tuple[Array, Interval]:
     found, arguments = _bound(layers, box, 0)
-    lost = ~np.isfinite(found.value.lo).all(axis=0)
+    lost: Mask = np.asarray(~np.isfinite(found.value.lo).all(axis=0))
     p, count = found.value.shape
     rows = np.repeat(np.eye(p)[:, :, None], count, axis=2)  # (width, p, M): coefficients of what a layer gives
     rest = Interval.point(np.zeros((p, count)))
@@ -230,7 +228,7 @@ def _relax(layers: Sequence[Weights], box: Interval) -> tuple[Array, Interval]:
         rows, error = _product(layer.weights.T, layer.size.T, flat, missed.reshape(width, p * count) * (number == 0))
         rows, error = rows.reshape(k, p, count), error.reshape(k, p, count)
         rest = rest + (Interval(-error, error) * Interval.point(size)[:, None]).sum(axis=0)
-    lost = lost | ~np.isfinite(rows).all(axis=(0, 1))
+    lost = np.asarray(lost | ~np.isfinite(rows).all(axis=(0, 1)))
     return np.where(lost, 0.0, np.swapaxes(rows, 0, 1)), _without(rest, lost)
 
 

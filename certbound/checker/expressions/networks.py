@@ -10,8 +10,9 @@ from flint import arb, arb_mat
 
 from certbound.checker.expressions import series as ts
 from certbound.checker.expressions import taylor as tm
-from certbound.checker.expressions.activations import ACTIVATIONS, Activation, Constants, kinked, line
+from certbound.checker.expressions.activation_balls import ACTIVATIONS, Activation, Constants, kinked, line
 from certbound.checker.expressions.arithmetic import Undecided, square
+from certbound.checker.report import Unproved
 from certbound.problem.model import Layer, Network, Part
 
 _ZERO = arb(0)
@@ -59,6 +60,8 @@ _LAST = _Last()
 
 def slope(graph: Builder, part: Part, args: tuple[int, ...], slopes: Sequence[int]) -> int:
     """The derivative of a part as a node, from those of its arguments."""
+    if len(part.by) > 1:
+        raise Unproved("the model has third derivatives of a network, which this proof does not treat")
     total = graph.const(0.0)
     for place, inner in enumerate(slopes):
         if inner != graph.const(0.0):
@@ -85,7 +88,9 @@ def ball(part: Part, args: Sequence[arb]) -> arb:
     return bends[part.by][part.output]  # type: ignore[no-any-return]  # as above
 
 
-def _ranges(network: Network, args: Sequence[arb], order: int) -> tuple[list[arb], Any, dict[tuple[int, ...], Any], bool]:
+def _ranges(
+    network: Network, args: Sequence[arb], order: int
+) -> tuple[list[arb], Any, dict[tuple[int, ...], Any], bool]:
     """Values, first derivatives, second derivatives by pairs, and whether a kink may lie in the box."""
     n = len(args)
     centre, radius = [arb(x.mid()) for x in args], [arb(x.rad()) for x in args]

@@ -178,7 +178,7 @@ class Flow:
         """The second derivatives over a box, in parts: balls say more of small ones."""
         nodes = list(self.bends.values())
         used = [self.graph.node(index) for index in self.graph.reachable(nodes)]
-        places = sorted({args[0] for op, args, _ in used if op == "input"})
+        places = sorted({args[0] for op, args, *_ in used if op == "input"})
         cuts = _MOST_CUTS
         while cuts > 1 and cuts ** len(places) > _MOST_PARTS:
             cuts -= 1

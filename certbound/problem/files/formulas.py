@@ -19,8 +19,8 @@ def formulas(
     """Expressions that give the tape's outputs, with definitions for what is used twice or nested deeply.
 
     Returns the definitions in order, their fresh names taken from ``names``, and one expression per output: read again,
-    they give the same operations on the same numbers. ``networks`` names the networks that it may call. An operation that problem files do not have (where, sign, floor,
-    comparisons) is a ValueError.
+    they give the same operations on the same numbers. ``networks`` names those that the tape calls. An operation that
+    problem files do not have (where, sign, floor, comparisons) is a ValueError.
     """
     uses = [0] * len(tape.nodes)
     for node in tape.nodes:

@@ -48,9 +48,9 @@ def parse(
 ) -> int:
     """Read an expression into a graph; the node of its value.
 
-    ``names`` maps a name to a node of the graph, or to a function that makes the node when the name is first used,
-    ``networks`` those of networks to these; ``where`` is what the expression belongs to, for messages. A text that is no expression, or uses an unknown name or
-    function, is a ValueError that names the nearest known one.
+    ``names`` maps a name to a node of the graph, or to a function that makes the node when the name is first used;
+    ``networks`` are those that may be called. ``where`` is what the expression belongs to, for messages. A text that is
+    no expression, or uses an unknown name or function, is a ValueError that names the nearest known one.
 
     Examples
     --------
@@ -95,9 +95,8 @@ class _Parser:
             if match is None:
                 blank = len(self.text[place:]) - len(self.text[place:].lstrip())
                 character = self.text[place + blank]
-                if tokens and (character, tokens[-1].text) == ("[", ")") or (
-                    character == "]" and tokens[-2:-1] and tokens[-2].text == "["
-                ):  # an output of a network
+                before = ["", "", *(token.text for token in tokens[-2:])]
+                if (character, before[-1]) == ("[", ")") or (character, before[-2]) == ("]", "["):  # of a network
                     tokens.append(_Token("symbol", character, place + blank))
                     place += blank + 1
                     continue

@@ -16,7 +16,7 @@ from certbound.problem import sets
 from certbound.problem.files.parser import CONSTANTS, constant, is_function, parse
 from certbound.problem.files.plans import read_plan
 from certbound.problem.files.schema import Constraint, Cost, Part, PolygonTable, Specification, Start
-from certbound.problem.model import OPERATIONS, Graph, Network, Tape
+from certbound.problem.model import OPERATIONS, Graph, Tape
 from certbound.problem.networks import network
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
@@ -30,13 +30,11 @@ class _ForbiddenError(ValueError):
     """An expression uses a name that exists, but not here."""
 
 
-def read_problem(
-    spec: Specification, folder: Path | None, source: Mapping[str, Any] | None = None
-) -> Problem:
+def read_problem(spec: Specification, folder: Path | None, source: Mapping[str, Any] | None = None) -> Problem:
     """Build the problem that a validated specification describes; ``source``, the raw content, is kept for saving.
 
-    ``plan.file`` and networks are read from ``folder``; None forbids it. Errors (ValueError, TypeError) name the key, the rule and
-    the value.
+    ``plan.file`` and networks are read from ``folder``; None forbids it. Errors (ValueError, TypeError) name the key,
+    the rule and the value.
     """
     return _Reader(spec, folder).problem(source)
 
@@ -52,7 +50,9 @@ class _Reader:
         self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
         self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
         taken |= set(self.parameters)
-        self.networks = self.read_networks(checked_names("networks", list(spec.networks), taken))
+        checked_names("networks", list(spec.networks), taken)
+        paths = {name: self.file(value, f"networks.{name}") for name, value in spec.networks.items()}
+        self.networks = {name: network(path, name=name).data for name, path in paths.items()}
         checked_names("definitions", list(spec.definitions), taken | set(self.networks))
 
     def problem(self, source: Mapping[str, Any] | None) -> Problem:
@@ -75,10 +75,6 @@ class _Reader:
             parameters=self.parameters,
             source=source,
         )
-
-    def read_networks(self, names: Sequence[str]) -> dict[str, Network]:
-        paths = {name: self.file(self.spec.networks[name], f"networks.{name}") for name in names}
-        return {name: network(path, name=name).data for name, path in paths.items()}
 
     # numbers and functions
 
@@ -108,11 +104,7 @@ class _Reader:
         return np.array(rows, dtype=float)
 
     def function(
-        self,
-        texts: Sequence[float | str],
-        inputs: Sequence[str],
-        where: Sequence[str],
-        shape: tuple[int, ...],
+        self, texts: Sequence[float | str], inputs: Sequence[str], where: Sequence[str], shape: tuple[int, ...]
     ) -> Tape:
         """The tape of expressions over ``inputs``, with the parameters put in and the definitions used."""
         graph = Graph(inputs)

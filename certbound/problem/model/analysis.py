@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certbound.problem.model.layers import Part
+from certbound.problem.model.network_data import Part
 from certbound.problem.model.operations import ROWS
 from certbound.problem.model.tape import JUMPS, Node, Tape, needed
 

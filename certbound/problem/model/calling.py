@@ -8,7 +8,7 @@ import numpy as np
 
 from certbound.problem.model import network_rows
 from certbound.problem.model.graph import Graph
-from certbound.problem.model.layers import Network, Part
+from certbound.problem.model.network_data import Network, Part
 from certbound.problem.model.tracer import Scalar, Traced, UntraceableError
 
 

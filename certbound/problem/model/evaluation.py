@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
+from certbound.problem.model.network_data import Part
 from certbound.problem.model.operations import ROWS
-from certbound.problem.model.layers import Part
 from certbound.problem.model.tape import Tape
 
 

@@ -13,7 +13,7 @@ from fractions import Fraction
 from functools import partial
 from typing import Any
 
-from certbound.problem.model.layers import PARTS, Part
+from certbound.problem.model.network_data import PARTS, Part
 from certbound.problem.model.operations import OPERATIONS
 from certbound.problem.model.tape import ARITY, Node, Tape, needed
 

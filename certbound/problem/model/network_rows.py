@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.problem.model.layers import Network, Part
+from certbound.problem.model.network_data import Network, Part
 from certbound.rigor import layers as ly
 from certbound.rigor.arithmetic import Interval
 from certbound.rigor.series import Series
@@ -64,9 +64,10 @@ def stacked(args: Sequence[Interval]) -> Interval:
 def _enclosure(args: tuple[Interval, ...], part: Part) -> ly.Enclosure:
     order = len(part.by)
     box = partial(stacked, args)
-    return _RECENT.of(
+    found: ly.Enclosure = _RECENT.of(
         (part.network, order), args, lambda: ly.bound_network(weights_of(part.network), box(), order)
-    )  # type: ignore[no-any-return]  # what `compute` gives
+    )
+    return found
 
 
 def interval(*given: Any) -> Interval:
@@ -138,7 +139,6 @@ def numpy(*given: Any) -> Any:
 
 def _float_columns(layers: Sequence[ly.Weights], points: Array, order: int) -> Array:
     """Values (p, M), derivatives (p, n, M), or second ones (p, n, n, M), in floats."""
-    n, count = points.shape
     if order:
         known = np.isfinite(points).all(axis=0)
         points = np.where(known, points, 0.0)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
-from certbound.problem.model.layers import PARTS, Part
+from certbound.problem.model.network_data import PARTS, Part
 
 T = TypeVar("T")
 
@@ -39,8 +39,8 @@ class Node(NamedTuple):
     """One operation: ``args`` are indices of earlier nodes.
 
     ``value`` is the number of a ``const`` node and the exponent of a ``pow`` node; an ``input`` node has its
-    slot as its only argument. A node of ``layers.PARTS`` is the ``part`` of a network, with the network's inputs as
-    arguments.
+    slot as its only argument. A node of ``network_data.PARTS`` is the ``part`` of a network, with the inputs of that
+    as arguments.
     """
 
     op: str

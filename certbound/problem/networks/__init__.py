@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from certbound.problem.networks.functions import NetworkFunction, network, write_network
+from certbound.problem.networks.network_functions import NetworkFunction, network, write_network
 
 __all__ = ["network", "NetworkFunction", "write_network"]

@@ -33,7 +33,7 @@ def read_onnx(path: Path) -> list[Layer]:
         raise ImportError("ONNX files need the package onnx: pip install 'certbound[onnx]'.") from error
     try:
         model = onnx.load(str(path), load_external_data=False)
-    except Exception as error:  # noqa: BLE001  (protobuf's errors have no common base)
+    except Exception as error:
         raise ValueError(f"`source` must be an ONNX file, {str(path)!r} is none ({type(error).__name__}).") from error
     return _Chain(model.graph, str(path), onnx).layers()
 

@@ -1,4 +1,4 @@
-"""Activations of networks on balls, written anew: values, slopes, bends, series, and what Taylor models need of them."""
+"""Activations of networks on balls, written anew: values, slopes, bends, series, and what Taylor models need."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Activation:
     """One activation; every function takes its constants last.
 
     ``value``, ``slope`` and ``bend`` enclose phi, phi' and phi'' (generalised at kinks) over balls; ``series`` are its
-    Taylor coefficients; ``expansion`` gives phi, phi' and phi''/2 at a ball and phi''' over another, where it is smooth;
-    ``knots`` are the kinks of a piecewise linear one.
+    Taylor coefficients; ``expansion`` gives phi, phi' and phi''/2 at a ball and phi''' over another, where it is
+    smooth; ``knots`` are the kinks of a piecewise linear one.
     """
 
     value: Callable[..., arb]
@@ -72,7 +72,7 @@ _softplus = balls.increasing(_softplus_at)
 
 
 def _softplus_expansion(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
-    value, slope, half, _ = _sigmoid_expansion(v, r)
+    value, slope, _, _ = _sigmoid_expansion(v, r)
     return _softplus_at(v), value, slope / 2, _cubic_hull(balls.tanh(r / 2)) / 8
 
 

@@ -36,7 +36,7 @@ class Layer:
         if not 1 <= rows <= MOST_WIDTH or not 1 <= len(self.weights[0]) <= MOST_WIDTH:
             raise ValueError(f"a layer must have 1 to {MOST_WIDTH} inputs and outputs, got {rows} outputs.")
         if any(len(row) != len(self.weights[0]) for row in self.weights) or len(self.bias) != rows:
-            raise ValueError(f"a layer's weights must be a matrix with one row an entry of the bias ({len(self.bias)}).")
+            raise ValueError(f"a layer must have as many rows of weights as entries of its bias, {len(self.bias)}.")
         wanted = CONSTANTS.get(self.activation)
         if wanted is None:
             raise ValueError(f"a layer's activation must be one of {', '.join(CONSTANTS)}, got {self.activation!r}.")
@@ -93,7 +93,7 @@ class Part(NamedTuple):
 
     @property
     def op(self) -> str:
-        """The operation of its nodes: ``network``, ``bent`` where it has kinks, ``jumping`` where these make it jump."""
+        """The operation of its nodes: ``network``, with kinks ``bent``, or ``jumping`` where these make it jump."""
         return "network" if self.network.smooth else "jumping" if len(self.by) > 1 else "bent"
 
     def derivative(self, place: int) -> Part:
