@@ -97,7 +97,7 @@ class Expansion:
 
         The kinks of networks are bounded by planes instead: beta is a linear function up to their distance.
         """
-        if self.model.bent:
+        if self.model.planar:
             return self._expanded(boxes, order=1)
         parts = self._expanded(boxes, order=2)
         if not self.model.kinked or not parts.bad.any():
@@ -147,7 +147,7 @@ class Expansion:
         slots = model.slots(f.middle_time[items], thin, f.inputs[items], f.disturbance_middle)
         wide = model.slots(f.span[items], thin + Interval(-reach, reach), f.inputs[items], f.disturbance_middle)
         planes: Interval | None = None
-        if model.bent:
+        if model.planar:
             value, planes = self._planes(slots, boxes.radius)
         else:
             value = enclose(model.value, slots, undefined="infinite").broadcast_to((count, n))
