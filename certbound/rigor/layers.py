@@ -120,22 +120,17 @@ def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclos
         if bad.any():
             lost = np.asarray(lost | bad)
             mid, rad = np.where(bad, 0.0, mid), np.where(bad, 0.0, rad)
-        whole = Interval.around(mid, rad)
-        centre, slopes = whole[:, 0], whole[:, 2 : 2 + n]
-        over = _meet(whole[:, 1], centre + (Interval(-radius, radius)[None] * slopes).sum(axis=1))
+        centre, over = _ranges(mid, rad, radius)
         arguments.append((centre, over))
         kinked = kinked | layer.row.kinked(over, layer.constants).any(axis=0)
-        mid, rad = _activated(layer, whole, over, pairs)
-    whole = Interval.around(mid, rad)
-    spread = (Interval(-radius, radius)[None] * whole[:, 2 : 2 + n]).sum(axis=1)
-    value = _meet(whole[:, 1], whole[:, 0] + spread)
-    bends = None
+        mid, rad = _activated(layer, mid, rad, (centre, over), pairs)
+    value, bends = _ranges(mid, rad, radius)[1], None
     if order > 1:
         place = np.zeros((n, n), dtype=int)
         for number, (i, j) in enumerate(pairs):
             place[i, j] = place[j, i] = 2 + n + number
-        bends = _without(whole[:, place], lost)
-    first = _without(whole[:, 2 : 2 + n], lost) if order else None
+        bends = _without(Interval.around(mid[:, place], rad[:, place]), lost)
+    first = _without(Interval.around(mid[:, 2 : 2 + n], rad[:, 2 : 2 + n]), lost) if order else None
     found = Enclosure(_without(value, lost), first, bends, np.asarray(kinked | lost))
     return found, arguments
 
@@ -150,28 +145,50 @@ def _affine(layer: Weights, mid: Array, rad: Array) -> tuple[Array, Array]:
     return mid, rad
 
 
+def _ranges(mid: Array, rad: Array, radius: Array) -> tuple[Interval, Interval]:
+    """What the first column says of the centres, and the second and the mean value form together of the boxes."""
+    n = len(radius)
+    reach = ((np.abs(mid[:, 2 : 2 + n]) + rad[:, 2 : 2 + n]) * radius).sum(axis=1)
+    reach = upper(reach, step=(n + 8) * STEP, tiny=TINY)
+    centre = Interval.around(mid[:, 0], rad[:, 0])
+    return centre, _meet(Interval.around(mid[:, 1], rad[:, 1]), centre + Interval(-reach, reach))
+
+
+_Pair = tuple[Array, Array]
+
+
+def _times(first: _Pair, second: _Pair) -> _Pair:
+    """The product of two midpoint-radius arrays."""
+    (a, r), (b, q) = first, second
+    mid = a * b
+    return mid, upper(np.abs(a) * q + r * (np.abs(b) + q) + STEP * np.abs(mid), step=8 * STEP, tiny=4 * TINY)
+
+
+def _plus(first: _Pair, second: _Pair) -> _Pair:
+    mid = first[0] + second[0]
+    return mid, upper(first[1] + second[1] + STEP * np.abs(mid), step=4 * STEP)
+
+
 def _activated(
-    layer: Weights, whole: Interval, over: Interval, pairs: Sequence[tuple[int, int]]
-) -> tuple[Array, Array]:
+    layer: Weights, mid: Array, rad: Array, arguments: tuple[Interval, Interval], pairs: Sequence[tuple[int, int]]
+) -> _Pair:
     """The columns behind the activation: phi' J, and phi' H + phi'' J_i J_j."""
-    row, constants = layer.row, layer.constants
-    values = [row.value(whole[:, 0], *constants), row.value(over, *constants)]
+    row, constants, over = layer.row, layer.constants, arguments[1]
     slope = row.slope(over, *constants)
-    n = whole.shape[1] - 2 - len(pairs)
-    rest = whole[:, 2:] * slope[:, None]
+    own = slope.mid[:, None], slope.rad[:, None]
+    new_mid, new_rad = np.empty(mid.shape), np.empty(rad.shape)
+    for column, argument in enumerate(arguments):
+        value = row.value(argument, *constants)
+        new_mid[:, column], new_rad[:, column] = value.mid, value.rad
+    new_mid[:, 2:], new_rad[:, 2:] = _times((mid[:, 2:], rad[:, 2:]), own)
     if pairs:
         bend = row.bend(over, *constants)
         first, second = ([2 + pair[side] for pair in pairs] for side in (0, 1))
-        squares = whole[:, first] * whole[:, second]
-        same = np.array([i == j for i, j in pairs])[:, None]
-        squares = Interval(np.where(same, np.maximum(squares.lo, 0.0), squares.lo), squares.hi)
-        bent = rest[:, n:] + squares * bend[:, None]
-        rest = Interval(np.concatenate([rest.lo[:, :n], bent.lo], 1), np.concatenate([rest.hi[:, :n], bent.hi], 1))
-    mid, rad = np.empty(whole.shape), np.empty(whole.shape)
-    for column, value in enumerate(values):
-        mid[:, column], rad[:, column] = value.mid, value.rad
-    mid[:, 2:], rad[:, 2:] = rest.mid, rest.rad
-    return mid, rad
+        squares = _times((mid[:, first], rad[:, first]), (mid[:, second], rad[:, second]))
+        bent = _times(squares, (bend.mid[:, None], bend.rad[:, None]))
+        last = slice(mid.shape[1] - len(pairs), None)
+        new_mid[:, last], new_rad[:, last] = _plus((new_mid[:, last], new_rad[:, last]), bent)
+    return new_mid, new_rad
 
 
 def _meet(first: Interval, second: Interval) -> Interval:

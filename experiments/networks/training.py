@@ -9,6 +9,7 @@ whatever it was taught: how well it imitates only matters for how large the cert
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,7 +113,7 @@ def train(task: Task, *, width: int, activation: str, seed: int = 0, steps: int 
     rng = np.random.default_rng(seed)
     sizes = [len(task.low), width, width, 1]
     values = []
-    for k, p in zip(sizes, sizes[1:]):
+    for k, p in itertools.pairwise(sizes):
         values += [rng.normal(size=(p, k)) / np.sqrt(k), np.zeros(p)]
     moments = [(np.zeros_like(value), np.zeros_like(value)) for value in values]
     for step in range(1, steps + 1):

@@ -6,7 +6,8 @@ believes nothing of this table; it has one of its own, ``checker/expressions/ope
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import ChainMap
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, Protocol
@@ -289,9 +290,10 @@ OPERATIONS: dict[str, Operation] = {
 }  # fmt: skip
 """Operation name to its row (``const`` and ``input``, which compute nothing, have none)."""
 
-ROWS: dict[str, Operation] = OPERATIONS | {
+_PARTS: dict[str, Operation] = {
     "network": Operation(nets.numpy, "", nets.interval, nets.series),
     "bent": Operation(nets.numpy, "", nets.interval, nets.series, kink=nets.kinked),
     "jumping": Operation(nets.numpy, "", nets.interval, nets.series, jump=nets.jumps),
 }
+ROWS: Mapping[str, Operation] = ChainMap(OPERATIONS, _PARTS)
 """The same with the parts of networks, which have as many arguments as their network and the part as a last one."""

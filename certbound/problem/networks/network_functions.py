@@ -70,7 +70,7 @@ def network(source: str | Path | Sequence[Mapping[str, Any]], *, name: str = "")
     --------
     >>> policy = network([{"weights": [[-1.2, -0.5]], "activation": "tanh"}])
     >>> [round(float(value), 6) for value in policy([0.1, 0.2])]
-    [-0.21652]
+    [-0.216518]
     """
     if isinstance(source, (str, Path)):
         path = Path(source)

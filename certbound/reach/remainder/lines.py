@@ -46,7 +46,7 @@ def follow_lines(tape: Tape, slots: Sequence[Interval], radii: Mapping[int, Arra
     --------
     >>> tape = Tape(inputs=("a",), nodes=(Node("input", (0,)), Node("sq", (0,))), outputs=(1,), shape=(1,))
     >>> (line,) = follow_lines(tape, [Interval.point([1.0])], {0: np.array([0.5])})
-    >>> [float(x.mid[0]) for x in (line.coefficients[0], line.rest)]
+    >>> [round(float(x.mid[0]), 9) for x in (line.coefficients[0], line.rest)]
     [2.0, 1.0]
     """
     spans = {slot: Interval(-radius, radius) for slot, radius in radii.items()}
