@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.problem.export import export_control as export_control
     from certbound.problem.files import load as load
     from certbound.problem.files import save as save
+    from certbound.problem.networks import network as network
     from certbound.problem.noise import Bounded as Bounded
     from certbound.problem.noise import Gaussian as Gaussian
     from certbound.problem.noise import Rademacher as Rademacher
@@ -79,6 +80,7 @@ _HOME = {
     "problem.noise": "Gaussian Uniform Triangular Rademacher Bounded SubGaussian",
     "problem.table_laws": "Discrete Histogram Laplace",
     "problem.sets": "Box Ball Ellipsoid HalfSpace Polytope GaussianStart Inside Outside Reach",
+    "problem.networks": "network",
     "problem.problem": "Problem",
     "problem.files": "load save",
     "problem.export": "export_casadi export_control",

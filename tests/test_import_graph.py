@@ -26,7 +26,7 @@ rigor
 problem.model
 problem.sets problem.noise
 problem.table_laws
-problem.adapters
+problem.adapters problem.networks
 problem.systems
 problem.ingredients
 problem.problem
@@ -98,7 +98,7 @@ KNOWS_ONLY = {  # rooms that may be taken out and used elsewhere
     "values": GROUND | {"problem"},
 }
 CHECKER_MAY_IMPORT = {"certbound.errors", "certbound.problem.model", "flint"}
-CHECKER_TAKES = {"Tape", "Node", "JUMPS"}
+CHECKER_TAKES = {"Tape", "Node", "JUMPS", "Layer", "Network", "Part"}
 """What the checker may take of ``problem.model``: the description of a tape."""
 ON_ARRAYS = "certbound.checker.values"
 """The part of the checker that may take NumPy besides; it is loaded only for certificates that need it."""
@@ -113,7 +113,7 @@ MANY_DOORS = {
     "values.continuous": (8, "bounds and charts, and the surfaces that certificates state, with what they were paid"),
     "values.discrete": (7, "kernels and interpolation of discrete time are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
-    "problem.model": (23, "the one description of functions, which every room reads, differentiates and evaluates"),
+    "problem.model": (32, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),
     "reach.linear": (16, "certificates state the records of the search: its linearisation, shares, levels, references"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),

@@ -15,7 +15,7 @@ import numpy as np
 
 from certbound.errors import CertificateError
 from certbound.problem.goals import met_at
-from certbound.problem.model import Tape
+from certbound.problem.model import Network, Tape
 from certbound.problem.noise import Law, check_law
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, StartUnion
@@ -209,16 +209,35 @@ def _constraint(constraint: Inside) -> dict[str, Any]:
 
 
 def tape_data(tape: Tape) -> dict[str, Any]:
-    """A tape's operations: [op, ...arguments], ["const", value], ["pow", argument, exponent]."""
+    """A tape's operations: [op, ...arguments], ["const", value], ["pow", argument, exponent].
+
+    The output k of a network is ["network", its number in ``networks``, k, ...arguments].
+    """
     nodes: list[list[Any]] = []
+    networks: list[Network] = []
     for node in tape.nodes:
         if node.op == "const":
             nodes.append(["const", exact(float(node.value))])
         elif node.op == "pow":
             nodes.append(["pow", node.args[0], exact(float(node.value))])
+        elif node.part is not None:
+            if node.part.network not in networks:
+                networks.append(node.part.network)
+            nodes.append(["network", networks.index(node.part.network), node.part.output, *node.args])
         else:
             nodes.append([node.op, *node.args])
-    return {"nodes": nodes, "outputs": list(tape.outputs)}
+    called = {"networks": [_layers(network) for network in networks]} if networks else {}
+    return {"nodes": nodes, "outputs": list(tape.outputs), **called}
+
+
+def _layers(network: Network) -> list[dict[str, Any]]:
+    return [
+        {
+            "weights": exact(np.array(layer.weights)), "bias": exact(np.array(layer.bias)),
+            "activation": layer.activation, "constants": exact(np.array(layer.constants)),
+        }
+        for layer in network.layers
+    ]  # fmt: skip
 
 
 def _ranges(pairs: Iterable[tuple[float, float]]) -> list[list[Any]]:

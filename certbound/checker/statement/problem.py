@@ -184,9 +184,9 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
         if record["law"] != "wiener":
             raise CertificateError(f"`{path}.law` must be \"wiener\" in continuous time.")
         if isinstance(record["diffusion"], dict):
-            inner = Record(record["diffusion"], path + ".diffusion", ("columns", "nodes", "outputs"))
+            inner = Record(record["diffusion"], path + ".diffusion", ("columns", "nodes", "outputs"), ("networks",))
             m = inner.whole("columns", 1, MOST_STATES)
-            tape = {name: inner[name] for name in ("nodes", "outputs")}
+            tape = {name: entry for name, entry in inner.value.items() if name != "columns"}
             return Noise(
                 diffusion=read_tape(tape, inner.path, ("t", *states), (n, m)), proxy=diagonal([arb(1)] * m),
                 gaussian=True,

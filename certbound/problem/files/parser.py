@@ -1,7 +1,8 @@
 """Expressions in problem files: a small language with a parser of its own, safe on a stranger's file.
 
-Numbers, names, ``+ - * / **``, parentheses and the functions below; nothing else exists, so nothing else can
-be reached. ``**`` binds tighter than a sign on its left, as in Python.
+Numbers, names, ``+ - * / **``, parentheses, the functions below and the outputs ``policy(x, v)[0]`` of the file's
+networks; nothing else exists, so nothing else can be reached. ``**`` binds tighter than a sign on its left, as in
+Python.
 """
 
 from __future__ import annotations
@@ -9,10 +10,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from certbound.checks import nearest
-from certbound.problem.model import ARITY, OPERATIONS, Graph, arithmetic
+from certbound.problem.model import ARITY, OPERATIONS, Graph, Network, Part, arithmetic
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi}
 
@@ -40,12 +42,15 @@ class _Token(NamedTuple):
     place: int
 
 
-def parse(text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str) -> int:
+def parse(
+    text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str,
+    networks: Mapping[str, Network] = MappingProxyType({}),
+) -> int:
     """Read an expression into a graph; the node of its value.
 
     ``names`` maps a name to a node of the graph, or to a function that makes the node when the name is first used;
-    ``where`` is what the expression belongs to, for messages. A text that is no expression, or uses an unknown name or
-    function, is a ValueError that names the nearest known one.
+    ``networks`` are those that may be called. ``where`` is what the expression belongs to, for messages. A text that is
+    no expression, or uses an unknown name or function, is a ValueError that names the nearest known one.
 
     Examples
     --------
@@ -57,12 +62,15 @@ def parse(text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]],
     if len(text) > _LONGEST:
         size = f"at most {_LONGEST} characters, got {len(text)}"
         raise ValueError(f"`{where}` must have {size}; use [definitions].")
-    return _Parser(text, graph, names, where).result()
+    return _Parser(text, graph, names, where, networks).result()
 
 
 class _Parser:
-    def __init__(self, text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str) -> None:
-        self.text, self.graph, self.names, self.where = text, graph, names, where
+    def __init__(
+        self, text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str,
+        networks: Mapping[str, Network],
+    ) -> None:
+        self.text, self.graph, self.names, self.where, self.networks = text, graph, names, where, networks
         self.tokens = self._split()
         self.next = 0
         self.depth = 0
@@ -87,6 +95,11 @@ class _Parser:
             if match is None:
                 blank = len(self.text[place:]) - len(self.text[place:].lstrip())
                 character = self.text[place + blank]
+                before = ["", "", *(token.text for token in tokens[-2:])]
+                if (character, before[-1]) == ("[", ")") or (character, before[-2]) == ("]", "["):  # of a network
+                    tokens.append(_Token("symbol", character, place + blank))
+                    place += blank + 1
+                    continue
                 cure = _CURES.get(character, "such a character does not exist here")
                 raise self.fail(f"{cure} ({character!r})", place + blank)
             kind = match.lastgroup or "symbol"
@@ -167,16 +180,14 @@ class _Parser:
 
     def call(self, token: _Token) -> int:
         name = token.text
+        if name in self.networks:
+            return self.output(self.networks[name], token)
         if not is_function(name):
             if name in self.names or name in CONSTANTS:
                 raise self.fail(f"{name!r} is not a function; write * to multiply", token.place)
-            raise self.fail(f"unknown function {name!r}{nearest(name, filter(is_function, OPERATIONS))}", token.place)
-        self.expect("(")
-        arguments = [self.expression(0)]
-        while self.peek().text == ",":
-            self.next += 1
-            arguments.append(self.expression(0))
-        self.expect(")")
+            known = [*filter(is_function, OPERATIONS), *self.networks]
+            raise self.fail(f"unknown function {name!r}{nearest(name, known)}", token.place)
+        arguments = self.arguments()
         count = ARITY[name]
         if len(arguments) != count and not (name in ("min", "max") and len(arguments) > 2):
             wanted = f"{count} argument{'s' * (count > 1)}"
@@ -185,6 +196,30 @@ class _Parser:
         for argument in arguments[count:]:
             node = self.graph.apply(name, node, argument)
         return node
+
+    def arguments(self) -> list[int]:
+        self.expect("(")
+        found = [self.expression(0)]
+        while self.peek().text == ",":
+            self.next += 1
+            found.append(self.expression(0))
+        self.expect(")")
+        return found
+
+    def output(self, network: Network, token: _Token) -> int:
+        """An output of a network: its number in brackets may be left out where there is one."""
+        arguments = self.arguments()
+        if len(arguments) != network.inputs:
+            raise self.fail(f"{token.text} takes {network.inputs} arguments, got {len(arguments)}", token.place)
+        number = "0" if network.outputs == 1 else ""
+        if self.peek().text == "[":
+            self.next += 1
+            number = self.take().text
+            self.expect("]")
+        if not number.isdigit() or int(number) >= network.outputs:
+            last = network.outputs - 1
+            raise self.fail(f"write {token.text}(...)[k] with k from 0 to {last} for one of its outputs", token.place)
+        return self.graph.part(Part(network, int(number)), tuple(arguments))
 
 
 def is_function(name: str) -> bool:

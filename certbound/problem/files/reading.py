@@ -17,6 +17,7 @@ from certbound.problem.files.parser import CONSTANTS, constant, is_function, par
 from certbound.problem.files.plans import read_plan
 from certbound.problem.files.schema import Constraint, Cost, Part, PolygonTable, Specification, Start
 from certbound.problem.model import OPERATIONS, Graph, Tape
+from certbound.problem.networks import network
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
@@ -29,13 +30,11 @@ class _ForbiddenError(ValueError):
     """An expression uses a name that exists, but not here."""
 
 
-def read_problem(
-    spec: Specification, folder: Path | None, source: Mapping[str, Any] | None = None
-) -> Problem:
+def read_problem(spec: Specification, folder: Path | None, source: Mapping[str, Any] | None = None) -> Problem:
     """Build the problem that a validated specification describes; ``source``, the raw content, is kept for saving.
 
-    ``plan.file`` is read from ``folder``; None forbids it. Errors (ValueError, TypeError) name the key, the rule and
-    the value.
+    ``plan.file`` and networks are read from ``folder``; None forbids it. Errors (ValueError, TypeError) name the key,
+    the rule and the value.
     """
     return _Reader(spec, folder).problem(source)
 
@@ -50,7 +49,11 @@ class _Reader:
         taken |= set(self.disturbances)
         self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
         self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
-        checked_names("definitions", list(spec.definitions), taken | set(self.parameters))
+        taken |= set(self.parameters)
+        checked_names("networks", list(spec.networks), taken)
+        paths = {name: self.file(value, f"networks.{name}") for name, value in spec.networks.items()}
+        self.networks = {name: network(path, name=name).data for name, path in paths.items()}
+        checked_names("definitions", list(spec.definitions), taken | set(self.networks))
 
     def problem(self, source: Mapping[str, Any] | None) -> Problem:
         spec = self.spec
@@ -101,11 +104,7 @@ class _Reader:
         return np.array(rows, dtype=float)
 
     def function(
-        self,
-        texts: Sequence[float | str],
-        inputs: Sequence[str],
-        where: Sequence[str],
-        shape: tuple[int, ...],
+        self, texts: Sequence[float | str], inputs: Sequence[str], where: Sequence[str], shape: tuple[int, ...]
     ) -> Tape:
         """The tape of expressions over ``inputs``, with the parameters put in and the definitions used."""
         graph = Graph(inputs)
@@ -122,12 +121,11 @@ class _Reader:
         nodes = [self._node(text, graph, names, place) for text, place in zip(texts, where)]
         return graph.tape(nodes, shape)
 
-    @staticmethod
     def _node(
-        text: float | str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str
+        self, text: float | str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str
     ) -> int:
         try:
-            return parse(text, graph, names, where) if isinstance(text, str) else graph.const(text)
+            return parse(text, graph, names, where, self.networks) if isinstance(text, str) else graph.const(text)
         except _ForbiddenError as error:
             raise _ForbiddenError(f"`{where}`: {error}") from None
 
@@ -241,7 +239,7 @@ class _Reader:
         if table is None:
             return None
         if set(table) == {"file"} and "file" not in self.inputs:
-            return read_plan(self.plan_path(table["file"]), self.inputs)
+            return read_plan(self.file(table["file"], "plan.file"), self.inputs)
         for key in table:
             if key not in self.inputs:
                 raise ValueError(f"unknown key {key!r} in [plan]{nearest(key, [*self.inputs, 'file'])}")
@@ -252,10 +250,10 @@ class _Reader:
         texts = [table[name] for name in self.inputs]
         return self.function(texts, ("t", *self.states), where, (len(self.inputs),))
 
-    def plan_path(self, value: Any) -> Path:
+    def file(self, value: Any, where: str) -> Path:
         path = Path(str(value))
         if self.folder is None or path.is_absolute() or ".." in path.parts or not isinstance(value, str):
-            raise ValueError(f"`plan.file` must be a file in the problem file's folder, got {value!r}.")
+            raise ValueError(f"`{where}` must be a file in the problem file's folder, got {value!r}.")
         return self.folder / path
 
     def weights(self, cost: Cost) -> tuple[Array, Array]:

@@ -209,6 +209,7 @@ class Specification(_Table):
     inputs: dict[str, Pair] = {}
     disturbances: dict[str, Pair] = {}
     uncertain: dict[str, Pair] = {}
+    networks: dict[str, str] = {}
     definitions: dict[str, Number] = {}
     plan: dict[str, Number] | None = None
     cost: Cost | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -12,7 +13,7 @@ from certbound.problem import sets
 from certbound.problem.files.formulas import formulas
 from certbound.problem.files.reading import RESERVED
 from certbound.problem.files.schema import Constraint, Start
-from certbound.problem.model import Tape
+from certbound.problem.model import Network, Tape
 from certbound.problem.noise import check_law
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
@@ -25,7 +26,34 @@ def content_of(problem: Problem, plan_file: str) -> dict[str, Any]:
     content = copy.deepcopy(dict(problem.source))
     if isinstance(problem.plan, np.ndarray):
         content["plan"] = {"file": plan_file}
+    if "networks" in content:
+        content["networks"] = network_files(problem, plan_file)
     return content
+
+
+def networks_of(problem: Problem) -> dict[str, Network]:
+    """The networks that a problem calls, by names that no two of them share."""
+    system = problem.system
+    tapes = [system.dynamics, problem.plan, system.diffusion if isinstance(system, ContinuousSystem) else None]
+    found: dict[str, Network] = {}
+    taken = {*RESERVED, *system.states, *system.input_names, *system.disturbance_names, *problem.parameters}
+    for tape in tapes:
+        for node in tape.nodes if isinstance(tape, Tape) else ():
+            if node.part is not None and not any(known is node.part.network for known in found.values()):
+                plain = re.sub(r"\W", "_", node.part.network.name) or "network"
+                plain = f"n_{plain}" if plain[0].isdigit() else plain
+                name, number = plain, 1
+                while name in found or name in taken:
+                    number += 1
+                    name = f"{plain}_{number}"
+                found[name] = node.part.network
+    return found
+
+
+def network_files(problem: Problem, plan_file: str) -> dict[str, str]:
+    """Files of the networks, beside that of the plan."""
+    stem = plan_file.removesuffix(".plan.json")
+    return {name: f"{stem}.{name}.npz" for name in networks_of(problem)}
 
 
 def describe_problem(problem: Problem, plan_file: str) -> dict[str, Any]:
@@ -42,12 +70,13 @@ class _Writer:
     def __init__(self, problem: Problem, plan_file: str) -> None:
         self.problem, self.system, self.plan_file = problem, problem.system, plan_file
         self.states = problem.system.states
+        self.networks = {network: name for name, network in networks_of(problem).items()}
         self.definitions: dict[str, str] = {}
         self.fresh = self._fresh()
 
     def _fresh(self) -> Iterator[str]:
         system = self.system
-        taken = {*RESERVED, *self.states, *system.input_names, *system.disturbance_names}
+        taken = {*RESERVED, *self.states, *system.input_names, *system.disturbance_names, *self.networks.values()}
         number = 0
         while True:
             number += 1
@@ -55,7 +84,7 @@ class _Writer:
                 yield f"s{number}"
 
     def texts(self, tape: Tape) -> list[str]:
-        definitions, texts = formulas(tape, self.fresh)
+        definitions, texts = formulas(tape, self.fresh, self.networks)
         self.definitions |= definitions
         return texts
 
@@ -76,6 +105,7 @@ class _Writer:
             "inputs": self.signal(system.inputs, system.input_names),
             "disturbances": {name: ends for name, ends in bounded.items() if name not in problem.unknown},
             "uncertain": {name: ends for name, ends in bounded.items() if name in problem.unknown},
+            "networks": network_files(problem, self.plan_file),
             "definitions": self.definitions,
             "dynamics": dynamics,
             "plan": plan,

@@ -6,13 +6,16 @@ believes nothing of this table; it has one of its own, ``checker/expressions/ope
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import ChainMap
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from certbound.arrays import Mask
+from certbound.problem.model import network_rows as nets
 from certbound.problem.model.tape import Node
 from certbound.rigor import arithmetic as ia
 from certbound.rigor import elementary as iv
@@ -73,7 +76,7 @@ class Operation:
 def arithmetic(column: Literal["numpy", "interval"]) -> dict[str, Callable[..., Any]]:
     """One column as the arithmetic that ``Tape.evaluate`` takes."""
     const: Callable[..., Any] = float if column == "numpy" else Interval.point
-    return {"const": const} | {op: getattr(row, column) for op, row in OPERATIONS.items()}
+    return {"const": const} | {op: getattr(row, column) for op, row in ROWS.items()}
 
 
 def enclosed(node: Node, args: Sequence[Interval]) -> Interval:
@@ -85,18 +88,40 @@ def enclosed(node: Node, args: Sequence[Interval]) -> Interval:
             return iv.sq(args[0])
         if node.op == "sub":
             return Interval.point(np.zeros(args[0].shape))
-    return OPERATIONS[node.op].interval(*operands(node, args))
+    return ROWS[node.op].interval(*operands(node, args))
 
 
 def undefined_where(node: Node, args: Sequence[Interval]) -> Mask | None:
     """The members of a batch on which a node is undefined somewhere; None where it never is."""
-    row = OPERATIONS.get(node.op)
+    row = ROWS.get(node.op)
     return None if row is None or row.undefined is None else np.asarray(row.undefined(*operands(node, args)))
 
 
 def operands(node: Node, args: Sequence[Any]) -> tuple[Any, ...]:
     """The arguments that the table's functions take."""
+    if node.part is not None:
+        return (*args, node.part)
     return (*args, node.value) if node.op == "pow" else tuple(args)
+
+
+def jumps_where(node: Node, value: Interval, args: Sequence[Interval]) -> Mask | None:
+    """The members of a batch on which a node of range ``value`` may jump; None where it never does."""
+    row = ROWS.get(node.op)
+    return None if row is None or row.jump is None else np.asarray(row.jump(value, *operands(node, args)))
+
+
+def kinks_where(node: Node, args: Sequence[Interval]) -> Mask | None:
+    """The members of a batch on which the slope of a node may jump; None where it never does."""
+    row = ROWS.get(node.op)
+    return None if row is None or row.kink is None else np.asarray(row.kink(*operands(node, args)))
+
+
+def slope_by(node: Node, position: int) -> Callable[..., int] | None:
+    """How the derivative of a node by one of its arguments is made; None where all are 0."""
+    if node.part is not None:
+        return partial(nets.slope, position)
+    slopes = ROWS[node.op].slopes
+    return slopes[position] if slopes else None
 
 
 def _truth(comparison: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
@@ -264,3 +289,11 @@ OPERATIONS: dict[str, Operation] = {
     ),
 }  # fmt: skip
 """Operation name to its row (``const`` and ``input``, which compute nothing, have none)."""
+
+_PARTS: dict[str, Operation] = {
+    "network": Operation(nets.numpy, "", nets.interval, nets.series),
+    "bent": Operation(nets.numpy, "", nets.interval, nets.series, kink=nets.kinked),
+    "jumping": Operation(nets.numpy, "", nets.interval, nets.series, jump=nets.jumps),
+}
+ROWS: Mapping[str, Operation] = ChainMap(OPERATIONS, _PARTS)
+"""The same with the parts of networks, which have as many arguments as their network and the part as a last one."""

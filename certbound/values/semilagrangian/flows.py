@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Mask
-from certbound.problem.model import JUMPS, OPERATIONS, Graph, Tape, jacobian
+from certbound.problem.model import JUMPS, ROWS, Graph, Tape, jacobian
 from certbound.rigor.intervals import Interval
 from certbound.rigor.series import ZERO, Series
 from certbound.values.discrete import evaluate
@@ -30,13 +30,13 @@ _ROUNDS = 40
 
 def series_along(tape: Tape, inputs: Sequence[Series], order: int) -> list[Series]:
     """Taylor coefficients of a tape's outputs, from those of its inputs."""
-    table: dict[str, Callable[..., Any]] = {op: partial(_applied, op, order) for op in OPERATIONS}
+    table: dict[str, Callable[..., Any]] = {op: partial(_applied, op, order) for op in ROWS}
     table["const"] = lambda value: [Interval.point(value)]
     return tape.evaluate(table, inputs)
 
 
 def _applied(op: str, order: int, *args: Any) -> Series:
-    row = OPERATIONS[op]
+    row = ROWS[op]
     if op not in JUMPS and op not in ("kink", "pow") and all(len(x) == 1 for x in args):
         return [row.interval(*(x[0] for x in args))]
     return row.series(*args, order)
