@@ -40,7 +40,7 @@ class Center:
     steps: int
 
 
-class _Block:
+class Block:
     """One inequality F > 0 and the derivatives of -log det F."""
 
     def __init__(self, block: Array | Sector, *, continuous: bool) -> None:
@@ -85,7 +85,7 @@ class _Block:
         return top / 2 if self.continuous else top
 
 
-class _Pairs:
+class Pairs:
     """Symmetric matrices by their upper triangle: gradients and the Hessian of tr(K dP L dP)."""
 
     def __init__(self, n: int) -> None:
@@ -131,12 +131,12 @@ def center_metric(
     """
     root = np.asarray(np.linalg.cholesky(starting_metric(blocks, continuous=continuous)).T)
     inverse = np.asarray(np.linalg.inv(root), dtype=float)
-    work = [_Block(transformed(block, root, inverse), continuous=continuous) for block in blocks]
+    work = [Block(transformed(block, root, inverse), continuous=continuous) for block in blocks]
     n = work[0].n
     P = np.eye(n) / 2
     multipliers = [_first_multipliers(block, P) for block in work]
     value = max(block.smallest_value(P, lam) for block, lam in zip(work, multipliers))
-    center = _Centring(work, _Pairs(n), max_steps).descend(P, multipliers, value, lower, tolerance)
+    center = _Centring(work, Pairs(n), max_steps).descend(P, multipliers, value, lower, tolerance)
     return replace(center, metric=frozen(root.T @ center.metric @ root))
 
 
@@ -153,7 +153,7 @@ def starting_metric(blocks: Sequence[Array | Sector], *, continuous: bool) -> Ar
         half = metric / 2
         value = -np.inf
         for block in blocks:
-            work = _Block(block, continuous=continuous)
+            work = Block(block, continuous=continuous)
             first = _first_multipliers(work, half)
             value = max(value, min(work.smallest_value(half, s * first) for s in (1.0, 4.0, 16.0, 64.0)))
         if value < best:
@@ -193,7 +193,7 @@ def center_multipliers(
     metric: Array, block: Sector, *, continuous: bool, tolerance: float = 1e-7, max_steps: int = 200
 ) -> Center:
     """Diagonal multipliers that nearly minimise c or L^2 of a sector in a given metric (k + 1 unknowns)."""
-    work = _Block(block, continuous=continuous)
+    work = Block(block, continuous=continuous)
     P = np.asarray(metric, dtype=float)
     P = P / (2 * np.linalg.norm(P, 2))
     first = _first_multipliers(work, P)
@@ -215,7 +215,7 @@ def reachable_value(metric: Array, jacobians: JacobianSet, *, continuous: bool) 
     return max(values)
 
 
-def _first_multipliers(block: _Block, P: Array) -> Array:
+def _first_multipliers(block: Block, P: Array) -> Array:
     inner = block.H[:, block.n :].T @ P @ block.H[:, block.n :]
     size = np.linalg.norm(inner, 2) if block.k else 0.0
     return np.full(block.k, 2 * float(size) + 1e-6)
@@ -224,7 +224,7 @@ def _first_multipliers(block: _Block, P: Array) -> Array:
 class _Centring:
     """The method of centres over some inequalities; without ``pairs`` P is fixed, and the multipliers are sought."""
 
-    def __init__(self, blocks: Sequence[_Block], pairs: _Pairs | None, max_steps: int) -> None:
+    def __init__(self, blocks: Sequence[Block], pairs: Pairs | None, max_steps: int) -> None:
         self.blocks, self.pairs, self.max_steps = blocks, pairs, max_steps
 
     def descend(self, P: Array, multipliers: list[Array], value: float, lower: float, tolerance: float) -> Center:

@@ -1,0 +1,305 @@
+"""Metrics of least erosion by Newton's method on a barrier: P, the multipliers and the value searched at once.
+
+With the value v (c, or L^2) as a variable, and symbols of ``centers``, what is minimised is
+
+    log q(P) + (alpha t + beta tr G'PG)/N_0 + log g(v)  -  mu [log det F(v, P, Lambda) + log det(t I - G'PG)]
+
+where q is a smooth maximum of a_j' P^-1 a_j / room_j^2 and g(v) the squared radius of the real tube, followed to
+second order in log(v - v_0) between two fits; alpha and beta majorise the concave dependence of g on nu as in
+``least_erosion``. For fixed v the function is convex. Everything is evaluated again from P in floating point, and
+what comes out is a proposal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.constants.programs.centers import Block, Pairs
+from certbound.constants.programs.least_erosion import Fit, RadiusModel, Rooms, TightMetric, erosion_factors, noise_numbers
+from certbound.constants.programs.sectors import Sector
+from certbound.watch import poll
+
+_POWER = 16.0
+"""Of the mean that stands for the tightest of several directions."""
+_WEIGHTS = (3e-2, 6e-3, 1.2e-3, 4e-4)
+"""Barrier weights mu, one stage each."""
+_NEWTON = 8
+"""Steps of a stage."""
+_CENTRED = 0.5
+"""Newton decrement (in units of sqrt(mu)) at which a stage ends."""
+_FARTHEST = 0.5
+"""How far log(v - v_0) may go in a step."""
+_FINE = 0.1
+
+
+class Point(NamedTuple):
+    """Where a search stands; ``shift`` is log of v - v_0 in units of the scale."""
+
+    P: Array  # (n, n)
+    multipliers: Array  # (k,)
+    top: float  # t > lambda_max(G' P G)
+    shift: float
+
+
+class _Tube(NamedTuple):
+    """What the real tube says near a point: weights of the noise, log g to second order in the shift, rooms."""
+
+    alpha: float
+    beta: float
+    shift: float
+    rise: float
+    bend: float
+    rooms: Array  # (directions,)
+
+
+@dataclass(frozen=True, eq=False)
+class _Value:
+    """A function value with its derivatives in (P, multipliers, t, shift)."""
+
+    gradient: Array
+    hessian: Array
+
+
+class ErosionBarrier:
+    """The least erosion over room of one sector set; ``least`` is v_0, a value that some metric comes close to.
+
+    ``noise`` are the matrices (n, m) at unit proxy, all of which the metric must serve. The best metric so far, by its
+    own tube, is in ``best``.
+    """
+
+    def __init__(
+        self, block: Sector, targets: Rooms, noise: Sequence[Array], model: RadiusModel, least: float
+    ) -> None:
+        self.block = Block(block, continuous=model.continuous)
+        self.pairs = Pairs(self.block.n)
+        self.targets, self.model, self.least = targets.coarse(), model, least
+        self.noise = [G[:, G.any(axis=0)] for G in noise if G.any()]
+        self.scale = abs(least if model.continuous else 1 - least) + 1 / model.horizon
+        self.best: TightMetric | None = None
+        self._fit: Fit | None = None
+
+    def value(self, shift: float) -> float:
+        """c or L^2 at a shift."""
+        return self.least + self.scale * float(np.exp(shift))
+
+    def start(self, P: Array, multipliers: Array, shift: float) -> Point | None:
+        """A point from a metric and its multipliers; the shift is raised until they are strictly feasible there."""
+        sigma2, _ = noise_numbers(P, self.noise)
+        for _ in range(12):
+            point = Point(P / sigma2, multipliers / sigma2, 1.5, shift)
+            if np.isfinite(self._barrier(point)):
+                return point
+            shift += 0.4
+        return None
+
+    def search(self, point: Point, weights: Sequence[float] = _WEIGHTS) -> Point:
+        """Improve a strictly feasible point; the point near the end of the path is returned."""
+        for mu in weights:
+            tube = self._followed(point)
+            if tube is None:
+                break
+            point = self._centre(point, tube, mu)
+        self._followed(point)
+        return point
+
+    def _centre(self, point: Point, tube: _Tube, mu: float) -> Point:
+        """Damped Newton steps at one barrier weight."""
+        here = self._merit(point, tube, mu)
+        for _ in range(_NEWTON):
+            poll()
+            found = self._derivatives(point, tube, mu)
+            direction = _descent(found, mu)
+            if direction is None:
+                return point
+            slope = float(found.gradient @ direction)
+            length = min(1.0, _FARTHEST / max(abs(float(direction[-1])), 1e-300))
+            while length > 1e-6:
+                moved = self._moved(point, direction, length)
+                there = self._merit(moved, tube, mu)
+                if there <= here + 0.1 * length * slope:
+                    break
+                length *= 0.5
+            else:
+                return point
+            point, here = moved, there
+            if -slope < _CENTRED**2 * mu:
+                break
+        return point
+
+    def _moved(self, point: Point, direction: Array, length: float) -> Point:
+        size, k = self.pairs.size, self.block.k
+        return Point(
+            point.P + length * self.pairs.matrix(direction[:size]),
+            point.multipliers + length * direction[size : size + k],
+            point.top + length * float(direction[-2]),
+            point.shift + length * float(direction[-1]),
+        )
+
+    def _merit(self, point: Point, tube: _Tube, mu: float) -> float:
+        barrier = self._barrier(point)
+        if not np.isfinite(barrier):
+            return float(np.inf)
+        q, _, _ = self._reaches(point.P, tube)
+        away = point.shift - tube.shift
+        trace = sum(float(np.sum(G * (point.P @ G))) for G in self._widest(point.P))
+        return (
+            float(np.log(np.sum(q**_POWER)) / _POWER)
+            + tube.alpha * point.top
+            + tube.beta * trace
+            + tube.rise * away
+            + tube.bend * away**2 / 2
+            + mu * barrier
+        )
+
+    def _barrier(self, point: Point) -> float:
+        """-log det of what must be positive definite; inf where it is not."""
+        matrices = [point.P, self.block.matrix(self.value(point.shift), point.P, point.multipliers)]
+        matrices += [point.top * np.eye(G.shape[1]) - G.T @ point.P @ G for G in self.noise]
+        total = 0.0
+        for place, matrix in enumerate(matrices):
+            try:
+                part = float(np.log(np.diagonal(np.linalg.cholesky(matrix))).sum())
+            except np.linalg.LinAlgError:
+                return float(np.inf)
+            total -= 2 * part if place else 0.0
+        return total
+
+    def _widest(self, P: Array) -> list[Array]:
+        """The noise matrix of the largest trace."""
+        return [max(self.noise, key=lambda G: float(np.sum(G * (P @ G))))]
+
+    def _reaches(self, P: Array, tube: _Tube) -> tuple[Array, Array, Array]:
+        """q_j = a_j' P^-1 a_j / room_j^2 for all columns of all directions, u_j = P^-1 a_j / room_j, and P^-1."""
+        inverse = np.linalg.inv(P)
+        inverse = (inverse + inverse.T) / 2
+        columns = [a / room for a, room in zip(self.targets.directions, tube.rooms)]
+        a = np.concatenate(columns, axis=1)
+        u = inverse @ a
+        return np.maximum(np.sum(a * u, axis=0), 1e-300), u, inverse
+
+    def _derivatives(self, point: Point, tube: _Tube, mu: float) -> _Value:
+        size, k = self.pairs.size, self.block.k
+        gradient, hessian = np.zeros(size + k + 2), np.zeros((size + k + 2, size + k + 2))
+        self._add_sector(point, gradient, hessian)
+        self._add_noise(point, gradient, hessian)
+        gradient *= mu
+        hessian *= mu
+        self._add_objective(point, tube, gradient, hessian)
+        upper = np.triu_indices(len(gradient), 1)
+        hessian[upper[1], upper[0]] = hessian[upper]
+        return _Value(gradient, hessian)
+
+    def _add_sector(self, point: Point, gradient: Array, hessian: Array) -> None:
+        """-log det F with respect to P, the multipliers and the shift (upper triangle)."""
+        block, pairs, n, size, k = self.block, self.pairs, self.block.n, self.pairs.size, self.block.k
+        value = self.value(point.shift)
+        W = np.linalg.inv(block.matrix(value, point.P, point.multipliers))
+        W = (W + W.T) / 2
+        here = slice(size, size + k)
+        WC, WQ = W @ block.Chat.T, W @ block.Qhat.T
+        cc, cq, qq = block.Chat @ WC, block.Chat @ WQ, block.Qhat @ WQ
+        gradient[here] -= np.diag(qq) - np.diag(cc)
+        hessian[here, here] += cc**2 - cq**2 - cq.T**2 + qq**2
+        rate = (2.0 if block.continuous else 1.0) * (value - self.least)  # d(v)/d(shift), times the factor of E'PE
+        WE = W[:n] @ np.eye(n, n + k).T
+        gain = rate * float(np.sum(WE * point.P))
+        V = rate * W[:, :n] @ point.P @ W[:n]
+        gradient[-1] -= gain
+        hessian[-1, -1] += rate * float(np.sum(V[:n, :n] * point.P)) - gain
+        hessian[here, -1] += np.diag(block.Qhat @ V @ block.Qhat.T) - np.diag(block.Chat @ V @ block.Chat.T)
+        hessian[:size, -1] -= rate * pairs.gradient(WE)
+        terms = block.terms(value)
+        for a, (c, X, Y) in enumerate(terms):
+            gradient[:size] -= c * pairs.gradient(Y @ W @ X.T)
+            hessian[:size, -1] += c * pairs.gradient(Y @ V @ X.T)
+            for b in range(a + 1):
+                d, U, Z = terms[b]
+                part = pairs.hessian(Z @ W @ X.T, Y @ W @ U.T)
+                part *= c * d
+                hessian[:size, :size] += part if a == b else part + part.T
+            for sign, factor in ((1.0, WQ), (-1.0, WC)):
+                left, right = X @ factor, Y @ factor
+                cross = left[pairs.i] * right[pairs.j] + left[pairs.j] * right[pairs.i]
+                hessian[:size, here] += sign * c * pairs.scale[:, None] * cross
+
+    def _add_noise(self, point: Point, gradient: Array, hessian: Array) -> None:
+        """-log det(t I - G'PG) with respect to P and t (upper triangle)."""
+        pairs, size = self.pairs, self.pairs.size
+        for G in self.noise:
+            W = np.linalg.inv(point.top * np.eye(G.shape[1]) - G.T @ point.P @ G)
+            spread = G @ W @ G.T
+            gradient[:size] += pairs.gradient(spread)
+            gradient[-2] -= float(np.trace(W))
+            hessian[:size, :size] += pairs.hessian(spread, spread)
+            hessian[:size, -2] -= pairs.gradient(G @ W @ W @ G.T)
+            hessian[-2, -2] += float(np.sum(W * W))
+
+    def _add_objective(self, point: Point, tube: _Tube, gradient: Array, hessian: Array) -> None:
+        """log q, the noise and log g."""
+        pairs, size = self.pairs, self.pairs.size
+        q, u, inverse = self._reaches(point.P, tube)
+        shares = (q / q.max()) ** _POWER
+        shares /= shares.sum()
+        slopes = []
+        for share, level, column in zip(shares, q, u.T):
+            if share < 1e-6:
+                continue
+            slope = -pairs.gradient(np.outer(column, column)) / level
+            slopes.append((share, slope))
+            hessian[:size, :size] += (2 * share / level) * pairs.hessian(np.outer(column, column), inverse)
+            hessian[:size, :size] += (_POWER - 1) * share * np.outer(slope, slope)
+        mean = np.sum([share * slope for share, slope in slopes], axis=0)
+        hessian[:size, :size] -= _POWER * np.outer(mean, mean)
+        gradient[:size] += mean
+        for G in self._widest(point.P):
+            gradient[:size] += tube.beta * pairs.gradient(G @ G.T)
+        away = point.shift - tube.shift
+        gradient[-2] += tube.alpha
+        gradient[-1] += tube.rise + tube.bend * away
+        hessian[-1, -1] += tube.bend
+
+    def _followed(self, point: Point) -> _Tube | None:
+        """The real tube at a point, whose metric is noted; None where it overflows."""
+        P, value = point.P, self.value(point.shift)
+        sigma2, nu = noise_numbers(P, self.noise)
+        factors = erosion_factors(P, self.targets.directions) * np.sqrt(sigma2)
+        room = (self.targets.rooms / factors[:, None]).min(axis=0)
+        fits = []
+        for shift in (point.shift, point.shift - _FINE, point.shift + _FINE):
+            fits.append(self.model.fit(self.value(shift), nu, self.targets.times, room, self._fit))
+            self._fit = fits[0]
+        here, below, above = (float(np.log(fit.square)) for fit in fits)
+        if not np.isfinite(here + below + above):
+            return None
+        ratio = float(np.sqrt(fits[0].square))
+        if self.best is None or ratio < self.best.ratio:
+            self.best = TightMetric(metric=P, value=value, ratio=ratio, status="barrier")
+        alpha = max(1 - fits[0].slope * nu, 0.0)
+        share = 1 / (sigma2 * (alpha + fits[0].slope * nu))
+        rise, bend = (above - below) / (2 * _FINE), (above - 2 * here + below) / _FINE**2
+        with np.errstate(all="ignore"):
+            spread = np.sqrt(self.model.variances(value, self.targets.times))
+            rooms = self.targets.effective(spread / spread.max())
+        return _Tube(alpha * share, fits[0].slope * share, point.shift, rise, max(bend, 0.0), rooms)
+
+
+def _descent(found: _Value, mu: float) -> Array | None:
+    """The Newton direction; the curvature along the shift (the last entry), where it is not convex, is made so."""
+    from scipy.linalg import cho_factor, cho_solve
+
+    inner, cross = found.hessian[:-1, :-1], found.hessian[:-1, -1]
+    for damping in (1e-13, 1e-10, 1e-7, 1e-4):
+        try:
+            factor = cho_factor(inner + damping * np.diag(np.diag(inner)))
+        except np.linalg.LinAlgError:
+            continue
+        both = cho_solve(factor, np.stack([found.gradient[:-1], cross], axis=1))
+        curvature = max(abs(float(found.hessian[-1, -1] - cross @ both[:, 1])), mu)
+        shift = -float(found.gradient[-1] - cross @ both[:, 0]) / curvature
+        return np.append(-both[:, 0] - shift * both[:, 1], shift)
+    return None
