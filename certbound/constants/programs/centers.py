@@ -105,13 +105,20 @@ class Pairs:
 
     def hessian(self, K: Array, L: Array) -> Array:
         """Second derivative tr(K S_p L S_q) over basis pairs, symmetric part."""
-        i, j = self.i, self.j
-        total = K.T[np.ix_(i, j)] * L[np.ix_(j, i)]
-        total += K.T[np.ix_(i, i)] * L[np.ix_(j, j)]
-        total += K.T[np.ix_(j, j)] * L[np.ix_(i, i)]
-        total += K.T[np.ix_(j, i)] * L[np.ix_(i, j)]
-        total *= self.scale[:, None]
-        total *= self.scale
+        M = K.T
+        # row pairs (a, a..n-1) at a time: whole rows of gathered columns, which stay in the cache
+        MI, MJ, LI, LJ = (matrix[:, place] for matrix in (M, L) for place in (self.i, self.j))
+        total = np.empty((self.size, self.size))
+        start = 0
+        for a in range(self.n):
+            rows = total[start : start + self.n - a]
+            np.multiply(LI[a:], MJ[a], out=rows)
+            rows += LJ[a:] * MI[a]
+            rows += MJ[a:] * LI[a]
+            rows += MI[a:] * LJ[a]
+            rows *= self.scale
+            rows[0] *= 0.5
+            start += self.n - a
         return total
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,15 +26,19 @@ from certbound.watch import poll
 
 _POWER = 16.0
 """Of the mean that stands for the tightest of several directions."""
-_WEIGHTS = (3e-2, 6e-3, 1.2e-3, 4e-4)
-"""Barrier weights mu, one stage each."""
-_NEWTON = 8
+_STAGES = (64.0, 8.0, 1.0)
+"""Barrier weights mu, one stage each, in units of the last."""
+_LAST = 0.012
+"""The last weight times the order of the barrier: what is lost of log q there."""
+_NEWTON = 12
 """Steps of a stage."""
-_CENTRED = 0.5
+_CENTRED = 1.5
 """Newton decrement (in units of sqrt(mu)) at which a stage ends."""
 _FARTHEST = 0.5
 """How far log(v - v_0) may go in a step."""
-_FINE = 0.1
+_SHIFTS = np.linspace(-6.0, 2.0, 9)
+"""Where log g is tabulated."""
+_STEPS = 2.0 ** np.arange(3.0, -16.0, -0.5)
 
 
 class Point(NamedTuple):
@@ -51,9 +55,7 @@ class _Tube(NamedTuple):
 
     alpha: float
     beta: float
-    shift: float
-    rise: float
-    bend: float
+    level: Any  # log g as a function of the shift: a cubic spline
     rooms: Array  # (directions,)
 
 
@@ -82,6 +84,7 @@ class ErosionBarrier:
         self.scale = abs(least if model.continuous else 1 - least) + 1 / model.horizon
         self.best: TightMetric | None = None
         self._fit: Fit | None = None
+        self._level: Any = None
 
     def value(self, shift: float) -> float:
         """c or L^2 at a shift."""
@@ -97,9 +100,10 @@ class ErosionBarrier:
             shift += 0.4
         return None
 
-    def search(self, point: Point, weights: Sequence[float] = _WEIGHTS) -> Point:
+    def search(self, point: Point, stages: Sequence[float] = _STAGES) -> Point:
         """Improve a strictly feasible point; the point near the end of the path is returned."""
-        for mu in weights:
+        order = self.block.n + self.block.k + sum(G.shape[1] for G in self.noise)
+        for mu in np.array(stages) * _LAST / order:
             tube = self._followed(point)
             if tube is None:
                 break
@@ -116,20 +120,28 @@ class ErosionBarrier:
             direction = _descent(found, mu)
             if direction is None:
                 return point
-            slope = float(found.gradient @ direction)
-            length = min(1.0, _FARTHEST / max(abs(float(direction[-1])), 1e-300))
-            while length > 1e-6:
-                moved = self._moved(point, direction, length)
-                there = self._merit(moved, tube, mu)
-                if there <= here + 0.1 * length * slope:
-                    break
-                length *= 0.5
-            else:
-                return point
+            moved, there = self._line(point, here, direction, tube, mu)
+            slope = -float(found.gradient @ direction)
+            if moved is None or here - there < 1e-3 * mu:
+                break
             point, here = moved, there
-            if -slope < _CENTRED**2 * mu:
+            if slope < _CENTRED**2 * mu:
                 break
         return point
+
+    def _line(self, point: Point, here: float, direction: Array, tube: _Tube, mu: float) -> tuple[Point | None, float]:
+        """The best of some step lengths: a merit costs next to nothing beside a Hessian."""
+        best, least = None, here
+        for length in _STEPS:
+            if length * abs(float(direction[-1])) > _FARTHEST and length > _STEPS[-1] * 2:
+                continue
+            moved = self._moved(point, direction, float(length))
+            there = self._merit(moved, tube, mu)
+            if there < least:
+                best, least = moved, there
+            elif best is not None:
+                break
+        return best, least
 
     def _moved(self, point: Point, direction: Array, length: float) -> Point:
         size, k = self.pairs.size, self.block.k
@@ -141,18 +153,18 @@ class ErosionBarrier:
         )
 
     def _merit(self, point: Point, tube: _Tube, mu: float) -> float:
+        if not _SHIFTS[0] <= point.shift <= _SHIFTS[-1]:
+            return float(np.inf)
         barrier = self._barrier(point)
         if not np.isfinite(barrier):
             return float(np.inf)
         q, _, _ = self._reaches(point.P, tube)
-        away = point.shift - tube.shift
         trace = sum(float(np.sum(G * (point.P @ G))) for G in self._widest(point.P))
         return (
             float(np.log(np.sum(q**_POWER)) / _POWER)
             + tube.alpha * point.top
             + tube.beta * trace
-            + tube.rise * away
-            + tube.bend * away**2 / 2
+            + float(tube.level(point.shift))
             + mu * barrier
         )
 
@@ -258,10 +270,9 @@ class ErosionBarrier:
         gradient[:size] += mean
         for G in self._widest(point.P):
             gradient[:size] += tube.beta * pairs.gradient(G @ G.T)
-        away = point.shift - tube.shift
         gradient[-2] += tube.alpha
-        gradient[-1] += tube.rise + tube.bend * away
-        hessian[-1, -1] += tube.bend
+        gradient[-1] += float(tube.level(point.shift, 1))
+        hessian[-1, -1] += float(tube.level(point.shift, 2))
 
     def _followed(self, point: Point) -> _Tube | None:
         """The real tube at a point, whose metric is noted; None where it overflows."""
@@ -269,23 +280,33 @@ class ErosionBarrier:
         sigma2, nu = noise_numbers(P, self.noise)
         factors = erosion_factors(P, self.targets.directions) * np.sqrt(sigma2)
         room = (self.targets.rooms / factors[:, None]).min(axis=0)
-        fits = []
-        for shift in (point.shift, point.shift - _FINE, point.shift + _FINE):
-            fits.append(self.model.fit(self.value(shift), nu, self.targets.times, room, self._fit))
-            self._fit = fits[0]
-        here, below, above = (float(np.log(fit.square)) for fit in fits)
-        if not np.isfinite(here + below + above):
+        fit = self.model.fit(value, nu, self.targets.times, room, self._fit)
+        if not np.isfinite(fit.square):
             return None
-        ratio = float(np.sqrt(fits[0].square))
+        self._fit = fit
+        ratio = float(np.sqrt(fit.square))
         if self.best is None or ratio < self.best.ratio:
             self.best = TightMetric(metric=P, value=value, ratio=ratio, status="barrier")
-        alpha = max(1 - fits[0].slope * nu, 0.0)
-        share = 1 / (sigma2 * (alpha + fits[0].slope * nu))
-        rise, bend = (above - below) / (2 * _FINE), (above - 2 * here + below) / _FINE**2
+        if self._level is None:
+            self._level = self._tabulated(nu, room)
+        alpha = max(1 - fit.slope * nu, 0.0)
+        share = 1 / (sigma2 * (alpha + fit.slope * nu))
         with np.errstate(all="ignore"):
             spread = np.sqrt(self.model.variances(value, self.targets.times))
             rooms = self.targets.effective(spread / spread.max())
-        return _Tube(alpha * share, fits[0].slope * share, point.shift, rise, max(bend, 0.0), rooms)
+        return _Tube(alpha * share, fit.slope * share, self._level, rooms)
+
+    def _tabulated(self, nu: float, room: Array) -> Any:
+        """log g over the shifts, at one nu and one shape of the room over time."""
+        from scipy.interpolate import CubicSpline
+
+        levels, fit = [], self._fit
+        for shift in _SHIFTS:
+            fit = self.model.fit(self.value(shift), nu, self.targets.times, room, fit)
+            levels.append(np.log(fit.square) if np.isfinite(fit.square) else np.inf)
+        known = np.isfinite(levels)
+        found = np.where(known, levels, np.max(np.array(levels)[known], initial=0.0) + 20.0)
+        return CubicSpline(_SHIFTS, found)
 
 
 def _descent(found: _Value, mu: float) -> Array | None:
