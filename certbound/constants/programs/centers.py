@@ -203,11 +203,45 @@ def center_multipliers(
     work = Block(block, continuous=continuous)
     P = np.asarray(metric, dtype=float)
     P = P / (2 * np.linalg.norm(P, 2))
-    first = _first_multipliers(work, P)
-    value = work.smallest_value(P, first)
-    if not len(first):
+    if not work.k:
+        empty = np.zeros(0)
+        return Center(metric=frozen(P), multipliers=(frozen(empty),), value=work.smallest_value(P, empty), steps=0)
+    first, value = _shared_multipliers(work, P)
+    ends = np.array([block.A + sign * block.B @ block.C for sign in (-1.0, 0.0, 1.0)])
+    lower = contraction_value(P, ends, continuous=continuous)
+    lower = lower if continuous else lower**2
+    gap = value - lower
+    if gap <= tolerance * max(1.0, abs(value)):
         return Center(metric=frozen(P), multipliers=(frozen(first),), value=value, steps=0)
-    return _Centring([work], None, max_steps).descend(P, [first], value, -np.inf, tolerance)
+    return _Centring([work], None, max_steps).descend(P, [first], value, lower, tolerance, offset=0.3 * gap)
+
+
+def _shared_multipliers(block: Block, P: Array) -> tuple[Array, float]:
+    """Multipliers with one unknown scale: all equal, or in the proportion of what goes in and out; and their value."""
+    from scipy.linalg import eigh
+    from scipy.optimize import minimize_scalar
+
+    inner = block.H[:, block.n :].T @ P @ block.H[:, block.n :]
+    C = block.Chat[:, : block.n]
+    enters = np.maximum(np.diag(inner), 1e-300)
+    leaves = np.maximum(np.sum(C * np.linalg.solve(P, C.T).T, axis=1), 1e-300)
+    found = []
+    for shape in (np.ones(block.k), np.sqrt(enters / leaves)):
+        root = 1 / np.sqrt(shape)
+        smallest = 0.0 if block.continuous else float(eigh(inner * np.outer(root, root), eigvals_only=True)[-1])
+        unit = smallest or float(np.max(np.sqrt(enters / leaves) / shape))
+        scale = minimize_scalar(
+            _value_along, args=(block, P, shape, smallest, unit), bounds=(-25.0, 12.0), method="bounded",
+            options={"xatol": 1e-5, "maxiter": 60},
+        )  # fmt: skip
+        found.append((float(scale.fun), shape * (smallest + unit * np.exp(scale.x))))
+    value, best = min(found, key=lambda pair: pair[0])
+    return best, block.smallest_value(P, best) if value < 1e300 else float(np.inf)
+
+
+def _value_along(y: float, block: Block, P: Array, shape: Array, smallest: float, unit: float) -> float:
+    """The value at multipliers of one shape, ``smallest`` + ``unit`` exp(y) times; 1e300 where there is none."""
+    return min(block.smallest_value(P, shape * (smallest + unit * np.exp(y))), 1e300)
 
 
 def reachable_value(metric: Array, jacobians: JacobianSet, *, continuous: bool) -> float:
@@ -234,10 +268,16 @@ class _Centring:
     def __init__(self, blocks: Sequence[Block], pairs: Pairs | None, max_steps: int) -> None:
         self.blocks, self.pairs, self.max_steps = blocks, pairs, max_steps
 
-    def descend(self, P: Array, multipliers: list[Array], value: float, lower: float, tolerance: float) -> Center:
-        """Shrink the target towards the value reached, and centre again, until it no longer pays."""
+    def descend(
+        self, P: Array, multipliers: list[Array], value: float, lower: float, tolerance: float, offset: float | None = None
+    ) -> Center:
+        """Shrink the target towards the value reached, and centre again, until it no longer pays.
+
+        The first target lies by ``offset`` above the value; a tenth of it when omitted.
+        """
         best = P, multipliers, value
-        steps, target, before, last = 0, value + max(1e-3, 0.1 * abs(value)), np.inf, np.inf
+        away = max(1e-3, 0.1 * abs(value)) if offset is None else offset
+        steps, target, before, last = 0, value + away, np.inf, np.inf
         while steps < self.max_steps:
             P, multipliers, used = self._recenter(P, multipliers, target, self.max_steps - steps)
             steps += used
