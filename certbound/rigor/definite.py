@@ -133,7 +133,7 @@ def has_cholesky(A: Interval) -> bool:
     for factor in (1.0, 8.0):
         shift = factor * (2 * gamma * n * size) + 1.01 * spread
         try:
-            R = np.linalg.cholesky(middle - shift * np.eye(n)).T
+            R: Array = np.asarray(np.linalg.cholesky(middle - shift * np.eye(n)).T, dtype=float)
         except np.linalg.LinAlgError:
             return False
         rest = x - matmul(R.T, R) - shift * np.eye(n)

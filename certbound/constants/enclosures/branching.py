@@ -68,7 +68,8 @@ def bound_supremum(
     if earlier is None:
         boxes = box.reshape(1, -1) if starts is None else starts
         sampled, point = -np.inf, _centres(boxes)[0]
-        sampled, point = _sample(value, [_centres(boxes), random_points(rng, box, max(8, int(2048 * share)))], sampled, point)
+        tried = random_points(rng, box, max(8, int(2048 * share)))
+        sampled, point = _sample(value, [_centres(boxes), tried], sampled, point)
         sampled, point = _climb(value, rng, box, sampled, point, share)
     else:
         boxes, sampled, point = earlier.rest, earlier.sampled, earlier.point

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from certbound.arrays import Array
+from certbound.arrays import Array, Index
 
 UNIT = float(np.finfo(float).eps)
 
@@ -35,7 +35,7 @@ def factor(term: Array) -> tuple[Array, Array, Array]:
     return left, right, (np.abs(term - left @ right) + (2 * n + 4) * UNIT * size) * (1 + 8 * UNIT)
 
 
-def _compact_svd(term: Array, rows: Array, columns: Array) -> tuple[Array, Array, Array]:
+def _compact_svd(term: Array, rows: Index, columns: Index) -> tuple[Array, Array, Array]:
     """Singular vectors of a matrix from those of its rows and columns that are not zero."""
     u, s, vt = np.linalg.svd(term[np.ix_(rows, columns)], full_matrices=False)
     left, right = np.zeros((len(term), len(s))), np.zeros((len(s), len(term)))

@@ -269,7 +269,8 @@ class _Centring:
         self.blocks, self.pairs, self.max_steps = blocks, pairs, max_steps
 
     def descend(
-        self, P: Array, multipliers: list[Array], value: float, lower: float, tolerance: float, offset: float | None = None
+        self, P: Array, multipliers: list[Array], value: float, lower: float, tolerance: float,
+        offset: float | None = None,
     ) -> Center:
         """Shrink the target towards the value reached, and centre again, until it no longer pays.
 

@@ -20,7 +20,14 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.constants.programs.centers import Block, Pairs
-from certbound.constants.programs.least_erosion import Fit, RadiusModel, Rooms, TightMetric, erosion_factors, noise_numbers
+from certbound.constants.programs.least_erosion import (
+    Fit,
+    RadiusModel,
+    Rooms,
+    TightMetric,
+    erosion_factors,
+    noise_numbers,
+)
 from certbound.constants.programs.sectors import Sector
 from certbound.watch import poll
 
@@ -56,7 +63,7 @@ class _Tube(NamedTuple):
     alpha: float
     beta: float
     level: Any  # log g as a function of the shift: a cubic spline
-    rooms: Array  # (directions,)
+    columns: Array  # (n, directions): each over its room
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +92,7 @@ class ErosionBarrier:
         self.best: TightMetric | None = None
         self._fit: Fit | None = None
         self._level: Any = None
+        self._columns: list[Array] = []
 
     def value(self, shift: float) -> float:
         """c or L^2 at a shift."""
@@ -186,13 +194,11 @@ class ErosionBarrier:
         return [max(self.noise, key=lambda G: float(np.sum(G * (P @ G))))]
 
     def _reaches(self, P: Array, tube: _Tube) -> tuple[Array, Array, Array]:
-        """q_j = a_j' P^-1 a_j / room_j^2 for all columns of all directions, u_j = P^-1 a_j / room_j, and P^-1."""
+        """q_j = a_j' P^-1 a_j / room_j^2 for all columns, u_j = P^-1 a_j / room_j, and P^-1."""
         inverse = np.linalg.inv(P)
         inverse = (inverse + inverse.T) / 2
-        columns = [a / room for a, room in zip(self.targets.directions, tube.rooms)]
-        a = np.concatenate(columns, axis=1)
-        u = inverse @ a
-        return np.maximum(np.sum(a * u, axis=0), 1e-300), u, inverse
+        u = inverse @ tube.columns
+        return np.maximum(np.sum(tube.columns * u, axis=0), 1e-300), u, inverse
 
     def _derivatives(self, point: Point, tube: _Tube, mu: float) -> _Value:
         size, k = self.pairs.size, self.block.k
@@ -294,7 +300,18 @@ class ErosionBarrier:
         with np.errstate(all="ignore"):
             spread = np.sqrt(self.model.variances(value, self.targets.times))
             rooms = self.targets.effective(spread / spread.max())
-        return _Tube(alpha * share, fit.slope * share, self._level, rooms)
+        self._columns += self._widest_columns(P, rooms)
+        return _Tube(alpha * share, fit.slope * share, self._level, np.concatenate(self._columns, axis=1))
+
+    def _widest_columns(self, P: Array, rooms: Array) -> list[Array]:
+        """Each direction over its room; of a round one, a (n, r), the axes of a' P^-1 a are added time after time."""
+        found = []
+        for a, room in zip(self.targets.directions, rooms):
+            if a.shape[1] > 1:
+                found.append(a @ np.linalg.eigh(a.T @ np.linalg.solve(P, a))[1] / room)
+            elif not self._columns:
+                found.append(a / room)
+        return found
 
     def _tabulated(self, nu: float, room: Array) -> Any:
         """log g over the shifts, at one nu and one shape of the room over time."""

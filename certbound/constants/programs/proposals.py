@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +9,8 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.constants.jacobians import AffineForm, AffineSet, JacobianSet, VertexPolytope
 from certbound.constants.programs.centers import center_metric, center_multipliers, reachable_value, starting_metric
-from certbound.constants.programs.least_erosion import RadiusModel, Rooms, tighten
 from certbound.constants.programs.lmi import RateProgram
-from certbound.constants.programs.riccati import SectorRiccati, inverted, least_value
+from certbound.constants.programs.riccati import least_value
 from certbound.constants.programs.sectors import VERTEX_LIMIT, Sector, lmi_blocks
 from certbound.errors import SolverError
 
@@ -82,22 +80,20 @@ def _riccati_proposal(
     """The metric of a Riccati equation, and the value that it reaches: multipliers and metric in turn."""
     (block,) = lmi_blocks(members, form="sector")
     assert isinstance(block, Sector)
-    equation = SectorRiccati(block, continuous)
-    weights = np.ones(block.B.shape[1])
+    multipliers = np.ones(block.B.shape[1])
     best, least = None, np.inf
     for _ in range(_TURNS):
-        found = least_value(equation, weights, lower=lower, tolerance=tolerance)
-        metric = None if found is None else normalised(inverted(found[0]))
+        found = least_value(block, multipliers, continuous=continuous, lower=lower, tolerance=tolerance / 4)
+        metric = None if found is None else normalised(found.mean())
         if metric is None:
             break
         center = center_multipliers(metric, block, continuous=continuous)
         gained = least - center.value
         if gained > 0:
             best, least = metric, center.value
-        if least <= lower + 2 * tolerance or not gained > tolerance or not len(weights):
+        if least <= lower + 2 * tolerance or not gained > tolerance or not len(multipliers):
             break
-        weights = 1 / center.multipliers[0]
-        weights = weights / np.exp(np.mean(np.log(weights)))
+        multipliers = center.multipliers[0] / np.exp(np.mean(np.log(center.multipliers[0])))
     return None if best is None else Proposal(metric=best, status="Riccati equation"), least
 
 
@@ -114,23 +110,6 @@ def sampled_polytope(matrices: Array, *, limit: int = 24) -> VertexPolytope:
     scaled = flat[:, varying] / spread[varying]
     chosen = list(dict.fromkeys(int(k) for k in np.argmax(scaled @ directions.T, axis=0)))
     return VertexPolytope(matrices=matrices[chosen[:limit] or [0]])
-
-
-def erosion_proposals(
-    members: JacobianSet, targets: Rooms, noise: Sequence[Array], radius: RadiusModel
-) -> list[Proposal]:
-    """The tightened metric, and the one of least c or L that it was searched from."""
-    start = rate_proposals(members, continuous=radius.continuous, share=2e-3)[0]
-    result = tighten(members, targets, noise, radius, start.metric, form=_form(members))
-    metric = normalised(result.metric)
-    first = [] if metric is None else [Proposal(metric=metric, status=f"tightening: {result.status}")]
-    return [*first, start]
-
-
-def _form(members: JacobianSet) -> str:
-    """Sector form where there are many vertices and a sector form exists."""
-    structured = isinstance(members, AffineSet | AffineForm)
-    return "sector" if structured and members.vertex_count > 16 else "vertices"
 
 
 def spectral_bound(members: JacobianSet, *, continuous: bool) -> float:

@@ -1,15 +1,14 @@
 """Metrics of a sector set from Riccati equations: a second for two hundred states, where no semidefinite program goes.
 
-With the multipliers and a residual given, the inequality of the sector form (Sec. 6 of docs/theory.md) becomes an
-equation for X = P^-1, the bounded-real Riccati equation of the scaled plant in its dual form:
+With the multipliers Lambda given (diagonal, k numbers), the metrics in which the sector set reaches a value v lie
+between two solutions of bounded-real Riccati equations. The smallest solves
 
-    v X = A X A' + B M B' + R + A X C' (M - C X C')^-1 C X A'              (discrete time, v = L^2)
-    0 = (A - c I) X + X (A - c I)' + B M B' + R + X C' M^-1 C X            (continuous time)
+    v P = A'PA + C'Lam C + A'PB (Lam - B'PB)^-1 B'PA                      (discrete time, v = L^2)
+    0 = (A - c I)'P + P (A - c I) + C'Lam C + P B Lam^-1 B'P              (continuous time, v = c)
 
-with M the inverse multipliers (diagonal, k numbers) and R >= 0. Any solution X > 0 with M > C X C' (discrete time)
-proposes P = X^-1, with c or L^2 at most the value. The equation is solved by doubling: twenty products of n x n
-matrices. Its derivatives follow from one linear equation of the same size, so that M and R can be searched by any
-smooth objective. Everything is a proposal: ``recheck`` proves.
+and the largest is the inverse of the smallest solution of the dual, with A', C', B' and Lam^-1 for A, B, C and Lam.
+Every mean of the two serves as well, for the inequality is convex in (P, Lambda). The equations are solved by doubling:
+twenty products of n x n matrices. All of them are proposals: ``recheck`` proves.
 
 Source: Zhou, Doyle, Glover, Robust and Optimal Control (1996), Ch. 13; Chu, Fan, Lin, A structure-preserving doubling
 algorithm for continuous-time algebraic Riccati equations, Linear Algebra Appl. 396 (2005).
@@ -18,7 +17,6 @@ algorithm for continuous-time algebraic Riccati equations, Linear Algebra Appl. 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,136 +25,93 @@ from certbound.constants.programs.sectors import Sector
 
 _DOUBLINGS = 60
 _SETTLED = 1e-12
-_STEPS = 14
-"""Halvings of the distance to the least value that a bisection takes."""
-
-
-class Slopes(NamedTuple):
-    """Derivatives of a function of X with respect to the value, the inverse multipliers and the residual R."""
-
-    value: float
-    weights: Array  # (k,)
-    residual: Array  # (n, n)
+_HALVINGS = 14
+_SLIGHT = 1e-9
+"""A residual that keeps solutions off the border of the inequality, in units of what enters the equation."""
+SHARE = 1e-3
+"""Weight of the largest metric in a mean: the smallest is the better conditioned, and lies on the border."""
 
 
 @dataclass(frozen=True, eq=False)
-class SectorRiccati:
-    """The Riccati equation of one centred sector set."""
+class Pencil:
+    """The smallest and the largest metric of a sector set at one value, with the multipliers of both."""
 
-    block: Sector
-    continuous: bool
+    smallest: Array  # (n, n)
+    largest: Array  # (n, n)
+    multipliers: Array  # (k,)
+    value: float
 
-    @property
-    def dimension(self) -> int:
-        """State dimension n."""
-        return len(self.block.A)
-
-    def solve(self, value: float, weights: Array, residual: Array) -> Array | None:
-        """X, shape (n, n), for inverse multipliers (k,) and a residual (n, n); None where there is none."""
-        A, B, C = self.block.A, self.block.B, self.block.C
-        known = (B * weights) @ B.T + residual
-        quadratic = -(C.T / weights) @ C
-        with np.errstate(all="ignore"):
-            try:
-                if self.continuous:
-                    start = _cayley((A - value * np.eye(len(A))).T, quadratic, known)
-                    X = None if start is None else _doubled(*start)
-                elif value > 0:
-                    X = _doubled(A.T / np.sqrt(value), quadratic, known / value)
-                else:
-                    X = None
-            except np.linalg.LinAlgError:
-                return None
-        return X if X is not None and self._serves(X, value, weights) else None
-
-    def slopes(self, X: Array, value: float, weights: Array, gradient: Array) -> Slopes | None:
-        """Derivatives of f(X) with df = tr(gradient dX); None where the linear equation has no solution."""
-        B, C = self.block.B, self.block.C
-        try:
-            closed, reach = self._closed(X, value, weights)
-            Z = _adjoint(closed, gradient, value, continuous=self.continuous)
-        except (np.linalg.LinAlgError, ValueError):
-            return None
-        if not np.isfinite(Z).all():
-            return None
-        share = np.einsum("ik,ij,jk->k", B, Z, B, optimize=True)
-        share -= np.einsum("ik,ij,jk->k", reach, Z, reach, optimize=True) / weights**2
-        scale = 2.0 if self.continuous else 1.0
-        return Slopes(-scale * float(np.sum(Z * X)), share, Z)
-
-    def _closed(self, X: Array, value: float, weights: Array) -> tuple[Array, Array]:
-        """The matrix that small changes of X go through, and the columns by which changes of M enter."""
-        A, C = self.block.A, self.block.C
-        if self.continuous:
-            reach = X @ C.T
-            return A - value * np.eye(len(A)) + (reach / weights) @ C, reach
-        gain = np.linalg.solve(np.diag(weights) - C @ X @ C.T, C @ X @ A.T).T
-        closed = A + gain @ C
-        return closed, closed @ X @ C.T
-
-    def _serves(self, X: Array, value: float, weights: Array) -> bool:
-        """Whether X > 0 solves the equation, with M > C X C' in discrete time."""
-        if not np.isfinite(X).all():
-            return False
-        values = np.linalg.eigvalsh(X)
-        if values[0] <= 1e-14 * values[-1]:
-            return False
-        if self.continuous:
-            return True
-        inner = self.block.C @ X @ self.block.C.T / np.sqrt(np.outer(weights, weights))
-        return not len(inner) or float(np.linalg.eigvalsh(inner)[-1]) < 1
+    def mean(self, share: float = SHARE) -> Array:
+        """A metric in between, exactly symmetric."""
+        P = (1 - share) * self.smallest + share * self.largest
+        return np.asarray((P + P.T) / 2)
 
 
-def spectral_values(block: Sector, *, continuous: bool) -> float:
-    """The largest spectral abscissa (or squared radius) at the middle and at the two ends of all slopes."""
-    matrices = np.array([block.A + s * block.B @ block.C for s in (-1.0, 0.0, 1.0)])
-    eigenvalues = np.linalg.eigvals(matrices)
-    return float(eigenvalues.real.max() if continuous else (np.abs(eigenvalues) ** 2).max())
+def pencil(block: Sector, multipliers: Array, value: float, *, continuous: bool) -> Pencil | None:
+    """The two extreme metrics at a value, c or L^2; None where there is none (or none was found)."""
+    A, B, C = block.A, block.B, block.C
+    smallest = _solution(A.T, C.T, B.T, multipliers, value, continuous=continuous)
+    if smallest is None:
+        return None
+    inverse = _solution(A, B, C, 1 / multipliers, value, continuous=continuous)
+    if inverse is None:
+        return None
+    largest = np.linalg.inv(inverse) / (1.0 if continuous else value)
+    return Pencil(smallest, (largest + largest.T) / 2, multipliers, value)
 
 
 def least_value(
-    equation: SectorRiccati, weights: Array, *, lower: float, tolerance: float
-) -> tuple[Array, float] | None:
-    """X and the least value, up to ``tolerance``, at which the equation with given multipliers has a solution.
+    block: Sector, multipliers: Array, *, continuous: bool, lower: float, tolerance: float
+) -> Pencil | None:
+    """The metrics at the least value, up to ``tolerance``, that given multipliers allow; ``lower`` bounds it below.
 
-    ``lower`` is a lower bound of the value. The residual is as large as a tenth of the room above the least value
-    allows, so that X is no worse conditioned than need be. None where no value up to 1e4 times the size of the
-    Jacobian has a solution.
+    None where no value up to 1e4 times the size of the Jacobian allows any.
     """
-    size = float(np.linalg.norm(equation.block.A, 2)) ** (1 if equation.continuous else 2)
-    n = equation.dimension
-    unit = np.eye(n) * float(np.trace((equation.block.B * weights) @ equation.block.B.T) or 1.0) / n
-    slight = 1e-9 * unit
-    high, step = lower + tolerance, tolerance
-    low = lower
-    found = equation.solve(high, weights, slight)
+    size = max(float(np.linalg.norm(block.A, 2)) ** (1 if continuous else 2), 1e-300)
+
+    def tried(value: float) -> Pencil | None:
+        return pencil(block, multipliers, value, continuous=continuous)
+
+    low, step = lower, tolerance
+    high, found = lower + step, tried(lower + step)
     while found is None:
-        if step > 1e4 * max(size, 1e-300):
+        if step > 1e4 * size:
             return None
         step *= 4
         low, high = high, lower + step
-        found = equation.solve(high, weights, slight)
-    for _ in range(_STEPS):
+        found = tried(high)
+    for _ in range(_HALVINGS):
         if high - low <= tolerance:
             break
         middle = (low + high) / 2
-        X = equation.solve(middle, weights, slight)
-        if X is None:
-            low = middle
-        else:
-            high, found = middle, X
-    value = high + tolerance
-    for exponent in np.arange(0.0, -9.0, -1.0):
-        X = equation.solve(value, weights, 10**exponent * unit)
-        if X is not None:
-            return X, value
-    return found, high
+        better = tried(middle)
+        low, high, found = (middle, high, found) if better is None else (low, middle, better)
+    return found
 
 
-def inverted(X: Array) -> Array:
-    """P = X^-1, exactly symmetric."""
-    P = np.linalg.inv((X + X.T) / 2)
-    return np.asarray((P + P.T) / 2)
+def _solution(A: Array, B: Array, C: Array, weights: Array, value: float, *, continuous: bool) -> Array | None:
+    """The smallest X with v X = A X A' + B W B' + A X C' (W - C X C')^-1 C X A' (or its like in continuous time)."""
+    n = len(A)
+    known = (B * weights) @ B.T
+    known = known + _SLIGHT * (float(np.trace(known)) / n or 1.0) * np.eye(n)
+    quadratic = -(C.T / weights) @ C
+    with np.errstate(all="ignore"):
+        try:
+            if continuous:
+                start = _cayley((A - value * np.eye(n)).T, quadratic, known)
+                X = _doubled(*start)
+            else:
+                X = None if value <= 0 else _doubled(A.T / np.sqrt(value), quadratic, known / value)
+        except np.linalg.LinAlgError:
+            return None
+    if X is None:
+        return None
+    if float(np.linalg.eigvalsh(X)[0]) <= 0:
+        return None
+    inner = C @ X @ C.T / np.sqrt(np.outer(weights, weights))
+    if not continuous and len(inner) and float(np.linalg.eigvalsh(inner)[-1]) >= 1:
+        return None
+    return X
 
 
 def _doubled(A: Array, G: Array, H: Array) -> Array | None:
@@ -170,36 +125,18 @@ def _doubled(A: Array, G: Array, H: Array) -> Array | None:
         H = H + (added + added.T) / 2
         G = G + (spread + spread.T) / 2
         A = A @ both[:, :n]
-        size = float(np.linalg.norm(H))
-        if not np.isfinite(size):
+        if not np.isfinite(H).all() or not np.isfinite(G).all():
             return None
-        if float(np.linalg.norm(added)) <= _SETTLED * size:
+        if float(np.linalg.norm(added)) <= _SETTLED * float(np.linalg.norm(H)):
             return H
     return None
 
 
-def _cayley(A: Array, G: Array, H: Array) -> tuple[Array, Array, Array] | None:
+def _cayley(A: Array, G: Array, H: Array) -> tuple[Array, Array, Array]:
     """The first matrices of the doubling for A' X + X A - X G X + H = 0."""
-    shift = 1.1 * float(np.linalg.norm(A, 2)) / 2 + 1e-300
+    shift = 0.55 * float(np.linalg.norm(A, 2)) + 1e-300
     identity = np.eye(len(A))
     moved = A - shift * identity
     inverse = np.linalg.inv(moved)
     W = np.linalg.inv(moved.T + H @ inverse @ G)
     return identity + 2 * shift * W.T, 2 * shift * inverse @ G @ W, 2 * shift * W @ H @ inverse
-
-
-def _adjoint(closed: Array, gradient: Array, value: float, *, continuous: bool) -> Array:
-    """Z with v Z = F' Z F + gradient (discrete time), F' Z + Z F + gradient = 0 (continuous time)."""
-    from scipy.linalg import solve_continuous_lyapunov
-
-    if continuous:
-        Z = solve_continuous_lyapunov(closed.T, -gradient)
-        return np.asarray((Z + Z.T) / 2)
-    power, Z = closed / np.sqrt(value), gradient / value
-    for _ in range(_DOUBLINGS):
-        added = power.T @ Z @ power
-        Z = Z + added
-        power = power @ power
-        if not float(np.linalg.norm(added)) > _SETTLED * float(np.linalg.norm(Z)):
-            break
-    return np.asarray((Z + Z.T) / 2)
