@@ -24,7 +24,7 @@ FIRST_BUDGET = 4000
 """Boxes before the affine structure of the Jacobian is looked for."""
 MOST_SIDES = 8
 """Coordinates above which bisection is left out where the affine structure gives a bound."""
-SMALL = 24
+SMALL = 12
 """States up to which as many Jacobians are sampled as is usual."""
 EXACT = 1e-9
 """A relative gap that leaves nothing to gain."""

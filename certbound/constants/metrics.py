@@ -17,18 +17,7 @@ from numpy.typing import ArrayLike
 from certbound.arrays import Array
 from certbound.constants.certification import certify
 from certbound.constants.jacobians import AffineSet, JacobianSet, as_set
-from certbound.constants.model_data import Model, model_of
-from certbound.constants.programs import (
-    RadiusModel,
-    Rooms,
-    constraint_targets,
-    cut_rooms,
-    erosion_proposals,
-    rate_proposals,
-    rooms_of,
-    stated_rooms,
-)
-from certbound.constants.tightening import (
+from certbound.constants.least_eroding import (
     Tightening,
     candidate_sets,
     certified,
@@ -37,6 +26,17 @@ from certbound.constants.tightening import (
     model_set,
     noise_matrices,
     tried,
+)
+from certbound.constants.model_data import Model, model_of
+from certbound.constants.programs import (
+    ErosionSearch,
+    RadiusModel,
+    Rooms,
+    constraint_targets,
+    cut_rooms,
+    rate_proposals,
+    rooms_of,
+    stated_rooms,
 )
 from certbound.parallel import crew, result_of
 from certbound.problem.problem import Problem
@@ -121,7 +121,7 @@ def propose_metrics(
     radius = RadiusModel(
         continuous=continuous, dimension=members.dimension, horizon=horizon, delta=delta, gaussian=gaussian
     )
-    return [p.metric for p in erosion_proposals(members, targets, matrices, radius)]
+    return [p.metric for p in ErosionSearch(members, matrices, radius).proposals(targets)]
 
 
 def improve(

@@ -63,8 +63,9 @@ class ErosionSearch:
         """The tightened metric, and the one of least c or L that it was searched from."""
         result = self._tightened(targets)
         metric = None if result is None else normalised(result.metric)
-        first = [] if result is None or metric is None else [Proposal(metric=metric, status=f"tightening: {result.status}")]
-        return [*first, self.start]
+        if result is None or metric is None:
+            return [self.start]
+        return [Proposal(metric=metric, status=f"tightening: {result.status}"), self.start]
 
     def _tightened(self, targets: Rooms) -> TightMetric | None:
         found = None
@@ -117,10 +118,3 @@ class ErosionSearch:
         factors = erosion_factors(metric, rooms.directions) * np.sqrt(sigma2)
         room = (rooms.rooms / factors[:, None]).min(axis=0)
         return float(np.sqrt(self.radius.fit(value, nu, rooms.times, room).square))
-
-
-def erosion_proposals(
-    members: JacobianSet, targets: Rooms, noise: Sequence[Array], radius: RadiusModel
-) -> list[Proposal]:
-    """The tightened metric, and the one of least c or L that it was searched from."""
-    return ErosionSearch(members, noise, radius).proposals(targets)

@@ -18,7 +18,6 @@ from certbound.constants.enclosures import random_points
 from certbound.constants.jacobians import AffineSet, JacobianSet, affine_set
 from certbound.constants.model_data import Model
 from certbound.constants.programs import (
-    MOST_STATES,
     ErosionSearch,
     Proposal,
     RadiusModel,
@@ -33,6 +32,8 @@ from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.tubes.constants import Constants
 from certbound.watch import poll
 
+_MOST = 60
+"""States beyond which samples propose nothing: each is a vertex, and no semidefinite program takes so many."""
 _SAMPLES, _SMALL = 2000, 40
 """Jacobians that are sampled, up to so many states; fewer beyond, for each has n^2 numbers."""
 
@@ -119,7 +120,7 @@ def candidate_sets(model: Model) -> list[JacobianSet]:
     given: list[JacobianSet] = [] if structured is None else [structured]
     slots = StateJacobian(model.dynamics, model.state_slots, model.ranges)
     bounded = bool(np.isfinite(slots.box.lo).all() and np.isfinite(slots.box.hi).all())
-    if not bounded or not slots.active or (given and model.dimension > MOST_STATES):
+    if not bounded or not slots.active or (given and model.dimension > _MOST):
         return given
     count = int(_SAMPLES * min(1.0, (_SMALL / model.dimension) ** 2))
     matrices = slots.values(random_points(np.random.default_rng(0), slots.box, count))
