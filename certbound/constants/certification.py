@@ -26,6 +26,8 @@ MOST_SIDES = 8
 """Coordinates above which bisection is left out where the affine structure gives a bound."""
 SMALL = 12
 """States up to which as many Jacobians are sampled as is usual."""
+LARGE = 24
+"""States above which no side is bisected where there are many and the affine structure gives a bound."""
 EXACT = 1e-9
 """A relative gap that leaves nothing to gain."""
 
@@ -77,7 +79,8 @@ def _supremum(model: Model, jacobian: StateJacobian, norm: Metric, tolerance: fl
     unbounded = not (np.isfinite(jacobian.box.lo) & np.isfinite(jacobian.box.hi)).all()
     many = len(jacobian.active) > 3
     budget = max(1, int(budget * min(1.0, (6 / model.dimension) ** 2)))  # a box costs the more, the larger n
-    if unbounded:
+    large = len(jacobian.active) > MOST_SIDES and model.dimension > LARGE
+    if unbounded or large:
         ceiling = _structural_bound(model, jacobian, norm)
         hopeless = len(jacobian.active) > MOST_SIDES and np.isfinite(ceiling)
         return search(budget=1 if hopeless else budget, ceiling=ceiling)

@@ -26,8 +26,10 @@ from certbound.constants.programs.sectors import Sector
 _DOUBLINGS = 60
 _SETTLED = 1e-12
 _HALVINGS = 14
-_SLIGHT = 1e-9
-"""A residual that keeps solutions off the border of the inequality, in units of what enters the equation."""
+SLIGHT = 1e-9
+"""The least residual: it keeps solutions off the border of the inequality, in units of what enters the equation."""
+_RESIDUALS = 10.0 ** np.arange(0.0, -9.0, -1.0)
+"""Larger ones, tried at last: what the slopes do not see should weigh something too."""
 SHARE = 1e-3
 """Weight of the largest metric in a mean: the smallest is the better conditioned, and lies on the border."""
 
@@ -47,13 +49,15 @@ class Pencil:
         return np.asarray((P + P.T) / 2)
 
 
-def pencil(block: Sector, multipliers: Array, value: float, *, continuous: bool) -> Pencil | None:
+def pencil(
+    block: Sector, multipliers: Array, value: float, *, continuous: bool, residual: float = SLIGHT
+) -> Pencil | None:
     """The two extreme metrics at a value, c or L^2; None where there is none (or none was found)."""
     A, B, C = block.A, block.B, block.C
-    smallest = _solution(A.T, C.T, B.T, multipliers, value, continuous=continuous)
+    smallest = _solution(A.T, C.T, B.T, multipliers, value, residual, continuous=continuous)
     if smallest is None:
         return None
-    inverse = _solution(A, B, C, 1 / multipliers, value, continuous=continuous)
+    inverse = _solution(A, B, C, 1 / multipliers, value, residual, continuous=continuous)
     if inverse is None:
         return None
     largest = np.linalg.inv(inverse) / (1.0 if continuous else value)
@@ -86,14 +90,20 @@ def least_value(
         middle = (low + high) / 2
         better = tried(middle)
         low, high, found = (middle, high, found) if better is None else (low, middle, better)
+    for residual in _RESIDUALS:
+        better = pencil(block, multipliers, high + tolerance, continuous=continuous, residual=float(residual))
+        if better is not None:
+            return better
     return found
 
 
-def _solution(A: Array, B: Array, C: Array, weights: Array, value: float, *, continuous: bool) -> Array | None:
+def _solution(
+    A: Array, B: Array, C: Array, weights: Array, value: float, residual: float, *, continuous: bool
+) -> Array | None:
     """The smallest X with v X = A X A' + B W B' + A X C' (W - C X C')^-1 C X A' (or its like in continuous time)."""
     n = len(A)
     known = (B * weights) @ B.T
-    known = known + _SLIGHT * (float(np.trace(known)) / n or 1.0) * np.eye(n)
+    known = known + residual * (float(np.trace(known)) / n or 1.0) * np.eye(n)
     quadratic = -(C.T / weights) @ C
     with np.errstate(all="ignore"):
         try:
