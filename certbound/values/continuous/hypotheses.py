@@ -68,9 +68,9 @@ class Model:
         """Samples in time and in each state with which the residual is a polynomial known exactly."""
         n = self.drift.axes - 1
         f, a = self.drift.degrees, self.square.degrees
-        own = 4 if n == 1 else 5  # degree of V_x in its own variable; that of V_y in x is 5
-        squared = 8 if n == 1 else 10
-        space = [max(5, f[1 + i] + own, a[1 + i] + squared) + 1 for i in range(n)]
+        whole = 3 if n == 3 else 5  # V's degree in each state
+        own = 4 if n == 1 else whole  # degree of V_x in its own variable; that of V_y in x is V's
+        space = [max(whole, f[1 + i] + own, a[1 + i] + 2 * own) + 1 for i in range(n)]
         return (max(3 + f[0], 6 + a[0]) + 1, *space)
 
 
