@@ -36,6 +36,7 @@ from certbound.values.continuous.residual import (
     bound_ranges,
     coarse_size,
     sample_in_plane,
+    sample_in_space,
     value_range,
 )  # fmt: skip
 from certbound.values.continuous.surface import Surface
@@ -138,12 +139,12 @@ def side_by_side(look: Callable[[tuple[int, int]], Found], chunks: list[tuple[in
 
 
 def sampled_residual(surface: Surface, model: Model, *, upper: bool = True) -> tuple[Array, Array]:
-    """The largest R among a few samples of each patch in two states, and V's least value there: no bounds.
+    """The largest R among a few samples of each patch in two or three states, and V's least value there: no bounds.
 
     For lower bounds the largest -R of the best branch, and V's largest value. Both have shape (slabs, *cells); a
     sketch of what `examine` finds, at a tenth of its cost.
     """
-    counts = (4, 5, 5)
+    counts, sample = ((4, 5, 5), sample_in_plane) if len(surface.axes) == 2 else ((4, 4, 4, 4), sample_in_space)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
 
@@ -151,7 +152,7 @@ def sampled_residual(surface: Surface, model: Model, *, upper: bool = True) -> t
         patches = surface.patches(*ends)
         place = np.arange(len(patches.size)) % (per if fixed else len(patches.size))
         drifts, squares = fixed or interpolants(surface, model, *ends, counts)
-        excess = sample_in_plane(patches, drifts, squares, place, counts, upper=upper)
+        excess = sample(patches, drifts, squares, place, counts, upper=upper)
         return excess, value_range(patches)[0 if upper else 1]
 
     found = side_by_side(look, list(surface.chunks()))

@@ -238,7 +238,7 @@ def _run_space(
     square = np.ascontiguousarray(squares.samples)
     extremes_in_space(
         np.ascontiguousarray(patches.coefficients).reshape(len(out), 4, 64),
-        1 / np.array([patches.step, *patches.widths]), place, force.reshape(*force.shape[:4], -1),
+        1 / np.array([patches.step, *patches.widths]), place, force.reshape(3 * len(force), *force.shape[2:4], -1),
         square.reshape(*square.shape[:3], -1), bool(square[[1, 2, 5]].any()), tuple(itertools.chain(*bases)), changes,
         wanted, out,
     )  # fmt: skip

@@ -18,37 +18,36 @@ BLOCK = 8
 
 @njit(cache=True)
 def _contract(matrix: Array, table: Array, before: int, after: int, out: Array) -> None:
-    """A matrix along the middle one of three axes, of lengths ``before``, its columns and ``after``; flat arrays."""
+    """A matrix along the middle one of three axes, of lengths ``before``, its columns (4 or more) and ``after``.
+
+    The arrays are flat; slices let the compiler see that rows do not overlap.
+    """
     rows, columns = matrix.shape
     for b in range(before):
-        base = b * columns * after
+        own = table[b * columns * after : (b + 1) * columns * after]
+        t0, t1, t2, t3 = own[:after], own[after : 2 * after], own[2 * after : 3 * after], own[3 * after : 4 * after]
         for c in range(rows):
-            start = (b * rows + c) * after
-            place, k = base, 1
-            weight = matrix[c, 0]
+            row = out[(b * rows + c) * after : (b * rows + c + 1) * after]
+            m0, m1, m2, m3 = matrix[c, 0], matrix[c, 1], matrix[c, 2], matrix[c, 3]
             for s in range(after):
-                out[start + s] = weight * table[place + s]
-            while k + 2 < columns:
-                first, second, third = matrix[c, k], matrix[c, k + 1], matrix[c, k + 2]
-                p, q, r = base + k * after, base + (k + 1) * after, base + (k + 2) * after
+                row[s] = m0 * t0[s] + m1 * t1[s] + m2 * t2[s] + m3 * t3[s]
+        k = 4
+        while k + 2 < columns:
+            t0, t1, t2 = (own[k * after : (k + 1) * after], own[(k + 1) * after : (k + 2) * after],
+                          own[(k + 2) * after : (k + 3) * after])  # fmt: skip
+            for c in range(rows):
+                row = out[(b * rows + c) * after : (b * rows + c + 1) * after]
+                m0, m1, m2 = matrix[c, k], matrix[c, k + 1], matrix[c, k + 2]
                 for s in range(after):
-                    out[start + s] += first * table[p + s] + second * table[q + s] + third * table[r + s]
-                k += 3
-            while k < columns:
-                weight, place = matrix[c, k], base + k * after
+                    row[s] += m0 * t0[s] + m1 * t1[s] + m2 * t2[s]
+            k += 3
+        while k < columns:
+            t0 = own[k * after : (k + 1) * after]
+            for c in range(rows):
+                row, m0 = out[(b * rows + c) * after : (b * rows + c + 1) * after], matrix[c, k]
                 for s in range(after):
-                    out[start + s] += weight * table[place + s]
-                k += 1
-
-
-@njit(cache=True)
-def _cube(
-    table: Array, size: int, first: Array, second: Array, third: Array, one: Array, two: Array, out: Array
-) -> None:
-    """A matrix along each axis of a cube of ``size`` per axis; lanes last."""
-    _contract(third, table, size * size, BLOCK, one)
-    _contract(second, one, size, third.shape[0] * BLOCK, two)
-    _contract(first, two, 1, second.shape[0] * third.shape[0] * BLOCK, out)
+                    row[s] += m0 * t0[s]
+            k += 1
 
 
 @njit(cache=True)
@@ -123,30 +122,49 @@ def _derivatives(
 
 
 @njit(cache=True)
-def _residual(
-    v: Array, patch: int, lane: int, cell: int, sample: int, inverse: Array, drift: Array, square: Array, mixed: bool,
-    tables: Array, energy: Array,
+def _gathered(table: Array, output: int, cells: Index, sample: int, scale: Array, out: Array) -> None:
+    """One output of a table (outputs, cells, 1 or t, samples) for the cells of a block, scaled, lanes last."""
+    own = min(sample, table.shape[2] - 1)
+    if sample > own:
+        return
+    for s in range(BLOCK):
+        row = table[output, cells[s], own]
+        for p in range(table.shape[3]):
+            out[p * BLOCK + s] = row[p] * scale[s]
+
+
+@njit(cache=True)
+def _residual(v: Array, drift: Array, square: Array, mixed: bool, out: Array, energy: Array) -> None:
+    """R for every branch (a row of ``out``; ``drift`` has three for each) and Q2 at the samples of space, flat."""
+    vt, vx, vy, vz, xx, yy, zz = v[0], v[1], v[2], v[3], v[4], v[5], v[6]
+    a, b, c = square[0], square[1], square[2]
+    for p in range(len(vt)):
+        energy[p] = a[p] * vx[p] * vx[p] + b[p] * vy[p] * vy[p] + c[p] * vz[p] * vz[p]
+        vt[p] += a[p] * xx[p] + b[p] * yy[p] + c[p] * zz[p]
+    if mixed:
+        d, f, g, xy, xz, yz = square[3], square[4], square[5], v[7], v[8], v[9]
+        for p in range(len(vt)):
+            energy[p] += d[p] * vx[p] * vy[p] + f[p] * vx[p] * vz[p] + g[p] * vy[p] * vz[p]
+            vt[p] += d[p] * xy[p] + f[p] * xz[p] + g[p] * yz[p]
+    for branch in range(len(out)):
+        own, fx, fy, fz = out[branch], drift[3 * branch], drift[3 * branch + 1], drift[3 * branch + 2]
+        for p in range(len(vt)):
+            own[p] = vt[p] + energy[p] + (fx[p] * vx[p] + fy[p] * vy[p] + fz[p] * vz[p])
+
+
+@njit(cache=True)
+def _model(
+    drift: Array, square: Array, cells: Index, sample: int, sides: Array, mixed: bool, force: Array, spread: Array
 ) -> None:
-    """R for every branch and Q2 at the samples of space and one of time, for one lane."""
-    size = square.shape[3]
-    own = min(sample, square.shape[2] - 1)
-    now = min(sample, drift.shape[3] - 1)
-    h, wx, wy, wz = inverse[0, patch], inverse[1, patch], inverse[2, patch], inverse[3, patch]
-    for p in range(size):
-        at = p * BLOCK + lane
-        gx, gy, gz = v[1, at] * wx, v[2, at] * wy, v[3, at] * wz
-        a, b, c = 0.5 * square[0, cell, own, p], 0.5 * square[4, cell, own, p], 0.5 * square[8, cell, own, p]
-        e = a * gx * gx + b * gy * gy + c * gz * gz
-        rest = v[0, at] * h + a * v[4, at] * wx * wx + b * v[5, at] * wy * wy + c * v[6, at] * wz * wz
-        if mixed:
-            d, f, g = square[1, cell, own, p], square[2, cell, own, p], square[5, cell, own, p]
-            e += d * gx * gy + f * gx * gz + g * gy * gz
-            rest += d * v[7, at] * wx * wy + f * v[8, at] * wx * wz + g * v[9, at] * wy * wz
-        place = sample * size * BLOCK + at
-        energy[place] = e
-        for branch in range(drift.shape[0]):
-            force = drift[branch, 0, cell, now, p] * gx + drift[branch, 1, cell, now, p] * gy
-            tables[branch, place] = rest + e + (force + drift[branch, 2, cell, now, p] * gz)
+    """f_i / h_i, a_ii / (2 h_i^2) and a_ij / (h_i h_j) at the samples, so that V's derivatives are those on [0, 1]."""
+    for output in range(len(drift)):
+        _gathered(drift, output, cells, sample, sides[1 + output % 3], force[output])
+    for axis in range(3):
+        _gathered(square, 4 * axis, cells, sample, 0.5 * sides[1 + axis] * sides[1 + axis], spread[axis])
+    if mixed:
+        _gathered(square, 1, cells, sample, sides[1] * sides[2], spread[3])
+        _gathered(square, 2, cells, sample, sides[1] * sides[3], spread[4])
+        _gathered(square, 5, cells, sample, sides[2] * sides[3], spread[5])
 
 
 @njit(cache=True, nogil=True)
@@ -157,7 +175,7 @@ def extremes_in_space(
     """Write to ``out`` (B, branches, 6): extreme coefficients of R, the least of Q2, extreme samples of R, Q2's size.
 
     ``coefficients`` has shape (B, 4, 64); ``inverse`` (4, B) holds 1 / the sides, time first; ``drift`` has shape
-    (branches, 3, cells, 1 or t, x y z), ``square`` (9, cells, 1 or t, x y z); ``place`` says which cell a patch is.
+    (3 branches, cells, 1 or t, x y z), ``square`` (9, cells, 1 or t, x y z); ``place`` says which cell a patch is.
     ``bases`` are the values of the basis and of its derivatives at the samples: time 0, 1; then 0, 1, 2 of each
     state. ``parts`` (parts, samples, samples) lead from samples to Bernstein coefficients on equal parts of each axis.
     """
@@ -169,23 +187,26 @@ def extremes_in_space(
     stages = (np.empty(16 * nz * BLOCK), np.empty(16 * nz * BLOCK), np.empty(16 * nz * BLOCK),
               np.empty(4 * ny * nz * BLOCK))  # fmt: skip
     v = np.zeros((10, size * BLOCK))
-    tables, energy = np.empty((drift.shape[0], nt * size * BLOCK)), np.empty(nt * size * BLOCK)
+    force, spread = np.empty((drift.shape[0], size * BLOCK)), np.empty((6, size * BLOCK))
+    tables, energy = np.empty((drift.shape[0] // 3, nt * size * BLOCK)), np.empty(nt * size * BLOCK)
     work = (np.empty(size * BLOCK), np.empty(size * BLOCK), np.empty(nt * size * BLOCK), np.empty(nt * size * BLOCK))
     low, high, look = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-    least, most = np.empty(BLOCK), np.empty(BLOCK)
+    least, most, cells, sides = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, dtype=np.intp), np.empty((4, BLOCK))
     count = coefficients.shape[0]
     for begin in range(0, count, BLOCK):
         for s in range(BLOCK):  # the last patch is repeated where the block is not full
-            c[:, :, s] = coefficients[min(begin + s, count - 1)]
-            look[s] = 0.0
+            patch = min(begin + s, count - 1)
+            c[:, :, s], cells[s], sides[:, s], look[s] = coefficients[patch], place[patch], inverse[:, patch], 0.0
         for sample in range(nt):
             _contract(t0[sample : sample + 1], c.reshape(-1), 1, 64 * BLOCK, now)
             _contract(t1[sample : sample + 1], c.reshape(-1), 1, 64 * BLOCK, rate)
-            _derivatives(now, rate, axes, mixed, stages, v)
             for s in range(BLOCK):
-                patch = min(begin + s, count - 1)
-                _residual(v, patch, s, place[patch], sample, inverse, drift, square, mixed, tables, energy)
-        for branch in range(drift.shape[0]):
+                rate[s::BLOCK] *= sides[0, s]
+            _derivatives(now, rate, axes, mixed, stages, v)
+            _model(drift, square, cells, sample, sides, mixed, force, spread)
+            own = slice(sample * size * BLOCK, (sample + 1) * size * BLOCK)
+            _residual(v, force, spread, mixed, tables[:, own], energy[own])
+        for branch in range(len(tables)):
             _extreme_parts(tables[branch], parts, work, low, high)
             _extreme(tables[branch], nt * size, least, most)
             for s in range(min(BLOCK, count - begin)):

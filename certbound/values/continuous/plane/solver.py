@@ -188,7 +188,7 @@ class Solver:
             line = np.ascontiguousarray(right if axis == 0 else right.T)
             speed = np.ascontiguousarray(speeds[axis] if axis == 0 else speeds[axis].T)
             half = np.ascontiguousarray(0.5 * (a[0, 0] if axis == 0 else a[1, 1].T) * np.ones(line.shape))
-            _solve_lines(own.at[0], own.at[1], own.at[2], speed, half, _GAMMA * step, line)
+            solve_lines(own.at[0], own.at[1], own.at[2], speed, half, _GAMMA * step, line)
             line = own.dense[0] @ line
             right = line if axis == 0 else line.T
         return right
@@ -245,7 +245,7 @@ def weakened(plane: Plane, plan: Plan, drift: Array, a: Array, places: tuple[Arr
 
 
 @njit(cache=True)
-def _solve_lines(mass: Array, slope: Array, bend: Array, speed: Array, half: Array, step: float, right: Array) -> None:
+def solve_lines(mass: Array, slope: Array, bend: Array, speed: Array, half: Array, step: float, right: Array) -> None:
     """Solve (mass - step (speed slope + half bend)) k = right along the first axis, line by line, in place.
 
     The three matrices are given by the rows of their bands (entry (i, k) belongs to column i + k - band); the first and
