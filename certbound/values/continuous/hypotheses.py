@@ -100,12 +100,16 @@ class Need:
         return self.spare * (1 + np.exp(np.minimum(self.start - high, 700.0)) * (1 - 1e-13)) * (1 - 1e-13)
 
 
-def examine(surface: Surface, model: Model, need: Need, *, upper: bool) -> Proof:
-    """Enclose R (closely on one side), V and Q2 on every patch of a surface that needs it."""
+def examine(surface: Surface, model: Model, need: Need, *, upper: bool, near: Array | None = None) -> Proof:
+    """Enclose R (closely on one side), V and Q2 on every patch of a surface that needs it.
+
+    ``near``, shape (slabs, *cells), says how far from samples of R its bound may lie where that is nothing to lose.
+    """
     counts = model.counts()
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
     share = _NEAR * (0.5 + 0.5 * surface.times[-1] / (surface.slabs * surface.steps))
+    loose = np.zeros(surface.slabs * per) if near is None else near.reshape(-1)
 
     def look(ends: tuple[int, int]) -> tuple[Index, Ranges] | None:
         patches = surface.patches(*ends)
@@ -116,20 +120,23 @@ def examine(surface: Surface, model: Model, need: Need, *, upper: bool) -> Proof
         kept = np.flatnonzero(~(low >= need.top) & ~(size <= need.free(high)))  # what is no number is looked at
         if not len(kept):
             return None
+        close = np.maximum(share[ends[0] + kept // per] * need.free(high[kept]), loose[ends[0] * per + kept])
         ranges = bound_ranges(
-            patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare,
-            near=share[ends[0] + kept // per] * need.free(high[kept]), upper=upper,
-        )  # fmt: skip
+            patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare, near=close, upper=upper
+        )
         return ends[0] * per + kept, ranges
 
     found = [one for one in side_by_side(look, list(surface.chunks())) if one is not None]
-    empty = np.empty(0)
-    joined = {
-        name: np.concatenate([empty, *(getattr(ranges, name) for _, ranges in found)])
-        for name in Ranges.__dataclass_fields__
-    }
     patch = np.concatenate([np.empty(0, dtype=np.intp), *(index for index, _ in found)])
-    return Proof(ranges=Ranges(**joined), slab=patch // per, cell=patch % per)
+    return Proof(ranges=joined([ranges for _, ranges in found]), slab=patch // per, cell=patch % per)
+
+
+def joined(ranges: Sequence[Ranges]) -> Ranges:
+    """All of them, one after the other."""
+    return Ranges(**{
+        name: np.concatenate([np.empty(0), *(getattr(one, name) for one in ranges)])
+        for name in Ranges.__dataclass_fields__
+    })
 
 
 def side_by_side(look: Callable[[tuple[int, int]], Found], chunks: list[tuple[int, int]]) -> list[Found]:

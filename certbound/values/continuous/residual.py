@@ -1,7 +1,7 @@
 """Ranges of the residual, of V and of |g' grad V|^2 / 2 over cells and slabs.
 
-V is the polynomial of `surface.Surface` on a cell: degree 3 in time, 5 in each state, or 3 in each of three states. With a drift and a squared
-diffusion that are polynomials up to a remainder (`coefficients`), the residual
+V is the polynomial of `surface.Surface` on a cell: degree 3 in time, 5 in each state, or 3 in each of three. With a
+drift and a squared diffusion that are polynomials up to a remainder (`coefficients`), the residual
 
     R = V_t + f.grad V + tr(a V'') / 2 + Q2,        Q2 = grad V' a grad V / 2,
 

@@ -94,7 +94,7 @@ def _derivatives(
     """V_t, V_x, V_y, V_z, V_xx, V_yy, V_zz (and V_xy, V_xz, V_yz) at the samples of space, in the cell's units."""
     x0, x1, x2, y0, y1, y2, z0, z1, z2 = axes
     za, zb, zc, yy = work
-    nx, ny, nz = x0.shape[0], y0.shape[0], z0.shape[0]
+    ny, nz = y0.shape[0], z0.shape[0]
     deep, wide = nz * BLOCK, ny * nz * BLOCK
     _contract(z0, rate, 16, BLOCK, za)
     _contract(y0, za, 4, deep, yy)

@@ -22,6 +22,8 @@ from certbound.values.continuous.polynomials import CUBIC_HERMITE, HERMITE, QUAR
 from certbound.values.continuous.residual import Patches, along, value_range
 from certbound.watch import poll
 
+_MANY = 4000  # cells that are looked at together in three states
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Surface:
@@ -104,6 +106,17 @@ class Surface:
                  self.values[first + 1 : last + 1], self.end_rates[first:last]]  # fmt: skip
         return self._patches(np.stack(parts, axis=1), self.steps[first:last])
 
+    def rows(self, limit: int = 4000) -> Iterator[tuple[int, Surface]]:
+        """The surface in slices along the first state, each with its first cell; ``limit`` cells, or one row."""
+        stride = max(1, limit // int(np.prod(self.cells[1:])))
+        for first in range(0, self.cells[0], stride):
+            own = slice(first, first + stride + 1)
+            parts = [part[:, own] for part in (self.values, self.start_rates, self.end_rates)]
+            yield first, Surface(
+                axes=(self.axes[0][own], *self.axes[1:]), times=self.times, values=parts[0], start_rates=parts[1],
+                end_rates=parts[2],
+            )  # fmt: skip
+
     def chunks(self, limit: int = 4000) -> Iterator[tuple[int, int]]:
         """Ranges of slabs with at most ``limit`` patches (or one slab)."""
         stride = max(1, limit // int(np.prod(self.cells)))
@@ -113,6 +126,9 @@ class Surface:
 
     def range_at(self, index: int) -> tuple[Array, Array]:
         """Bounds of V over each cell at one end of a slab, shape ``cells``."""
+        if len(self.axes) == 3 and np.prod(self.cells) > _MANY:
+            found = [part.range_at(index) for _, part in self.rows(_MANY)]
+            return np.concatenate([low for low, _ in found]), np.concatenate([high for _, high in found])
         data = self.values[index][None, None] * np.ones((1, 4, *([1] * (2 * len(self.axes)))))
         data[:, 1] = data[:, 3] = 0.0
         low, high = value_range(self._patches(data, np.ones(1)))

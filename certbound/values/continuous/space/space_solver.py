@@ -30,6 +30,8 @@ _BENT = 1.5  # jump of V' over five points, times a cell, above which a is raise
 _ZONE = 0.88  # of a cell's mean width: how far from a face the inward drift is weakened
 _CARRIED = 0.5  # of |f_i| times a cell: what is added to a_ii
 _AMPLE = 4.0  # times a_ii, which is enough in place of that
+_FLAT = 6.0  # depth within which the layer at a face without noise is flat
+_ANYWAY = 0.1  # of it, where u_ii < 0: else fronts ring
 
 
 class SpaceSolver:
@@ -68,6 +70,9 @@ class SpaceSolver:
             for side in (0, 1):
                 rate = layer_rate(self.plane, self.plan, axis, side)
                 depth = rate * (place - self.plane.low[axis] if side == 0 else self.plane.high[axis] - place)
+                if not self.plane.noisy(axis):  # flat at the face: what is carried inward has no concave kink
+                    sides.append(-(depth**2) / (depth + _FLAT))
+                    continue
                 bend, curve = self._layer(axis, side, rate)
                 sides.append(np.log1p(bend * depth) + 0.5 * curve * depth**2 * np.exp(-depth) - depth)
         far = np.logaddexp.reduce(sides)
@@ -80,9 +85,6 @@ class SpaceSolver:
 
     def _layer(self, axis: int, side: int, rate: float) -> tuple[Array, Array]:
         """c and b of the layer (1 + c k d) exp(b (k d)^2 exp(-k d) / 2 - k d); a u'' / 2 + f u' = 0 on the face."""
-        if not self.plane.noisy(axis):
-            return np.zeros(1), np.zeros(1)
-        points = self.plane.lattice(axis, np.array([self.plane.low[axis] if side == 0 else self.plane.high[axis]]), 9)
         points = list(self.places)
         points[axis] = np.full(points[axis].shape, self.plane.low[axis] if side == 0 else self.plane.high[axis])
         a = np.maximum(self.plane.square(self.plane.horizon, *points)[axis, axis], 1e-300)
@@ -119,7 +121,7 @@ class SpaceSolver:
         lacking = np.maximum(_CARRIED * np.abs(force) * self.widths[axis] - _AMPLE * a, 0.0)
         if not lacking.any():
             return lacking
-        share = np.clip((bend + slope**2) * self.widths[axis] ** 2 / 0.05, 0.0, 1.0)
+        share = np.clip((bend + slope**2) * self.widths[axis] ** 2 / 0.05, _ANYWAY, 1.0)
         return np.asarray(lacking * share)
 
     def _kinked(self, a: Array, slope: Array, bend: Array, axis: int) -> Array:
