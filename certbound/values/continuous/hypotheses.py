@@ -146,26 +146,31 @@ def side_by_side(look: Callable[[tuple[int, int]], Found], chunks: list[tuple[in
 
 
 def sampled_residual(surface: Surface, model: Model, *, upper: bool = True) -> tuple[Array, Array]:
-    """The largest R among a few samples of each patch in two or three states, and V's least value there: no bounds.
+    """The largest R among a few samples of each patch in two states, and V's least value there: no bounds.
 
     For lower bounds the largest -R of the best branch, and V's largest value. Both have shape (slabs, *cells); a
     sketch of what `examine` finds, at a tenth of its cost.
     """
+    excess, low, high = sampled(surface, model, upper=upper)
+    return excess, low if upper else high
+
+
+def sampled(surface: Surface, model: Model, *, upper: bool = True) -> tuple[Array, Array, Array]:
+    """The same in two or three states, with V's least and largest values."""
     counts, sample = ((4, 5, 5), sample_in_plane) if len(surface.axes) == 2 else ((4, 4, 4, 4), sample_in_space)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
 
-    def look(ends: tuple[int, int]) -> tuple[Array, Array]:
+    def look(ends: tuple[int, int]) -> tuple[Array, Array, Array]:
         patches = surface.patches(*ends)
         place = np.arange(len(patches.size)) % (per if fixed else len(patches.size))
         drifts, squares = fixed or interpolants(surface, model, *ends, counts)
-        excess = sample(patches, drifts, squares, place, counts, upper=upper)
-        return excess, value_range(patches)[0 if upper else 1]
+        return sample(patches, drifts, squares, place, counts, upper=upper), *value_range(patches)
 
     found = side_by_side(look, list(surface.chunks()))
     shape = (surface.slabs, *surface.cells)
-    excess, values = (np.concatenate(parts).reshape(shape) for parts in zip(*found))
-    return excess, values
+    excess, low, high = (np.concatenate(parts).reshape(shape) for parts in zip(*found))
+    return excess, low, high
 
 
 def interpolants(

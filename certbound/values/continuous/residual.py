@@ -232,15 +232,15 @@ def _run_space(
     from certbound.values.continuous.space_kernel import extremes_in_space
 
     bases = [_derivatives(counts[0], TIME, 2), *(_derivatives(count, CUBIC, 3) for count in counts[1:])]
-    changes = tuple(to_parts(count, parts) if parts else np.empty((0, count, count)) for count in counts)
+    time, x, y, z = (to_parts(count, parts) if parts else np.empty((0, count, count)) for count in counts)
     out = np.empty((len(patches.size), len(drifts), 6))
     force = np.ascontiguousarray([drift.samples for drift in drifts])
     square = np.ascontiguousarray(squares.samples)
     extremes_in_space(
         np.ascontiguousarray(patches.coefficients).reshape(len(out), 4, 64),
         1 / np.array([patches.step, *patches.widths]), place, force.reshape(3 * len(force), *force.shape[2:4], -1),
-        square.reshape(*square.shape[:3], -1), bool(square[[1, 2, 5]].any()), tuple(itertools.chain(*bases)), changes,
-        wanted, out,
+        square.reshape(*square.shape[:3], -1), bool(square[[1, 2, 5]].any()), tuple(itertools.chain(*bases)),
+        (time, x, y, z), wanted, out,
     )  # fmt: skip
     return out
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -39,7 +40,26 @@ _ZONE = 0.88  # of the width over the number of cells: how far from a face the i
 _FALL = 0.5  # half of what V may fall by over the cell beside a face, where the drift is inward
 
 
-def integrated(solver: Solver) -> Surface | None:
+class _Timed(Protocol):
+    @property
+    def horizon(self) -> float: ...
+
+
+class Stepper(Protocol):
+    """What `integrated` asks for: V as an array, its rate, steps, and the surface through what was found."""
+
+    @property
+    def plane(self) -> _Timed: ...
+    @property
+    def plan(self) -> Plan: ...
+    def start(self) -> Array: ...
+    def rate(self, tau: float, value: Array) -> Array: ...
+    def steps(self, tau: float, value: Array, span: float) -> int: ...
+    def step(self, tau: float, value: Array, h: float) -> Array: ...
+    def surface(self, times: Array, values: list[Array], first: list[Array], last: list[Array]) -> Surface: ...
+
+
+def integrated(solver: Stepper) -> Surface | None:
     """What a solver makes of its start; None where that breaks down or needs too many steps."""
     plane, plan = solver.plane, solver.plan
     times = slab_times(plane.horizon, plan)

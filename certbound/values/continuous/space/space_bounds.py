@@ -27,7 +27,7 @@ from certbound.values.continuous.hypotheses import (
     extreme_over,
     joined,
     raised_above,
-    sampled_residual,
+    sampled,
     up,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
@@ -43,11 +43,10 @@ _FACTOR = 1.12
 _TOP = -0.03  # where V is above, the proof may lift it over 0 instead
 _CAP = 50.0
 _GRANTED = 0.005  # eps that the proof may pay, in units of the bound, summed over the horizon
-_VARIED = 1.0  # about how much V varies on a patch
 _SLACK = 0.02  # of log P, which bounds of R may add to its samples
 _RATE = 4_000  # patches that are proposed and proved in a second of a processor
 _MOST = 3_000_000  # patches, which take 600 MB
-_PASSES = 3
+_PASSES = 6
 _CLOSE = 0.1
 _WORTH = 0.03  # of log P: a pass that gains less is the last one
 _HOPELESS = 60.0  # what a first proposal may lose (log P)
@@ -69,8 +68,8 @@ def three_states(problem: Problem, model: Model, deadline: float) -> tuple[float
     patches = min(_RATE * max(1.0, round(deadline - time.perf_counter(), 1)), _MOST)
     upper, done = 0.0, []
     level = _rough_level(space)
-    for share in _SHARES:
-        plan = _plan(space, level, share * patches)
+    plans = {plan.cells: plan for plan in (_plan(space, level, share * patches) for share in _SHARES)}
+    for plan in plans.values():
         try:
             sketch = _promising(space, model, plan)
             if sketch is not None:
@@ -157,9 +156,9 @@ class _Sketch:
     @classmethod
     def of(cls, surface: Surface, model: Model, starts: list[tuple[float, float]]) -> _Sketch:
         start = extreme_over(surface, starts, upper=True)
-        found = [sampled_residual(part, model) for _, part in surface.rows()]
-        highest, low = (np.concatenate(parts, axis=1) for parts in zip(*found))
-        paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - low - _VARIED, 50.0))
+        found = [sampled(part, model) for _, part in surface.rows()]
+        highest, low, high = (np.concatenate(parts, axis=1) for parts in zip(*found))
+        paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - high, 50.0))
         return cls(surface=surface, start=start, highest=highest, paid=paid, low=low)
 
     @property

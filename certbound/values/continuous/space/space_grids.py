@@ -33,7 +33,7 @@ class Space:
         """Points with the given places along one axis, and evenly spread ones along the others."""
         ends = [np.linspace(low, high, others) for low, high in zip(self.low, self.high)]
         ends[axis] = places
-        return np.meshgrid(*ends, indexing="ij")
+        return list(np.meshgrid(*ends, indexing="ij"))
 
     def noise(self, points: list[Array]) -> Array:
         """a at the horizon."""

@@ -45,7 +45,7 @@ class SpaceSolver:
         self.slope = [one.dense[1] @ inverse for one, inverse in zip(self.splines, self.inverse)]
         self.bend = [one.dense[2] @ inverse for one, inverse in zip(self.splines, self.inverse)]
         points = [one.points for one in self.splines]
-        self.places = np.meshgrid(*points, indexing="ij")
+        self.places = list(np.meshgrid(*points, indexing="ij"))
         self.gaps = [self._along(np.gradient(one), axis) for axis, one in enumerate(points)]
         widths = [np.interp(one, nodes, np.gradient(nodes)) for one, nodes in zip(points, self.nodes)]
         self.widths = [self._along(width, axis) for axis, width in enumerate(widths)]
@@ -201,7 +201,7 @@ class SpaceSolver:
             for table, out in zip(reversed(tables), found):
                 np.copyto(out, np.einsum("iap,jbq,kcr,pqr->iajbkc", *maps, table, optimize=True))
             for axis in range(3):  # V = 0 on the faces, exactly
-                found[(slice(None), *(slice(None),) * (2 * axis), [0, -1], 0)] = 0.0
+                np.moveaxis(found, (1 + 2 * axis, 2 + 2 * axis), (0, 1))[[0, -1], 0] = 0.0
             return found
 
         forward = self.plane.horizon - times[::-1]
