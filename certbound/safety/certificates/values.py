@@ -106,6 +106,11 @@ def _induction(
 
 def _passage(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]:
     """Continuous time: V and what it is paid with; the coarsest one that costs little."""
+    if problem.system.dimension == 3:
+        raise CertificateError(
+            "no certificate states a value function in continuous time and three states yet; `quadratic` and `barrier` "
+            "write certificates of such problems."
+        )
     if not found.proposed:
         raise CertificateError(
             "no value function was found that a certificate can state: in two states it states bounded boxes, no "

@@ -16,6 +16,7 @@ from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
 
 _SECONDS = 20.0  # about what may be spent
+_SPACE = 120.0  # the same for three states in continuous time
 _LEAST = 1e-3
 _FLOOR = -300.0
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
@@ -28,7 +29,9 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     """
     if asked.quick:
         return EngineAnswer(applicable=False, method="values", reason="left out, since another engine has answered.")
-    limit = max(min(_SECONDS if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
+    wide = problem.system.dimension == 3 and not isinstance(problem.system, DiscreteSystem)
+    most = _SPACE if wide else _SECONDS
+    limit = max(min(most if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
     try:
         if problem.reach is None and serves(problem):
             return _continuous(bound_exits_by_steps(problem, seconds=limit))
