@@ -57,11 +57,11 @@ reach.sets reach.remainder
 reach.contraction reach.linear reach.sampled
 reach
 quadratic
-safety.answers
+safety.answers safety.falsification
 safety.engines safety.starts safety.first_exits
 safety.certificates
 safety.portfolio
-safety.certificate safety.falsification
+safety.certificate
 safety.verdict
 safety.members safety.misses
 safety.decision

@@ -1,13 +1,15 @@
 """The search for a verdict: which engine is asked when, and what is kept once the time is over.
 
-Sketches come first, since they cost next to nothing; then the engines in turn, until one has proved SAFE; then those
-that spared themselves, thoroughly. Under a limit of time an engine that takes long is interrupted for the others, and
-goes on with what they leave: none starves, and nothing is proved twice.
+Sketches come first, since they cost next to nothing; then the engines in turn, until one has proved SAFE, and last
+those of which a sketch says that they have hardly a chance; then those that spared themselves, thoroughly. Under a
+limit of time an engine that takes long is interrupted, early for the first bounds of those that have one soon, later
+for all others, and goes on with what they leave: none starves, and nothing is proved twice.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -30,6 +32,9 @@ _log = logging.getLogger(__name__)
 _LARGE = 60  # states beyond which no other engine is asked once one has proved SAFE
 _PATIENCE = 0.4  # of the time that is left, after which the other engines have a turn
 _TURN = 0.5  # of the time that is left then, for all of them
+_LAST = 0.2  # of the time that is left then, where none of them has much of a chance
+_SOON = 0.5  # seconds after which those that have a first bound soon are asked for it, under a limit
+_UNLIKELY = 4.0  # seconds for an engine that has hardly a chance, once there is a bound
 _EXTRA = 0.2  # of the time that is left, for a bound that can no longer change the verdict
 
 
@@ -74,6 +79,7 @@ class _Search:
         self.answers: dict[str, EngineAnswer] = {}
         self.left_at: dict[str, str] = {}
         self.sketches: dict[str, EngineAnswer] = {}
+        self.chances: dict[Any, float] = {}
 
     @property
     def settled(self) -> bool:
@@ -85,6 +91,11 @@ class _Search:
     def safe(self) -> bool:
         """Whether SAFE is proved."""
         return any(is_safe(answer, self.problem) for answer in (*self.answers.values(), *self.sketches.values()))
+
+    @property
+    def bounded(self) -> bool:
+        """Whether any probability below 1 is proved."""
+        return any(answer.applicable and answer.log10_delta < 0 for answer in self.answers.values())
 
     def spared(self, name: str) -> bool:
         """Whether an engine may be quick: not where it alone could prove UNSAFE of what is near the truth."""
@@ -108,10 +119,11 @@ class _Search:
         if self.problem.system.dimension <= _LARGE and self.request.constants is None:
             for name in (name for name in names if ENGINES[name].sketch):
                 self.sketches[name] = self._asked(name, replace(self.request, quick=True))
+        names = tuple(sorted(names, key=lambda name: not self._likely(name)))
         self._in_turn(names)
         if self.safe or self.request.cells is not None:
             return
-        for name in (name for name in names if ENGINES[name].again):
+        for name in (name for name in names if ENGINES[name].again and (self._likely(name) or not self.bounded)):
             first = self.answers.get(name)
             if first is not None and first.applicable and not first.conclusive:
                 self.ask(name, Request(before=first.details))
@@ -121,18 +133,51 @@ class _Search:
         if not names:
             return
         turn: list[bool] = []
+        patience = _PATIENCE * self.watch.left
+        share = _TURN if any(map(self._likely, names[1:])) or not self._likely(names[0]) else _LAST
 
         def others() -> None:
             turn.append(True)
-            with self.watch.share(_TURN):
+            with self.watch.share(share):
                 self._in_turn(names[1:])
             if self.safe:
                 raise OutOfTime
 
-        with self.watch.after(_PATIENCE * self.watch.left, others):
+        def first_bounds() -> None:
+            self._first_bounds(names[1:])
+            if self.safe:
+                raise OutOfTime
+            self.watch.remind(max(patience - _SOON, 0.0), others)
+
+        early = _SOON < patience < math.inf and not self.bounded
+        with self.watch.after(_SOON if early else patience, first_bounds if early else others):
             self._turn_of(names[0])
         if not turn:
             self._in_turn(names[1:])
+
+    def _first_bounds(self, names: tuple[str, ...]) -> None:
+        """Ask those that have a first bound soon for it."""
+        for name in (name for name in names if name not in self.answers and self._soon(name)):
+            with self.watch.share(_TURN):
+                self.ask(name, replace(self.request, first=True))
+
+    def _soon(self, name: str) -> bool:
+        return 0 < ENGINES[name].soon <= self.problem.system.dimension
+
+    def _likely(self, name: str) -> bool:
+        """Whether no sketch says that an engine has hardly a chance."""
+        chance, sketched = ENGINES[name].chance, self.sketches.get(name)
+        if chance is None or self.request.constants is not None:
+            return True
+        if sketched is not None and sketched.applicable and sketched.log10_delta < 0:
+            return True
+        if chance not in self.chances:
+            try:
+                with contained(name):
+                    self.chances[chance] = chance(self.problem)
+            except EngineError:
+                self.chances[chance] = math.inf
+        return self.chances[chance] >= 1
 
     def _turn_of(self, name: str) -> None:
         quick = self.spared(name)
@@ -141,8 +186,12 @@ class _Search:
         if quick and name in self.sketches:
             self.answers[name] = self.sketches[name]
             return
-        with self.watch.share(_EXTRA if self.safe else 1.0):
-            self.ask(name, replace(self.request, quick=quick))
+        before = self.answers.get(name)  # of a first turn
+        if before is not None and not before.applicable:
+            return
+        most = _UNLIKELY if self.bounded and not self._likely(name) else math.inf
+        with self.watch.share(_EXTRA if self.safe else 1.0, most):
+            self.ask(name, replace(self.request, quick=quick, before=None if before is None else before.details))
 
     def ask(self, name: str, request: Request) -> None:
         """Keep the best that an engine finds; ``OutOfTime`` where the time ended it."""

@@ -23,7 +23,7 @@ from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lo
 from certbound.values.continuous.line import ladder
 from certbound.values.continuous.line.initial_law import start_of
 from certbound.values.continuous.payment import BIN, Levels, Patched, Terms, pay_lower, pay_upper, repay
-from certbound.values.continuous.plane import two_sides
+from certbound.values.continuous.plane import plane_below, two_sides
 from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
 from certbound.values.continuous.plane.plane_grids import Plan, Source
 from certbound.values.continuous.plane.plane_proposal import propose_plane
@@ -428,7 +428,7 @@ def test_two_states_without_coupling_are_as_safe_as_each_alone() -> None:
     assert found.lower is None  # the bound above is small enough
 
 
-def test_a_lower_bound_in_two_states_holds_whatever_is_proposed() -> None:
+def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
     system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.8 * np.eye(2))
     problem = two_free_states().replace(system=system)
     alone = exit_probability(lambda t, x: -x, lambda t, x: 0.8 + 0 * x, -1, 1, 1, 0.0)
@@ -436,8 +436,16 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed() -> None:
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
     plane = two_sides._plane(problem, model, room.outer_low, room.outer_high, starts)
     plan = plan_below(plane, truth, 2500)
+    proposals: list[Any] = []
+    monkeypatch.setattr(plane_below, "propose_plane", lambda *given: proposals.append(given) or propose_plane(*given))
     bound = bound_plane_below(plane, model, plan, starts)
     assert bound is not None
+    assert len(proposals) == 3  # none that is not looked at
+    with monkeypatch.context() as hopeless:
+        hopeless.setattr(plane_below._Sketch, "estimate", lambda self: plan.floor - 100)
+        hopeless.setattr(plane_below, "prove_lower", lambda *given: pytest.fail("nothing can come of this proof"))
+        assert bound_plane_below(plane, model, plan, starts) is None
+    assert len(proposals) == 4
     assert truth - 1.3 < bound <= truth
     surface, rng = propose_plane(plane, plan), np.random.default_rng(0)
     assert surface is not None

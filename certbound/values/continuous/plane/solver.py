@@ -197,8 +197,12 @@ class Solver:
     def steps(self, tau: float, value: Array, span: float) -> int:
         """How many steps a slab needs, so that nothing moves by more than a few cells in one."""
         _, speed_x, speed_y, _ = self._right(tau, value)
-        fastest = max(float(np.max(np.abs(v) / w)) for v, w in zip((speed_x, speed_y), self.widths))
+        fastest = max(float(np.max(np.abs(v) / w)) for v, w in zip((speed_x, speed_y), self._reaches()))
         return max(4, math.ceil(min(span * fastest / _COURANT, 1e6)) if math.isfinite(fastest) else 4)
+
+    def _reaches(self) -> list[Array]:
+        """The width of a cell along both axes, of which V may not move by more than a few in a step."""
+        return list(self.widths)
 
     def _divided(self, right: Array, speeds: tuple[Array, Array], a: Array, step: float, fed: Array) -> Array:
         """(I - g h J_x)^-1 (I - g h J_y)^-1 (I - g h J_s)^-1 applied, J_s = -``fed`` being the source's part."""
