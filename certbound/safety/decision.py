@@ -10,6 +10,8 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from functools import cached_property
+from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 from certbound.errors import EngineError, contained
@@ -74,6 +76,8 @@ class _Search:
         self.answers: dict[str, EngineAnswer] = {}
         self.left_at: dict[str, str] = {}
         self.sketches: dict[str, EngineAnswer] = {}
+        self.spent: dict[str, float] = {}
+        self._inner = 0.0  # seconds of engines that had a turn inside another one's
 
     @property
     def settled(self) -> bool:
@@ -166,9 +170,10 @@ class _Search:
             found(answer)
 
     def _asked(self, name: str, request: Request) -> EngineAnswer:
-        """What an engine answers; where it fails, that it does not apply, and why."""
+        """What an engine answers; where it fails, that it does not apply, and why. ``spent`` counts the seconds."""
         self.watch.engine, self.watch.phase = name, ""
         self.watch.poll()
+        begun, outer, self._inner = perf_counter(), self._inner, 0.0
         try:
             with contained(name):
                 found = request.found
@@ -178,6 +183,10 @@ class _Search:
                 return self._without(self._meeting(name, asked))
         except EngineError as error:
             return EngineAnswer(applicable=False, reason=str(error), method=name)
+        finally:
+            whole = perf_counter() - begun
+            self.spent[name] = self.spent.get(name, 0.0) + whole - self._inner
+            self._inner = outer + whole
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
         """The answer without its lower bound where constants are unknown: it is of disturbances that may change."""
@@ -215,6 +224,7 @@ class _Search:
             self.answers.setdefault(name, answer)
         answers = {name: self.answers[name] for name in ENGINES if name in self.answers}
         found = verdict_of(self.problem, answers, names[0] if len(names) == 1 else "auto")
+        found = replace(found, seconds=MappingProxyType({name: self.spent.get(name, 0.0) for name in answers}))
         over = self.watch.limit is not None and self.watch.left <= 0 and found.status == "UNKNOWN"
         return replace(found, reason=f"{found.reason} {self._undone(names)}".strip()) if over else found
 

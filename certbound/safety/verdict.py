@@ -58,6 +58,8 @@ class Verdict(Shown):
         no engine has one.
     limits : Limits or None
         What would be SAFE, where that was asked for and the problem is not (`certbound.safety.limits`).
+    seconds : mapping of str to float
+        The time that every engine took, by its name.
     members : tuple of Verdict
         Where the start is a union, the verdict on every member; this one is the worst of them.
     """
@@ -77,6 +79,7 @@ class Verdict(Shown):
     answers: Mapping[str, EngineAnswer] = field(default_factory=dict, repr=False)
     log10_lower: float | None = None
     limits: Any = None
+    seconds: Mapping[str, float] = field(default_factory=dict, repr=False)
     members: tuple[Verdict, ...] = field(default=(), repr=False)
 
     @property

@@ -54,6 +54,16 @@ class LinearAnswer:
     def _tightest(self) -> tuple[Requirement | None, int, float]:
         return self.run.tightest(self.shown)
 
+    @cached_property
+    def rooms(self) -> list[tuple[Requirement, Array]]:
+        """Every requirement with the room that the problem's delta leaves of it on each piece; ``margin`` is the least.
+
+        Each is measured along its own direction; empty where nothing was bounded.
+        """
+        if self.shown.bounds is None:
+            return []
+        return list(zip(self.run.requirements[self.shown.cell], self.run.left(self.shown).T))
+
     @property
     def margin(self) -> float:
         """Room left at the problem's delta, in the units of the tightest constraint.
@@ -170,6 +180,14 @@ class SplitAnswer(LinearAnswer):
     @cached_property
     def _tightest(self) -> tuple[Requirement | None, int, float]:
         return min((part._tightest for part in self.parts), key=lambda found: found[2])
+
+    @cached_property
+    def rooms(self) -> list[tuple[Requirement, Array]]:
+        """The least over the cells; see `LinearAnswer.rooms`."""
+        found = [part.rooms for part in self.parts]
+        if not all(found):
+            return []
+        return [(same[0][0], np.min([room for _, room in same], axis=0)) for same in zip(*found)]
 
     @cached_property
     def tube(self) -> DeviationTube | None:
