@@ -7,6 +7,7 @@ goes on with what they leave: none starves, and nothing is proved twice.
 
 from __future__ import annotations
 
+import difflib
 import logging
 from dataclasses import replace
 from functools import cached_property
@@ -269,5 +270,7 @@ def _chosen(method: str) -> tuple[str, ...]:
         return (name,)
     from certbound.tubes.tuning import METHODS
 
-    known = ", ".join(["auto", *ENGINES, *(name for name in METHODS if name != "auto")])
-    raise ValueError(f"`method` must be one of {known}, got {method!r}.")
+    known = ["auto", *ENGINES, *(name for name in METHODS if name != "auto")]
+    near = difflib.get_close_matches(str(method), known, n=1)
+    cure = f"did you mean {near[0]!r}?" if near else "leave it out for the best of all engines."
+    raise ValueError(f"`method` must be one of {', '.join(known)}, got {method!r}; {cure}")
