@@ -76,8 +76,11 @@ def scene_of(problem: Problem, verdict: Verdict, reach: ReachTube, title: str) -
     """What is drawn of a verdict."""
     import numpy as np
 
-    from certbound.plotting import Scene, noisy_reach
+    from certbound.plotting import Scene, measured_rooms, noisy_reach
 
     paths = sampled(problem)
     times = None if paths is None else np.linspace(0.0, float(problem.horizon), paths.shape[1])
-    return Scene(problem=problem, reach=reach, tube=noisy_reach(verdict), times=times, paths=paths, title=title)
+    rooms = measured_rooms(verdict) if verdict.problem is not None and verdict.problem.safe == problem.safe else ()
+    return Scene(
+        problem=problem, reach=reach, tube=noisy_reach(verdict), times=times, paths=paths, rooms=rooms, title=title
+    )

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from certbound.plotting.panels import draw_panel, panels_of
+from certbound.plotting.asked import panels_of
+from certbound.plotting.panels import draw_panel
 from certbound.plotting.plane import draw_plane, plane_of
 from certbound.plotting.scene import BLUE, INK, OUTER, Scene, noisy_reach
 from certbound.plotting.sweep_maps import draw_sweep_into

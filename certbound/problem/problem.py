@@ -293,7 +293,10 @@ class Problem(Shown):
         if plan is None:
             return None
         if system.inputs is None:
-            raise ValueError("`plan` must be omitted for a system without inputs; give the system `inputs=`.")
+            raise ValueError(
+                "`plan` must be omitted for a system without inputs; "
+                "give the system `inputs=` ([inputs] in a problem file)."
+            )
         count = len(system.input_names)
         if callable(plan) or isinstance(plan, Tape):
             tape = plan if isinstance(plan, Tape) else trace(plan, {"t": ["t"], "x": system.states})

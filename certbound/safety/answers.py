@@ -148,6 +148,9 @@ class Request:
     found: Callable[[EngineAnswer], object] = lambda answer: None
 
 
+SPARED = "not asked, since another engine had answered."
+"""The reason of an engine that was left out."""
+
 AS_IT_IS = Request()
 """Nothing but the problem."""
 

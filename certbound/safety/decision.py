@@ -8,10 +8,13 @@ for all others, and goes on with what they leave: none starves, and nothing is p
 
 from __future__ import annotations
 
+import difflib
 import logging
 import math
 from dataclasses import replace
 from functools import cached_property
+from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 from certbound.errors import EngineError, contained
@@ -80,6 +83,8 @@ class _Search:
         self.left_at: dict[str, str] = {}
         self.sketches: dict[str, EngineAnswer] = {}
         self.chances: dict[Any, float] = {}
+        self.spent: dict[str, float] = {}
+        self._inner = 0.0  # seconds of engines that had a turn inside another one's
 
     @property
     def settled(self) -> bool:
@@ -215,9 +220,10 @@ class _Search:
             found(answer)
 
     def _asked(self, name: str, request: Request) -> EngineAnswer:
-        """What an engine answers; where it fails, that it does not apply, and why."""
+        """What an engine answers; where it fails, that it does not apply, and why. ``spent`` counts the seconds."""
         self.watch.engine, self.watch.phase = name, ""
         self.watch.poll()
+        begun, outer, self._inner = perf_counter(), self._inner, 0.0
         try:
             with contained(name):
                 found = request.found
@@ -227,6 +233,10 @@ class _Search:
                 return self._without(self._meeting(name, asked))
         except EngineError as error:
             return EngineAnswer(applicable=False, reason=str(error), method=name)
+        finally:
+            whole = perf_counter() - begun
+            self.spent[name] = self.spent.get(name, 0.0) + whole - self._inner
+            self._inner = outer + whole
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
         """The answer without its lower bound where constants are unknown: it is of disturbances that may change."""
@@ -264,6 +274,7 @@ class _Search:
             self.answers.setdefault(name, answer)
         answers = {name: self.answers[name] for name in ENGINES if name in self.answers}
         found = verdict_of(self.problem, answers, names[0] if len(names) == 1 else "auto")
+        found = replace(found, seconds=MappingProxyType({name: self.spent.get(name, 0.0) for name in answers}))
         over = self.watch.limit is not None and self.watch.left <= 0 and found.status == "UNKNOWN"
         return replace(found, reason=f"{found.reason} {self._undone(names)}".strip()) if over else found
 
@@ -308,5 +319,7 @@ def _chosen(method: str) -> tuple[str, ...]:
         return (name,)
     from certbound.tubes.tuning import METHODS
 
-    known = ", ".join(["auto", *ENGINES, *(name for name in METHODS if name != "auto")])
-    raise ValueError(f"`method` must be one of {known}, got {method!r}.")
+    known = ["auto", *ENGINES, *(name for name in METHODS if name != "auto")]
+    near = difflib.get_close_matches(str(method), known, n=1)
+    cure = f"did you mean {near[0]!r}?" if near else "leave it out for the best of all engines."
+    raise ValueError(f"`method` must be one of {', '.join(known)}, got {method!r}; {cure}")

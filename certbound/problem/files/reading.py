@@ -178,6 +178,9 @@ class _Reader:
         if not table:
             return None
         ends = np.array([self.array(pair, f"{where}.{name}") for name, pair in table.items()])
+        for name, (low, high) in zip(table, ends):
+            if low > high:
+                raise ValueError(f"`{where}.{name}` must be [low, high], got {low:g} > {high:g}; swap the two.")
         return sets.Box(ends[:, 0], ends[:, 1])
 
     def diffusion(self) -> dict[str, Any]:
@@ -241,6 +244,8 @@ class _Reader:
         if set(table) == {"file"} and "file" not in self.inputs:
             return read_plan(self.file(table["file"], "plan.file"), self.inputs)
         for key in table:
+            if not self.inputs:
+                raise ValueError(f"`plan.{key}` must be an input, and the file has none; give an [inputs] table.")
             if key not in self.inputs:
                 raise ValueError(f"unknown key {key!r} in [plan]{nearest(key, [*self.inputs, 'file'])}")
         for name in self.inputs:
@@ -267,8 +272,8 @@ class _Reader:
 
     def box(self, table: Any, where: str, missing: float | None, center: Any = None) -> sets.Box:
         pairs, coordinates = self.by_state(table, where)
-        ends = [self.array(pair, f"{where}.{k}") for k, pair in enumerate(pairs)]
         indices = range(len(self.states)) if coordinates is None else coordinates
+        ends = [self.array(pair, f"{where}.{self.states[k]}") for k, pair in zip(indices, pairs)]
         if missing is None and len(ends) != len(self.states):
             absent = [name for k, name in enumerate(self.states) if k not in indices]
             raise ValueError(f"`{where}` must bound every state, {', '.join(absent)} is missing.")

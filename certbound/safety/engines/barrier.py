@@ -31,7 +31,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.nominal import initial_cells
 from certbound.rigor.intervals import Interval
-from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
+from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
 from certbound.watch import poll, solver_limit
 
@@ -76,7 +76,7 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
 
     It covers the disturbances that do not see coming noise.
     """
-    refused = "another engine is enough." if asked.quick else _refusal(problem)
+    refused = SPARED if asked.quick else _refusal(problem)
     if refused is not None:
         return EngineAnswer(applicable=False, reason=refused, method="barrier")
     assert isinstance(problem.system, ContinuousSystem)

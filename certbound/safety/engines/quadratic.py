@@ -5,7 +5,7 @@ from __future__ import annotations
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.quadratic import QuadraticBound, bound_quadratic
-from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
+from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.watch import seconds_left
 
 _SECONDS = 20.0  # about what may be spent
@@ -21,7 +21,7 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     Proves: P(failing) <= 10**log10_delta for every start and every disturbance that does not see coming noise.
     """
     if asked.quick:
-        return EngineAnswer(applicable=False, method="quadratic", reason="left out, since another engine has answered.")
+        return EngineAnswer(applicable=False, method="quadratic", reason=SPARED)
     if not asked.thorough and problem.system.dimension < _FEW:
         reason = "left out, since value functions on grids say more in one or two states; ask for it by name."
         return EngineAnswer(applicable=False, method="quadratic", reason=reason)

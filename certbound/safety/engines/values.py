@@ -9,7 +9,7 @@ from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.goals import until
 from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
-from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
+from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.values.continuous import ExitBounds, bound_exits
 from certbound.values.discrete import FailureBounds, bound_failure
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
@@ -28,7 +28,7 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     Proves: log10_lower <= log10 of the largest probability of failing over starts and disturbances <= log10_delta.
     """
     if asked.quick:
-        return EngineAnswer(applicable=False, method="values", reason="left out, since another engine has answered.")
+        return EngineAnswer(applicable=False, method="values", reason=SPARED)
     wide = problem.system.dimension == 3 and not isinstance(problem.system, DiscreteSystem)
     most = _SPACE if wide else _SECONDS
     limit = max(min(most if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)

@@ -247,7 +247,7 @@ def check_noise(model: Model, span: tuple[float, float], ends: Sequence[tuple[fl
     if not np.all(smallest > 0):
         raise InfeasibleError(
             "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
-            "direction has none somewhere (noise in the velocities only, say): another engine's answer stands."
+            "direction has none somewhere (noise in the velocities only, say), and value functions prove nothing."
         )
 
 

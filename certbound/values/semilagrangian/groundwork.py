@@ -107,7 +107,7 @@ def _clock(setting: Setting, plan: Plan) -> Clock:
     known = blocks.known
     if not known.any():
         raise InfeasibleError(
-            "the model is undefined, or steps of this length cannot be enclosed; another engine's answer stands."
+            "the model is undefined, or steps of this length cannot be enclosed; value functions prove nothing here."
         )
     ratio = blocks.covariance[1].mid[known] / blocks.covariance[2].mid[known]
     return replace(first, shear=float(np.median(ratio)))
@@ -128,7 +128,7 @@ def _axes(setting: Setting, clock: Clock, plan: Plan, rough: Blocks) -> tuple[Ar
     sigma = math.sqrt(max(float(np.median(yy[known])), 0.0)), math.sqrt(float(np.median(qq[known])))
     if not sigma[0] > 1e-7 * (p1 - p0):
         raise InfeasibleError(
-            "the noise hardly reaches the coordinate without noise; another engine's answer stands."
+            "the noise hardly reaches the coordinate without noise; value functions prove nothing here."
         )
     dip = rough.strays.dip[:, known]
     p0, p1 = p0 + float(np.median(dip[0])), p1 - float(np.median(dip[1]))
@@ -290,7 +290,7 @@ def _groups(blocks: Blocks, usable: Mask) -> list[tuple[int, int]]:
     qq = blocks.covariance[2].mid
     rows = np.flatnonzero(usable.any(axis=1))
     if not len(rows):
-        raise InfeasibleError("no part of the safe set could be followed over a step; another engine's answer stands.")
+        raise InfeasibleError("no part of the safe set could be followed over a step; value functions prove nothing.")
     middle = np.array([float(np.median(line[keep])) if keep.any() else 0.0 for line, keep in zip(qq, usable)])
     tolerance = 5e-4
     while True:

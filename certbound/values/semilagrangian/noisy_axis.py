@@ -61,7 +61,7 @@ def setting_of(problem: Problem) -> Setting:
     if system.disturbance is not None or problem.input_sequence is not None:
         raise InfeasibleError(
             "value functions with noise in one coordinate serve neither disturbances nor plans yet; "
-            "another engine's answer stands."
+            "value functions prove nothing here."
         )
     gain = np.asarray(system.diffusion, dtype=float)
     noisy = int(np.flatnonzero(np.any(gain != 0, axis=1))[0])
@@ -83,7 +83,7 @@ def _reordered(tape: Tape, order: tuple[int, int]) -> Tape:
         if any(live):
             raise InfeasibleError(
                 "value functions with noise in one coordinate serve no models that change with time yet; "
-                "another engine's answer stands."
+                "value functions prove nothing here."
             )
     graph = Graph(("t", "p", "q"))
     slots = [0, 0, 0]
