@@ -203,7 +203,7 @@ class Problem(Shown):
         Raises
         ------
         ValueError
-            If the model uses what problem files do not have (np.where, ...).
+            If the model uses what problem files do not have (the kink of a derivative).
         """
         content: dict[str, Any] = ask_later_room("content", self, f"{self.name}.plan.json")
         return content

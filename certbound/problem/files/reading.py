@@ -13,16 +13,13 @@ from certbound.arrays import Array
 from certbound.checks import names as checked_names
 from certbound.checks import nearest
 from certbound.problem import sets
-from certbound.problem.files.parser import CONSTANTS, constant, is_function, parse
+from certbound.problem.files.parser import RESERVED, constant, parse
 from certbound.problem.files.plans import read_plan
 from certbound.problem.files.schema import Constraint, Cost, Part, PolygonTable, Specification, Start
-from certbound.problem.model import OPERATIONS, Graph, Tape
+from certbound.problem.model import Graph, Tape
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
-
-RESERVED = frozenset({"t", *filter(is_function, OPERATIONS), *CONSTANTS})
-"""Names that no state, input, disturbance, parameter or definition may have."""
 
 
 class _ForbiddenError(ValueError):

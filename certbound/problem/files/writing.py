@@ -10,7 +10,7 @@ import numpy as np
 
 from certbound.problem import sets
 from certbound.problem.files.formulas import formulas
-from certbound.problem.files.reading import RESERVED
+from certbound.problem.files.parser import RESERVED
 from certbound.problem.files.schema import Constraint, Start
 from certbound.problem.model import Tape
 from certbound.problem.noise import check_law
@@ -32,7 +32,7 @@ def describe_problem(problem: Problem, plan_file: str) -> dict[str, Any]:
     """Content of the problem file of any problem, with its model as expressions.
 
     ``plan_file`` is the name to put under ``plan.file`` where the plan is an array (the caller writes it). A model that
-    uses what problem files do not have (np.where, np.sign, ...) is a ValueError.
+    uses what problem files do not have (the kink of a derivative) is a ValueError.
     """
     content = _Writer(problem, plan_file).content()
     return {key: value for key, value in content.items() if value not in ({}, [], None)}
