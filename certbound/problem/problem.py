@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -43,7 +44,7 @@ class Problem(Shown):
     safe : sequence of Inside and Outside
         Constraints, each over its own window.
     horizon : float or int
-        Seconds (CT) or steps (DT); positive.
+        Seconds (CT) or steps (DT); positive. Infinity is for ever, which few engines serve.
     delta : float
         Accepted probability of leaving the safe set, in (0, 1).
     reach : Reach or a set, optional
@@ -134,6 +135,17 @@ class Problem(Shown):
         return self.kept
 
     @property
+    def endless(self) -> bool:
+        """Whether the horizon is infinite."""
+        return math.isinf(self.horizon)
+
+    @property
+    def span(self) -> str:
+        """The horizon in words."""
+        unit = "s" if self.system.time == "continuous" else "steps"
+        return "at any time" if self.endless else f"within {self.horizon:g} {unit}"
+
+    @property
     def failing(self) -> str:
         """What is bounded, in a word."""
         return "leaving" if self.reach is None else "failing"
@@ -182,10 +194,9 @@ class Problem(Shown):
 
     def summary(self) -> str:
         """The problem in one line."""
-        unit = "s" if self.system.time == "continuous" else "steps"
         count = {"state": self.system.dimension, "constraint": len(self.safe)}
         what = ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for word, number in count.items())
-        return f"{name_text(self.name)}, {what}, {self.horizon:g} {unit}, delta {self.delta!r}"
+        return f"{name_text(self.name)}, {what}, {self.span.removeprefix('within ')}, delta {self.delta!r}"
 
     def rows(self) -> list[tuple[str, str]]:
         """Signals, start and constraints."""
@@ -250,6 +261,11 @@ class Problem(Shown):
         return tuple(result)
 
     def _check_window(self, name: str, window: tuple[float, float]) -> None:
+        if self.endless:
+            raise ValueError(
+                f"`{name}` must have no `during` where the horizon is infinite, got {list(window)}; give a finite "
+                "horizon, or leave the window out."
+            )
         if window[1] > self.horizon:
             raise ValueError(
                 f"`{name}` must have `during` within [0, {self.horizon:g}], got {list(window)}; "
@@ -306,6 +322,8 @@ class Problem(Shown):
         return self._array_plan(plan, system.inputs, count)
 
     def _array_plan(self, plan: Any, box: Box, count: int) -> Array:
+        if self.endless:
+            raise ValueError("`plan` must be a feedback law where the horizon is infinite, got an array.")
         rows = np.asarray(plan, dtype=float)
         rows = rows[:, None] if rows.ndim == 1 and count == 1 else rows
         if rows.ndim != 2 or rows.shape[1] != count or not len(rows) or not np.all(np.isfinite(rows)):

@@ -66,6 +66,8 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
+    if problem.endless:
+        raise CertificateError("certificates state finite horizons; verify a finite `horizon`.")
     members = getattr(verdict, "members", ())
     if verdict.status == "UNSAFE" or any(one.status == "UNSAFE" for one in members):
         return _lower_data(problem, verdict, attempt)

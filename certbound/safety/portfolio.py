@@ -57,6 +57,8 @@ class Engine:
         Asked before all others, quickly: that takes next to nothing.
     dear : bool
         Too slow to be asked a dozen times for what would be SAFE.
+    endless : bool
+        Whether it takes infinite horizons without a target.
     reaches : bool
         Whether it takes targets itself; others are asked to meet the target at one time (`certbound.problem.goals`).
     """
@@ -73,6 +75,7 @@ class Engine:
     sketch: bool = False
     dear: bool = False
     reaches: bool = False
+    endless: bool = False
 
 
 ENGINES: dict[str, Engine] = {
@@ -116,6 +119,7 @@ ENGINES: dict[str, Engine] = {
             reserve=True,
             dear=True,
             reaches=True,
+            endless=True,
         ),
         Engine(
             name="quadratic",

@@ -11,7 +11,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.values.continuous import ExitBounds, bound_exits
-from certbound.values.discrete import FailureBounds, bound_failure
+from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
 
@@ -42,6 +42,9 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
 
 def _failure(problem: Problem, limit: float) -> FailureBounds:
     target = problem.reach
+    found = bound_long_run(problem, seconds=limit, delta=problem.delta)
+    if found is not None:
+        return found
     if target is None:
         return bound_failure(problem, seconds=limit, delta=problem.delta)
     first, last = target.during or (0, problem.horizon)
@@ -76,6 +79,8 @@ def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
     least, most = rounded(found.lower, up=False, digits=4), rounded(found.upper, up=True, digits=4)
     below = f"at least {least}" if found.lower > 0 else "no lower bound"
     reason = f"the probability of failing is at most {most} and {below}, on a grid of {cells} cells"
+    if found.rate is not None and found.before is not None:
+        reason += f". {_for_all(found.rate, found.before)}"
     if found.lower > problem.delta:
         reason += f": more than the {problem.delta!r} that is asked, from some start"
     return EngineAnswer(
@@ -86,6 +91,20 @@ def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
         details=found,
         conclusive=found.upper <= _CLOSE * found.lower,
     )
+
+
+def _for_all(rate: tuple[float, float], before: tuple[int, float, float]) -> str:
+    """What is known of every horizon."""
+    low, high = rounded(rate[0], up=False, digits=4), rounded(rate[1], up=True, digits=4)
+    least, most = rounded(before[1], up=False, digits=4), rounded(before[2], up=True, digits=4)
+    return (
+        f"For every T from {before[0]}: 1 - {_power(least, low, before[0])} <= P(leaving within T steps) <= "
+        f"1 - {_power(most, high, before[0])}"
+    )
+
+
+def _power(share: str, rate: str, steps: int) -> str:
+    return f"(1 - {share})(1 - {rate})^(T - {steps})"
 
 
 def log10_outward(probability: float, *, up: bool) -> float:

@@ -67,7 +67,7 @@ def final(grid: Grid, zones: Zones, *, above: bool) -> ValueFunction:
         if zones.has_target:
             level = np.where(zones.undone, 1.0, level)
         fixed = level > 0
-    return _function(grid, np.zeros(grid.node_shape), np.zeros((grid.dimension, *grid.shape)), fixed, level)
+    return assembled(grid, np.zeros(grid.node_shape), np.zeros((grid.dimension, *grid.shape)), fixed, level)
 
 
 def back_above(transition: AnyTransition, value: ValueFunction, zones: Zones) -> ValueFunction:
@@ -79,7 +79,7 @@ def back_above(transition: AnyTransition, value: ValueFunction, zones: Zones) ->
     if zones.has_target:
         ended = zones.done & zones.safe
         fixed, level = fixed | ended, np.where(ended, 0.0, level)
-    return _function(grid, nodal, bend, fixed, level)
+    return assembled(grid, nodal, bend, fixed, level)
 
 
 def values_above(transition: AnyTransition, value: ValueFunction) -> tuple[Array, Array, Mask]:
@@ -104,7 +104,7 @@ def back_below(transition: AnyTransition, value: ValueFunction, zones: Zones) ->
     if zones.has_target:
         maybe = ~zones.undone & ~zones.unsafe
         fixed, level = fixed | maybe, np.where(maybe, 0.0, level)
-    return _function(grid, nodal, bend, fixed, level)
+    return assembled(grid, nodal, bend, fixed, level)
 
 
 def _policy(options: list[Array]) -> Array:
@@ -146,7 +146,7 @@ def _without_holes(nodal: Array, filling: float) -> tuple[Array, Mask]:
     return np.where(bad, filling, nodal), np.logical_or.reduce(corners(bad))
 
 
-def _function(grid: Grid, nodal: Array, bend: Array, fixed: Mask, level: Array) -> ValueFunction:
+def assembled(grid: Grid, nodal: Array, bend: Array, fixed: Mask, level: Array) -> ValueFunction:
     """Cells that are not fixed keep their bends; nodes that only fixed cells use take their level."""
     if not fixed.any():
         return ValueFunction(grid=grid, nodal=nodal, bend=bend, fixed=None, level=level)
