@@ -29,6 +29,9 @@ from certbound.problem.sets import (
 )
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
+DOMAIN = "the model's domain"
+"""Label of the constraint to stay in it."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Problem(Shown):
@@ -58,6 +61,9 @@ class Problem(Shown):
         Weights of x' Q x + u' R u: matrices, or vectors of their diagonals.
     domain : Box, optional
         Where the model is meant; leaving it is never counted as safe (see ``constraints``).
+    leaving : str
+        "unsafe", or "ends": a path that leaves the domain ends there, and does not fail. Value functions in discrete
+        time and simulations count that; other bounds, which hold all the same, count it as failing.
     name : str
         For humans.
     parameters : mapping, optional
@@ -91,6 +97,7 @@ class Problem(Shown):
     plan: Any = field(default=None, kw_only=True)
     cost: Any = field(default=None, kw_only=True)
     domain: Any = field(default=None, kw_only=True)
+    leaving: str = field(default="unsafe", kw_only=True)
     name: str = field(default="problem", kw_only=True)
     parameters: Any = field(default=None, kw_only=True)
     source: Any = field(default=None, kw_only=True, repr=False)
@@ -155,7 +162,12 @@ class Problem(Shown):
         """What a path respects until it is in the target, where there is one; otherwise ``constraints``."""
         if self.domain is None:
             return tuple(self.safe)
-        return (*self.safe, Inside(self.domain, label="the model's domain"))
+        return (*self.safe, Inside(self.domain, label=DOMAIN))
+
+    @property
+    def ending(self) -> bool:
+        """Whether a path that leaves the domain ends there, without failing."""
+        return self.leaving == "ends"
 
     @property
     def starts(self) -> tuple[Region | GaussianStart, ...]:
@@ -297,11 +309,17 @@ class Problem(Shown):
         return named
 
     def _domain(self) -> Box | None:
+        if self.leaving not in ("unsafe", "ends"):
+            raise ValueError(f'`leaving` must be "unsafe" or "ends", got {self.leaving!r}.')
         if self.domain is None:
+            if self.leaving == "ends":
+                raise ValueError('`leaving` must be "unsafe" without a `domain`, got "ends"; give a domain.')
             return None
         if not isinstance(self.domain, Box) or self.domain.moving or self.domain.coordinates is not None:
             raise TypeError(f"`domain` must be a fixed Box over all states, got {self.domain!r}.")
         check_dimension("domain", self.domain, self.system.dimension)
+        if self.leaving == "ends" and not np.isfinite([self.domain.low, self.domain.high]).any():
+            raise ValueError("`domain` must have a bound where leaving it ends a path.")
         return self.domain
 
     def _checked_plan(self) -> Array | Tape | None:

@@ -95,7 +95,7 @@ class _Search:
 
     def violation(self) -> Violation | None:
         """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
-        if self.lasting:
+        if self.lasting or self.problem.ending:
             return None
         self.watch.engine = "noise-free"
         try:
@@ -186,8 +186,12 @@ class _Search:
             return EngineAnswer(applicable=False, reason=str(error), method=name)
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
-        """The answer without its lower bound where constants are unknown: it is of disturbances that may change."""
-        return replace(answer, log10_lower=None, conclusive=False) if self.problem.unknown else answer
+        """The answer without its lower bound where that is of disturbances that may change, or counts too much.
+
+        Constants that are unknown do not change, and a path may end where it leaves the domain.
+        """
+        ends = self.problem.ending and self.problem.system.time == "continuous"
+        return replace(answer, log10_lower=None, conclusive=False) if ends or self.problem.unknown else answer
 
     @cached_property
     def lasting(self) -> bool:

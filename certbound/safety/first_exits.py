@@ -173,6 +173,8 @@ Curve = list[tuple[float, float, float]]
 
 def _check(problem: Problem) -> None:
     check_end(problem, "a curve of exit times")
+    if problem.ending:
+        raise InfeasibleError("exit times count leaving the domain as an exit; leave `leaving` out.")
     if problem.system.dimension != 1:
         raise InfeasibleError(f"exit times are bounded in one state, the problem has {problem.system.dimension}.")
     if len(problem.starts) > 1 or problem.initial.random:

@@ -65,6 +65,7 @@ class _Reader:
             plan=self.plan(),
             cost=None if spec.cost is None else self.weights(spec.cost),
             domain=None if spec.domain is None else self.box(spec.domain.box, "domain.box", np.inf),
+            leaving="unsafe" if spec.domain is None else spec.domain.leaving,
             name=spec.name,
             parameters=self.parameters,
             source=source,

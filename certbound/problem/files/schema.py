@@ -100,6 +100,7 @@ class DomainTable(_Table):
 
     title: ClassVar[str] = "[domain]"
     box: Intervals
+    leaving: Literal["unsafe", "ends"] = "unsafe"
 
 
 class _Choice(_Table):

@@ -82,11 +82,17 @@ class _Writer:
             "cost": cost and {"Q": _rows(cost[0]), "R": _rows(cost[1])},
             "noise": noise,
             "initial": starts[0] if len(starts) == 1 else starts,
-            "domain": None if problem.domain is None else {"box": self.intervals(problem.domain)},
+            "domain": self.domain(),
             "stay": stay,
             "avoid": avoid,
             "reach": [] if problem.reach is None else [self.constraint(problem.reach)],
         }
+
+    def domain(self) -> dict[str, Any] | None:
+        if self.problem.domain is None:
+            return None
+        ends = {"leaving": self.problem.leaving} if self.problem.ending else {}
+        return {"box": self.intervals(self.problem.domain)} | ends
 
     @staticmethod
     def signal(box: sets.Box | None, names: tuple[str, ...]) -> dict[str, Any]:

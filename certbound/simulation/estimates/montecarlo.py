@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.problem.problem import DOMAIN
 from certbound.simulation.blocks import Counts, check_count
 from certbound.simulation.checkpoint import seed_of
 from certbound.simulation.estimates.preparation import Setting, prepare
@@ -143,6 +144,8 @@ def simulate_exits(
     )
     outcome = run_work(work, executor, checkpoint, progress)
     counts = outcome.tally.counts
+    if problem.ending and barriers[-1].label == DOMAIN:  # who left the domain has ended, and does not count
+        rows, counts = [row for row in rows if row is not barriers[-1]], np.delete(counts, len(barriers) - 1, axis=0)
     exits = int(counts.sum())
     lower, upper = bound_binomial(exits, paths, confidence)
     by_constraint: dict[str, int] = {}

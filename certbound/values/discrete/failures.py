@@ -193,6 +193,8 @@ class Work:
             raise Inapplicable(f"a step by step induction takes at most {_MOST_STEPS} steps, not {problem.horizon}.")
         self.problem, self.target, self.n, self.since = problem, target, system.dimension, since
         self.horizon, self.ending = int(problem.horizon), target if since == 0 else None
+        self.limits = problem.safe if problem.ending else problem.constraints
+        self.beyond = 0.0 if problem.ending else 1.0
         self.shocks = shocks_of(system.noise, system.noise_matrix)
         self.dynamics = Dynamics(problem, parts)
         self.boxes: Boxes = boxes_of(problem, self.shocks, self.dynamics)
@@ -244,7 +246,7 @@ class Work:
         made: dict[bytes, Grid] = {}
         for t in range(self.horizon + 1):
             low, high = self.boxes.low[t], self.boxes.high[t]
-            active = active_at(self.problem.constraints, t)
+            active = active_at(self.limits, t)
             moving = any(c.region.moving for c in active) or (self.target is not None and self.target.moving)
             key = b"".join([low.tobytes(), high.tobytes(), repr([id(c) for c in active]).encode()])
             key += repr(t if moving else 0).encode()
@@ -278,8 +280,8 @@ class Work:
         """(step, function above, function below), from the horizon back to step ``end``."""
         last = self.horizon
         zones = [self.zones(grid, t) for t, grid in enumerate(grids)]
-        above = final(grids[last], zones[last], above=True)
-        below = final(grids[last], zones[last], above=False)
+        above = final(grids[last], zones[last], above=True, beyond=self.beyond)
+        below = final(grids[last], zones[last], above=False, beyond=self.beyond)
         yield last, above, below
         kept: tuple[object, AnyTransition] | None = None
         for t in range(last - 1, end - 1, -1):
@@ -301,7 +303,7 @@ class Work:
             if t not in steps:
                 continue
             parts = next((parts for parts in (8, 4, 2) if above.nodal.size * parts**self.n <= _CHARTED), 1)
-            active, cells = active_at(self.problem.constraints, t), grids[t].cells()
+            active, cells = active_at(self.limits, t), grids[t].cells()
             masks = [*respected(active, cells, t), respected(active, cells, t, interiors=True)[1]]
             whole = [np.kron(mask.reshape(grids[t].shape), np.ones([parts] * self.n, dtype=bool)) for mask in masks]
             safe, broken, inner = (mask > 0 for mask in whole)  # for starts, unlike later on, faces count
@@ -314,7 +316,7 @@ class Work:
         return Charts(upper=tuple(upper[::-1]), lower=tuple(lower[::-1]))
 
     def zones(self, grid: Grid, t: int) -> Zones:
-        return zones_of(grid, active_at(self.problem.constraints, t), self.target, t, ends=t >= self.since)
+        return zones_of(grid, active_at(self.limits, t), self.target, t, ends=t >= self.since)
 
     def transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
         step = self.dynamics.step(t, grid)
@@ -342,7 +344,7 @@ class Work:
         grid = self._start_grid(region, share)
         cells = grid.cells()
         meets = ~contains(region, cells, 0)[1]
-        safe, _ = respected(active_at(self.problem.constraints, 0), cells, 0)
+        safe, _ = respected(active_at(self.limits, 0), cells, 0)
         if self.ending is not None:
             meets &= ~(contains(self.ending, cells, 0)[0] & safe)
         if not meets.any():

@@ -47,6 +47,8 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
         If some state is not bounded at some step; the message says what bound would help.
     """
     n, horizon = problem.system.dimension, int(problem.horizon)
+    if problem.ending:
+        return _of_domain(problem, np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (REACH * (1 + 1e-12)))
     low, high = np.empty((horizon + 1, n)), np.empty((horizon + 1, n))
     spread = REACH * (np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (1 + 1e-12))
     reach = _start_box(problem, spread)
@@ -63,6 +65,16 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
         if t < horizon and _needed(problem, t):
             reach = _next_reach(dynamics, t, low[t], high[t], reach, spread)
     return Boxes(low, high, leak)
+
+
+def _of_domain(problem: Problem, spread: Array) -> Boxes:
+    """The domain at all steps, where paths that leave it end."""
+    low, high = np.asarray(problem.domain.low), np.asarray(problem.domain.high)
+    if not np.isfinite([low, high]).all():
+        raise Inapplicable("value functions need a domain that bounds every state, where leaving it ends a path.")
+    _check_box(problem, low, high, 0, spread)
+    steps = (int(problem.horizon) + 1, 1)
+    return Boxes(np.tile(low, steps), np.tile(high, steps), 0.0)
 
 
 def _start_box(problem: Problem, spread: Array) -> tuple[Array, Array]:

@@ -76,7 +76,7 @@ def bound_long_run(
     Inapplicable
         If value functions do not fit the problem; the message says why.
     """
-    short = problem.horizon <= _LONG or problem.reach is not None or not _all_alike(problem)
+    short = problem.ending or problem.horizon <= _LONG or problem.reach is not None or not _all_alike(problem)
     if short and not problem.endless:
         return None
     begun = time.perf_counter()
@@ -127,6 +127,8 @@ class _Run:
     """One problem with all steps alike."""
 
     def __init__(self, problem: Problem, parts: int) -> None:
+        if problem.ending:
+            raise Inapplicable("value functions of infinite horizons count leaving the domain as failing here.")
         if not _all_alike(problem):
             raise Inapplicable(
                 "value functions of infinite horizons need a feedback law, and a model and limits that do not change."
@@ -214,7 +216,7 @@ def _levelled(value: ValueFunction, cells: Mask, level: Array) -> ValueFunction:
     """The function with constants on some more cells."""
     before = np.zeros(value.grid.shape, dtype=bool) if value.fixed is None else value.fixed
     fixed = before | cells
-    return assembled(value.grid, value.nodal, value.bend, fixed, np.where(cells, level, value.level))
+    return assembled(value.grid, value.nodal, value.bend, fixed, np.where(cells, level, value.level), value.beyond)
 
 
 def later(probability: float, rate: float, more: float, *, up: bool) -> float:
