@@ -44,7 +44,7 @@ tubes.exact
 tubes
 values
 values.continuous values.discrete
-values.semilagrangian
+values.semilagrangian values.chains
 simulation.compiled
 simulation
 simulation.estimates

@@ -305,6 +305,11 @@ class Problem(Shown):
             self._check_window("reach", target.during)
             if target.during[1] <= 0:
                 raise ValueError(f"`reach` must have a time after 0 in `during`, got {list(target.during)}.")
+        if target.stays and (self.system.time == "continuous" or self.endless):
+            raise ValueError(
+                '`reach` must not have `then = "stay"` in continuous time, where a path that has just entered leaves '
+                "again, or for ever; state a constraint with `during` from a time on."
+            )
         named: Reach = target.named(self.system.states)
         return named
 

@@ -176,7 +176,11 @@ def problem_data(problem: Problem) -> dict[str, Any]:
     ------
     ValueError
         If the system has inputs and no plan.
+    CertificateError
+        If certificates do not state such problems.
     """
+    if problem.reach is not None and problem.reach.stays:
+        raise CertificateError("certificates do not state targets that are to be stayed in.")
     system, tape = problem.system, problem.closed_loop
     continuous = system.time == "continuous"
     rows = problem.input_sequence
@@ -239,6 +243,8 @@ def _noise(system: Any) -> dict[str, Any]:
         if isinstance(g, Tape):
             return {"law": "wiener", "diffusion": {"columns": int(g.shape[1]), **tape_data(g)}}
         return {"law": "wiener", "diffusion": exact(np.asarray(g, dtype=float))}
+    if system.gain is not None:
+        raise CertificateError("certificates do not state noise that is multiplied by the state in discrete time.")
     law: Law = system.noise
     check_law(law, "be certified", CertificateError)
     return {

@@ -95,7 +95,8 @@ class _Search:
 
     def violation(self) -> Violation | None:
         """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
-        if self.lasting or self.problem.ending:
+        stays = self.problem.reach is not None and self.problem.reach.stays
+        if self.lasting or self.problem.ending or stays:
             return None
         self.watch.engine = "noise-free"
         try:
@@ -179,6 +180,8 @@ class _Search:
                 row = ENGINES[name]
                 if self.lasting and self.problem.reach is None and not row.endless:
                     raise EngineError("this engine needs a finite horizon, and not a very long one.")
+                if not row.reaches and self.problem.reach is not None and self.problem.reach.stays:
+                    raise EngineError("this engine does not serve targets that are to be stayed in.")
                 if self.problem.reach is None or (row.reaches and not self.fixed):
                     return self._without(row.prove(self.problem, asked) if not self.late else self._in_time(row, asked))
                 return self._without(self._meeting(name, asked))
@@ -213,7 +216,7 @@ class _Search:
     def fixed(self) -> bool:
         """Whether the target counts at one time only, so that to meet it then is all that is asked."""
         first, last = window_of(self.problem)
-        return first == last
+        return first == last and not self.problem.reach.stays
 
     @cached_property
     def meeting(self) -> tuple[float, Problem]:

@@ -188,7 +188,8 @@ class _Parser:
         if not is_function(name):
             if name in self.names or name in CONSTANTS:
                 raise self.fail(f"{name!r} is not a function; write * to multiply", token.place)
-            raise self.fail(f"unknown function {name!r}{nearest(name, FUNCTIONS)}", token.place)
+            known = filter(is_function, [*OPERATIONS, "where"])
+            raise self.fail(f"unknown function {name!r}{nearest(name, known)}", token.place)
         self.expect("(")
         arguments = [self.expression(0)]
         while self.peek().text == ",":
@@ -213,16 +214,13 @@ class _Parser:
         return self.graph.apply("add", first, self.graph.apply("if_else_zero", opposite, y))
 
 
-FUNCTIONS = (*(name for name, row in OPERATIONS.items() if row.in_files), "where")
-"""What expressions may call: min and max take two arguments or more, every other as many as on a tape."""
-
-RESERVED = frozenset({"t", *FUNCTIONS, *CONSTANTS, *_LOGIC})
-"""Names that no state, input, disturbance, parameter or definition may have."""
-
-
 def is_function(name: str) -> bool:
-    """Whether expressions may call it."""
-    return name in FUNCTIONS
+    """Whether expressions may call it: min and max take two arguments or more, every other as many as on a tape."""
+    return name == "where" or (name in OPERATIONS and OPERATIONS[name].in_files)
+
+
+RESERVED = frozenset({"t", *filter(is_function, [*OPERATIONS, "where"]), *CONSTANTS, *_LOGIC})
+"""Names that no state, input, disturbance, parameter or definition may have."""
 
 
 def constant(graph: Graph, node: int) -> float | None:

@@ -173,6 +173,7 @@ class Constraint(_Shapes):
     choices: ClassVar[tuple[str, ...]] = (*_Shapes.choices, "all")
     all: Annotated[list[Part], Field(min_length=1)] | None = None
     during: Pair | None = None
+    then: Literal["stay"] | None = None
     label: str | None = None
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from certbound.arrays import Array
 from certbound.problem import sets
 from certbound.problem.files.formulas import formulas
 from certbound.problem.files.parser import RESERVED
@@ -109,13 +110,17 @@ class _Writer:
     def noise(self) -> dict[str, Any]:
         system = self.system
         if isinstance(system, ContinuousSystem):
-            if not isinstance(system.diffusion, Tape):
-                return {"diffusion": _rows(system.diffusion)}
-            texts, columns = self.texts(system.diffusion), system.diffusion.shape[1]
-            return {"diffusion": [texts[k : k + columns] for k in range(0, len(texts), columns)]}
+            return {"diffusion": self.entries(system.diffusion)}
         assert isinstance(system, DiscreteSystem)
         check_law(system.noise, "be written")
-        return system.noise.data() | {"matrix": _rows(system.noise_matrix)}
+        return system.noise.data() | {"matrix": self.entries(system.fixed_gain if system.gain is None else system.gain)}
+
+    def entries(self, value: Array | Tape) -> list[list[Any]]:
+        """A matrix of numbers, or of expressions."""
+        if not isinstance(value, Tape):
+            return _rows(value)
+        texts, columns = self.texts(value), value.shape[1]
+        return [texts[k : k + columns] for k in range(0, len(texts), columns)]
 
     def intervals(self, box: sets.Box) -> dict[str, Any]:
         used = self.states if box.coordinates is None else [self.states[k] for k in box.coordinates]
@@ -151,7 +156,9 @@ class _Writer:
         table = self.region(constraint.region)
         if constraint.during is not None:
             table["during"] = list(constraint.during)
-        usual = type(constraint)(constraint.region, constraint.during).named(self.states).label
+        more = {"then": constraint.then} if isinstance(constraint, sets.Reach) and constraint.stays else {}
+        table |= more
+        usual = type(constraint)(constraint.region, constraint.during, **more).named(self.states).label
         return table if constraint.label == usual else table | {"label": constraint.label}
 
     def start(self, start: Any) -> Mapping[str, Any]:

@@ -10,6 +10,7 @@ from certbound.problem.goals import until
 from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
+from certbound.values.chains import bound_chain
 from certbound.values.continuous import ExitBounds, bound_exits
 from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
@@ -41,15 +42,24 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
 
 
 def _failure(problem: Problem, limit: float) -> FailureBounds:
-    target = problem.reach
     found = bound_long_run(problem, seconds=limit, delta=problem.delta)
     if found is not None:
         return found
-    if target is None:
-        return bound_failure(problem, seconds=limit, delta=problem.delta)
-    first, last = target.during or (0, problem.horizon)
-    plain = until(problem, int(last))
-    return bound_failure(plain, target=target.region, since=int(first), seconds=limit, delta=problem.delta)
+    target = problem.reach
+    try:
+        if target is None:
+            return bound_failure(problem, seconds=limit, delta=problem.delta)
+        if not target.stays:
+            first, last = target.during or (0, problem.horizon)
+            plain = until(problem, int(last))
+            return bound_failure(plain, target=target.region, since=int(first), seconds=limit, delta=problem.delta)
+        refused = "a target that is to be stayed in is served in one or two states"
+    except InfeasibleError as error:
+        refused = str(error)
+    try:
+        return bound_chain(problem, seconds=limit, delta=problem.delta)
+    except InfeasibleError as error:
+        raise InfeasibleError(f"{refused.rstrip('.')}; and {error}") from error
 
 
 def _exits(problem: Problem, limit: float) -> ExitBounds:

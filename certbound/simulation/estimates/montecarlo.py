@@ -16,7 +16,7 @@ from certbound.simulation.checkpoint import seed_of
 from certbound.simulation.estimates.preparation import Setting, prepare
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
 from certbound.simulation.executors import Progress, run_work
-from certbound.simulation.gap_tests import barriers_of, goal_of, tables_of
+from certbound.simulation.gap_tests import barriers_of, goal_of, keep_of, tables_of
 from certbound.simulation.kernel_source import kernel_source
 from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
@@ -134,9 +134,10 @@ def simulate_exits(
     paths, confidence = check_count("paths", paths), check_confidence(confidence)
     setting = prepare(problem, steps, scenario)
     barriers, goal = barriers_of(problem, setting.times), goal_of(problem, setting.times)
-    rows = barriers if goal is None else [*barriers, goal]
+    keep = keep_of(problem, setting.times)
+    rows = [*barriers, *(row for row in (goal, keep) if row is not None)]
     work = setting.work(
-        kernel_source(setting.model, Task(kind="exits", barriers=barriers, goal=goal)),
+        kernel_source(setting.model, Task(kind="exits", barriers=barriers, goal=goal, keep=keep)),
         **tables_of(rows),
         counts_shape=(len(rows), 1 + min(setting.steps, _TIME_BINS)),
         paths=paths,
