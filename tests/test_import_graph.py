@@ -44,7 +44,7 @@ tubes.exact
 tubes
 values
 values.continuous values.discrete
-values.semilagrangian
+values.semilagrangian values.chains
 simulation.compiled
 simulation
 simulation.estimates
@@ -111,7 +111,7 @@ ENTERED = {
 MOST_DOORS = 5
 MANY_DOORS = {
     "values.continuous": (8, "bounds and charts, and the surfaces that certificates state, with what they were paid"),
-    "values.discrete": (7, "kernels and interpolation of discrete time are those of the steps along the flow too"),
+    "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (32, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),

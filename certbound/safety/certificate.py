@@ -66,6 +66,8 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
+    if problem.endless:
+        raise CertificateError("certificates state finite horizons; verify a finite `horizon`.")
     members = getattr(verdict, "members", ())
     if verdict.status == "UNSAFE" or any(one.status == "UNSAFE" for one in members):
         return _lower_data(problem, verdict, attempt)
@@ -174,7 +176,11 @@ def problem_data(problem: Problem) -> dict[str, Any]:
     ------
     ValueError
         If the system has inputs and no plan.
+    CertificateError
+        If certificates do not state such problems.
     """
+    if problem.reach is not None and problem.reach.stays:
+        raise CertificateError("certificates do not state targets that are to be stayed in.")
     system, tape = problem.system, problem.closed_loop
     continuous = system.time == "continuous"
     rows = problem.input_sequence
@@ -194,6 +200,7 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "noise": _noise(system),
         "initial": initial_data(problem.initial),
         "constraints": [_constraint(constraint) for constraint in problem.safe],
+        **({"leaving": problem.leaving} if problem.ending else {}),
         "domain": None if problem.domain is None else _ranges(zip(problem.domain.low, problem.domain.high)),
         **({} if problem.reach is None else {"reach": _constraint(problem.reach)}),
     }
@@ -255,6 +262,8 @@ def _noise(system: Any) -> dict[str, Any]:
         if isinstance(g, Tape):
             return {"law": "wiener", "diffusion": {"columns": int(g.shape[1]), **tape_data(g)}}
         return {"law": "wiener", "diffusion": exact(np.asarray(g, dtype=float))}
+    if system.gain is not None:
+        raise CertificateError("certificates do not state noise that is multiplied by the state in discrete time.")
     law: Law = system.noise
     check_law(law, "be certified", CertificateError)
     return {

@@ -25,7 +25,7 @@ from certbound.safety.answers import EngineAnswer, Request, is_more_than
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import best_time, find_miss, window_of
-from certbound.safety.portfolio import ENGINES, engine_named
+from certbound.safety.portfolio import ENGINES, Engine, engine_named
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
@@ -38,6 +38,7 @@ _TURN = 0.5  # of the time that is left then, for all of them
 _LAST = 0.2  # of the time that is left then, where none of them has much of a chance
 _SOON = 0.5  # seconds after which those that have a first bound soon are asked for it, under a limit
 _UNLIKELY = 4.0  # seconds for an engine that has hardly a chance, once there is a bound
+_LASTING = 100_000  # steps
 _EXTRA = 0.2  # of the time that is left, for a bound that can no longer change the verdict
 
 
@@ -110,6 +111,9 @@ class _Search:
 
     def violation(self) -> Violation | None:
         """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
+        stays = self.problem.reach is not None and self.problem.reach.stays
+        if self.lasting or self.problem.ending or stays:
+            return None
         self.watch.engine = "noise-free"
         try:
             with contained("noise-free"):
@@ -228,8 +232,13 @@ class _Search:
             with contained(name):
                 found = request.found
                 asked = replace(request, found=lambda answer: found(self._without(answer)))
-                if self.problem.reach is None or (ENGINES[name].reaches and not self.fixed):
-                    return self._without(ENGINES[name].prove(self.problem, asked))
+                row = ENGINES[name]
+                if self.lasting and self.problem.reach is None and not row.endless:
+                    raise EngineError("this engine needs a finite horizon, and not a very long one.")
+                if not row.reaches and self.problem.reach is not None and self.problem.reach.stays:
+                    raise EngineError("this engine does not serve targets that are to be stayed in.")
+                if self.problem.reach is None or (row.reaches and not self.fixed):
+                    return self._without(row.prove(self.problem, asked) if not self.late else self._in_time(row, asked))
                 return self._without(self._meeting(name, asked))
         except EngineError as error:
             return EngineAnswer(applicable=False, reason=str(error), method=name)
@@ -239,14 +248,34 @@ class _Search:
             self._inner = outer + whole
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
-        """The answer without its lower bound where constants are unknown: it is of disturbances that may change."""
-        return replace(answer, log10_lower=None, conclusive=False) if self.problem.unknown else answer
+        """The answer without its lower bound where that is of disturbances that may change, or counts too much.
+
+        Constants that are unknown do not change, and a path may end where it leaves the domain.
+        """
+        ends = self.problem.ending and self.problem.system.time == "continuous"
+        return replace(answer, log10_lower=None, conclusive=False) if ends or self.problem.unknown else answer
+
+    @cached_property
+    def lasting(self) -> bool:
+        """Whether the horizon is infinite, or of so many steps that none of them can be looked at."""
+        many = self.problem.system.time == "discrete" and self.problem.horizon > _LASTING
+        return many or self.problem.endless
+
+    @property
+    def late(self) -> bool:
+        """Whether a target may be met at any time, and time goes on without steps: it is met by some time then."""
+        return self.problem.endless and self.problem.reach is not None and self.problem.system.time == "continuous"
+
+    def _in_time(self, row: Engine, request: Request) -> EngineAnswer:
+        """What an engine answers about meeting the target by a time; not to meet it by then says nothing from below."""
+        found = row.prove(self.problem.replace(horizon=self.meeting[0]), request)
+        return replace(found, log10_lower=None, conclusive=False)
 
     @cached_property
     def fixed(self) -> bool:
         """Whether the target counts at one time only, so that to meet it then is all that is asked."""
         first, last = window_of(self.problem)
-        return first == last
+        return first == last and not self.problem.reach.stays
 
     @cached_property
     def meeting(self) -> tuple[float, Problem]:

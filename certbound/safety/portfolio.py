@@ -65,6 +65,8 @@ class Engine:
         ``chance(problem)`` says, from a sketch in floating point that takes next to nothing, how far the constraints
         are away in units of what the engine needs: at less than 1 it comes after those that may do better, and has
         little time of its own once one of them has proved anything.
+    endless : bool
+        Whether it takes infinite horizons without a target.
     reaches : bool
         Whether it takes targets itself; others are asked to meet the target at one time (`certbound.problem.goals`).
     """
@@ -83,6 +85,7 @@ class Engine:
     soon: int = 0
     chance: Callable[[Problem], float] | None = None
     reaches: bool = False
+    endless: bool = False
 
 
 ENGINES: dict[str, Engine] = {
@@ -128,6 +131,7 @@ ENGINES: dict[str, Engine] = {
             reserve=True,
             dear=True,
             reaches=True,
+            endless=True,
         ),
         Engine(
             name="quadratic",

@@ -37,7 +37,10 @@ def derive(
     as_json: JsonOption = False,
 ) -> None:
     """Bound the contraction rate (or gain) and the noise, with a metric for each constraint."""
+    from certbound.problem.goals import check_end
+
     subject = load_problem(problem, pairs, horizon=horizon)
+    check_end(subject, "a rate along the trajectory")
     started = time.perf_counter()
     with (
         progress(f"bounding the constants of {name_text(subject.name)}", time_limit) as tell,

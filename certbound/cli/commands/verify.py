@@ -227,17 +227,17 @@ def _certify(problem: Problem, verdict: Verdict, path: Path, left: float | None)
 
 def _print(problem: Problem, result: dict[str, Any], caution: str) -> None:
     screen = console()
-    unit = "s" if problem.system.time == "continuous" else "steps"
     print_status(screen, result["status"])
     screen.print(
-        f"{name_text(problem.name)}: P({problem.failing} within {problem.horizon:g} {unit}) <= "
+        f"{name_text(problem.name)}: P({problem.failing} {problem.span}) <= "
         f"{log10_text(result['log10_delta'])}{at_least_text(result['log10_lower'])}, asked {result['delta']!r}",
         markup=False,
     )
     if SETTINGS.quiet:
         return
     if result["margin"] is not None and result["constraint"]:
-        when = "" if result["time"] is None else f" at {'t' if unit == 's' else 'step'} = {result['time']:.4g}"
+        clock = "t" if problem.system.time == "continuous" else "step"
+        when = "" if result["time"] is None else f" at {clock} = {result['time']:.4g}"
         margin = rounded(result["margin"], up=False, digits=4)
         where = f"constraint: {one_line(result['constraint'])}{caution}"
         screen.print(f"margin {margin}{when}, {where}", markup=False)

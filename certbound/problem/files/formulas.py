@@ -8,9 +8,12 @@ from types import MappingProxyType
 from certbound.problem.files.parser import is_function
 from certbound.problem.model import Network, Tape
 
-_INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2)}
+_INFIX = {
+    "or": ("or", 1), "and": ("and", 2), "lt": ("<", 4), "le": ("<=", 4), "eq": ("==", 4), "ne": ("!=", 4),
+    "add": ("+", 5), "sub": ("-", 5), "mul": ("*", 6), "div": ("/", 6),
+}  # fmt: skip
+_NOT, _TIGHT, _SIGN, _POWER, _ATOM = 3, 6, 7, 8, 9
 _DEEPEST = 12
-_ATOM = 5
 
 
 def formulas(
@@ -20,7 +23,7 @@ def formulas(
 
     Returns the definitions in order, their fresh names taken from ``names``, and one expression per output: read again,
     they give the same operations on the same numbers. ``networks`` names those that the tape calls. An operation that
-    problem files do not have (where, sign, floor, comparisons) is a ValueError.
+    problem files do not have (the kink of a derivative) is a ValueError.
     """
     uses = [0] * len(tape.nodes)
     for node in tape.nodes:
@@ -48,19 +51,23 @@ def _text(
     if node.op == "input":
         return tape.inputs[node.args[0]], _ATOM
     if node.op == "const":
-        return _number(node.value), _ATOM if node.value >= 0 else 3
+        return _number(node.value), _ATOM if node.value >= 0 else _SIGN
     if node.op in _INFIX:
         symbol, strength = _INFIX[node.op]
-        left = _bracketed(texts[node.args[0]], strength)
+        left = _bracketed(texts[node.args[0]], strength + (strength == _INFIX["lt"][1]))
         right = _bracketed(texts[node.args[1]], strength + 1)
-        space = " " if strength == 1 else ""
+        space = "" if strength == _TIGHT else " "
         return f"{left}{space}{symbol}{space}{right}", strength
     if node.op == "neg":
-        return f"-{_bracketed(texts[node.args[0]], 4)}", 3
+        return f"-{_bracketed(texts[node.args[0]], _POWER)}", _SIGN
+    if node.op == "not":
+        return f"not {_bracketed(texts[node.args[0]], _NOT + 1)}", _NOT
+    if node.op == "if_else_zero":
+        return f"where({texts[node.args[0]][0]}, {texts[node.args[1]][0]}, 0)", _ATOM
     if node.op in ("sq", "pow"):
         exponent = 2.0 if node.op == "sq" else node.value
         power = _number(exponent) if exponent >= 0 else f"({_number(exponent)})"
-        return f"{_bracketed(texts[node.args[0]], _ATOM)}**{power}", 4
+        return f"{_bracketed(texts[node.args[0]], _ATOM)}**{power}", _POWER
     if node.part is not None and not node.part.by and node.part.network in networks:
         name = networks[node.part.network]
         return f"{name}({', '.join(texts[arg][0] for arg in node.args)})[{node.part.output}]", _ATOM

@@ -103,8 +103,8 @@ def save(problem: Problem, path: str | Path) -> None:
     Raises
     ------
     ValueError
-        If the path does not end in ``.toml``, or the model uses what problem files do not have (np.where,
-        ...).
+        If the path does not end in ``.toml``, or the model uses what problem files do not have (the
+        kink of a derivative).
     """
     from certbound.problem.files.writing import content_of, networks_of
 

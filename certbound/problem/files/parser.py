@@ -1,8 +1,8 @@
 """Expressions in problem files: a small language with a parser of its own, safe on a stranger's file.
 
-Numbers, names, ``+ - * / **``, parentheses, the functions below and the outputs ``policy(x, v)[0]`` of the file's
-networks; nothing else exists, so nothing else can be reached. ``**`` binds tighter than a sign on its left, as in
-Python.
+Numbers, names, ``+ - * / **``, comparisons with ``and or not``, parentheses, functions and the outputs
+``policy(x, v)[0]`` of the file's networks; nothing else exists, so nothing else can be reached. All bind as in Python,
+where ``**`` is tighter than a sign on its left; a truth is 0 or 1.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CONSTANTS: Mapping[str, float] = {"pi": math.pi}
 _LONGEST, _DEEPEST = 20_000, 60
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)|(?P<name>[^\W\d]\w*)"
-    r"|(?P<symbol>\*\*|[-+*/(),]))"
+    r"|(?P<symbol>\*\*|[<>=!]=|[-+*/(),<>]))"
 )
 _CURES = {
     ".": "attribute access does not exist here",
@@ -32,8 +32,16 @@ _CURES = {
     "'": "text does not exist here",
     '"': "text does not exist here",
 }
-_BINDING = {"+": 1, "-": 1, "*": 2, "/": 2, "**": 4}
-_SIGN = 3
+_COMPARISONS = {
+    "<": ("lt", False), "<=": ("le", False), ">": ("lt", True), ">=": ("le", True), "==": ("eq", False),
+    "!=": ("ne", False),
+}  # fmt: skip
+"""The tape's operation of each, and whether it takes the sides in the other order."""
+_BINDING = {
+    "or": 1, "and": 2, **dict.fromkeys(_COMPARISONS, 4), "+": 5, "-": 5, "*": 6, "/": 6, "**": 8,
+}  # fmt: skip
+_NOT, _SIGN = 3, 7
+_LOGIC = ("and", "or", "not")
 
 
 class _Token(NamedTuple):
@@ -103,7 +111,8 @@ class _Parser:
                 cure = _CURES.get(character, "such a character does not exist here")
                 raise self.fail(f"{cure} ({character!r})", place + blank)
             kind = match.lastgroup or "symbol"
-            tokens.append(_Token(kind, match.group(kind), match.start(kind)))
+            word = match.group(kind)
+            tokens.append(_Token("symbol" if word in _LOGIC else kind, word, match.start(kind)))
             place = match.end()
         return [*tokens, _Token("end", "the end", end)]
 
@@ -138,6 +147,13 @@ class _Parser:
         if token.text == "**":
             return self.power(left, self.expression(_SIGN - 1))
         right = self.expression(strength)
+        if token.text in _COMPARISONS:
+            if self.peek().text in _COMPARISONS:
+                raise self.fail("a chain of comparisons does not exist here; write a < b and b < c", self.peek().place)
+            op, turned = _COMPARISONS[token.text]
+            return self.graph.apply(op, *((right, left) if turned else (left, right)))
+        if token.text in _LOGIC:
+            return self.graph.apply(token.text, left, right)
         if token.text == "/" and self.graph.number(right) == 0:
             raise self.fail("division by 0", token.place)
         op = {"+": "add", "-": "sub", "*": "mul", "/": "div"}[token.text]
@@ -165,6 +181,8 @@ class _Parser:
         if token.text in ("-", "+"):
             node = self.expression(_SIGN)
             return self.graph.apply("neg", node) if token.text == "-" else node
+        if token.text == "not" and token.kind == "symbol":
+            return self.graph.apply("not", self.expression(_NOT))
         raise self.fail(f"expected a value, got {token.text!r}", token.place)
 
     def variable(self, token: _Token) -> int:
@@ -185,13 +203,15 @@ class _Parser:
         if not is_function(name):
             if name in self.names or name in CONSTANTS:
                 raise self.fail(f"{name!r} is not a function; write * to multiply", token.place)
-            known = [*filter(is_function, OPERATIONS), *self.networks]
+            known = [*filter(is_function, [*OPERATIONS, "where"]), *self.networks]
             raise self.fail(f"unknown function {name!r}{nearest(name, known)}", token.place)
         arguments = self.arguments()
-        count = ARITY[name]
+        count = 3 if name == "where" else ARITY[name]
         if len(arguments) != count and not (name in ("min", "max") and len(arguments) > 2):
             wanted = f"{count} argument{'s' * (count > 1)}"
             raise self.fail(f"{name} takes {wanted}, got {len(arguments)}", token.place)
+        if name == "where":
+            return self.choice(*arguments)
         node = self.graph.apply(name, *arguments[:count])
         for argument in arguments[count:]:
             node = self.graph.apply(name, node, argument)
@@ -222,9 +242,19 @@ class _Parser:
         return self.graph.part(Part(network, int(number)), tuple(arguments))
 
 
+    def choice(self, condition: int, x: int, y: int) -> int:
+        """``where``: x where the condition holds, else y."""
+        first, opposite = self.graph.apply("if_else_zero", condition, x), self.graph.apply("not", condition)
+        return self.graph.apply("add", first, self.graph.apply("if_else_zero", opposite, y))
+
+
 def is_function(name: str) -> bool:
     """Whether expressions may call it: min and max take two arguments or more, every other as many as on a tape."""
-    return name in OPERATIONS and OPERATIONS[name].in_files
+    return name == "where" or (name in OPERATIONS and OPERATIONS[name].in_files)
+
+
+RESERVED = frozenset({"t", *filter(is_function, [*OPERATIONS, "where"]), *CONSTANTS, *_LOGIC})
+"""Names that no state, input, disturbance, parameter or definition may have."""
 
 
 def constant(graph: Graph, node: int) -> float | None:

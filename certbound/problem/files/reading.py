@@ -13,17 +13,14 @@ from certbound.arrays import Array
 from certbound.checks import names as checked_names
 from certbound.checks import nearest
 from certbound.problem import sets
-from certbound.problem.files.parser import CONSTANTS, constant, is_function, parse
+from certbound.problem.files.parser import RESERVED, constant, parse
 from certbound.problem.files.plans import read_plan
 from certbound.problem.files.schema import Constraint, Cost, Part, PolygonTable, Specification, Start
-from certbound.problem.model import OPERATIONS, Graph, Tape
+from certbound.problem.model import Graph, Tape, sources
 from certbound.problem.networks import network
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
-
-RESERVED = frozenset({"t", *filter(is_function, OPERATIONS), *CONSTANTS})
-"""Names that no state, input, disturbance, parameter or definition may have."""
 
 
 class _ForbiddenError(ValueError):
@@ -71,6 +68,7 @@ class _Reader:
             plan=self.plan(),
             cost=None if spec.cost is None else self.weights(spec.cost),
             domain=None if spec.domain is None else self.box(spec.domain.box, "domain.box", np.inf),
+            leaving="unsafe" if spec.domain is None else spec.domain.leaving,
             name=spec.name,
             parameters=self.parameters,
             source=source,
@@ -198,13 +196,24 @@ class _Reader:
             value = [[value]] if len(self.states) == 1 else value
         if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
             return {"diffusion": self.array(value, "noise.diffusion")}
+        return {"diffusion": self.expressions(value, "noise.diffusion")}
+
+    def expressions(self, value: list[Any], name: str) -> Tape:
+        """A matrix of expressions in t and the states."""
         rows: list[list[float | str]] = [list(row) for row in value if isinstance(row, list)]
         texts = [entry for row in rows for entry in row]
         shape = (len(rows), len(rows[0]))
         if len(texts) != shape[0] * shape[1] or any(len(row) != shape[1] for row in rows):
-            raise ValueError("`noise.diffusion` must have rows of equal length.")
-        where = [f"noise.diffusion.{k // shape[1]}.{k % shape[1]}" for k in range(len(texts))]
-        return {"diffusion": self.function(texts, ("t", *self.states), where, shape)}
+            raise ValueError(f"`{name}` must have rows of equal length.")
+        where = [f"{name}.{k // shape[1]}.{k % shape[1]}" for k in range(len(texts))]
+        return self.function(texts, ("t", *self.states), where, shape)
+
+    def gain(self, value: Any, name: str) -> Array | Tape:
+        """G: numbers, or expressions in t and the states."""
+        if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
+            return self.matrix(value, name)
+        tape = self.expressions(value, name)
+        return tape if any(sources(tape)) else self.matrix(value, name)
 
     def law(self) -> dict[str, Any]:
         table = self.spec.noise
@@ -232,7 +241,7 @@ class _Reader:
         level = {key: self.array(value, f"noise.{key}") for key, value in entries.items()}
         result: dict[str, Any] = {"noise": build(**level, **tables, **flags)}
         if table.matrix is not None:
-            result["noise_matrix"] = self.matrix(table.matrix, "noise.matrix")
+            result["noise_matrix"] = self.gain(table.matrix, "noise.matrix")
         return result
 
     # the plan, the cost, the sets
@@ -345,6 +354,7 @@ class _Reader:
 
     def stays(self, table: Constraint, where: str) -> list[Any]:
         """Staying in an intersection is staying in each of its parts."""
+        _refuse_then(table, where)
         during = None if table.during is None else self.array(table.during, f"{where}.during")
         return [sets.Inside(part, during=during, label=table.label) for part in self.parts(table, where)]
 
@@ -353,6 +363,9 @@ class _Reader:
         whole, outward = table.all is not None, kind is sets.Outside
         parts = self.parts(table, where, outward=outward)
         region = sets.intersection(parts, dimension=len(self.states), outward=outward) if whole else parts[0]
+        if kind is sets.Reach:
+            return kind(region, during=during, label=table.label, then=table.then)
+        _refuse_then(table, where)
         return kind(region, during=during, label=table.label)
 
     def parts(self, table: Constraint, where: str, *, outward: bool = False) -> list[Any]:
@@ -387,6 +400,11 @@ class _Reader:
                 center = self.place(full, f"{where}.center")[0]
             return self.box(table.box, where, np.inf, center)
         return self.shape(getattr(table, table.chosen), table.chosen, where)
+
+
+def _refuse_then(table: Constraint, where: str) -> None:
+    if table.then is not None:
+        raise ValueError(f"`{where}.then` must be omitted, got {table.then!r}; it says what follows in a [[reach]].")
 
 
 _SHAPES: dict[str, Any] = {shape.kind: shape for name in sets.__all__ if hasattr(shape := getattr(sets, name), "kind")}

@@ -100,6 +100,7 @@ class DomainTable(_Table):
 
     title: ClassVar[str] = "[domain]"
     box: Intervals
+    leaving: Literal["unsafe", "ends"] = "unsafe"
 
 
 class _Choice(_Table):
@@ -172,6 +173,7 @@ class Constraint(_Shapes):
     choices: ClassVar[tuple[str, ...]] = (*_Shapes.choices, "all")
     all: Annotated[list[Part], Field(min_length=1)] | None = None
     during: Pair | None = None
+    then: Literal["stay"] | None = None
     label: str | None = None
 
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from certbound.arrays import Array
 from certbound.problem import sets
 from certbound.problem.files.formulas import formulas
-from certbound.problem.files.reading import RESERVED
+from certbound.problem.files.parser import RESERVED
 from certbound.problem.files.schema import Constraint, Start
 from certbound.problem.model import Network, Tape
 from certbound.problem.noise import check_law
@@ -60,7 +61,7 @@ def describe_problem(problem: Problem, plan_file: str) -> dict[str, Any]:
     """Content of the problem file of any problem, with its model as expressions.
 
     ``plan_file`` is the name to put under ``plan.file`` where the plan is an array (the caller writes it). A model that
-    uses what problem files do not have (np.where, np.sign, ...) is a ValueError.
+    uses what problem files do not have (the kink of a derivative) is a ValueError.
     """
     content = _Writer(problem, plan_file).content()
     return {key: value for key, value in content.items() if value not in ({}, [], None)}
@@ -112,11 +113,17 @@ class _Writer:
             "cost": cost and {"Q": _rows(cost[0]), "R": _rows(cost[1])},
             "noise": noise,
             "initial": starts[0] if len(starts) == 1 else starts,
-            "domain": None if problem.domain is None else {"box": self.intervals(problem.domain)},
+            "domain": self.domain(),
             "stay": stay,
             "avoid": avoid,
             "reach": [] if problem.reach is None else [self.constraint(problem.reach)],
         }
+
+    def domain(self) -> dict[str, Any] | None:
+        if self.problem.domain is None:
+            return None
+        ends = {"leaving": self.problem.leaving} if self.problem.ending else {}
+        return {"box": self.intervals(self.problem.domain)} | ends
 
     @staticmethod
     def signal(box: sets.Box | None, names: tuple[str, ...]) -> dict[str, Any]:
@@ -133,13 +140,17 @@ class _Writer:
     def noise(self) -> dict[str, Any]:
         system = self.system
         if isinstance(system, ContinuousSystem):
-            if not isinstance(system.diffusion, Tape):
-                return {"diffusion": _rows(system.diffusion)}
-            texts, columns = self.texts(system.diffusion), system.diffusion.shape[1]
-            return {"diffusion": [texts[k : k + columns] for k in range(0, len(texts), columns)]}
+            return {"diffusion": self.entries(system.diffusion)}
         assert isinstance(system, DiscreteSystem)
         check_law(system.noise, "be written")
-        return system.noise.data() | {"matrix": _rows(system.noise_matrix)}
+        return system.noise.data() | {"matrix": self.entries(system.fixed_gain if system.gain is None else system.gain)}
+
+    def entries(self, value: Array | Tape) -> list[list[Any]]:
+        """A matrix of numbers, or of expressions."""
+        if not isinstance(value, Tape):
+            return _rows(value)
+        texts, columns = self.texts(value), value.shape[1]
+        return [texts[k : k + columns] for k in range(0, len(texts), columns)]
 
     def intervals(self, box: sets.Box) -> dict[str, Any]:
         used = self.states if box.coordinates is None else [self.states[k] for k in box.coordinates]
@@ -175,7 +186,9 @@ class _Writer:
         table = self.region(constraint.region)
         if constraint.during is not None:
             table["during"] = list(constraint.during)
-        usual = type(constraint)(constraint.region, constraint.during).named(self.states).label
+        more = {"then": constraint.then} if isinstance(constraint, sets.Reach) and constraint.stays else {}
+        table |= more
+        usual = type(constraint)(constraint.region, constraint.during, **more).named(self.states).label
         return table if constraint.label == usual else table | {"label": constraint.label}
 
     def start(self, start: Any) -> Mapping[str, Any]:

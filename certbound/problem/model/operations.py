@@ -168,9 +168,11 @@ def _power_slope(g: Builder, a: int, exponent: float, node: int) -> int:
     return g.apply("mul", g.const(exponent), g.apply("div", node, a))
 
 
-def _step(numpy: Callable[..., Any], kernel: str, interval: Callable[..., Interval]) -> Operation:
+def _step(
+    numpy: Callable[..., Any], kernel: str, interval: Callable[..., Interval], *, in_files: bool = False
+) -> Operation:
     """An operation that jumps and is constant beside that."""
-    return Operation(numpy, kernel, interval, ts.jump(interval), jump=_split)
+    return Operation(numpy, kernel, interval, ts.jump(interval), jump=_split, in_files=in_files)
 
 
 def _function(
@@ -238,8 +240,8 @@ OPERATIONS: dict[str, Operation] = {
     ),
     "abs": _function(np.abs, "abs({0})", iv.abs_, ts.abs_, lambda g, a, y: g.apply("kink", a), kink=_holds_zero),
     "kink": Operation(np.sign, _SIGN, iv.kink, ts.kink, kink=_holds_zero),
-    "sign": _step(np.sign, _SIGN, iv.sign),
-    "floor": _step(np.floor, "np.floor({0})", iv.floor),
+    "sign": _step(np.sign, _SIGN, iv.sign, in_files=True),
+    "floor": _step(np.floor, "np.floor({0})", iv.floor, in_files=True),
     "not": _step(lambda a: np.asarray(np.equal(a, 0), dtype=float)[()], "(1.0 if {0} == 0.0 else 0.0)", iv.not_),
     "pow": Operation(
         lambda base, exponent: np.power(np.asarray(base, dtype=float), exponent), "{0} ** {1}", iv.pow_, ts.power,

@@ -51,6 +51,8 @@ def values_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
 
     CertificateError where the checker knows no proof of what was bounded.
     """
+    if problem.ending:
+        raise CertificateError("the checker counts leaving the domain as failing, and this bound does not.")
     effort = min(attempt, len(_ROOMS) - 1)
     flat = isinstance(answer.details, ExitBounds) and problem.system.dimension > 1
     room = _ROOMS[effort] * (_MORE_ROOM if flat else 1)
@@ -67,6 +69,8 @@ def values_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
 def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
     """The same for the lower bound."""
     effort = min(attempt, len(_ROOMS) - 1)
+    if problem.ending:
+        raise CertificateError("certificates of lower bounds count leaving the domain as failing.")
     if answer.log10_lower is None:
         raise CertificateError("no lower bound was found.")
     if not problem.initial.random and problem.initial.data(_STARTS)["kind"] not in _STARTS:

@@ -10,8 +10,9 @@ from certbound.problem.goals import until
 from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
+from certbound.values.chains import bound_chain
 from certbound.values.continuous import ExitBounds, bound_exits
-from certbound.values.discrete import FailureBounds, bound_failure
+from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
 
@@ -44,12 +45,24 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
 
 
 def _failure(problem: Problem, limit: float) -> FailureBounds:
+    found = bound_long_run(problem, seconds=limit, delta=problem.delta)
+    if found is not None:
+        return found
     target = problem.reach
-    if target is None:
-        return bound_failure(problem, seconds=limit, delta=problem.delta)
-    first, last = target.during or (0, problem.horizon)
-    plain = until(problem, int(last))
-    return bound_failure(plain, target=target.region, since=int(first), seconds=limit, delta=problem.delta)
+    try:
+        if target is None:
+            return bound_failure(problem, seconds=limit, delta=problem.delta)
+        if not target.stays:
+            first, last = target.during or (0, problem.horizon)
+            plain = until(problem, int(last))
+            return bound_failure(plain, target=target.region, since=int(first), seconds=limit, delta=problem.delta)
+        refused = "a target that is to be stayed in is served in one or two states"
+    except InfeasibleError as error:
+        refused = str(error)
+    try:
+        return bound_chain(problem, seconds=limit, delta=problem.delta)
+    except InfeasibleError as error:
+        raise InfeasibleError(f"{refused.rstrip('.')}; and {error}") from error
 
 
 def _exits(problem: Problem, limit: float) -> ExitBounds:
@@ -79,6 +92,8 @@ def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
     least, most = rounded(found.lower, up=False, digits=4), rounded(found.upper, up=True, digits=4)
     below = f"at least {least}" if found.lower > 0 else "no lower bound"
     reason = f"the probability of failing is at most {most} and {below}, on a grid of {cells} cells"
+    if found.rate is not None and found.before is not None:
+        reason += f". {_for_all(found.rate, found.before)}"
     if found.lower > problem.delta:
         reason += f": more than the {problem.delta!r} that is asked, from some start"
     return EngineAnswer(
@@ -89,6 +104,20 @@ def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
         details=found,
         conclusive=found.upper <= _CLOSE * found.lower,
     )
+
+
+def _for_all(rate: tuple[float, float], before: tuple[int, float, float]) -> str:
+    """What is known of every horizon."""
+    low, high = rounded(rate[0], up=False, digits=4), rounded(rate[1], up=True, digits=4)
+    least, most = rounded(before[1], up=False, digits=4), rounded(before[2], up=True, digits=4)
+    return (
+        f"For every T from {before[0]}: 1 - {_power(least, low, before[0])} <= P(leaving within T steps) <= "
+        f"1 - {_power(most, high, before[0])}"
+    )
+
+
+def _power(share: str, rate: str, steps: int) -> str:
+    return f"(1 - {share})(1 - {rate})^(T - {steps})"
 
 
 def log10_outward(probability: float, *, up: bool) -> float:

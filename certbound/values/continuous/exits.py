@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from certbound.errors import InfeasibleError
+from certbound.problem.goals import check_end
 from certbound.problem.model import Node, Tape, edged, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box
@@ -225,6 +226,7 @@ def _check(problem: Problem, target: Any, seconds: float, most: int = 2) -> None
         raise TypeError(f"`problem` must be a Problem, got {problem!r}.")
     if not seconds > 0:
         raise ValueError(f"`seconds` must be positive, got {seconds!r}.")
+    check_end(problem, "a value function in continuous time")
     if problem.system.time != "continuous":
         raise InfeasibleError("value functions of this kind need continuous time; the problem is discrete.")
     if problem.system.dimension > most:
