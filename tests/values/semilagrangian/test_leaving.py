@@ -117,7 +117,7 @@ def test_more_work_buys_finer_plans_and_the_clock_is_not_asked() -> None:
     setting = setting_of(mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.5, (0.1, 0.0)))
     turn = leaving._turn(setting)
     assert leaving._affordable(setting, turn, 1.0) == [leaving._PLANS[0]]
-    first, chosen = leaving._affordable(setting, turn, 7.3e6)
+    first, chosen = leaving._affordable(setting, turn, 1.2e7)
     assert first == leaving._PLANS[0]
     assert chosen in leaving._PLANS[1:-1]
 
