@@ -240,7 +240,10 @@ class _Columns:
         if not (reach < _SMALL and cubic.is_finite()):
             slopes = row.slope(whole, *constants)
             plain = (arb(slopes.rad()) * reach).upper()  # to first order, by the mean value theorem
-            if not cubic.is_finite() or plain < cubic:
+            level = row.value(whole, *constants)
+            if level.rad() < plain and not cubic < level.rad():  # a constant
+                return [arb(level.mid()), *[_ZERO] * (len(own) - 1)], _ZERO, arb(level.rad())
+            if not cubic.is_finite() or plain < cubic or reach > 1:
                 middle = arb(slopes.mid())
                 return [value, *(middle * x for x in own[1:])], abs(middle) * error, plain
         found = [value, *(first * x for x in own[1:])]
