@@ -37,7 +37,7 @@ def proved(activation: str, time: str = "discrete") -> tuple[cb.Problem, cb.Verd
 
 
 cases = pytest.mark.parametrize(
-    "activation, time", [("tanh", "discrete"), ("relu", "discrete"), ("tanh", "continuous"), ("relu", "continuous")]
+    ("activation", "time"), [("tanh", "discrete"), ("relu", "discrete"), ("tanh", "continuous"), ("relu", "continuous")]
 )
 
 
@@ -57,7 +57,7 @@ def test_simulation_leaves_no_more_often_than_the_bound() -> None:
 
 
 def test_a_bit_of_a_weight_makes_another_problem() -> None:
-    problem, verdict = proved("tanh")
+    _problem, verdict = proved("tanh")
     rows = random_layers("tanh", sizes=(2, 6, 6, 1), scale=1.0)
     rows[1]["weights"][2, 3] = np.nextafter(rows[1]["weights"][2, 3], np.inf)
     data = json.loads(json.dumps(verdict.certificate))
