@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ def random_layers(
     """Layers of the given sizes, the last one linear."""
     rng = np.random.default_rng(seed)
     rows = []
-    for number, (k, p) in enumerate(zip(sizes, sizes[1:])):
+    for number, (k, p) in enumerate(itertools.pairwise(sizes)):
         last = number == len(sizes) - 2
         rows.append({
             "weights": rng.normal(size=(p, k)) * scale / np.sqrt(k), "bias": rng.normal(size=p) * 0.3,

@@ -93,7 +93,7 @@ def test_rounding_in_the_products_is_covered() -> None:
 
 
 def test_an_unbounded_box_has_an_unbounded_range() -> None:
-    network, box = layers("relu"), Interval(np.array([[-np.inf, 0.0], [0.0, 0.0]]), np.array([[0.0, 0.0], [0.0, 0.0]]))
+    network, box = layers("relu"), Interval(np.array([[-np.inf, 0.0], [0.0, 0.0]]), np.zeros((2, 2)))
     found, (_, rest) = bound_network(network, box, 1), relax_network(network, box)
     assert np.isinf(found.value.lo[:, 0]).all()
     assert np.isinf(rest.hi[:, 0]).all()
@@ -104,8 +104,8 @@ def test_an_unbounded_box_has_an_unbounded_range() -> None:
 def test_series_follow_the_network_along_a_line(activation: str) -> None:
     network, point = layers(activation), np.array([0.31, -0.22])
     direction, step = np.array([0.7, 0.4]), 1e-3
-    series = expand_network(network, [
-        [Interval.point(np.array([a])), Interval.point(np.array([b]))] for a, b in zip(point, direction)], 3)  # fmt: skip
+    line = [[Interval.point(np.array([x])) for x in pair] for pair in zip(point, direction)]
+    series = expand_network(network, line, 3)
     expected = values(network, (point + step * direction)[:, None])[:, 0]
     found = [sum(float(c.mid[0]) * step**k for k, c in enumerate(output)) for output in series]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)

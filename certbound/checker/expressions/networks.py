@@ -148,12 +148,30 @@ def series(part: Part, args: Sequence[ts.Series]) -> ts.Series:
 def model(part: Part, args: Sequence[tm.Model]) -> tm.Model | None:
     """The model of an output over a box; None where it is not defined."""
     if part.by:
-        found = ball(part, [x.range() for x in args])
-        return tm.Model(arb(found.mid()), {}, {}, arb(found.rad()), {}) if found.is_finite() else None
+        whole = ball(part, [x.range() for x in args])
+        return tm.Model(arb(whole.mid()), {}, {}, arb(whole.rad()), {}) if whole.is_finite() else None
     if not all(x.range().is_finite() for x in args):
         return None
-    found = _LAST.of((part.network, "model"), args, lambda: _models(part.network, args))
-    return found[part.output]  # type: ignore[no-any-return]  # one model an output
+    key = part.network, tuple(map(_digits, args))
+    found = _MODELS.get(key)
+    if found is None:
+        if len(_MODELS) >= _MOST_MODELS:
+            _MODELS.clear()
+        found = _MODELS[key] = _models(part.network, args)
+    return found[part.output]
+
+
+_MODELS: dict[Any, list[tm.Model]] = {}
+"""Models by the very digits of their arguments: outputs of the dynamics that call one network ask the same."""
+_MOST_MODELS = 300
+
+
+def _digits(x: tm.Model) -> tuple[Any, ...]:
+    """All that a model says, as whole numbers."""
+    parts: list[Any] = []
+    for key, value in [(0, x.value), (0, x.error), *x.linear.items(), *x.squares.items()]:
+        parts += [key, *value.mid().man_exp(), *value.rad().man_exp()]
+    return tuple(parts)
 
 
 class _Columns:
@@ -240,7 +258,10 @@ class _Columns:
         if not (reach < _SMALL and cubic.is_finite()):
             slopes = row.slope(whole, *constants)
             plain = (arb(slopes.rad()) * reach).upper()  # to first order, by the mean value theorem
-            if not cubic.is_finite() or plain < cubic:
+            level = row.value(whole, *constants)
+            if level.rad() < plain and not cubic < level.rad():  # a constant
+                return [arb(level.mid()), *[_ZERO] * (len(own) - 1)], _ZERO, arb(level.rad())
+            if not cubic.is_finite() or plain < cubic or reach > 1:
                 middle = arb(slopes.mid())
                 return [value, *(middle * x for x in own[1:])], abs(middle) * error, plain
         found = [value, *(first * x for x in own[1:])]

@@ -105,7 +105,7 @@ def test_a_python_model_is_written_with_its_network(tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded(0, 0.3, -0.2), compile_numpy(problem.closed_loop)(0, 0.3, -0.2))
 
 
-@pytest.mark.parametrize("text, words", [
+@pytest.mark.parametrize(("text", "words"), [
     ("policy(x)[1]", "takes 2 arguments, got 1"), ("policy(x, v)", r"policy\(\.\.\.\)\[k\]"),
     ("policy(x, v)[2]", "k from 0 to 1"), ("polcy(x, v)[0]", "policy"), ("x[0]", "indexing does not exist"),
     ("policy(x, v)[x]", "k from 0 to 1"), ("policy(x, v)[0][0]", "indexing does not exist"),
@@ -135,12 +135,13 @@ def test_json_and_npz_hold_the_same_network(tmp_path: Path, activation: str) -> 
         np.testing.assert_array_equal(cb.network(tmp_path / name)(point), cb.network(rows)(point))
 
 
-@pytest.mark.parametrize("rows, words", [
+@pytest.mark.parametrize(("rows", "words"), [
     ([], "1 to 32 layers"), ([{"bias": [1]}], "with `weights`"), ([{"weights": [[1]], "activation": "gelu"}], "one of"),
     ([{"weights": [[1, 2]]}, {"weights": [[1, 2]]}], "take what the one before gives"),
     ([{"weights": [[np.inf]]}], "finite"), ([{"weights": [[1]], "wieghts": 2}], "weights"),
     ([{"weights": [[1]], "activation": "clip", "low": 1}], "must give 'high'"), ([{"weights": [1]}], "matrix"),
-    ([{"weights": [["a"]]}], "numbers"), ("tanh", "must end in"), ([{"weights": [[1]], "bias": [1, 2]}], "as many rows"),
+    ([{"weights": [["a"]]}], "numbers"), ("tanh", "must end in"),
+    ([{"weights": [[1]], "bias": [1, 2]}], "as many rows"),
     ([{"weights": [[1]], "activation": "clip", "low": 1, "high": 0}], "at most the upper"), ({}, "list of layers"),
 ])  # fmt: skip
 def test_what_is_no_network_is_refused_in_words(rows: Any, words: str) -> None:

@@ -60,7 +60,7 @@ def test_dense_layers_as_keras_exports_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(policy(POINTS), 3 / (1 + np.exp(-inner)), rtol=1e-12)
 
 
-@pytest.mark.parametrize("make, function", [
+@pytest.mark.parametrize(("make", "function"), [
     (node("LeakyRelu", "in", alpha=0.25), lambda z: np.where(z > 0, z, 0.25 * z)),
     (node("Clip", "in", "low", "high"), lambda z: np.clip(z, -0.5, 0.5)),
     (node("Softplus", "in"), lambda z: np.log1p(np.exp(z))), (node("Sin", "in"), np.sin),
@@ -77,8 +77,9 @@ def test_constants_in_nodes_are_folded(tmp_path: Path) -> None:
     np.testing.assert_allclose(cb.network(file(tmp_path, *layers))(POINTS), POINTS @ W.T.astype(float), rtol=1e-13)
 
 
-@pytest.mark.parametrize("nodes, words", [
-    ([node("Softmax", "in")], "Softmax is not supported; supported are Gemm"), ([node("Elu", "in", alpha=2.0)], "alpha"),
+@pytest.mark.parametrize(("nodes", "words"), [
+    ([node("Softmax", "in")], "Softmax is not supported; supported are Gemm"),
+    ([node("Elu", "in", alpha=2.0)], "alpha"),
     ([node("Add", "in", "x")], "beside the chain"), ([node("Div", "B", "in")], "divided by"),
     ([node("MatMul", "in", "W")], "meet"), ([node("Clip", "in", "low")], "one end only"),
     ([node("Gemm", "in", "W", alpha=2.0)], "alpha or beta"), ([node("Add", "in", "B")], "4 numbers meets 2"),
