@@ -10,6 +10,7 @@ from pathlib import Path
 
 import certbound as cb
 import certbound.constants
+from tests.syntax import nodes_of
 
 ROOT = Path(__file__).resolve().parents[1]
 ALONE = {
@@ -35,22 +36,14 @@ def modules() -> dict[str, tuple[ast.Module, bool]]:
 @functools.cache
 def words(tree: ast.AST) -> tuple[Counter[str], set[tuple[str | None, str]]]:
     """Names that a piece of code reads, and with a dot before them attributes; what it imports from where."""
-    names, imported, nodes = list[str](), set[tuple[str | None, str]](), [tree]
-    while nodes:  # `ast.walk` takes twice as long
-        node = nodes.pop()
+    names, imported = list[str](), set[tuple[str | None, str]]()
+    for node in nodes_of(tree):
         if isinstance(node, ast.Name):
             names.append(node.id)
-            continue
-        if isinstance(node, ast.Attribute):
+        elif isinstance(node, ast.Attribute):
             names.append(f".{node.attr}")
         elif isinstance(node, ast.ImportFrom):
             imported |= {(node.module, alias.name) for alias in node.names}
-            continue
-        for value in vars(node).values():
-            if isinstance(value, ast.AST):
-                nodes.append(value)
-            elif isinstance(value, list):
-                nodes += [part for part in value if isinstance(part, ast.AST)]
     return Counter(names), imported
 
 
