@@ -66,19 +66,19 @@ def test_the_bound_is_above_what_simulation_counts_and_near_it(force, s, low, hi
 
 
 def test_states_may_come_in_either_order() -> None:
-    problem = mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.5, (0.1, 0.0))
+    problem = mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.25, (0.1, 0.0))
     system = cb.ContinuousSystem(lambda x: [-2 * x[1] - x[0], x[0]], states=2, diffusion=[[0.8], [0.0]])
-    turned = cb.Problem(system, initial=[0.0, 0.1], safe=[cb.Inside(cb.Box([-3, -0.8], [3, 0.8]))], horizon=0.5)
-    plan = Plan(count=8, fine=1.0, wide=0.02, cell=0.5, spare=1e-7)
+    turned = cb.Problem(system, initial=[0.0, 0.1], safe=[cb.Inside(cb.Box([-3, -0.8], [3, 0.8]))], horizon=0.25)
+    plan = Plan(count=4, fine=1.0, wide=0.02, cell=0.5, spare=1e-7)
     assert bound_by_steps(setting_of(problem), plan) == bound_by_steps(setting_of(turned), plan)
 
 
 def test_a_start_that_runs_into_a_face_is_sure_to_fail_and_a_longer_horizon_never_safer() -> None:
     force = (lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3])
-    short, long = (replace(COARSE, count=count) for count in (12, 16))
-    doomed = setting_of(mechanical(*force, 0.75, (0.79, 2.0)))
+    short, long = (replace(COARSE, count=count) for count in (6, 8))
+    doomed = setting_of(mechanical(*force, 0.375, (0.79, 2.0)))
     assert bound_by_steps(doomed, short) == pytest.approx(1.0, rel=1e-3)
-    safer, riskier = (setting_of(mechanical(*force, horizon, (0.1, 0.0))) for horizon in (0.75, 1.0))
+    safer, riskier = (setting_of(mechanical(*force, horizon, (0.1, 0.0))) for horizon in (0.375, 0.5))
     assert bound_by_steps(safer, short) < bound_by_steps(riskier, long) < 0.1
 
 
