@@ -1,4 +1,4 @@
-"""Riccati metrics reach what the spectrum allows, also with two hundred states, and wrong ones certify nothing wrong."""
+"""Riccati metrics reach what the spectrum allows, with many states too, and wrong ones certify nothing wrong."""
 
 from __future__ import annotations
 
