@@ -147,7 +147,7 @@ def tried(propose: Callable[[], list[Any]]) -> list[Any]:
 def certified(model: Model, proposal: Proposal) -> list[Constants]:
     try:
         return [certify(model, proposal.metric, status=proposal.status, tolerance=2e-3, budget=60_000)]
-    except (EnclosureError, InfeasibleError):
+    except (EnclosureError, InfeasibleError, ValueError):  # whatever proposed it, a metric that is none is no candidate
         return []
 
 

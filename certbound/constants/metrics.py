@@ -138,12 +138,12 @@ def improve(
         return Tightening(model, euclidean, horizon=horizon, delta=delta).best(_targets(model, horizon))
     if model.dimension == 1:
         return euclidean
-    found = [euclidean]
+    found, wanted = [euclidean], euclidean.worst_slope - _GAIN * max(1e-3, abs(euclidean.worst_slope))
     for members in candidate_sets(model):
-        for proposal in tried(partial(rate_proposals, members, continuous=model.continuous)):
+        for proposal in tried(partial(rate_proposals, members, continuous=model.continuous, wanted=wanted)):
             found += certified(model, proposal)
-    best, plain = min(found, key=lambda constants: constants.worst_slope), euclidean.worst_slope
-    return best if best.worst_slope < plain - _GAIN * max(1e-3, abs(plain)) else euclidean
+    best = min(found, key=lambda constants: constants.worst_slope)
+    return best if best.worst_slope < wanted else euclidean
 
 
 def bound_metrics(

@@ -191,7 +191,12 @@ def _fractions(matrix: Array) -> Rational:
 
 
 def _times(a: Rational, b: Rational) -> Rational:
-    return [[sum((x * y for x, y in zip(row, column)), Fraction(0)) for column in zip(*b)] for row in a]
+    """The product; what is 0 in a row is left out, for large matrices are mostly that."""
+    found = []
+    for row in a:
+        terms = [(x, b[k]) for k, x in enumerate(row) if x]
+        found.append([sum((x * other[j] for x, other in terms), Fraction(0)) for j in range(len(b[0]))])
+    return found
 
 
 def _product(gain: Rational, covariance: Rational) -> Rational:

@@ -68,8 +68,10 @@ def bound_supremum(
     if earlier is None:
         boxes = box.reshape(1, -1) if starts is None else starts
         sampled, point = -np.inf, _centres(boxes)[0]
-        tried = random_points(rng, box, max(8, int(2048 * share)))
-        sampled, point = _sample(value, [_centres(boxes), tried], sampled, point)
+        tried = [_centres(boxes), random_points(rng, box, max(8, int(2048 * share)))]
+        if share < 1 and np.isfinite(box.lo).all() and np.isfinite(box.hi).all():
+            tried.append(np.stack([box.lo, box.hi]))  # few samples: the ends of all sides at once among them
+        sampled, point = _sample(value, tried, sampled, point)
         sampled, point = _climb(value, rng, box, sampled, point, share)
     else:
         boxes, sampled, point = earlier.rest, earlier.sampled, earlier.point

@@ -38,7 +38,7 @@ FEW_VERTICES = 4
 """Up to so many vertices each has an inequality of its own, in semidefinite programs."""
 _SHIFT = -2.5
 _SHIFTS = (-5.0, -4.0, -3.0, -2.25, -1.5, -0.75, 0.0, 0.75)
-_SHARES = 10.0 ** np.arange(-5.0, 0.0, 0.5)
+_SHARES = (1e-4, 1e-3, 1e-2, 0.05, 0.3)
 
 
 class ErosionSearch:
@@ -106,7 +106,7 @@ class ErosionSearch:
             if found is None:
                 continue
             for share in _SHARES:
-                metric = found.mean(float(share))
+                metric = found.mean(share)
                 ratio = self._ratio(metric, value, rooms)
                 if best is None or ratio < best.ratio:
                     best = TightMetric(metric=metric, value=value, ratio=ratio, status="mean of Riccati metrics")

@@ -32,13 +32,19 @@ class Proposal:
     status: str
 
 
-def rate_proposals(members: JacobianSet, *, continuous: bool, share: float = 5e-3) -> list[Proposal]:
+def rate_proposals(
+    members: JacobianSet, *, continuous: bool, share: float = 5e-3, wanted: float = np.inf
+) -> list[Proposal]:
     """A metric of nearly least c or L: the method of centres, or semidefinite programs where it stalls.
 
     The sector form comes first: one inequality. Where it stays short of what the spectrum allows, few vertices
     are tried as well, for it may be conservative.
+
+    With many states none is returned where the spectrum allows no value, c or L, below ``wanted``.
     """
     lower = spectral_bound(members, continuous=continuous)
+    if members.dimension > MOST_STATES and (lower if continuous else np.sqrt(lower)) > wanted:
+        return []
     tolerance = share * max(abs(lower if continuous else 1 - lower), 1e-6)
     found: list[tuple[float, Proposal]] = []
     structured = isinstance(members, AffineSet | AffineForm)

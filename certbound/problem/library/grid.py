@@ -11,7 +11,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside
 from certbound.problem.systems import ContinuousSystem
 
-DEFAULTS = {"damping": 2.0, "droop": 2.0, "load_inertia": 2.0, "sigma": 0.01}
+DEFAULTS = {"damping": 4.0, "load_damping": 20.0, "droop": 4.0, "load_inertia": 5.0, "side": 0.1, "sigma": 0.01}
 
 BUSES = 39
 # (bus, bus, reactance per unit)
@@ -38,19 +38,21 @@ ANGLES = (
 
 
 def grid(**parameters: float) -> Problem:
-    """Noise in the loads of a power grid: does every angle stay within 0.2 rad of the solved power flow?
+    """Noise in the loads of a power grid: does every angle stay near the solved power flow?
 
-    m_i d_i'' = -damping m_i d_i' - droop m_i d_i - sum_j b_ij (sin(a_i + d_i - a_j - d_j) - sin(a_i - a_j)) + noise,
-    with d_i the deviation of bus i's angle from that of the power flow, a_i; b_ij = 1/x_ij at voltages of 1 (losses left
-    out) and m_i = 2 H_i / (2 pi 60). On the domain |d_i| <= 0.25. The angle droop stands for a wide-area control and
-    makes the common angle restoring; ``damping`` and ``droop`` are no data.
+    m_i d_i'' = -damping_i m_i d_i' - droop m_i d_i - sum_j b_ij (sin(a_i + d_i - a_j - d_j) - sin(a_i - a_j)) + noise,
+    with d_i the deviation of bus i's angle from that of the power flow, a_i; b_ij = 1/x_ij at voltages of 1 (losses
+    left out) and m_i = 2 H_i / (2 pi 60). On the domain |d_i| <= side. The angle droop stands for a wide-area control
+    and makes the common angle restoring; ``damping``, ``load_damping`` and ``droop`` are no data.
 
     Parameters
     ----------
-    damping, droop : float
-        In 1/s and 1/s^2.
+    damping, load_damping, droop : float
+        In 1/s (of buses with a machine, and of the others) and 1/s^2.
     load_inertia : float
         H in seconds of the buses without a machine (motors).
+    side : float
+        In rad: the model's domain; angles are asked to stay within 0.8 of it.
     sigma : float
         Noise level of each angular acceleration.
 
@@ -61,6 +63,8 @@ def grid(**parameters: float) -> Problem:
     angles = np.radians(ANGLES)
     mass = np.array([INERTIA.get(bus + 1, values["load_inertia"]) for bus in range(BUSES)]) / (60 * np.pi)
 
+    drag = np.array([values["damping" if bus + 1 in INERTIA else "load_damping"] for bus in range(BUSES)])
+
     def rate(x: Any) -> list[Any]:
         d, w = x[:BUSES], x[BUSES:]
         force = [0.0 * d[0] for _ in range(BUSES)]
@@ -69,7 +73,7 @@ def grid(**parameters: float) -> Problem:
             steady = float(angles[i] - angles[j])
             flow = (np.sin(steady + d[i] - d[j]) - np.sin(steady)) / reactance
             force[i], force[j] = force[i] - flow, force[j] + flow
-        pull = [force[i] / mass[i] - values["droop"] * d[i] - values["damping"] * w[i] for i in range(BUSES)]
+        pull = [force[i] / mass[i] - values["droop"] * d[i] - drag[i] * w[i] for i in range(BUSES)]
         return [*(w[i] for i in range(BUSES)), *pull]
 
     system = ContinuousSystem(
@@ -85,10 +89,10 @@ def grid(**parameters: float) -> Problem:
     return Problem(
         system,
         initial=np.zeros(2 * BUSES),
-        safe=[Inside(box(0.2))],
+        safe=[Inside(box(0.8 * values["side"]))],
         horizon=10.0,
         delta=1e-3,
-        domain=box(0.25),
+        domain=box(values["side"]),
         name="grid",
         parameters=values,
     )

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from certbound.arrays import Array
 from certbound.problem.library.parameters import merged, whole
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside
