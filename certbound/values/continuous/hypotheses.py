@@ -157,7 +157,7 @@ def sampled_residual(surface: Surface, model: Model, *, upper: bool = True) -> t
 
 def sampled(surface: Surface, model: Model, *, upper: bool = True) -> tuple[Array, Array, Array]:
     """The same in two or three states, with V's least and largest values."""
-    counts, sample = ((4, 5, 5), sample_in_plane) if len(surface.axes) == 2 else ((4, 4, 4, 4), sample_in_space)
+    counts, sample = ((4, 5, 5), sample_in_plane) if len(surface.axes) == 2 else ((4, 7, 7, 7), sample_in_space)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
 

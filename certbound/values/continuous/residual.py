@@ -97,7 +97,7 @@ def bound_ranges(
         Where |R| <= ``wanted`` the bound of Q2 may be 0, which saves its evaluation.
     near : float or ndarray, shape (B,)
         How far from the samples of R its bound, the upper or the lower one, may lie before the halves and quarters of
-        a patch are looked at (halves alone in three states); two or three states.
+        a patch are looked at; two or three states.
 
     Notes
     -----
@@ -157,17 +157,17 @@ def _in_plane(
     counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
 ) -> Extremes:
     """The same in two states, compiled; halves and quarters are looked at where the coefficients lie far off."""
-    return _looked_at(_run_plane, 4, patches, drifts, squares, place, counts, wanted, near, upper)
+    return _looked_at(_run_plane, patches, drifts, squares, place, counts, wanted, near, upper)
 
 
 def _looked_at(
-    run: Callable[..., Array], finest: int, patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant,
-    place: Index, counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
+    run: Callable[..., Array], patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
+    counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
 ) -> Extremes:
-    """What ``run`` finds on whole patches, and on their halves (and quarters) where the coefficients lie far off."""
+    """What ``run`` finds on whole patches, and on their halves and quarters where the coefficients lie far off."""
     out = run(patches, drifts, squares, place, counts, 1, wanted)
     near = np.broadcast_to(near, len(out))
-    for parts in (2, 4)[: finest // 2]:
+    for parts in (2, 4):
         far = out[:, :, 1] - np.maximum(out[:, :, 4], 0) if upper else np.minimum(out[:, :, 3], 0) - out[:, :, 0]
         beyond = np.maximum(out[:, :, 4] if upper else -out[:, :, 3], 0)
         bad = np.flatnonzero(np.any(far > near[:, None] + 0.05 * beyond, axis=1))
@@ -211,8 +211,8 @@ def _in_space(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
     counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
 ) -> Extremes:
-    """The same in three states; halves are looked at where the coefficients lie far off."""
-    return _looked_at(_run_space, 2, patches, drifts, squares, place, counts, wanted, near, upper)
+    """The same in three states; time is not cut."""
+    return _looked_at(_run_space, patches, drifts, squares, place, counts, wanted, near, upper)
 
 
 def sample_in_space(
@@ -228,11 +228,12 @@ def _run_space(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
     counts: Sequence[int], parts: int, wanted: float,
 ) -> Array:
-    """What the kernel finds with this many parts along each axis; samples alone for 0."""
+    """What the kernel finds with this many parts along each state; samples alone for 0."""
     from certbound.values.continuous.space_kernel import extremes_in_space
 
     bases = [_derivatives(counts[0], TIME, 2), *(_derivatives(count, CUBIC, 3) for count in counts[1:])]
-    time, x, y, z = (to_parts(count, parts) if parts else np.empty((0, count, count)) for count in counts)
+    cuts = (min(parts, 1), parts, parts, parts)
+    time, x, y, z = (to_parts(count, k) if k else np.empty((0, count, count)) for count, k in zip(counts, cuts))
     out = np.empty((len(patches.size), len(drifts), 6))
     force = np.ascontiguousarray([drift.samples for drift in drifts])
     square = np.ascontiguousarray(squares.samples)

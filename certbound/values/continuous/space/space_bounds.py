@@ -7,6 +7,7 @@ surfaces too, so that memory is that of the surface: about 200 bytes a patch.
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from dataclasses import dataclass, replace
 
@@ -45,12 +46,14 @@ _CAP = 50.0
 _GRANTED = 0.005  # eps that the proof may pay, in units of the bound, summed over the horizon
 _SLACK = 0.02  # of log P, which bounds of R may add to its samples
 _RATE = 4_000  # patches that are proposed and proved in a second of a processor
+_CLOCKED = 2.5  # times the work, where the model depends on time: it is read anew on every slab
 _MOST = 3_000_000  # patches, which take 600 MB
 _PASSES = 6
 _CLOSE = 0.1
 _WORTH = 0.03  # of log P: a pass that gains less is the last one
 _HOPELESS = 60.0  # what a first proposal may lose (log P)
 _SHARES = (0.05, 0.95)  # of the patches, for one grid after the other
+_FAR = 1.5  # of log P, between the bound and a rough guess
 _FEWEST = 8  # cells along an axis
 
 
@@ -65,7 +68,7 @@ def three_states(problem: Problem, model: Model, deadline: float) -> tuple[float
         The safe set is no box.
     """
     space = _space(problem, model)
-    patches = min(_RATE * max(1.0, round(deadline - time.perf_counter(), 1)), _MOST)
+    patches = min(_RATE * max(1.0, round(deadline - time.perf_counter(), 1)) / _effort(model), _MOST)
     upper, done = 0.0, []
     level = _rough_level(space)
     plans = {plan.cells: plan for plan in (_plan(space, level, share * patches) for share in _SHARES)}
@@ -79,7 +82,16 @@ def three_states(problem: Problem, model: Model, deadline: float) -> tuple[float
                 break
             raise
         done.append(f"{plan.cells}^3")
-    return upper, f"value function in three states, cells: {', '.join(done)}"
+    words = f"value function in three states, cells: {', '.join(done)}"
+    if level < 0 and upper > level + _FAR:
+        words += f"; a rough guess that nothing proves is {math.exp(level):.1g}: more time, as by name, may prove more"
+    return upper, words
+
+
+def _effort(model: Model) -> float:
+    """What a patch costs, relative to a drift of degree 2 or 3 without time and disturbance."""
+    samples = float(np.prod(model.counts())) / 7**4
+    return samples * (1 + len(model.branches)) / 2 * (1.0 if model.autonomous else _CLOCKED)
 
 
 def prove_in_space(
