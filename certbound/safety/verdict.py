@@ -60,6 +60,8 @@ class Verdict(Shown):
         What would be SAFE, where that was asked for and the problem is not (`certbound.safety.limits`).
     members : tuple of Verdict
         Where the start is a union, the verdict on every member; this one is the worst of them.
+    reserves : dict
+        What engines answered that only a certificate had to ask, by name: kept, so that none is asked twice.
     """
 
     status: str
@@ -78,6 +80,7 @@ class Verdict(Shown):
     log10_lower: float | None = None
     limits: Any = None
     members: tuple[Verdict, ...] = field(default=(), repr=False)
+    reserves: dict[str, EngineAnswer] = field(default_factory=dict, repr=False)
 
     @property
     def worst(self) -> Verdict:
