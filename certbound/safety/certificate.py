@@ -156,12 +156,14 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
     """
     useful = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_delta < 0]
     yield from sorted(useful, key=lambda item: (not item[1].certified, item[1].log10_delta))
+    known: dict[str, EngineAnswer] = getattr(verdict, "reserves", {})
     for name, row in ENGINES.items():
         asked = verdict.answers.get(name)
         if problem.reach is not None or verdict.status != "SAFE" or asked is None or asked.applicable:
             continue
         if row.reserve and row.write:
-            answer = row.prove(problem)
+            answer = known[name] if name in known else row.prove(problem)
+            known[name] = answer
             if answer.applicable and answer.log10_delta < 0:
                 yield name, answer
 

@@ -37,7 +37,7 @@ _PATIENCE = 0.4  # of the time that is left, after which the other engines have 
 _TURN = 0.5  # of the time that is left then, for all of them
 _LAST = 0.2  # of the time that is left then, where none of them has much of a chance
 _SOON = 0.5  # seconds after which those that have a first bound soon are asked for it, under a limit
-_UNLIKELY = 4.0  # seconds for an engine that has hardly a chance, once there is a bound
+_UNLIKELY = 2.0  # seconds for an engine that has hardly a chance, once there is a bound
 _LASTING = 100_000  # steps
 _EXTRA = 0.2  # of the time that is left, for a bound that can no longer change the verdict
 

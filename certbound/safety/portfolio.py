@@ -5,6 +5,7 @@ An engine from outside is a row too: ``ENGINES["mine"] = Engine(name="mine", ...
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -88,6 +89,11 @@ class Engine:
     endless: bool = False
 
 
+def _polynomials(problem: Problem) -> float:
+    """In three states a search for a polynomial takes many seconds, and quadratic bounds are there in one."""
+    return 0.5 if problem.system.dimension > 2 else math.inf
+
+
 ENGINES: dict[str, Engine] = {
     row.name: row
     for row in (
@@ -119,6 +125,7 @@ ENGINES: dict[str, Engine] = {
             prove=barrier_engine,
             write=barrier_proof,
             reserve=True,
+            chance=_polynomials,
         ),
         Engine(
             name="values",

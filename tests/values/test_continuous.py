@@ -438,8 +438,9 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pyt
     plan = plan_below(plane, truth, 2500)
     proposals: list[Any] = []
     monkeypatch.setattr(plane_below, "propose_plane", lambda *given: proposals.append(given) or propose_plane(*given))
-    bound = bound_plane_below(plane, model, plan, starts)
-    assert bound is not None
+    found = bound_plane_below(plane, model, plan, starts)
+    assert found is not None
+    bound = found[1].log
     assert len(proposals) == 3  # none that is not looked at
     with monkeypatch.context() as hopeless:
         hopeless.setattr(plane_below._Sketch, "estimate", lambda self: plan.floor - 100)

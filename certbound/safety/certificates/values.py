@@ -75,7 +75,8 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
         raise CertificateError("no lower bound was found.")
     if not problem.initial.random and problem.initial.data(_STARTS)["kind"] not in _STARTS:
         raise CertificateError("lower bounds are stated from starts in a box, a ball or an ellipsoid, or normal ones.")
-    claim = _claim_below(answer.log10_lower, problem.delta, _ROOMS[effort])
+    flat = isinstance(answer.details, ExitBounds) and problem.system.dimension > 1
+    claim = _claim_below(answer.log10_lower, problem.delta, _ROOMS[effort] * (_MORE_ROOM if flat else 1))
     if isinstance(answer.details, ExitBounds):
         return _crossing(problem, answer.details, effort), claim, []
     data = _induction(problem, effort, _grids(problem, effort), partial(_outward, problem))

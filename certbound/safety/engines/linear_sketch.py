@@ -35,12 +35,12 @@ def linear_chance(problem: Problem) -> float:
     Infinite where nothing speaks against it: a linear model, discrete time, few states (whose sets of starts can be
     halved), targets.
     """
-    n = problem.system.dimension
-    if problem.system.time == "discrete" or not _FEWEST <= n <= _MOST or problem.reach is not None:
+    system, n = problem.system, problem.system.dimension
+    if not isinstance(system, ContinuousSystem) or not _FEWEST <= n <= _MOST or problem.reach is not None:
         return math.inf
     flow = Flow(problem)
     curved = edged(flow.tape) or any(varying_outputs(flow.state_jacobian))
-    if not curved and not isinstance(problem.system.diffusion, Tape):
+    if not curved and not isinstance(system.diffusion, Tape):
         return math.inf
     with np.errstate(all="ignore"):
         far, needed = _Sketch.of(problem, flow).levels()

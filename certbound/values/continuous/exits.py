@@ -45,7 +45,7 @@ class ExitBounds:
     proposed : tuple of (Surface, Payment)
         V of every upper bound that was better than those before, and what it was paid with.
     proposed_below : tuple of (Surface, Payment)
-        The same of the lower bounds, one state.
+        The same of the lower bounds.
     """
 
     upper: float
@@ -129,7 +129,7 @@ def bound_exits(
         if lower:
             check_noise(model, (0.0, float(problem.horizon)), list(zip(room.outer_low, room.outer_high)))
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
-        upper, least, words, proposed = two_states(problem, model, room, begin + seconds, wanted)
+        upper, least, words, (proposed, below) = two_states(problem, model, room, begin + seconds, wanted)
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),

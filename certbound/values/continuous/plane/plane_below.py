@@ -14,6 +14,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.values.continuous.hypotheses import Model, covers, extreme_over, prove_lower, sampled_residual
+from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.surface import Surface
@@ -38,8 +39,10 @@ def plan_below(plane: Plane, level: float, patches: float) -> Plan:
     return plan
 
 
-def bound_plane_below(plane: Plane, model: Model, plan: Plan, starts: list[Pair]) -> float | None:
-    """A lower bound of log P by the most promising of a few proposals; None where there is none."""
+def bound_plane_below(
+    plane: Plane, model: Model, plan: Plan, starts: list[Pair]
+) -> tuple[Surface, Payment] | None:
+    """The most promising of a few proposals, and what it pays for its lower bound of log P; None where that is none."""
     source: Source | None = None
     best: _Sketch | None = None
     for number in range(_PASSES + 1):
@@ -56,7 +59,7 @@ def bound_plane_below(plane: Plane, model: Model, plan: Plan, starts: list[Pair]
     if best is None or best.estimate() < plan.floor:  # what is subtracted at last would leave nothing
         return None
     payment = prove_lower(best.surface, model, starts)
-    return None if payment is None else payment.log
+    return None if payment is None else (best.surface, payment)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
