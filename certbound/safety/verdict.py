@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from certbound.display import Shown, at_least_text, log10_text, name_text, rounded
 from certbound.errors import CertificateError, SolverError
@@ -63,6 +63,8 @@ class Verdict(Shown):
     members : tuple of Verdict
         Where the start is a union, the verdict on every member; this one is the worst of them.
     """
+
+    pictured: ClassVar[bool] = True
 
     status: str
     log10_delta: float
