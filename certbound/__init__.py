@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.errors import EngineError as EngineError
     from certbound.errors import InfeasibleError as InfeasibleError
     from certbound.errors import SolverError as SolverError
+    from certbound.plotting import animate as animate
     from certbound.problem.export import export_casadi as export_casadi
     from certbound.problem.export import export_control as export_control
     from certbound.problem.files import load as load
@@ -101,16 +102,17 @@ _HOME = {
     "synthesis.plans": "synthesize_plan",
     "synthesis.controllers": "simulate_closed_loop PredictiveController ConvexPlanner SafetyFilter",
     "synthesis.terminal": "TerminalSet",
+    "plotting": "animate",
     "errors": "CertboundError CertificateError EnclosureError EngineError InfeasibleError SolverError",
 }
 
 __all__ = ["__version__", *names_in(_HOME)]
 
 
-def _draw(result: Any, axes: Any) -> None:
-    from certbound.plotting.results import draw
+def _draw(result: Any, axes: Any, states: Any, times: Any) -> None:
+    from certbound.plotting.results import draw_chosen
 
-    draw(result, axes)
+    draw_chosen(result, axes, states, times)
 
 
 def _content(problem: Any, plan_file: str) -> dict[str, Any]:

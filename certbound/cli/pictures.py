@@ -38,10 +38,10 @@ def check_picture(path: Path | None) -> None:
         )
 
 
-def write_picture(path: Path, figure: Figure) -> None:
+def write_picture(path: Path, figure: Figure, *, dpi: int = 150) -> None:
     """Write a figure in the format that the file's name ends in."""
     stream = BytesIO()
-    figure.savefig(stream, format=path.suffix.lstrip(".") or "png", dpi=150)
+    figure.savefig(stream, format=path.suffix.lstrip(".") or "png", dpi=dpi)
     write_file(path, stream.getvalue())
 
 

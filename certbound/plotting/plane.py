@@ -28,7 +28,7 @@ def plane_of(problem: Problem) -> Plane | None:
 
     A single half-space asks for a panel over time, not for a plane.
     """
-    for constraint in problem.safe:
+    for constraint in sorted(problem.safe, key=lambda one: not one.outside):  # obstacles first
         asked, form = asked_of(constraint.region), constraint.region.form
         if len(asked) == 2 and not (isinstance(form, Faces) and len(form.bounds) == 1):
             return asked[0], asked[1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -51,6 +51,21 @@ class Scene:
             problem=verdict.problem, reach=verdict.reach, tube=noisy_reach(verdict), times=times, paths=paths,
             rooms=measured_rooms(verdict), title=title,
         )  # fmt: skip
+
+    def between(self, first: float, last: float) -> Scene:
+        """The part of the scene from one time to another, by whole pieces."""
+        curve = self.reach.curve
+        kept = np.flatnonzero((np.asarray(curve.ends) >= first) & (np.asarray(curve.starts) <= last))
+        if not len(kept):
+            raise ValueError(f"`times` must meet [0, {self.reach.end:g}], got ({first:g}, {last:g}).")
+        ends = int(kept[0]), int(kept[-1]) + 1
+        tube = None if self.tube is None else self.tube.section(*ends)
+        rooms = tuple((number, rows[slice(*ends)], room[slice(*ends)]) for number, rows, room in self.rooms)
+        found = replace(self, reach=self.reach.section(*ends), tube=tube, rooms=rooms)
+        if self.times is None or self.paths is None:
+            return found
+        now = (self.times >= first) & (self.times <= last)
+        return replace(found, times=self.times[now], paths=self.paths[:, now])
 
     @property
     def tubes(self) -> list[tuple[ReachTube, str]]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from certbound.display import Shown, at_least_text, log10_text, name_text, rounded
 from certbound.errors import CertificateError, SolverError
@@ -65,6 +65,8 @@ class Verdict(Shown):
     reserves : dict
         What engines answered that only a certificate had to ask, by name: kept, so that none is asked twice.
     """
+
+    pictured: ClassVar[bool] = True
 
     status: str
     log10_delta: float
