@@ -1,4 +1,4 @@
-"""Thirty targets drawn at random: bounds of failing around simulations, close to each other and to a verdict on either side."""
+"""Targets drawn at random: bounds of failing around simulations, close to each other and to a verdict on either side."""
 
 import numpy as np
 import pytest
