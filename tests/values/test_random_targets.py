@@ -1,4 +1,4 @@
-"""Targets drawn at random: bounds of failing around simulations, close to each other and to a verdict on either side."""
+"""Targets drawn at random: bounds of failing around simulations, close to each other and to verdicts on either side."""
 
 import numpy as np
 import pytest
