@@ -60,7 +60,7 @@ def _failure(problem: Problem, limit: float) -> FailureBounds:
     except InfeasibleError as error:
         refused = str(error)
     try:
-        return bound_chain(problem, seconds=limit, delta=problem.delta)
+        return bound_chain(problem, seconds=min(2 * limit, seconds_left()), delta=problem.delta)
     except InfeasibleError as error:
         raise InfeasibleError(f"{refused.rstrip('.')}; and {error}") from error
 

@@ -37,7 +37,7 @@ _SIDES = {1: (150, 600, 2400, 9600), 2: (40, 80, 160, 320)}
 """Cells along each side, grid after grid, by the number of states ..."""
 _PIECES = {1: (0.8, 96), 2: (0.25, 16)}
 """... and pieces of each entry of the noise, by the number of entries: so many for each of them, at least so many."""
-_QUERY_SECONDS = 1.5e-7
+_QUERY_SECONDS = 7e-8
 _CACHED = 60_000_000  # numbers of images that are kept
 _PARTS = 4
 _MOST_STEPS = 100_000
