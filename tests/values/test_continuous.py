@@ -448,7 +448,8 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pyt
         assert bound_plane_below(plane, model, plan, starts) is None
     assert len(proposals) == 4
     assert truth - 1.3 < bound <= truth
-    surface, rng = propose_plane(plane, plan), np.random.default_rng(0)
+    coarse = dataclasses.replace(plan, cells=10, growth=0.6)
+    surface, rng = propose_plane(plane, coarse), np.random.default_rng(0)
     assert surface is not None
     for size, shift in ((0.0, -0.3), (0.0, 1.0), (1e-3, 0.0)):
         payment = prove_lower(spoilt(surface, rng, size).raised(shift), model, starts)
