@@ -214,3 +214,11 @@ def test_a_target_of_one_state_is_met_at_any_time():
     verdict = cb.verify_safety(problem, method="values")
     assert truth <= 10**verdict.log10_delta <= 0.003
     assert verdict.log10_lower is None
+
+
+def test_continuous_time_without_an_end_or_a_target_is_not_served():
+    system = cb.ContinuousSystem(lambda x: [x[1], -x[0] - x[1]], states=2, diffusion=[[0], [0.2]])
+    walls = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    verdict = cb.verify_safety(cb.Problem(system, initial=[0, 0], safe=walls, horizon=np.inf))
+    assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", 0.0)
+    assert "needs an end, and the horizon is infinite" in verdict.answers["values"].reason

@@ -6,7 +6,7 @@ import math
 
 from certbound.display import rounded
 from certbound.errors import EnclosureError, InfeasibleError
-from certbound.problem.goals import until
+from certbound.problem.goals import check_end, until
 from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
@@ -34,6 +34,8 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     most = _SPACE if wide else _SECONDS
     limit = max(min(most if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
     try:
+        if problem.system.time == "continuous":
+            check_end(problem, "a value function in continuous time")
         if problem.reach is None and serves(problem):
             return _continuous(bound_exits_by_steps(problem, seconds=limit))
         if not isinstance(problem.system, DiscreteSystem):

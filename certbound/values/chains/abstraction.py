@@ -247,6 +247,7 @@ class _Images:
         self.chain, self.grid, self.cells = chain, grid, cells
         size = len(cells) * len(chain.pieces.most) * 4 * (len(chain.boxes) + len(chain.corners))
         self.keeps = chain.steady and size <= _CACHED
+        self.lost: dict[tuple[int, bool], Mask] = {}  # where the model is undefined
         self.kept: dict[tuple[int, bool], list[tuple[Integers, Integers]]] = {}
 
     def means(self, t: int, value: _Sides) -> tuple[Array, Array]:
@@ -259,10 +260,10 @@ class _Images:
 
     def _sum(self, t: int, k: int, extremes: Extremes, weights: Array, above: bool) -> Array:
         total = np.zeros(len(self.cells))
-        for (first, last), weight in zip(self._met(t, k, above), weights):
+        for (first, last), weight in zip(self._met(t, k, above), weights, strict=True):
             if weight > 0:
                 total += weight * extremes.over(first, last)
-        return total
+        return np.where(self.lost[k, above], 1.0 if above else 0.0, total)
 
     def _met(self, t: int, k: int, above: bool) -> Iterator[tuple[Integers, Integers]]:
         """First and last cell along each axis, shapes (2, boxes), of the ringed grid."""
@@ -283,6 +284,7 @@ class _Images:
         if isinstance(chain.gain, Tape):
             found, worse, _ = evaluate(chain.gain, clock)
             gain, bad = found.reshape(-1, *chain.gain.shape), bad | worse
+        self.lost[k, above] = bad
         noise = chain.pieces.boxes
         for place in range(len(chain.pieces.most)):
             w = noise[place]

@@ -227,6 +227,18 @@ def test_targets_disturbances_and_domains_agree_with_finer_functions():
     assert 10**exact.log10_lower <= found.upper <= 1.7 * found.lower
 
 
+def test_where_the_model_is_undefined_nothing_is_known():
+    system = cb.DiscreteSystem(lambda x: 0.1 * np.sqrt(x), states=["x"], noise=cb.Triangular(halfwidth=0.5))
+    problem = cb.Problem(
+        system, initial=[0.01], safe=[cb.Inside(cb.HalfSpace([1], 5))], horizon=2, domain=cb.Box([-1], [1]),
+        leaving="ends",
+    )  # fmt: skip
+    found = bound_chain(problem, seconds=0.2)
+    negative = (1 - 0.01 / 0.5) ** 2 / 2  # P(0.01 + w < 0)
+    assert found.upper >= negative
+    assert found.lower == 0
+
+
 def test_what_chains_do_not_serve():
     free = contraction(LAWS["triangular"]).replace(safe=[cb.Inside(cb.HalfSpace([1], 1))])
     with pytest.raises(InfeasibleError, match="`x` has none at some step"):
