@@ -16,7 +16,7 @@ from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import problem_data
 from certbound.safety.certificates.barrier import barrier_proof
 from certbound.safety.engines import barrier as engine
-from certbound.safety.engines.barrier import Barrier, _Work, barrier_engine
+from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.gaps import gaps_of, lies_inside
 
 
@@ -211,14 +211,14 @@ def test_of_many_points_only_those_that_bind_enter_the_program(monkeypatch: pyte
 
 def test_a_further_degree_that_cannot_reach_the_target_is_given_up_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     hopes: list[tuple[int, float]] = []
-    program = _Work._program
+    program = engine._Work._program
 
-    def noted(self: _Work, exponents: Any, *points: Any) -> Any:
+    def noted(self: Any, exponents: Any, *points: Any) -> Any:
         found = program(self, exponents, *points)
         hopes.append((int(exponents.sum(axis=1).max()), found[1]))
         return found
 
-    monkeypatch.setattr(_Work, "_program", noted)
+    monkeypatch.setattr(engine._Work, "_program", noted)
     system = cb.ContinuousSystem(lambda x: [x[0] - x[0] ** 3, -x[1]], states=2, diffusion=0.3 * np.eye(2))
     room = cb.Inside(cb.Box([-0.4, -1.5], [2, 1.5]))
     problem = cb.Problem(system, initial=cb.Box([0.9, -0.1], [1.0, 0.1]), safe=[room], horizon=3)
