@@ -3,9 +3,10 @@
     python -m experiments.waiting [--folder DIR ...] [--seconds S] [--explain] [--limits 2 5 20] [name ...]
 
 The bundled problems, the benchmarks, the cases of `experiments.middle`, and every problem file of the folders. The
-clock is that of the processor, and so is the limit that is kept: other work on the machine does not count. The first
-table says what missed its time: 10 s with at most three states, 30 s with at most six. ``--limits`` asks for the slow
-problems again under each limit instead, and prints what was not kept, and every bound that got worse with more time.
+clock is that of the processor, and so is the limit that is kept: other work on the machine does not count, but for the
+solvers' own limits, which are of the clock on the wall and bite on a crowded machine. The first table says what missed
+its time: 10 s with at most three states, 30 s with at most six. ``--limits`` asks for the slow problems again under
+each limit instead, and prints what was not kept, and every bound that got worse with more time.
 """
 
 from __future__ import annotations

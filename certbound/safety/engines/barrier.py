@@ -90,7 +90,7 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     level = 0.0
     for degree in _DEGREES[work.n]:
         try:
-            found = work.search(degree, lambda barrier: asked.found(_answer(problem, barrier)))
+            found = work.search(degree, lambda barrier: asked.found(_answer(problem, barrier)), known=best is not None)
         except EngineError:
             if best is None:
                 raise
@@ -155,10 +155,11 @@ class _Work:
 
     # ---- the search ------------------------------------------------------------------------------------------
 
-    def search(self, degree: int, found: Callable[[Barrier], object]) -> Barrier | None:
+    def search(self, degree: int, found: Callable[[Barrier], object], *, known: bool = False) -> Barrier | None:
         """The best polynomial of the convex program, and what is proved of it; ``found`` takes better and better ones.
 
-        Few points first: what they hope for says whether more, which take long, are worth it.
+        Few points first: what they hope for says whether more, which take long, are worth it. Where a bound is
+        ``known`` already, only the target is.
         """
         exponents = np.array([e for e in itertools.product(range(degree + 1), repeat=self.n) if 0 < sum(e) <= degree])
         horizon, target = self.problem.horizon, math.log10(self.problem.delta)
@@ -177,7 +178,8 @@ class _Work:
                 best = proved
                 found(best)
             level = 0.0 if best is None else best.log10_probability(horizon)
-            vain = self.n == _MOST_STATES and (hoped > _FAR * target or (number > 1 and proved is None))
+            vain = known and hoped > target
+            vain = vain or (self.n == _MOST_STATES and (hoped > _FAR * target or (number > 1 and proved is None)))
             if level <= target or vain or (number and level <= hoped + _CLOSE):
                 return best  # more points only raise what is hoped for, and in many states they take many seconds
             if number == 0 and hoped <= _FAR * target:

@@ -43,6 +43,7 @@ from certbound.safety.certificate import certificate_text, initial_data, problem
 from certbound.safety.certificates import values_proof_below
 from certbound.safety.certificates.parts import packed
 from certbound.safety.verification import verify_safety
+from certbound.values.continuous import bound_exits
 from tests.checker.conftest import (
     exit_certificate,
     leaving,
@@ -262,6 +263,23 @@ def test_the_two_bounds_of_a_probability_enclose_a_simulation(make: Any) -> None
         found = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(4), confidence=0.999)
         assert 10**least.log10_lower_proved <= found.upper
         assert found.lower <= 10**most.log10_proved
+
+
+@pytest.mark.slow
+def test_a_lower_bound_in_the_plane_is_proved_again() -> None:
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.8 * np.eye(2))
+    room = cb.Inside(cb.Box([-1, -1], [1, 1]))
+    problem = cb.Problem(system, initial=[0, 0], safe=[room], horizon=0.5)
+    found = bound_exits(problem, seconds=0.5)
+    assert found.lower is not None
+    assert len(found.proposed_below) == 1
+    answer = EngineAnswer(log10_delta=found.upper, log10_lower=found.lower, details=found, method="values")
+    verdict = SimpleNamespace(status="UNSAFE", reason="", answers={"values": answer})
+    report = check_data(parse(certificate_text(problem, verdict)), problem_data(problem))
+    assert report.valid
+    seen = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(0))
+    assert report.log10_lower_proved is not None
+    assert found.lower - 0.3 < report.log10_lower_proved <= math.log10(seen.upper)
 
 
 def test_levels_from_below_are_held_to_the_largest_slope_that_is_due() -> None:

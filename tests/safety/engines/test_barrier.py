@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -205,3 +207,21 @@ def test_of_many_points_only_those_that_bind_enter_the_program(monkeypatch: pyte
     found = barrier_engine(oscillator(0.4))
     assert found.log10_delta < -2
     assert max(asked) < 0.8 * engine._FINE[2] ** 2
+
+
+def test_a_further_degree_that_cannot_reach_the_target_is_given_up_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    hopes: list[tuple[int, float]] = []
+    program = engine._Work._program
+
+    def noted(self: Any, exponents: Any, *points: Any) -> Any:
+        found = program(self, exponents, *points)
+        hopes.append((int(exponents.sum(axis=1).max()), found[1]))
+        return found
+
+    monkeypatch.setattr(engine._Work, "_program", noted)
+    system = cb.ContinuousSystem(lambda x: [x[0] - x[0] ** 3, -x[1]], states=2, diffusion=0.3 * np.eye(2))
+    room = cb.Inside(cb.Box([-0.4, -1.5], [2, 1.5]))
+    problem = cb.Problem(system, initial=cb.Box([0.9, -0.1], [1.0, 0.1]), safe=[room], horizon=3)
+    assert barrier_engine(problem).log10_delta < -1
+    assert [degree for degree, _ in hopes].count(6) == 1
+    assert hopes[-1][1] > -3
