@@ -36,6 +36,8 @@ VERTEX_WORK = 2e7
 """Largest count * n^3 for which a parametric set is proved vertex by vertex."""
 QUICK_WORK = 5e5
 """The same, up to which the sector inequality is not even tried."""
+MOST_VERTICES = 1 << 16
+"""What a set returns as vertices at most."""
 SECTOR_LOSS = 1e-3
 """What the sector inequality may lose to the vertices, relative to c or 1 - L^2, before these are proved instead."""
 
@@ -131,7 +133,7 @@ def _member_value(frame: _Frame, member: JacobianSet, *, continuous: bool) -> fl
         return _vertex_value(frame, member, continuous=continuous)
     sector = member if isinstance(member, SectorSet) else member.sector()
     value = _sector_value(frame, sector, continuous=continuous)
-    if work > VERTEX_WORK:
+    if work > VERTEX_WORK or member.vertex_count > MOST_VERTICES:
         return value
     measured = matrix_measure if continuous else induced_norm
     reached = float(np.max(measured(member.vertices(), 2, weights=frame.P)))

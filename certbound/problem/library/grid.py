@@ -90,7 +90,7 @@ def grid(**parameters: float) -> Problem:
         system,
         initial=np.zeros(2 * BUSES),
         safe=[Inside(box(0.8 * values["side"]))],
-        horizon=10.0,
+        horizon=1.0,
         delta=1e-3,
         domain=box(values["side"]),
         name="grid",

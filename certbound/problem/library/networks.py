@@ -15,7 +15,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside
 from certbound.problem.systems import ContinuousSystem
 
-FORMATION = {"agents": 50.0, "stiffness": 1.0, "anchor": 0.5, "damping": 2.0, "sigma": 0.02}
+FORMATION = {"agents": 50.0, "stiffness": 1.0, "anchor": 0.5, "damping": 2.0, "sigma": 0.005}
 HEAT = {"nodes": 200.0, "conductivity": 1.0, "reaction": 2.0, "sigma": 0.01}
 KURAMOTO = {"oscillators": 60.0, "coupling": 1.0, "forcing": 1.0, "spread": 0.1, "sigma": 0.02}
 
@@ -53,7 +53,7 @@ def formation(**parameters: float) -> Problem:
         diffusion=values["sigma"] * np.vstack([np.zeros((n, n)), np.eye(n)]),
     )
     sides = np.concatenate([np.full(n, 0.5), np.full(n, np.inf)])
-    return _problem("formation", system, [Inside(Box(-sides, sides))], values, horizon=10.0)
+    return _problem("formation", system, [Inside(Box(-sides, sides))], values, horizon=2.0)
 
 
 def heat(**parameters: float) -> Problem:
@@ -85,7 +85,7 @@ def heat(**parameters: float) -> Problem:
         rate, states=[f"u{i + 1}" for i in range(n)], diffusion=values["sigma"] * np.eye(n)
     )
     one = np.ones(n)
-    return _problem("heat", system, [Inside(Box(-one, one))], values, horizon=1.0, domain=Box(-1.2 * one, 1.2 * one))
+    return _problem("heat", system, [Inside(Box(-one, one))], values, horizon=0.2, domain=Box(-1.2 * one, 1.2 * one))
 
 
 def kuramoto(**parameters: float) -> Problem:
