@@ -232,8 +232,17 @@ class Run:
             self._compare("simulate", level, again)
         if found is not None and oracle.lower_limit(found.exits, found.paths) > level:
             self._compare("simulate", level, by_certbound)
+        if self.verdict.log10_lower is not None and self._truth_from_above:
+            self._compare("simulate", 10.0**self.verdict.log10_lower, again, below=True)
         if self.verdict.status == "UNSAFE_NOMINAL":
             self._leaves_without_noise()
+
+    @property
+    def _truth_from_above(self) -> bool:
+        """Whether no other start, disturbance or law that is allowed fails more often than the simulated one."""
+        known = self.draft.noise is None or self.draft.noise.law not in ("bounded", "subgaussian")
+        start = self.problem.initial
+        return known and self.draft.disturbance is None and (start.random or start.is_point)
 
     def file(self) -> None:
         """Saved and loaded again: the same problem."""
@@ -341,8 +350,10 @@ class Run:
         trace = "".join(traceback.format_exception(error))
         self.report(command, "error", signature_of(error), trace[-1900:])
 
-    def _compare(self, command: str, level: float, count: Callable[[int], tuple[int, int]]) -> None:
-        """A finding where hits out of paths refute ``level``, on every finer grid as well."""
+    def _compare(
+        self, command: str, level: float, count: Callable[[int], tuple[int, int]], *, below: bool = False
+    ) -> None:
+        """A finding where hits out of paths refute ``level`` as an upper (or lower) bound, on finer grids as well."""
         said = []
         for factor in (1, *FINER) if self.draft.continuous else (1,):
             try:
@@ -350,9 +361,9 @@ class Run:
             except Exception as error:  # noqa: BLE001  (what was answered cannot be used: a finding too)
                 self.report(command, "error", signature_of(error), str(error))
                 return
-            lower = oracle.lower_limit(hits, paths)
             said.append(f"{hits} of {paths} in {oracle.STEPS * factor} steps")
-            if lower <= level:
+            limits = oracle.lower_limit(hits, paths), 1 - oracle.lower_limit(paths - hits, paths)
+            if limits[1] >= level if below else limits[0] <= level:
                 return
         self.report(
             command, "contradiction", f"{command} refuted by simulation", f"certified {level:.6g}: {', '.join(said)}"

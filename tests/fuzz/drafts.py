@@ -119,13 +119,17 @@ class Wall:
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """Discrete-time noise: a law's name, its level's name and value, and the matrix G (None: the identity)."""
+    """Discrete-time noise: a law's name, its level's name and value, the matrix G (None: the identity) and a table.
+
+    The table of a ``discrete`` law is (values, probabilities), that of a ``histogram`` (edges, probabilities).
+    """
 
     law: str
     level: str
     value: Array
     matrix: Array | None = None
     independent: bool = True
+    table: tuple[Array, Array] | None = None
 
     def build(self, units: Units) -> dict[str, Any]:
         """Arguments of a discrete-time system."""
@@ -138,9 +142,12 @@ class Noise:
             value = value * (units.state**2 if self.level.endswith("variance") else units.state)
         kinds = {
             "gaussian": cb.Gaussian, "uniform": cb.Uniform, "rademacher": cb.Rademacher, "bounded": cb.Bounded,
-            "subgaussian": cb.SubGaussian,
+            "subgaussian": cb.SubGaussian, "triangular": cb.Triangular, "laplace": cb.Laplace, "discrete": cb.Discrete,
+            "histogram": cb.Histogram,
         }  # fmt: skip
         options: dict[str, Any] = {self.level: value}
+        if self.table is not None:
+            options |= {"edges" if self.law == "histogram" else "values": self.table[0], "probabilities": self.table[1]}
         if self.law == "bounded":
             options["independent"] = self.independent
         found: dict[str, Any] = {"noise": kinds[self.law](**options)}
@@ -149,7 +156,11 @@ class Noise:
 
 @dataclass(frozen=True, kw_only=True)
 class Draft:
-    """A random problem: the model's formulas over t, x0.., u0.., d0.., and everything around it."""
+    """A random problem: the model's formulas over t, x0.., u0.., d0.., and everything around it.
+
+    Where ``shifts`` are given the start is a union: the set ``start`` moved by each of them. Where ``constant`` is true
+    the disturbance is unknown but the same at all times. A ``target`` is to be reached before a wall is broken.
+    """
 
     seed: int
     family: str
@@ -162,6 +173,9 @@ class Draft:
     diffusion: tuple[tuple[Formula, ...], ...] = ()
     noise: Noise | None = None
     disturbance: tuple[Array, Array] | None = None
+    constant: bool = False
+    shifts: tuple[Array, ...] = ()
+    target: Wall | None = None
     inputs: tuple[Array, Array] | None = None
     plan: Any = None
     domain: tuple[Array, Array] | None = None
@@ -197,6 +211,8 @@ class Draft:
             safe=[self._wall(wall, units) for wall in self.walls],
             horizon=self.horizon * units.time,
             delta=self.delta,
+            reach=None if self.target is None else self._wall(self.target, units, cb.Reach),
+            unknown=system.disturbance_names if self.constant else (),
             plan=plan,
             domain=None if domain is None else cb.Box(domain[0] * units.state, domain[1] * units.state),
             name=f"fuzz {self.seed}",
@@ -264,10 +280,15 @@ class Draft:
         return matrix
 
     def _start(self, units: Units) -> Any:
+        if self.shifts:
+            return [self._start_at(shift, units) for shift in self.shifts]
+        return self._start_at(np.zeros(self.dimension), units)
+
+    def _start_at(self, shift: Array, units: Units) -> Any:
         kind, first, second = self.start
-        scale = units.state
+        first, scale = first + shift, units.state
         if kind == "box":
-            return cb.Box(first * scale, second * scale)
+            return cb.Box(first * scale, (second + shift) * scale)
         if kind == "gaussian":
             return cb.GaussianStart(first * scale, second * np.outer(scale, scale))
         if kind == "ball" and units.common:
@@ -276,9 +297,10 @@ class Draft:
         return cb.Ellipsoid(first * scale, shape * np.outer(scale, scale))
 
     @staticmethod
-    def _wall(wall: Wall, units: Units) -> Any:
+    def _wall(wall: Wall, units: Units, word: Any = None) -> Any:
         during = None if wall.during is None else (wall.during[0] * units.time, wall.during[1] * units.time)
-        return (cb.Inside if wall.inside else cb.Outside)(wall.shape.build(units), during=during)
+        word = word or (cb.Inside if wall.inside else cb.Outside)
+        return word(wall.shape.build(units), during=during)
 
     # ---- by way of a problem file ----------------------------------------------------------------------------
 

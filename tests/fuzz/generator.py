@@ -26,6 +26,7 @@ PILOT, PILOT_STEPS = 200, 40
 LARGEST = 1e3
 """Size beyond which a pilot run has exploded, and the horizon is cut."""
 TRIES = 40
+_MISPLACED = ("`initial` must satisfy every constraint", "`reach` must meet the safe set")
 
 
 def draw(seed: int) -> tuple[Draft, cb.Problem]:
@@ -44,7 +45,7 @@ def draw(seed: int) -> tuple[Draft, cb.Problem]:
         try:
             return draft, draft.problem()
         except ValueError as error:
-            if "`initial` must satisfy every constraint" not in str(error):
+            if not any(words in str(error) for words in _MISPLACED):
                 raise
             refusal = error
     raise ValueError(f"no problem was drawn from seed {seed}.") from refusal
@@ -74,8 +75,59 @@ def _draft(seed: int, rng: Random) -> Draft | None:
         draft = replace(draft, domain=(low - room, high + room))
     count = int(rng.choice([1, 2, 3], p=[0.65, 0.25, 0.1]))
     draft = replace(draft, walls=tuple(_wall(rng, draft, times, states) for _ in range(count)))
+    draft = _asked(rng.spawn(1)[0], draft, times, states)
     draft = replace(draft, route=_route(rng, draft), units=_units(rng, draft))
     return replace(draft, features=_features(draft))
+
+
+def _asked(rng: Random, draft: Draft, times: Array, states: Array) -> Draft:
+    """Now and then a union of starts, a target, a constant that is unknown, and a law from a table."""
+    n, roll = draft.dimension, rng.random(4)
+    if roll[0] < 0.15 and draft.start[0] != "gaussian":
+        size = float(np.median(np.std(states[-1], axis=0))) + 1e-4
+        more = tuple(np.round(size * rng.standard_normal(n), 4) for _ in range(int(rng.integers(1, 3))))
+        draft = replace(draft, shifts=(np.zeros(n), *more))
+    if roll[1] < 0.15:
+        draft = replace(draft, target=_target(rng, draft, times, states))
+    if draft.disturbance is not None and roll[2] < 0.3:
+        draft = replace(draft, constant=True)
+    if draft.noise is not None and draft.noise.law in ("uniform", "rademacher") and roll[3] < 0.7:
+        draft = replace(draft, noise=_tabled(rng, draft.noise))
+    return draft
+
+
+def _target(rng: Random, draft: Draft, times: Array, states: Array) -> Wall:
+    """A box or a ball about where paths are at some time, to be reached by the end, in a window, or at the end."""
+    k = int(rng.integers(len(times) // 2, len(times)))
+    spread = np.std(states[k], axis=0) + 1e-3
+    center = states[k].mean(axis=0) + spread * rng.normal(size=draft.dimension) * rng.choice([0.3, 1.5])
+    during = _window(rng, draft, times)
+    if rng.random() < 0.3:
+        shape = Shape(kind="ball", data=(float(2.0 * spread.max() * rng.uniform(0.5, 2.0)),), center=tuple(
+            number(float(c)) for c in center
+        ))  # fmt: skip
+        return Wall(shape=shape, during=during)
+    half = spread * rng.uniform(0.5, 4.0, draft.dimension)
+    low, high = center - half, center + half
+    if rng.random() < 0.3:
+        open_side = int(rng.integers(draft.dimension))
+        high[open_side] = np.inf
+    return Wall(shape=Shape(kind="box", data=(low, high)), during=during)
+
+
+def _tabled(rng: Random, noise: Noise) -> Noise:
+    """The same size of another law: triangular, of a table, or with the tails of an exponential."""
+    law = str(rng.choice(["triangular", "discrete", "histogram", "laplace"], p=[0.35, 0.3, 0.3, 0.05]))
+    if law == "triangular":
+        return replace(noise, law=law, level="halfwidth")
+    if law == "laplace":
+        return replace(noise, law=law, level="scale")
+    count = int(rng.integers(2, 5))
+    weights = np.round(0.05 + (1 - 0.05 * count) * rng.dirichlet(np.full(count, 2.0)), 6)
+    weights[-1] = 1.0 - weights[:-1].sum()
+    places = np.sort(rng.uniform(-1.0, 1.0, count + (law == "histogram")))
+    middles = 0.5 * (places[1:] + places[:-1]) if law == "histogram" else places
+    return replace(noise, law=law, level="scale", table=(places - weights @ middles, weights))
 
 
 def _inputs(rng: Random, model: Sketch) -> tuple[tuple[Formula, ...], Any, Any]:
@@ -366,7 +418,10 @@ def _features(draft: Draft) -> frozenset[str]:
         "noise: dependent entries" if draft.noise and not draft.noise.independent else "",
         "noise: matrix" if draft.noise and draft.noise.matrix is not None else "",
         "noise: g(t, x)" if g - {"t"} else "noise: g(t)" if g else "noise: constant g" if draft.diffusion else "",
-        "disturbance" if draft.disturbance else "",
+        ("disturbance: constant" if draft.constant else "disturbance") if draft.disturbance else "",
+        "start: union" if draft.shifts else "",
+        "target" if draft.target else "",
+        "target: window" if draft.target and draft.target.during else "",
         "plan: " + ("array" if isinstance(draft.plan, np.ndarray) else "feedback") if draft.inputs else "",
         "domain" if draft.domain else "",
         "units: 1" if np.all(draft.units.state == 1) else "units: common" if draft.units.common else "units: mixed",

@@ -75,6 +75,8 @@ def policies(draft: Draft, rng: np.random.Generator) -> list[Policy | None]:
     low, high = draft.disturbance
     corners = [np.array(c) for c in itertools.product(*zip(low, high))][:4]
     found: list[Policy | None] = [Policy(low, high, constant=corner) for corner in corners]
+    if draft.constant:
+        return [*found, Policy(low, high, constant=0.5 * (low + high))]
     center = starts(draft, rng, 1)[0]
     for _ in range(3):
         direction = rng.standard_normal((len(low), draft.dimension))
@@ -84,6 +86,11 @@ def policies(draft: Draft, rng: np.random.Generator) -> list[Policy | None]:
 
 def starts(draft: Draft, rng: np.random.Generator, count: int) -> Array:
     """The centre, corners (or points of the surface), and random points of the initial set."""
+    points = _points(draft, rng, count)
+    return points + np.array(draft.shifts)[np.arange(count) % len(draft.shifts)] if draft.shifts else points
+
+
+def _points(draft: Draft, rng: np.random.Generator, count: int) -> Array:
     kind, first, second = draft.start
     n = draft.dimension
     if kind == "gaussian":
@@ -114,6 +121,15 @@ def variates(draft: Draft, rng: np.random.Generator, count: int) -> Array:
         w = rng.standard_normal((count, m)) * (np.sqrt(value) if noise.level.endswith("variance") else value)
     elif noise.law == "uniform":
         w = rng.uniform(-1.0, 1.0, (count, m)) * value
+    elif noise.law == "triangular":
+        w = rng.triangular(-1.0, 0.0, 1.0, (count, m)) * value
+    elif noise.law == "laplace":
+        w = rng.laplace(size=(count, m)) * value
+    elif noise.table is not None:
+        places, weights = noise.table
+        chosen = rng.choice(len(weights), size=(count, m), p=weights)
+        w = places[chosen] if noise.law == "discrete" else rng.uniform(places[chosen], places[chosen + 1])
+        w = w * value
     else:
         signs = 2.0 * rng.integers(0, 2, (count, m)) - 1.0
         w = (signs if noise.independent else np.broadcast_to(signs[:, :1], signs.shape)) * value
@@ -203,22 +219,33 @@ def broken(wall: Wall, t: float, x: Array, horizon: float) -> NDArray[np.bool_]:
     return wall.shape.contains(x, t, -EDGE)
 
 
+def arrived(target: Wall, t: float, x: Array, horizon: float) -> NDArray[np.bool_]:
+    """Which states may be in the target at time t."""
+    first, last = (0.0, horizon) if target.during is None else target.during
+    if not first - 1e-9 * horizon <= t <= last + 1e-9 * horizon:
+        return np.zeros(len(x), dtype=bool)
+    return target.shape.contains(x, t, EDGE)
+
+
 def exits(
     draft: Draft, start: Array, rng: np.random.Generator, *, steps: int, policy: Signal | None, noise: bool = True
 ) -> NDArray[np.bool_]:
-    """Which paths break a wall, or leave the domain."""
-    gone = np.zeros(len(start), dtype=bool)
-    domain = draft.domain
+    """Which paths break a wall, or leave the domain; with a target, before they are in it, or are never in it."""
+    gone, there = np.zeros((2, len(start)), dtype=bool)
+    domain, finite = draft.domain, np.ones(len(start), dtype=bool)
     with np.errstate(all="ignore"):
         for t, x in follow(draft, start, rng, steps=steps, policy=policy, noise=noise):
-            usable = np.all(np.isfinite(x), axis=1)
+            finite &= np.all(np.isfinite(x), axis=1)
+            if draft.target is not None:
+                there |= ~gone & arrived(draft.target, t, x, draft.horizon)
+            usable = finite & ~there
             for wall in draft.walls:
                 gone |= usable & broken(wall, t, x, draft.horizon)
             if domain is not None:
                 gone |= usable & np.any((x < domain[0]) | (x > domain[1]), axis=1)
             if np.any(gone):
                 x[gone] = start[gone]  # in place: a path that left goes on where it can do no harm
-    return gone
+    return gone if draft.target is None else gone | (finite & ~there)
 
 
 def worst_case(draft: Draft, rng: np.random.Generator, *, paths: int, pilot: int = 1000) -> tuple[Count, Policy | None]:

@@ -65,6 +65,8 @@ def test_two_hundred_seeds_cover_the_language():
     assert {f"states: {n}" for n in range(1, 7)} <= features
     assert {"model: kink", "model: jump", "model: in t", "noise: g(t, x)", "disturbance", "domain"} <= features
     assert {"plan: array", "plan: feedback", "units: common", "units: mixed", "units: time"} <= features
+    assert {"start: union", "target", "target: window", "disturbance: constant"} <= features
+    assert {f"noise: {law}" for law in ("triangular halfwidth", "discrete scale", "histogram scale")} <= features
     assert {"route: python", "route: file", "route: linear", "wall: moving", "wall: window"} <= features
 
 
@@ -116,6 +118,41 @@ def test_a_probability_below_the_truth_is_a_contradiction():
     run.simulate()
     assert kinds(run) == set()
     assert run.facts["ratio"] >= 1
+
+
+def test_a_lower_bound_above_the_truth_is_a_contradiction():
+    run = run_of(walk(delta=1e-2))
+    run.verify()
+    assert run.verdict.log10_lower is not None
+    run.simulate()
+    assert kinds(run) == set()
+    run = run_of(walk())
+    run.verdict = replace(cb.verify_safety(run.problem), log10_lower=np.log10(0.3), log10_delta=0.0)
+    run.simulate()
+    assert kinds(run) == {("simulate", "contradiction")}
+
+
+def test_paths_that_never_reach_their_target_fail():
+    around = Wall(shape=Shape(kind="box", data=(np.array([-0.05]), np.array([0.04]))))
+    draft = walk(target=around, start=("box", np.full(1, 0.1), np.full(1, 0.1)), delta=1e-2)
+    count, _ = oracle.worst_case(draft, np.random.default_rng(0), paths=20_000)
+    both = cb.verify_safety(draft.problem())
+    assert 10**both.log10_lower - 0.02 < count.exits / count.paths < 10**both.log10_delta + 0.02
+    assert both.log10_delta - both.log10_lower < 0.02
+
+
+def test_every_member_of_a_union_and_every_law_is_simulated():
+    apart = walk(shifts=(np.zeros(1), np.array([0.15])))
+    rng = np.random.default_rng(0)
+    assert sorted(set(np.round(oracle.starts(apart, rng, 10)[:, 0], 6))) == [0.0, 0.15]
+    levels = {"triangular": "halfwidth", "discrete": "scale", "histogram": "scale", "laplace": "scale"}
+    shares = [0.1, 0.3, 0.6, 0.95]
+    for law, level in levels.items():
+        table = {"discrete": ([-1.0, 0.5], [1 / 3, 2 / 3]), "histogram": ([-1.0, 0.5, 1.0], [0.75, 0.25])}.get(law)
+        noise = Noise(law=law, level=level, value=np.array([0.1]), table=table and tuple(map(np.array, table)))
+        drawn = oracle.variates(walk(noise=noise), rng, 50_000)[:, 0]
+        own = noise.build(Units(state=np.ones(1)))["noise"].resolve(1).sample(rng, 50_000)[:, 0]
+        assert np.quantile(drawn, shares) == pytest.approx(np.quantile(own, shares), abs=0.004)
 
 
 def test_a_contradiction_in_continuous_time_must_survive_finer_steps():

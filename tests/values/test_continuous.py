@@ -485,7 +485,6 @@ def test_a_source_is_at_least_what_is_needed_on_every_patch() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"safe": [cb.Inside(cb.HalfSpace([1.0, 0.0], 1.0))]}, "x1 is unbounded below"),
         ({"safe": [cb.Inside(cb.Box([-1, -1], [1, 1]), during=(0.5, 1.0))]}, "over a window"),
         ({"safe": [cb.Inside(cb.Box([-1, -1], [1, 1], center=lambda t: [0.1 * t, 0.0]))]}, "moving sets"),
         ({"initial": cb.GaussianStart([0.0, 0.0], 0.01 * np.eye(2))}, "random start"),

@@ -216,6 +216,35 @@ def test_random_curved_problems_are_left_no_more_often_than_bounded(seed: int) -
     assert check("curved", seed, paths=200_000, seconds=5.0)[0] == ""
 
 
+def half_plane() -> cb.Problem:
+    """Two states that do not meet, x1 <= 1."""
+    free = cb.ContinuousSystem(lambda x: [-x[0], 0.2 - x[1]], states=2, diffusion=0.5 * np.eye(2))
+    return cb.Problem(free, initial=[0, 0], safe=[cb.Inside(cb.HalfSpace([1.0, 0.0], 1.0))], horizon=0.5)
+
+
+def test_a_state_without_limits_gets_a_box_that_few_paths_leave() -> None:
+    problem = half_plane()
+    assert walled(problem)
+    plane, region, level = bounding._setting(problem, exits._model(problem))
+    assert 1 - 1e-12 < plane.high[0] == region.high[0] <= 1.0
+    assert not region.walls.groups
+    assert plane.low[0] < -1.0
+    assert plane.low[1] < -1.0 < 1.0 < plane.high[1]
+    assert np.log(2e-4) < level < np.log(2e-3)  # one state alone: 6.1e-4
+
+
+@pytest.mark.slow
+def test_a_half_plane_is_left_as_often_as_one_state_says() -> None:
+    found = bound_exits(half_plane(), seconds=2.0)
+    line = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=0.5)
+    alone = cb.Problem(line, initial=[0], safe=[cb.Inside(cb.Box([-np.inf], [1.0]))], horizon=0.5)
+    truth = bound_exits(alone, seconds=1.0)
+    assert truth.lower is not None
+    assert truth.lower < found.upper < truth.upper + np.log10(2.5)
+    assert found.lower is None
+    assert not found.proposed
+
+
 def test_the_worst_point_of_a_ball_of_starts_counts_and_starts_at_a_wall_are_lost() -> None:
     _problem, _, walls, surface = disc_proposals()
     ball = cb.Ball([0.1, 0.05], 0.4)

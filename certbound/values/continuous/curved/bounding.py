@@ -24,7 +24,7 @@ from certbound.values.continuous.curved.proof import Lot, highest_over, look_ove
 from certbound.values.continuous.curved.region import Region, region_of
 from certbound.values.continuous.hypotheses import LIFTS, Model, covers, extreme_over
 from certbound.values.continuous.payment import Payment
-from certbound.values.continuous.plane import Plan, Plane, Source, slab_times
+from certbound.values.continuous.plane import Plan, Plane, Source, bound_plane_above, rough_level, slab_times
 from certbound.values.continuous.residual import sample_in_plane, value_range
 from certbound.values.continuous.room import starts_of
 from certbound.values.continuous.surface import Surface
@@ -53,6 +53,9 @@ def bound_region(
     """The upper bound on one grid after another; nothing is proposed for certificates, which know boxes only."""
     plane, region, level = _setting(problem, model)
     patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
+    if not region.walls.groups:
+        upper, done, _ = bound_plane_above(plane, model, level, patches)
+        return upper, None, f"value function in two states on a box that few paths leave, cells: {', '.join(done)}", []
     upper, done = 0.0, []
     for share in _SHARES:
         plan = _plan(plane, level, share * patches)
@@ -123,6 +126,8 @@ def _with(plane: Plane, cells: int, growth: float, floor: float) -> Plan:
 
 def _rough_level(plane: Plane, walls: Walls) -> float:
     """log P from a coarse proposal; the floor is lowered until it does not matter."""
+    if not walls.groups:
+        return rough_level(plane)
     level = 0.0
     for floor in (-8.0, -20.0, -45.0):
         surface = propose_within(plane, _with(plane, 28, 0.4, floor), walls)

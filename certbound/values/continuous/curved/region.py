@@ -30,8 +30,12 @@ class Region:
 
 
 def walled(problem: Problem) -> bool:
-    """Whether a problem in the plane has obstacles, or limits that do not lie along the coordinates."""
-    return any(constraint.outside or not _square(constraint) for constraint in problem.constraints)
+    """Whether the safe set of a problem in the plane is more than a box: obstacles, other limits, or a missing one."""
+    kept = problem.constraints
+    if any(constraint.outside or not _square(constraint) for constraint in kept):
+        return True
+    sides = np.vstack([np.eye(2), -np.eye(2)])
+    return bool(np.isinf(np.min([constraint.region.support(sides) for constraint in kept], axis=0)).any())
 
 
 def _square(constraint: Inside) -> bool:

@@ -61,23 +61,8 @@ def two_states(
     starts = starts_of(problem)
     inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
     patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
-    level = _rough_level(inner)
-    upper, done = 0.0, []
-    proposed: list[tuple[Surface, Payment]] = []
-    for share in _SHARES:
-        plan = _plan(inner, level, share * patches)
-        try:
-            surface = _promising(inner, model, plan)
-            if surface is not None:
-                payment = prove_upper(surface, model, starts)
-                if payment.log < upper:
-                    upper = payment.log
-                    proposed.append((raised_above(surface), payment))
-        except OutOfTime:
-            if upper < 0:
-                break
-            raise
-        done.append(f"{plan.cells}^2")
+    level = rough_level(inner)
+    upper, done, proposed = bound_plane_above(inner, model, level, patches)
     lower = None
     if upper > wanted:
         outer = _plane(problem, model, room.outer_low, room.outer_high, starts)
@@ -86,6 +71,29 @@ def two_states(
             lower = bound_plane_below(outer, model, plan, starts)
         done.append(f"{plan.cells}^2 below")
     return upper, lower, f"value function in two states, cells: {', '.join(done)}", proposed
+
+
+def bound_plane_above(
+    plane: Plane, model: Model, level: float, patches: float
+) -> tuple[float, list[str], list[tuple[Surface, Payment]]]:
+    """An upper bound of log P(leaving the box) on one grid after another, what was done, and what was proved."""
+    upper, done = 0.0, []
+    proposed: list[tuple[Surface, Payment]] = []
+    for share in _SHARES:
+        plan = _plan(plane, level, share * patches)
+        try:
+            surface = _promising(plane, model, plan)
+            if surface is not None:
+                payment = prove_upper(surface, model, plane.starts)
+                if payment.log < upper:
+                    upper = payment.log
+                    proposed.append((raised_above(surface), payment))
+        except OutOfTime:
+            if upper < 0:
+                break
+            raise
+        done.append(f"{plan.cells}^2")
+    return upper, done, proposed
 
 
 def _plan(plane: Plane, level: float, patches: float) -> Plan:
@@ -101,7 +109,7 @@ def _plan(plane: Plane, level: float, patches: float) -> Plan:
     return plan
 
 
-def _rough_level(plane: Plane) -> float:
+def rough_level(plane: Plane) -> float:
     """log P from a coarse proposal; 0 where that breaks down."""
     rough = propose_plane(plane, Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon))
     return 0.0 if rough is None else min(0.0, float(extreme_over(rough, plane.starts, upper=True)))
@@ -110,7 +118,7 @@ def _rough_level(plane: Plane) -> float:
 def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], seconds: float) -> list[Chart]:
     """Upper bounds from every cell at t = 0, sharp at the levels of log P; none where no proposal comes to an end."""
     plane = _plane(problem, model, room.inner_low, room.inner_high, starts_of(problem))
-    least = _rough_level(plane)
+    least = rough_level(plane)
     levels = sorted({max(level, least) for level in levels})
     plan = _plan(plane, levels[0], _SHARES[0] * _RATE * seconds)
     surface = _promising(plane, model, plan, levels[-1])
