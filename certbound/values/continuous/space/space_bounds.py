@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.continuous.hypotheses import (
@@ -65,7 +66,7 @@ def three_states(problem: Problem, model: Model, deadline: float) -> tuple[float
     Raises
     ------
     InfeasibleError
-        The safe set is no box.
+        The safe set is no box; or nothing was proved, and some state has no noise of its own.
     """
     space = _space(problem, model)
     patches = min(_RATE * max(1.0, round(deadline - time.perf_counter(), 1)) / _effort(model), _MOST)
@@ -82,6 +83,11 @@ def three_states(problem: Problem, model: Model, deadline: float) -> tuple[float
                 break
             raise
         done.append(f"{plan.cells}^3")
+    if upper == 0.0 and not all(space.noisy(axis) for axis in range(3)):
+        raise InfeasibleError(
+            "value functions in three states proved nothing: where a state has no noise of its own they have fronts "
+            "that grids of this size do not follow; another engine's answer stands."
+        )
     words = f"value function in three states, cells: {', '.join(done)}"
     if level < 0 and upper > level + _FAR:
         words += f"; a rough guess that nothing proves is {math.exp(level):.1g}: more time, as by name, may prove more"
