@@ -41,7 +41,9 @@ from certbound.values.continuous.space.space_solver import SpaceSolver
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
-_FACTOR = 1.12
+_FACTORS = (0.5, 0.6, 0.8, 1.12, 1.12, 1.12)
+"""Of what a proof would pay, for one source after the other: a node takes the largest value around it, so that the
+first ones are too large where they need not be."""
 _TOP = -0.03  # where V is above, the proof may lift it over 0 instead
 _CAP = 50.0
 _GRANTED = 0.005  # eps that the proof may pay, in units of the bound, summed over the horizon
@@ -49,7 +51,6 @@ _SLACK = 0.02  # of log P, which bounds of R may add to its samples
 _RATE = 4_000  # patches that are proposed and proved in a second of a processor
 _CLOCKED = 2.5  # times the work, where the model depends on time: it is read anew on every slab
 _MOST = 3_000_000  # patches, which take 600 MB
-_PASSES = 6
 _CLOSE = 0.1
 _WORTH = 0.03  # of log P: a pass that gains less is the last one
 _HOPELESS = 60.0  # what a first proposal may lose (log P)
@@ -145,8 +146,8 @@ def _promising(space: Space, model: Model, plan: Plan) -> _Sketch | None:
     sketch = best = _Sketch.of(surface, model, space.starts)
     if sketch.estimate() > sketch.start + _HOPELESS:
         return None
-    for _ in range(_PASSES):
-        more = Source.above(sketch.surface, _FACTOR * sketch.needed(_TOP))
+    for factor in _FACTORS:
+        more = Source.above(sketch.surface, factor * sketch.needed(_TOP))
         source = more if source is None else source.plus(more)
         surface = integrated(SpaceSolver(space, plan, source))
         if surface is None:
