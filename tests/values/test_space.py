@@ -166,6 +166,15 @@ def test_a_state_without_limits_gets_ends_beyond_simulated_paths() -> None:
     assert -3 < low[2] < -1
 
 
+def test_no_bound_without_noise_along_a_state_is_said_in_words() -> None:
+    noise = [[0.0], [0.0], [1.0]]
+    system = cb.ContinuousSystem(lambda x: [np.cos(x[2]), np.sin(x[2]), 0 * x[0]], states=3, diffusion=noise)
+    safe = [cb.Inside(cb.Box([-1, -1, -np.inf], [3, 1, np.inf]))]
+    problem = cb.Problem(system, initial=[0, 0, 0], safe=safe, horizon=1.5)
+    with pytest.raises(InfeasibleError, match="no noise of its own"):
+        bound_exits(problem, seconds=1.0)
+
+
 @pytest.mark.parametrize(
     ("safe", "match"),
     [

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.continuous.hypotheses import (
@@ -40,7 +41,9 @@ from certbound.values.continuous.space.space_solver import SpaceSolver
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
-_FACTOR = 1.12
+_FACTORS = (0.5, 0.6, 0.8, 1.12, 1.12, 1.12)
+"""Of what a proof would pay, for one source after the other: a node takes the largest value around it, so that the
+first ones are too large where they need not be."""
 _TOP = -0.03  # where V is above, the proof may lift it over 0 instead
 _CAP = 50.0
 _GRANTED = 0.005  # eps that the proof may pay, in units of the bound, summed over the horizon
@@ -48,7 +51,6 @@ _SLACK = 0.02  # of log P, which bounds of R may add to its samples
 _RATE = 4_000  # patches that are proposed and proved in a second of a processor
 _CLOCKED = 2.5  # times the work, where the model depends on time: it is read anew on every slab
 _MOST = 3_000_000  # patches, which take 600 MB
-_PASSES = 6
 _CLOSE = 0.1
 _WORTH = 0.03  # of log P: a pass that gains less is the last one
 _HOPELESS = 60.0  # what a first proposal may lose (log P)
@@ -65,7 +67,7 @@ def three_states(problem: Problem, model: Model, deadline: float) -> tuple[float
     Raises
     ------
     InfeasibleError
-        The safe set is no box.
+        The safe set is no box; or nothing was proved, and some state has no noise of its own.
     """
     space = _space(problem, model)
     patches = min(_RATE * max(1.0, round(deadline - time.perf_counter(), 1)) / _effort(model), _MOST)
@@ -82,6 +84,11 @@ def three_states(problem: Problem, model: Model, deadline: float) -> tuple[float
                 break
             raise
         done.append(f"{plan.cells}^3")
+    if upper == 0.0 and not all(space.noisy(axis) for axis in range(3)):
+        raise InfeasibleError(
+            "value functions in three states proved nothing: where a state has no noise of its own they have fronts "
+            "that grids of this size do not follow; another engine's answer stands."
+        )
     words = f"value function in three states, cells: {', '.join(done)}"
     if level < 0 and upper > level + _FAR:
         words += f"; a rough guess that nothing proves is {math.exp(level):.1g}: more time, as by name, may prove more"
@@ -139,8 +146,8 @@ def _promising(space: Space, model: Model, plan: Plan) -> _Sketch | None:
     sketch = best = _Sketch.of(surface, model, space.starts)
     if sketch.estimate() > sketch.start + _HOPELESS:
         return None
-    for _ in range(_PASSES):
-        more = Source.above(sketch.surface, _FACTOR * sketch.needed(_TOP))
+    for factor in _FACTORS:
+        more = Source.above(sketch.surface, factor * sketch.needed(_TOP))
         source = more if source is None else source.plus(more)
         surface = integrated(SpaceSolver(space, plan, source))
         if surface is None:
