@@ -109,3 +109,22 @@ def test_series_follow_the_network_along_a_line(activation: str) -> None:
     expected = values(network, (point + step * direction)[:, None])[:, 0]
     found = [sum(float(c.mid[0]) * step**k for k, c in enumerate(output)) for output in series]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_no_point_of_a_million_is_outside() -> None:
+    """50 networks of up to 2 x 64 neurons, 1e4 boxes, 1e6 points, against ranges and planes."""
+    rng = np.random.default_rng(22)
+    for seed in range(50):
+        width, inputs = int(rng.integers(4, 65)), int(rng.integers(1, 5))
+        kind = sorted(ACTIVATIONS)[seed % len(ACTIVATIONS)]
+        network = weights_of(random_network(kind, seed, sizes=(inputs, width, width, 1)).data)
+        centre, radius = rng.normal(size=(inputs, BOXES)), 10 ** rng.uniform(-8, 0.5, (inputs, BOXES))
+        box = Interval(centre - radius, centre + radius)
+        found, (slopes, rest) = bound_network(network, box, 0).value, relax_network(network, box)
+        for number in range(100):
+            share = rng.uniform(-1, 1, (inputs, BOXES))
+            point = np.clip(centre + (np.sign(share) if number < 20 else share) * radius, box.lo, box.hi)
+            value = values(network, point)
+            assert outside(value, found, 1e-13) == 0
+            assert outside(value - np.einsum("pnm,nm->pm", slopes, point - box.mid), rest, 1e-12) == 0

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from certbound.problem.model.derivative import jacobian
     from certbound.problem.model.evaluation import compile_numpy, compile_scalar
     from certbound.problem.model.graph import Graph, substitute
-    from certbound.problem.model.network_data import Layer, Network, Part
+    from certbound.problem.model.network_data import PARTS, Layer, Network, Part
     from certbound.problem.model.network_rows import relaxed
     from certbound.problem.model.operations import (
         OPERATIONS,
@@ -45,7 +45,7 @@ _HOME = {
     "graph": "Graph substitute",
     "calling": "call_network",
     "network_rows": "relaxed",
-    "network_data": "Layer Network Part",
+    "network_data": "PARTS Layer Network Part",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
     "tracing": "trace",
@@ -73,6 +73,7 @@ __all__ = [
     "Node",
     "OPERATIONS",
     "Part",
+    "PARTS",
     "relaxed",
     "ROWS",
     "selected",

@@ -18,7 +18,7 @@ CONSTANTS: dict[str, int] = {
     "linear": 0, "tanh": 0, "sigmoid": 0, "softplus": 0, "elu": 0, "sin": 0, "relu": 0, "leaky_relu": 1, "clip": 2,
 }  # fmt: skip
 """Activations, and how many constants each has (``leaky_relu`` its slope left of 0, ``clip`` its ends)."""
-MOST_LAYERS, MOST_WIDTH, MOST_WEIGHTS, LARGEST = 32, 4096, 2_000_000, 1e8
+MOST_LAYERS, MOST_WIDTH, MOST_WEIGHTS, LARGEST = 32, 4096, 300_000, 1e8
 """Limits of what a network may hold: layers, outputs of a layer, numbers, and their size."""
 
 

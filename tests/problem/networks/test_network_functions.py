@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 import certbound as cb
 from certbound.constants.enclosures import enclose
+from certbound.problem.adapters.casadi import to_casadi
 from certbound.problem.model import compile_numpy, jacobian, trace
 from certbound.problem.networks import write_network
 from certbound.rigor.intervals import Interval
@@ -69,11 +71,12 @@ def test_second_derivatives_of_a_network_with_kinks_are_refused_where_these_lie(
 
 
 @pytest.mark.parametrize("activation", ["tanh", "sigmoid", "softplus", "elu", "sin", "relu", "leaky_relu", "clip"])
-def test_kernels_compute_the_network(activation: str) -> None:
+def test_kernels_and_casadi_compute_the_network(activation: str) -> None:
     policy = random_network(activation)
     tape = trace(lambda a, b: [policy(a[0], b[0])[1]], {"a": ["a"], "b": ["b"]})
     for point in ((0.3, -0.4), (-2.0, 1.5)):
         np.testing.assert_allclose(run(tape, *point), policy(*point)[1], rtol=1e-13)
+        np.testing.assert_allclose(float(to_casadi(tape, point)), policy(*point)[1], rtol=1e-13)
 
 
 def test_a_derivative_of_a_network_has_no_kernel() -> None:
@@ -164,6 +167,14 @@ def test_files_that_are_none_are_refused(tmp_path: Path) -> None:
         cb.network(tmp_path / "missing.npz")
     with pytest.raises(ValueError, match=r"must end in \.npz"):
         write_network(random_network("tanh"), tmp_path / "a.onnx")
+
+
+def test_a_pickled_model_is_the_same_function() -> None:
+    policy = random_network("relu")
+    tape = trace(lambda x: list(policy(x)), {"x": ["a", "b"]})
+    copy = pickle.loads(pickle.dumps(tape))
+    assert copy.nodes[2].part.network is copy.nodes[3].part.network
+    np.testing.assert_array_equal(compile_numpy(copy)(0.1, 0.2), compile_numpy(tape)(0.1, 0.2))
 
 
 def test_a_network_is_called_on_vectors_and_batches() -> None:
