@@ -49,6 +49,13 @@ class Wall:
             return form.values(y) - form.bounds
         return (y * self._weighed(y)).sum(axis=-1)[:, None] - 1.0
 
+    def hull(self) -> Interval:
+        """Ends of a box around the region in (p, q), shape (2,)."""
+        places = self.region.places(2)
+        found, own = Interval(np.full(2, -np.inf), np.full(2, np.inf)), self.region.hull(0.0)
+        found.lo[places], found.hi[places] = own.lo, own.hi
+        return found[list(self.order)]
+
     def _boxes(self, p: Interval, q: Interval) -> Interval:
         both = (p, q) if self.order == (0, 1) else (q, p)
         return stack(both, axis=-1)[:, self.region.places(2)]

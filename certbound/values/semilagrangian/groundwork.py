@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -154,7 +155,9 @@ def _axes(setting: Setting, clock: Clock, plan: Plan, rough: Blocks) -> tuple[Ar
     low = min(ends[0] - slant[1], p0 - away[1]) - 13 * sigma[0]
     high = max(ends[1] - slant[0], p1 - away[0]) + 13 * sigma[0]
     places = np.linspace(low, high, 4001)
-    gap = np.minimum(*(np.maximum(np.maximum(f - away[1] - places, places - f + away[0]), 0.0) for f in (p0, p1)))
+    gap = np.full(len(places), np.inf)
+    for end, slant in _upright(setting, clock.shear, (p0, p1)):
+        gap = np.minimum(gap, np.maximum(np.maximum(end - slant[1] - places, places - end + slant[0]), 0.0))
     wanted = np.minimum(plan.fine * sigma[0] + 0.1 * gap, plan.wide * (p1 - p0))
     y = graded_axis(low, high, places, np.maximum(wanted, 1e-12))
     count = max(8, math.ceil((q1 - q0) / (plan.cell * sigma[1])))
@@ -164,6 +167,20 @@ def _axes(setting: Setting, clock: Clock, plan: Plan, rough: Blocks) -> tuple[Ar
     steps = near[-1] + np.cumsum(np.minimum(plan.cell * 1.35 ** np.arange(1, 60), 1.6)) * sigma[1]
     steps = np.concatenate([near, steps[: int(np.searchsorted(steps, beyond)) + 1]])
     return y, np.concatenate([q0 - steps[::-1], core, q1 + steps])
+
+
+def _upright(setting: Setting, shear: float, ends: tuple[float, float]) -> Iterator[tuple[float, list[float]]]:
+    """Places of p where the safe set ends along q, about, each with the range of shear q there."""
+    faces = setting.faces[1]
+    for end, limit in zip(ends, setting.beyond[0]):
+        if math.isfinite(limit):
+            yield end, sorted(shear * q for q in faces)
+    for wall in setting.walls:
+        hull = wall.hull()
+        tall = sorted(shear * float(np.clip(q, *faces)) for q in (hull.lo[1], hull.hi[1]))
+        for end in (float(hull.lo[0]), float(hull.hi[0])):
+            if math.isfinite(end):
+                yield end, tall
 
 
 def _chunks(axis: Array, count: int) -> tuple[Index, Array]:

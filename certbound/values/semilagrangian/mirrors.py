@@ -91,7 +91,7 @@ class Mirror:
         sag[:, :-1] = np.maximum(sag[:, :-1], sag[:, 1:])
         gain = np.where(np.isnan(self.rate)[:, None], 0.0, np.maximum(power * share - sag * _UP, 0.0))
         gain = np.minimum.accumulate(gain[:, ::-1], axis=1)[:, ::-1]
-        return self._all(np.maximum((1 + gain) / self.factor[:, None], 1.0))
+        return self._all((1 + gain) / self.factor[:, None])
 
     def _all(self, found: Array) -> Array:
         more = len(self.places) - found.shape[1]
@@ -149,7 +149,7 @@ def mirrors_of(
             else:
                 rates[0, line], factors[0, line] = found
             least = float(faces[0].inward.lo[line])
-            rates[1, line], factors[1, line] = _granted(least, setting.noise, clock.step, depths), 1 + _SPARED
+            rates[1, line], factors[1, line] = _granted(least, setting.noise, clock.step, depths)
         mirror = Mirror(
             inside=inside, beyond=beyond, depths=depths, places=places, rate=rates[0], factor=factors[0],
             window=_window(y, window),
@@ -200,16 +200,18 @@ def _paid(
     last = float(depths[rate * depths <= math.log(_MOST)][-1])
     lost = 6 * upper_tail(wide[0]) + 6 * upper_tail(wide[0] - 2 * turn)
     lost += upper_tail(last / (s * math.sqrt(step)) - turn)
+    lost /= upper_tail(turn) / _UP**2  # only what is beyond makes up for it, and that counts at least P(d >= 0)
     return (rate, _UP / (1 - lost)) if lost < wide[1] else None
 
 
-def _granted(inward: float, s: float, step: float, depths: Array) -> float:
-    """The rate from below; nan where paths may come farther than the mirrored nodes."""
+def _granted(inward: float, s: float, step: float, depths: Array) -> tuple[float, float]:
+    """The rate from below and the factor; (nan, 1) where paths may come too far, beyond the mirrored nodes."""
     outward = max(-inward, 0.0) * math.sqrt(step) / s
     if not math.isfinite(inward) or 4 * upper_tail(float(depths[-1]) / (s * math.sqrt(step)) - outward) > _SPARED / 2:
-        return math.nan
+        return math.nan, 1.0
+    share = _SPARED / (upper_tail(max(inward, 0.0) * math.sqrt(step) / s) / _UP**2)
     rate = 2 * inward / s**2
-    return rate - 1e-9 * abs(rate)
+    return (rate - 1e-9 * abs(rate), 1 / (1 - share)) if share < 0.2 else (math.nan, 1.0)
 
 
 def _face(setting: Setting, clock: Clock, y: Array, where: tuple[int, float], wide: float) -> _Face:
