@@ -29,7 +29,7 @@ def draw(data: Data) -> Figure:
         axes.set_title(f"({'bcd'[index]})", loc="left", pad=3)
         if index == 0:
             axes.set_ylabel("ratio")
-    shared_legend(figure, [chart], columns=4)
+    shared_legend(figure, [chart], columns=2)
     return figure
 
 
