@@ -21,7 +21,7 @@ from certbound.values.semilagrangian.leaving import bound_by_steps, bound_by_ste
 from certbound.values.semilagrangian.noisy_axis import setting_of
 from certbound.watch import OutOfTime, Watch
 
-COARSE = Plan(count=20, fine=1.0, wide=0.012, cell=0.4, spare=1e-7)
+COARSE = Plan(count=20, fine=1.0, wide=0.012, cell=0.4, spare=1e-12)
 
 
 def mechanical(force, s: float, low, high, horizon: float, start) -> cb.Problem:
