@@ -70,7 +70,7 @@ class Mirror:
         """Values at ``places``, shape (ny, P), for upper bounds."""
         value = self._inside(nodal, bend, dq, sign=-1.0)
         least = np.minimum.accumulate(self._extreme(value, np.minimum), axis=1)
-        share = 1 - np.maximum(least - _SLACK, 0.0)
+        share = 1 - np.clip(least - _SLACK, 0.0, 1.0)  # beyond, never less than 1: else a larger drift might count less
         rate = np.nan_to_num(self.rate)[:, None]
         power = np.exp(np.minimum(rate * self.depths, math.log(_MOST)) * _UP)
         power = np.where(np.isnan(self.rate)[:, None], 0.0, power)

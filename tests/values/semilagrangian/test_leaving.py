@@ -18,10 +18,11 @@ from certbound.safety.engines import values
 from certbound.values.semilagrangian import bound_exits_by_steps, leaving
 from certbound.values.semilagrangian.groundwork import Plan, layout_of
 from certbound.values.semilagrangian.leaving import bound_by_steps, bound_by_steps_below
+from certbound.values.semilagrangian.mirrors import Mirror
 from certbound.values.semilagrangian.noisy_axis import setting_of
 from certbound.watch import OutOfTime, Watch
 
-COARSE = Plan(count=20, fine=1.0, wide=0.012, cell=0.4, spare=1e-7)
+COARSE = Plan(count=20, fine=1.0, wide=0.012, cell=0.4, spare=1e-12)
 
 
 def mechanical(force, s: float, low, high, horizon: float, start) -> cb.Problem:
@@ -206,3 +207,13 @@ def test_the_steps_end_when_the_time_is_over() -> None:
     ticks = itertools.count()
     with pytest.raises(OutOfTime), Watch(limit=3.0, clock=lambda: next(ticks)).running():
         bound_by_steps(setting, COARSE)
+
+
+def test_beyond_a_face_nobody_counts_less_than_once() -> None:
+    mirror = Mirror(
+        inside=np.array([2, 1, 0]), beyond=np.array([2, 3, 4]), depths=np.array([0.0, 0.1, 0.2]),
+        places=np.array([2, 3, 4]), rate=np.zeros(1), factor=np.ones(1), window=(np.zeros(1, int), np.ones(1, int)),
+    )  # fmt: skip
+    found = mirror.above(np.array([[0.5, 0.9, 1.2, 0.0, 0.0]]), np.zeros((1, 4)), np.full(4, 0.1))
+    assert np.allclose(found, [[1.0, 1.1, 1.5]], atol=1e-9)
+    assert np.all(found >= 1)
