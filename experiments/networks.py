@@ -14,7 +14,7 @@ import numpy as np
 
 import certbound as cb
 from certbound.problem.library.grid import grid
-from certbound.problem.library.networks import formation, heat, kuramoto
+from certbound.problem.library.large_models import formation, heat, kuramoto
 from certbound.problem.problem import Problem
 from experiments.harness import Arrays, Claims, main
 

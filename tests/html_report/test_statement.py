@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import certbound as cb
 from certbound.html_report import typeset
 from certbound.html_report.statement import problem_section
+from certbound.problem.model import jacobian
 
 ROBOT = """
 time = "continuous"
@@ -85,8 +87,11 @@ def test_linear_models_laws_and_large_matrices_are_said_in_words() -> None:
 
 
 def test_a_model_that_no_file_can_hold_says_so() -> None:
-    system = cb.ContinuousSystem(lambda x: np.where(x > 0, -x, -2 * x), states=1, diffusion=[[0.1]])
-    problem = cb.Problem(system, initial=[0.5], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1)
+    bent = cb.ContinuousSystem(lambda x: np.minimum(x**2, x), states=1, diffusion=[[0.1]])
+    slope = replace(jacobian(bent.dynamics, [1]), shape=(1,))  # the kink of a derivative
+    system = cb.ContinuousSystem(lambda x, u: u, states=1, inputs=cb.Box([-9], [9]), diffusion=[[0.1]])
+    safe = [cb.Inside(cb.Box([-1], [1]))]
+    problem = cb.Problem(system, initial=[0.5], safe=safe, horizon=1, plan=slope)
     assert "does not exist in problem files" in said(problem)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import certbound as cb
 from certbound.problem.library.grid import ANGLES, BUSES, INERTIA, LINES, grid
-from certbound.problem.library.networks import formation, heat, kuramoto
+from certbound.problem.library.large_models import formation, heat, kuramoto
 from certbound.problem.model import compile_numpy
 
 
