@@ -22,10 +22,12 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.errors import EngineError as EngineError
     from certbound.errors import InfeasibleError as InfeasibleError
     from certbound.errors import SolverError as SolverError
+    from certbound.plotting import animate as animate
     from certbound.problem.export import export_casadi as export_casadi
     from certbound.problem.export import export_control as export_control
     from certbound.problem.files import load as load
     from certbound.problem.files import save as save
+    from certbound.problem.networks import network as network
     from certbound.problem.noise import Bounded as Bounded
     from certbound.problem.noise import Gaussian as Gaussian
     from certbound.problem.noise import Rademacher as Rademacher
@@ -79,6 +81,7 @@ _HOME = {
     "problem.noise": "Gaussian Uniform Triangular Rademacher Bounded SubGaussian",
     "problem.table_laws": "Discrete Histogram Laplace",
     "problem.sets": "Box Ball Ellipsoid HalfSpace Polytope GaussianStart Inside Outside Reach",
+    "problem.networks": "network",
     "problem.problem": "Problem",
     "problem.files": "load save",
     "problem.export": "export_casadi export_control",
@@ -99,16 +102,17 @@ _HOME = {
     "synthesis.plans": "synthesize_plan",
     "synthesis.controllers": "simulate_closed_loop PredictiveController ConvexPlanner SafetyFilter",
     "synthesis.terminal": "TerminalSet",
+    "plotting": "animate",
     "errors": "CertboundError CertificateError EnclosureError EngineError InfeasibleError SolverError",
 }
 
 __all__ = ["__version__", *names_in(_HOME)]
 
 
-def _draw(result: Any, axes: Any) -> None:
-    from certbound.plotting.results import draw
+def _draw(result: Any, axes: Any, states: Any, times: Any) -> None:
+    from certbound.plotting.results import draw_chosen
 
-    draw(result, axes)
+    draw_chosen(result, axes, states, times)
 
 
 def _content(problem: Any, plan_file: str) -> dict[str, Any]:

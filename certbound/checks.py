@@ -131,7 +131,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
     """``; did you mean 'x'?`` with the nearest known word, or the list of known words."""
     known = sorted(known)
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(known) or 'none'}."
+    return f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(dict.fromkeys(known)) or 'none'}."
 
 
 def pick(coordinates: Any, dimension: int) -> tuple[int, ...] | None:

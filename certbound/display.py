@@ -6,10 +6,12 @@ import html
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from base64 import b64encode
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from certbound._version import __version__
 
@@ -24,8 +26,8 @@ _LATER: dict[str, Callable[..., Any]] = {}
 def connect(**calls: Callable[..., Any]) -> None:
     """Say who does what a result is asked for and a later room does; the package's own ``__init__`` does so.
 
-    ``draw`` (result, axes) draws a result, ``content`` (problem, plan file) is what a problem file holds, ``constants``
-    (data) reads constants back. In this way no room has to know a later one.
+    ``draw`` (result, axes, states, times) draws a result, ``content`` (problem, plan file) is what a file holds,
+    ``constants`` (data) reads constants back. In this way no room has to know a later one.
     """
     _LATER.update(calls)
 
@@ -45,6 +47,9 @@ class Shown:
     """A result that shows itself; a subclass says its ``summary``, its ``rows`` and its plain data (``to_dict``)."""
 
     __slots__ = ()
+
+    pictured: ClassVar[bool] = False
+    """Whether notebooks show the picture of ``plot`` beside the table: where it takes no new work."""
 
     def summary(self) -> str:
         """The result in one line."""
@@ -75,13 +80,37 @@ class Shown:
         content = {"certbound": __version__, "type": type(self).__name__, "data": plain(self.to_dict())}
         Path(path).write_text(json.dumps(content, allow_nan=False, indent=1) + "\n", encoding="utf-8")
 
-    def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the result into matplotlib axes (the current ones when omitted) and return them."""
-        if ax is None:
-            import matplotlib.pyplot as plt
+    def plot(
+        self, ax: Axes | None = None, *, states: Sequence[str | int] | str | int | None = None,
+        times: tuple[float, float] | None = None, style: Mapping[str, Any] | None = None,
+    ) -> Axes:  # fmt: skip
+        """Draw the result into matplotlib axes (the current ones when omitted) and return them.
 
-            ax = plt.gca()
-        ask_later_room("draw", self, ax)
+        Parameters
+        ----------
+        ax : Axes, optional
+            Axes of a figure, with or without pyplot.
+        states : name, index or list of them, optional
+            Of a verdict, problem or reach tube: one state over time, or two in their plane; the place where the
+            constraints are when omitted.
+        times : (float, float), optional
+            The part of the horizon that is drawn.
+        style : mapping, optional
+            matplotlib's rcParams for this picture, such as {"font.size": 8}.
+
+        Raises
+        ------
+        ValueError
+            If a state is unknown, the times are not in order, or the result has nothing that could be drawn.
+        """
+        import matplotlib as mpl
+
+        with mpl.rc_context(dict(style or {})):  # type: ignore[arg-type]  # rcParams by any name
+            if ax is None:
+                import matplotlib.pyplot as plt
+
+                ax = plt.gca()
+            ask_later_room("draw", self, ax, states, times)
         return ax
 
     def __repr__(self) -> str:
@@ -96,7 +125,23 @@ class Shown:
             f'<td style="text-align:left">{html.escape(value)}</td></tr>'
             for name, value in self.rows()
         )
-        return f"<div><b>{html.escape(self.summary())}</b><table>{cells}</table></div>"
+        drawn = self._repr_png_() if self.pictured else None
+        picture = "" if drawn is None else f'<img alt="" src="data:image/png;base64,{b64encode(drawn).decode()}">'
+        return f"<div><b>{html.escape(self.summary())}</b><table>{cells}</table>{picture}</div>"
+
+    def _repr_png_(self) -> bytes | None:
+        """The picture of ``plot`` for notebooks; None where nothing can be drawn without new work."""
+        if not self.pictured:
+            return None
+        from matplotlib.figure import Figure
+
+        figure, stream = Figure(figsize=(6.0, 3.6), layout="constrained"), BytesIO()
+        try:
+            self.plot(figure.subplots())
+        except (TypeError, ValueError):
+            return None
+        figure.savefig(stream, format="png", dpi=90)
+        return stream.getvalue()
 
 
 class Record(Shown, Mapping[str, Any]):
@@ -141,7 +186,7 @@ class Record(Shown, Mapping[str, Any]):
         """The entries."""
         return dict(self._data)
 
-    def plot(self, ax: Any = None) -> Any:
+    def plot(self, ax: Any = None, **options: Any) -> Any:
         """A record cannot be drawn.
 
         Raises

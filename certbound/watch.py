@@ -177,10 +177,12 @@ class Watch:
                 signal.setitimer(signal.ITIMER_REAL, max(outer - (time.perf_counter() - began), _GRACE), again)
 
     @contextlib.contextmanager
-    def share(self, part: float) -> Iterator[None]:
-        """Leave a part of the time to the block, and end it quietly then, unless the whole of it is over."""
+    def share(self, part: float, most: float = math.inf) -> Iterator[None]:
+        """Leave a part of the time to the block, at ``most`` so many seconds, and end it quietly then, unless the whole
+        of it is over.
+        """
         before = self._end
-        self._end = min(before, self._clock() + part * self.left)
+        self._end = min(before, self._clock() + min(part * self.left, most))
         try:
             yield
         except OutOfTime:
@@ -189,15 +191,19 @@ class Watch:
         finally:
             self._end = before
 
-
     @contextlib.contextmanager
     def after(self, seconds: float, call: Callable[[], object]) -> Iterator[None]:
         """Interrupt the block once, at a `poll` after so many seconds, for a call; the block goes on afterwards."""
-        before, self._alarm = self._alarm, (self._clock() + seconds, call)
+        before = self._alarm
+        self.remind(seconds, call)
         try:
             yield
         finally:
             self._alarm = before
+
+    def remind(self, seconds: float, call: Callable[[], object]) -> None:
+        """Interrupt the work at hand once, at a `poll` after so many seconds; what was to interrupt it does not."""
+        self._alarm = (self._clock() + seconds, call)
 
 
 _CURRENT: ContextVar[Watch | None] = ContextVar("certbound_watch", default=None)

@@ -5,6 +5,8 @@ Controller gains, disturbance and noise level are reconstructed (see ``certbound
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 import certbound as cb
@@ -13,7 +15,7 @@ from experiments.harness import Arrays, Claims, main
 
 HORIZONS = {"left": 2.0, "right": 5.0}
 POINTS = 50
-BOXES = 9
+BOXES = 16
 
 
 def compute(full: bool) -> tuple[Arrays, Claims]:
@@ -29,6 +31,9 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
             rng = np.random.default_rng(80 + seed)
             states = cb.sample_paths(subject, paths=count, rng=rng, points=POINTS)
             arrays[f"{side}_{name}"] = states[..., :2].astype(np.float32)
+        rng = np.random.default_rng(82 + seed)
+        apart = cb.sample_paths(problem, paths=60, rng=rng, points=POINTS, deviation=True)[..., :2]
+        arrays[f"{side}_deviation"] = np.linalg.norm(apart, axis=-1).astype(np.float32)
         arrays[f"{side}_boxes"] = _boxes(verdict.reach.pieces, horizon)
         exits = cb.simulate_exits(problem, paths=5000, rng=np.random.default_rng(85 + seed))
         band = np.linalg.norm(verdict.deviation.extent[:, :2], axis=1)
@@ -45,10 +50,14 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
 
 
 def _boxes(pieces, horizon: float) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """Reachable boxes (low, high) in the plane at evenly spaced times, shape (BOXES, 2, 2)."""
-    ends = np.array([piece.end for piece in pieces])
-    chosen = np.searchsorted(ends, np.linspace(0.0, horizon, BOXES).clip(ends[0], ends[-1]))
-    return np.array([[pieces[k].low[:2], pieces[k].high[:2]] for k in chosen])
+    """Boxes (low, high) in the plane that hold the state over stretches of time without gaps: (BOXES, 2, 2)."""
+    starts, ends = (np.array([getattr(piece, name) for piece in pieces]) for name in ("start", "end"))
+    borders = np.linspace(0.0, horizon, BOXES + 1)
+    found = []
+    for first, last in itertools.pairwise(borders):
+        held = [pieces[k] for k in np.flatnonzero((ends > first) & (starts < last))]
+        found.append([np.min([p.low[:2] for p in held], axis=0), np.max([p.high[:2] for p in held], axis=0)])
+    return np.array(found)
 
 
 def _hits(problem: Problem, paths: np.ndarray, band: float) -> int:

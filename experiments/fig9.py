@@ -38,7 +38,7 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
         arrays[name] = (states @ direction).astype(np.float32)
         arrays[f"{name}_nominal"] = planned.states @ direction
         arrays[f"{name}_thm5"] = np.asarray(planned.verdict.tube.extent(direction, steps))
-        arrays[f"{name}_bound"] = _bound(verdict, direction)
+        arrays[f"{name}_bound"] = _bound(verdict, direction, planned.states @ direction, low, high)
         arrays[f"{name}_limit"] = np.array(low if np.isfinite(low) else high)
     arrays["input"] = np.abs(plan).max(axis=1)
     inputs = np.sum(plan**2, axis=1) * INPUT_WEIGHT
@@ -62,11 +62,19 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
     return arrays, claims
 
 
-def _bound(verdict, direction: np.ndarray) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """The tube's half-width along a direction at each step (0 at the start)."""
-    if hasattr(verdict.tube, "half_widths"):
-        return np.abs(direction) @ verdict.tube.half_widths.T
-    return np.asarray(verdict.tube.extent(direction, np.arange(len(verdict.deviation.extent) + 1.0)))
+def _bound(  # type: ignore[no-untyped-def]
+    verdict, direction: np.ndarray, nominal: np.ndarray, low: float, high: float
+) -> np.ndarray:
+    """What the engine certifies along the constraint's own direction at each step (0 at the start).
+
+    It is the room along the nominal less the room that is left: all constraints keep theirs at once but for delta.
+    """
+    details = verdict.answers["linear"].details
+    sign, limit = (1.0, high) if np.isfinite(high) else (-1.0, low)
+    for asked, left in details.rooms:
+        if np.array_equal(asked.rows[0], sign * direction):
+            return np.asarray(sign * (limit - nominal) - left)
+    raise ValueError(f"no constraint is along {direction}.")
 
 
 def markov_fits(delta: float) -> bool:

@@ -16,7 +16,7 @@ from certbound.errors import CertboundError
 from certbound.problem.problem import Problem
 from experiments.harness import Arrays, Claims, main
 
-QUICK, FULL = (0.5, 1.0), (0.5, 1.0, 2.0, 3.5, 5.0)
+QUICK, FULL = (0.5, 0.75, 1.0), (0.5, 1.0, 2.0, 3.5, 5.0)
 LOCAL = 1.0  # the longest horizon at which local rates are tried at more than the lowest level
 
 

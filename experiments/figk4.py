@@ -18,7 +18,7 @@ import certbound as cb
 from certbound.errors import CertboundError
 from experiments.harness import Arrays, Claims, main
 
-QUICK, FULL = (3, 6), (3, 5, 10, 20, 40)
+QUICK, FULL = (3, 4, 6), (3, 5, 10, 20, 40)
 CONFIDENCE = 0.99
 LEVELS = (1e-3, 1e-6)
 

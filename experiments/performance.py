@@ -22,6 +22,7 @@ import numpy as np
 import certbound as cb
 from certbound.display import log10_text
 from experiments.limits import exact_radius
+from experiments.literature import LITERATURE, PATHS, literature_row
 
 __all__ = ["BENCHMARKS", "benchmark_row", "equal_strength", "machine", "main", "power", "table"]
 
@@ -111,6 +112,8 @@ and the whole verdict.
 def _benchmarks(head: str) -> str:
     rows = [benchmark_row(name) for name in BENCHMARKS]
     found = table(["problem", "asked", "answer", "proved: P(leaving) <=", "seconds", "published"], rows)
+    heading = ["problem", "asked", "answer", "proved: P <=", ">=", "simulated", "seconds", "published: P(failing)"]
+    stated = table(heading, [literature_row(name) for name in LITERATURE])
     return f"""# Benchmarks of other tools
 
 {head}
@@ -125,6 +128,15 @@ what could be proved. Leaving the model's domain counts as leaving here, and doe
 - `van_der_pol_dt`: from the corner (5, 5) the noise-free next state (5.5, -7.5) lies outside the domain.
 - `oscillator_cubic`: about 2e-5 of simulated runs fail; a polynomial barrier proves it safe, where the linear response
   and the constants prove nothing.
+
+## Word for word
+
+The files in `experiments/literature/` state published problems as they were asked, as far as certbound can: targets,
+unions of starts, infinite horizons, noise that multiplies the state, domains whose leaving ends a path. `simulated` is
+the share of failures in {PATHS} paths, whose starts are drawn from the set; what is proved holds for the worst of
+them.
+
+{stated}
 """
 
 

@@ -31,7 +31,7 @@ from certbound.values.discrete import bound_failure
 from experiments import values_continuous, values_discrete
 from experiments.values_continuous import line_problems, plane_problems
 
-__all__ = ["CASES", "Case", "compute", "engines", "growth", "plane_truth", "truth_of"]
+__all__ = ["CASES", "Case", "compute", "engines", "growth", "plane_truth", "space_growth", "truth_of"]
 
 Ends = tuple[float, float]
 QUICK = ("double well 0.5", "linear 0.4", "Van der Pol 0.3", "logistic map, std .06", "pendulum, std .15")
@@ -109,6 +109,13 @@ def lorenz() -> cb.Problem:
     return cb.Problem(system, initial=cb.Box([-0.2] * 3, [0.2] * 3), safe=safe, horizon=2)
 
 
+def cube() -> cb.Problem:
+    """Brownian motion in a cube, from its middle: three independent lines."""
+    system = cb.ContinuousSystem(lambda x: [0 * x[0], 0 * x[1], 0 * x[2]], states=3, diffusion=0.35 * np.eye(3))
+    safe = [cb.Inside(cb.Box([-1] * 3, [1] * 3))]
+    return cb.Problem(system, initial=[0, 0, 0], safe=safe, horizon=1)
+
+
 def _listed(problems: Iterator[tuple[str, cb.Problem]], truth: str, aims: dict[str, Ends]) -> Iterator[Case]:
     for name, problem in problems:
         upper, lower = next((pair for key, pair in aims.items() if name.startswith(key)), (1.05, 1.1))
@@ -126,6 +133,7 @@ CASES: tuple[Case, ...] = (
     Case(name="in an ellipse", problem=in_ellipse, truth="paths", upper=1.3, lower=None),
     Case(name="half-disc in its box", problem=half_disc, truth="paths", upper=1.3, lower=None),
     Case(name="Lorenz-like", problem=lorenz, truth="paths", upper=5.0, lower=None),
+    Case(name="cube", problem=cube, truth="paths", upper=1.5, lower=None),
     *(Case(name=name, problem=make, truth="paths", upper=1.1, lower=1.1)
       for name, make in values_discrete.PROBLEMS.items()),
 )  # fmt: skip
@@ -307,6 +315,25 @@ def growth(quick: bool) -> Iterator[str]:
             yield f"| {n} | cells^p | p = {laws[0]:.2f} | p = {laws[1]:.2f} | p = {laws[2]:.2f} |"
 
 
+def space_growth(quick: bool) -> Iterator[str]:
+    """The cube: what seconds buy in three states and continuous time, where the truth is known in closed form."""
+    odd = 2 * np.arange(60) + 1.0
+    stays = 4 / np.pi * np.sum((-1.0) ** np.arange(60) / odd * np.exp(-((0.35 * np.pi * odd) ** 2) / 8))
+    truth, rows = 1 - float(stays) ** 3, []
+    yield "| seconds granted | grids | CPU s | MB | upper/truth |"
+    yield "| --- " * 5 + "|"
+    for seconds in (2.0, 8.0) if quick else (2.0, 8.0, 32.0, 128.0):
+        begin = time.process_time()
+        found = values_continuous.bound_exits(cube(), seconds=seconds, lower=False)
+        spent, ratio = time.process_time() - begin, 10.0**found.upper / truth
+        memory = _memory(lambda s=seconds: values_continuous.bound_exits(cube(), seconds=s, lower=False))
+        rows.append((spent, memory, ratio - 1))
+        yield f"| {seconds:g} | {found.words.rpartition('cells: ')[2]} | {spent:.1f} | {memory:.0f} | {ratio:.3f} |"
+    logs = np.log(np.array(rows))
+    laws = [float(np.polyfit(logs[:, 0], logs[:, k], 1)[0]) for k in (1, 2)]
+    yield f"| | CPU s^p | | p = {laws[0]:.2f} | ratio - 1: p = {laws[1]:.2f} |"
+
+
 def _memory(task: Callable[[], object]) -> float:
     """The peak of what Python and NumPy allocate, in megabytes; measured apart, since measuring takes time."""
     tracemalloc.start()
@@ -333,7 +360,7 @@ def main() -> None:
         for line in compute(options.names or (list(QUICK) if options.quick else []), seconds=options.seconds):
             print(line, flush=True)
     if options.growth or (options.quick and not options.names):
-        for line in growth(options.quick):
+        for line in itertools.chain(growth(options.quick), space_growth(options.quick)):
             print(line, flush=True)
 
 

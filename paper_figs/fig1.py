@@ -11,8 +11,8 @@ from matplotlib.patches import Patch
 
 from paper_figs.style import BLACK, COLUMN, Data, main, panels
 
-WALL, BAND, DARK = "#7f7f7f", "#8fc1e3", "#3a3a3a"
-TUBES = ("#d7e8f5", "#a3cae8", "#5f9fd3")
+WALL, BAND, RIM, PATH = "#7f7f7f", "#F7EC8C", "#8a7d00", "#D55E00"
+TUBES = ("#e3eef8", "#a6cfee", "#4a90cc")
 
 
 def draw(data: Data) -> Figure:
@@ -21,7 +21,7 @@ def draw(data: Data) -> Figure:
     handles = [
         Patch(facecolor=WALL, label="unsafe"),
         Line2D([], [], color=BLACK, linewidth=1.5, label="noise-free $x_t$"),
-        Line2D([], [], color=DARK, linewidth=0.6, label="noisy $X_t$"),
+        Line2D([], [], color=PATH, linewidth=0.9, label="noisy $X_t$"),
         *_erosion(axes[0, 0], data),
         *_tubes(axes[1, 0], data),
     ]
@@ -41,7 +41,7 @@ def _erosion(axes: Axes, data: Data) -> list[Patch]:
     radius = data.claims["radius"]
     distance = data["distance"]
     axes.contourf(data["x"], data["y"], distance, levels=[-2, radius], colors=[BAND], zorder=1)
-    axes.contour(data["x"], data["y"], distance, levels=[radius], colors=["#1f5f8b"], linewidths=0.7, zorder=2)
+    axes.contour(data["x"], data["y"], distance, levels=[radius], colors=[RIM], linewidths=0.7, zorder=2)
     axes.plot(*data["nominal"].T, color=BLACK, linewidth=1.5, zorder=5)
     return [Patch(facecolor=BAND, label=rf"eroded by {radius:.2f} m")]
 
@@ -59,8 +59,8 @@ def _tubes(axes: Axes, data: Data) -> list[Patch]:
         exponent = round(np.log10(data["levels"][index]))
         handles.append(Patch(facecolor=TUBES[place], label=rf"tube, $\delta=10^{{{exponent}}}$"))
     for path in data["paths"]:
-        axes.plot(*path.T, color=DARK, linewidth=0.3, alpha=0.8, zorder=4)
-    axes.plot(*data["nominal"].T, color=BLACK, linewidth=1.5, zorder=5)
+        axes.plot(*path.T, color=PATH, linewidth=0.35, alpha=0.7, zorder=4)
+    axes.plot(*data["nominal"].T, color=BLACK, linewidth=0.9, zorder=5)
     return handles
 
 

@@ -12,8 +12,8 @@ PANELS = {"a": "$c=1$, $T=2$", "b": "$c=0$, $T=2$", "c": "$c=-1$, $T=2$", "d": "
 
 def draw(data: Data) -> Figure:
     """Four panels; each has a lower part on the scale of the paths and a strip for eps = 1/16."""
-    figure = Figure(figsize=(COLUMN, 4.0), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.015, hspace=0.0, wspace=0.04)
+    figure = Figure(figsize=(COLUMN, 4.1), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.03, hspace=0.0, wspace=0.04)
     grid = figure.subfigures(2, 2, hspace=0.03)
     lower = []
     for place, (name, title) in zip(grid.flat, PANELS.items()):
@@ -35,7 +35,7 @@ def _panel(axes: Axes, data: Data, name: str) -> None:
     times = data[f"{name}_times"]
     paths(axes, times, data[f"{name}_paths"])
     axes.plot(times, data[f"{name}_paper"], label=r"Thm 2, $\varepsilon=15/16$", **LINES["paper"])
-    axes.plot(times, data[f"{name}_kummer"], label="certbound (Kummer, Bessel)", **LINES["kummer"])
+    axes.plot(times, data[f"{name}_kummer"], label="certbound's tube", **LINES["kummer"])
     axes.plot(times, data[f"{name}_exact"], label="exact constant radius", **LINES["exact"])
     top = 1.12 * max(data[f"{name}_paper"].max(), data[f"{name}_exact"].max(), data[f"{name}_paths"].max())
     axes.set(xlim=(0, times[-1]), ylim=(0, top))

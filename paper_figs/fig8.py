@@ -24,9 +24,10 @@ def draw(data: Data) -> Figure:
             _scene(axes[row, column], data, side)
         _paths(axes[0, column], data[f"{side}_nominal"], NOMINAL)
         for low, high in data[f"{side}_boxes"]:
-            box = Rectangle(tuple(low), *(high - low), facecolor=BOX, edgecolor=BLUE, linewidth=0.7, alpha=0.8)
+            box = Rectangle(tuple(low), *(high - low), facecolor=BOX, edgecolor=BLUE, linewidth=0.4, alpha=0.8)
             axes[1, column].add_patch(box)
         _paths(axes[2, column], data[f"{side}_noisy"], NOISY)
+        _inset(axes[2, column], data, side)
     for row in range(3):
         axes[row, 0].set_ylabel("$p_y$ (m)")
     for column in range(2):
@@ -57,6 +58,20 @@ def _scene(axes: Axes, data: Data, side: str) -> None:
     axes.plot(0.5, 0.0, "x", color="black", markersize=4, zorder=6)
     axes.set(xlim=(-2.6, 7.8), ylim=(-1.0, 5.6), xticks=range(-2, 8, 2), yticks=range(0, 6, 2))
     axes.set_aspect("equal", adjustable="box")
+
+
+def _inset(axes: Axes, data: Data, side: str) -> None:
+    """How far the noise carries each path from its noise-free twin, in cm, under what is certified."""
+    small = axes.inset_axes((0.79, 0.5, 0.2, 0.44))
+    deviation = 100 * data[f"{side}_deviation"]
+    times = np.linspace(0.0, float(TITLES[side].strip("$T=")), deviation.shape[1])
+    for one in deviation:
+        small.plot(times, one, color=NOISY, linewidth=0.25, alpha=0.6)
+    small.axhline(100 * float(data[f"{side}_band"]), color=EDGE, linewidth=0.8)
+    small.set(xlim=(0, times[-1]), ylim=(0, 112 * float(data[f"{side}_band"])), xticks=[], yticks=[])
+    top = 100 * float(data[f"{side}_band"])
+    small.text(0.95, 0.86, f"{top:.0f} cm", fontsize=5, ha="right", va="top", transform=small.transAxes)
+    small.grid(False)
 
 
 def _paths(axes: Axes, paths: np.ndarray, color: str) -> None:

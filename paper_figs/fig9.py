@@ -8,6 +8,7 @@ from matplotlib.ticker import MaxNLocator
 
 from paper_figs.style import BLACK, COLUMN, LINES, Data, letter, main, panels, paths, shared_legend
 
+STEP = 0.1  # seconds
 NAMES = {"p1": "$p_1$ (m)", "dp21": r"$\Delta p_{21}$ (m)", "dp32": r"$\Delta p_{32}$ (m)", "v3": "$v_3$ (m/s)"}
 
 
@@ -16,23 +17,23 @@ def draw(data: Data) -> Figure:
     figure, axes = panels(COLUMN, 4.6, 3, 2, sharex=True)
     for panel, name in zip(axes.flat, NAMES):
         _constraint(panel, data, name)
-    steps = data["steps"][:-1]
+    steps = STEP * data["steps"][:-1]
     axes[2, 0].step(steps, data["input"], where="post", color=BLACK, linewidth=1.0)
     axes[2, 0].set_ylim(0, None)
     paths(axes[2, 1], steps, data["cost"])
     axes[2, 1].plot(steps, data["cost"].mean(axis=0), color=BLACK, linewidth=1.0)
     axes[2, 1].set_ylim(0, None)
     for panel in axes[2]:
-        panel.set_xlabel("step (0.1 s)")
+        panel.set_xlabel("time (s)")
     letter(axes.flat, [*NAMES.values(), r"input $\|u\|_\infty$ (N)", "cost of the step"])
     shared_legend(figure, [axes[0, 0]], columns=4)
     for panel in axes.flat:
-        panel.set_xlim(0, data["steps"][-1])
+        panel.set_xlim(0, STEP * data["steps"][-1])
     return figure
 
 
 def _constraint(axes: Axes, data: Data, name: str) -> None:
-    steps, nominal, half = data["steps"], data[f"{name}_nominal"], data[f"{name}_bound"]
+    steps, nominal, half = STEP * data["steps"], data[f"{name}_nominal"], data[f"{name}_bound"]
     paths(axes, steps, data[name])
     axes.plot(steps, nominal, color=BLACK, linewidth=1.0, label="nominal")
     for width, label, look in (

@@ -37,7 +37,7 @@ def _chart(axes: Axes, data: Data) -> None:
     rows = np.arange(len(data["table"]))[::-1]
     methods = data.claims["methods"]
     for place, (method, (name, color, marker, _)) in enumerate(LOOKS.items()):
-        style = {"markersize": 10 if marker == "|" else 4.4, "markeredgewidth": 1.4, "zorder": 3 + place}
+        style = {"markersize": 9 if marker == "|" else 4.0, "markeredgewidth": 1.4, "zorder": 3 + place}
         axes.plot(data["table"][:, methods.index(method)], rows, marker, color=color, label=name, **style)
     for row, value in zip(rows, data["table"][:, methods.index("printed")]):
         axes.text(TOP, row, f"{value:.0f} $\\rightarrow$", ha="right", va="center", fontsize=6.5)

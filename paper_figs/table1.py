@@ -30,7 +30,7 @@ def draw(data: Data) -> Figure:
         figure.add_artist(_rule(height, width))
     note = (
         r"* with the factor 1/L that the print lacks. Largest radius, $n=\sigma=1$, $\delta=10^{-3}$. "
-        "K: Kummer, B: Bessel."
+        "K: Kummer, B: Bessel, T: Theorem 3 sharpened."
     )
     figure.text(0.01, 0.05, note, fontsize=4.7, va="center")
     return figure

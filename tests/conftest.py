@@ -1,11 +1,24 @@
-"""Kernels of the tests are kept between runs in pytest's own cache, and a test leaves balls as precise as they were."""
+"""Kernels of the tests are kept between runs in pytest's own cache, and a test leaves balls as precise as they were.
+
+What is imported and collected stays to the end: the garbage collector does not walk it again and again (that took a
+sixth of the time).
+"""
 
 from __future__ import annotations
 
+import gc
 import sys
 from pathlib import Path
 
 import pytest
+
+gc.disable()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -72,7 +72,10 @@ def parse(content: str | bytes) -> dict[str, Any]:
     except RecursionError as error:
         raise CertificateError("the certificate is nested too deeply.") from error
     except json.JSONDecodeError as error:
-        raise CertificateError(f"the certificate is no JSON: {error.msg} at character {error.pos}.") from error
+        raise CertificateError(
+            f"the certificate is no JSON: {error.msg} at character {error.pos}; give a file that "
+            "`certbound verify --certificate` wrote."
+        ) from error
     if not isinstance(value, dict):
         raise CertificateError("the certificate must be one JSON object.")
     return value

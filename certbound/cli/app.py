@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import logging
+import re
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -24,8 +25,8 @@ from certbound.cli.commands import (
     tune,
     verify,
 )
-from certbound.cli.messages import BAD_INPUT, INTERRUPTED, explain, write_error
-from certbound.cli.output import SETTINGS, logging_to_stderr
+from certbound.cli.messages import BAD_INPUT, INTERRUPTED, explain, for_files, write_error
+from certbound.cli.output import SETTINGS, logging_to_stderr, show
 
 _ClickException = typer.BadParameter.__mro__[2]  # whichever click typer brings: vendored or its own
 _log = logging.getLogger(__name__)
@@ -64,6 +65,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; ``--verbose`` and ``--quiet`` may stand anywhere."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     SETTINGS.verbose, SETTINGS.quiet, SETTINGS.json = ("--verbose" in words, "--quiet" in words, "--json" in words)
+    SETTINGS.answered = False
     words = [word for word in words if word not in ("--verbose", "--quiet")]
     command = next((word for word in words if not word.startswith("-")), "")
     with logging_to_stderr(verbose=SETTINGS.verbose):
@@ -81,10 +83,10 @@ def _run(words: list[str], command: str) -> int:
         return 0
     except Exception as error:  # noqa: BLE001  (the outermost frame: whatever happened, three lines)
         _log.debug("the command ended with an error", exc_info=True)
-        return _report(error, command)
+        return _report(error, command, words)
     if code == INTERRUPTED:
         kept = next((word for word in ("--checkpoint", "--resume") if word in words), "")
-        write_error(
+        _tell(
             f"{command or 'the command'} was interrupted",
             "it had no answer yet; " + (f"what was done is in the file of {kept}" if kept else "nothing was written"),
             "run it again to go on" if kept else f"run it again{_shorter(command)}",
@@ -92,24 +94,42 @@ def _run(words: list[str], command: str) -> int:
     return code if isinstance(code, int) else 0
 
 
+def _tell(what: str, why: str, cure: str) -> None:
+    """Three lines on standard error; with ``--json`` the same as the one object on standard output, too."""
+    write_error(what, why, cure)
+    if SETTINGS.json and not SETTINGS.answered:
+        show({"error": what, "why": why, "try": cure}, as_json=True, in_words=lambda: None)
+
+
 def _shorter(command: str) -> str:
     limited = command in ("verify", "derive", "tune", "simulate", "exit-times")
     return "; --time-limit SECONDS gives the best answer after some time" if limited else " and let it finish"
 
 
-def _report(error: Exception, command: str) -> int:
+def _report(error: Exception, command: str, words: list[str]) -> int:
     known = [entry.name for entry in app.registered_commands if entry.name]
     if isinstance(error, _ClickException):
         why = error.format_message().rstrip(".")  # type: ignore[attr-defined]  # which class it is, click and typer do not agree
-        write_error("the command line was not understood", why, _usage_hint(command, known))
+        _tell("the command line was not understood", why.partition(". Did you")[0], _usage_hint(command, known))
         return BAD_INPUT
     code, why, cure = explain(error, command)
-    write_error(f"{command or 'the command'} {'refused its input' if code == BAD_INPUT else 'failed'}", why, cure)
+    named = re.search(r"`([a-z_]+)`", why)
+    if named and cure == f"see `certbound {command} --help`" and f"--{named[1]}" in words:
+        cure = f"change --{named[1]}; `certbound {command} --help` says what it takes"
+    if not any(":" in word for word in words):  # a problem of the user's in Python is told Python's cures
+        why, cure = for_files(why), for_files(cure)
+    _tell(f"{command or 'the command'} {'refused its input' if code == BAD_INPUT else 'failed'}", why, cure)
     return code
+
+
+def _example(command: str) -> str:
+    """The first example of a command's help."""
+    epilog = next(entry.epilog for entry in app.registered_commands if entry.name == command)
+    return (epilog or f"certbound {command}").partition("\n")[0].removeprefix("Example: ").strip()
 
 
 def _usage_hint(command: str, known: list[str]) -> str:
     if command in known:
-        return f"see `certbound {command} --help`"
+        return f"for example `{_example(command)}`; see `certbound {command} --help`"
     near = difflib.get_close_matches(command, known, n=1)
     return f"did you mean `certbound {near[0]}`?" if near else "see `certbound --help` for the commands"

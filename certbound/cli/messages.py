@@ -54,6 +54,9 @@ def explain(error: Exception, command: str) -> tuple[int, str, str]:
     if isinstance(error, SyntaxError):
         place = f"line {error.lineno} of {error.filename}"
         return BAD_INPUT, f"{place} is not Python: {error.msg}", "mend the module"
+    if isinstance(error, FileNotFoundError):
+        why = f"`{error.filename or error}`: {error.strerror or 'No such file'}"
+        return BAD_INPUT, why, "check the path and the folder"
     if isinstance(error, OSError):
         subject = f"`{error.filename}`: " if error.filename else ""
         return BAD_INPUT, f"{subject}{error.strerror or error}", "check the path and its permissions"
@@ -100,12 +103,41 @@ def split_cure(message: str) -> tuple[str, str]:
     depth = 0
     for position, letter in enumerate(text):
         depth += (letter in "([{") - (letter in ")]}")
-        if depth <= 0 and text.startswith("; ", position):
+        if depth <= 0 and text.startswith("; ", position) and not text.startswith("; got ", position):
             return text[:position], text[position + 2 :].rstrip(".")
     match = re.search(r"(?<=[\w`)\]])\. (?=[A-Z`])", text)
     if match:
         return text[: match.start()], text[match.end() :].rstrip(".")
     return text.rstrip("."), ""
+
+
+_FOR_FILES = (
+    (r"`plan=` \(\[plan\] in a problem file\)", "a [plan] table"),
+    (r"`inputs=` \(\[inputs\] in a problem file\)", "an [inputs] table"),
+    (r"(a smaller )?`domain=(cb\.Box\(low, high\))?`", "\\1[domain] table with a box"),
+    (r"(?<=give )\[domain\]", "a [domain]"),
+    (r"`plan=`", "a [plan] table"),
+    (r"`reach=`", "[[reach]]"),
+    (r"`disturbance=`", "a [disturbances] table"),
+    (r"`inputs=`", "an [inputs] table"),
+    (r"\(`?cells`?\)", "(--cells)"),
+    (r"method [\"'](\w+)[\"']", "--method \\1"),
+    (r"use cb\.(Box|Ball|Ellipsoid)\(.*?\)", "write a table"),
+)
+"""What a message says to who writes Python, and what to who writes problem files."""
+
+
+def for_files(text: str) -> str:
+    """A message with the cures of problem files and of the command line, in place of those of Python.
+
+    Examples
+    --------
+    >>> for_files("use more cells, or give `domain=cb.Box(low, high)`")
+    'use more cells, or give a [domain] table with a box'
+    """
+    for pattern, words in _FOR_FILES:
+        text = re.sub(pattern, words, text)
+    return text
 
 
 def write_error(what: str, why: str, cure: str) -> None:

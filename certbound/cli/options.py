@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -113,16 +114,22 @@ def load_problem(
     """The problem that the arguments name, with its parameters, horizon and delta changed as asked."""
     from certbound.problem.files import load
 
+    if source.endswith(".toml") and not Path(source).exists():
+        folder = Path(source).parent
+        here = sorted(path.name for path in folder.glob("*.toml"))[:3] if folder.is_dir() else []
+        cure = f"there is {', '.join(here)} in that folder" if here else "check the path"
+        raise InputError(f"`{source}`: No such file or directory", f"{cure}; `certbound new NAME` writes one")
     parameters: dict[str, Any] = dict(settings_of(pairs))
     changes: dict[str, Any] = {} if delta is None else {"delta": delta}
     with _as_input_error(_cure(source), module=":" in source):
         problem = load(source, **parameters)
     if horizon is not None:
         changes["horizon"] = _whole(horizon) if problem.system.time == "discrete" else horizon
-    if not changes:
-        return problem
-    with _as_input_error("choose another --horizon or --delta"):
-        return problem.replace(**changes)
+    for name, value in changes.items():
+        like = "a probability such as --delta 1e-3" if name == "delta" else "a positive --horizon, such as 5"
+        with _as_input_error(f"give {like}"):
+            problem = problem.replace(**{name: value})
+    return problem
 
 
 def _cure(source: str) -> str:
@@ -142,11 +149,17 @@ def _as_input_error(cure: str, *, module: bool = False) -> Iterator[None]:
         raise
     except (ValueError, TypeError, ArithmeticError) as error:
         why, own = split_cure(str(error))
-        raise InputError(why, own or cure) from error
+        raise InputError(why, own or _about(why, cure)) from error
     except Exception as error:  # a user's module may raise anything; what is ours is raised again
         if not module:
             raise
         raise InputError(f"the module raised {type(error).__name__}: {' '.join(str(error).split())}", cure) from error
+
+
+def _about(why: str, cure: str) -> str:
+    """A cure that names the key which the reason names."""
+    named = re.search(r"`([\w.\[\]]+)`", why)
+    return cure.replace("mend the file", f"change `{named[1]}` in the file") if named else cure
 
 
 def check_writable(*paths: Path | None) -> None:

@@ -30,6 +30,8 @@ class Settings:
     verbose: bool = False
     quiet: bool = False
     json: bool = False
+    answered: bool = False
+    """Whether the one JSON object of ``--json`` has been printed."""
 
 
 SETTINGS = Settings()
@@ -49,6 +51,7 @@ def show(result: Mapping[str, Any], as_json: bool, in_words: Callable[[], None])
     if not as_json:
         in_words()
         return
+    SETTINGS.answered = True
     sys.stdout.write(json.dumps(plain(result), allow_nan=False) + "\n")
     sys.stdout.flush()
 

@@ -38,10 +38,10 @@ def check_picture(path: Path | None) -> None:
         )
 
 
-def write_picture(path: Path, figure: Figure) -> None:
+def write_picture(path: Path, figure: Figure, *, dpi: int = 150) -> None:
     """Write a figure in the format that the file's name ends in."""
     stream = BytesIO()
-    figure.savefig(stream, format=path.suffix.lstrip(".") or "png", dpi=150)
+    figure.savefig(stream, format=path.suffix.lstrip(".") or "png", dpi=dpi)
     write_file(path, stream.getvalue())
 
 
@@ -76,8 +76,11 @@ def scene_of(problem: Problem, verdict: Verdict, reach: ReachTube, title: str) -
     """What is drawn of a verdict."""
     import numpy as np
 
-    from certbound.plotting import Scene, noisy_reach
+    from certbound.plotting import Scene, measured_rooms, noisy_reach
 
     paths = sampled(problem)
     times = None if paths is None else np.linspace(0.0, float(problem.horizon), paths.shape[1])
-    return Scene(problem=problem, reach=reach, tube=noisy_reach(verdict), times=times, paths=paths, title=title)
+    rooms = measured_rooms(verdict) if verdict.problem is not None and verdict.problem.safe == problem.safe else ()
+    return Scene(
+        problem=problem, reach=reach, tube=noisy_reach(verdict), times=times, paths=paths, rooms=rooms, title=title
+    )

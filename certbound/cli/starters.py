@@ -138,5 +138,80 @@ point = [0]
 [[stay]]
 box = { x = [-1.2, 1.2] }
 """,
+    "forever": """\
+# An infinite horizon: the target is met at some time, with the limit kept until then.
+name = "NAME"
+time = "discrete"
+horizon = inf
+delta = 0.05
+states = ["x"]
+
+[dynamics]
+x = "x - 0.3"
+
+[noise]
+law = "gaussian"
+std = 0.3
+
+[initial]
+point = [0]
+
+[[stay]]
+halfspace = { normal = { x = 1 }, bound = 1 }
+
+[[reach]]
+halfspace = { normal = { x = 1 }, bound = -1 }
+""",
+    "growth": """\
+# Noise that multiplies the state, and a domain that a path may leave: it ends there, and does not fail.
+name = "NAME"
+time = "discrete"
+horizon = 6
+delta = 0.2
+states = ["x"]
+
+[dynamics]
+x = "where(x > 1, 0.9*x, 1.05*x)"
+
+[noise]
+law = "gaussian"
+std = 1
+matrix = [["0.1*x"]]       # of [dynamics] + matrix * noise: expressions in t and the states
+
+[initial]
+point = [1]
+
+[[avoid]]
+box = { x = [1.6, 1.8] }
+
+[domain]
+box = { x = [0.2, 3] }
+leaving = "ends"           # or "unsafe"
+""",
+    "staying": """\
+# A target that is not left again: from the first entry on the state stays in it, until the horizon.
+name = "NAME"
+time = "discrete"
+horizon = 10
+delta = 0.1
+states = ["x"]
+
+[dynamics]
+x = "0.5*x"
+
+[noise]
+law = "triangular"
+halfwidth = 0.2
+
+[initial]
+point = [0.9]
+
+[[stay]]
+box = { x = [-1, 1] }
+
+[[reach]]
+box = { x = [-0.3, 0.3] }
+then = "stay"
+""",
 }
 """By the name that ``certbound new --example`` takes."""

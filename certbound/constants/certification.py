@@ -24,6 +24,10 @@ FIRST_BUDGET = 4000
 """Boxes before the affine structure of the Jacobian is looked for."""
 MOST_SIDES = 8
 """Coordinates above which bisection is left out where the affine structure gives a bound."""
+SMALL = 12
+"""States up to which as many Jacobians are sampled as is usual."""
+LARGE = 24
+"""States above which no side is bisected where there are many and the affine structure gives a bound."""
 EXACT = 1e-9
 """A relative gap that leaves nothing to gain."""
 
@@ -69,11 +73,14 @@ def _supremum(model: Model, jacobian: StateJacobian, norm: Metric, tolerance: fl
 
     limit = tolerance * _scale(jacobian, norm)
     starts = jacobian.starts()
-    search = functools.partial(bound_supremum, bound, value, jacobian.box, tolerance=limit, starts=starts)
+    search = functools.partial(
+        bound_supremum, bound, value, jacobian.box, tolerance=limit, starts=starts, share=_effort(model.dimension)
+    )
     unbounded = not (np.isfinite(jacobian.box.lo) & np.isfinite(jacobian.box.hi)).all()
     many = len(jacobian.active) > 3
     budget = max(1, int(budget * min(1.0, (6 / model.dimension) ** 2)))  # a box costs the more, the larger n
-    if unbounded:
+    large = len(jacobian.active) > MOST_SIDES and model.dimension > LARGE
+    if unbounded or large:
         ceiling = _structural_bound(model, jacobian, norm)
         hopeless = len(jacobian.active) > MOST_SIDES and np.isfinite(ceiling)
         return search(budget=1 if hopeless else budget, ceiling=ceiling)
@@ -120,9 +127,15 @@ def slope_weights(norm: Metric, spread: Any, fallback: Array) -> Array:
     return np.where(finite[:, None], weights, fallback)
 
 
+def _effort(dimension: int) -> float:
+    """Share of the usual samples: a singular value decomposition costs n^3."""
+    return min(1.0, (SMALL / dimension) ** 3)
+
+
 def _scale(jacobian: StateJacobian, norm: Metric) -> float:
     """max(1, largest sampled norm of the Jacobian)."""
-    matrices = jacobian.values(random_points(np.random.default_rng(1), jacobian.box, 256))
+    count = max(8, int(256 * _effort(jacobian.dimension)))
+    matrices = jacobian.values(random_points(np.random.default_rng(1), jacobian.box, count))
     defined = np.isfinite(matrices).all(axis=(-1, -2))
     return max(1.0, float(np.max(norm.sample_norm(matrices[defined]), initial=0.0)))
 

@@ -7,7 +7,8 @@ gives each constraint a metric of its own and ``split_delta`` shares delta betwe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,34 +16,37 @@ from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
 from certbound.constants.certification import certify
-from certbound.constants.enclosures import random_points
-from certbound.constants.jacobians import AffineSet, JacobianSet, affine_set, as_set
+from certbound.constants.jacobians import AffineSet, JacobianSet, as_set
+from certbound.constants.least_eroding import (
+    Tightening,
+    candidate_sets,
+    certified,
+    erosion_ratio,
+    is_gaussian,
+    model_set,
+    noise_matrices,
+    tried,
+)
 from certbound.constants.model_data import Model, model_of
 from certbound.constants.programs import (
-    Proposal,
+    ErosionSearch,
     RadiusModel,
     Rooms,
     constraint_targets,
     cut_rooms,
-    erosion_factors,
-    erosion_proposals,
     rate_proposals,
     rooms_of,
-    sampled_polytope,
     stated_rooms,
 )
-from certbound.constants.state_jacobian import StateJacobian
-from certbound.errors import EnclosureError, InfeasibleError, SolverError
-from certbound.problem.model import Tape, compile_numpy, jacobian
+from certbound.parallel import crew, result_of
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box
-from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
+from certbound.problem.systems import System
 from certbound.tubes.constants import Constants
+from certbound.watch import poll
 
 _GAIN = 1e-3
 """Smallest decrease of c or L for which another metric than the identity is worth its name."""
-
-_SAMPLES = 2000
 
 
 def propose_metrics(
@@ -103,8 +107,8 @@ def propose_metrics(
         targets = None
     else:
         model = model_of(source, domain, horizon)
-        members, matrices = model_set(model), _noise_matrices(model)
-        continuous, gaussian = model.continuous, _gaussian(model)
+        members, matrices = model_set(model), noise_matrices(model)
+        continuous, gaussian = model.continuous, is_gaussian(model)
         horizon, delta = _horizon(model, horizon), delta if delta is not None else _delta(model)
         targets = None if objective == "rate" or directions is not None else _targets(model, horizon)
     if objective == "rate":
@@ -117,7 +121,7 @@ def propose_metrics(
     radius = RadiusModel(
         continuous=continuous, dimension=members.dimension, horizon=horizon, delta=delta, gaussian=gaussian
     )
-    return [p.metric for p in erosion_proposals(members, targets, matrices, radius)]
+    return [p.metric for p in ErosionSearch(members, matrices, radius).proposals(targets)]
 
 
 def improve(
@@ -131,19 +135,19 @@ def improve(
     check_objective(objective)
     if objective == "erosion":
         horizon, delta = _required(_horizon(model, horizon), _delta(model) if delta is None else delta)
-        return _least_erosion(model, euclidean, _targets(model, horizon), horizon, delta)
+        return Tightening(model, euclidean, horizon=horizon, delta=delta).best(_targets(model, horizon))
     if model.dimension == 1:
         return euclidean
-    found = [euclidean]
-    for members in _candidate_sets(model):
-        for proposal in _tried(members, lambda s: rate_proposals(s, continuous=model.continuous)):
-            found += _certified(model, proposal)
-    best, plain = min(found, key=lambda constants: constants.worst_slope), euclidean.worst_slope
-    return best if best.worst_slope < plain - _GAIN * max(1e-3, abs(plain)) else euclidean
+    found, wanted = [euclidean], euclidean.worst_slope - _GAIN * max(1e-3, abs(euclidean.worst_slope))
+    for members in candidate_sets(model):
+        for proposal in tried(partial(rate_proposals, members, continuous=model.continuous, wanted=wanted)):
+            found += certified(model, proposal)
+    best = min(found, key=lambda constants: constants.worst_slope)
+    return best if best.worst_slope < wanted else euclidean
 
 
 def bound_metrics(
-    problem: Problem, *, horizon: float | None = None, delta: float | None = None, domain: Any = None
+    problem: Problem, *, horizon: float | None = None, delta: float | None = None, domain: Any = None, jobs: int = 1
 ) -> tuple[Constants, ...]:
     """Certified constants in a metric of its own for each constraint of a problem.
 
@@ -156,6 +160,8 @@ def bound_metrics(
         The problem's own when omitted; the metrics are tuned for equal shares of delta.
     domain : Box, optional
         As for ``bound_constants``.
+    jobs : int
+        Processes that work side by side.
 
     Returns
     -------
@@ -171,6 +177,24 @@ def bound_metrics(
 
     Source: "one metric per constraint", Sec. 4 and 6 of docs/theory.md.
     """
+    found = dict(each_metric(problem, horizon=horizon, delta=delta, domain=domain, jobs=jobs))
+    return tuple(found[index] for index in range(len(problem.constraints)))
+
+
+def each_metric(
+    problem: Problem,
+    *,
+    only: Sequence[int] | None = None,
+    horizon: float | None = None,
+    delta: float | None = None,
+    domain: Any = None,
+    jobs: int = 1,
+) -> Iterator[tuple[int, Constants]]:
+    """The same one by one as they are found, each with its place among ``problem.constraints``.
+
+    Those come first whose constraints lose most of their room in the metric that the search starts from; ``only`` are
+    the places that are asked for (all when omitted). Parameters and errors are those of `bound_metrics`.
+    """
     if not isinstance(problem, Problem):
         raise TypeError(f"`problem` must be a Problem, got {type(problem).__name__}.")
     model = model_of(problem, domain, horizon)
@@ -178,14 +202,36 @@ def bound_metrics(
     span = float(problem.horizon) if horizon is None else float(horizon)
     times, targets = constraint_targets(problem)
     share = (problem.delta if delta is None else delta) / len(problem.constraints)
-    results = []
-    for index in range(len(problem.constraints)):
+    work = Tightening(model, euclidean, horizon=span, delta=share)
+    rooms: dict[int, Rooms] = {}
+    for index in range(len(problem.constraints)) if only is None else only:
         own = [target for target in targets if target.constraint == index]
         if own:
-            results.append(_least_erosion(model, euclidean, cut_rooms(rooms_of(times, own), span), span, share))
+            rooms[index] = cut_rooms(rooms_of(times, own), span)
         else:
-            results.append(euclidean)
-    return tuple(results)
+            yield index, euclidean
+    order = sorted(rooms, key=lambda index: -work.promise(rooms[index]))
+    if jobs < 2 or len(order) < 2:
+        for place, index in enumerate(order):
+            poll(f"a metric for constraint {place + 1} of {len(order)}")
+            yield index, work.best(rooms[index])
+        return
+    first, rest = order[0], order[1:]
+    yield first, work.best(rooms[first])  # what the others share is found on the way
+    with crew(jobs) as workers:
+        yield from _side_by_side(workers, {index: partial(work.best, rooms[index]) for index in rest})
+
+
+def _side_by_side(workers: Any, tasks: dict[int, Any]) -> Iterator[tuple[int, Constants]]:
+    waiting, count = list(tasks), 0
+    while count < len(tasks):
+        while waiting and len(tasks) - len(waiting) - count < workers.width:
+            index = waiting.pop(0)
+            workers.begin(index, tasks[index])
+        for index, answer in workers.finished():
+            count += 1
+            yield index, result_of(answer)
+        poll(f"a metric for constraint {count + 2} of {len(tasks) + 1}")
 
 
 def split_delta(
@@ -264,106 +310,6 @@ def jacobian_set(source: Problem | System, domain: Box | None = None, *, toleran
         If the Jacobian is unbounded, undefined or jumping on the domain.
     """
     return model_set(model_of(source, domain, None), tolerance=tolerance)
-
-
-def model_set(model: Model, *, tolerance: float = 1e-3) -> AffineSet:
-    """The affine set of all Jacobians of a model over its ranges."""
-    tape = jacobian(model.dynamics, model.state_slots)
-    return affine_set(tape, [model.ranges[slot] for slot in range(len(model.ranges))], tolerance=tolerance)
-
-
-def erosion_ratio(constants: Constants, rooms: Rooms, horizon: float, delta: float) -> float:
-    """Largest erosion over room of the best quick tube, in floating point."""
-    from certbound.tubes.tuning import tune_tube
-
-    if constants.continuous:
-        rooms = rooms.coarse(12)
-    room = (rooms.rooms / erosion_factors(constants.matrix, rooms.directions)[:, None]).min(axis=0)
-    if constants.continuous:  # both ends of a piece count
-        times = np.concatenate([[0.0], rooms.times[:-1], [horizon]])
-        values = np.minimum(room, np.concatenate([room[:1], room[:-1]]))
-    else:
-        steps = np.arange(1, int(horizon) + 1)
-        values = np.concatenate([[np.inf], room[np.searchsorted(rooms.times, steps)]])
-        times = np.arange(int(horizon) + 2.0)
-    tube = tune_tube(constants, horizon=horizon, delta=delta, objective=(times, values))
-    asked = np.isfinite(room)  # elsewhere nothing is asked, and an endless radius is no erosion
-    with np.errstate(over="ignore"):  # a ratio beyond all floats is endless
-        ratios = np.asarray(tube.radius(rooms.times))[asked] / room[asked]
-    return float(np.max(ratios, initial=0.0))
-
-
-def _least_erosion(model: Model, euclidean: Constants, targets: Rooms, horizon: float, delta: float) -> Constants:
-    """The certified constants whose tube erodes least, among the identity metric and the proposals."""
-    radius = RadiusModel(
-        continuous=model.continuous, dimension=model.dimension, horizon=horizon, delta=delta, gaussian=_gaussian(model)
-    )
-    found, matrices = [euclidean], _noise_matrices(model)
-    if model.dimension > 1 and any(G.any() for G in matrices):
-        for members in _candidate_sets(model):
-            for proposal in _tried(members, lambda s: erosion_proposals(s, targets, matrices, radius)):
-                found += _certified(model, proposal)
-    if len(found) == 1:
-        return euclidean
-    return min(found, key=lambda constants: erosion_ratio(constants, targets, horizon, delta))
-
-
-def _candidate_sets(model: Model) -> list[JacobianSet]:
-    """Sets to propose for: all Jacobians, structured; and samples of them, where that set is loose or missing."""
-    try:
-        structured = model_set(model)
-    except EnclosureError:
-        structured = None
-    given: list[JacobianSet] = [] if structured is None else [structured]
-    slots = StateJacobian(model.dynamics, model.state_slots, model.ranges)
-    bounded = bool(np.isfinite(slots.box.lo).all() and np.isfinite(slots.box.hi).all())
-    if not bounded or not slots.active:
-        return given
-    matrices = slots.values(random_points(np.random.default_rng(0), slots.box, _SAMPLES))
-    matrices = matrices[np.isfinite(matrices).all(axis=(1, 2))]
-    if not len(matrices):
-        return given
-    sampled = sampled_polytope(matrices)
-    if structured is None:
-        return [sampled]
-    directions = np.random.default_rng(1).normal(size=(16, model.dimension, model.dimension))
-    widths = [members.support(directions) + members.support(-directions) for members in (structured, sampled)]
-    loose = bool(np.any(widths[0] > 1.1 * widths[1] + 1e-12 * np.abs(structured.J0).max()))
-    return [*given, sampled] if loose else given
-
-
-def _tried(members: JacobianSet, propose: Callable[[JacobianSet], list[Proposal]]) -> list[Proposal]:
-    """The proposals, or none where every solver stalls or overflows: the identity metric is there already."""
-    try:
-        return propose(members)
-    except (SolverError, np.linalg.LinAlgError):
-        return []
-
-
-def _certified(model: Model, proposal: Proposal) -> list[Constants]:
-    try:
-        return [certify(model, proposal.metric, status=proposal.status, tolerance=2e-3, budget=60_000)]
-    except (EnclosureError, InfeasibleError):
-        return []
-
-
-def _noise_matrices(model: Model) -> list[Array]:
-    """Noise matrices at unit proxy: the constant one, or samples of a state-dependent diffusion."""
-    system = model.system
-    if isinstance(system, DiscreteSystem):
-        values, vectors = np.linalg.eigh(np.asarray(system.noise.proxy, dtype=float))
-        return [np.asarray(system.noise_matrix @ (vectors * np.sqrt(np.maximum(values, 0.0))))]
-    assert isinstance(system, ContinuousSystem)
-    if not isinstance(system.diffusion, Tape):
-        return [np.asarray(system.diffusion, dtype=float)]
-    points = random_points(np.random.default_rng(0), model.ranges[: model.dimension + 1], 16)
-    with np.errstate(all="ignore"):
-        values = np.broadcast_to(compile_numpy(system.diffusion)(*points.T), (16, *system.diffusion.shape))
-    return [np.asarray(G) for G in values if np.all(np.isfinite(G))]
-
-
-def _gaussian(model: Model) -> bool:
-    return not isinstance(model.system, DiscreteSystem) or bool(model.system.noise.gaussian)
 
 
 def _horizon(model: Model, horizon: float | None) -> float | None:

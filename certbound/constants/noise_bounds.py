@@ -44,24 +44,38 @@ def bound_noise(model: Model, norm: Metric, pieces: Interval | None = None) -> N
     if isinstance(system, DiscreteSystem):
         gain, proxy = system.noise_matrix, system.noise.proxy
         gaussian = system.noise.gaussian
-        exact = _product(_fractions(gain), system.noise.exact_covariance()) if gaussian else None
+        square = system.noise.exact_covariance() if gaussian else None
     else:
         assert isinstance(system.diffusion, np.ndarray)
         gain, proxy, gaussian = system.diffusion, np.eye(system.noise_dimension), True
-        exact = _product(_fractions(gain), _fractions(np.eye(gain.shape[1])))
+        square = _fractions(np.eye(gain.shape[1]))
     if not (gain.any() and proxy.any()):
         silent: Any = 0.0 if pieces is None else np.zeros(len(pieces))
         nu = float(model.dimension)
         return NoiseBound(sigma=silent, effective_dimension=nu, isotropic=False, gaussian=gaussian)
     covariance = matmul(matmul(gain, proxy), np.swapaxes(gain, 0, 1))
-    square, trace = _level(norm, Interval(covariance.lo[None], covariance.hi[None]))
+    exact = None
+    if square is not None and _may_be_isotropic(norm, covariance):
+        exact = _product(_fractions(gain), square)
+    level, trace = _level(norm, Interval(covariance.lo[None], covariance.hi[None]))
     isotropic = exact is not None and _is_isotropic(norm, exact)
-    known = exact[0][0] if exact is not None and isotropic and norm.matrix is None else Fraction(float(square[0]))
+    known = exact[0][0] if exact is not None and isotropic and norm.matrix is None else Fraction(float(level[0]))
     sigma = _root(known)
     nu = _effective(trace, np.array([sigma]), min(gain.shape))
     value = sigma if pieces is None else np.full(len(pieces), sigma)
     nu = float(model.dimension) if isotropic else nu
     return NoiseBound(sigma=value, effective_dimension=nu, isotropic=isotropic, gaussian=gaussian)
+
+
+@quiet
+def _may_be_isotropic(norm: Metric, covariance: Interval) -> bool:
+    """False where P M is no multiple of the identity for any M in the interval matrix: rational arithmetic is slow."""
+    product = covariance if norm.matrix is None else matmul(norm.matrix, covariance)
+    diagonal = np.arange(norm.dimension)
+    ends = product[diagonal, diagonal]
+    off = (product.lo <= 0) & (product.hi >= 0)
+    off[diagonal, diagonal] = True
+    return bool(off.all() and float(ends.lo.max()) <= float(ends.hi.min()))
 
 
 @quiet
@@ -177,7 +191,12 @@ def _fractions(matrix: Array) -> Rational:
 
 
 def _times(a: Rational, b: Rational) -> Rational:
-    return [[sum((x * y for x, y in zip(row, column)), Fraction(0)) for column in zip(*b)] for row in a]
+    """The product; what is 0 in a row is left out, for large matrices are mostly that."""
+    found = []
+    for row in a:
+        terms = [(x, b[k]) for k, x in enumerate(row) if x]
+        found.append([sum((x * other[j] for x, other in terms), Fraction(0)) for j in range(len(b[0]))])
+    return found
 
 
 def _product(gain: Rational, covariance: Rational) -> Rational:

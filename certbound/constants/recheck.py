@@ -23,6 +23,8 @@ from certbound.constants.jacobians import (
     SectorSet,
     UnionSet,
     as_set,
+    induced_norm,
+    matrix_measure,
     square_matrix,
 )
 from certbound.constants.programs import center_multipliers, centred, varying
@@ -32,6 +34,12 @@ from certbound.rigor.intervals import Interval, down, matmul, up
 
 VERTEX_WORK = 2e7
 """Largest count * n^3 for which a parametric set is proved vertex by vertex."""
+QUICK_WORK = 5e5
+"""The same, up to which the sector inequality is not even tried."""
+MOST_VERTICES = 1 << 16
+"""What a set returns as vertices at most."""
+SECTOR_LOSS = 1e-3
+"""What the sector inequality may lose to the vertices, relative to c or 1 - L^2, before these are proved instead."""
 
 _CHUNK = 4096
 
@@ -120,11 +128,19 @@ class _Frame(NamedTuple):
 
 
 def _member_value(frame: _Frame, member: JacobianSet, *, continuous: bool) -> float:
-    by_vertices = member.vertex_count * member.dimension**3 <= VERTEX_WORK
-    if by_vertices or not isinstance(member, (AffineSet, SectorSet)):
+    work = member.vertex_count * member.dimension**3
+    if work <= QUICK_WORK or not isinstance(member, (AffineSet, SectorSet)):
         return _vertex_value(frame, member, continuous=continuous)
     sector = member if isinstance(member, SectorSet) else member.sector()
-    return _sector_value(frame, sector, continuous=continuous)
+    value = _sector_value(frame, sector, continuous=continuous)
+    if work > VERTEX_WORK or member.vertex_count > MOST_VERTICES:
+        return value
+    measured = matrix_measure if continuous else induced_norm
+    reached = float(np.max(measured(member.vertices(), 2, weights=frame.P)))
+    least, scale = (reached, abs(reached)) if continuous else (reached**2, abs(1 - reached**2))
+    if value - least <= SECTOR_LOSS * max(scale, 1e-9 * abs(least)):
+        return value
+    return min(value, _vertex_value(frame, member, continuous=continuous))
 
 
 def _coordinates(metric: ArrayLike) -> _Frame:

@@ -8,7 +8,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.constants.enclosures import Spread, enclose
-from certbound.problem.model import OPERATIONS, Node, Tape, compile_numpy, jacobian, sources
+from certbound.problem.model import ROWS, Node, Tape, compile_numpy, jacobian, sources
 from certbound.rigor.intervals import Interval
 
 PERIOD = 6.283185307179588
@@ -60,7 +60,7 @@ class StateJacobian:
 
     def remark(self, status: str) -> str:
         """``status``, and that the Jacobian is the generalised one where the model has kinks (abs, min, max)."""
-        if all(node.op != "kink" for node in self.tape.nodes):
+        if all(node.op not in ("kink", "bent") for node in self.tape.nodes):
             return status
         return f"{status}; generalised Jacobian at the kinks of abs, min, max"
 
@@ -135,7 +135,7 @@ def _is_affine(tape: Tape, slot: int) -> bool:
 
 def _is_risky(node: Node) -> bool:
     """Whether it may jump or be undefined."""
-    row = OPERATIONS.get(node.op)
+    row = ROWS.get(node.op)
     return row is not None and (row.jump is not None or row.undefined is not None)
 
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.plotting.scene import GREY, INK, RIM, VERMILION, YELLOW, Scene
-from certbound.problem.sets import Inside, Quadratic, Region
+from certbound.plotting.certified import supports
+from certbound.plotting.scene import EDGE, GREEN, GREY, INK, RIM, VERMILION, YELLOW, Scene
+from certbound.problem.sets import Faces, Inside, Quadratic, Region
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,12 +24,23 @@ OUTLINES = 160
 
 
 def plane_of(problem: Problem) -> Plane | None:
-    """The two states that a constraint lives in, or the only two states of a planar system."""
-    for constraint in problem.safe:
-        coordinates = constraint.region.coordinates
-        if coordinates is not None and len(coordinates) == 2:
-            return int(coordinates[0]), int(coordinates[1])
+    """The two states that a constraint asks about, or the only two states of a planar system.
+
+    A single half-space asks for a panel over time, not for a plane.
+    """
+    for constraint in sorted(problem.safe, key=lambda one: not one.outside):  # obstacles first
+        asked, form = asked_of(constraint.region), constraint.region.form
+        if len(asked) == 2 and not (isinstance(form, Faces) and len(form.bounds) == 1):
+            return asked[0], asked[1]
     return (0, 1) if problem.system.dimension == 2 else None
+
+
+def asked_of(region: Region) -> list[int]:
+    """The states that a region asks about: those of its faces' normals, or that a quadratic form lives in."""
+    places = region.places(region.dimension)
+    if isinstance(region.form, Faces):
+        return [places[k] for k in np.flatnonzero(np.any(region.form.normals != 0, axis=0))]
+    return places
 
 
 def draw_plane(axes: Axes, scene: Scene, plane: Plane) -> None:
@@ -43,33 +55,46 @@ def draw_plane(axes: Axes, scene: Scene, plane: Plane) -> None:
         segments = list(scene.paths[..., list(plane)])
         axes.add_collection(LineCollection(segments, colors=GREY, linewidths=0.4, alpha=0.5, zorder=3))
     axes.plot(*scene.nominal()[1][:, list(plane)].T, color=INK, linewidth=1.2, zorder=5)
+    _draw_starts(axes, scene.problem, plane)
     axes.autoscale_view()
-    limits = _limits(scene.problem, plane, (*axes.get_xlim(), *axes.get_ylim()))
+    limits = frame_of(scene.problem, plane, (*axes.get_xlim(), *axes.get_ylim()))
     for constraint in scene.problem.safe:
         if lives_in(constraint.region, plane):
-            draw_set(axes, constraint, plane, limits, _band(scene, constraint, plane))
+            band = band_of(scene, constraint, plane)
+            draw_set(axes, constraint, plane, limits, band, horizon=float(scene.problem.horizon))
+    target = scene.problem.reach
+    if target is not None and lives_in(target.region, plane):
+        draw_set(axes, target, plane, limits, style=TARGET)
     names = scene.problem.system.states
     axes.set(xlim=limits[:2], ylim=limits[2:], xlabel=names[plane[0]], ylabel=names[plane[1]])
     if any(c.region.form.even and lives_in(c.region, plane) for c in scene.problem.safe):
         axes.set_aspect("equal", adjustable="box")
 
 
-def supports(tube: ReachTube, direction: Array) -> Array:
-    """max a.x over the tube on each piece, over all cells: shape (K,)."""
-    from certbound.reach.nominal import polynomial_range
-    from certbound.rigor.intervals import Interval
+def _draw_starts(axes: Axes, problem: Problem, plane: Plane) -> None:
+    """A frame around where the state starts; a cross where that is a point or random."""
+    from matplotlib.patches import Rectangle
 
-    coefficients = tube.curve.coefficients
-    along = [Interval.point(coefficients[:, :, j] @ direction) for j in range(coefficients.shape[2])]
-    centre = polynomial_range(along, tube.curve.span)
-    return np.asarray(np.max(np.asarray(centre.hi) + tube.spread(direction), axis=0))
+    for start in problem.starts:
+        low, high = ends_of(start)
+        corner, size = low[list(plane)], (high - low)[list(plane)]
+        if np.any(size > 0):
+            axes.add_patch(Rectangle(tuple(corner), *size, fill=False, edgecolor=INK, linewidth=0.8, zorder=6))
+        else:
+            axes.plot(*corner, marker="x", color=INK, markersize=4, markeredgewidth=1.0, zorder=6)
 
 
-def outlines(tube: ReachTube, plane: Plane) -> Array:
-    """Polygons around the tube's projections on a plane, shape (pieces, corners, 2)."""
+def ends_of(start: Any) -> tuple[Array, Array]:
+    """Lowest and highest states of a start; of a random one its mean."""
+    around = None if start.random else start.hull()
+    return (start.mean, start.mean) if around is None else (around.lo, around.hi)
+
+
+def outlines(tube: ReachTube, plane: Plane, pieces: Array | None = None) -> Array:
+    """Polygons around the tube's projections on a plane, shape (pieces, corners, 2); of some pieces, where given."""
     angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     heights = np.stack([supports(tube, _row(tube, plane, angle)) for angle in angles])
-    chosen = np.unique(np.linspace(0, tube.curve.pieces - 1, OUTLINES).astype(int))
+    chosen = np.unique(np.linspace(0, tube.curve.pieces - 1, OUTLINES).astype(int)) if pieces is None else pieces
     here, following = heights[:, chosen], np.roll(heights, -1, axis=0)[:, chosen]
     turn = 2 * np.pi / DIRECTIONS
     along = (following - here * np.cos(turn)) / np.sin(turn)
@@ -84,49 +109,90 @@ def _row(tube: ReachTube, plane: Plane, angle: float) -> Array:
 
 
 def lives_in(region: Region, plane: Plane) -> bool:
-    coordinates = set(region.places(region.dimension))
-    return coordinates == set(plane) or (region.form.axial and bool(coordinates & set(plane)))
+    """Whether a region can be drawn in a plane: it asks about both of its states, or is a box with sides in it."""
+    asked = set(asked_of(region))
+    return asked == set(plane) or (region.form.axial and bool(asked & set(plane)))
 
 
-def _limits(problem: Problem, plane: Plane, limits: tuple[float, ...]) -> tuple[float, ...]:
-    """The picture's frame, grown so that every round obstacle is in it."""
-    left, right, bottom, top = limits
-    for constraint in problem.safe:
+def frame_of(problem: Problem, plane: Plane, limits: tuple[float, ...]) -> tuple[float, ...]:
+    """The picture's frame, grown so that every bounded set that lives in the plane alone is in it."""
+    low, high = np.array(limits[::2]), np.array(limits[1::2])
+    goal = () if problem.reach is None else (problem.reach,)
+    for constraint in (*problem.safe, *goal):
         region = constraint.region
-        if constraint.outside and isinstance(region.form, Quadratic) and region.form.even and lives_in(region, plane):
-            x, y = region.center_at(0.0)
-            grown = 1.25 * region.form.radius
-            left, right = min(left, x - grown), max(right, x + grown)
-            bottom, top = min(bottom, y - grown), max(top, y + grown)
-    return left, right, bottom, top
+        if set(asked_of(region)) != set(plane):
+            continue
+        for t in constraint.during or (0.0, float(problem.horizon)):
+            hull = region.hull(t)[np.array(order_in(region, plane))]
+            size = hull.hi - hull.lo
+            room = np.where(np.isfinite(size), np.minimum(0.12 * size, 0.5), 0.0)
+            low = np.where(np.isfinite(hull.lo), np.minimum(low, hull.lo - room), low)
+            high = np.where(np.isfinite(hull.hi), np.maximum(high, hull.hi + room), high)
+    return low[0], high[0], low[1], high[1]
 
 
-def draw_set(axes: Axes, constraint: Inside, plane: Plane, limits: tuple[float, ...], band: float) -> None:
-    """An obstacle with the band that the noise adds to it, or the border of where the state must stay."""
+SOLID: dict[str, Any] = {"facecolor": VERMILION, "edgecolor": RIM, "hatch": "////", "linewidth": 0.6, "zorder": 0.5}
+BORDER: dict[str, Any] = {
+    "fill": False, "edgecolor": VERMILION, "linestyle": (0, (5, 2)), "linewidth": 1.2, "zorder": 6,
+}  # fmt: skip
+BAND: dict[str, Any] = {"facecolor": YELLOW, "alpha": 0.6, "zorder": 0.2}
+INSET: dict[str, Any] = {"fill": False, "edgecolor": EDGE, "linestyle": (0, (1, 1.5)), "linewidth": 0.9, "zorder": 6}
+TARGET: dict[str, Any] = {"facecolor": GREEN, "edgecolor": GREEN, "alpha": 0.3, "linewidth": 1.0, "zorder": 0.4}
+GHOSTS = 4  # places at which a moving set is drawn again, faintly
+
+
+def draw_set(
+    axes: Axes, constraint: Inside, plane: Plane, limits: tuple[float, ...], band: float = 0.0, *,
+    horizon: float = 0.0, style: dict[str, Any] | None = None,
+) -> None:  # fmt: skip
+    """An obstacle with the band that the noise adds to it, or the border of where the state must stay.
+
+    What moves is drawn where it is when it is first asked, and faintly where it goes until the horizon.
+    """
+    region, obstacle = constraint.region, constraint.outside
+    first, last = constraint.during or (0.0, horizon)
+    style = style or (SOLID if obstacle else BORDER)
+    if band > 0 and (grown := grown_by(region, band if obstacle else -band)) is not None:
+        _outline(axes, grown, plane, first, limits, {**(BAND if obstacle else INSET)})
+    _outline(axes, region, plane, first, limits, style)
+    for t in np.linspace(first, last, GHOSTS + 1)[1:] if region.moving and last > first else ():
+        _outline(axes, region, plane, float(t), limits, {**style, "alpha": 0.25})
+
+
+def grown_by(region: Region, distance: float) -> Region | None:
+    """The region moved outward; None for shapes that do not know how, or of which nothing is left."""
+    try:
+        return region.grown(distance)
+    except ValueError:
+        return None
+
+
+def _outline(
+    axes: Axes, region: Region, plane: Plane, t: float, limits: tuple[float, ...], style: dict[str, Any]
+) -> None:
     from matplotlib.patches import Circle, Polygon
 
-    region, obstacle = constraint.region, constraint.outside
-    centre = region.center_at(constraint.during[0] if constraint.during else 0.0)
-    solid = {"facecolor": VERMILION, "edgecolor": RIM, "hatch": "////", "linewidth": 0.6, "zorder": 0.5}
-    border = {"fill": False, "edgecolor": VERMILION, "linestyle": (0, (5, 2)), "linewidth": 1.2, "zorder": 6}
-    style: dict[str, Any] = solid if obstacle else border
+    centre = region.center_at(t)
     if isinstance(region.form, Quadratic) and region.form.even:
-        axes.add_patch(Circle(tuple(centre), region.form.radius, **style))
-        if band > 0:
-            radius = region.form.radius + (band if obstacle else -band)
-            axes.add_patch(Circle(tuple(centre), radius, facecolor=YELLOW, alpha=0.6, zorder=0.2, fill=obstacle))
+        axes.add_patch(Circle(tuple(centre[order_in(region, plane)]), region.form.radius, **style))
         return
-    corners = _corners(region, centre, plane, limits)
+    corners = corners_of(region, centre, plane, limits)
     if len(corners):
         axes.add_patch(Polygon(corners, closed=True, **style))
 
 
-def _corners(region: Region, centre: Array, plane: Plane, limits: tuple[float, ...]) -> Array:
+def order_in(region: Region, plane: Plane) -> list[int]:
+    """Where the plane's two states are among the coordinates of a region that has both."""
+    places = region.places(region.dimension)
+    return [places.index(state) for state in plane]
+
+
+def corners_of(region: Region, centre: Array, plane: Plane, limits: tuple[float, ...]) -> Array:
     """Outline of a set about its centre, cut to a little more than the picture; empty where it is not in it."""
     if isinstance(region.form, Quadratic):
         angles = np.linspace(0, 2 * np.pi, 90)
         circle = region.form.radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-        return np.asarray(centre + circle @ np.linalg.cholesky(region.form.shape).T)
+        return np.asarray((centre + circle @ np.linalg.cholesky(region.form.shape).T)[:, order_in(region, plane)])
     left, right, bottom, top = limits
     width, height = right - left, top - bottom
     ends = [(left - width, right + width), (bottom - height, top + height)]
@@ -152,9 +218,10 @@ def _cut(corners: Array, row: Array, bound: float) -> Array:
     return np.array(kept).reshape(-1, 2)
 
 
-def _band(scene: Scene, constraint: Inside, plane: Plane) -> float:
-    """The largest stochastic deviation in the plane: how far a round obstacle is grown in the picture."""
-    if scene.tube is None or not constraint.region.form.even:
+def band_of(scene: Scene, constraint: Inside, plane: Plane) -> float:
+    """The largest stochastic deviation in the plane: how far a set that lives in it is grown in the picture."""
+    region = constraint.region
+    if scene.tube is None or set(asked_of(region)) != set(plane):
         return 0.0
     rows = [_row(scene.reach, plane, angle) for angle in np.linspace(0, 2 * np.pi, 16, endpoint=False)]
     width = max(float(np.max(supports(scene.tube, row) - supports(scene.reach, row))) for row in rows)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import singledispatch
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from certbound.plotting.panels import draw_panel, panels_of
+from certbound.checks import nearest
+from certbound.plotting.asked import Panel, panels_of
+from certbound.plotting.panels import draw_panel
+from certbound.plotting.picture import tightest
 from certbound.plotting.plane import draw_plane, plane_of
-from certbound.plotting.scene import BLUE, INK, OUTER, Scene, noisy_reach
+from certbound.plotting.scene import BLUE, INK, OUTER, Scene
 from certbound.plotting.sweep_maps import draw_sweep_into
 from certbound.plotting.value_maps import draw_curves, draw_map, slices_of
 from certbound.problem.problem import Problem
@@ -24,6 +28,59 @@ from certbound.tubes.tube import Tube
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+
+States = Sequence[str | int] | str | int | None
+
+
+def draw_chosen(result: Any, axes: Axes, states: States, times: tuple[float, float] | None) -> None:
+    """Draw a result, or of one with states the chosen ones, into axes; over time from the first to the second time."""
+    if times is not None and not times[0] < times[1]:
+        raise ValueError(f"`times` must be (first, last) in order, got {times!r}.")
+    if states is None:
+        draw(result, axes)
+    else:
+        _draw_states(_scene_of(result), axes, states, times)
+    if times is not None and axes.get_xlabel().startswith("time"):
+        axes.set_xlim(times)
+
+
+def _scene_of(result: Any) -> Scene:
+    """The scene of a verdict, or of a problem without noise."""
+    if isinstance(result, Verdict):
+        return Scene.of(result)
+    if isinstance(result, Problem):
+        from certbound.reach.dispatch import bound_reach
+
+        return Scene(problem=result, reach=bound_reach(result, noise=False))
+    raise ValueError(f"`states` must be omitted for a {type(result).__name__}; verdicts and problems have them.")
+
+
+def _draw_states(scene: Scene, axes: Axes, states: States, times: tuple[float, float] | None) -> None:
+    names = scene.problem.system.states
+    chosen = [states] if isinstance(states, (str, int)) else list(states or ())
+    numbers = [_number(name, names) for name in chosen]
+    if times is not None:
+        scene = scene.between(*times)
+    if len(numbers) == 2:
+        draw_plane(axes, scene, (numbers[0], numbers[1]))
+    elif len(numbers) == 1:
+        row = np.eye(len(names))[numbers[0]]
+        known = [one for one in panels_of(scene.problem) if one.direction is not None and (one.direction == row).all()]
+        draw_panel(axes, scene, known[0] if known else Panel(label=names[numbers[0]], direction=row))
+        axes.set(xlabel=_time(scene.reach.curve.continuous), ylabel=names[numbers[0]])
+        axes.set_title("")
+    else:
+        raise ValueError(f"`states` must be one state over time or two in their plane, got {len(numbers)}.")
+
+
+def _number(state: str | int, names: tuple[str, ...]) -> int:
+    if isinstance(state, str) and state not in names:
+        raise ValueError(f"`states` must be among {', '.join(names)}, got {state!r}{nearest(state, names)}")
+    number = names.index(state) if isinstance(state, str) else state
+    if not 0 <= number < len(names):
+        raise ValueError(f"`states` must be below {len(names)}, got {number}.")
+    return number
 
 
 @singledispatch
@@ -74,17 +131,14 @@ def _reach(result: ReachTube, axes: Axes) -> None:
 
 @draw.register(Verdict)
 def _verdict(result: Verdict, axes: Axes) -> None:
-    if result.problem is None or result.reach is None:
-        raise ValueError(f"nothing was proved that could be drawn; {result.reason}")
-    scene = Scene(problem=result.problem, reach=result.reach, tube=noisy_reach(result))
-    plane = plane_of(result.problem)
+    scene = Scene.of(result)
+    plane = plane_of(scene.problem)
     if plane is not None:
         draw_plane(axes, scene, plane)
     else:
-        panels = panels_of(result.problem)
-        tightest = [c.label for c in result.problem.safe].index(result.constraint) if _named(result) else 0
-        draw_panel(axes, scene, panels[min(tightest, len(panels) - 1)])
-        axes.set_xlabel(_time(result.reach.curve.continuous))
+        (panel,) = tightest(scene, panels_of(scene.problem), 1)
+        draw_panel(axes, scene, panel)
+        axes.set(xlabel=_time(scene.reach.curve.continuous), ylabel=panel.label)
     axes.set_title(result.summary(), fontsize="small")
 
 
@@ -128,10 +182,6 @@ def _problem(result: Problem, axes: Axes) -> None:
         draw_panel(axes, scene, panels_of(result)[0])
         axes.set_xlabel(_time(reach.curve.continuous))
     axes.set_title(result.summary(), fontsize="small")
-
-
-def _named(verdict: Verdict) -> bool:
-    return verdict.problem is not None and verdict.constraint in [c.label for c in verdict.problem.safe]
 
 
 def _time(continuous: bool) -> str:

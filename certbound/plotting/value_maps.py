@@ -15,7 +15,7 @@ import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.display import log10_text
-from certbound.plotting.plane import Plane, draw_set, lives_in
+from certbound.plotting.plane import Plane, draw_set, ends_of, lives_in
 from certbound.plotting.scene import BLUE, GREY, INK, RIM, VERMILION
 from certbound.safety.starts import SafeStarts
 from certbound.values.charts import Chart
@@ -75,7 +75,7 @@ def draw_curves(axes: Axes, starts: SafeStarts) -> None:
                   label="lower bounds" if number == 0 else None)  # fmt: skip
     axes.axhline(starts.delta, label=f"delta = {starts.delta:g}", **BORDER)
     for number, start in enumerate(problem.starts):
-        low, high = _ends(start)
+        low, high = ends_of(start)
         axes.axvspan(low[0], high[0], facecolor=GREY, edgecolor=GREY, alpha=0.35, linewidth=1.0,
                      label="stated start" if number == 0 else None)  # fmt: skip
     for number, (box,) in enumerate(starts.boxes):
@@ -87,12 +87,6 @@ def draw_curves(axes: Axes, starts: SafeStarts) -> None:
     axes.margins(x=0.01)
     axes.grid(color="#e6e6e6", linewidth=0.5)
     axes.set_axisbelow(True)
-
-
-def _ends(start: Any) -> tuple[Array, Array]:
-    """Lowest and highest states of a start; of a random one its mean."""
-    around = None if start.random else start.hull()
-    return (start.mean, start.mean) if around is None else (around.lo, around.hi)
 
 
 def _of_times(starts: SafeStarts) -> Iterator[str]:
@@ -112,7 +106,7 @@ def steps_of(chart: Chart, least: float) -> tuple[Array, Array]:
 def slices_of(starts: SafeStarts) -> Iterator[tuple[Plane, str, Chart]]:
     """Planes of two states, through the middle of the stated start: (plane, words, the chart in it); none for one."""
     chart, names = starts.chart, starts.problem.system.states
-    low, high = _ends(starts.problem.starts[0])
+    low, high = ends_of(starts.problem.starts[0])
     middle = 0.5 * (low + high)
     for plane in itertools.combinations(range(len(chart.axes)), 2):
         index: list[Any] = [slice(None)] * len(chart.axes)
@@ -142,7 +136,7 @@ def draw_map(axes: Axes, starts: SafeStarts, plane: Plane, chart: Chart) -> Any:
                              linewidths=0.7, linestyles="solid", zorder=2)  # fmt: skip
         axes.clabel(lines, fmt=lambda value: f"1e{value:.0f}", fontsize=6.5, inline_spacing=2)
     _draw_outline(axes, chart.axes, starts.safe(chart))
-    for low, high in (_ends(start) for start in starts.problem.starts):
+    for low, high in (ends_of(start) for start in starts.problem.starts):
         corner, size = low[list(plane)], (high - low)[list(plane)]
         if np.all(size > 0):
             for colour, width in (("white", 2.6), (INK, 1.4)):

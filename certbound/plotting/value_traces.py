@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.plotting.plane import Plane, lives_in
-from certbound.plotting.scene import BLUE, INK, RIM, VERMILION
+from certbound.plotting.plane import Plane
+from certbound.plotting.plane_shapes import shapes_of
+from certbound.plotting.scene import BLUE, VERMILION
 from certbound.plotting.value_maps import DEEPEST, TIMES, coarser, outline_of, slices_of, steps_of
-from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart, Quadratic
 from certbound.safety.starts import SafeStarts
 from certbound.values.charts import Chart
 
@@ -45,7 +44,8 @@ def _map_figure(starts: SafeStarts, plane: Plane, where: str, chart: Chart) -> t
     rim = {"x": x, "y": y, "showlegend": False, "hoverinfo": "skip", **stroke("#ffffff", 5)}
     safe = {"x": x, "y": y, "name": f"safe starts: P <= {starts.delta:g}", **stroke(BLUE, 3)}
     layout: Trace = {"xaxis": {"title": {"text": first}}, "yaxis": {"title": {"text": second}}}
-    layout["shapes"] = [*circles(starts.problem, plane), *_stated(starts, plane)]
+    ends = tuple(float(end) for axis in chart.axes for end in (axis[0], axis[-1]))
+    layout["shapes"] = shapes_of(starts.problem, plane, ends)
     words = "Certified upper bound of the probability of leaving from every start, cell by cell. Black: the stated one."
     title = f"Where it is safe to start: {first}, {second}{' at ' if where else ''}{where}"
     return title, words, [heat, rim, safe], layout
@@ -71,34 +71,6 @@ def _curves_figure(starts: SafeStarts) -> tuple[str, str, list[Trace], Trace]:
     layout = {"xaxis": {"title": {"text": name}}, "yaxis": {"type": "log", "title": {"text": "P(leaving)"}}}
     words = "Certified bounds of the probability of leaving by the horizon, over the state, from several times on."
     return f"Probability of leaving over {name}", words, traces, layout
-
-
-def _stated(starts: SafeStarts, plane: Plane) -> list[Trace]:
-    """Boxes around the stated starts as frames; of a random one nothing."""
-    shapes = []
-    for start in starts.problem.starts:
-        if isinstance(start, GaussianStart):
-            continue
-        around = start.hull()
-        (x0, y0), (x1, y1) = (end[list(plane)] for end in (around.lo, around.hi))
-        ends = {"x0": float(x0), "x1": float(x1), "y0": float(y0), "y1": float(y1)}
-        shapes.append({"type": "rect", **ends, "line": {"color": INK, "width": 2}})
-    return shapes
-
-
-def circles(problem: Problem, plane: Plane) -> list[Trace]:
-    """Round obstacles in a plane."""
-    shapes = []
-    for constraint in problem.safe:
-        region = constraint.region
-        form = region.form
-        if not constraint.outside or not isinstance(form, Quadratic) or not form.even or form.dimension != 2:
-            continue
-        if lives_in(region, plane):
-            (x0, y0), r = region.center_at(0.0), form.radius
-            ends = {"x0": x0 - r, "x1": x0 + r, "y0": y0 - r, "y1": y0 + r}
-            shapes.append({"type": "circle", **ends, "fillcolor": VERMILION, "line": {"color": RIM, "width": 1}})
-    return shapes
 
 
 def stroke(color: str, width: float) -> Trace:

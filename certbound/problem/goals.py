@@ -34,6 +34,12 @@ def until(problem: Problem, t: float) -> Problem:
     return problem.replace(**changes)
 
 
+def check_end(problem: Problem, what: str) -> None:
+    """Refuse an infinite horizon, with an InfeasibleError, where ``what`` needs an end."""
+    if problem.endless:
+        raise InfeasibleError(f"{what} needs an end, and the horizon is infinite: give a finite `horizon`.")
+
+
 def met_at(problem: Problem, t: float) -> Problem:
     """The plain problem of keeping the constraints up to a time, and of being in the target then."""
     plain, target = until(problem, t), problem.reach

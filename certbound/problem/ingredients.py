@@ -13,11 +13,11 @@ from certbound.problem.sets import Box, GaussianStart, Region, StartUnion
 
 
 def checked_horizon(value: Any, discrete: bool) -> float | int:
-    """Seconds, or whole steps."""
-    horizon = number("horizon", value)
-    if horizon <= 0:
+    """Seconds, or whole steps; infinity is for ever."""
+    horizon = number("horizon", value, infinite=True)
+    if not horizon > 0:
         raise ValueError(f"`horizon` must be positive, got {horizon:g}.")
-    if discrete:
+    if discrete and np.isfinite(horizon):
         if horizon != int(horizon):
             raise ValueError(f"`horizon` must be a whole number of steps in discrete time, got {horizon:g}.")
         return int(horizon)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -28,6 +29,9 @@ from certbound.problem.sets import (
 )
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
+DOMAIN = "the model's domain"
+"""Label of the constraint to stay in it."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Problem(Shown):
@@ -43,7 +47,7 @@ class Problem(Shown):
     safe : sequence of Inside and Outside
         Constraints, each over its own window.
     horizon : float or int
-        Seconds (CT) or steps (DT); positive.
+        Seconds (CT) or steps (DT); positive. Infinity is for ever, which few engines serve.
     delta : float
         Accepted probability of leaving the safe set, in (0, 1).
     reach : Reach or a set, optional
@@ -57,6 +61,9 @@ class Problem(Shown):
         Weights of x' Q x + u' R u: matrices, or vectors of their diagonals.
     domain : Box, optional
         Where the model is meant; leaving it is never counted as safe (see ``constraints``).
+    leaving : str
+        "unsafe", or "ends": a path that leaves the domain ends there, and does not fail. Value functions in discrete
+        time and simulations count that; other bounds, which hold all the same, count it as failing.
     name : str
         For humans.
     parameters : mapping, optional
@@ -90,6 +97,7 @@ class Problem(Shown):
     plan: Any = field(default=None, kw_only=True)
     cost: Any = field(default=None, kw_only=True)
     domain: Any = field(default=None, kw_only=True)
+    leaving: str = field(default="unsafe", kw_only=True)
     name: str = field(default="problem", kw_only=True)
     parameters: Any = field(default=None, kw_only=True)
     source: Any = field(default=None, kw_only=True, repr=False)
@@ -134,6 +142,17 @@ class Problem(Shown):
         return self.kept
 
     @property
+    def endless(self) -> bool:
+        """Whether the horizon is infinite."""
+        return math.isinf(self.horizon)
+
+    @property
+    def span(self) -> str:
+        """The horizon in words."""
+        unit = "s" if self.system.time == "continuous" else "steps"
+        return "at any time" if self.endless else f"within {self.horizon:g} {unit}"
+
+    @property
     def failing(self) -> str:
         """What is bounded, in a word."""
         return "leaving" if self.reach is None else "failing"
@@ -143,7 +162,12 @@ class Problem(Shown):
         """What a path respects until it is in the target, where there is one; otherwise ``constraints``."""
         if self.domain is None:
             return tuple(self.safe)
-        return (*self.safe, Inside(self.domain, label="the model's domain"))
+        return (*self.safe, Inside(self.domain, label=DOMAIN))
+
+    @property
+    def ending(self) -> bool:
+        """Whether a path that leaves the domain ends there, without failing."""
+        return self.leaving == "ends"
 
     @property
     def starts(self) -> tuple[Region | GaussianStart, ...]:
@@ -182,10 +206,9 @@ class Problem(Shown):
 
     def summary(self) -> str:
         """The problem in one line."""
-        unit = "s" if self.system.time == "continuous" else "steps"
         count = {"state": self.system.dimension, "constraint": len(self.safe)}
         what = ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for word, number in count.items())
-        return f"{name_text(self.name)}, {what}, {self.horizon:g} {unit}, delta {self.delta!r}"
+        return f"{name_text(self.name)}, {what}, {self.span.removeprefix('within ')}, delta {self.delta!r}"
 
     def rows(self) -> list[tuple[str, str]]:
         """Signals, start and constraints."""
@@ -203,7 +226,7 @@ class Problem(Shown):
         Raises
         ------
         ValueError
-            If the model uses what problem files do not have (np.where, ...).
+            If the model uses what problem files do not have (the kink of a derivative).
         """
         content: dict[str, Any] = ask_later_room("content", self, f"{self.name}.plan.json")
         return content
@@ -250,6 +273,11 @@ class Problem(Shown):
         return tuple(result)
 
     def _check_window(self, name: str, window: tuple[float, float]) -> None:
+        if self.endless:
+            raise ValueError(
+                f"`{name}` must have no `during` where the horizon is infinite, got {list(window)}; give a finite "
+                "horizon, or leave the window out."
+            )
         if window[1] > self.horizon:
             raise ValueError(
                 f"`{name}` must have `during` within [0, {self.horizon:g}], got {list(window)}; "
@@ -277,15 +305,26 @@ class Problem(Shown):
             self._check_window("reach", target.during)
             if target.during[1] <= 0:
                 raise ValueError(f"`reach` must have a time after 0 in `during`, got {list(target.during)}.")
+        if target.stays and (self.system.time == "continuous" or self.endless):
+            raise ValueError(
+                '`reach` must not have `then = "stay"` in continuous time, where a path that has just entered leaves '
+                "again, or for ever; state a constraint with `during` from a time on."
+            )
         named: Reach = target.named(self.system.states)
         return named
 
     def _domain(self) -> Box | None:
+        if self.leaving not in ("unsafe", "ends"):
+            raise ValueError(f'`leaving` must be "unsafe" or "ends", got {self.leaving!r}.')
         if self.domain is None:
+            if self.leaving == "ends":
+                raise ValueError('`leaving` must be "unsafe" without a `domain`, got "ends"; give a domain.')
             return None
         if not isinstance(self.domain, Box) or self.domain.moving or self.domain.coordinates is not None:
             raise TypeError(f"`domain` must be a fixed Box over all states, got {self.domain!r}.")
         check_dimension("domain", self.domain, self.system.dimension)
+        if self.leaving == "ends" and not np.isfinite([self.domain.low, self.domain.high]).any():
+            raise ValueError("`domain` must have a bound where leaving it ends a path.")
         return self.domain
 
     def _checked_plan(self) -> Array | Tape | None:
@@ -293,7 +332,10 @@ class Problem(Shown):
         if plan is None:
             return None
         if system.inputs is None:
-            raise ValueError("`plan` must be omitted for a system without inputs; give the system `inputs=`.")
+            raise ValueError(
+                "`plan` must be omitted for a system without inputs; "
+                "give the system `inputs=` ([inputs] in a problem file)."
+            )
         count = len(system.input_names)
         if callable(plan) or isinstance(plan, Tape):
             tape = plan if isinstance(plan, Tape) else trace(plan, {"t": ["t"], "x": system.states})
@@ -306,6 +348,8 @@ class Problem(Shown):
         return self._array_plan(plan, system.inputs, count)
 
     def _array_plan(self, plan: Any, box: Box, count: int) -> Array:
+        if self.endless:
+            raise ValueError("`plan` must be a feedback law where the horizon is infinite, got an array.")
         rows = np.asarray(plan, dtype=float)
         rows = rows[:, None] if rows.ndim == 1 and count == 1 else rows
         if rows.ndim != 2 or rows.shape[1] != count or not len(rows) or not np.all(np.isfinite(rows)):

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
 from certbound.checks import assign, frozen, matrix, names, number, vector
+from certbound.errors import InfeasibleError
 from certbound.problem import table_laws  # noqa: F401  (its laws enter the list of laws)
 from certbound.problem.adapters import import_control, is_control_system, is_symbolic, read_model, symbol_names
 from certbound.problem.model import Tape, compile_numpy
@@ -170,8 +171,8 @@ class DiscreteSystem(System):
         Bounded set of the unknown signal d; without it there is none.
     noise : Law, optional
         Law of w; no noise when omitted.
-    noise_matrix : array_like, shape (n, m), optional
-        G; the identity when omitted.
+    noise_matrix : array_like or function of t, x, shape (n, m), optional
+        G; the identity when omitted. One that depends on t or x is ``gain``, and few engines serve it.
     input_names, disturbance_names : sequence of str, optional
         Names; u1, u2, ... and d1, d2, ... when omitted (u and d alone).
 
@@ -189,7 +190,8 @@ class DiscreteSystem(System):
     """
 
     noise: Law
-    noise_matrix: Array
+    gain: Tape | None
+    fixed_gain: Array
 
     time: ClassVar[str] = "discrete"
 
@@ -201,7 +203,7 @@ class DiscreteSystem(System):
         inputs: Box | None = None,
         disturbance: Box | None = None,
         noise: Law | None = None,
-        noise_matrix: ArrayLike | None = None,
+        noise_matrix: Any = None,
         input_names: Sequence[str] | None = None,
         disturbance_names: Sequence[str] | None = None,
     ) -> None:
@@ -219,13 +221,30 @@ class DiscreteSystem(System):
                 f"{known_laws()}."
             )
         matrix_value = np.eye(self.dimension) if noise_matrix is None else noise_matrix
-        gain = _noise_matrix("noise_matrix", matrix_value, self.states)
-        assign(self, noise_matrix=gain)
+        gain = _diffusion(matrix_value, self.states, "noise_matrix")
+        moves = isinstance(gain, Tape)
+        assign(self, gain=gain if moves else None, fixed_gain=frozen(np.full(gain.shape, np.nan)) if moves else gain)
         assign(self, noise=law.resolve(gain.shape[1]))
 
     @property
+    def noise_matrix(self) -> Array:
+        """G, shape (n, m).
+
+        Raises
+        ------
+        InfeasibleError
+            If it depends on t or x.
+        """
+        if self.gain is not None:
+            raise InfeasibleError(
+                "the noise matrix depends on t or the states; only value functions of one or two states "
+                '(method "values") and simulations serve that.'
+            )
+        return self.fixed_gain
+
+    @property
     def noise_dimension(self) -> int:
-        return int(self.noise_matrix.shape[1])
+        return int(self.fixed_gain.shape[1])
 
 
 def linear_system(
@@ -361,23 +380,23 @@ def _noise_matrix(name: str, value: Any, states: Sequence[str]) -> Array:
     return matrix(name, array, rows=n)
 
 
-def _diffusion(value: Any, states: Sequence[str]) -> Array | Tape:
+def _diffusion(value: Any, states: Sequence[str], name: str = "diffusion") -> Array | Tape:
     n = len(states)
     if value is None:
         return frozen(np.zeros((n, 1)))
     if not callable(value) and not isinstance(value, Tape) and not is_symbolic(value):
-        return _noise_matrix("diffusion", value, states)
+        return _noise_matrix(name, value, states)
     tape = value if isinstance(value, Tape) else read_model(value, {"t": ["t"], "x": states}, matrix=True)
     if tape.inputs != ("t", *states):
-        raise ValueError(f"`diffusion` must be a tape over {('t', *states)}, got {tape.inputs}.")
+        raise ValueError(f"`{name}` must be a tape over {('t', *states)}, got {tape.inputs}.")
     shape = tape.shape if len(tape.shape) == 2 else (1, *tape.shape)
     if len(tape.shape) == 1 and n > 1:
         raise ValueError(
-            f"`diffusion` must return a matrix with {n} rows (one per state), got shape {tape.shape}; write "
+            f"`{name}` must return a matrix with {n} rows (one per state), got shape {tape.shape}; write "
             "np.diag([...]) for independent noise on every state, or a column [[...], [...]]."
         )
     if shape[0] != n:
-        raise ValueError(f"`diffusion` must return {n} rows (one per state), got shape {shape}.")
+        raise ValueError(f"`{name}` must return {n} rows (one per state), got shape {shape}.")
     if all(node.op != "input" for node in tape.nodes):
         return frozen(compile_numpy(tape)(*np.zeros(n + 1)).reshape(shape))
     return Tape(inputs=tape.inputs, nodes=tape.nodes, outputs=tape.outputs, shape=shape)

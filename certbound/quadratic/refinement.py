@@ -49,6 +49,8 @@ class QuadraticBound:
         Working box and walls.
     walls : tuple of Attempt
         What is proved at each wall, in one window of time or several that cover the horizon.
+    search : Search or None
+        What a later search of the same problem goes on from.
     """
 
     upper: float
@@ -56,10 +58,11 @@ class QuadraticBound:
     seconds: float
     setting: Setting | None = None
     walls: tuple[Attempt, ...] = ()
+    search: Search | None = None
 
 
 def bound_quadratic(
-    problem: Problem, *, target: float = 0.0, seconds: float = 20.0,
+    problem: Problem, *, target: float = 0.0, seconds: float = 20.0, before: QuadraticBound | None = None,
     found: Callable[[QuadraticBound], object] = lambda bound: None,
 ) -> QuadraticBound:
     """Bound P(failing within T) by Theorem K9: one time-varying quadratic value bound a wall of the safe set.
@@ -72,6 +75,8 @@ def bound_quadratic(
         The refinement ends at a bound below this.
     seconds : float
         About what may be spent.
+    before : QuadraticBound, optional
+        Of the same problem: the search goes on from there.
     found : callable
         Takes each better bound while the search goes on (it stands where a watch ends the search).
 
@@ -98,7 +103,10 @@ def bound_quadratic(
     if n > _MOST_STATES:
         raise InfeasibleError(f"quadratic value bounds serve at most {_MOST_STATES} states, the problem has {n}.")
     refuse(problem)
-    return _Quest(problem, target, seconds, found).run()
+    quest = _Quest(problem, target, seconds, found)
+    if before is not None and before.search is not None:
+        quest.best, quest.chosen = before, before.search
+    return quest.run()
 
 
 class _Quest:
@@ -116,7 +124,7 @@ class _Quest:
 
     def run(self) -> QuadraticBound:
         seconds = self.until - self.begin
-        for low, high in _boxes(self.problem):
+        for low, high in _boxes(self.problem) if self.best is None else ():
             left = self.until - time.perf_counter()
             if self.best is not None and (left <= seconds / 2 or self.best.upper < 0):
                 break
@@ -126,9 +134,8 @@ class _Quest:
         self._move()
         if self.best.upper > _log10(self.target):
             self.chosen.run(self.target, self.until - time.perf_counter(), self._note)
-        best = self.best
-        return QuadraticBound(upper=best.upper, words=best.words, seconds=time.perf_counter() - self.begin,
-                              setting=best.setting, walls=best.walls)  # fmt: skip
+        spent = time.perf_counter() - self.begin
+        return replace(self.best, seconds=spent, search=self.chosen)
 
     def _try(self, low: Array, high: Array, share: float, *, together: bool = True) -> Search | None:
         """One pass over the walls of a working box; None where there can be none."""

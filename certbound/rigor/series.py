@@ -45,14 +45,17 @@ def subtract(x: Series, y: Series, order: int) -> Series:
     return [*(a - b for a, b in zip(x, y)), *x[common:], *(-b for b in y[common:])]
 
 
-def product(x: Series, y: Series, order: int | None = None) -> Series:
-    """Cauchy product, cut after ``order`` when given."""
+def product(x: Series, y: Series, order: int | None = None, known: Sequence[Interval] = ()) -> Series:
+    """Cauchy product, cut after ``order`` when given; its first coefficients may be ``known``."""
     length = len(x) + len(y) - 1
     if order is not None:
         length = min(length, order + 1)
     return [
-        _sum([x[j] * y[k - j] for j in range(max(0, k - len(y) + 1), min(k, len(x) - 1) + 1)])
-        for k in range(length)
+        *known,
+        *(
+            _sum([x[j] * y[k - j] for j in range(max(0, k - len(y) + 1), min(k, len(x) - 1) + 1)])
+            for k in range(len(known), length)
+        ),
     ]
 
 

@@ -133,8 +133,9 @@ class Request:
     ``method`` is "auto", or a tube method by name; ``cells`` are parts along each side of the initial set;
     ``constants`` are used instead of certified ones. ``quick``: another engine has proved SAFE or been conclusive, and
     what is slow and then seldom decides may be left out. Not ``thorough``: an engine may spare itself, as it is asked
-    again where that matters, with the ``details`` of its first answer as ``before``. ``found`` takes an answer that
-    holds already while the engine looks for a better one: it stands where time ends the search (`certbound.watch`).
+    again where that matters, with the ``details`` of its first answer as ``before``. ``first``: it may end with the
+    first bound that it finds, and goes on from there when it is asked again. ``found`` takes an answer that holds
+    already while the engine looks for a better one: it stands where time ends the search (`certbound.watch`).
     """
 
     method: str = "auto"
@@ -142,9 +143,13 @@ class Request:
     constants: Constants | None = None
     quick: bool = False
     thorough: bool = True
+    first: bool = False
     before: Any = None
     found: Callable[[EngineAnswer], object] = lambda answer: None
 
+
+SPARED = "not asked, since another engine had answered."
+"""The reason of an engine that was left out."""
 
 AS_IT_IS = Request()
 """Nothing but the problem."""

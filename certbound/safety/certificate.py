@@ -15,7 +15,7 @@ import numpy as np
 
 from certbound.errors import CertificateError
 from certbound.problem.goals import met_at
-from certbound.problem.model import Tape
+from certbound.problem.model import Network, Tape
 from certbound.problem.noise import Law, check_law
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, StartUnion
@@ -66,6 +66,8 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
+    if problem.endless:
+        raise CertificateError("certificates state finite horizons; verify a finite `horizon`.")
     members = getattr(verdict, "members", ())
     if verdict.status == "UNSAFE" or any(one.status == "UNSAFE" for one in members):
         return _lower_data(problem, verdict, attempt)
@@ -154,12 +156,14 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
     """
     useful = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_delta < 0]
     yield from sorted(useful, key=lambda item: (not item[1].certified, item[1].log10_delta))
+    known: dict[str, EngineAnswer] = getattr(verdict, "reserves", {})
     for name, row in ENGINES.items():
         asked = verdict.answers.get(name)
         if problem.reach is not None or verdict.status != "SAFE" or asked is None or asked.applicable:
             continue
         if row.reserve and row.write:
-            answer = row.prove(problem)
+            answer = known[name] if name in known else row.prove(problem)
+            known[name] = answer
             if answer.applicable and answer.log10_delta < 0:
                 yield name, answer
 
@@ -174,7 +178,11 @@ def problem_data(problem: Problem) -> dict[str, Any]:
     ------
     ValueError
         If the system has inputs and no plan.
+    CertificateError
+        If certificates do not state such problems.
     """
+    if problem.reach is not None and problem.reach.stays:
+        raise CertificateError("certificates do not state targets that are to be stayed in.")
     system, tape = problem.system, problem.closed_loop
     continuous = system.time == "continuous"
     rows = problem.input_sequence
@@ -194,6 +202,7 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "noise": _noise(system),
         "initial": initial_data(problem.initial),
         "constraints": [_constraint(constraint) for constraint in problem.safe],
+        **({"leaving": problem.leaving} if problem.ending else {}),
         "domain": None if problem.domain is None else _ranges(zip(problem.domain.low, problem.domain.high)),
         **({} if problem.reach is None else {"reach": _constraint(problem.reach)}),
     }
@@ -209,16 +218,35 @@ def _constraint(constraint: Inside) -> dict[str, Any]:
 
 
 def tape_data(tape: Tape) -> dict[str, Any]:
-    """A tape's operations: [op, ...arguments], ["const", value], ["pow", argument, exponent]."""
+    """A tape's operations: [op, ...arguments], ["const", value], ["pow", argument, exponent].
+
+    The output k of a network is ["network", its number in ``networks``, k, ...arguments].
+    """
     nodes: list[list[Any]] = []
+    networks: list[Network] = []
     for node in tape.nodes:
         if node.op == "const":
             nodes.append(["const", exact(float(node.value))])
         elif node.op == "pow":
             nodes.append(["pow", node.args[0], exact(float(node.value))])
+        elif node.part is not None:
+            if node.part.network not in networks:
+                networks.append(node.part.network)
+            nodes.append(["network", networks.index(node.part.network), node.part.output, *node.args])
         else:
             nodes.append([node.op, *node.args])
-    return {"nodes": nodes, "outputs": list(tape.outputs)}
+    called = {"networks": [_layers(network) for network in networks]} if networks else {}
+    return {"nodes": nodes, "outputs": list(tape.outputs), **called}
+
+
+def _layers(network: Network) -> list[dict[str, Any]]:
+    return [
+        {
+            "weights": exact(np.array(layer.weights)), "bias": exact(np.array(layer.bias)),
+            "activation": layer.activation, "constants": exact(np.array(layer.constants)),
+        }
+        for layer in network.layers
+    ]  # fmt: skip
 
 
 def _ranges(pairs: Iterable[tuple[float, float]]) -> list[list[Any]]:
@@ -236,6 +264,8 @@ def _noise(system: Any) -> dict[str, Any]:
         if isinstance(g, Tape):
             return {"law": "wiener", "diffusion": {"columns": int(g.shape[1]), **tape_data(g)}}
         return {"law": "wiener", "diffusion": exact(np.asarray(g, dtype=float))}
+    if system.gain is not None:
+        raise CertificateError("certificates do not state noise that is multiplied by the state in discrete time.")
     law: Law = system.noise
     check_law(law, "be certified", CertificateError)
     return {

@@ -1,15 +1,20 @@
 """The search for a verdict: which engine is asked when, and what is kept once the time is over.
 
-Sketches come first, since they cost next to nothing; then the engines in turn, until one has proved SAFE; then those
-that spared themselves, thoroughly. Under a limit of time an engine that takes long is interrupted for the others, and
-goes on with what they leave: none starves, and nothing is proved twice.
+Sketches come first, since they cost next to nothing; then the engines in turn, until one has proved SAFE, and last
+those of which a sketch says that they have hardly a chance; then those that spared themselves, thoroughly. Under a
+limit of time an engine that takes long is interrupted, early for the first bounds of those that have one soon, later
+for all others, and goes on with what they leave: none starves, and nothing is proved twice.
 """
 
 from __future__ import annotations
 
+import difflib
 import logging
+import math
 from dataclasses import replace
 from functools import cached_property
+from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 from certbound.errors import EngineError, contained
@@ -20,7 +25,7 @@ from certbound.safety.answers import EngineAnswer, Request, is_more_than
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import best_time, find_miss, window_of
-from certbound.safety.portfolio import ENGINES, engine_named
+from certbound.safety.portfolio import ENGINES, Engine, engine_named
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
@@ -30,6 +35,10 @@ _log = logging.getLogger(__name__)
 _LARGE = 60  # states beyond which no other engine is asked once one has proved SAFE
 _PATIENCE = 0.4  # of the time that is left, after which the other engines have a turn
 _TURN = 0.5  # of the time that is left then, for all of them
+_LAST = 0.2  # of the time that is left then, where none of them has much of a chance
+_SOON = 0.5  # seconds after which those that have a first bound soon are asked for it, under a limit
+_UNLIKELY = 2.0  # seconds for an engine that has hardly a chance, once there is a bound
+_LASTING = 100_000  # steps
 _EXTRA = 0.2  # of the time that is left, for a bound that can no longer change the verdict
 
 
@@ -74,6 +83,9 @@ class _Search:
         self.answers: dict[str, EngineAnswer] = {}
         self.left_at: dict[str, str] = {}
         self.sketches: dict[str, EngineAnswer] = {}
+        self.chances: dict[Any, float] = {}
+        self.spent: dict[str, float] = {}
+        self._inner = 0.0  # seconds of engines that had a turn inside another one's
 
     @property
     def settled(self) -> bool:
@@ -86,6 +98,11 @@ class _Search:
         """Whether SAFE is proved."""
         return any(is_safe(answer, self.problem) for answer in (*self.answers.values(), *self.sketches.values()))
 
+    @property
+    def bounded(self) -> bool:
+        """Whether any probability below 1 is proved."""
+        return any(answer.applicable and answer.log10_delta < 0 for answer in self.answers.values())
+
     def spared(self, name: str) -> bool:
         """Whether an engine may be quick: not where it alone could prove UNSAFE of what is near the truth."""
         below = best_lower(self.answers)
@@ -94,6 +111,9 @@ class _Search:
 
     def violation(self) -> Violation | None:
         """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
+        stays = self.problem.reach is not None and self.problem.reach.stays
+        if self.lasting or self.problem.ending or stays:
+            return None
         self.watch.engine = "noise-free"
         try:
             with contained("noise-free"):
@@ -108,10 +128,11 @@ class _Search:
         if self.problem.system.dimension <= _LARGE and self.request.constants is None:
             for name in (name for name in names if ENGINES[name].sketch):
                 self.sketches[name] = self._asked(name, replace(self.request, quick=True))
+        names = tuple(sorted(names, key=lambda name: not self._likely(name)))
         self._in_turn(names)
         if self.safe or self.request.cells is not None:
             return
-        for name in (name for name in names if ENGINES[name].again):
+        for name in (name for name in names if ENGINES[name].again and (self._likely(name) or not self.bounded)):
             first = self.answers.get(name)
             if first is not None and first.applicable and not first.conclusive:
                 self.ask(name, Request(before=first.details))
@@ -121,18 +142,51 @@ class _Search:
         if not names:
             return
         turn: list[bool] = []
+        patience = _PATIENCE * self.watch.left
+        share = _TURN if any(map(self._likely, names[1:])) or not self._likely(names[0]) else _LAST
 
         def others() -> None:
             turn.append(True)
-            with self.watch.share(_TURN):
+            with self.watch.share(share):
                 self._in_turn(names[1:])
             if self.safe:
                 raise OutOfTime
 
-        with self.watch.after(_PATIENCE * self.watch.left, others):
+        def first_bounds() -> None:
+            self._first_bounds(names[1:])
+            if self.safe:
+                raise OutOfTime
+            self.watch.remind(max(patience - _SOON, 0.0), others)
+
+        early = _SOON < patience < math.inf and not self.bounded
+        with self.watch.after(_SOON if early else patience, first_bounds if early else others):
             self._turn_of(names[0])
         if not turn:
             self._in_turn(names[1:])
+
+    def _first_bounds(self, names: tuple[str, ...]) -> None:
+        """Ask those that have a first bound soon for it."""
+        for name in (name for name in names if name not in self.answers and self._soon(name)):
+            with self.watch.share(_TURN):
+                self.ask(name, replace(self.request, first=True))
+
+    def _soon(self, name: str) -> bool:
+        return 0 < ENGINES[name].soon <= self.problem.system.dimension
+
+    def _likely(self, name: str) -> bool:
+        """Whether no sketch says that an engine has hardly a chance."""
+        chance, sketched = ENGINES[name].chance, self.sketches.get(name)
+        if chance is None or self.request.constants is not None:
+            return True
+        if sketched is not None and sketched.applicable and sketched.log10_delta < 0:
+            return True
+        if chance not in self.chances:
+            try:
+                with contained(name):
+                    self.chances[chance] = chance(self.problem)
+            except EngineError:
+                self.chances[chance] = math.inf
+        return self.chances[chance] >= 1
 
     def _turn_of(self, name: str) -> None:
         quick = self.spared(name)
@@ -141,8 +195,12 @@ class _Search:
         if quick and name in self.sketches:
             self.answers[name] = self.sketches[name]
             return
-        with self.watch.share(_EXTRA if self.safe else 1.0):
-            self.ask(name, replace(self.request, quick=quick))
+        before = self.answers.get(name)  # of a first turn
+        if before is not None and not before.applicable:
+            return
+        most = _UNLIKELY if self.bounded and not self._likely(name) else math.inf
+        with self.watch.share(_EXTRA if self.safe else 1.0, most):
+            self.ask(name, replace(self.request, quick=quick, before=None if before is None else before.details))
 
     def ask(self, name: str, request: Request) -> None:
         """Keep the best that an engine finds; ``OutOfTime`` where the time ended it."""
@@ -166,28 +224,58 @@ class _Search:
             found(answer)
 
     def _asked(self, name: str, request: Request) -> EngineAnswer:
-        """What an engine answers; where it fails, that it does not apply, and why."""
+        """What an engine answers; where it fails, that it does not apply, and why. ``spent`` counts the seconds."""
         self.watch.engine, self.watch.phase = name, ""
         self.watch.poll()
+        begun, outer, self._inner = perf_counter(), self._inner, 0.0
         try:
             with contained(name):
                 found = request.found
                 asked = replace(request, found=lambda answer: found(self._without(answer)))
-                if self.problem.reach is None or (ENGINES[name].reaches and not self.fixed):
-                    return self._without(ENGINES[name].prove(self.problem, asked))
+                row = ENGINES[name]
+                if self.lasting and self.problem.reach is None and not row.endless:
+                    raise EngineError("this engine needs a finite horizon, and not a very long one.")
+                if not row.reaches and self.problem.reach is not None and self.problem.reach.stays:
+                    raise EngineError("this engine does not serve targets that are to be stayed in.")
+                if self.problem.reach is None or (row.reaches and not self.fixed):
+                    return self._without(row.prove(self.problem, asked) if not self.late else self._in_time(row, asked))
                 return self._without(self._meeting(name, asked))
         except EngineError as error:
             return EngineAnswer(applicable=False, reason=str(error), method=name)
+        finally:
+            whole = perf_counter() - begun
+            self.spent[name] = self.spent.get(name, 0.0) + whole - self._inner
+            self._inner = outer + whole
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
-        """The answer without its lower bound where constants are unknown: it is of disturbances that may change."""
-        return replace(answer, log10_lower=None, conclusive=False) if self.problem.unknown else answer
+        """The answer without its lower bound where that is of disturbances that may change, or counts too much.
+
+        Constants that are unknown do not change, and a path may end where it leaves the domain.
+        """
+        ends = self.problem.ending and self.problem.system.time == "continuous"
+        return replace(answer, log10_lower=None, conclusive=False) if ends or self.problem.unknown else answer
+
+    @cached_property
+    def lasting(self) -> bool:
+        """Whether the horizon is infinite, or of so many steps that none of them can be looked at."""
+        many = self.problem.system.time == "discrete" and self.problem.horizon > _LASTING
+        return many or self.problem.endless
+
+    @property
+    def late(self) -> bool:
+        """Whether a target may be met at any time, and time goes on without steps: it is met by some time then."""
+        return self.problem.endless and self.problem.reach is not None and self.problem.system.time == "continuous"
+
+    def _in_time(self, row: Engine, request: Request) -> EngineAnswer:
+        """What an engine answers about meeting the target by a time; not to meet it by then says nothing from below."""
+        found = row.prove(self.problem.replace(horizon=self.meeting[0]), request)
+        return replace(found, log10_lower=None, conclusive=False)
 
     @cached_property
     def fixed(self) -> bool:
         """Whether the target counts at one time only, so that to meet it then is all that is asked."""
         first, last = window_of(self.problem)
-        return first == last
+        return first == last and not self.problem.reach.stays
 
     @cached_property
     def meeting(self) -> tuple[float, Problem]:
@@ -215,6 +303,7 @@ class _Search:
             self.answers.setdefault(name, answer)
         answers = {name: self.answers[name] for name in ENGINES if name in self.answers}
         found = verdict_of(self.problem, answers, names[0] if len(names) == 1 else "auto")
+        found = replace(found, seconds=MappingProxyType({name: self.spent.get(name, 0.0) for name in answers}))
         over = self.watch.limit is not None and self.watch.left <= 0 and found.status == "UNKNOWN"
         return replace(found, reason=f"{found.reason} {self._undone(names)}".strip()) if over else found
 
@@ -259,5 +348,7 @@ def _chosen(method: str) -> tuple[str, ...]:
         return (name,)
     from certbound.tubes.tuning import METHODS
 
-    known = ", ".join(["auto", *ENGINES, *(name for name in METHODS if name != "auto")])
-    raise ValueError(f"`method` must be one of {known}, got {method!r}.")
+    known = ["auto", *ENGINES, *(name for name in METHODS if name != "auto")]
+    near = difflib.get_close_matches(str(method), known, n=1)
+    cure = f"did you mean {near[0]!r}?" if near else "leave it out for the best of all engines."
+    raise ValueError(f"`method` must be one of {', '.join(known)}, got {method!r}; {cure}")

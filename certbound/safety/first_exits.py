@@ -19,6 +19,7 @@ from certbound.arrays import Array
 from certbound.checks import vector
 from certbound.display import Shown, rounded
 from certbound.errors import EngineError, InfeasibleError, contained
+from certbound.problem.goals import check_end
 from certbound.problem.model import sources
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
@@ -171,6 +172,9 @@ Curve = list[tuple[float, float, float]]
 
 
 def _check(problem: Problem) -> None:
+    check_end(problem, "a curve of exit times")
+    if problem.ending:
+        raise InfeasibleError("exit times count leaving the domain as an exit; leave `leaving` out.")
     if problem.system.dimension != 1:
         raise InfeasibleError(f"exit times are bounded in one state, the problem has {problem.system.dimension}.")
     if len(problem.starts) > 1 or problem.initial.random:

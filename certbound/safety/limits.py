@@ -176,7 +176,7 @@ def _noisier(problem: Problem, factor: float) -> Problem:
             value = factor * value
         object.__setattr__(system, "diffusion", value)
     else:
-        object.__setattr__(system, "noise_matrix", factor * np.asarray(problem.system.noise_matrix))  # type: ignore[union-attr]
+        object.__setattr__(system, "fixed_gain", factor * np.asarray(problem.system.noise_matrix))  # type: ignore[union-attr]
     return problem.replace(system=system)
 
 

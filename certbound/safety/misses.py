@@ -13,6 +13,8 @@ from certbound.reach.sets import constraint_clearance
 from certbound.rigor.norms import Norm
 from certbound.safety.falsification import ATTEMPTS, Violation, candidates, follow, proved, rooms
 
+_DOUBLINGS, _SETTLED = 12, 3
+
 
 def window_of(problem: Problem) -> tuple[float, float]:
     """When the target counts."""
@@ -24,6 +26,8 @@ def best_time(problem: Problem) -> float:
 
     In floating point: whatever it is, to meet the target then is one way of not failing.
     """
+    if problem.endless:
+        return _arrival(problem)
     first, last = window_of(problem)
     if first == last or (isinstance(problem.plan, np.ndarray) and problem.system.time == "continuous"):
         return last
@@ -31,6 +35,19 @@ def best_time(problem: Problem) -> float:
     depth = rooms(Inside(problem.reach.region, (first, last)), flow, times, paths).min(axis=0)
     depth = np.where(np.isfinite(depth) & (times > 0), depth, -np.inf)
     return float(times[np.argmax(depth)]) if np.any(depth > -np.inf) else last
+
+
+def _arrival(problem: Problem) -> float:
+    """A time by which noise-free trajectories are well inside the target, where they ever are."""
+    last, inside = 1.0, 0
+    for _ in range(_DOUBLINGS):
+        last *= 2
+        shorter = problem.replace(horizon=int(last) if problem.system.time == "discrete" else last)
+        times, _, _, paths, flow = _followed(shorter)
+        inside += bool(rooms(Inside(problem.reach.region), flow, times, paths)[:, -1].min() > 0)
+        if inside == _SETTLED:
+            break
+    return last
 
 
 def find_miss(problem: Problem) -> Violation | None:

@@ -5,6 +5,7 @@ An engine from outside is a row too: ``ENGINES["mine"] = Engine(name="mine", ...
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ from certbound.safety.certificates import (
 from certbound.safety.engines import (
     barrier_engine,
     constants_engine,
+    linear_chance,
     linear_engine,
     quadratic_engine,
     values_engine,
@@ -57,6 +59,15 @@ class Engine:
         Asked before all others, quickly: that takes next to nothing.
     dear : bool
         Too slow to be asked a dozen times for what would be SAFE.
+    soon : int
+        From so many states on (0: never) it has a first bound after little time, and goes on from it: where the engine
+        at work is slow, and there is a limit, it is asked for that in between.
+    chance : callable, optional
+        ``chance(problem)`` says, from a sketch in floating point that takes next to nothing, how far the constraints
+        are away in units of what the engine needs: at less than 1 it comes after those that may do better, and has
+        little time of its own once one of them has proved anything.
+    endless : bool
+        Whether it takes infinite horizons without a target.
     reaches : bool
         Whether it takes targets itself; others are asked to meet the target at one time (`certbound.problem.goals`).
     """
@@ -72,7 +83,15 @@ class Engine:
     again: bool = False
     sketch: bool = False
     dear: bool = False
+    soon: int = 0
+    chance: Callable[[Problem], float] | None = None
     reaches: bool = False
+    endless: bool = False
+
+
+def _polynomials(problem: Problem) -> float:
+    """In three states a search for a polynomial takes many seconds, and quadratic bounds are there in one."""
+    return 0.5 if problem.system.dimension > 2 else math.inf
 
 
 ENGINES: dict[str, Engine] = {
@@ -86,6 +105,7 @@ ENGINES: dict[str, Engine] = {
             prove=linear_engine,
             write=response_proof,
             again=True,
+            chance=linear_chance,
         ),
         Engine(
             name="constants",
@@ -96,6 +116,7 @@ ENGINES: dict[str, Engine] = {
             write=constants_proof,
             methods=True,
             sketch=True,
+            chance=linear_chance,
         ),
         Engine(
             name="barrier",
@@ -104,6 +125,7 @@ ENGINES: dict[str, Engine] = {
             prove=barrier_engine,
             write=barrier_proof,
             reserve=True,
+            chance=_polynomials,
         ),
         Engine(
             name="values",
@@ -116,6 +138,7 @@ ENGINES: dict[str, Engine] = {
             reserve=True,
             dear=True,
             reaches=True,
+            endless=True,
         ),
         Engine(
             name="quadratic",
@@ -127,6 +150,7 @@ ENGINES: dict[str, Engine] = {
             write=quadratic_proof,
             reserve=True,
             dear=True,
+            soon=4,
         ),
     )
 }

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from certbound.display import Shown, at_least_text, log10_text, name_text, rounded
 from certbound.errors import CertificateError, SolverError
 from certbound.problem.problem import Problem
 from certbound.reach.sets import ReachTube
-from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, is_more_than, settled
+from certbound.safety.answers import SPARED, Deviation, EngineAnswer, is_at_most, is_more_than, settled
 from certbound.safety.falsification import Violation
 
 if TYPE_CHECKING:
@@ -58,9 +58,15 @@ class Verdict(Shown):
         no engine has one.
     limits : Limits or None
         What would be SAFE, where that was asked for and the problem is not (`certbound.safety.limits`).
+    seconds : mapping of str to float
+        The time that every engine took, by its name.
     members : tuple of Verdict
         Where the start is a union, the verdict on every member; this one is the worst of them.
+    reserves : dict
+        What engines answered that only a certificate had to ask, by name: kept, so that none is asked twice.
     """
+
+    pictured: ClassVar[bool] = True
 
     status: str
     log10_delta: float
@@ -77,7 +83,9 @@ class Verdict(Shown):
     answers: Mapping[str, EngineAnswer] = field(default_factory=dict, repr=False)
     log10_lower: float | None = None
     limits: Any = None
+    seconds: Mapping[str, float] = field(default_factory=dict, repr=False)
     members: tuple[Verdict, ...] = field(default=(), repr=False)
+    reserves: dict[str, EngineAnswer] = field(default_factory=dict, repr=False)
 
     @property
     def worst(self) -> Verdict:
@@ -148,12 +156,20 @@ class Verdict(Shown):
         bounds = f"{log10_text(self.log10_delta)}{at_least_text(self.log10_lower)}"
         return f"{self.status}  {asked}P({failing}) <= {bounds}{target}"
 
+    @property
+    def caution(self) -> str:
+        """What to add to a margin that is positive though nothing is decided; empty elsewhere."""
+        if self.status != "UNKNOWN" or self.margin is None or self.margin <= 0:
+            return ""
+        return " (of what could be followed; it does not make the answer SAFE)"
+
     def rows(self) -> list[tuple[str, str]]:
         """Margin, method and reason."""
         where = "" if self.time is None else f" at t = {self.time:.4g}"
         found = []
         if self.margin is not None:
-            found.append(("margin", f"{rounded(self.margin, up=False, digits=4)}{where}, {self.constraint}"))
+            words = f"{rounded(self.margin, up=False, digits=4)}{where}, {self.constraint}{self.caution}"
+            found.append(("margin", words))
         found += [] if self.constants is None else [("constants", self.constants.summary())]
         return [*found, ("method", self.method), ("reason", self.reason)]
 
@@ -226,7 +242,8 @@ def verdict_of(problem: Problem, answers: Mapping[str, EngineAnswer], method: st
             f"two engines contradict each other: {name} proves at most 10^{level:.6g}, another one at least "
             f"10^{lower:.6g}; this is a defect of certbound, and nothing is answered."
         )
-    others = [f"By {other}: {_sentence(answers[other].reason)}" for other in answers if other != name and not safe]
+    asked = {other: answer for other, answer in answers.items() if other != name and answer.reason != SPARED}
+    others = [f"By {other}: {_sentence(answer.reason)}" for other, answer in asked.items() if not safe]
     return Verdict(
         status="SAFE" if safe else "UNSAFE" if unsafe else "UNKNOWN",
         log10_delta=level,

@@ -103,6 +103,13 @@ def goal_of(problem: Any, times: Array) -> Barrier | None:
     return found[0]
 
 
+def keep_of(problem: Any, times: Array) -> Barrier | None:
+    """The target of a problem as a set to be stayed in from its first entry on; None where that is not asked."""
+    if problem.reach is None or not problem.reach.stays:
+        return None
+    return _watched(problem, [Inside(problem.reach.region, None, f"left again: {problem.reach.label}")], times)[0]
+
+
 def _watched(problem: Any, constraints: Sequence[Inside], times: Array) -> list[Barrier]:
     barriers = []
     for constraint in constraints:

@@ -156,7 +156,7 @@ def _noise(model: StepModel, p: Parameters) -> tuple[list[str], list[str], Bridg
         drawn += [f"z_{j} = noise[{j}]" for j in range(m)] if m > 1 else []
         drawn += [f"z_{j}, = unit(p, z_{j})" for j in range(m)] if model.unit is not None else []
     if isinstance(model.noise, Tape):
-        root = p.add(np.sqrt(model.step))
+        root = p.add(np.sqrt(model.step) if model.step > 0.0 else 1.0)
         entries = _entries(model.noise)
         drawn += [
             f"{_targets([e if e != '0.0' else '_' for row in entries for e in row])} = "

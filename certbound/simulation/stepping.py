@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
-from certbound.problem.model import Node, Tape, compile_numpy, edged, is_zero, jacobian, trace
+from certbound.problem.model import Node, Tape, compile_numpy, edged, is_zero, jacobian, substitute, trace
 from certbound.problem.noise import Law, check_law
 from certbound.simulation.tape_text import live_nodes
 from certbound.simulation.transition import exact_transition
@@ -118,10 +118,26 @@ def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
         law: Law = system.noise
         check_law(law, "be simulated")
         law.check_drawable()
-        noise = _without_zeros(np.asarray(system.noise_matrix) @ law.factor)
+        if system.gain is not None:
+            noise: Array | Tape = _multiplied(system.gain, law.factor)
+        else:
+            noise = _without_zeros(np.asarray(system.noise_matrix) @ law.factor)
         return StepModel(drift=tape, variate=law.variate, unit=_unit(law), noise=noise, **fields)
     step = float(problem.horizon) / steps
     return _continuous(tape, system.diffusion, step, scenario, fields)
+
+
+def _multiplied(gain: Tape, factor: Array) -> Tape:
+    """G(t, x) F as a tape."""
+    rows, columns = gain.shape
+    names = [f"g {k}" for k in range(rows * columns)]
+
+    def entries(g: Any) -> list[list[Any]]:
+        return [[sum(g[i * columns + k] * f for k, f in enumerate(column) if f) + 0.0 for column in factor.T]
+                for i in range(rows)]  # fmt: skip
+
+    product = trace(entries, {"g": names})
+    return substitute(product, gain.inputs, {name: (gain, k) for k, name in enumerate(names)})
 
 
 def _table(rows: Array, steps: int) -> Array:

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from certbound.problem.model import OPERATIONS, Node, Tape, needed
+from certbound.problem.model import OPERATIONS, Network, Node, Tape, needed
+from certbound.simulation.network_text import network_lines
 
 
 @dataclass(eq=False, slots=True)
@@ -66,6 +67,7 @@ def function_source(name: str, tape: Tape, arguments: Sequence[str], parameters:
     names: dict[int, str] = {}
     live = live_nodes(tape)
     pairs = _pairs(tape, live)
+    called: dict[tuple[Network, tuple[int, ...]], str] = {}
     for index in live:
         node = tape.nodes[index]
         if node.op == "input":
@@ -77,6 +79,15 @@ def function_source(name: str, tape: Tape, arguments: Sequence[str], parameters:
             if index == min(sine, cosine):
                 lines.append(f"    v{sine}, v{cosine} = sincos({names[node.args[0]]})")
             names[index] = f"v{index}"
+        elif node.part is not None:
+            if node.part.by:
+                raise ValueError("a derivative of a network has no kernel; simulate with scheme='euler'.")
+            key = node.part.network, node.args
+            if key not in called:
+                called[key] = f"n{index}"
+                operands = [names[arg] for arg in node.args]
+                lines += indent(network_lines(node.part.network, f"n{index}", operands, parameters))
+            names[index] = f"{called[key]}[{node.part.output}]"
         else:
             names[index] = f"v{index}"
             operands = [names[arg] for arg in node.args]

@@ -31,6 +31,7 @@ class Task:
     kind: Literal["exits", "deviation", "record"]
     barriers: Sequence[Barrier] = ()  # constraints of an ``exits`` task
     goal: Barrier | None = None  # its target, where it has one: a path that never enters it counts in a last row
+    keep: Barrier | None = None  # the target again, where it is to be stayed in
     norm: Array | None = None  # (rows, n): the deviation s is measured by ‖norm s‖ ...
     directions: Array | None = None  # (rows, n): ... or by the value of each directions . s (with one histogram each)
     # whether each path has a noise-free path of its own (which shares its start and disturbance); otherwise all
@@ -71,7 +72,12 @@ def _exits(task: Task, bridge: Bridge | None, p: Parameters) -> Lines:
         column += len(barrier.matrix) if barrier.moving else 0
     if task.goal is not None:
         number = len(task.barriers)
-        return _until_goal(number, barrier_source(number, task.goal, bridge, p, column), (begin, within, end))
+        goal = barrier_source(number, task.goal, bridge, p, column)
+        if task.keep is None:
+            return _until_goal(number, goal, (begin, within, end))
+        column += len(task.goal.matrix) if task.goal.moving else 0
+        keep = barrier_source(number + 1, task.keep, bridge, p, column)
+        return _kept_goal(number, goal, keep, (begin, within, end))
     begin += ["if left >= 0:", "    counts[left, 0] += 1", "    continue"]
     within += ["if left >= 0:", "    counts[left, 1 + k * (counts.shape[1] - 1) // steps] += 1", "    break"]
     return begin, within, end, []
@@ -86,6 +92,20 @@ def _until_goal(
     within += ["if left >= 0:", "    counts[left, 1 + k * (counts.shape[1] - 1) // steps] += 1", "    break"]
     within += [*watch[1], "if left >= 0:", "    break"]
     return begin, within, end, ["if left < 0:", f"    counts[{number}, counts.shape[1] - 1] += 1"]
+
+
+def _kept_goal(
+    number: int, watch: tuple[list[str], list[str], list[str]], keep: tuple[list[str], list[str], list[str]],
+    lines: tuple[list[str], list[str], list[str]],
+) -> Lines:  # fmt: skip
+    """A path fails that leaves the goal once it has run into it, or never does (in discrete time: no bridges)."""
+    leaves = ["if left >= 0:", "    counts[left, 1 + k * (counts.shape[1] - 1) // steps] += 1", "    break"]
+    arrives = ["if left >= 0:", "    left = -1", "    arrived = True"]
+    begin = [*lines[0], "if left >= 0:", "    counts[left, 0] += 1", "    continue"]
+    begin += [*keep[0], "left = -1", *watch[0], "arrived = False", *arrives]
+    within = [*lines[1], *leaves, "if arrived:", *indent([*keep[1], *leaves]), "else:", *indent([*watch[1], *arrives])]
+    finish = ["if left < 0 and not arrived:", f"    counts[{number}, counts.shape[1] - 1] += 1"]
+    return begin, within, [*lines[2], *keep[2], *watch[2]], finish
 
 
 def _record(task: Task, dimension: int, bridge: Bridge | None, p: Parameters) -> Lines:

@@ -116,7 +116,8 @@ def close_loop(system: System, gain: Array) -> System:
     if isinstance(system, ContinuousSystem):
         return ContinuousSystem(dynamics, diffusion=system.diffusion, **options)
     assert isinstance(system, DiscreteSystem)
-    return DiscreteSystem(dynamics, noise=system.noise, noise_matrix=system.noise_matrix, **options)
+    matrix = system.fixed_gain if system.gain is None else system.gain
+    return DiscreteSystem(dynamics, noise=system.noise, noise_matrix=matrix, **options)
 
 
 def constrain_inputs(problem: Problem, gain: Array, plan: Array, used: Array) -> list[Inside]:

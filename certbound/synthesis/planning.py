@@ -108,7 +108,9 @@ class Planner:
     ) -> None:
         system = problem.system
         if system.inputs is None:
-            raise ValueError("`problem` must have inputs to plan; give the system `inputs=`.")
+            raise ValueError(
+                "`problem` must have inputs to plan; give the system `inputs=` ([inputs] in a problem file)."
+            )
         self.problem = problem
         self.grid = _grid(problem, steps)
         self.start = problem.initial.middle

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from flint import arb, arb_mat
@@ -67,6 +67,8 @@ class Tube(Shown):
 
     Source: Def. 2 (paper); Sec. 4 of docs/theory.md.
     """
+
+    pictured: ClassVar[bool] = True
 
     method: str
     parameters: dict[str, Any]

@@ -41,7 +41,7 @@ def survivors(data: Any, problem: Any, changes: Any, count: int, seed: int) -> l
 @pytest.mark.parametrize(
     ("name", "changes", "count"),
     [("stepping", LINEAR, 55), ("flowing", LINEAR, 11), ("contracting", CONSTANTS, 14), ("springing", BARRIER, 27),
-     ("stirring", STATE, 36), ("valuing", VALUES, 16), ("valuing_below", VALUES_BELOW, 14)],
+     ("stirring", STATE, 24), ("valuing", VALUES, 8), ("valuing_below", VALUES_BELOW, 8)],
 )
 def test_what_weakens_the_support_of_a_claim_is_rejected(
     name: str, changes: Any, count: int, request: pytest.FixtureRequest

@@ -23,8 +23,8 @@ ELSEWHERE = {"pip", "python3.11", ".", "git", "make", "dask", "jupytext", "mkdoc
 """Programs that the test of a fresh environment runs, or that need a second computer."""
 SLOW = {
     "README.md", "certificate.md", "how-to/certificates.md", "how-to/cluster.md", "how-to/expressions.md",
-    "how-to/mpc.md", "how-to/obstacles.md", "how-to/python-control.md", "how-to/sweeps.md", "how-to/toml.md",
-    "tutorial.md",
+    "how-to/mpc.md", "how-to/networks.md", "how-to/obstacles.md", "how-to/python-control.md", "how-to/sweeps.md",
+    "how-to/toml.md", "tutorial.md",
 }  # fmt: skip
 """Pages that take more than some seconds; the tutorial's and the README's first steps are in other tests as well."""
 
@@ -42,6 +42,7 @@ def _cases() -> list[Any]:
 def test_a_page_does_what_it_says(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
+    (tmp_path / "docs").symlink_to(DOCS)  # the README's commands are typed in the project's folder
     for extra in ("sympy", "distributed"):
         if any(f"{extra} import" in block.text or f"import {extra}" in block.text for block in blocks(page)):
             pytest.importorskip(extra, reason="needs an extra")

@@ -46,7 +46,9 @@ def test_every_internal_link_leads_to_a_page_and_a_heading(page: Path) -> None:
             assert anchor in anchors(file), target
 
 
-@pytest.mark.skipif(find_spec("mkdocs") is None, reason="needs the extra `docs` (mkdocs)")
+@pytest.mark.skipif(
+    find_spec("mkdocs") is None or find_spec("latex2mathml") is None, reason="needs the extra `docs` (mkdocs)"
+)
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
@@ -57,6 +59,11 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     for name in cb.__all__:
         if not name.startswith("_"):
             assert f">{name}<" in shown or f".{name}" in shown, name
+    theory = (tmp_path / "site" / "theory" / "index.html").read_text(encoding="utf-8")
+    assert theory.count("<math") > 100
+    assert "arithmatex" not in theory
+    assert "mathjax" not in theory.lower()  # formulas are read without a script and without the network
+    assert (tmp_path / "site" / "pictures" / "warehouse_robot.png").exists()
     commands = (tmp_path / "site" / "commands" / "index.html").read_text(encoding="utf-8")
     assert "--certificate FILE" in commands
     assert "<!-- commands -->" not in commands

@@ -16,7 +16,7 @@ def _where(a: Any, b: Any, c: Any) -> Any:
     return np.where(a > 0, b, c)
 
 
-_OPERATIONS: dict[str, tuple[Callable[..., Any], str | None]] = {
+_OPERATIONS: dict[str, tuple[Callable[..., Any], str]] = {
     "add": (operator.add, "({} + {})"),
     "sub": (operator.sub, "({} - {})"),
     "mul": (operator.mul, "{}*{}"),
@@ -31,15 +31,15 @@ _OPERATIONS: dict[str, tuple[Callable[..., Any], str | None]] = {
     "asin": (np.arcsin, "asin({})"),
     "acos": (np.arccos, "acos({})"),
     "atan": (np.arctan, "atan({})"),
-    "where": (_where, None),
-    "sign": (np.sign, None),
-    "floor": (np.floor, None),
+    "where": (_where, "where({} > 0, {}, {})"),
+    "sign": (np.sign, "sign({})"),
+    "floor": (np.floor, "floor({})"),
 }
 for _name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt"):
     _OPERATIONS[_name] = (getattr(np, _name), _name + "({})")
 
 JUMPS = frozenset({"where", "sign", "floor"})
-"""Operations that problem files do not have."""
+"""Operations that jump."""
 KINKS = frozenset({"abs", "min", "max", "hypot"})
 
 
@@ -60,15 +60,12 @@ class Formula:
         return _OPERATIONS[self.op][0](*(argument.value(names) for argument in self.args))
 
     def text(self, names: Mapping[str, str]) -> str:
-        """The expression of a problem file; a jump has none (KeyError)."""
+        """The expression of a problem file."""
         if self.op == "number":
             return f"({self.leaf!r})" if float(self.leaf) < 0 else repr(self.leaf)
         if self.op == "symbol":
             return names[str(self.leaf)]
-        template = _OPERATIONS[self.op][1]
-        if template is None:
-            raise KeyError(self.op)
-        return template.format(*(argument.text(names) for argument in self.args))
+        return _OPERATIONS[self.op][1].format(*(argument.text(names) for argument in self.args))
 
     def operations(self) -> set[str]:
         """Names of the operations used."""

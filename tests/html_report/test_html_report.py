@@ -100,7 +100,8 @@ def test_every_constraint_and_the_plane_have_a_picture(page: str) -> None:
 def test_the_margins_are_what_the_tube_leaves(case: tuple[Scene, Verdict], page: str) -> None:
     """The least margin in the figure agrees with the tube's distance to the constraint."""
     scene, _ = case
-    found = re.search(r"<figcaption>Room that the tube with noise leaves\. (.*?)</figcaption>", page)
+    words = r"<figcaption>Room that is certified at the allowed probability, shared evenly\. (.*?)</figcaption>"
+    found = re.search(words, page)
     assert found is not None
     numbers = [float(text) for text in re.findall(r"at least ([-+.e\d]+?)(?=[;.](?: |$))", html.unescape(found[1]))]
     assert scene.tube is not None

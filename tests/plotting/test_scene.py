@@ -14,8 +14,9 @@ from matplotlib.patches import Circle
 
 import certbound as cb
 from certbound.plotting import Scene, draw_scene, noisy_reach
-from certbound.plotting.panels import panels_of
-from certbound.plotting.plane import outlines, plane_of, supports
+from certbound.plotting.asked import panels_of
+from certbound.plotting.certified import bounds_of, room_of, supports
+from certbound.plotting.plane import outlines, plane_of
 from certbound.problem.problem import Problem
 from certbound.reach.nominal.curve import Curve
 from certbound.reach.sets.reach_tube import ReachTube
@@ -108,8 +109,28 @@ def test_a_twelve_dimensional_chain_without_a_plane_gets_panels_only() -> None:
     assert plane_of(problem) is None
     inner, outer = tubes(problem, [0.0] * 12, [0.5] * 12)
     figure = draw_scene(Scene(problem=problem, reach=inner, tube=outer, title="chain"))
-    assert [axes.get_title(loc="left") for axes in figure.axes] == ["x1", "x2", "x3", "x4", "x5", "x6"]
-    assert "3 more constraints" in figure.get_suptitle()
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [f"x{k + 1}" for k in range(9)]
+
+
+def test_of_more_constraints_than_fit_those_with_the_least_room_are_drawn() -> None:
+    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=20, noise=cb.Gaussian(std=0.1))
+    high = np.linspace(3.0, 1.0, 20)
+    problem = cb.Problem(system, initial=np.zeros(20), safe=[cb.Inside(cb.Box(-high, high))], horizon=10)
+    inner, outer = tubes(problem, [0.0] * 20, [0.5] * 20)
+    figure = draw_scene(Scene(problem=problem, reach=inner, tube=outer, title="many"))
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [f"x{k}" for k in range(9, 21)]
+    assert "12 constraints with the least room, of 20" in figure.get_suptitle()
+
+
+def test_the_certified_bound_of_a_panel_agrees_with_the_verdict() -> None:
+    verdict = cb.verify_safety(cb.load("chain_rest"), method="linear")
+    scene = Scene.of(verdict)
+    rooms = [room_of(scene, panel) for panel in panels_of(scene.problem)]
+    assert min(float(np.min(room)) for room in rooms if room is not None) == pytest.approx(verdict.margin, abs=1e-12)
+    (bound, room), *_ = bounds_of(scene, panels_of(scene.problem)[0])
+    assert np.allclose(bound - room, -1.2)  # p1 stays above -1.2 by its room
+    assert scene.tube is not None
+    assert np.all(room >= 1.2 - supports(scene.tube, np.eye(6)[0] * -1) - 1e-9)
 
 
 def test_drawing_does_not_touch_pyplot() -> None:

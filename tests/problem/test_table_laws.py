@@ -124,12 +124,12 @@ def test_a_table_without_a_scale_is_read(tmp_path):
     np.testing.assert_array_equal(load(tmp_path / "walk.toml").system.noise.scale, [1, 1])
 
 
-def test_laplace_noise_is_bounded_by_no_engine_and_says_why():
+def test_laplace_noise_is_bounded_by_value_functions_alone():
     problem = walk(cb.Laplace(scale=0.1))
-    verdict = cb.verify_safety(problem)
-    assert verdict.status == "UNKNOWN"
-    assert verdict.log10_delta == 0
-    assert "Laplace noise has no variance proxy" in verdict.reason
+    verdict = cb.verify_safety(problem.replace(delta=1e-9), time_limit=5)
+    assert verdict.status == "UNSAFE"
+    assert verdict.log10_lower <= verdict.log10_delta < 0
+    assert "Laplace noise has no variance proxy" in verdict.answers["linear"].reason
     with pytest.raises(InfeasibleError, match="tails are exponential"):
         _ = problem.system.noise.proxy
     assert "laplace" not in LAWS

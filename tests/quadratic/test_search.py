@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.quadratic import QuadraticBound, bound_quadratic
+from certbound.quadratic import QuadraticBound, bound_quadratic, refinement
 from certbound.quadratic.inequality import prove
 from certbound.quadratic.refinement import make_search
 from certbound.quadratic.surroundings import moved_sides, working_box
@@ -114,6 +114,13 @@ def test_better_bounds_are_told_and_the_end_of_the_time_is_kept() -> None:
     assert uppers
     assert all(later < earlier for earlier, later in itertools.pairwise([0.0, *uppers]))
     assert "wall" in watch.phase or "refining" in watch.phase
+
+
+def test_a_search_goes_on_from_an_earlier_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = bound_quadratic(problem_of(), target=0.999, seconds=20.0)
+    monkeypatch.setattr(refinement, "_boxes", lambda problem: pytest.fail("the first pass was made again"))
+    later = bound_quadratic(problem_of(), before=first, seconds=1.0)
+    assert later.upper <= first.upper < 0
 
 
 def test_a_timer_does_not_break_the_solver_while_it_loads() -> None:

@@ -26,7 +26,7 @@ def test_the_tube_is_not_much_wider_than_the_sampled_hull_and_a_narrower_one_is_
     assert 1.0 <= found.mean_ratio < 1.1
     assert reach.box is not None
     narrow = reach.altered(box=0.9 * reach.box)
-    assert compare(problem, narrow, 3000).outside > 0
+    assert compare(problem, narrow, 500).outside > 0
 
 
 @pytest.mark.slow

@@ -100,3 +100,34 @@ def test_malformed_matrices_are_refused():
         eigenvalue_upper(np.ones((2, 3)))
     with pytest.raises(ValueError, match="symmetric"):
         eigenvalue_upper(np.array([[1.0, 2.0], [0.0, 1.0]]))
+
+
+@pytest.mark.parametrize("n", [40, 400])
+def test_a_large_matrix_is_proved_definite_by_its_factor(n):
+    rng = np.random.default_rng(0)
+    basis = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    values = np.geomspace(1e-5, 1.0, n)
+    matrix = (basis * values) @ basis.T
+    matrix = (matrix + matrix.T) / 2
+    assert is_positive_definite(matrix)
+    shifted = matrix - 1.0001e-5 * np.eye(n)
+    assert not is_positive_definite(shifted)
+    assert not is_positive_definite(Interval.around(matrix, np.full((n, n), 1e-5)))
+
+
+def test_a_large_matrix_in_very_different_units_is_proved_definite():
+    n = 50
+    rng = np.random.default_rng(1)
+    units = 10.0 ** rng.uniform(-20, 20, n)
+    root = np.eye(n) + 0.3 * rng.normal(size=(n, n)) / np.sqrt(n)
+    matrix = root @ root.T
+    scaled = units[:, None] * ((matrix + matrix.T) / 2) * units
+    assert is_positive_definite(np.minimum(scaled, scaled.T))
+
+
+def test_a_factor_proves_nothing_of_an_unbounded_matrix():
+    n = 40
+    entries = np.eye(n)
+    high = entries.copy()
+    high[0, 1] = high[1, 0] = np.inf
+    assert not is_positive_definite(Interval(entries, high))

@@ -7,11 +7,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 import certbound as cb
 from certbound.safety.answers import EngineAnswer, Request
 from certbound.safety.decision import decide
+from certbound.safety.engines import linear_chance
 from certbound.safety.limits import Limits
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verdict import Verdict
@@ -60,7 +62,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch, clock: Time, scripts: dict[str, St
                 request.found(best)
             return best
 
-        plain = {"sketch": False, "again": False, "reserve": False}
+        plain = {"sketch": False, "again": False, "reserve": False, "soon": 0, "chance": None}
         return replace(ENGINES[name], prove=prove, **plain | flags)
 
     for name in ENGINES:
@@ -138,6 +140,57 @@ def test_a_sketch_that_proves_safe_spares_the_others(monkeypatch: pytest.MonkeyP
     verdict, _ = run(clock, None)
     assert asked == list(ENGINES)  # each for its sketch, none a second time
     assert verdict.status == "SAFE"
+
+
+def test_a_slow_engine_is_interrupted_early_for_a_first_bound(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    asked = scripted(monkeypatch, clock, {"linear": [(7, -5)], "quadratic": [(1, -1)]})
+    monkeypatch.setitem(ENGINES, "quadratic", replace(ENGINES["quadratic"], soon=1))
+    told: list[Progress] = []
+    verdict, _ = run(clock, 30, told)
+    assert asked[:2] == ["linear", "quadratic"]
+    assert next(p.seconds for p in told if p.log10_delta < 0) < 2
+    assert (verdict.status, verdict.method) == ("SAFE", "linear")
+
+
+def test_a_first_bound_that_is_safe_ends_the_slow_engine(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    scripted(monkeypatch, clock, {"linear": [(500, -5)], "quadratic": [(1, -4)]})
+    monkeypatch.setitem(ENGINES, "quadratic", replace(ENGINES["quadratic"], soon=1))
+    verdict, seconds = run(clock, 30)
+    assert (verdict.status, verdict.method) == ("SAFE", "quadratic")
+    assert seconds < 3
+
+
+def test_an_engine_without_a_chance_comes_last_and_is_brief(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    asked = scripted(monkeypatch, clock, {"linear": [(100, -2)], "barrier": [(2, -1)]})
+    hopeless = replace(ENGINES["linear"], chance=lambda problem: 0.5)
+    monkeypatch.setitem(ENGINES, "linear", hopeless)
+    verdict, seconds = run(clock, None)
+    assert asked[-1] == "linear"
+    assert (verdict.method, verdict.log10_delta) == ("barrier", -1)
+    assert seconds < 5
+
+
+def test_an_engine_without_a_chance_has_all_the_time_where_nothing_else_proves_anything(
+    monkeypatch: pytest.MonkeyPatch, clock: Time
+) -> None:
+    scripted(monkeypatch, clock, {"linear": [(100, -2)]})
+    monkeypatch.setitem(ENGINES, "linear", replace(ENGINES["linear"], chance=lambda problem: 0.5))
+    verdict, seconds = run(clock, None)
+    assert verdict.log10_delta == -2
+    assert seconds == pytest.approx(100, abs=1)
+
+
+def test_a_sketch_of_the_remainder_tells_where_the_linear_response_has_a_chance() -> None:
+    def flow(noise: float) -> cb.Problem:
+        system = cb.ContinuousSystem(
+            lambda x: [2 * (x[1] - x[0]), x[0] * (0.5 - x[2]) - x[1], x[0] * x[1] - x[2]], states=3,
+            diffusion=noise * np.eye(3),
+        )  # fmt: skip
+        room = cb.Inside(cb.Box([-1.5] * 3, [1.5] * 3))
+        return cb.Problem(system, initial=cb.Box([-0.2] * 3, [0.2] * 3), safe=[room], horizon=2)
+
+    assert linear_chance(flow(0.05)) > 1 > linear_chance(flow(0.35))
+    assert linear_chance(problem()) == np.inf  # discrete time: nothing speaks against it
 
 
 def test_progress_tells_who_is_at_what_and_the_bound(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:

@@ -187,3 +187,38 @@ def test_what_does_not_know_targets_says_so():
         cb.bound_metrics(problem)
     with pytest.raises(InfeasibleError, match="the problem has a target"):
         cb.verify_safety(problem, method="values").safe_starts()
+
+
+def test_to_arrive_by_some_time_is_to_arrive_at_any():
+    system = cb.ContinuousSystem(lambda x: -x, states=4, diffusion=0.01 * np.eye(4))
+    problem = cb.Problem(
+        system, initial=0.5 * np.ones(4), safe=[cb.Inside(cb.Ball(np.zeros(4), 2))], horizon=np.inf,
+        reach=cb.Ball(np.zeros(4), 0.2),
+    )  # fmt: skip
+    verdict = cb.verify_safety(problem, method="linear")
+    assert verdict.status == "SAFE"
+    assert 2 <= verdict.answers["linear"].hit <= 64
+    assert verdict.log10_lower is None
+    with pytest.raises(cb.CertificateError, match="certificates state finite horizons"):
+        verdict.certificate_text(problem)
+    assert cb.verify_safety(problem.replace(reach=None), method="linear").status == "UNKNOWN"
+
+
+def test_a_target_of_one_state_is_met_at_any_time():
+    system = cb.ContinuousSystem(lambda x: -1.0 + 0 * x, states=1, diffusion=0.5)
+    problem = cb.Problem(
+        system, initial=[1.0], safe=[cb.Inside(cb.HalfSpace([1], 2))], horizon=np.inf, reach=cb.HalfSpace([1], 0),
+        delta=0.01,
+    )  # fmt: skip
+    truth = (np.exp(8) - 1) / (np.exp(16) - 1)  # the scale function exp(2 x / sigma^2)
+    verdict = cb.verify_safety(problem, method="values")
+    assert truth <= 10**verdict.log10_delta <= 0.003
+    assert verdict.log10_lower is None
+
+
+def test_continuous_time_without_an_end_or_a_target_is_not_served():
+    system = cb.ContinuousSystem(lambda x: [x[1], -x[0] - x[1]], states=2, diffusion=[[0], [0.2]])
+    walls = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    verdict = cb.verify_safety(cb.Problem(system, initial=[0, 0], safe=walls, horizon=np.inf))
+    assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", 0.0)
+    assert "needs an end, and the horizon is infinite" in verdict.answers["values"].reason

@@ -1,6 +1,6 @@
 """Random problems in the plane, in space and beyond: upper bounds beside simulated paths, on purpose.
 
-    python -m tests.values.random_systems [plane | velocity | steps | quadratic | maps] [first] [last]
+    python -m tests.values.random_systems [plane | velocity | steps | quadratic | maps | space] [first] [last]
 
 Paths of Euler's method without bridges miss exits, so that their frequency is at most the truth (up to the weak error
 of the step, for which one per cent is granted): an upper bound below its lower limit is a defect. Where f grows with
@@ -29,7 +29,7 @@ from tests.values.random_problems import limits
 
 Random = np.random.Generator
 GRANTED = 1e-2
-KINDS = ("plane", "velocity", "steps", "quadratic", "maps")
+KINDS = ("plane", "velocity", "steps", "quadratic", "maps", "space")
 _TERMS: tuple[Callable[[Any, Any], Any], ...] = (
     lambda x, y: x * y,
     lambda x, y: np.sin(2 * x),
@@ -103,6 +103,15 @@ def velocity(rng: Random) -> cb.Problem:
 
     system = cb.ContinuousSystem(f, states=2, diffusion=[[s], [0.0]] if swap else [[0.0], [s]])
     return _box_problem(rng, system, float(rng.choice([0.7, 2.0])), wide=0.1)
+
+
+def space(rng: Random) -> cb.Problem:
+    """Three states, noise of any rank: correlated, or dependent on the state."""
+    gain: Any = np.diag(rng.uniform(0.3, 0.6, 3) * (1.0 if rng.random() < 0.8 else rng.permutation([0.0, 1.0, 1.0])))
+    gain[0, 1:] = rng.choice([0.0, 0.2, -0.3]), rng.choice([0.0, 0.2])
+    if rng.random() < 0.4:
+        gain = _tilted(gain, rng.uniform(-0.4, 0.4, 3))
+    return _box_problem(rng, _system(rng, 3, gain, tuple(range(8))), float(rng.choice([0.3, 1.0])))
 
 
 def steps(rng: Random) -> cb.Problem:
@@ -190,7 +199,7 @@ def _flow(problem: cb.Problem, place: Any, push: Any, count: int, rng: Random, e
 
 def upper_bound(kind: str, problem: cb.Problem, seconds: float) -> float:
     """The bound of the engine that the kind is about."""
-    if kind == "plane":
+    if kind in ("plane", "space"):
         return float(10 ** bound_exits(problem, seconds=seconds).upper)
     if kind == "velocity":
         return float(10 ** bound_exits_by_steps(problem, seconds=seconds).upper)
@@ -204,7 +213,8 @@ def check(kind: str, seed: int, *, paths: int = 100_000, seconds: float = 3.0) -
     rng = np.random.default_rng([seed, 10 + KINDS.index(kind)])
     if kind == "maps":
         return _check_map(rng, paths, seconds)
-    problem = {"plane": plane, "velocity": velocity, "steps": steps, "quadratic": quadratic}[kind](rng)
+    makers = {"plane": plane, "velocity": velocity, "steps": steps, "quadratic": quadratic, "space": space}
+    problem = makers[kind](rng)
     upper = upper_bound(kind, problem, seconds)
     if upper >= 1:
         return "", 0.0, 1.0, 1.0

@@ -16,14 +16,14 @@ import certbound as cb
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model.tracing import trace
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous import exits, hypotheses
+from certbound.values.continuous import exits, hypotheses, payment
 from certbound.values.continuous.coefficients import Cells, Reader, enclose, squared_diffusion
 from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.line import ladder
 from certbound.values.continuous.line.initial_law import start_of
-from certbound.values.continuous.payment import BIN, Levels, Patched, pay_lower, pay_upper, repay
-from certbound.values.continuous.plane import two_sides
+from certbound.values.continuous.payment import BIN, Levels, Patched, Terms, pay_lower, pay_upper, repay
+from certbound.values.continuous.plane import plane_below, two_sides
 from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
 from certbound.values.continuous.plane.plane_grids import Plan, Source
 from certbound.values.continuous.plane.plane_proposal import propose_plane
@@ -249,6 +249,35 @@ def test_what_is_paid_covers_every_patch_and_costs_what_the_formula_says() -> No
     assert pay_upper(patched, -5.0, -8.0).log < paid.log
 
 
+@pytest.mark.parametrize("bound", [payment.bound_above, payment.bound_below])
+def test_terms_in_rows_are_bounded_as_each_alone(bound) -> None:
+    m = np.array([[0.3, 0.5], [0.0, 0.2], [0.3, 0.1], [0.1, 0.4]])
+    q = np.stack([repay(row, upper=True) for row in m])
+    lam, eps = np.full((4, 3), 0.02), np.array([[0.0, 0.1, 0.2], [0.3, 0.1, 0.0], [0.1, np.inf, 0.0], [0.1, 0.2, 0.3]])
+    lam[3] = 40.0  # no more is bounded by what this costs, nor by what an infinite eps does
+    common = {"steps": np.array([0.5, 0.3, 0.7]), "start": -3.0, "end": -8.0}
+    edges = BIN * np.array([-2.0, -1.0, 0.0])
+    terms = [Terms(levels=Levels(m=m[k], q=q[k], edges=edges), lam=lam[k], eps=eps[k], **common) for k in range(4)]
+    whole = Terms(levels=Levels(m=m, q=q, edges=edges), lam=lam, eps=eps, **common)
+    alone = [float(bound(one, np.array(-3.0))) for one in terms]
+    assert bound(whole, np.array(-3.0)).tolist() == alone
+    assert np.isfinite(alone[:2]).all()
+    assert alone[2:] == ([0.0, 0.0] if bound is payment.bound_above else [-np.inf, -np.inf])
+
+
+def test_the_order_of_the_patches_does_not_matter() -> None:
+    rng = np.random.default_rng(1)
+    low = rng.uniform(-6, -0.5, 40)
+    numbers = {"excess": rng.uniform(0, 0.3, 40), "low": low, "high": low + rng.uniform(0, 1, 40)}
+    numbers |= {"energy": rng.uniform(0, 2, 40), "slab": np.repeat(np.arange(4), 10)}
+    order, rest = rng.permutation(40), {"steps": np.full(5, 0.2), "spare": 1e-9}  # the last slab has no patch
+    sorted_, mixed = (Patched(**{k: v[o] for k, v in numbers.items()}, **rest) for o in (np.arange(40), order))
+    assert pay_upper(sorted_, -5.0, -9.0).log == pay_upper(mixed, -5.0, -9.0).log < -4
+    below = pay_lower(sorted_, -1.0, -9.0), pay_lower(mixed, -1.0, -9.0)
+    assert below[0] is not None
+    assert below[0].log == below[1].log
+
+
 # whole problems
 
 WELL = (lambda x: [x[0] - x[0] ** 3], 0.35, 0.0, 2.5, 10.0, (0.9, 1.1))
@@ -399,7 +428,7 @@ def test_two_states_without_coupling_are_as_safe_as_each_alone() -> None:
     assert found.lower is None  # the bound above is small enough
 
 
-def test_a_lower_bound_in_two_states_holds_whatever_is_proposed() -> None:
+def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
     system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.8 * np.eye(2))
     problem = two_free_states().replace(system=system)
     alone = exit_probability(lambda t, x: -x, lambda t, x: 0.8 + 0 * x, -1, 1, 1, 0.0)
@@ -407,10 +436,20 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed() -> None:
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
     plane = two_sides._plane(problem, model, room.outer_low, room.outer_high, starts)
     plan = plan_below(plane, truth, 2500)
-    bound = bound_plane_below(plane, model, plan, starts)
-    assert bound is not None
+    proposals: list[Any] = []
+    monkeypatch.setattr(plane_below, "propose_plane", lambda *given: proposals.append(given) or propose_plane(*given))
+    found = bound_plane_below(plane, model, plan, starts)
+    assert found is not None
+    bound = found[1].log
+    assert len(proposals) == 3  # none that is not looked at
+    with monkeypatch.context() as hopeless:
+        hopeless.setattr(plane_below._Sketch, "estimate", lambda self: plan.floor - 100)
+        hopeless.setattr(plane_below, "prove_lower", lambda *given: pytest.fail("nothing can come of this proof"))
+        assert bound_plane_below(plane, model, plan, starts) is None
+    assert len(proposals) == 4
     assert truth - 1.3 < bound <= truth
-    surface, rng = propose_plane(plane, plan), np.random.default_rng(0)
+    coarse = dataclasses.replace(plan, cells=10, growth=0.6)
+    surface, rng = propose_plane(plane, coarse), np.random.default_rng(0)
     assert surface is not None
     for size, shift in ((0.0, -0.3), (0.0, 1.0), (1e-3, 0.0)):
         payment = prove_lower(spoilt(surface, rng, size).raised(shift), model, starts)

@@ -108,7 +108,7 @@ def _affine(graph: Graph, node: int) -> tuple[arb, dict[int, arb]]:
     while stack:
         graph.budget.check()
         index, factor = stack.pop()
-        op, args, _ = graph.node(index)
+        op, args, *_ = graph.node(index)
         count += 1
         if not graph.masks[index]:
             constant += factor * _constant(graph, index)

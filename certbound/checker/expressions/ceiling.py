@@ -23,7 +23,7 @@ from certbound.problem.model import JUMPS
 _MOST_BOXES = 200_000
 _DEEPEST = 40
 _EVEN = 6
-_RISKY = JUMPS | {"kink", "atan2"}
+_RISKY = JUMPS | {"kink", "atan2", "jumping"}
 
 Side = tuple[arb, arb]
 
@@ -63,7 +63,7 @@ class Ceiling:
         self._wide = Program(graph, hessian, risky | guards, variables=count)
         self._slopes = Program(graph, gradient, guards, variables=count, generalised=True)
         self._range = Program(graph, [node], guards, variables=count)
-        self._kinked = any(graph.node(index).op == "kink" for index in graph.reachable(gradient))
+        self._kinked = any(graph.node(index).op in ("kink", "bent") for index in graph.reachable(gradient))
         for program in (self._thin, self._wide, self._slopes, self._range):
             program.prepare([])
 

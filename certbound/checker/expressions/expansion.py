@@ -6,17 +6,19 @@ from collections.abc import Sequence
 
 from flint import arb
 
+from certbound.checker.expressions import networks
 from certbound.checker.expressions.arithmetic import Undecided, holds
 from certbound.checker.expressions.graph import Graph
 from certbound.checker.expressions.operations import OPERATIONS
 from certbound.checker.expressions.quadratic import Quadratic
 from certbound.checker.expressions.taylor import Model, constant
+from certbound.problem.model import Part
 
 _ZERO = arb(0)
 _MANY = 100
 """Terms whose time and memory are worth counting."""
 
-_Step = tuple[str, tuple[int, ...], float]
+_Step = tuple[str, tuple[int, ...], float | Part]
 
 
 class Expansion:
@@ -35,9 +37,9 @@ class Expansion:
         below = (1 << variables) - 1
         self._nodes: list[_Step] = []
         for index in order:
-            op, args, value = graph.node(index)
+            op, args, value, part = graph.node(index)
             places = args if op == "input" else tuple(place[arg] for arg in args)
-            self._nodes.append((op, places, value))
+            self._nodes.append((op, places, part or value))
         self._early = [number for number, index in enumerate(order) if not graph.masks[index] & below]
         self._first = [number for number, index in enumerate(order) if graph.masks[index] & below == 1]
         self._later = [number for number, index in enumerate(order) if graph.masks[index] & below > 1]
@@ -107,8 +109,11 @@ class Expansion:
                     self._budget.hold(3 * len(found.squares))
 
 
-def _value(op: str, args: tuple[int, ...], value: float, values: list[Model | None]) -> Model | None:
+def _value(op: str, args: tuple[int, ...], value: float | Part, values: list[Model | None]) -> Model | None:
     """A node's model; None is what is not defined. A jump, a kink or a branch cut in the box is `Undecided`."""
+    if isinstance(value, Part):
+        inner = [model for model in (values[arg] for arg in args) if model is not None]
+        return networks.model(value, inner) if len(inner) == len(args) else None
     if op == "const":
         return constant(arb(value))
     given = [model for model in (values[arg] for arg in args) if model is not None]

@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
+from certbound.checker.expressions import networks
 from certbound.checker.expressions.operations import OPERATIONS
 from certbound.checker.report import Budget, Unproved
-from certbound.problem.model import Node, Tape
+from certbound.problem.model import Node, Part, Tape
 
 MOST_NODES = 400_000
 _NODE = 6
@@ -38,20 +39,20 @@ class Graph:
         self.budget = Budget(math.inf) if budget is None else budget
         self.nodes: list[Node] = []
         self.masks: list[int] = []
-        self._numbers: dict[tuple[str, tuple[int, ...], str], int] = {}
+        self._numbers: dict[tuple[str, tuple[int, ...], str | Part], int] = {}
         self._derivatives: dict[tuple[int, int], int] = {}
 
     # ---- building ----------------------------------------------------------------------------------------
 
-    def apply(self, op: str, *args: int, value: float = 0.0) -> int:
+    def apply(self, op: str, *args: int, value: float = 0.0, part: Part | None = None) -> int:
         """The node of an operation, as it stands."""
-        key = (op, args, value.hex())
+        key = (op, args, part or value.hex())
         found = self._numbers.get(key)
         if found is not None:
             return found
         if len(self.nodes) >= MOST_NODES:
             raise Unproved(f"the model and its derivatives have more than {MOST_NODES} operations")
-        self.nodes.append(Node(op, args, value))
+        self.nodes.append(Node(op, args, value, part))
         mask = 1 << args[0] if op == "input" else 0
         if op != "input":
             for arg in args:
@@ -64,6 +65,10 @@ class Graph:
     def const(self, value: float) -> int:
         """A constant."""
         return self.apply("const", value=float(value))
+
+    def part(self, part: Part, args: tuple[int, ...]) -> int:
+        """A part of a network."""
+        return self.apply(part.op, *args, part=part)
 
     def input(self, slot: int) -> int:
         """An input."""
@@ -126,7 +131,8 @@ class Graph:
             elif node.op == "const":
                 numbers.append(self.const(node.value))
             else:
-                numbers.append(self.apply(node.op, *(numbers[arg] for arg in node.args), value=node.value))
+                args = [numbers[arg] for arg in node.args]
+                numbers.append(self.apply(node.op, *args, value=node.value, part=node.part))
         return numbers
 
     def reachable(self, outputs: Iterable[int]) -> list[int]:
@@ -162,9 +168,11 @@ class Graph:
         return self._derivatives.get((index, slot), -1) if self.masks[index] >> slot & 1 else self.const(0.0)
 
     def _rule(self, index: int, slot: int) -> int:
-        op, args, value = self.nodes[index]
+        op, args, value, part = self.nodes[index]
         if op == "input":
             return self.const(1.0)
+        if part is not None:
+            return networks.slope(self, part, args, [self._known(arg, slot) for arg in args])
         slope = OPERATIONS[op].slope
         if slope is None:
             return self.const(0.0)

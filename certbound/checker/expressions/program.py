@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterable, Sequence
 
 from flint import arb
 
+from certbound.checker.expressions import networks
 from certbound.checker.expressions.arithmetic import Undecided, generalised_kink
 from certbound.checker.expressions.graph import Graph
 from certbound.checker.expressions.operations import OPERATIONS
 from certbound.checker.expressions.series import Series, constant
 from certbound.checker.report import Budget
-from certbound.problem.model import Tape
+from certbound.problem.model import Node, Tape
 
 Step = tuple[int, Callable[..., arb], int, int]
 
@@ -52,13 +53,16 @@ class Program:
                 self._constants.append((number, arb(node.value)))
             else:
                 steps = self._late if graph.masks[index] & below else self._early
-                steps.append(self._step(number, node.op, [place[arg] for arg in node.args], node.value))
+                steps.append(self._step(number, node, [place[arg] for arg in node.args]))
         self._outputs = [place[index] for index in outputs]
         self._watched = [place[index] for index in watched]
         self._size = len(order)
         self._template: list[arb] = []
 
-    def _step(self, number: int, op: str, args: list[int], value: float) -> Step:
+    def _step(self, number: int, node: Node, args: list[int]) -> Step:
+        op, _, value, part = node
+        if part is not None:
+            return number, lambda values: networks.ball(part, [values[arg] for arg in args]), -1, -1
         ball = self._special.get(op, OPERATIONS[op].ball)
         if op == "pow":
             return number, lambda x: ball(x, value), args[0], -1
@@ -104,7 +108,10 @@ class Program:
 
 def _execute(steps: list[Step], values: list[arb]) -> None:
     for number, function, first, second in steps:
-        values[number] = function(values[first]) if second < 0 else function(values[first], values[second])
+        if first < 0:  # as many arguments as a network takes
+            values[number] = function(values)
+        else:
+            values[number] = function(values[first]) if second < 0 else function(values[first], values[second])
 
 
 def expand(tape: Tape, inputs: Sequence[Series], order: int, budget: Budget) -> list[Series]:
@@ -117,6 +124,8 @@ def expand(tape: Tape, inputs: Sequence[Series], order: int, budget: Budget) -> 
             values.append(given + [arb(0)] * (order + 1 - len(given)))
         elif node.op == "const":
             values.append(constant(arb(node.value), order))
+        elif node.part is not None:
+            values.append(networks.series(node.part, [values[arg] for arg in node.args]))
         else:
             exponent = [node.value] if node.op == "pow" else []
             values.append(OPERATIONS[node.op].series(*(values[arg] for arg in node.args), *exponent))

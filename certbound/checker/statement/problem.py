@@ -86,6 +86,7 @@ class Model:
     domain: list[tuple[float | None, float | None]] | None
     states: tuple[str, ...] = field(default=())
     target: Constraint | None = None  # then a path fails that breaks a constraint before it is there, or never is
+    ends: bool = False  # where the domain is left: that is no failure, and counting it as one bounds from above only
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
     @property
@@ -112,7 +113,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     CertificateError where a field is missing, has the wrong size, or makes no sense; Unproved where it is too large for
     the budget.
     """
-    record = Record(value, path, _FIELDS, ("reach",))
+    record = Record(value, path, _FIELDS, ("reach", "leaving"))
     time = record["time"]
     if time not in ("continuous", "discrete"):
         raise CertificateError(f"`{path}.time` must be \"continuous\" or \"discrete\".")
@@ -126,6 +127,8 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     inputs, disturbances = _names(record, "inputs", 0), _names(record, "disturbances", 0)
     n = len(states)
     dynamics = read_tape(record["dynamics"], record.at("dynamics"), ("t", *states, *inputs, *disturbances), (n,))
+    if record["leaving"] not in (None, "ends"):
+        raise CertificateError(f"`{path}.leaving` must be \"ends\" or absent.")
     domain = _ranges(record["domain"], record.at("domain"), n) if record["domain"] is not None else None
     constraints = [
         read_constraint(item, f"{path}.constraints[{index}]", n, horizon, budget)
@@ -137,7 +140,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         constraints.append(Constraint.of_domain(domain))
     return Model(
         name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
-        plan=_plan(record, len(inputs), continuous, horizon), states=states,
+        ends=record["leaving"] == "ends", plan=_plan(record, len(inputs), continuous, horizon), states=states,
         disturbance=_disturbance(record, len(disturbances)),
         noise=_noise(record["noise"], path + ".noise", states, time, budget),
         initial=initial, members=members, target=_target(record, n, horizon, budget),
@@ -184,9 +187,9 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
         if record["law"] != "wiener":
             raise CertificateError(f"`{path}.law` must be \"wiener\" in continuous time.")
         if isinstance(record["diffusion"], dict):
-            inner = Record(record["diffusion"], path + ".diffusion", ("columns", "nodes", "outputs"))
+            inner = Record(record["diffusion"], path + ".diffusion", ("columns", "nodes", "outputs"), ("networks",))
             m = inner.whole("columns", 1, MOST_STATES)
-            tape = {name: inner[name] for name in ("nodes", "outputs")}
+            tape = {name: entry for name, entry in inner.value.items() if name != "columns"}
             return Noise(
                 diffusion=read_tape(tape, inner.path, ("t", *states), (n, m)), proxy=diagonal([arb(1)] * m),
                 gaussian=True,

@@ -83,7 +83,7 @@ def structure_of(model: Model, budget: Budget) -> Structure:
 
 def _deciding(graph: Graph, index: int) -> int:
     """The inputs that decide on which side of a jump an operation is, or whether it is defined."""
-    op, args, value = graph.node(index)
+    op, args, value, _ = graph.node(index)
     if op == "if_else_zero":
         return graph.masks[args[0]]
     if op == "div":

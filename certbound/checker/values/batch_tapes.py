@@ -29,10 +29,10 @@ def run(tape: Tape, inputs: Sequence[Batch]) -> list[Batch]:
             values.append(_power(args[0], node.value))
         elif node.op in _DIRECT:
             values.append(_DIRECT[node.op](*args))
-        elif len(args) == 1:
+        elif len(args) == 1 and node.part is None:
             values.append(tm.composed(args[0], OPERATIONS[node.op].series))
         else:
-            values.append(tm.unknown(like))  # atan2
+            values.append(tm.unknown(like))  # atan2, parts of networks
     return [values[output] for output in tape.outputs]
 
 

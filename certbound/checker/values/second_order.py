@@ -17,7 +17,7 @@ from certbound.problem.model import JUMPS, Tape
 Pair = tuple[int, int]
 _MOST_PARTS = 64
 _MOST_CUTS = 8
-_KINKED = {"abs", "min", "max", "hypot", "atan2", "fmod", "copysign"}
+_KINKED = {"bent", "jumping", "abs", "min", "max", "hypot", "atan2", "fmod", "copysign"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,7 +75,7 @@ class Flow:
     def _refuse(self) -> None:
         reached = self.graph.reachable([*self.outputs, *self.noise])
         for index in reached:
-            op, args, _ = self.graph.node(index)
+            op, args, *_ = self.graph.node(index)
             if op in JUMPS or op in _KINKED:
                 raise Unproved(f"the model has an operation ({op}) that this proof does not treat")
             if op == "input" and args[0] == 0:
@@ -178,7 +178,7 @@ class Flow:
         """The second derivatives over a box, in parts: balls say more of small ones."""
         nodes = list(self.bends.values())
         used = [self.graph.node(index) for index in self.graph.reachable(nodes)]
-        places = sorted({args[0] for op, args, _ in used if op == "input"})
+        places = sorted({args[0] for op, args, *_ in used if op == "input"})
         cuts = _MOST_CUTS
         while cuts > 1 and cuts ** len(places) > _MOST_PARTS:
             cuts -= 1

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import logging
 import time
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
 from certbound.cli.clock import Clock, TimeLimitOption
 from certbound.cli.describe import describe_constants
-from certbound.cli.messages import computing
-from certbound.cli.options import HorizonOption, JsonOption, ProblemArgument, SetOption, examples, load_problem
+from certbound.cli.messages import InputError, computing
+from certbound.cli.options import (
+    HorizonOption,
+    JsonOption,
+    ProblemArgument,
+    SetOption,
+    examples,
+    integer,
+    load_problem,
+    option,
+)
 from certbound.cli.output import SETTINGS, console, show
 from certbound.cli.progress import progress
 from certbound.display import log10_text, name_text
@@ -25,7 +36,19 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
     from certbound.tubes.constants import Constants
 
-EXAMPLES = examples("certbound derive chain --json", "certbound derive unicycle --time-limit 20")
+EXAMPLES = examples(
+    "certbound derive chain --json",
+    "certbound derive unicycle --time-limit 20",
+    'certbound derive chain --constraint "v3 <= 2"',
+    "certbound derive chain_rest --set masses=20 --constraint all --jobs 2",
+)
+MOST_UNASKED = 24
+"""States up to which every constraint gets a metric of its own unless something else is asked for."""
+ConstraintOption = Annotated[
+    list[str] | None,
+    option("--constraint", "NAME", "A metric of its own for this one (repeat for more), for all, or none [all]."),
+]
+JobsOption = Annotated[int, option("--jobs", "N", "Processes that work on metrics side by side [1].", integer)]
 _log = logging.getLogger(__name__)
 
 
@@ -33,69 +56,118 @@ def derive(
     problem: ProblemArgument,
     pairs: SetOption = None,
     horizon: HorizonOption = None,
+    constraint: ConstraintOption = None,
+    jobs: JobsOption = 1,
     time_limit: TimeLimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Bound the contraction rate (or gain) and the noise, with a metric for each constraint."""
+    from certbound.problem.goals import check_end
+
     subject = load_problem(problem, pairs, horizon=horizon)
+    check_end(subject, "a rate along the trajectory")
+    asked = _Asked(_places(subject, constraint), _checked_jobs(jobs), live=not as_json)
     started = time.perf_counter()
     with (
         progress(f"bounding the constants of {name_text(subject.name)}", time_limit) as tell,
         computing("constants", subject),
     ):
-        constants, metrics, where = _bound(subject, Clock(time_limit, tell))
+        constants, metrics, where = _bound(subject, asked, Clock(time_limit, tell))
     seconds = time.perf_counter() - started
     result = {
         **describe_constants(constants),
         "domain": where,
         "status": None if constants.proof is None else constants.proof.status,
         "metrics": [
-            {"constraint": constraint.label, **describe_constants(one)}
-            for constraint, one in zip(subject.safe, metrics)
+            {"constraint": subject.constraints[place].label, **describe_constants(one)}
+            for place, one in sorted(metrics.items())
         ],
         "seconds": seconds,
     }
     show(result, as_json, lambda: _print(constants, result))
 
 
-def _bound(subject: Problem, clock: Clock) -> tuple[Constants, list[Constants], str]:
+@dataclass(frozen=True)
+class _Asked:
+    """Which constraints get a metric of their own, on how many processes, and whether each is printed when found."""
+
+    places: list[int]
+    jobs: int
+    live: bool
+
+
+def _places(subject: Problem, names: list[str] | None) -> list[int]:
+    """Places of the constraints that are asked for."""
+    labels = [constraint.label for constraint in subject.safe]
+    if names is None:
+        return list(range(len(labels))) if subject.system.dimension <= MOST_UNASKED else []
+    if names == ["none"]:
+        return []
+    if "all" in names:
+        return list(range(len(labels)))
+    for name in names:
+        if name not in labels:
+            nearest = difflib.get_close_matches(name, labels, n=1, cutoff=0.0)[0]
+            raise InputError(f"no constraint is called `{name}`", f'the nearest is "{nearest}"; or give all')
+    return [place for place, label in enumerate(labels) if label in names]
+
+
+def _checked_jobs(jobs: int) -> int:
+    if jobs < 1:
+        raise InputError(f"`--jobs` must be positive, got {jobs}", "give a number of processes such as 2")
+    return jobs
+
+
+Found = tuple["Constants", dict[int, "Constants"], str]
+
+
+def _bound(subject: Problem, asked: _Asked, clock: Clock) -> Found:
     """Constants and where they hold: the domain, all of R^n, or else along the noise-free reach tube.
 
-    With a limit, quick constants in the Euclidean norm come first, and are what is left when the time is over.
+    With a limit, quick constants in the Euclidean norm come first; what is found when the time is over is kept.
     """
+    found: list[Found] = []
     if clock.limit is None:
         with clock.running():
-            return _searched(subject)
+            _search(subject, asked, found)
+        return found[-1]
     from certbound.constants.bounds import bound_constants
 
-    found: tuple[Constants, list[Constants], str] | None = None
     with contextlib.suppress(OutOfTime):
         with clock.running(), contextlib.suppress(EnclosureError, InfeasibleError):
             quick = bound_constants(subject, metric="euclidean")
-            found = quick, [], "stated" if quick.proof is None else quick.proof.domain
+            found.append((quick, {}, "stated" if quick.proof is None else quick.proof.domain))
         with clock.running():
-            found = _searched(subject)
-    if found is None:
+            _search(subject, asked, found)
+    if not found:
         raise SolverError(f"no constants were proved within {clock.limit:g} s; give a larger --time-limit")
-    return found
+    return found[-1]
 
 
-def _searched(subject: Problem) -> tuple[Constants, list[Constants], str]:
+def _search(subject: Problem, asked: _Asked, found: list[Found]) -> None:
+    """Append what is found: the common metric first, to which those of single constraints are added one by one."""
     from certbound.constants.bounds import bound_constants
-    from certbound.constants.metrics import bound_metrics
+    from certbound.constants.metrics import each_metric
 
     try:
         poll("one metric for all constraints")
         constants = bound_constants(subject)
+        metrics: dict[int, Constants] = {}
+        found.append((constants, metrics, constants.proof.domain if constants.proof is not None else "stated"))
+        if not asked.places:
+            return
         poll("a metric for each constraint")
-        where = constants.proof.domain if constants.proof is not None else "stated"
-        return constants, list(bound_metrics(subject)), where
+        for place, one in each_metric(subject, only=asked.places, jobs=asked.jobs):
+            metrics[place] = one
+            if asked.live and not SETTINGS.quiet:
+                console().print(f"{subject.constraints[place].label}: {one.summary()}", markup=False)
+        return
     except (EnclosureError, InfeasibleError) as error:
         if subject.domain is not None:
             raise
         _log.info("no constants hold everywhere: %s", error)
     constants, where = _local(subject)
-    return constants, [], f"{where} (no constants hold on all of R^n)"
+    found.append((constants, {}, f"{where} (no constants hold on all of R^n)"))
 
 
 def _local(subject: Problem) -> tuple[Constants, str]:
@@ -139,7 +211,9 @@ def _print(constants: Constants, result: dict[str, Any]) -> None:
         screen.print(f"at most {constants.gap:.3g} above what sampling found")
     screen.print(f"holds on {result['domain']}", markup=False)
     screen.print(f"proposed by: {result['status']}", markup=False)
-    if result["metrics"]:
+    if not result["metrics"]:
+        screen.print("metrics of single constraints: --constraint NAME, or all")
+    else:
         screen.print(_table(name, [{"constraint": "all in one", **result}, *result["metrics"]]))
     screen.print(f"{result['seconds']:.2f} s")
 

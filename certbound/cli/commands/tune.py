@@ -58,7 +58,10 @@ def tune(
     """Compute the probabilistic tube by every method that applies, and say which is smallest."""
     check_writable(plot)
     check_picture(plot)
+    from certbound.problem.goals import check_end
+
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
+    check_end(subject, "a tube")
     rows: list[dict[str, Any]] = []
     tubes: dict[str, Tube] = {}
     constants: Constants | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import sys
 import time
@@ -15,6 +16,7 @@ import typer
 from certbound.cli.clock import Clock, VerdictLimitOption
 from certbound.cli.commands.check import proved_certificate
 from certbound.cli.describe import attributes, describe_constants, describe_deviation
+from certbound.cli.messages import for_files
 from certbound.cli.options import (
     ClusterOption,
     DeltaOption,
@@ -101,8 +103,11 @@ def verify(
     result = _result(subject, verdict, seconds)
     if explain:
         result["engines"] = _engines(verdict)
+    if ":" not in problem:
+        for told in (result, *result.get("engines", ())):
+            told["reason"] = for_files(told["reason"])
     if not as_json:  # the verdict comes first: it stands, whatever becomes of the rest
-        _print(subject, result)
+        _print(subject, result, verdict.caution)
     if explain and verdict.status == "UNKNOWN":
         result["limits"] = _limits(verdict, cells, clock)
         if not as_json and not SETTINGS.quiet:
@@ -220,27 +225,30 @@ def _certify(problem: Problem, verdict: Verdict, path: Path, left: float | None)
     return text, {"path": str(path), "log10_delta": proved, "reason": reason, **spent}
 
 
-def _print(problem: Problem, result: dict[str, Any]) -> None:
+def _print(problem: Problem, result: dict[str, Any], caution: str) -> None:
     screen = console()
-    unit = "s" if problem.system.time == "continuous" else "steps"
     print_status(screen, result["status"])
     screen.print(
-        f"{name_text(problem.name)}: P({problem.failing} within {problem.horizon:g} {unit}) <= "
+        f"{name_text(problem.name)}: P({problem.failing} {problem.span}) <= "
         f"{log10_text(result['log10_delta'])}{at_least_text(result['log10_lower'])}, asked {result['delta']!r}",
         markup=False,
     )
     if SETTINGS.quiet:
         return
     if result["margin"] is not None and result["constraint"]:
-        when = "" if result["time"] is None else f" at {'t' if unit == 's' else 'step'} = {result['time']:.4g}"
+        clock = "t" if problem.system.time == "continuous" else "step"
+        when = "" if result["time"] is None else f" at {clock} = {result['time']:.4g}"
         margin = rounded(result["margin"], up=False, digits=4)
-        screen.print(f"margin {margin}{when}, constraint: {one_line(result['constraint'])}", markup=False)
+        where = f"constraint: {one_line(result['constraint'])}{caution}"
+        screen.print(f"margin {margin}{when}, {where}", markup=False)
     if result["reason"]:
-        screen.print(one_line(result["reason"]), markup=False)
+        for line in re.split(r"(?<=[.!?]) (?=By \w+: )", one_line(result["reason"])):
+            screen.print(line, markup=False)
     tube = result["tube"]
     if tube is not None:
         largest = rounded(float(max(tube["radius"])), up=True, digits=4)
-        screen.print(f"stochastic deviation: at most {largest} with that probability", markup=False)
+        but = f"but for a probability of {result['delta']!r}"
+        screen.print(f"stochastic deviation: at most {largest}, {but}", markup=False)
     screen.print(f"method {result['method']}, {result['seconds']:.1f} s", markup=False)
     for row in result.get("engines", ()):
         bound = f"<= {log10_text(row['log10_delta'])}" if row["applicable"] else "does not apply"

@@ -45,6 +45,7 @@ def bound_supremum(
     ceiling: float = np.inf,
     starts: Interval | None = None,
     earlier: Supremum | None = None,
+    share: float = 1.0,
 ) -> Supremum:
     """Bound sup value over a box, best boxes first.
 
@@ -57,7 +58,8 @@ def bound_supremum(
 
     The search stops once upper - sampled is at most ``tolerance``, or after about ``budget`` boxes. ``ceiling`` is an
     upper bound known beforehand, ``starts`` boxes that together hold the supremum, ``earlier`` a search of the same
-    supremum that ran out of its budget, to go on from.
+    supremum that ran out of its budget, to go on from. ``share`` is that of the usual number of samples to be taken,
+    where a value is expensive.
     """
     if not tolerance > 0:
         raise ValueError(f"`tolerance` must be positive, got {tolerance}.")
@@ -66,8 +68,11 @@ def bound_supremum(
     if earlier is None:
         boxes = box.reshape(1, -1) if starts is None else starts
         sampled, point = -np.inf, _centres(boxes)[0]
-        sampled, point = _sample(value, [_centres(boxes), random_points(rng, box, 2048)], sampled, point)
-        sampled, point = _climb(value, rng, box, sampled, point)
+        tried = [_centres(boxes), random_points(rng, box, max(8, int(2048 * share)))]
+        if share < 1 and np.isfinite(box.lo).all() and np.isfinite(box.hi).all():
+            tried.append(np.stack([box.lo, box.hi]))  # few samples: the ends of all sides at once among them
+        sampled, point = _sample(value, tried, sampled, point)
+        sampled, point = _climb(value, rng, box, sampled, point, share)
     else:
         boxes, sampled, point = earlier.rest, earlier.sampled, earlier.point
         retired, retired_box, count = min(earlier.settled, ceiling), earlier.worst, earlier.boxes
@@ -100,7 +105,7 @@ def bound_supremum(
         boxes = Interval(np.concatenate([boxes.lo[rest], children.lo]), np.concatenate([boxes.hi[rest], children.hi]))
         uppers = np.concatenate([uppers[rest], new_uppers])
         weights = np.concatenate([weights[rest], new_weights])
-    sampled, point = _climb(value, rng, box, sampled, point)
+    sampled, point = _climb(value, rng, box, sampled, point, share)
     worst, settled = retired_box, retired
     if len(boxes) and uppers.max() > retired:
         first = int(np.argmax(uppers))
@@ -176,13 +181,14 @@ def random_points(rng: np.random.Generator, box: Interval, count: int) -> Array:
 
 
 def _climb(
-    value: Callable[[Array], Array], rng: np.random.Generator, box: Interval, sampled: float, point: Array
+    value: Callable[[Array], Array], rng: np.random.Generator, box: Interval, sampled: float, point: Array, share: float
 ) -> tuple[float, Array]:
     """Random search around the best point, in ever smaller steps."""
     with np.errstate(all="ignore"):
         width = np.where(np.isfinite(box.hi - box.lo), box.hi - box.lo, 1.0 + np.abs(point))
+    count = max(1, int(48 * share))
     for step in 0.3 * 0.6 ** np.arange(24):
-        near = point + step * width * rng.normal(size=(48, len(point))) * (rng.uniform(size=(48, 1)) < 0.8)
+        near = point + step * width * rng.normal(size=(count, len(point))) * (rng.uniform(size=(count, 1)) < 0.8)
         sampled, point = _sample(value, [np.clip(near, box.lo, box.hi)], sampled, point)
     return sampled, point
 

@@ -8,6 +8,7 @@ enclosed.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from certbound.arrays import Mask
 from certbound.errors import EnclosureError
-from certbound.problem.model import OPERATIONS, Node, Tape, enclosed, undefined_where
+from certbound.problem.model import ROWS, Node, Tape, enclosed, jumps_where, undefined_where
 from certbound.rigor.intervals import Interval
 from certbound.watch import poll
 
@@ -111,17 +112,16 @@ def _evaluate(tape: Tape, inputs: Sequence[Interval]) -> tuple[list[Interval], l
 
 def _jumps(node: Node, args: Sequence[Interval], value: Interval, index: int, refusals: list[Refusal]) -> bool:
     """Whether the node can jump; undecided members are added to the refusals."""
-    jump = _jump(node)
-    if jump is None:
+    mask = jumps_where(node, value, args)
+    if mask is None:
         return False
-    mask = jump(value, *args)
     if np.any(mask):
         refusals.append(Refusal(index, np.asarray(mask)))
-    return node.op not in ("if_else_zero", "atan2")
+    return node.op not in ("if_else_zero", "atan2", "jumping")
 
 
 def _jump(node: Node) -> Callable[..., Mask] | None:
-    return OPERATIONS[node.op].jump if node.op in OPERATIONS else None
+    return ROWS[node.op].jump if node.op in ROWS else None
 
 
 def _undefined(node: Node, args: Sequence[Interval]) -> Mask | None:
@@ -137,7 +137,7 @@ def _inherited(node: Node, args: Sequence[Interval], masks: Sequence[Mask | None
         return inner if masks[0] is None else inner | masks[0]
     if not present:
         return None
-    return present[0] if len(present) == 1 else present[0] | present[1]
+    return functools.reduce(np.logical_or, present)
 
 
 def _message(tape: Tape, inputs: Sequence[Interval], refusal: Refusal) -> str:

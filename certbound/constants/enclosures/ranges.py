@@ -86,7 +86,10 @@ def _refined(tape: Tape, used: list[int], low: Array, high: Array, tolerance: fl
 
 
 def _upper(tape: Tape, lower: Array, upper: Array) -> Array:
-    inputs = [Interval(lower[:, slot], upper[:, slot]) for slot in range(lower.shape[1])]
+    idle = Interval(np.array(0.0), np.array(0.0))  # of hundreds of slots a range reads a few
+    inputs = [idle] * lower.shape[1]
+    for slot in _slots(tape):
+        inputs[slot] = Interval(lower[:, slot], upper[:, slot])
     return np.asarray(enclose(tape, inputs, undefined="infinite").hi[:, 0])
 
 

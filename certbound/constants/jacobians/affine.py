@@ -189,7 +189,9 @@ class SectorSet(AffineForm):
         member = np.array([[g == groups[i] for g in groups] for i in first], dtype=float).reshape(len(first), k)
         if np.any(box != box[:, [groups.index(g) for g in groups]]):
             raise ValueError("`groups` must join entries of equal range only.")
-        terms = np.einsum("gk,ik,kj->gij", member, b, c)
+        terms = np.zeros((len(first), n, n))
+        for term, mine in zip(terms, member > 0):
+            term += b[:, mine] @ c[mine]
         affine = AffineSet(center=a, terms=terms, low=box[0, first], high=box[1, first], slack=self.slack)
         assign(self, left=frozen(b), right=frozen(c), groups=groups, affine=affine)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from certbound.arrays import Array
+from certbound.arrays import Array, Index
 
 UNIT = float(np.finfo(float).eps)
 
@@ -24,8 +24,8 @@ def factor(term: Array) -> tuple[Array, Array, Array]:
     rows = np.flatnonzero(term.any(axis=1))
     columns = np.flatnonzero(term.any(axis=0))
     n = len(term)
-    u, s, vt = np.linalg.svd(term)
-    rank = int(np.count_nonzero(s > s[0] * n * 4 * UNIT)) if s[0] > 0 else 0
+    u, s, vt = _compact_svd(term, rows, columns)
+    rank = int(np.count_nonzero(s > s[0] * n * 4 * UNIT)) if len(s) and s[0] > 0 else 0
     if min(len(rows), len(columns)) <= rank:  # exact: unit vectors on one side
         if len(columns) <= len(rows):
             return term[:, columns], np.eye(n)[columns], np.zeros((n, n))
@@ -33,6 +33,14 @@ def factor(term: Array) -> tuple[Array, Array, Array]:
     left, right = u[:, :rank] * np.sqrt(s[:rank]), np.sqrt(s[:rank])[:, None] * vt[:rank]
     size = np.abs(left) @ np.abs(right) + np.abs(term)
     return left, right, (np.abs(term - left @ right) + (2 * n + 4) * UNIT * size) * (1 + 8 * UNIT)
+
+
+def _compact_svd(term: Array, rows: Index, columns: Index) -> tuple[Array, Array, Array]:
+    """Singular vectors of a matrix from those of its rows and columns that are not zero."""
+    u, s, vt = np.linalg.svd(term[np.ix_(rows, columns)], full_matrices=False)
+    left, right = np.zeros((len(term), len(s))), np.zeros((len(s), len(term)))
+    left[rows], right[:, columns] = u, vt
+    return left, s, right
 
 
 def is_near(

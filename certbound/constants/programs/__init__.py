@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from certbound.constants.programs.centers import center_multipliers
+from certbound.constants.programs.erosion_search import ErosionSearch
 from certbound.constants.programs.least_erosion import RadiusModel, Rooms, erosion_factors
 from certbound.constants.programs.lmi import design_feedback
-from certbound.constants.programs.proposals import Proposal, erosion_proposals, rate_proposals, sampled_polytope
+from certbound.constants.programs.proposals import Proposal, rate_proposals, sampled_polytope
 from certbound.constants.programs.sectors import centred, varying
 from certbound.constants.programs.targets import constraint_targets, cut_rooms, rooms_of, stated_rooms
 
@@ -16,7 +17,7 @@ __all__ = [
     "cut_rooms",
     "design_feedback",
     "erosion_factors",
-    "erosion_proposals",
+    "ErosionSearch",
     "Proposal",
     "RadiusModel",
     "rate_proposals",

@@ -40,7 +40,7 @@ class Center:
     steps: int
 
 
-class _Block:
+class Block:
     """One inequality F > 0 and the derivatives of -log det F."""
 
     def __init__(self, block: Array | Sector, *, continuous: bool) -> None:
@@ -85,7 +85,7 @@ class _Block:
         return top / 2 if self.continuous else top
 
 
-class _Pairs:
+class Pairs:
     """Symmetric matrices by their upper triangle: gradients and the Hessian of tr(K dP L dP)."""
 
     def __init__(self, n: int) -> None:
@@ -105,13 +105,20 @@ class _Pairs:
 
     def hessian(self, K: Array, L: Array) -> Array:
         """Second derivative tr(K S_p L S_q) over basis pairs, symmetric part."""
-        i, j = self.i, self.j
-        total = K.T[np.ix_(i, j)] * L[np.ix_(j, i)]
-        total += K.T[np.ix_(i, i)] * L[np.ix_(j, j)]
-        total += K.T[np.ix_(j, j)] * L[np.ix_(i, i)]
-        total += K.T[np.ix_(j, i)] * L[np.ix_(i, j)]
-        total *= self.scale[:, None]
-        total *= self.scale
+        M = K.T
+        # row pairs (a, a..n-1) at a time: whole rows of gathered columns, which stay in the cache
+        MI, MJ, LI, LJ = (matrix[:, place] for matrix in (M, L) for place in (self.i, self.j))
+        total = np.empty((self.size, self.size))
+        start = 0
+        for a in range(self.n):
+            rows = total[start : start + self.n - a]
+            np.multiply(LI[a:], MJ[a], out=rows)
+            rows += LJ[a:] * MI[a]
+            rows += MJ[a:] * LI[a]
+            rows += MI[a:] * LJ[a]
+            rows *= self.scale
+            rows[0] *= 0.5
+            start += self.n - a
         return total
 
 
@@ -131,12 +138,12 @@ def center_metric(
     """
     root = np.asarray(np.linalg.cholesky(starting_metric(blocks, continuous=continuous)).T)
     inverse = np.asarray(np.linalg.inv(root), dtype=float)
-    work = [_Block(transformed(block, root, inverse), continuous=continuous) for block in blocks]
+    work = [Block(transformed(block, root, inverse), continuous=continuous) for block in blocks]
     n = work[0].n
     P = np.eye(n) / 2
     multipliers = [_first_multipliers(block, P) for block in work]
     value = max(block.smallest_value(P, lam) for block, lam in zip(work, multipliers))
-    center = _Centring(work, _Pairs(n), max_steps).descend(P, multipliers, value, lower, tolerance)
+    center = _Centring(work, Pairs(n), max_steps).descend(P, multipliers, value, lower, tolerance)
     return replace(center, metric=frozen(root.T @ center.metric @ root))
 
 
@@ -153,7 +160,7 @@ def starting_metric(blocks: Sequence[Array | Sector], *, continuous: bool) -> Ar
         half = metric / 2
         value = -np.inf
         for block in blocks:
-            work = _Block(block, continuous=continuous)
+            work = Block(block, continuous=continuous)
             first = _first_multipliers(work, half)
             value = max(value, min(work.smallest_value(half, s * first) for s in (1.0, 4.0, 16.0, 64.0)))
         if value < best:
@@ -193,14 +200,48 @@ def center_multipliers(
     metric: Array, block: Sector, *, continuous: bool, tolerance: float = 1e-7, max_steps: int = 200
 ) -> Center:
     """Diagonal multipliers that nearly minimise c or L^2 of a sector in a given metric (k + 1 unknowns)."""
-    work = _Block(block, continuous=continuous)
+    work = Block(block, continuous=continuous)
     P = np.asarray(metric, dtype=float)
     P = P / (2 * np.linalg.norm(P, 2))
-    first = _first_multipliers(work, P)
-    value = work.smallest_value(P, first)
-    if not len(first):
+    if not work.k:
+        empty = np.zeros(0)
+        return Center(metric=frozen(P), multipliers=(frozen(empty),), value=work.smallest_value(P, empty), steps=0)
+    first, value = _shared_multipliers(work, P)
+    ends = np.array([block.A + sign * block.B @ block.C for sign in (-1.0, 0.0, 1.0)])
+    lower = contraction_value(P, ends, continuous=continuous)
+    lower = lower if continuous else lower**2
+    gap = value - lower
+    if gap <= tolerance * max(1.0, abs(value)):
         return Center(metric=frozen(P), multipliers=(frozen(first),), value=value, steps=0)
-    return _Centring([work], None, max_steps).descend(P, [first], value, -np.inf, tolerance)
+    return _Centring([work], None, max_steps).descend(P, [first], value, lower, tolerance, offset=0.3 * gap)
+
+
+def _shared_multipliers(block: Block, P: Array) -> tuple[Array, float]:
+    """Multipliers with one unknown scale: all equal, or in the proportion of what goes in and out; and their value."""
+    from scipy.linalg import eigh
+    from scipy.optimize import minimize_scalar
+
+    inner = block.H[:, block.n :].T @ P @ block.H[:, block.n :]
+    C = block.Chat[:, : block.n]
+    enters = np.maximum(np.diag(inner), 1e-300)
+    leaves = np.maximum(np.sum(C * np.linalg.solve(P, C.T).T, axis=1), 1e-300)
+    found = []
+    for shape in (np.ones(block.k), np.sqrt(enters / leaves)):
+        root = 1 / np.sqrt(shape)
+        smallest = 0.0 if block.continuous else float(eigh(inner * np.outer(root, root), eigvals_only=True)[-1])
+        unit = smallest or float(np.max(np.sqrt(enters / leaves) / shape))
+        scale = minimize_scalar(
+            _value_along, args=(block, P, shape, smallest, unit), bounds=(-25.0, 12.0), method="bounded",
+            options={"xatol": 1e-5, "maxiter": 60},
+        )  # fmt: skip
+        found.append((float(scale.fun), shape * (smallest + unit * np.exp(scale.x))))
+    value, best = min(found, key=lambda pair: pair[0])
+    return best, block.smallest_value(P, best) if value < 1e300 else float(np.inf)
+
+
+def _value_along(y: float, block: Block, P: Array, shape: Array, smallest: float, unit: float) -> float:
+    """The value at multipliers of one shape, ``smallest`` + ``unit`` exp(y) times; 1e300 where there is none."""
+    return min(block.smallest_value(P, shape * (smallest + unit * np.exp(y))), 1e300)
 
 
 def reachable_value(metric: Array, jacobians: JacobianSet, *, continuous: bool) -> float:
@@ -215,7 +256,7 @@ def reachable_value(metric: Array, jacobians: JacobianSet, *, continuous: bool) 
     return max(values)
 
 
-def _first_multipliers(block: _Block, P: Array) -> Array:
+def _first_multipliers(block: Block, P: Array) -> Array:
     inner = block.H[:, block.n :].T @ P @ block.H[:, block.n :]
     size = np.linalg.norm(inner, 2) if block.k else 0.0
     return np.full(block.k, 2 * float(size) + 1e-6)
@@ -224,13 +265,20 @@ def _first_multipliers(block: _Block, P: Array) -> Array:
 class _Centring:
     """The method of centres over some inequalities; without ``pairs`` P is fixed, and the multipliers are sought."""
 
-    def __init__(self, blocks: Sequence[_Block], pairs: _Pairs | None, max_steps: int) -> None:
+    def __init__(self, blocks: Sequence[Block], pairs: Pairs | None, max_steps: int) -> None:
         self.blocks, self.pairs, self.max_steps = blocks, pairs, max_steps
 
-    def descend(self, P: Array, multipliers: list[Array], value: float, lower: float, tolerance: float) -> Center:
-        """Shrink the target towards the value reached, and centre again, until it no longer pays."""
+    def descend(
+        self, P: Array, multipliers: list[Array], value: float, lower: float, tolerance: float,
+        offset: float | None = None,
+    ) -> Center:
+        """Shrink the target towards the value reached, and centre again, until it no longer pays.
+
+        The first target lies by ``offset`` above the value; a tenth of it when omitted.
+        """
         best = P, multipliers, value
-        steps, target, before, last = 0, value + max(1e-3, 0.1 * abs(value)), np.inf, np.inf
+        away = max(1e-3, 0.1 * abs(value)) if offset is None else offset
+        steps, target, before, last = 0, value + away, np.inf, np.inf
         while steps < self.max_steps:
             P, multipliers, used = self._recenter(P, multipliers, target, self.max_steps - steps)
             steps += used

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from certbound.arrays import Array
 from certbound.constants.jacobians import AffineForm, AffineSet, JacobianSet, VertexPolytope
-from certbound.constants.programs.centers import center_metric, reachable_value, starting_metric
-from certbound.constants.programs.least_erosion import RadiusModel, Rooms, tighten
+from certbound.constants.programs.centers import center_metric, center_multipliers, reachable_value, starting_metric
 from certbound.constants.programs.lmi import RateProgram
-from certbound.constants.programs.sectors import VERTEX_LIMIT, lmi_blocks
+from certbound.constants.programs.riccati import least_value
+from certbound.constants.programs.sectors import VERTEX_LIMIT, Sector, lmi_blocks
 from certbound.errors import SolverError
 
 _FEW_BLOCKS = 4
 """Up to so many inequalities the method of centres is used; beyond, a semidefinite solver."""
+
+MANY_STATES = 12
+"""From here on a Riccati equation proposes first."""
+MOST_STATES = 60
+"""Beyond, nothing else proposes: semidefinite programs take hours."""
+_TURNS = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -27,16 +32,28 @@ class Proposal:
     status: str
 
 
-def rate_proposals(members: JacobianSet, *, continuous: bool, share: float = 5e-3) -> list[Proposal]:
+def rate_proposals(
+    members: JacobianSet, *, continuous: bool, share: float = 5e-3, wanted: float = np.inf
+) -> list[Proposal]:
     """A metric of nearly least c or L: the method of centres, or semidefinite programs where it stalls.
 
     The sector form comes first: one inequality. Where it stays short of what the spectrum allows, few vertices
     are tried as well, for it may be conservative.
+
+    With many states none is returned where the spectrum allows no value, c or L, below ``wanted``.
     """
     lower = spectral_bound(members, continuous=continuous)
+    if members.dimension > MOST_STATES and (lower if continuous else np.sqrt(lower)) > wanted:
+        return []
     tolerance = share * max(abs(lower if continuous else 1 - lower), 1e-6)
     found: list[tuple[float, Proposal]] = []
     structured = isinstance(members, AffineSet | AffineForm)
+    if structured and members.dimension >= MANY_STATES:
+        proposal, value = _riccati_proposal(members, continuous=continuous, lower=lower, tolerance=tolerance)
+        if proposal is not None:
+            found.append((value, proposal))
+        if members.dimension > MOST_STATES or value <= lower + 4 * tolerance:
+            return [_kept(found)]
     for form in ("sector", "vertices") if structured else ("vertices",):
         if form == "vertices" and structured and members.vertex_count > VERTEX_LIMIT:
             continue
@@ -54,9 +71,36 @@ def rate_proposals(members: JacobianSet, *, continuous: bool, share: float = 5e-
             found.append((value, Proposal(metric=scaled, status=status)))
         if value <= lower + 4 * tolerance:
             break
+    return [_kept(found)]
+
+
+def _kept(found: list[tuple[float, Proposal]]) -> Proposal:
     if not found:
         raise SolverError("no program returned a positive definite metric; scale the states, or give a metric.")
-    return [min(found, key=lambda pair: pair[0])[1]]
+    return min(found, key=lambda pair: pair[0])[1]
+
+
+def _riccati_proposal(
+    members: JacobianSet, *, continuous: bool, lower: float, tolerance: float
+) -> tuple[Proposal | None, float]:
+    """The metric of a Riccati equation, and the value that it reaches: multipliers and metric in turn."""
+    (block,) = lmi_blocks(members, form="sector")
+    assert isinstance(block, Sector)
+    multipliers = np.ones(block.B.shape[1])
+    best, least = None, np.inf
+    for _ in range(_TURNS):
+        found = least_value(block, multipliers, continuous=continuous, lower=lower, tolerance=tolerance / 4)
+        metric = None if found is None else normalised(found.mean())
+        if metric is None:
+            break
+        center = center_multipliers(metric, block, continuous=continuous)
+        gained = least - center.value
+        if gained > 0:
+            best, least = metric, center.value
+        if least <= lower + 2 * tolerance or not gained > tolerance or not len(multipliers):
+            break
+        multipliers = center.multipliers[0] / np.exp(np.mean(np.log(center.multipliers[0])))
+    return None if best is None else Proposal(metric=best, status="Riccati equation"), least
 
 
 def sampled_polytope(matrices: Array, *, limit: int = 24) -> VertexPolytope:
@@ -74,26 +118,10 @@ def sampled_polytope(matrices: Array, *, limit: int = 24) -> VertexPolytope:
     return VertexPolytope(matrices=matrices[chosen[:limit] or [0]])
 
 
-def erosion_proposals(
-    members: JacobianSet, targets: Rooms, noise: Sequence[Array], radius: RadiusModel
-) -> list[Proposal]:
-    """The tightened metric, and the one of least c or L that it was searched from."""
-    start = rate_proposals(members, continuous=radius.continuous, share=2e-3)[0]
-    result = tighten(members, targets, noise, radius, start.metric, form=_form(members))
-    metric = normalised(result.metric)
-    first = [] if metric is None else [Proposal(metric=metric, status=f"tightening: {result.status}")]
-    return [*first, start]
-
-
-def _form(members: JacobianSet) -> str:
-    """Sector form where there are many vertices and a sector form exists."""
-    structured = isinstance(members, AffineSet | AffineForm)
-    return "sector" if structured and members.vertex_count > 16 else "vertices"
-
-
 def spectral_bound(members: JacobianSet, *, continuous: bool) -> float:
     """A lower bound of c or L^2 in every metric: spectral abscissa or radius over some members."""
-    matrices = members.sample(np.random.default_rng(0), 64)
+    count = min(64, max(2, int(64 * (40 / members.dimension) ** 3)))
+    matrices = members.sample(np.random.default_rng(0), count)
     if members.vertex_count <= 512:
         matrices = np.concatenate([matrices, members.vertices()])
     elif isinstance(members, AffineSet):

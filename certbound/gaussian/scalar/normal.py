@@ -51,6 +51,13 @@ def _mills_table() -> Array:
     return table
 
 
+@lru_cache(maxsize=1)
+def _mills_rows() -> list[list[float]]:
+    """The same, cell by cell, highest powers first."""
+    rows: list[list[float]] = _mills_table()[::-1].T.tolist()
+    return rows
+
+
 @lru_cache(maxsize=8)
 def gauss_rule(count: int) -> tuple[Array, Array]:
     """Gauss-Legendre nodes and weights on [-1, 1], the exact ones rounded to nearest."""
@@ -75,6 +82,8 @@ def mills(x: Array) -> Array:
     on: x R = 1 - y + 3y^2 - ... up to y^10 with y = 1/x^2; the series envelops R, its next term is below
     1e-15. Horner's rule on these rapidly falling coefficients loses less than 8 eps.
     """
+    if x.size == 1 and x.flat[0] < _FAR:  # the same arithmetic on one number, ten times as fast
+        return np.full(x.shape, _mills_of(max(float(x.flat[0]), 0.0)))
     near = np.fmin(np.fmax(x, 0.0), _FAR * (1 - EPS))  # NaN as 0
     cell = (near * _CELLS).astype(np.intp)
     table = _mills_table()
@@ -95,6 +104,16 @@ def mills(x: Array) -> Array:
         value[far] = series / large
     result: Array = value
     return result
+
+
+def _mills_of(x: float) -> float:
+    """`mills` of one number in [0, 16)."""
+    near = min(x, _FAR * (1 - EPS))
+    cell = int(near * _CELLS)
+    u, (value, *rest) = near - (cell + 0.5) / _CELLS, _mills_rows()[cell]
+    for coefficient in rest:
+        value = value * u + coefficient
+    return value
 
 
 @quiet

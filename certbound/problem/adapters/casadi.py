@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from certbound.problem.model import OPERATIONS, Graph, Tape
+from certbound.problem.model import OPERATIONS, PARTS, Graph, Tape
 
 
 def casadi_module() -> Any:
@@ -53,7 +53,30 @@ def _casadi_arithmetic(ca: Any) -> dict[str, Callable[..., Any]]:
         "if_else_zero": lambda condition, value: ca.if_else(condition, value, 0),
         "const": float,
         "pow": lambda base, exponent: ca.power(base, exponent),
+        **dict.fromkeys(PARTS, lambda *given: _network_output(ca, *given)),
     }
+
+
+def _network_output(ca: Any, *given: Any) -> Any:
+    """An output of a network (its derivatives are CasADi's own affair)."""
+    *args, part = given
+    if part.by:
+        return _refused(part.op)()
+    column = ca.vertcat(*args)
+    for layer in part.network.layers:
+        column = ca.DM(layer.weights) @ column + ca.DM(layer.bias)
+        column = _ACTIVATIONS[layer.activation](ca, column, *layer.constants)
+    return column[part.output]
+
+
+_ACTIVATIONS: dict[str, Callable[..., Any]] = {
+    "linear": lambda ca, z: z, "tanh": lambda ca, z: ca.tanh(z), "sin": lambda ca, z: ca.sin(z),
+    "sigmoid": lambda ca, z: 0.5 + 0.5 * ca.tanh(0.5 * z), "relu": lambda ca, z: ca.fmax(z, 0),
+    "softplus": lambda ca, z: ca.fmax(z, 0) + ca.log1p(ca.exp(-ca.fabs(z))),
+    "elu": lambda ca, z: ca.fmax(z, 0) + ca.expm1(ca.fmin(z, 0)),
+    "leaky_relu": lambda ca, z, left: ca.fmax(z, 0) + left * ca.fmin(z, 0),
+    "clip": lambda ca, z, low, high: ca.fmin(ca.fmax(z, low), high),
+}  # fmt: skip
 
 
 def _refused(op: str) -> Callable[..., Any]:

@@ -14,6 +14,7 @@ import numpy as np
 from certbound.checks import nearest, number
 from certbound.problem.files.plans import write_plan
 from certbound.problem.files.toml import toml_text
+from certbound.problem.networks import NetworkFunction, write_network
 from certbound.problem.problem import Problem
 
 _LARGEST = 20_000_000
@@ -62,7 +63,7 @@ def load(source: str | Path, **parameters: Any) -> Problem:
 
 
 def loads(text: str, *, folder: Path | None = None, **parameters: Any) -> Problem:
-    """A problem from the text of a problem file; ``plan.file`` is read from ``folder`` only.
+    """A problem from the text of a problem file; ``plan.file`` and networks are read from ``folder`` only.
 
     Errors are those of ``load``.
     """
@@ -90,7 +91,7 @@ def save(problem: Problem, path: str | Path) -> None:
 
     A problem that came from a file is written as it was there, with the parameters that were set; any other
     one with its traced model turned into expressions. An array plan goes to ``<stem>.plan.json`` beside the
-    file.
+    file, a network to ``<stem>.<name>.npz``.
 
     Parameters
     ----------
@@ -102,10 +103,10 @@ def save(problem: Problem, path: str | Path) -> None:
     Raises
     ------
     ValueError
-        If the path does not end in ``.toml``, or the model uses what problem files do not have (np.where,
-        ...).
+        If the path does not end in ``.toml``, or the model uses what problem files do not have (the
+        kink of a derivative).
     """
-    from certbound.problem.files.writing import content_of
+    from certbound.problem.files.writing import content_of, networks_of
 
     target = Path(path)
     if target.suffix != ".toml":
@@ -114,6 +115,8 @@ def save(problem: Problem, path: str | Path) -> None:
     content = content_of(problem, plan_file)
     if isinstance(problem.plan, np.ndarray):
         write_plan(target.with_name(plan_file), problem.plan, problem.system.input_names)
+    for name, network in networks_of(problem).items():
+        write_network(NetworkFunction(network), target.with_name(f"{target.stem}.{name}.npz"))
     target.write_text(toml_text(content), encoding="utf-8")
 
 

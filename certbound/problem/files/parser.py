@@ -1,7 +1,8 @@
 """Expressions in problem files: a small language with a parser of its own, safe on a stranger's file.
 
-Numbers, names, ``+ - * / **``, parentheses and the functions below; nothing else exists, so nothing else can
-be reached. ``**`` binds tighter than a sign on its left, as in Python.
+Numbers, names, ``+ - * / **``, comparisons with ``and or not``, parentheses, functions and the outputs
+``policy(x, v)[0]`` of the file's networks; nothing else exists, so nothing else can be reached. All bind as in Python,
+where ``**`` is tighter than a sign on its left; a truth is 0 or 1.
 """
 
 from __future__ import annotations
@@ -9,17 +10,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from certbound.checks import nearest
-from certbound.problem.model import ARITY, OPERATIONS, Graph, arithmetic
+from certbound.problem.model import ARITY, OPERATIONS, Graph, Network, Part, arithmetic
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi}
 
 _LONGEST, _DEEPEST = 20_000, 60
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)|(?P<name>[^\W\d]\w*)"
-    r"|(?P<symbol>\*\*|[-+*/(),]))"
+    r"|(?P<symbol>\*\*|[<>=!]=|[-+*/(),<>]))"
 )
 _CURES = {
     ".": "attribute access does not exist here",
@@ -30,8 +32,16 @@ _CURES = {
     "'": "text does not exist here",
     '"': "text does not exist here",
 }
-_BINDING = {"+": 1, "-": 1, "*": 2, "/": 2, "**": 4}
-_SIGN = 3
+_COMPARISONS = {
+    "<": ("lt", False), "<=": ("le", False), ">": ("lt", True), ">=": ("le", True), "==": ("eq", False),
+    "!=": ("ne", False),
+}  # fmt: skip
+"""The tape's operation of each, and whether it takes the sides in the other order."""
+_BINDING = {
+    "or": 1, "and": 2, **dict.fromkeys(_COMPARISONS, 4), "+": 5, "-": 5, "*": 6, "/": 6, "**": 8,
+}  # fmt: skip
+_NOT, _SIGN = 3, 7
+_LOGIC = ("and", "or", "not")
 
 
 class _Token(NamedTuple):
@@ -40,12 +50,15 @@ class _Token(NamedTuple):
     place: int
 
 
-def parse(text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str) -> int:
+def parse(
+    text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str,
+    networks: Mapping[str, Network] = MappingProxyType({}),
+) -> int:
     """Read an expression into a graph; the node of its value.
 
     ``names`` maps a name to a node of the graph, or to a function that makes the node when the name is first used;
-    ``where`` is what the expression belongs to, for messages. A text that is no expression, or uses an unknown name or
-    function, is a ValueError that names the nearest known one.
+    ``networks`` are those that may be called. ``where`` is what the expression belongs to, for messages. A text that is
+    no expression, or uses an unknown name or function, is a ValueError that names the nearest known one.
 
     Examples
     --------
@@ -57,12 +70,15 @@ def parse(text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]],
     if len(text) > _LONGEST:
         size = f"at most {_LONGEST} characters, got {len(text)}"
         raise ValueError(f"`{where}` must have {size}; use [definitions].")
-    return _Parser(text, graph, names, where).result()
+    return _Parser(text, graph, names, where, networks).result()
 
 
 class _Parser:
-    def __init__(self, text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str) -> None:
-        self.text, self.graph, self.names, self.where = text, graph, names, where
+    def __init__(
+        self, text: str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str,
+        networks: Mapping[str, Network],
+    ) -> None:
+        self.text, self.graph, self.names, self.where, self.networks = text, graph, names, where, networks
         self.tokens = self._split()
         self.next = 0
         self.depth = 0
@@ -87,10 +103,16 @@ class _Parser:
             if match is None:
                 blank = len(self.text[place:]) - len(self.text[place:].lstrip())
                 character = self.text[place + blank]
+                before = ["", "", *(token.text for token in tokens[-2:])]
+                if (character, before[-1]) == ("[", ")") or (character, before[-2]) == ("]", "["):  # of a network
+                    tokens.append(_Token("symbol", character, place + blank))
+                    place += blank + 1
+                    continue
                 cure = _CURES.get(character, "such a character does not exist here")
                 raise self.fail(f"{cure} ({character!r})", place + blank)
             kind = match.lastgroup or "symbol"
-            tokens.append(_Token(kind, match.group(kind), match.start(kind)))
+            word = match.group(kind)
+            tokens.append(_Token("symbol" if word in _LOGIC else kind, word, match.start(kind)))
             place = match.end()
         return [*tokens, _Token("end", "the end", end)]
 
@@ -125,6 +147,13 @@ class _Parser:
         if token.text == "**":
             return self.power(left, self.expression(_SIGN - 1))
         right = self.expression(strength)
+        if token.text in _COMPARISONS:
+            if self.peek().text in _COMPARISONS:
+                raise self.fail("a chain of comparisons does not exist here; write a < b and b < c", self.peek().place)
+            op, turned = _COMPARISONS[token.text]
+            return self.graph.apply(op, *((right, left) if turned else (left, right)))
+        if token.text in _LOGIC:
+            return self.graph.apply(token.text, left, right)
         if token.text == "/" and self.graph.number(right) == 0:
             raise self.fail("division by 0", token.place)
         op = {"+": "add", "-": "sub", "*": "mul", "/": "div"}[token.text]
@@ -152,6 +181,8 @@ class _Parser:
         if token.text in ("-", "+"):
             node = self.expression(_SIGN)
             return self.graph.apply("neg", node) if token.text == "-" else node
+        if token.text == "not" and token.kind == "symbol":
+            return self.graph.apply("not", self.expression(_NOT))
         raise self.fail(f"expected a value, got {token.text!r}", token.place)
 
     def variable(self, token: _Token) -> int:
@@ -167,29 +198,63 @@ class _Parser:
 
     def call(self, token: _Token) -> int:
         name = token.text
+        if name in self.networks:
+            return self.output(self.networks[name], token)
         if not is_function(name):
             if name in self.names or name in CONSTANTS:
                 raise self.fail(f"{name!r} is not a function; write * to multiply", token.place)
-            raise self.fail(f"unknown function {name!r}{nearest(name, filter(is_function, OPERATIONS))}", token.place)
-        self.expect("(")
-        arguments = [self.expression(0)]
-        while self.peek().text == ",":
-            self.next += 1
-            arguments.append(self.expression(0))
-        self.expect(")")
-        count = ARITY[name]
+            known = [*filter(is_function, [*OPERATIONS, "where"]), *self.networks]
+            raise self.fail(f"unknown function {name!r}{nearest(name, known)}", token.place)
+        arguments = self.arguments()
+        count = 3 if name == "where" else ARITY[name]
         if len(arguments) != count and not (name in ("min", "max") and len(arguments) > 2):
             wanted = f"{count} argument{'s' * (count > 1)}"
             raise self.fail(f"{name} takes {wanted}, got {len(arguments)}", token.place)
+        if name == "where":
+            return self.choice(*arguments)
         node = self.graph.apply(name, *arguments[:count])
         for argument in arguments[count:]:
             node = self.graph.apply(name, node, argument)
         return node
 
+    def arguments(self) -> list[int]:
+        self.expect("(")
+        found = [self.expression(0)]
+        while self.peek().text == ",":
+            self.next += 1
+            found.append(self.expression(0))
+        self.expect(")")
+        return found
+
+    def output(self, network: Network, token: _Token) -> int:
+        """An output of a network: its number in brackets may be left out where there is one."""
+        arguments = self.arguments()
+        if len(arguments) != network.inputs:
+            raise self.fail(f"{token.text} takes {network.inputs} arguments, got {len(arguments)}", token.place)
+        number = "0" if network.outputs == 1 else ""
+        if self.peek().text == "[":
+            self.next += 1
+            number = self.take().text
+            self.expect("]")
+        if not number.isdigit() or int(number) >= network.outputs:
+            last = network.outputs - 1
+            raise self.fail(f"write {token.text}(...)[k] with k from 0 to {last} for one of its outputs", token.place)
+        return self.graph.part(Part(network, int(number)), tuple(arguments))
+
+
+    def choice(self, condition: int, x: int, y: int) -> int:
+        """``where``: x where the condition holds, else y."""
+        first, opposite = self.graph.apply("if_else_zero", condition, x), self.graph.apply("not", condition)
+        return self.graph.apply("add", first, self.graph.apply("if_else_zero", opposite, y))
+
 
 def is_function(name: str) -> bool:
     """Whether expressions may call it: min and max take two arguments or more, every other as many as on a tape."""
-    return name in OPERATIONS and OPERATIONS[name].in_files
+    return name == "where" or (name in OPERATIONS and OPERATIONS[name].in_files)
+
+
+RESERVED = frozenset({"t", *filter(is_function, [*OPERATIONS, "where"]), *CONSTANTS, *_LOGIC})
+"""Names that no state, input, disturbance, parameter or definition may have."""
 
 
 def constant(graph: Graph, node: int) -> float | None:

@@ -13,29 +13,25 @@ from certbound.arrays import Array
 from certbound.checks import names as checked_names
 from certbound.checks import nearest
 from certbound.problem import sets
-from certbound.problem.files.parser import CONSTANTS, constant, is_function, parse
+from certbound.problem.files.parser import RESERVED, constant, parse
 from certbound.problem.files.plans import read_plan
 from certbound.problem.files.schema import Constraint, Cost, Part, PolygonTable, Specification, Start
-from certbound.problem.model import OPERATIONS, Graph, Tape
+from certbound.problem.model import Graph, Tape, sources
+from certbound.problem.networks import network
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
-
-RESERVED = frozenset({"t", *filter(is_function, OPERATIONS), *CONSTANTS})
-"""Names that no state, input, disturbance, parameter or definition may have."""
 
 
 class _ForbiddenError(ValueError):
     """An expression uses a name that exists, but not here."""
 
 
-def read_problem(
-    spec: Specification, folder: Path | None, source: Mapping[str, Any] | None = None
-) -> Problem:
+def read_problem(spec: Specification, folder: Path | None, source: Mapping[str, Any] | None = None) -> Problem:
     """Build the problem that a validated specification describes; ``source``, the raw content, is kept for saving.
 
-    ``plan.file`` is read from ``folder``; None forbids it. Errors (ValueError, TypeError) name the key, the rule and
-    the value.
+    ``plan.file`` and networks are read from ``folder``; None forbids it. Errors (ValueError, TypeError) name the key,
+    the rule and the value.
     """
     return _Reader(spec, folder).problem(source)
 
@@ -50,7 +46,11 @@ class _Reader:
         taken |= set(self.disturbances)
         self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
         self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
-        checked_names("definitions", list(spec.definitions), taken | set(self.parameters))
+        taken |= set(self.parameters)
+        checked_names("networks", list(spec.networks), taken)
+        paths = {name: self.file(value, f"networks.{name}") for name, value in spec.networks.items()}
+        self.networks = {name: network(path, name=name).data for name, path in paths.items()}
+        checked_names("definitions", list(spec.definitions), taken | set(self.networks))
 
     def problem(self, source: Mapping[str, Any] | None) -> Problem:
         spec = self.spec
@@ -68,6 +68,7 @@ class _Reader:
             plan=self.plan(),
             cost=None if spec.cost is None else self.weights(spec.cost),
             domain=None if spec.domain is None else self.box(spec.domain.box, "domain.box", np.inf),
+            leaving="unsafe" if spec.domain is None else spec.domain.leaving,
             name=spec.name,
             parameters=self.parameters,
             source=source,
@@ -101,11 +102,7 @@ class _Reader:
         return np.array(rows, dtype=float)
 
     def function(
-        self,
-        texts: Sequence[float | str],
-        inputs: Sequence[str],
-        where: Sequence[str],
-        shape: tuple[int, ...],
+        self, texts: Sequence[float | str], inputs: Sequence[str], where: Sequence[str], shape: tuple[int, ...]
     ) -> Tape:
         """The tape of expressions over ``inputs``, with the parameters put in and the definitions used."""
         graph = Graph(inputs)
@@ -122,12 +119,11 @@ class _Reader:
         nodes = [self._node(text, graph, names, place) for text, place in zip(texts, where)]
         return graph.tape(nodes, shape)
 
-    @staticmethod
     def _node(
-        text: float | str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str
+        self, text: float | str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str
     ) -> int:
         try:
-            return parse(text, graph, names, where) if isinstance(text, str) else graph.const(text)
+            return parse(text, graph, names, where, self.networks) if isinstance(text, str) else graph.const(text)
         except _ForbiddenError as error:
             raise _ForbiddenError(f"`{where}`: {error}") from None
 
@@ -180,6 +176,9 @@ class _Reader:
         if not table:
             return None
         ends = np.array([self.array(pair, f"{where}.{name}") for name, pair in table.items()])
+        for name, (low, high) in zip(table, ends):
+            if low > high:
+                raise ValueError(f"`{where}.{name}` must be [low, high], got {low:g} > {high:g}; swap the two.")
         return sets.Box(ends[:, 0], ends[:, 1])
 
     def diffusion(self) -> dict[str, Any]:
@@ -197,13 +196,24 @@ class _Reader:
             value = [[value]] if len(self.states) == 1 else value
         if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
             return {"diffusion": self.array(value, "noise.diffusion")}
+        return {"diffusion": self.expressions(value, "noise.diffusion")}
+
+    def expressions(self, value: list[Any], name: str) -> Tape:
+        """A matrix of expressions in t and the states."""
         rows: list[list[float | str]] = [list(row) for row in value if isinstance(row, list)]
         texts = [entry for row in rows for entry in row]
         shape = (len(rows), len(rows[0]))
         if len(texts) != shape[0] * shape[1] or any(len(row) != shape[1] for row in rows):
-            raise ValueError("`noise.diffusion` must have rows of equal length.")
-        where = [f"noise.diffusion.{k // shape[1]}.{k % shape[1]}" for k in range(len(texts))]
-        return {"diffusion": self.function(texts, ("t", *self.states), where, shape)}
+            raise ValueError(f"`{name}` must have rows of equal length.")
+        where = [f"{name}.{k // shape[1]}.{k % shape[1]}" for k in range(len(texts))]
+        return self.function(texts, ("t", *self.states), where, shape)
+
+    def gain(self, value: Any, name: str) -> Array | Tape:
+        """G: numbers, or expressions in t and the states."""
+        if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
+            return self.matrix(value, name)
+        tape = self.expressions(value, name)
+        return tape if any(sources(tape)) else self.matrix(value, name)
 
     def law(self) -> dict[str, Any]:
         table = self.spec.noise
@@ -231,7 +241,7 @@ class _Reader:
         level = {key: self.array(value, f"noise.{key}") for key, value in entries.items()}
         result: dict[str, Any] = {"noise": build(**level, **tables, **flags)}
         if table.matrix is not None:
-            result["noise_matrix"] = self.matrix(table.matrix, "noise.matrix")
+            result["noise_matrix"] = self.gain(table.matrix, "noise.matrix")
         return result
 
     # the plan, the cost, the sets
@@ -241,8 +251,10 @@ class _Reader:
         if table is None:
             return None
         if set(table) == {"file"} and "file" not in self.inputs:
-            return read_plan(self.plan_path(table["file"]), self.inputs)
+            return read_plan(self.file(table["file"], "plan.file"), self.inputs)
         for key in table:
+            if not self.inputs:
+                raise ValueError(f"`plan.{key}` must be an input, and the file has none; give an [inputs] table.")
             if key not in self.inputs:
                 raise ValueError(f"unknown key {key!r} in [plan]{nearest(key, [*self.inputs, 'file'])}")
         for name in self.inputs:
@@ -252,10 +264,10 @@ class _Reader:
         texts = [table[name] for name in self.inputs]
         return self.function(texts, ("t", *self.states), where, (len(self.inputs),))
 
-    def plan_path(self, value: Any) -> Path:
+    def file(self, value: Any, where: str) -> Path:
         path = Path(str(value))
         if self.folder is None or path.is_absolute() or ".." in path.parts or not isinstance(value, str):
-            raise ValueError(f"`plan.file` must be a file in the problem file's folder, got {value!r}.")
+            raise ValueError(f"`{where}` must be a file in the problem file's folder, got {value!r}.")
         return self.folder / path
 
     def weights(self, cost: Cost) -> tuple[Array, Array]:
@@ -269,8 +281,8 @@ class _Reader:
 
     def box(self, table: Any, where: str, missing: float | None, center: Any = None) -> sets.Box:
         pairs, coordinates = self.by_state(table, where)
-        ends = [self.array(pair, f"{where}.{k}") for k, pair in enumerate(pairs)]
         indices = range(len(self.states)) if coordinates is None else coordinates
+        ends = [self.array(pair, f"{where}.{self.states[k]}") for k, pair in zip(indices, pairs)]
         if missing is None and len(ends) != len(self.states):
             absent = [name for k, name in enumerate(self.states) if k not in indices]
             raise ValueError(f"`{where}` must bound every state, {', '.join(absent)} is missing.")
@@ -342,6 +354,7 @@ class _Reader:
 
     def stays(self, table: Constraint, where: str) -> list[Any]:
         """Staying in an intersection is staying in each of its parts."""
+        _refuse_then(table, where)
         during = None if table.during is None else self.array(table.during, f"{where}.during")
         return [sets.Inside(part, during=during, label=table.label) for part in self.parts(table, where)]
 
@@ -350,6 +363,9 @@ class _Reader:
         whole, outward = table.all is not None, kind is sets.Outside
         parts = self.parts(table, where, outward=outward)
         region = sets.intersection(parts, dimension=len(self.states), outward=outward) if whole else parts[0]
+        if kind is sets.Reach:
+            return kind(region, during=during, label=table.label, then=table.then)
+        _refuse_then(table, where)
         return kind(region, during=during, label=table.label)
 
     def parts(self, table: Constraint, where: str, *, outward: bool = False) -> list[Any]:
@@ -384,6 +400,11 @@ class _Reader:
                 center = self.place(full, f"{where}.center")[0]
             return self.box(table.box, where, np.inf, center)
         return self.shape(getattr(table, table.chosen), table.chosen, where)
+
+
+def _refuse_then(table: Constraint, where: str) -> None:
+    if table.then is not None:
+        raise ValueError(f"`{where}.then` must be omitted, got {table.then!r}; it says what follows in a [[reach]].")
 
 
 _SHAPES: dict[str, Any] = {shape.kind: shape for name in sets.__all__ if hasattr(shape := getattr(sets, name), "kind")}

@@ -100,6 +100,7 @@ class DomainTable(_Table):
 
     title: ClassVar[str] = "[domain]"
     box: Intervals
+    leaving: Literal["unsafe", "ends"] = "unsafe"
 
 
 class _Choice(_Table):
@@ -172,6 +173,7 @@ class Constraint(_Shapes):
     choices: ClassVar[tuple[str, ...]] = (*_Shapes.choices, "all")
     all: Annotated[list[Part], Field(min_length=1)] | None = None
     during: Pair | None = None
+    then: Literal["stay"] | None = None
     label: str | None = None
 
 
@@ -209,6 +211,7 @@ class Specification(_Table):
     inputs: dict[str, Pair] = {}
     disturbances: dict[str, Pair] = {}
     uncertain: dict[str, Pair] = {}
+    networks: dict[str, str] = {}
     definitions: dict[str, Number] = {}
     plan: dict[str, Number] | None = None
     cost: Cost | None = None
@@ -233,11 +236,30 @@ def explain(error: ValidationError) -> str:
     for fault in error.errors():
         keys = [str(part) for part in fault["loc"] if not (isinstance(part, str) and _is_machinery(part))]
         message = fault["msg"].removeprefix("Value error, ")
-        message = message[:1].lower() + message[1:]
-        line = f"`{'.'.join(keys)}`: {message}" if keys else message
+        key, plain = ".".join(keys), _PLAIN.get(fault["type"], "").format(**fault.get("ctx", {}))
+        if key in ("stay", "avoid", "reach") and fault["type"] == "list_type":
+            plain = f"must be a list of tables; write [[{key}]]"
+        if any(line.startswith((f"`{key}`", f"`{key}.")) for line in lines) and plain:
+            continue  # another alternative of what was refused already
+        line = f"`{key}` {plain}" if plain else f"`{key}`: {message[:1].lower()}{message[1:]}"
+        line = line if keys else line.removeprefix("``: ")
         if line not in lines:
             lines.append(line)
     return ", and ".join(lines[:4]) + (", and more" if len(lines) > 4 else "") + "."
+
+
+_PLAIN = {
+    "missing": "is missing",
+    "list_type": "must be a list, such as [0, 1]",
+    "dict_type": "must be a table, such as {{ x = 0 }}",
+    "mapping_type": "must be a table, such as {{ x = 0 }}",
+    "too_short": "must have at least {min_length} entries, got {actual_length}",
+    "too_long": "must have at most {max_length} entries, got {actual_length}",
+    "float_parsing": "must be a number",
+    "float_type": "must be a number",
+    "string_type": "must be a text in quotes",
+}
+"""What pydantic's kinds of faults are in the words of this program."""
 
 
 def _is_machinery(part: str) -> bool:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
+from certbound.arrays import Array
 from certbound.problem import sets
 from certbound.problem.files.formulas import formulas
-from certbound.problem.files.reading import RESERVED
+from certbound.problem.files.parser import RESERVED
 from certbound.problem.files.schema import Constraint, Start
-from certbound.problem.model import Tape
+from certbound.problem.model import Network, Tape
 from certbound.problem.noise import check_law
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
@@ -25,14 +27,41 @@ def content_of(problem: Problem, plan_file: str) -> dict[str, Any]:
     content = copy.deepcopy(dict(problem.source))
     if isinstance(problem.plan, np.ndarray):
         content["plan"] = {"file": plan_file}
+    if "networks" in content:
+        content["networks"] = network_files(problem, plan_file)
     return content
+
+
+def networks_of(problem: Problem) -> dict[str, Network]:
+    """The networks that a problem calls, by names that no two of them share."""
+    system = problem.system
+    tapes = [system.dynamics, problem.plan, system.diffusion if isinstance(system, ContinuousSystem) else None]
+    found: dict[str, Network] = {}
+    taken = {*RESERVED, *system.states, *system.input_names, *system.disturbance_names, *problem.parameters}
+    for tape in tapes:
+        for node in tape.nodes if isinstance(tape, Tape) else ():
+            if node.part is not None and not any(known is node.part.network for known in found.values()):
+                plain = re.sub(r"\W", "_", node.part.network.name) or "network"
+                plain = f"n_{plain}" if plain[0].isdigit() else plain
+                name, number = plain, 1
+                while name in found or name in taken:
+                    number += 1
+                    name = f"{plain}_{number}"
+                found[name] = node.part.network
+    return found
+
+
+def network_files(problem: Problem, plan_file: str) -> dict[str, str]:
+    """Files of the networks, beside that of the plan."""
+    stem = plan_file.removesuffix(".plan.json")
+    return {name: f"{stem}.{name}.npz" for name in networks_of(problem)}
 
 
 def describe_problem(problem: Problem, plan_file: str) -> dict[str, Any]:
     """Content of the problem file of any problem, with its model as expressions.
 
     ``plan_file`` is the name to put under ``plan.file`` where the plan is an array (the caller writes it). A model that
-    uses what problem files do not have (np.where, np.sign, ...) is a ValueError.
+    uses what problem files do not have (the kink of a derivative) is a ValueError.
     """
     content = _Writer(problem, plan_file).content()
     return {key: value for key, value in content.items() if value not in ({}, [], None)}
@@ -42,12 +71,13 @@ class _Writer:
     def __init__(self, problem: Problem, plan_file: str) -> None:
         self.problem, self.system, self.plan_file = problem, problem.system, plan_file
         self.states = problem.system.states
+        self.networks = {network: name for name, network in networks_of(problem).items()}
         self.definitions: dict[str, str] = {}
         self.fresh = self._fresh()
 
     def _fresh(self) -> Iterator[str]:
         system = self.system
-        taken = {*RESERVED, *self.states, *system.input_names, *system.disturbance_names}
+        taken = {*RESERVED, *self.states, *system.input_names, *system.disturbance_names, *self.networks.values()}
         number = 0
         while True:
             number += 1
@@ -55,7 +85,7 @@ class _Writer:
                 yield f"s{number}"
 
     def texts(self, tape: Tape) -> list[str]:
-        definitions, texts = formulas(tape, self.fresh)
+        definitions, texts = formulas(tape, self.fresh, self.networks)
         self.definitions |= definitions
         return texts
 
@@ -76,17 +106,24 @@ class _Writer:
             "inputs": self.signal(system.inputs, system.input_names),
             "disturbances": {name: ends for name, ends in bounded.items() if name not in problem.unknown},
             "uncertain": {name: ends for name, ends in bounded.items() if name in problem.unknown},
+            "networks": network_files(problem, self.plan_file),
             "definitions": self.definitions,
             "dynamics": dynamics,
             "plan": plan,
             "cost": cost and {"Q": _rows(cost[0]), "R": _rows(cost[1])},
             "noise": noise,
             "initial": starts[0] if len(starts) == 1 else starts,
-            "domain": None if problem.domain is None else {"box": self.intervals(problem.domain)},
+            "domain": self.domain(),
             "stay": stay,
             "avoid": avoid,
             "reach": [] if problem.reach is None else [self.constraint(problem.reach)],
         }
+
+    def domain(self) -> dict[str, Any] | None:
+        if self.problem.domain is None:
+            return None
+        ends = {"leaving": self.problem.leaving} if self.problem.ending else {}
+        return {"box": self.intervals(self.problem.domain)} | ends
 
     @staticmethod
     def signal(box: sets.Box | None, names: tuple[str, ...]) -> dict[str, Any]:
@@ -103,13 +140,17 @@ class _Writer:
     def noise(self) -> dict[str, Any]:
         system = self.system
         if isinstance(system, ContinuousSystem):
-            if not isinstance(system.diffusion, Tape):
-                return {"diffusion": _rows(system.diffusion)}
-            texts, columns = self.texts(system.diffusion), system.diffusion.shape[1]
-            return {"diffusion": [texts[k : k + columns] for k in range(0, len(texts), columns)]}
+            return {"diffusion": self.entries(system.diffusion)}
         assert isinstance(system, DiscreteSystem)
         check_law(system.noise, "be written")
-        return system.noise.data() | {"matrix": _rows(system.noise_matrix)}
+        return system.noise.data() | {"matrix": self.entries(system.fixed_gain if system.gain is None else system.gain)}
+
+    def entries(self, value: Array | Tape) -> list[list[Any]]:
+        """A matrix of numbers, or of expressions."""
+        if not isinstance(value, Tape):
+            return _rows(value)
+        texts, columns = self.texts(value), value.shape[1]
+        return [texts[k : k + columns] for k in range(0, len(texts), columns)]
 
     def intervals(self, box: sets.Box) -> dict[str, Any]:
         used = self.states if box.coordinates is None else [self.states[k] for k in box.coordinates]
@@ -145,7 +186,9 @@ class _Writer:
         table = self.region(constraint.region)
         if constraint.during is not None:
             table["during"] = list(constraint.during)
-        usual = type(constraint)(constraint.region, constraint.during).named(self.states).label
+        more = {"then": constraint.then} if isinstance(constraint, sets.Reach) and constraint.stays else {}
+        table |= more
+        usual = type(constraint)(constraint.region, constraint.during, **more).named(self.states).label
         return table if constraint.label == usual else table | {"label": constraint.label}
 
     def start(self, start: Any) -> Mapping[str, Any]:

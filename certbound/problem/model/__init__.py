@@ -20,10 +20,21 @@ if TYPE_CHECKING:
         varying_outputs,
         watched,
     )
+    from certbound.problem.model.calling import call_network
     from certbound.problem.model.derivative import jacobian
     from certbound.problem.model.evaluation import compile_numpy, compile_scalar
     from certbound.problem.model.graph import Graph, substitute
-    from certbound.problem.model.operations import OPERATIONS, arithmetic, enclosed, undefined_where
+    from certbound.problem.model.network_data import PARTS, Layer, Network, Part
+    from certbound.problem.model.network_rows import relaxed
+    from certbound.problem.model.operations import (
+        OPERATIONS,
+        ROWS,
+        arithmetic,
+        enclosed,
+        jumps_where,
+        kinks_where,
+        undefined_where,
+    )
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
     from certbound.problem.model.tracing import trace
 
@@ -32,7 +43,10 @@ _HOME = {
     "derivative": "jacobian",
     "evaluation": "compile_numpy compile_scalar",
     "graph": "Graph substitute",
-    "operations": "OPERATIONS arithmetic enclosed undefined_where",
+    "calling": "call_network",
+    "network_rows": "relaxed",
+    "network_data": "PARTS Layer Network Part",
+    "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
     "tracing": "trace",
 }
@@ -41,6 +55,7 @@ __all__ = [
     "adds_plainly",
     "arithmetic",
     "ARITY",
+    "call_network",
     "compile_numpy",
     "compile_scalar",
     "deciding",
@@ -50,9 +65,17 @@ __all__ = [
     "is_zero",
     "jacobian",
     "JUMPS",
+    "jumps_where",
+    "kinks_where",
+    "Layer",
     "needed",
+    "Network",
     "Node",
     "OPERATIONS",
+    "Part",
+    "PARTS",
+    "relaxed",
+    "ROWS",
     "selected",
     "sources",
     "substitute",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from certbound.problem.model.operations import OPERATIONS
+from certbound.problem.model.network_data import Part
+from certbound.problem.model.operations import ROWS
 from certbound.problem.model.tape import JUMPS, Node, Tape, needed
 
 
@@ -14,7 +15,7 @@ def selected(tape: Tape, outputs: list[int], function: Tape | None) -> Tape:
     base = 0 if function is None else len(function.nodes)
     live = needed(tape.nodes, [tape.outputs[output] for output in outputs], base)
     moved: dict[int, int] = {}
-    seen: dict[tuple[str, tuple[int, ...], str], int] = {}
+    seen: dict[tuple[str, tuple[int, ...], str | Part], int] = {}
     nodes: list[Node] = []
     for index, node in enumerate(tape.nodes):
         if not live[index]:
@@ -22,11 +23,11 @@ def selected(tape: Tape, outputs: list[int], function: Tape | None) -> Tape:
         args = node.args if node.op == "input" else tuple(moved[arg] for arg in node.args)
         if node.op in ("add", "mul"):
             args = tuple(sorted(args))
-        key = (node.op, args, float(node.value).hex() if node.op in ("const", "pow") else "")
+        key = (node.op, args, node.part or (float(node.value).hex() if node.op in ("const", "pow") else ""))
         if index < base or key not in seen:
             seen.setdefault(key, len(nodes))
             moved[index] = len(nodes)
-            nodes.append(Node(node.op, args, node.value))
+            nodes.append(node._replace(args=args))
         else:
             moved[index] = seen[key]
     return Tape(inputs=tape.inputs, nodes=tuple(nodes), outputs=tuple(moved[tape.outputs[o]] for o in outputs),
@@ -73,7 +74,7 @@ def deciding(tape: Tape) -> dict[int, set[int]]:
 def edged(tape: Tape) -> bool:
     """Whether a node may jump (but for ``atan2``) or have a kink: derivatives do not tell all of such a function."""
     return any(
-        node.op in JUMPS or (node.op in OPERATIONS and OPERATIONS[node.op].kink is not None) for node in tape.nodes
+        node.op in JUMPS or (node.op in ROWS and ROWS[node.op].kink is not None) for node in tape.nodes
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 from certbound.problem.model.graph import Graph
-from certbound.problem.model.operations import OPERATIONS, operands
+from certbound.problem.model.operations import operands, slope_by
 from certbound.problem.model.tape import Tape
 
 
@@ -45,10 +45,10 @@ def _jacobian(tape: Tape, columns: tuple[int, ...]) -> Tape:
             continue
         total: dict[int, int] = {}
         for position, arg in enumerate(node.args):
-            slopes = OPERATIONS[node.op].slopes
-            if not tangents[arg] or not slopes:
+            slope = slope_by(node, position)
+            if not tangents[arg] or slope is None:
                 continue
-            partial = slopes[position](graph, *operands(node, node.args), index)
+            partial = slope(graph, *operands(node, node.args), index)
             for column, tangent in tangents[arg].items():
                 term = graph.apply("mul", partial, tangent)
                 total[column] = graph.apply("add", total[column], term) if column in total else term

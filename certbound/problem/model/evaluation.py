@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
-from certbound.problem.model.operations import OPERATIONS
+from certbound.problem.model.network_data import Part
+from certbound.problem.model.operations import ROWS
 from certbound.problem.model.tape import Tape
 
 
@@ -69,14 +70,14 @@ def _runner(tape: Tape) -> Callable[[Sequence[Any]], list[Any]]:
                 values[target] = number if not args else inputs[args[0]]
             elif number is None:
                 values[target] = function(*[values[arg] for arg in args])
-            else:
-                values[target] = function(values[args[0]], number)
+            else:  # an exponent, or the part of a network
+                values[target] = function(*[values[arg] for arg in args], number)
         return [values[output] for output in outputs]
 
     return run
 
 
-_Step = tuple[int, Callable[..., Any] | None, tuple[int, ...], float | None]
+_Step = tuple[int, Callable[..., Any] | None, tuple[int, ...], float | Part | None]
 
 
 def _program(tape: Tape) -> tuple[list[_Step], int, dict[int, int]]:
@@ -100,6 +101,6 @@ def _program(tape: Tape) -> tuple[list[_Step], int, dict[int, int]]:
         if not leaf:
             free += [register[arg] for arg in set(node.args) if last[arg] == index]
         register[index] = free.pop() if free else len(set(register.values()))
-        number = node.value if node.op in ("const", "pow") else None
-        program.append((register[index], None if leaf else OPERATIONS[node.op].numpy, args, number))
+        number = node.value if node.op in ("const", "pow") else node.part
+        program.append((register[index], None if leaf else ROWS[node.op].numpy, args, number))
     return program, len(set(register.values())), register

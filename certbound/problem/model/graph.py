@@ -13,6 +13,7 @@ from fractions import Fraction
 from functools import partial
 from typing import Any
 
+from certbound.problem.model.network_data import PARTS, Part
 from certbound.problem.model.operations import OPERATIONS
 from certbound.problem.model.tape import ARITY, Node, Tape, needed
 
@@ -109,9 +110,14 @@ class Graph:
                 return self.const(folded)
         return self._intern(Node("pow", (base,), exponent))
 
+    def part(self, part: Part, args: tuple[int, ...]) -> int:
+        """The node of a part of a network."""
+        return self._intern(Node(part.op, args, 0.0, part))
+
     def arithmetic(self) -> dict[str, Callable[..., int]]:
         """The arithmetic with which ``Tape.evaluate`` copies a tape into this graph."""
         table: dict[str, Callable[..., int]] = {op: partial(self.apply, op) for op in OPERATIONS}
+        table |= dict.fromkeys(PARTS, lambda *given: self.part(given[-1], given[:-1]))
         return table | {"const": self.const, "pow": self.pow}
 
     def _intern(self, node: Node) -> int:

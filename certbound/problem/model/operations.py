@@ -6,13 +6,16 @@ believes nothing of this table; it has one of its own, ``checker/expressions/ope
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import ChainMap
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from certbound.arrays import Mask
+from certbound.problem.model import network_rows as nets
 from certbound.problem.model.tape import Node
 from certbound.rigor import arithmetic as ia
 from certbound.rigor import elementary as iv
@@ -73,7 +76,7 @@ class Operation:
 def arithmetic(column: Literal["numpy", "interval"]) -> dict[str, Callable[..., Any]]:
     """One column as the arithmetic that ``Tape.evaluate`` takes."""
     const: Callable[..., Any] = float if column == "numpy" else Interval.point
-    return {"const": const} | {op: getattr(row, column) for op, row in OPERATIONS.items()}
+    return {"const": const} | {op: getattr(row, column) for op, row in ROWS.items()}
 
 
 def enclosed(node: Node, args: Sequence[Interval]) -> Interval:
@@ -85,18 +88,40 @@ def enclosed(node: Node, args: Sequence[Interval]) -> Interval:
             return iv.sq(args[0])
         if node.op == "sub":
             return Interval.point(np.zeros(args[0].shape))
-    return OPERATIONS[node.op].interval(*operands(node, args))
+    return ROWS[node.op].interval(*operands(node, args))
 
 
 def undefined_where(node: Node, args: Sequence[Interval]) -> Mask | None:
     """The members of a batch on which a node is undefined somewhere; None where it never is."""
-    row = OPERATIONS.get(node.op)
+    row = ROWS.get(node.op)
     return None if row is None or row.undefined is None else np.asarray(row.undefined(*operands(node, args)))
 
 
 def operands(node: Node, args: Sequence[Any]) -> tuple[Any, ...]:
     """The arguments that the table's functions take."""
+    if node.part is not None:
+        return (*args, node.part)
     return (*args, node.value) if node.op == "pow" else tuple(args)
+
+
+def jumps_where(node: Node, value: Interval, args: Sequence[Interval]) -> Mask | None:
+    """The members of a batch on which a node of range ``value`` may jump; None where it never does."""
+    row = ROWS.get(node.op)
+    return None if row is None or row.jump is None else np.asarray(row.jump(value, *operands(node, args)))
+
+
+def kinks_where(node: Node, args: Sequence[Interval]) -> Mask | None:
+    """The members of a batch on which the slope of a node may jump; None where it never does."""
+    row = ROWS.get(node.op)
+    return None if row is None or row.kink is None else np.asarray(row.kink(*operands(node, args)))
+
+
+def slope_by(node: Node, position: int) -> Callable[..., int] | None:
+    """How the derivative of a node by one of its arguments is made; None where all are 0."""
+    if node.part is not None:
+        return partial(nets.slope, position)
+    slopes = ROWS[node.op].slopes
+    return slopes[position] if slopes else None
 
 
 def _truth(comparison: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
@@ -143,9 +168,11 @@ def _power_slope(g: Builder, a: int, exponent: float, node: int) -> int:
     return g.apply("mul", g.const(exponent), g.apply("div", node, a))
 
 
-def _step(numpy: Callable[..., Any], kernel: str, interval: Callable[..., Interval]) -> Operation:
+def _step(
+    numpy: Callable[..., Any], kernel: str, interval: Callable[..., Interval], *, in_files: bool = False
+) -> Operation:
     """An operation that jumps and is constant beside that."""
-    return Operation(numpy, kernel, interval, ts.jump(interval), jump=_split)
+    return Operation(numpy, kernel, interval, ts.jump(interval), jump=_split, in_files=in_files)
 
 
 def _function(
@@ -213,8 +240,8 @@ OPERATIONS: dict[str, Operation] = {
     ),
     "abs": _function(np.abs, "abs({0})", iv.abs_, ts.abs_, lambda g, a, y: g.apply("kink", a), kink=_holds_zero),
     "kink": Operation(np.sign, _SIGN, iv.kink, ts.kink, kink=_holds_zero),
-    "sign": _step(np.sign, _SIGN, iv.sign),
-    "floor": _step(np.floor, "np.floor({0})", iv.floor),
+    "sign": _step(np.sign, _SIGN, iv.sign, in_files=True),
+    "floor": _step(np.floor, "np.floor({0})", iv.floor, in_files=True),
     "not": _step(lambda a: np.asarray(np.equal(a, 0), dtype=float)[()], "(1.0 if {0} == 0.0 else 0.0)", iv.not_),
     "pow": Operation(
         lambda base, exponent: np.power(np.asarray(base, dtype=float), exponent), "{0} ** {1}", iv.pow_, ts.power,
@@ -264,3 +291,11 @@ OPERATIONS: dict[str, Operation] = {
     ),
 }  # fmt: skip
 """Operation name to its row (``const`` and ``input``, which compute nothing, have none)."""
+
+_PARTS: dict[str, Operation] = {
+    "network": Operation(nets.numpy, "", nets.interval, nets.series),
+    "bent": Operation(nets.numpy, "", nets.interval, nets.series, kink=nets.kinked),
+    "jumping": Operation(nets.numpy, "", nets.interval, nets.series, jump=nets.jumps),
+}
+ROWS: Mapping[str, Operation] = ChainMap(OPERATIONS, _PARTS)
+"""The same with the parts of networks, which have as many arguments as their network and the part as a last one."""

@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
+from certbound.problem.model.network_data import PARTS, Part
+
 T = TypeVar("T")
 
 ARITY: dict[str, int] = {
@@ -37,12 +39,21 @@ class Node(NamedTuple):
     """One operation: ``args`` are indices of earlier nodes.
 
     ``value`` is the number of a ``const`` node and the exponent of a ``pow`` node; an ``input`` node has its
-    slot as its only argument.
+    slot as its only argument. A node of ``network_data.PARTS`` is the ``part`` of a network, with the inputs of that
+    as arguments.
     """
 
     op: str
     args: tuple[int, ...] = ()
     value: float = 0.0
+    part: Part | None = None
+
+    @property
+    def arity(self) -> int | None:
+        """The number of arguments that the operation has; None for an unknown one."""
+        if self.op in PARTS:
+            return None if self.part is None or self.part.op != self.op else self.part.network.inputs
+        return ARITY.get(self.op)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -60,7 +71,7 @@ class Tape:
             limit = len(self.inputs) if node.op == "input" else index
             if any(not 0 <= arg < limit for arg in node.args):
                 raise ValueError(f"`nodes` must refer to earlier nodes only; node {index} is {node}.")
-            if len(node.args) != ARITY.get(node.op):
+            if len(node.args) != node.arity:
                 raise ValueError(f"`nodes` holds an unknown operation or arity: node {index} is {node}.")
         if any(not 0 <= output < len(self.nodes) for output in self.outputs):
             raise ValueError("`outputs` must be indices of nodes.")
@@ -71,7 +82,8 @@ class Tape:
         Parameters
         ----------
         arithmetic : mapping
-            Operation name to function; ``const`` maps a float, ``pow`` maps (base, exponent as float).
+            Operation name to function; ``const`` maps a float, ``pow`` maps (base, exponent as float), and the parts of
+            networks have the part as a last argument.
         inputs : sequence
             One value per input slot, of whatever type the arithmetic works on.
         """
@@ -85,6 +97,8 @@ class Tape:
                 values.append(arithmetic["const"](node.value))
             elif node.op == "pow":
                 values.append(arithmetic["pow"](values[node.args[0]], node.value))
+            elif node.part is not None:
+                values.append(arithmetic[node.op](*(values[arg] for arg in node.args), node.part))
             else:
                 values.append(arithmetic[node.op](*(values[arg] for arg in node.args)))
         return [values[output] for output in self.outputs]
@@ -108,6 +122,9 @@ class Tape:
             return f"({parts[0]} {infix[node.op]} {parts[1]})"
         if node.op in ("pow", "sq"):
             return f"{parts[0]}**{2 if node.op == 'sq' else node.value:g}"
+        if node.part is not None:
+            slopes = "".join(f", d{place}" for place in node.part.by)
+            return f"{node.part.network.name}({', '.join(parts)})[{node.part.output}{slopes}]"
         return f"-{parts[0]}" if node.op == "neg" else f"{node.op}({', '.join(parts)})"
 
 

@@ -86,14 +86,30 @@ class Reach(Inside):
         When the target counts; the whole horizon when omitted, and (T, T) is one time.
     label : str, optional
         Short text for humans.
+    then : str, optional
+        "stay": from its first entry the state stays in the target until the horizon, or fails (discrete time). Without
+        it what comes after does not count.
     """
 
+    then: Any = None
+
     word: ClassVar[str] = "reach"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.then not in (None, "stay"):
+            raise ValueError(f'`then` must be "stay" or omitted, got {self.then!r}.')
+
+    @property
+    def stays(self) -> bool:
+        """Whether the target is not to be left again."""
+        return self.then is not None
 
     def named(self, states: tuple[str, ...]) -> Any:
         if self.label is not None:
             return self
-        return replace(self, label=f"reach {self.region.describe(states, 'inside').removeprefix('inside ')}")
+        where = self.region.describe(states, "inside").removeprefix("inside ")
+        return replace(self, label=f"reach {'and stay ' if self.stays else ''}{where}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
+from certbound.display import log10_text
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear import answer_tubes
 from certbound.reach.linear.answer_tubes import DeviationTube
@@ -54,6 +55,16 @@ class LinearAnswer:
     def _tightest(self) -> tuple[Requirement | None, int, float]:
         return self.run.tightest(self.shown)
 
+    @cached_property
+    def rooms(self) -> list[tuple[Requirement, Array]]:
+        """Every requirement with the room that the problem's delta leaves of it on each piece; ``margin`` is the least.
+
+        Each is measured along its own direction; empty where nothing was bounded.
+        """
+        if self.shown.bounds is None:
+            return []
+        return list(zip(self.run.requirements[self.shown.cell], self.run.left(self.shown).T))
+
     @property
     def margin(self) -> float:
         """Room left at the problem's delta, in the units of the tightest constraint.
@@ -87,7 +98,14 @@ class LinearAnswer:
             )
         if self.margin == -np.inf:
             return f"no bound of the deviation was found that the room of '{self.constraint}' could be compared with"
-        return f"the room of '{self.constraint}' at t = {self.time:.4g} is {self.margin:.4g}"
+        asked, logs = self.run.requirements[self.outcome.cell], self.outcome.logs
+        if not asked or len(logs) != len(asked) or self.log10_delta >= 0:
+            return f"the noise takes more than the room of '{self.constraint}' at t = {self.time:.4g}"
+        worst = int(np.argmax(logs))
+        part = f"{log10_text(min(logs[worst] / np.log(10.0), 0.0))} for '{asked[worst].label}'"
+        left = log10_text(min(self.outcome.nonlinear.log / np.log(10.0), 0.0))
+        rest = f", and {left} is spent on bounding the remainder of the linearisation" if self.run.curved else ""
+        return f"the largest part of that probability is {part}{rest}"
 
     @cached_property
     def tube(self) -> DeviationTube | None:
@@ -170,6 +188,14 @@ class SplitAnswer(LinearAnswer):
     @cached_property
     def _tightest(self) -> tuple[Requirement | None, int, float]:
         return min((part._tightest for part in self.parts), key=lambda found: found[2])
+
+    @cached_property
+    def rooms(self) -> list[tuple[Requirement, Array]]:
+        """The least over the cells; see `LinearAnswer.rooms`."""
+        found = [part.rooms for part in self.parts]
+        if not all(found):
+            return []
+        return [(same[0][0], np.min([room for _, room in same], axis=0)) for same in zip(*found)]
 
     @cached_property
     def tube(self) -> DeviationTube | None:

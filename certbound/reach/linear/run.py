@@ -219,6 +219,14 @@ class LinearRun(Inclusion):
         asked = self.requirements[outcome.cell]
         if not asked:
             return None, 0, np.inf
+        left = self.left(outcome)
+        piece, tightest = divmod(int(np.argmin(left)), len(asked))
+        return asked[tightest], piece, float(left[piece, tightest])
+
+    def left(self, outcome: Outcome) -> Array:
+        """The room that the problem's delta, shared evenly, leaves of every requirement on every piece: (K, R)."""
+        assert outcome.bounds is not None
+        asked = self.requirements[outcome.cell]
         rooms = self.rooms(outcome.cell, outcome.bounds)
         kept = self.kept.get(outcome.nonlinear, (None, []))[1]
         events = kept[outcome.cell] if kept else self.events(outcome.cell, outcome.nonlinear.common(self.inner))
@@ -229,8 +237,7 @@ class LinearRun(Inclusion):
             level = level_along(event, target) if event.profile.max() > 0 else np.zeros(len(rooms))
             asking = np.isfinite(rooms[:, index])  # elsewhere no level, however large, takes the room
             left[:, index] = np.where(asking, rooms[:, index] - np.where(asking, level, 0.0), rooms[:, index])
-        piece, tightest = divmod(int(np.argmin(left)), len(asked))
-        return asked[tightest], piece, float(left[piece, tightest])
+        return left
 
 
 def correlated(events: StepEvents, asked: list[Requirement], rooms: Array, shared: float, logs: list[float]) -> float:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
+from certbound.problem.goals import check_end
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.reach.nominal.series import expand
@@ -39,6 +40,7 @@ class Flow:
     dimension: int = field(init=False)
 
     def __post_init__(self) -> None:
+        check_end(self.problem, "a noise-free trajectory")
         object.__setattr__(self, "tape", self.problem.closed_loop)
         object.__setattr__(self, "dimension", self.problem.system.dimension)
 

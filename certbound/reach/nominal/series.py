@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from certbound.problem.model import JUMPS, OPERATIONS, Tape
+from certbound.problem.model import JUMPS, ROWS, Tape
 from certbound.rigor.arithmetic import Interval
 from certbound.rigor.series import ZERO, Series
 
@@ -65,12 +65,12 @@ def taylor_bounds(centre: Series, piece: Series, span: Interval) -> list[Interva
 
 def series_arithmetic(order: int) -> dict[str, Callable[..., Any]]:
     """Arithmetic for ``Tape.evaluate`` whose values are series cut after ``order``."""
-    table: dict[str, Callable[..., Any]] = {op: partial(_applied, op, order) for op in OPERATIONS}
+    table: dict[str, Callable[..., Any]] = {op: partial(_applied, op, order) for op in ROWS}
     return table | {"const": lambda value: [Interval.point(value)]}
 
 
 def _applied(op: str, order: int, *args: Any) -> Series:
-    row = OPERATIONS[op]
+    row = ROWS[op]
     jumps = op in JUMPS or op in ("kink", "pow")
     if not jumps and all(len(x) == 1 for x in args):
         return [row.interval(*(x[0] for x in args))]

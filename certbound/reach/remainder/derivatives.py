@@ -20,6 +20,7 @@ from certbound.problem.model import (
     watched,
 )
 from certbound.problem.problem import Problem
+from certbound.problem.systems import ContinuousSystem
 from certbound.reach.remainder.frame import Frame
 from certbound.rigor.intervals import Interval
 
@@ -39,6 +40,9 @@ class Derivatives:
     second_index: list[tuple[int, int]] = field(init=False)
     sources: list[list[int]] = field(init=False)  # states that every such entry depends on
     kinked: bool = field(init=False)  # whether abs, min or max let the Jacobian jump
+    # whether planes bound it better than second derivatives do: networks have too many kinks to cut boxes at them, and
+    # without motion in time nothing else needs their derivatives
+    planar: bool = field(init=False)
     timed: list[int] = field(init=False)  # outputs that depend on time explicitly
     # f, its varying entries, their derivatives, derivatives by time, and the one by the disturbance
     value: Tape = field(init=False)
@@ -64,7 +68,7 @@ class Derivatives:
             low[fixed], high[fixed] = values.broadcast_to((1, len(fixed))).lo[0], values.hi.reshape(-1)
         varying = selected(first, entries, tape)
         # where the Jacobian has kinks its own nodes are kept: as jumps they tell on which boxes it is smooth
-        kinked = any(node.op == "kink" for node in varying.nodes)
+        kinked = any(node.op in ("kink", "bent") for node in varying.nodes)
         second = jacobian(varying, [0, *states])
         kept = [o for o in range(len(entries) * (n + 1)) if not is_zero(second, o)]
         slots_of = sources(varying)
@@ -74,6 +78,7 @@ class Derivatives:
         kept = [o for (i, j, k), o in named.items() if k < 0 or j <= k or (i, k, j) not in named]
         q = len(self.problem.system.disturbance_names)
         slots = list(range(len(tape.inputs) - q, len(tape.inputs)))
+        continuous = isinstance(self.problem.system, ContinuousSystem)
         time = jacobian(tape, [0])
         timed = [i for i in range(n) if not is_zero(time, i)]
         by_time = selected(time, timed, tape)
@@ -87,6 +92,7 @@ class Derivatives:
             "sources": [sorted(slot - 1 for slot in found if 1 <= slot <= n) for found in slots_of],
             "second": watched(selected(second, kept, varying)) if kinked else selected(second, kept, tape),
             "kinked": kinked,
+            "planar": any(node.op == "bent" or (node.part and not continuous) for node in tape.nodes),
             "time": by_time,
             "timed": timed,
             "time2": jacobian(by_time, [0]) if timed else by_time,

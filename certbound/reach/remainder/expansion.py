@@ -19,9 +19,10 @@ from certbound.arrays import Array, Index, Mask
 from certbound.constants.enclosures import enclose
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.frame import Frame
+from certbound.reach.remainder.lines import follow_lines
 from certbound.reach.remainder.nominal_defect import NominalDefect, product
 from certbound.reach.remainder.polytope import Boxes, Polytope, linear_range
-from certbound.rigor.intervals import Interval
+from certbound.rigor.intervals import Interval, stack
 
 _UNIT = 2.0**-53
 _WIDE = 1 + 1e-11  # covers the rounding errors of every sum of radii
@@ -57,6 +58,7 @@ class _Enclosed:
     wide: list[Interval]
     first: Interval | None
     second: Interval | None
+    planes: Interval | None  # slopes of planes in place of the first derivatives
 
 
 class Expansion:
@@ -91,7 +93,12 @@ class Expansion:
         self.nominal = NominalDefect(model, frame) if frame.half else None
 
     def parts(self, boxes: Boxes) -> Parts:
-        """The expansions on boxes; to first order, with the Jacobian over the whole box, where it may jump."""
+        """The expansions on boxes; to first order, with the Jacobian over the whole box, where it may jump.
+
+        The kinks of networks are bounded by planes instead: beta is a linear function up to their distance.
+        """
+        if self.model.planar:
+            return self._expanded(boxes, order=1)
         parts = self._expanded(boxes, order=2)
         if not self.model.kinked or not parts.bad.any():
             return parts
@@ -106,7 +113,7 @@ class Expansion:
         held, value, bad = self._enclosed(boxes, order)
         with np.errstate(invalid="ignore", over="ignore"):
             lower, upper, middle = self._values(boxes, value, *self._base(boxes.items, order))
-            gradient, blur = self._gradients(boxes.items, held.first)
+            gradient, blur = self._gradients(boxes.items, held.first if held.planes is None else held.planes)
             spend = np.zeros((*lower.shape, len(self.active)))
             if order == 2:
                 plus, minus, spend = self._curvature(held)
@@ -139,12 +146,16 @@ class Expansion:
         thin = f.middle[items] + shift
         slots = model.slots(f.middle_time[items], thin, f.inputs[items], f.disturbance_middle)
         wide = model.slots(f.span[items], thin + Interval(-reach, reach), f.inputs[items], f.disturbance_middle)
-        value = enclose(model.value, slots, undefined="infinite").broadcast_to((count, n))
+        planes: Interval | None = None
+        if model.planar:
+            value, planes = self._planes(slots, boxes.radius)
+        else:
+            value = enclose(model.value, slots, undefined="infinite").broadcast_to((count, n))
         bad = _infinite(value)
         if model.jumping:  # no derivative shows a jump: it must be decided over the whole box and piece
             bad = bad | _infinite(enclose(model.value, wide, undefined="infinite").broadcast_to((count, n)))
         first = second = None
-        if entries:
+        if entries and (planes is None or f.half):
             where = slots if order == 2 else wide
             first = enclose(model.varying, where, undefined="infinite").broadcast_to((count, entries))
             bad = bad | _infinite(first)
@@ -152,7 +163,21 @@ class Expansion:
             columns = len(model.second.outputs)
             second = enclose(model.second, wide, undefined="infinite").broadcast_to((count, columns))
             bad = bad | _infinite(second)
-        return _Enclosed(boxes=boxes, reach=reach, slots=slots, wide=wide, first=first, second=second), value, bad
+        held = _Enclosed(
+            boxes=boxes, reach=reach, slots=slots, wide=wide, first=first, second=second, planes=planes
+        )  # fmt: skip
+        return held, value, bad
+
+    def _planes(self, slots: list[Interval], radius: Array) -> tuple[Interval, Interval]:
+        """What planes leave of f (Q, n), and their slopes by the varying entries (Q, E)."""
+        count = len(radius)
+        lines = follow_lines(self.model.value, slots, {1 + j: radius[:, a] for a, j in enumerate(self.active)})
+        rests = [line.rest.broadcast_to((count,)) for line in lines]
+        nothing = Interval.point(np.zeros(count))
+        slopes = [
+            lines[i].coefficients.get(1 + int(self.active[a]), nothing).broadcast_to((count,)) for i, a in self.entries
+        ]
+        return stack(rests, axis=1), stack(slopes, axis=1) if slopes else nothing[:, None][:, :0]
 
     def _first_motion(self, held: _Enclosed) -> tuple[Array, Array]:
         """The motion over the piece, by the rate of beta over the whole box and piece: of beta, of its slopes."""

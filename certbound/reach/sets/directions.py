@@ -75,7 +75,7 @@ def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
     found = []
     for number, constraint in enumerate(problem.constraints):
         own, needed = number if number < len(problem.safe) else -1, curve.required(constraint.during)
-        for label, rows, room in _constraint(constraint, curve):
+        for label, rows, room in _constraint(constraint, curve, problem.system.states):
             found.append(Requirement(label=label, constraint=own, rows=rows, room=np.where(needed, room, np.inf)))
     return found
 
@@ -83,7 +83,7 @@ def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
 Rows = Iterator[tuple[str, Array, Array]]
 
 
-def _constraint(constraint: Inside, curve: NominalPieces) -> Rows:
+def _constraint(constraint: Inside, curve: NominalPieces, states: tuple[str, ...]) -> Rows:
     region, label = constraint.region, str(constraint.label)
     match region.form:
         case Quadratic() as form if constraint.outside:
@@ -96,8 +96,19 @@ def _constraint(constraint: Inside, curve: NominalPieces) -> Rows:
             a, b = _facets(region, form, curve)
             for index in range(len(a)):
                 rows = np.broadcast_to(a[index], (curve.pieces, a.shape[1])).copy()
-                text = label if len(a) == 1 else f"{label} [side {index + 1}]"
+                text = label if len(a) == 1 else f"{label}, side {index + 1}{_side(region, a[index], index, states)}"
                 yield text, rows, curve.least(rows, b[:, index])
+
+
+def _side(region: Region, row: Array, index: int, states: tuple[str, ...]) -> str:
+    """One side of a resting set as an inequality in brackets."""
+    if region.moving or not isinstance(region.form, Faces):
+        return ""
+    bound = float(region.form.bounds[index] + region.form.normals[index] @ region.center_at())
+    sign = -1.0 if np.count_nonzero(row) == 1 and row.sum() < 0 else 1.0
+    factors = {1.0: "", -1.0: "-"}
+    parts = [f"{factors.get(sign * a, f'{sign * a:g}*')}{name}" for a, name in zip(row, states) if a]
+    return f" ({' + '.join(parts).replace('+ -', '- ')} {'<=' if sign > 0 else '>='} {sign * bound + 0.0:g})"
 
 
 def _outside_facet(region: Region, form: Faces, label: str, curve: NominalPieces) -> tuple[str, Array, Array]:
@@ -197,4 +208,4 @@ def _inside_round(region: Region, form: Quadratic, label: str, curve: NominalPie
         rows = np.broadcast_to(direction, (curve.pieces, k))
         offset = (Interval.point(rows) * centre).sum(axis=-1) + float(form.radius * scale)
         full = region.lifted(rows, curve.controls.shape[2])
-        yield f"{label} [direction {index + 1}]", full, curve.least(full, offset)
+        yield f"{label}, direction {index + 1} of {len(directions)}", full, curve.least(full, offset)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -83,6 +83,8 @@ class ReachTube(Shown):
     method: str = "contraction"
     assumption: str = ""
     norm: Norm = field(init=False, repr=False)
+
+    pictured: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         shape = (self.curve.cells, self.curve.pieces)

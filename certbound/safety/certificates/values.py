@@ -51,6 +51,8 @@ def values_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
 
     CertificateError where the checker knows no proof of what was bounded.
     """
+    if problem.ending:
+        raise CertificateError("the checker counts leaving the domain as failing, and this bound does not.")
     effort = min(attempt, len(_ROOMS) - 1)
     flat = isinstance(answer.details, ExitBounds) and problem.system.dimension > 1
     room = _ROOMS[effort] * (_MORE_ROOM if flat else 1)
@@ -67,11 +69,14 @@ def values_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
 def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
     """The same for the lower bound."""
     effort = min(attempt, len(_ROOMS) - 1)
+    if problem.ending:
+        raise CertificateError("certificates of lower bounds count leaving the domain as failing.")
     if answer.log10_lower is None:
         raise CertificateError("no lower bound was found.")
     if not problem.initial.random and problem.initial.data(_STARTS)["kind"] not in _STARTS:
         raise CertificateError("lower bounds are stated from starts in a box, a ball or an ellipsoid, or normal ones.")
-    claim = _claim_below(answer.log10_lower, problem.delta, _ROOMS[effort])
+    flat = isinstance(answer.details, ExitBounds) and problem.system.dimension > 1
+    claim = _claim_below(answer.log10_lower, problem.delta, _ROOMS[effort] * (_MORE_ROOM if flat else 1))
     if isinstance(answer.details, ExitBounds):
         return _crossing(problem, answer.details, effort), claim, []
     data = _induction(problem, effort, _grids(problem, effort), partial(_outward, problem))
@@ -106,6 +111,11 @@ def _induction(
 
 def _passage(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]:
     """Continuous time: V and what it is paid with; the coarsest one that costs little."""
+    if problem.system.dimension == 3:
+        raise CertificateError(
+            "no certificate states a value function in continuous time and three states yet; `quadratic` and `barrier` "
+            "write certificates of such problems."
+        )
     if not found.proposed:
         raise CertificateError(
             "no value function was found that a certificate can state: in two states it states bounded boxes, no "

@@ -6,6 +6,7 @@ from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.constants import constants_engine
 from certbound.safety.engines.erosion import Erosion, erode
 from certbound.safety.engines.linear import linear_engine
+from certbound.safety.engines.linear_sketch import linear_chance
 from certbound.safety.engines.quadratic import quadratic_engine
 from certbound.safety.engines.rooms import joined
 from certbound.safety.engines.values import values_engine
@@ -17,6 +18,7 @@ __all__ = [
     "erode",
     "Erosion",
     "joined",
+    "linear_chance",
     "linear_engine",
     "quadratic_engine",
     "values_engine",

@@ -31,7 +31,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.nominal import initial_cells
 from certbound.rigor.intervals import Interval
-from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
+from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
 from certbound.watch import poll, solver_limit
 
@@ -76,7 +76,7 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
 
     It covers the disturbances that do not see coming noise.
     """
-    refused = "another engine is enough." if asked.quick else _refusal(problem)
+    refused = SPARED if asked.quick else _refusal(problem)
     if refused is not None:
         return EngineAnswer(applicable=False, reason=refused, method="barrier")
     assert isinstance(problem.system, ContinuousSystem)
@@ -90,7 +90,7 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     level = 0.0
     for degree in _DEGREES[work.n]:
         try:
-            found = work.search(degree, lambda barrier: asked.found(_answer(problem, barrier)))
+            found = work.search(degree, lambda barrier: asked.found(_answer(problem, barrier)), known=best is not None)
         except EngineError:
             if best is None:
                 raise
@@ -155,10 +155,11 @@ class _Work:
 
     # ---- the search ------------------------------------------------------------------------------------------
 
-    def search(self, degree: int, found: Callable[[Barrier], object]) -> Barrier | None:
+    def search(self, degree: int, found: Callable[[Barrier], object], *, known: bool = False) -> Barrier | None:
         """The best polynomial of the convex program, and what is proved of it; ``found`` takes better and better ones.
 
-        Few points first: what they hope for says whether more, which take long, are worth it.
+        Few points first: what they hope for says whether more, which take long, are worth it. Where a bound is
+        ``known`` already, only the target is.
         """
         exponents = np.array([e for e in itertools.product(range(degree + 1), repeat=self.n) if 0 < sum(e) <= degree])
         horizon, target = self.problem.horizon, math.log10(self.problem.delta)
@@ -177,7 +178,8 @@ class _Work:
                 best = proved
                 found(best)
             level = 0.0 if best is None else best.log10_probability(horizon)
-            vain = self.n == _MOST_STATES and (hoped > _FAR * target or (number > 1 and proved is None))
+            vain = known and hoped > target
+            vain = vain or (self.n == _MOST_STATES and (hoped > _FAR * target or (number > 1 and proved is None)))
             if level <= target or vain or (number and level <= hoped + _CLOSE):
                 return best  # more points only raise what is hoped for, and in many states they take many seconds
             if number == 0 and hoped <= _FAR * target:

@@ -7,7 +7,7 @@ import numpy as np
 from certbound.problem.problem import Problem
 from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state, linear_answer
 from certbound.reach.remainder import hidden_jump
-from certbound.safety.answers import AS_IT_IS, Deviation, EngineAnswer, Request
+from certbound.safety.answers import AS_IT_IS, SPARED, Deviation, EngineAnswer, Request
 
 
 def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
@@ -20,7 +20,7 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     if hidden is not None:
         return EngineAnswer(applicable=False, reason=hidden, method="linear")
     if asked.quick and depends_on_state(problem):
-        return EngineAnswer(applicable=False, reason="left out, since another engine has answered.", method="linear")
+        return EngineAnswer(applicable=False, reason=SPARED, method="linear")
     foresight = not depends_on_state(problem)
 
     def found(answer: LinearAnswer) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.quadratic import QuadraticBound, bound_quadratic
-from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
+from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.watch import seconds_left
 
 _SECONDS = 20.0  # about what may be spent
+_SPARED = {3: 5.0, 12: 18.0}  # the same, by the number of states, where other engines are asked too
 _LEAST = 0.1
+_ANY = 0.999  # a target that any bound meets
 _FEW = 3  # states below which value functions on grids say more
 
 
@@ -19,15 +21,17 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     Proves: P(failing) <= 10**log10_delta for every start and every disturbance that does not see coming noise.
     """
     if asked.quick:
-        return EngineAnswer(applicable=False, method="quadratic", reason="left out, since another engine has answered.")
+        return EngineAnswer(applicable=False, method="quadratic", reason=SPARED)
     if not asked.thorough and problem.system.dimension < _FEW:
         reason = "left out, since value functions on grids say more in one or two states; ask for it by name."
         return EngineAnswer(applicable=False, method="quadratic", reason=reason)
     try:
-        limit = max(min(_SECONDS if asked.thorough else _SECONDS / 2, seconds_left()), _LEAST)
+        most = next((most for n, most in _SPARED.items() if problem.system.dimension <= n), _SECONDS)
+        limit = max(min(_SECONDS if asked.thorough else most, seconds_left()), _LEAST)
         best = bound_quadratic(
-            problem, target=problem.delta, seconds=limit, found=lambda bound: asked.found(_answer(bound))
-        )
+            problem, target=_ANY if asked.first else problem.delta, seconds=limit, before=asked.before,
+            found=lambda bound: asked.found(_answer(bound)),
+        )  # fmt: skip
     except (InfeasibleError, EnclosureError) as error:
         return EngineAnswer(applicable=False, method="quadratic", reason=str(error))
     return _answer(best)

@@ -6,16 +6,18 @@ import math
 
 from certbound.display import rounded
 from certbound.errors import EnclosureError, InfeasibleError
-from certbound.problem.goals import until
+from certbound.problem.goals import check_end, until
 from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
-from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
+from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
+from certbound.values.chains import bound_chain
 from certbound.values.continuous import ExitBounds, bound_exits
-from certbound.values.discrete import FailureBounds, bound_failure
+from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
 
 _SECONDS = 20.0  # about what may be spent
+_SPACE = 120.0  # the same for three states in continuous time
 _LEAST = 1e-3
 _FLOOR = -300.0
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
@@ -27,9 +29,13 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     Proves: log10_lower <= log10 of the largest probability of failing over starts and disturbances <= log10_delta.
     """
     if asked.quick:
-        return EngineAnswer(applicable=False, method="values", reason="left out, since another engine has answered.")
-    limit = max(min(_SECONDS if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
+        return EngineAnswer(applicable=False, method="values", reason=SPARED)
+    wide = problem.system.dimension == 3 and not isinstance(problem.system, DiscreteSystem)
+    most = _SPACE if wide else _SECONDS
+    limit = max(min(most if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
     try:
+        if problem.system.time == "continuous":
+            check_end(problem, "a value function in continuous time")
         if problem.reach is None and serves(problem):
             return _continuous(bound_exits_by_steps(problem, seconds=limit))
         if not isinstance(problem.system, DiscreteSystem):
@@ -41,12 +47,24 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
 
 
 def _failure(problem: Problem, limit: float) -> FailureBounds:
+    found = bound_long_run(problem, seconds=limit, delta=problem.delta)
+    if found is not None:
+        return found
     target = problem.reach
-    if target is None:
-        return bound_failure(problem, seconds=limit, delta=problem.delta)
-    first, last = target.during or (0, problem.horizon)
-    plain = until(problem, int(last))
-    return bound_failure(plain, target=target.region, since=int(first), seconds=limit, delta=problem.delta)
+    try:
+        if target is None:
+            return bound_failure(problem, seconds=limit, delta=problem.delta)
+        if not target.stays:
+            first, last = target.during or (0, problem.horizon)
+            plain = until(problem, int(last))
+            return bound_failure(plain, target=target.region, since=int(first), seconds=limit, delta=problem.delta)
+        refused = "a target that is to be stayed in is served in one or two states"
+    except InfeasibleError as error:
+        refused = str(error)
+    try:
+        return bound_chain(problem, seconds=min(2 * limit, seconds_left()), delta=problem.delta)
+    except InfeasibleError as error:
+        raise InfeasibleError(f"{refused.rstrip('.')}; and {error}") from error
 
 
 def _exits(problem: Problem, limit: float) -> ExitBounds:
@@ -76,6 +94,8 @@ def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
     least, most = rounded(found.lower, up=False, digits=4), rounded(found.upper, up=True, digits=4)
     below = f"at least {least}" if found.lower > 0 else "no lower bound"
     reason = f"the probability of failing is at most {most} and {below}, on a grid of {cells} cells"
+    if found.rate is not None and found.before is not None:
+        reason += f". {_for_all(found.rate, found.before)}"
     if found.lower > problem.delta:
         reason += f": more than the {problem.delta!r} that is asked, from some start"
     return EngineAnswer(
@@ -86,6 +106,20 @@ def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
         details=found,
         conclusive=found.upper <= _CLOSE * found.lower,
     )
+
+
+def _for_all(rate: tuple[float, float], before: tuple[int, float, float]) -> str:
+    """What is known of every horizon."""
+    low, high = rounded(rate[0], up=False, digits=4), rounded(rate[1], up=True, digits=4)
+    least, most = rounded(before[1], up=False, digits=4), rounded(before[2], up=True, digits=4)
+    return (
+        f"For every T from {before[0]}: 1 - {_power(least, low, before[0])} <= P(leaving within T steps) <= "
+        f"1 - {_power(most, high, before[0])}"
+    )
+
+
+def _power(share: str, rate: str, steps: int) -> str:
+    return f"(1 - {share})(1 - {rate})^(T - {steps})"
 
 
 def log10_outward(probability: float, *, up: bool) -> float:

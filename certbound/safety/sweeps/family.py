@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import itertools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,7 +145,9 @@ def _takes(source: Any) -> Callable[[str], bool]:
     return lambda name: name in names
 
 
-def _whole(horizon: float) -> int:
+def _whole(horizon: float) -> float:
+    if math.isinf(horizon):
+        return horizon
     if horizon != int(horizon):
         raise ValueError(f"`horizon` counts steps and must be whole, got {horizon:g}.")
     return int(horizon)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 from certbound.display import Shown, name_text
 
@@ -78,6 +78,8 @@ class Sweep(Shown):
     boundaries : tuple of Boundary or None
         Where the status changes along one parameter, for every choice of the others; None where that was not asked.
     """
+
+    pictured: ClassVar[bool] = True
 
     name: str
     delta: float | None

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.problem.problem import DOMAIN
 from certbound.simulation.blocks import Counts, check_count
 from certbound.simulation.checkpoint import seed_of
 from certbound.simulation.estimates.preparation import Setting, prepare
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
 from certbound.simulation.executors import Progress, run_work
-from certbound.simulation.gap_tests import barriers_of, goal_of, tables_of
+from certbound.simulation.gap_tests import barriers_of, goal_of, keep_of, tables_of
 from certbound.simulation.kernel_source import kernel_source
 from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
@@ -133,9 +134,10 @@ def simulate_exits(
     paths, confidence = check_count("paths", paths), check_confidence(confidence)
     setting = prepare(problem, steps, scenario)
     barriers, goal = barriers_of(problem, setting.times), goal_of(problem, setting.times)
-    rows = barriers if goal is None else [*barriers, goal]
+    keep = keep_of(problem, setting.times)
+    rows = [*barriers, *(row for row in (goal, keep) if row is not None)]
     work = setting.work(
-        kernel_source(setting.model, Task(kind="exits", barriers=barriers, goal=goal)),
+        kernel_source(setting.model, Task(kind="exits", barriers=barriers, goal=goal, keep=keep)),
         **tables_of(rows),
         counts_shape=(len(rows), 1 + min(setting.steps, _TIME_BINS)),
         paths=paths,
@@ -143,6 +145,8 @@ def simulate_exits(
     )
     outcome = run_work(work, executor, checkpoint, progress)
     counts = outcome.tally.counts
+    if problem.ending and barriers[-1].label == DOMAIN:  # who left the domain has ended, and does not count
+        rows, counts = [row for row in rows if row is not barriers[-1]], np.delete(counts, len(barriers) - 1, axis=0)
     exits = int(counts.sum())
     lower, upper = bound_binomial(exits, paths, confidence)
     by_constraint: dict[str, int] = {}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.problem.goals import check_end
 from certbound.problem.model import compile_scalar
 from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
 from certbound.simulation.stepping import Scenario, StepModel, step_model
@@ -106,6 +107,7 @@ def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = 
 
 
 def _steps(problem: Any, steps: int | None) -> int:
+    check_end(problem, "a simulation")
     if problem.system.time == "discrete":
         horizon = int(problem.horizon)
         if steps is not None and check_count("steps", steps) != horizon:

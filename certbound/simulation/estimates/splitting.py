@@ -114,6 +114,8 @@ def simulate_rare_exits(
     model = setting.model
     if model.switching > 0.0:
         raise ValueError("`disturbance` must not be 'switching' for rare exits; give a constant, an array or d(t, x).")
+    if problem.ending:
+        raise ValueError("`problem` must count leaving its domain as failing here; use simulate_exits.")
     if problem.reach is not None:
         raise ValueError("`problem` must have no target for rare exits; count plain paths, simulate_exits.")
     own = not setting.shared_nominal

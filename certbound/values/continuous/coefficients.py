@@ -21,7 +21,17 @@ import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.errors import EnclosureError
-from certbound.problem.model import OPERATIONS, Graph, Node, Tape, edged, enclosed, jacobian, undefined_where
+from certbound.problem.model import (
+    Graph,
+    Node,
+    Tape,
+    edged,
+    enclosed,
+    jacobian,
+    jumps_where,
+    kinks_where,
+    undefined_where,
+)
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.polynomials import interpolation, lebesgue, node_product, nodes_of, norm
 
@@ -53,11 +63,9 @@ def enclose(tape: Tape, inputs: Sequence[Interval]) -> tuple[list[Interval], Mas
                 "model on all of it: add constraints (or a `domain`) that keep away from there."
             )
         values.append(enclosed(node, args))
-        row = OPERATIONS.get(node.op)
-        if row is not None and row.kink is not None:
-            edge = edge | row.kink(*args)
-        elif row is not None and row.jump is not None:
-            edge = edge | row.jump(values[-1], *args)
+        own = kinks_where(node, args)
+        own = jumps_where(node, values[-1], args) if own is None else own
+        edge = edge if own is None else edge | own
     return [values[output] for output in tape.outputs], np.broadcast_to(edge, batch)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from certbound.errors import InfeasibleError
+from certbound.problem.goals import check_end
 from certbound.problem.model import Node, Tape, edged, jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box
@@ -44,7 +45,7 @@ class ExitBounds:
     proposed : tuple of (Surface, Payment)
         V of every upper bound that was better than those before, and what it was paid with.
     proposed_below : tuple of (Surface, Payment)
-        The same of the lower bounds, one state.
+        The same of the lower bounds.
     """
 
     upper: float
@@ -63,8 +64,9 @@ def bound_exits(
     Parameters
     ----------
     problem : Problem
-        Continuous time, one or two states, noise of full rank. In one state any limits, windows, moving sets, obstacles
-        and a random start; in two a bounded safe box, or any fixed limits and obstacles, over the whole horizon.
+        Continuous time, up to three states; noise of full rank in one and two. In one state any limits, windows,
+        moving sets, obstacles and a random start; in two a bounded safe box, or any fixed limits and obstacles, over
+        the whole horizon; in three a safe box, which may leave states unbounded, and an upper bound only.
     target : region, optional
         In one state: then the bounds are those of the probability of breaking a constraint before the target is
         entered, or of not entering it by the horizon.
@@ -97,7 +99,7 @@ def bound_exits(
     True
     """
     begin = time.perf_counter()
-    _check(problem, target, seconds)
+    _check(problem, target, seconds, most=3)
     model = _model(problem)
     proposed: Sequence[tuple[Surface, Payment]] = ()
     below: Sequence[tuple[Surface, Payment]] = ()
@@ -110,6 +112,11 @@ def bound_exits(
         from certbound.values.continuous.line import bound_line
 
         upper, least, words, (proposed, below) = bound_line(problem, model, seconds, lower)
+    elif problem.system.dimension == 3:
+        from certbound.values.continuous.space import three_states
+
+        _refuse_random(problem)
+        (upper, words), least = three_states(problem, model, begin + seconds), None
     elif walled(problem):
         _refuse_random(problem)
         upper, least, words, proposed = bound_region(problem, model, begin + seconds)
@@ -122,7 +129,7 @@ def bound_exits(
         if lower:
             check_noise(model, (0.0, float(problem.horizon)), list(zip(room.outer_low, room.outer_high)))
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
-        upper, least, words, proposed = two_states(problem, model, room, begin + seconds, wanted)
+        upper, least, words, (proposed, below) = two_states(problem, model, room, begin + seconds, wanted)
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),
@@ -211,19 +218,21 @@ def chart_slabs_of(problem: Problem, *, levels: Sequence[float], slabs: int, las
 
 def _refuse_random(problem: Problem) -> None:
     if problem.initial.random:
-        raise InfeasibleError("value functions in two states do not serve a random start; use a set of starts.")
+        raise InfeasibleError("value functions in several states do not serve a random start; use a set of starts.")
 
 
-def _check(problem: Problem, target: Any, seconds: float) -> None:
+def _check(problem: Problem, target: Any, seconds: float, most: int = 2) -> None:
     if not isinstance(problem, Problem):
         raise TypeError(f"`problem` must be a Problem, got {problem!r}.")
     if not seconds > 0:
         raise ValueError(f"`seconds` must be positive, got {seconds!r}.")
+    check_end(problem, "a value function in continuous time")
     if problem.system.time != "continuous":
         raise InfeasibleError("value functions of this kind need continuous time; the problem is discrete.")
-    if problem.system.dimension > 2:
+    if problem.system.dimension > most:
+        count = {2: "one or two", 3: "up to three"}[most]
         raise InfeasibleError(
-            f"value functions in continuous time serve one or two states, the problem has {problem.system.dimension}."
+            f"value functions in continuous time serve {count} states here, the problem has {problem.system.dimension}."
         )
     if target is not None and problem.system.dimension > 1:
         raise InfeasibleError("value functions in continuous time serve targets in one state only.")

@@ -36,6 +36,7 @@ from certbound.values.continuous.residual import (
     bound_ranges,
     coarse_size,
     sample_in_plane,
+    sample_in_space,
     value_range,
 )  # fmt: skip
 from certbound.values.continuous.surface import Surface
@@ -68,9 +69,9 @@ class Model:
         """Samples in time and in each state with which the residual is a polynomial known exactly."""
         n = self.drift.axes - 1
         f, a = self.drift.degrees, self.square.degrees
-        own = 4 if n == 1 else 5  # degree of V_x in its own variable; that of V_y in x is 5
-        squared = 8 if n == 1 else 10
-        space = [max(5, f[1 + i] + own, a[1 + i] + squared) + 1 for i in range(n)]
+        whole = 3 if n == 3 else 5  # V's degree in each state
+        own = 4 if n == 1 else whole  # degree of V_x in its own variable; that of V_y in x is V's
+        space = [max(whole, f[1 + i] + own, a[1 + i] + 2 * own) + 1 for i in range(n)]
         return (max(3 + f[0], 6 + a[0]) + 1, *space)
 
 
@@ -99,12 +100,16 @@ class Need:
         return self.spare * (1 + np.exp(np.minimum(self.start - high, 700.0)) * (1 - 1e-13)) * (1 - 1e-13)
 
 
-def examine(surface: Surface, model: Model, need: Need, *, upper: bool) -> Proof:
-    """Enclose R (closely on one side), V and Q2 on every patch of a surface that needs it."""
+def examine(surface: Surface, model: Model, need: Need, *, upper: bool, near: Array | None = None) -> Proof:
+    """Enclose R (closely on one side), V and Q2 on every patch of a surface that needs it.
+
+    ``near``, shape (slabs, *cells), says how far from samples of R its bound may lie where that is nothing to lose.
+    """
     counts = model.counts()
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
     share = _NEAR * (0.5 + 0.5 * surface.times[-1] / (surface.slabs * surface.steps))
+    loose = np.zeros(surface.slabs * per) if near is None else near.reshape(-1)
 
     def look(ends: tuple[int, int]) -> tuple[Index, Ranges] | None:
         patches = surface.patches(*ends)
@@ -115,20 +120,23 @@ def examine(surface: Surface, model: Model, need: Need, *, upper: bool) -> Proof
         kept = np.flatnonzero(~(low >= need.top) & ~(size <= need.free(high)))  # what is no number is looked at
         if not len(kept):
             return None
+        close = np.maximum(share[ends[0] + kept // per] * need.free(high[kept]), loose[ends[0] * per + kept])
         ranges = bound_ranges(
-            patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare,
-            near=share[ends[0] + kept // per] * need.free(high[kept]), upper=upper,
-        )  # fmt: skip
+            patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare, near=close, upper=upper
+        )
         return ends[0] * per + kept, ranges
 
     found = [one for one in side_by_side(look, list(surface.chunks())) if one is not None]
-    empty = np.empty(0)
-    joined = {
-        name: np.concatenate([empty, *(getattr(ranges, name) for _, ranges in found)])
-        for name in Ranges.__dataclass_fields__
-    }
     patch = np.concatenate([np.empty(0, dtype=np.intp), *(index for index, _ in found)])
-    return Proof(ranges=Ranges(**joined), slab=patch // per, cell=patch % per)
+    return Proof(ranges=joined([ranges for _, ranges in found]), slab=patch // per, cell=patch % per)
+
+
+def joined(ranges: Sequence[Ranges]) -> Ranges:
+    """All of them, one after the other."""
+    return Ranges(**{
+        name: np.concatenate([np.empty(0), *(getattr(one, name) for one in ranges)])
+        for name in Ranges.__dataclass_fields__
+    })
 
 
 def side_by_side(look: Callable[[tuple[int, int]], Found], chunks: list[tuple[int, int]]) -> list[Found]:
@@ -143,21 +151,26 @@ def sampled_residual(surface: Surface, model: Model, *, upper: bool = True) -> t
     For lower bounds the largest -R of the best branch, and V's largest value. Both have shape (slabs, *cells); a
     sketch of what `examine` finds, at a tenth of its cost.
     """
-    counts = (4, 5, 5)
+    excess, low, high = sampled(surface, model, upper=upper)
+    return excess, low if upper else high
+
+
+def sampled(surface: Surface, model: Model, *, upper: bool = True) -> tuple[Array, Array, Array]:
+    """The same in two or three states, with V's least and largest values."""
+    counts, sample = ((4, 5, 5), sample_in_plane) if len(surface.axes) == 2 else ((4, 7, 7, 7), sample_in_space)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
 
-    def look(ends: tuple[int, int]) -> tuple[Array, Array]:
+    def look(ends: tuple[int, int]) -> tuple[Array, Array, Array]:
         patches = surface.patches(*ends)
         place = np.arange(len(patches.size)) % (per if fixed else len(patches.size))
         drifts, squares = fixed or interpolants(surface, model, *ends, counts)
-        excess = sample_in_plane(patches, drifts, squares, place, counts, upper=upper)
-        return excess, value_range(patches)[0 if upper else 1]
+        return sample(patches, drifts, squares, place, counts, upper=upper), *value_range(patches)
 
     found = side_by_side(look, list(surface.chunks()))
     shape = (surface.slabs, *surface.cells)
-    excess, values = (np.concatenate(parts).reshape(shape) for parts in zip(*found))
-    return excess, values
+    excess, low, high = (np.concatenate(parts).reshape(shape) for parts in zip(*found))
+    return excess, low, high
 
 
 def interpolants(
@@ -234,7 +247,7 @@ def check_noise(model: Model, span: tuple[float, float], ends: Sequence[tuple[fl
     if not np.all(smallest > 0):
         raise InfeasibleError(
             "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
-            "direction has none somewhere (noise in the velocities only, say): another engine's answer stands."
+            "direction has none somewhere (noise in the velocities only, say), and value functions prove nothing."
         )
 
 

@@ -27,7 +27,7 @@ HERMITE = np.array([
     [0, 0, 0, 1, 0, 0],
 ])  # fmt: skip
 """Bernstein coefficients of degree 5 from (v, h v', h^2 v'') at the left and at the right end."""
-TIME_HERMITE = np.array([[1, 0, 0, 0], [1, 1 / 3, 0, 0], [0, 0, 1, -1 / 3], [0, 0, 1, 0]])
+CUBIC_HERMITE = np.array([[1, 0, 0, 0], [1, 1 / 3, 0, 0], [0, 0, 1, -1 / 3], [0, 0, 1, 0]])
 """Bernstein coefficients of degree 3 from (v, h v') at the left and at the right end."""
 _LEFT = np.array([[comb(i, k) / 2**i if k <= i else 0.0 for k in range(6)] for i in range(6)])
 _HALVES = (_LEFT, _LEFT[::-1, ::-1])

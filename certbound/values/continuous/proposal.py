@@ -138,31 +138,32 @@ def through(nodes: Array, points: tuple[float, float]) -> Array:
 
 
 class Splines:
-    """Collocation matrices of quintic splines with given nodes, banded."""
+    """Collocation matrices of splines with given nodes, quintic if nothing is said, banded."""
 
-    def __init__(self, nodes: Array) -> None:
-        knots = np.concatenate([[nodes[0]] * _DEGREE, nodes, [nodes[-1]] * _DEGREE])
-        self.count = len(knots) - _DEGREE - 1
-        self.points = np.array([knots[k + 1 : k + _DEGREE + 1].mean() for k in range(self.count)])
+    def __init__(self, nodes: Array, degree: int = _DEGREE) -> None:
+        knots = np.concatenate([[nodes[0]] * degree, nodes, [nodes[-1]] * degree])
+        self.count = len(knots) - degree - 1
+        self.points = np.array([knots[k + 1 : k + degree + 1].mean() for k in range(self.count)])
         self.points[0], self.points[-1] = nodes[0], nodes[-1]
-        spline = BSpline(knots, np.eye(self.count), _DEGREE)
+        spline = BSpline(knots, np.eye(self.count), degree)
+        self.band = degree
         self.dense = [spline(self.points, order) for order in range(3)]
         self.at = [self._banded(matrix) for matrix in self.dense]
         self.at_nodes = [spline(nodes, order) for order in range(3)]
 
-    @staticmethod
-    def _banded(matrix: Array) -> Array:
-        """Rows of the band: entry (i, k) is matrix[i, i + k - _BAND]."""
+    def _banded(self, matrix: Array) -> Array:
+        """Rows of the band: entry (i, k) is matrix[i, i + k - self.band]."""
         size = len(matrix)
-        band = np.zeros((size, 2 * _BAND + 1))
-        for offset in range(-_BAND, _BAND + 1):
+        band = np.zeros((size, 2 * self.band + 1))
+        for offset in range(-self.band, self.band + 1):
             rows = np.arange(max(0, -offset), min(size, size - offset))
-            band[rows, offset + _BAND] = matrix[rows, rows + offset]
+            band[rows, offset + self.band] = matrix[rows, rows + offset]
         return band
 
     def times(self, band: Array, vector: Array) -> Array:
-        padded = np.concatenate([np.zeros(_BAND), vector, np.zeros(_BAND)])
-        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BAND + 1)
+        padded = np.zeros(len(vector) + 2 * self.band)
+        padded[self.band:-self.band] = vector
+        windows = np.ndarray((len(vector), 2 * self.band + 1), float, padded, strides=2 * padded.strides)
         return np.asarray(np.einsum("ij,ij->i", band, windows))
 
 

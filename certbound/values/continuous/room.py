@@ -29,7 +29,28 @@ def safe_room(problem: Problem) -> Room:
     Raises
     ------
     InfeasibleError
-        Windows, moving sets, curved or oblique sets in two states, or an unbounded safe set.
+        Windows, moving sets, curved or oblique sets in several states, or an unbounded safe set.
+    """
+    room = limits_of(problem)
+    for name, low, high in zip(problem.system.states, room.inner_low, room.inner_high):
+        if not np.isfinite([low, high]).all():
+            where = "below" if low == -np.inf else "above"
+            raise InfeasibleError(
+                f"value functions need a bounded safe set, and {name} is unbounded {where}; a bound that paths hardly "
+                f"reach will do: add a `domain`, or a constraint on {name}."
+            )
+        if not low < high:
+            raise InfeasibleError("the safe set has no interior.")
+    return room
+
+
+def limits_of(problem: Problem) -> Room:
+    """The box of all limits, infinite where there is none.
+
+    Raises
+    ------
+    InfeasibleError
+        Windows, moving sets, curved or oblique sets in several states.
     """
     n = problem.system.dimension
     lows, highs = [[-np.inf] * n, [-np.inf] * n], [[np.inf] * n, [np.inf] * n]
@@ -41,16 +62,6 @@ def safe_room(problem: Problem) -> Room:
                     lows[place][axis] = max(lows[place][axis], value)
                 else:
                     highs[place][axis] = min(highs[place][axis], value)
-    for axis in range(n):
-        if not np.isfinite([lows[0][axis], highs[0][axis]]).all():
-            name = problem.system.states[axis]
-            where = "below" if lows[0][axis] == -np.inf else "above"
-            raise InfeasibleError(
-                f"value functions need a bounded safe set, and {name} is unbounded {where}; a bound that paths hardly "
-                f"reach will do: add a `domain`, or a constraint on {name}."
-            )
-        if not lows[0][axis] < highs[0][axis]:
-            raise InfeasibleError("the safe set has no interior.")
     ends = [tuple(float(value) for value in row) for row in (*lows, *highs)]
     return Room(inner_low=ends[0], outer_low=ends[1], inner_high=ends[2], outer_high=ends[3])
 
@@ -67,7 +78,8 @@ def _faces(constraint: Inside, problem: Problem) -> list[tuple[int, int, float, 
     """(state, side, inner place, outer place) of each face of a constraint."""
     n, region = problem.system.dimension, constraint.region
     if n > 1 and (constraint.outside or region.form.round):
-        raise InfeasibleError(f"value functions in two states serve boxes only, not '{constraint.label}'.")
+        count = "two" if n == 2 else "three"
+        raise InfeasibleError(f"value functions in {count} states serve boxes only, not '{constraint.label}'.")
     return _beside(constraint, problem) if constraint.outside else faces_of(region, constraint.label)
 
 

@@ -3,11 +3,13 @@
 From the bottom: ``dominance`` (constants of the normal density), ``shocks`` (the noise as independent coordinates),
 ``kernels`` (integrals of the basis functions), ``functions`` (what is carried from step to step), ``fields`` (its mean
 after the noise, as a function of where the noise-free step ends), ``steps`` (the noise-free step on a grid),
-``induction`` (one step back), ``failures`` (the answer, refined until it is good).
+``induction`` (one step back), ``failures`` (the answer, refined until it is good), ``long_runs`` (any number of steps).
 """
 
-from certbound.values.discrete.failures import FailureBounds, bound_failure, chart_failures, step_grids
+from certbound.values.discrete.failures import bound_failure, chart_failures, step_grids
 from certbound.values.discrete.kernels import AxisKernel, axis_kernel
+from certbound.values.discrete.layout import FailureBounds
+from certbound.values.discrete.long_runs import bound_long_run
 from certbound.values.discrete.steps import evaluate
 
 __all__ = [
@@ -15,6 +17,7 @@ __all__ = [
     "FailureBounds",
     "axis_kernel",
     "bound_failure",
+    "bound_long_run",
     "chart_failures",
     "evaluate",
     "step_grids",

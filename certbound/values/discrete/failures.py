@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array, Mask
+from certbound.problem.goals import check_end
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside, Region
 from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Chart, Charts, from_probability
-from certbound.values.discrete.effort import seconds_of, shares_of, without_hopeless
 from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import (
@@ -29,7 +28,16 @@ from certbound.values.discrete.induction import (
     values_above,
     zones_of,
 )
-from certbound.values.discrete.layout import Boxes, boxes_of, grid_of, widths_of
+from certbound.values.discrete.layout import (
+    Boxes,
+    FailureBounds,
+    boxes_of,
+    grid_of,
+    seconds_of,
+    shares_of,
+    widths_of,
+    without_hopeless,
+)
 from certbound.values.discrete.shocks import Inapplicable, Shocks, gaussian_shocks, shocks_of
 from certbound.values.discrete.steps import Dynamics, Step
 from certbound.values.discrete.transitions import Transition
@@ -40,38 +48,13 @@ from certbound.watch import OutOfTime, poll
 
 MOST_STATES = 3
 _UNIFORM_FLOOR = 1e-9  # means over boxes are known up to an absolute error
+_MOST_STEPS = 100_000
 _MOST_NODES = 3_000_000
 _NODE_SECONDS = {False: 1e-4, True: 2e-3}
 """Roughly what a node of a first grid takes, without and with a common factor in the noise; measured, for refusing."""
 _PATIENCE = 1.0  # seconds for which grids are refined although the question is answered
 _CHARTED = 300_000  # parts of cells that a map has at most
 _FLOOR = 1e-16  # where what lies beyond ten standard deviations begins to count
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FailureBounds:
-    """lower <= largest P(failure within the horizon) over starts and disturbances <= upper; a random start is averaged.
-
-    Parameters
-    ----------
-    upper, lower : float
-        Certified.
-    cells : tuple of int
-        Of the finest grid.
-    share : float
-        Its cells' size, relative to the lengths over which the solution changes.
-    seconds : float
-        Spent on all grids.
-    tried : tuple of (float, float, float)
-        Share, upper and lower of every grid.
-    """
-
-    upper: float
-    lower: float
-    cells: tuple[int, ...]
-    share: float
-    seconds: float
-    tried: tuple[tuple[float, float, float], ...]
 
 
 def bound_failure(
@@ -111,7 +94,7 @@ def bound_failure(
     Inapplicable
         If value functions do not fit the problem; the message says why.
     """
-    work = _Work(problem, target, parts, since)
+    work = Work(problem, target, parts, since)
     begun = time.perf_counter()
     upper, lower, spent = 1.0, 0.0, 0.0
     tried: list[tuple[float, float, float]] = []
@@ -170,7 +153,7 @@ def chart_failures(problem: Problem, *, share: float, times: int = 1, parts: int
     Inapplicable
         If value functions do not fit the problem; the message says why.
     """
-    work = _Work(problem, None, parts)
+    work = Work(problem, None, parts)
     return work.charts(share, sorted({work.horizon * k // times for k in range(times)}))
 
 
@@ -179,7 +162,7 @@ def step_grids(problem: Problem, share: float) -> list[Grid]:
 
     Inapplicable where value functions do not fit the problem, or the grids would be too large.
     """
-    work = _Work(problem, None, 1)
+    work = Work(problem, None, 1)
     found = work.layout(share)
     if found is None:
         raise Inapplicable(work.too_large)
@@ -191,7 +174,7 @@ def _settled(upper: float, lower: float, delta: float | None) -> bool:
     return delta is not None and (upper <= delta / 100 or lower >= min(100 * delta, 0.5))
 
 
-class _Work:
+class Work:
     """One problem: its noise, its boxes, its steps."""
 
     too_large = (
@@ -205,8 +188,13 @@ class _Work:
             raise Inapplicable("this engine's backward induction needs discrete time.")
         if system.dimension > MOST_STATES:
             raise Inapplicable(f"value functions on grids take at most {MOST_STATES} states, not {system.dimension}.")
+        check_end(problem, "a step by step induction")
+        if problem.horizon > _MOST_STEPS:
+            raise Inapplicable(f"a step by step induction takes at most {_MOST_STEPS} steps, not {problem.horizon}.")
         self.problem, self.target, self.n, self.since = problem, target, system.dimension, since
         self.horizon, self.ending = int(problem.horizon), target if since == 0 else None
+        self.limits = problem.safe if problem.ending else problem.constraints
+        self.beyond = 0.0 if problem.ending else 1.0
         self.shocks = shocks_of(system.noise, system.noise_matrix)
         self.dynamics = Dynamics(problem, parts)
         self.boxes: Boxes = boxes_of(problem, self.shocks, self.dynamics)
@@ -258,7 +246,7 @@ class _Work:
         made: dict[bytes, Grid] = {}
         for t in range(self.horizon + 1):
             low, high = self.boxes.low[t], self.boxes.high[t]
-            active = active_at(self.problem.constraints, t)
+            active = active_at(self.limits, t)
             moving = any(c.region.moving for c in active) or (self.target is not None and self.target.moving)
             key = b"".join([low.tobytes(), high.tobytes(), repr([id(c) for c in active]).encode()])
             key += repr(t if moving else 0).encode()
@@ -282,7 +270,7 @@ class _Work:
         """(upper, lower) from the grids."""
         end = 0 if self.random else 1
         *_, (_, above, below) = self._backward(grids, share, end)
-        upper, lower = self._at_random(above, below) if self.random else self._over_start(above, below, share)
+        upper, lower = self.at_random(above, below) if self.random else self.over_start(above, below, share)
         leak = self.boxes.leak * (1 + 1e-9)
         return min(max(upper, 0.0), 1.0), max(lower - leak, 0.0)
 
@@ -291,16 +279,16 @@ class _Work:
     ) -> Iterator[tuple[int, ValueFunction, ValueFunction]]:
         """(step, function above, function below), from the horizon back to step ``end``."""
         last = self.horizon
-        zones = [self._zones(grids, t) for t in range(last + 1)]
-        above = final(grids[last], zones[last], above=True)
-        below = final(grids[last], zones[last], above=False)
+        zones = [self.zones(grid, t) for t, grid in enumerate(grids)]
+        above = final(grids[last], zones[last], above=True, beyond=self.beyond)
+        below = final(grids[last], zones[last], above=False, beyond=self.beyond)
         yield last, above, below
         kept: tuple[object, AnyTransition] | None = None
         for t in range(last - 1, end - 1, -1):
             poll(f"values at step {t}, {math.prod(grids[t].shape)} cells")
             key = (id(grids[t]), id(grids[t + 1])) if self.dynamics.steady else t
             if kept is None or kept[0] != key:
-                kept = (key, self._transition(t, grids[t], grids[t + 1], share))
+                kept = (key, self.transition(t, grids[t], grids[t + 1], share))
             above = back_above(kept[1], above, zones[t])
             below = back_below(kept[1], below, zones[t])
             yield t, above, below
@@ -315,7 +303,7 @@ class _Work:
             if t not in steps:
                 continue
             parts = next((parts for parts in (8, 4, 2) if above.nodal.size * parts**self.n <= _CHARTED), 1)
-            active, cells = active_at(self.problem.constraints, t), grids[t].cells()
+            active, cells = active_at(self.limits, t), grids[t].cells()
             masks = [*respected(active, cells, t), respected(active, cells, t, interiors=True)[1]]
             whole = [np.kron(mask.reshape(grids[t].shape), np.ones([parts] * self.n, dtype=bool)) for mask in masks]
             safe, broken, inner = (mask > 0 for mask in whole)  # for starts, unlike later on, faces count
@@ -327,10 +315,10 @@ class _Work:
                 lower.append(Chart(time=float(t), axes=axes, log10=from_probability(low, up=False)))
         return Charts(upper=tuple(upper[::-1]), lower=tuple(lower[::-1]))
 
-    def _zones(self, grids: list[Grid], t: int) -> Zones:
-        return zones_of(grids[t], active_at(self.problem.constraints, t), self.target, t, ends=t >= self.since)
+    def zones(self, grid: Grid, t: int) -> Zones:
+        return zones_of(grid, active_at(self.limits, t), self.target, t, ends=t >= self.since)
 
-    def _transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
+    def transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
         step = self.dynamics.step(t, grid)
         if self.shocks.uniform:
             return UniformTransition(
@@ -338,7 +326,7 @@ class _Work:
             )
         return Transition(step, Tables(after, self.shocks, *step.hull()))
 
-    def _at_random(self, above: ValueFunction, below: ValueFunction) -> tuple[float, float]:
+    def at_random(self, above: ValueFunction, below: ValueFunction) -> tuple[float, float]:
         """Mean over a Gaussian start: one more convolution, read at the mean."""
         assert self.start_shocks is not None
         mean = self.problem.initial.mean
@@ -350,13 +338,13 @@ class _Work:
         ((low, other),) = transition.at_nodes(tables.field(below, order=0))
         return float(high.item() + error.item()), float(low.item() - other.item())
 
-    def _over_start(self, above: ValueFunction, below: ValueFunction, share: float) -> tuple[float, float]:
+    def over_start(self, above: ValueFunction, below: ValueFunction, share: float) -> tuple[float, float]:
         """Largest value over the initial set, on a grid of its own."""
         region = self._start_region()
         grid = self._start_grid(region, share)
         cells = grid.cells()
         meets = ~contains(region, cells, 0)[1]
-        safe, _ = respected(active_at(self.problem.constraints, 0), cells, 0)
+        safe, _ = respected(active_at(self.limits, 0), cells, 0)
         if self.ending is not None:
             meets &= ~(contains(self.ending, cells, 0)[0] & safe)
         if not meets.any():
@@ -364,9 +352,9 @@ class _Work:
         if not np.all(safe[meets]):
             upper = 1.0
         else:
-            transition = self._transition(0, grid, above.grid, share)
+            transition = self.transition(0, grid, above.grid, share)
             upper = self._highest(transition, above, meets)
-        transition = self._transition(0, grid, below.grid, share)
+        transition = self.transition(0, grid, below.grid, share)
         field: Any = transition.tables.field(below, order=0)
         values = np.maximum.reduce([at - error for at, error in transition.at_nodes(field)])
         inside = contains(region, Interval.point(grid.nodes()), 0)[0]

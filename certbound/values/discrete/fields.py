@@ -236,8 +236,9 @@ class Tables:
                 add(["bubble" if k == i else "whole" for k in range(self.n)], value.bend[i], -1.0)
         if value.fixed is not None:
             self._add_fixed(value, add)
-        for alpha, part in self._outside(order):
-            raw[alpha] = raw[alpha] + part
+        if value.beyond:
+            for alpha, part in self._outside(order):
+                raw[alpha] = raw[alpha] + value.beyond * part
         return raw
 
     def _add_fixed(self, value: ValueFunction, add: Callable[[list[str], Array, float], None]) -> None:

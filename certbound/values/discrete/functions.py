@@ -1,4 +1,4 @@
-"""Functions on a grid: multilinear plus a parabola per axis on every cell, constant on some cells, 1 outside.
+"""Functions on a grid: multilinear plus a parabola per axis on every cell, constant on some cells, 1 or 0 outside.
 
 On a cell with node values u and widths D,
     U(x) = (I u)(x) - sum_i b_i (x_i - a_i)(a_i + D_i - x_i)/2,
@@ -20,7 +20,7 @@ from certbound.values.grids import Grid, over_corners
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class ValueFunction:
-    """A function on a grid; 1 outside it.
+    """A function on a grid.
 
     Parameters
     ----------
@@ -33,6 +33,8 @@ class ValueFunction:
         Cells on which the function is a constant; None: there are none.
     level : ndarray, shape grid.shape
         That constant.
+    beyond : float
+        Outside the grid: 1, or 0 where paths that get there have ended.
     """
 
     grid: Grid
@@ -40,6 +42,7 @@ class ValueFunction:
     bend: Array
     fixed: Mask | None
     level: Array
+    beyond: float = 1.0
 
     def size(self) -> Array:
         """Upper bound of the sum of the absolute parts of the function on every cell, shape grid.shape."""
@@ -102,7 +105,7 @@ class ValueFunction:
         return tuple(np.append(node, axis[-1]) for node, axis in zip(nodes, self.grid.axes)), low, high
 
     def values(self, points: Array) -> Array:
-        """At points (P, n), in plain floats; 1 outside."""
+        """At points (P, n), in plain floats."""
         places, shares = [], []
         inside = np.ones(len(points), dtype=bool)
         for i, axis in enumerate(self.grid.axes):
@@ -121,4 +124,4 @@ class ValueFunction:
             total -= self.bend[(i, *places)] * width**2 * shares[i] * (1 - shares[i]) / 2
         if self.fixed is not None:
             total = np.where(self.fixed[tuple(places)], self.level[tuple(places)], total)
-        return np.where(inside, total, 1.0)
+        return np.where(inside, total, self.beyond)

@@ -1,8 +1,10 @@
-"""The boxes and grids of all steps: where value functions live, and how fine."""
+"""The boxes and grids of all steps: where value functions live, how fine, what that costs, and what comes of it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -45,6 +47,8 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
         If some state is not bounded at some step; the message says what bound would help.
     """
     n, horizon = problem.system.dimension, int(problem.horizon)
+    if problem.ending:
+        return _of_domain(problem, np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (REACH * (1 + 1e-12)))
     low, high = np.empty((horizon + 1, n)), np.empty((horizon + 1, n))
     spread = REACH * (np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (1 + 1e-12))
     reach = _start_box(problem, spread)
@@ -61,6 +65,16 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
         if t < horizon and _needed(problem, t):
             reach = _next_reach(dynamics, t, low[t], high[t], reach, spread)
     return Boxes(low, high, leak)
+
+
+def _of_domain(problem: Problem, spread: Array) -> Boxes:
+    """The domain at all steps, where paths that leave it end."""
+    low, high = np.asarray(problem.domain.low), np.asarray(problem.domain.high)
+    if not np.isfinite([low, high]).all():
+        raise Inapplicable("value functions need a domain that bounds every state, where leaving it ends a path.")
+    _check_box(problem, low, high, 0, spread)
+    steps = (int(problem.horizon) + 1, 1)
+    return Boxes(np.tile(low, steps), np.tile(high, steps), 0.0)
 
 
 def _start_box(problem: Problem, spread: Array) -> tuple[Array, Array]:
@@ -173,3 +187,96 @@ def _finer(
             half = float(form.radius * np.sqrt(form.shape[place, place]))
             near = np.abs(places - center) <= half + float(np.max(np.diff(places)))
             return np.where(near, np.minimum(widths, fine), widths), []
+
+
+_SHARES = {
+    1: (0.33, 0.15, 0.07, 0.035, 0.0175, 0.01),
+    2: (0.5, 0.33, 0.22, 0.15, 0.1, 0.07, 0.05, 0.035),
+    3: (0.4, 0.17, 0.14, 0.1, 0.07),
+}
+"""Sizes of the cells that are tried, relative to the lengths over which the solution changes."""
+_UNIFORM_SHARES = {
+    1: (0.2, 0.07, 0.025, 0.01, 0.005),
+    2: (0.3, 0.15, 0.07, 0.035, 0.02, 0.012),
+    3: (0.5, 0.3, 0.2, 0.12),
+}
+_CELL_SECONDS = 4e-6  # what a cell takes for one step, both bounds; measured once
+_ORDER, _UNIFORM_ORDER = 2.5, 2.0
+"""About the power of the cells' size with which the logarithm of upper over lower falls; measured."""
+_COMMON_FACTOR = 20.0  # how much more that is with a common factor in the noise
+_UNIFORM_FACTOR = 0.4
+_OVERHEAD = 250  # cells that every step is worth in addition
+_NEARLY = 1.15  # times the share that would do
+_WIDEST = 10.0  # upper over lower beyond which nothing is known of how it will fall
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FailureBounds:
+    """lower <= largest P(failure within the horizon) over starts and disturbances <= upper; a random start is averaged.
+
+    Parameters
+    ----------
+    upper, lower : float
+        Certified.
+    cells : tuple of int
+        Of the finest grid.
+    share : float
+        Its cells' size, relative to the lengths over which the solution changes.
+    seconds : float
+        Spent on all grids.
+    tried : tuple of (float, float, float)
+        Share, upper and lower of every grid.
+    rate : (float, float), optional
+        Of a long horizon: of what is still safe, within one step at least and at most this share leaves ...
+    before : (int, float, float), optional
+        ... after so many steps n, within which leaving has at least and at most these probabilities p:
+        1 - (1 - p)(1 - rate)^(T - n) bounds P(leaving within T) for every T >= n.
+    """
+
+    upper: float
+    lower: float
+    cells: tuple[int, ...]
+    share: float
+    seconds: float
+    tried: tuple[tuple[float, float, float], ...]
+    rate: tuple[float, float] | None = None
+    before: tuple[int, float, float] | None = None
+
+
+def shares_of(states: int, *, uniform: bool) -> list[float]:
+    """Sizes of the cells that are tried, relative to the lengths over which the solution changes."""
+    return list((_UNIFORM_SHARES if uniform else _SHARES)[states])
+
+
+def seconds_of(layout: list[Grid], *, common: bool, uniform: bool) -> float:
+    """Seconds that the grids of all steps stand for, without disturbances."""
+    rate = _CELL_SECONDS * (_COMMON_FACTOR if common else 1.0) * (_UNIFORM_FACTOR if uniform else 1.0)
+    return rate * sum(_OVERHEAD + math.prod(grid.shape) for grid in layout)
+
+
+def without_hopeless(
+    shares: list[float], last: tuple[float, float, float], ratio: float, uniform: bool,
+    affordable: Callable[[float], bool],
+) -> list[float]:  # fmt: skip
+    """The shares without those that would leave upper > ratio * lower, as long as the next one is affordable.
+
+    Parameters
+    ----------
+    shares : list of float
+        Falling; what is left to try.
+    last : tuple of float
+        The share of the last grid, upper and lower.
+    ratio : float
+        What is wanted.
+    uniform : bool
+        Whether the noise is.
+    affordable : callable
+        Whether a share may be tried.
+    """
+    share, upper, lower = last
+    if not 0 < lower < upper < _WIDEST * lower:
+        return shares
+    wanted = share * (math.log(ratio) / math.log(upper / lower)) ** (1 / (_UNIFORM_ORDER if uniform else _ORDER))
+    while len(shares) > 1 and shares[0] > _NEARLY * wanted and affordable(shares[1]):
+        shares = shares[1:]
+    return shares

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.problem.model import OPERATIONS, Tape, enclosed, jacobian, undefined_where
+from certbound.problem.model import Tape, enclosed, jacobian, jumps_where, undefined_where
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
 from certbound.values.grids import Grid
@@ -223,9 +223,8 @@ def _run(tape: Tape, inputs: list[Interval], undefined: Mask, jumps: Mask) -> li
             continue
         args = [values[arg] for arg in node.args]
         value = enclosed(node, args)
-        row = OPERATIONS.get(node.op)
-        if row is not None and row.jump is not None:
-            np.logical_or(jumps, row.jump(value, *args), out=jumps)
+        if (jump := jumps_where(node, value, args)) is not None:
+            np.logical_or(jumps, jump, out=jumps)
         elif (mask := undefined_where(node, args)) is not None:
             np.logical_or(undefined, mask, out=undefined)
         values.append(value)

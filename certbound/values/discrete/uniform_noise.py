@@ -101,13 +101,13 @@ class UniformTables(Tables):
         """h and the ranges of its slopes; ``order`` is ignored."""
         table = self.means(value)
         low, high = value.range()
-        slopes = [self._slopes(low, high, i) for i in range(self.n)]
+        slopes = [self._slopes(low, high, i, value.beyond) for i in range(self.n)]
         largest = max(1.0, float(value.size().max()))
         return UniformField(mesh=self.mesh, table=table, error=self.wrong * largest, slopes=slopes)
 
-    def _slopes(self, low: Array, high: Array, i: int) -> tuple[Array, Array]:
+    def _slopes(self, low: Array, high: Array, i: int, beyond: float) -> tuple[Array, Array]:
         """Range of d_i h over the mesh's cells."""
-        least, most = np.pad(low, 1, constant_values=1.0), np.pad(high, 1, constant_values=1.0)
+        least, most = np.pad(low, 1, constant_values=beyond), np.pad(high, 1, constant_values=beyond)
         for axis in range(self.n):
             if axis != i:
                 least = self._over_windows(least, axis, union=False)

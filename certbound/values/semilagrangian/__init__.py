@@ -1,9 +1,9 @@
 """Continuous time with noise in one of two coordinates: steps along the flow (K8-SL, docs/values.md).
 
-From the bottom: ``noisy_axis`` (the problem), ``flows`` (the flow and its covariance, enclosed), ``remainders`` (what
-the linearisation leaves out; how a path strays in a step), ``local_steps`` (both, box by box), ``smoothers``,
-``smoothing`` (the noise of one step), ``landings`` (of the flow), ``bands``, ``backward`` (one step), ``groundwork``,
-``leaving``.
+From the bottom: ``confines`` (what bounds the states), ``noisy_axis`` (the problem), ``flows`` (the flow and its
+covariance, enclosed), ``remainders`` (what the linearisation leaves out; how a path strays in a step), ``local_steps``
+(both, box by box), ``smoothers``, ``smoothing`` (the noise of one step), ``landings`` (of the flow), ``bands``,
+``mirrors`` (what is beyond a noisy face), ``backward`` (one step), ``groundwork``, ``leaving``.
 """
 
 from certbound.values.semilagrangian.leaving import bound_exits_by_steps

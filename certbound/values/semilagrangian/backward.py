@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,16 +10,40 @@ from scipy.ndimage import maximum_filter
 
 from certbound.arrays import Array, Mask
 from certbound.values.grids import around_nodes, corners
-from certbound.values.semilagrangian.bands import Band, Frame, through
+from certbound.values.semilagrangian.bands import NOWHERE, Band, Frame, through
+from certbound.values.semilagrangian.confines import TWICE
+from certbound.values.semilagrangian.mirrors import Mirror
+from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.smoothing import Lines
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Bounds:
-    """What U must be at least: ``level`` at nodes (0 where nothing is asked), and how far remainders reach in cells."""
+    """What the function must be at least where steps do not say it.
+
+    An upper bound U is stepped as it is, and a lower bound L as -L: both must lie above something.
+
+    Attributes
+    ----------
+    level : ndarray, shape (ny, nq)
+        At nodes; -inf where nothing is asked.
+    fixed : ndarray of bool, shape (ny, nq)
+        Nodes around which the function must lie above its chords as well.
+    free : ndarray of bool, shape (ny, nq)
+        Nodes that mirrors may set.
+    reach : (int, int)
+        How far remainders reach, in cells.
+    mirrors : sequence of Mirror
+    below : bool
+        Whether this is about -L.
+    """
 
     level: Array
+    fixed: Mask
+    free: Mask
     reach: tuple[int, int]
+    mirrors: Sequence[Mirror] = ()
+    below: bool = False
 
 
 def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines:
@@ -27,7 +52,7 @@ def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines
     Proves: if value >= u_{t+1} in the sense of the module ``semilagrangian``, the returned function is >= u_t.
     """
     slopes = _slopes(frame, value, bounds.reach)
-    nodal = np.zeros_like(value.nodal)
+    nodal = np.full_like(value.nodal, NOWHERE)
     bend = np.full_like(value.bend, -np.inf)
     payment = np.zeros(frame.live.shape)
     for band in bands:
@@ -41,14 +66,30 @@ def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines
 
 
 def limited(frame: Frame, bounds: Bounds, nodal: Array, bend: Array) -> Lines:
-    """Raise a function to its levels, and lower it to 1 where it is at least that all around."""
-    nodal = np.maximum(nodal, bounds.level)
-    full = np.minimum.reduce(corners(nodal)) >= 1
-    capped = (around_nodes((~full).astype(float), largest=True) <= 0) & (bounds.level <= 1)
-    nodal = np.where(capped, 1.0, nodal)
-    fixed = capped | (bounds.level > 0)
+    """Raise a function to its levels, and lower it to 1 (-L: to 0) where it is at least that all around."""
+    cap = 0.0 if bounds.below else 1.0
+    raised = np.maximum(nodal, bounds.level)
+    fixed = bounds.fixed | (raised > nodal) if bounds.below else bounds.fixed.copy()
+    full = np.minimum.reduce(corners(raised)) >= cap
+    capped = (around_nodes((~full).astype(float), largest=True) <= 0) & (bounds.level <= cap)
+    nodal = np.where(capped, cap, raised)
+    fixed |= capped
     sides = fixed[:, :-1] | fixed[:, 1:]
-    return Lines(nodal=nodal, bend=np.where(sides, np.maximum(bend, 0.0), bend))
+    bend = np.where(sides, np.maximum(bend, 0.0), bend)
+    for mirror in bounds.mirrors:
+        nodal = _mirrored(mirror, bounds, nodal, bend, np.diff(frame.q))
+    return Lines(nodal=nodal, bend=bend)
+
+
+def _mirrored(mirror: Mirror, bounds: Bounds, nodal: Array, bend: Array, dq: Array) -> Array:
+    """Put what lies beyond a face, from what lies inside."""
+    found = -mirror.below(-nodal, -bend, dq) if bounds.below else mirror.above(nodal, bend, dq)
+    free = bounds.free[:, mirror.places]
+    nodal = nodal.copy()
+    before = nodal[:, mirror.places]
+    found = found if bounds.below else np.maximum(found, before)
+    nodal[:, mirror.places] = np.where(free, found, before)
+    return nodal
 
 
 def _slopes(frame: Frame, value: Lines, reach: tuple[int, int]) -> tuple[Array, Array]:
@@ -63,21 +104,41 @@ def _slopes(frame: Frame, value: Lines, reach: tuple[int, int]) -> tuple[Array, 
     return one * (1 + 1e-9), two * (1 + 1e-9)
 
 
-def highest(frame: Frame, value: Lines, starts: tuple[tuple[float, float], tuple[float, float]], shear: float) -> float:
-    """Upper bound of the function over the starts p x q."""
-    p, q = starts
+def highest(frame: Frame, value: Lines, setting: Setting, shear: float) -> float:
+    """Upper bound of the function over the starts."""
+    low, high = setting.starts[1]
     best = 0.0
-    first = max(int(np.searchsorted(frame.q, q[0], side="right")) - 1, 0)
-    last = min(int(np.searchsorted(frame.q, q[1])), len(frame.q) - 1)
+    first = max(int(np.searchsorted(frame.q, low, side="right")) - 1, 0)
+    last = min(int(np.searchsorted(frame.q, high)), len(frame.q) - 1)
     for j in range(first, max(last, first + 1)):
-        low, high = max(q[0], frame.q[j]), min(q[1], frame.q[j + 1])
-        ends = sorted((shear * low, shear * high))
+        q = max(low, frame.q[j]), min(high, frame.q[j + 1])
+        p = setting.starts_between(*q)
+        ends = sorted((shear * q[0], shear * q[1]))
         slack = 1e-14 * (1 + abs(p[0]) + abs(p[1]))
         y = (p[0] - ends[1] - slack, p[1] - ends[0] + slack)
         if y[0] < frame.y[0] or y[1] > frame.y[-1]:
             return 1.0
-        best = max(best, _over_strip(frame, value, j, (low, high), y))
+        best = max(best, _over_strip(frame, value, j, q, y))
     return best
+
+
+def lowest(frame: Frame, value: Lines, points: Array, shear: float) -> float:
+    """Least of the function (that is, -L) over a few points of (p, q), shape (N, 2), rounded up."""
+    y, q = points[:, 0] - shear * points[:, 1], points[:, 1]
+    i = np.clip(np.searchsorted(frame.y, y, side="right") - 1, 0, len(frame.y) - 2)
+    j = np.clip(np.searchsorted(frame.q, q, side="right") - 1, 0, len(frame.q) - 2)
+    t = np.clip((y - frame.y[i]) / np.diff(frame.y)[i], 0.0, 1.0)
+    d = np.diff(frame.q)[j]
+    share = np.clip((q - frame.q[j]) / d, 0.0, 1.0)
+    arch = d**2 * share * (1 - share) / 2
+    low, high = (
+        (1 - share) * value.nodal[k, j] + share * value.nodal[k, j + 1] + arch * value.bend[k, j] for k in (i, i + 1)
+    )
+    found = (1 - t) * low + t * high
+    sizes = [np.abs(value.nodal[i + a, j + b]) for a in (0, 1) for b in (0, 1)]
+    error = 1e-12 * (np.maximum.reduce(sizes) + arch * np.abs(value.bend[i, j])) * (1 + 1 / np.diff(frame.y)[i] + 1 / d)
+    inside = (y > frame.y[0]) & (y < frame.y[-1]) & (q > frame.q[0]) & (q < frame.q[-1])
+    return float(np.where(inside, found + error, 0.0).min())
 
 
 def _over_strip(frame: Frame, value: Lines, j: int, q: tuple[float, float], y: tuple[float, float]) -> float:
@@ -91,11 +152,21 @@ def _over_strip(frame: Frame, value: Lines, j: int, q: tuple[float, float], y: t
     return float(max(*ends, (lines + arch)[:, inside].max(initial=0.0))) * (1 + 1e-12)
 
 
-def start_levels(frame: Frame, safe: Mask, inner: Mask) -> Array:
-    """Least values at nodes: 1 at corners of cells not surely safe, 2 where a noisy face may have been crossed.
+def levels_above(safe: Mask, crossed: Mask) -> Array:
+    """Least values at nodes: 1 at corners of cells not surely safe, more where a wall may have been crossed.
 
-    ``safe`` and ``inner``, shape (ny - 1, nq - 1): cells within the noise-free faces, and within the noisy ones.
+    ``safe`` and ``crossed``, shape (ny - 1, nq - 1): cells that lie in the safe set, and cells near walls.
     """
     outside = around_nodes((~safe).astype(float), largest=True)
-    beyond = around_nodes((~inner).astype(float), largest=True)
-    return np.where(beyond > 0, 2.0, np.where(outside > 0, 1.0, 0.0))
+    beyond = around_nodes(crossed.astype(float), largest=True)
+    return np.where(beyond > 0, TWICE, np.where(outside > 0, 1.0, 0.0))
+
+
+def bounds_below(live: Mask, broken: Mask, reach: tuple[int, int], mirrors: Sequence[Mirror]) -> Bounds:
+    """What -L must be at least: -1 where all around is surely broken or stepped, 0 where nothing is known."""
+    unknown = around_nodes((~live & ~broken).astype(float), largest=True) > 0
+    stepped = around_nodes(live.astype(float), largest=True) > 0
+    return Bounds(
+        level=np.where(unknown, 0.0, -1.0), fixed=unknown, free=~unknown & ~stepped, reach=reach, mirrors=mirrors,
+        below=True,
+    )  # fmt: skip

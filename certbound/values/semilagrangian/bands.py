@@ -14,7 +14,8 @@ from certbound.values.semilagrangian.smoothers import REACH, WIDER, Across, Alon
 from certbound.values.semilagrangian.smoothing import Lines, smoothed
 
 _UP = 1 + 1e-9
-_NEGLECTED = 4e-22  # what smoothing does not see of a function of size 8, beyond `REACH` standard deviations
+NOWHERE = -1e300
+_NEGLECTED = 1.5e-19  # what smoothing does not see of a function of size 3000, beyond `REACH` standard deviations
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -162,6 +163,7 @@ def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array])
     Returns
     -------
     nodal, bend : ndarray, shapes (cells + 1, nq), (cells + 1, nq - 1)
+        `NOWHERE` at nodes of no live cell.
     payment : ndarray, shape (cells, nq - 1)
     """
     lines, rows = band.lines, frame.y[band.rows]
@@ -175,6 +177,7 @@ def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array])
     tables = np.stack([found.cross_low, found.cross_high, found.steep_y, found.steep_w])
     wanted = _touched(band.live)
     nodal = at_nodes(image, radius, wanted, rows, frame.q, found.values, found.bend, tables[2:])
+    nodal = np.where(wanted, nodal, NOWHERE)
     dq = np.diff(frame.q)
     bend, extra = along_q(
         image, radius, band.live, frame.bends[2:, cells], dq, rows, frame.q, tables, found.bend, found.kinks

@@ -9,6 +9,7 @@ box (Picard) encloses x(h).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
@@ -17,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Mask
-from certbound.problem.model import JUMPS, OPERATIONS, Graph, Tape, jacobian
+from certbound.problem.model import JUMPS, ROWS, Graph, Tape, jacobian
 from certbound.rigor.intervals import Interval
-from certbound.rigor.series import ZERO, Series
+from certbound.rigor.series import ZERO, Series, product
 from certbound.values.discrete import evaluate
 from certbound.watch import poll
 
@@ -28,15 +29,28 @@ Box = list[Interval]
 _ROUNDS = 40
 
 
-def series_along(tape: Tape, inputs: Sequence[Series], order: int) -> list[Series]:
-    """Taylor coefficients of a tape's outputs, from those of its inputs."""
-    table: dict[str, Callable[..., Any]] = {op: partial(_applied, op, order) for op in OPERATIONS}
+def series_along(tape: Tape, inputs: Sequence[Series], order: int, products: list[Series]) -> list[Series]:
+    """Taylor coefficients of a tape's outputs, from those of its inputs.
+
+    ``products`` holds those of all products in turn, as a lower order left them; it is brought to this order.
+    """
+    table: dict[str, Callable[..., Any]] = {op: partial(_applied, op, order) for op in ROWS}
     table["const"] = lambda value: [Interval.point(value)]
-    return tape.evaluate(table, inputs)
+    turn = itertools.count()
+
+    def times(x: Series, y: Series) -> Series:
+        k = next(turn)
+        known = products[k] if k < len(products) else []
+        # of order 0 everything is computed as numbers, not as series, and may be closer by a rounding
+        found = product(x, y, order, known) if len(known) > 1 else _applied("mul", order, x, y)
+        products[k : k + 1] = [found]
+        return found
+
+    return tape.evaluate(table | {"mul": times}, inputs)
 
 
 def _applied(op: str, order: int, *args: Any) -> Series:
-    row = OPERATIONS[op]
+    row = ROWS[op]
     if op not in JUMPS and op not in ("kink", "pow") and all(len(x) == 1 for x in args):
         return [row.interval(*(x[0] for x in args))]
     return row.series(*args, order)
@@ -154,9 +168,10 @@ def flow(tape: Tape, start: Sequence[Interval], step: float, order: int) -> Flow
 def _coefficients(tape: Tape, start: Sequence[Interval], order: int) -> list[Series]:
     """x_0 ... x_order of the solution, from x_{k+1} = [f(x)]_k / (k + 1)."""
     found: list[Series] = [[value] for value in start]
+    products: list[Series] = []
     for k in range(order):
         poll("the flow over a step")
-        rates = series_along(tape, [[ZERO], *found], k)
+        rates = series_along(tape, [[ZERO], *found], k, products)
         for series, rate in zip(found, rates):
             coefficient = rate[k] if k < len(rate) else ZERO
             series.append((coefficient / float(k + 1)).broadcast_to(series[0].shape))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,11 +11,14 @@ import numpy as np
 from certbound.arrays import Array, Index, Mask
 from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval
+from certbound.values.discrete import evaluate
 from certbound.values.grids import Grid, graded_axis
-from certbound.values.semilagrangian.backward import Bounds, start_levels
+from certbound.values.semilagrangian.backward import Bounds, bounds_below, levels_above
 from certbound.values.semilagrangian.bands import Band, Frame, band_of
+from certbound.values.semilagrangian.confines import Wall
 from certbound.values.semilagrangian.flows import flow, sheared
 from certbound.values.semilagrangian.local_steps import Blocks, Clock, base_of, blocks_of
+from certbound.values.semilagrangian.mirrors import mirrors_of
 from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.remainders import chord_level, level_of
 from certbound.watch import poll
@@ -24,6 +28,7 @@ _ORDERS = (4, 8, 7)
 """Of Taylor's polynomials in time: for a first look, on blocks, at nodes."""
 _MOST_BANDS = 12
 _MOST_REACH = 6
+_MIRRORED = 6.0  # standard deviations beyond q's faces over which nodes are mirror images
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -56,7 +61,8 @@ class Layout:
     clock: Clock
     frame: Frame
     bands: list[Band]
-    bounds: Bounds
+    above: Bounds
+    below: Bounds
 
 
 def layout_of(setting: Setting, plan: Plan) -> Layout:
@@ -75,12 +81,20 @@ def layout_of(setting: Setting, plan: Plan) -> Layout:
     within = _inside(clock.shear, edges[0], edges[1], p, q, whole=False)
     blocks = blocks_of(setting, clock, edges[0], edges[1], order=_ORDERS[1], wanted=within)
     usable = blocks.known & _gentle(blocks, clock, axes)
-    frame, inner, safe = _frame(setting, clock, axes, blocks, usable, (index[0], index[1]))
+    marked = _marked(setting, clock, axes, blocks, usable)
+    live = ~marked.broken & marked.boxed & usable[np.ix_(*index)]
+    frame = _frame(setting, clock, axes, blocks, usable, (index[0], index[1]), live)
     bands, live = _bands(frame, blocks, usable, (index[0], index[1]), clock)
     frame = replace(frame, live=live)
-    level = start_levels(frame, safe & live, inner)
-    bounds = Bounds(level=level, reach=_reach(blocks, clock, usable, axes))
-    return Layout(clock=clock, frame=frame, bands=bands, bounds=bounds)
+    reach = _reach(blocks, clock, usable, axes)
+    above, below, beyond = mirrors_of(setting, clock, axes, blocks, usable)
+    level = np.maximum(levels_above(marked.safe & live, marked.crossed), beyond)
+    everywhere = np.ones(level.shape, dtype=bool)
+    return Layout(
+        clock=clock, frame=frame, bands=bands,
+        above=Bounds(level=level, fixed=level > 0, free=everywhere, reach=reach, mirrors=above),
+        below=bounds_below(live, marked.broken, reach, below),
+    )  # fmt: skip
 
 
 def nodes_of(setting: Setting, plan: Plan) -> int:
@@ -107,7 +121,7 @@ def _clock(setting: Setting, plan: Plan) -> Clock:
     known = blocks.known
     if not known.any():
         raise InfeasibleError(
-            "the model is undefined, or steps of this length cannot be enclosed; another engine's answer stands."
+            "the model is undefined, or steps of this length cannot be enclosed; value functions prove nothing here."
         )
     ratio = blocks.covariance[1].mid[known] / blocks.covariance[2].mid[known]
     return replace(first, shear=float(np.median(ratio)))
@@ -128,7 +142,7 @@ def _axes(setting: Setting, clock: Clock, plan: Plan, rough: Blocks) -> tuple[Ar
     sigma = math.sqrt(max(float(np.median(yy[known])), 0.0)), math.sqrt(float(np.median(qq[known])))
     if not sigma[0] > 1e-7 * (p1 - p0):
         raise InfeasibleError(
-            "the noise hardly reaches the coordinate without noise; another engine's answer stands."
+            "the noise hardly reaches the coordinate without noise; value functions prove nothing here."
         )
     dip = rough.strays.dip[:, known]
     p0, p1 = p0 + float(np.median(dip[0])), p1 - float(np.median(dip[1]))
@@ -141,15 +155,32 @@ def _axes(setting: Setting, clock: Clock, plan: Plan, rough: Blocks) -> tuple[Ar
     low = min(ends[0] - slant[1], p0 - away[1]) - 13 * sigma[0]
     high = max(ends[1] - slant[0], p1 - away[0]) + 13 * sigma[0]
     places = np.linspace(low, high, 4001)
-    gap = np.minimum(*(np.maximum(np.maximum(f - away[1] - places, places - f + away[0]), 0.0) for f in (p0, p1)))
+    gap = np.full(len(places), np.inf)
+    for end, slant in _upright(setting, clock.shear, (p0, p1)):
+        gap = np.minimum(gap, np.maximum(np.maximum(end - slant[1] - places, places - end + slant[0]), 0.0))
     wanted = np.minimum(plan.fine * sigma[0] + 0.1 * gap, plan.wide * (p1 - p0))
     y = graded_axis(low, high, places, np.maximum(wanted, 1e-12))
     count = max(8, math.ceil((q1 - q0) / (plan.cell * sigma[1])))
     core = np.linspace(q0, q1, count + 1)
     beyond = 11 * sigma[1] + max(q0 - tall[0], tall[1] - q1, 0.0)
-    steps = np.cumsum(np.minimum(plan.cell * 1.35 ** np.arange(1, 60), 1.6)) * sigma[1]
-    steps = steps[: int(np.searchsorted(steps, beyond)) + 1]
+    near = (core[1] - core[0]) * np.arange(1, math.ceil(_MIRRORED * sigma[1] / (core[1] - core[0])) + 1)
+    steps = near[-1] + np.cumsum(np.minimum(plan.cell * 1.35 ** np.arange(1, 60), 1.6)) * sigma[1]
+    steps = np.concatenate([near, steps[: int(np.searchsorted(steps, beyond)) + 1]])
     return y, np.concatenate([q0 - steps[::-1], core, q1 + steps])
+
+
+def _upright(setting: Setting, shear: float, ends: tuple[float, float]) -> Iterator[tuple[float, list[float]]]:
+    """Places of p where the safe set ends along q, about, each with the range of shear q there."""
+    faces = setting.faces[1]
+    for end, limit in zip(ends, setting.beyond[0]):
+        if math.isfinite(limit):
+            yield end, sorted(shear * q for q in faces)
+    for wall in setting.walls:
+        hull = wall.hull()
+        tall = sorted(shear * float(np.clip(q, *faces)) for q in (hull.lo[1], hull.hi[1]))
+        for end in (float(hull.lo[0]), float(hull.hi[0])):
+            if math.isfinite(end):
+                yield end, tall
 
 
 def _chunks(axis: Array, count: int) -> tuple[Index, Array]:
@@ -189,29 +220,89 @@ def _reach(blocks: Blocks, clock: Clock, usable: Mask, axes: tuple[Array, Array]
     return math.ceil(farthest[0] * 1.000001), math.ceil(farthest[1] * 1.000001)
 
 
-def _frame(
-    setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask, index: tuple[Index, Index]
-) -> tuple[Frame, Mask, Mask]:
-    """The frame, and the cells surely within the noisy faces, and within the others."""
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Marks:
+    """What is known of the cells, shape (ny - 1, nq - 1) each.
+
+    ``safe``: they lie in the safe set, far enough from p's faces; ``broken``: no point of theirs is safe; ``boxed``:
+    within the box, or across its end where that is a limit; ``crossed``: a path may end there that has met a wall.
+    """
+
+    safe: Mask
+    broken: Mask
+    boxed: Mask
+    crossed: Mask
+
+
+def _marked(setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask) -> _Marks:
     y, q = axes
-    spread = np.ix_(*index)
     dips = blocks.strays.dip
     touched = [float(np.where(usable, d, 0.0).max()) for d in dips]
     p, faces = setting.faces
     dip = _dips(blocks, usable, clock, p, touched)
-    safe = _inside(clock.shear, y, q, (p[0] + dip[0], p[1] - dip[1]), (-np.inf, np.inf), whole=True)
-    inner = _within_noisy(setting, clock, axes, blocks, usable)
-    live = safe & usable[spread] & ((q[:-1] >= faces[0]) & (q[1:] <= faces[1]))[None]
+    ends = Interval(q[:-1], q[1:])
+    places = Interval(y[:-1], y[1:])[:, None] + (ends * clock.shear)[None]
+    heights = ends[None].broadcast_to(places.shape)
+    safe = (places.lo >= p[0] + dip[0]) & (places.hi <= p[1] - dip[1]) & (ends.lo >= faces[0]) & (ends.hi <= faces[1])
+    past, over = setting.beyond
+    broken = (places.hi <= past[0]) | (places.lo >= past[1]) | (heights.hi <= over[0]) | (heights.lo >= over[1])
+    boxed = (ends.lo >= faces[0]) & (ends.hi <= faces[1])
+    boxed = boxed & ((places.lo >= p[0]) | math.isfinite(past[0])) & ((places.hi <= p[1]) | math.isfinite(past[1]))
+    crossed = np.zeros(safe.shape, dtype=bool)
+    nowhere = np.zeros((1, 1))
+    for wall in setting.walls:
+        sizes = wall.sizes(places.reshape(-1), heights.reshape(-1))
+        safe &= wall.safe(sizes, nowhere).reshape(safe.shape)
+        broken |= wall.broken(sizes).reshape(safe.shape)
+        margins = _near_wall(setting, clock, axes, blocks, usable, wall)
+        near = np.isfinite(margins[0])
+        kept = wall.safe(sizes, np.where(near, margins, 0.0).reshape(len(margins), -1)).reshape(safe.shape)
+        crossed |= near & ~kept
+    return _Marks(safe=safe, broken=broken, boxed=np.asarray(boxed), crossed=crossed)
+
+
+def _near_wall(
+    setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask, wall: Wall
+) -> Array:
+    """Largest margins of the paths that may meet a wall in a step and end in a cell, (m, ...); -inf where none does."""
+    y, q = axes
+    hit = np.nonzero(usable)
+    tube = tuple(part[hit] for part in blocks.strays.tube)
+    sizes = wall.sizes(*tube)
+    meets = ~wall.safe(sizes, np.zeros((1, 1)))
+    hit = tuple(index[meets] for index in hit)
+    tube = tuple(part[meets] for part in tube)
+    f, undefined, _ = evaluate(setting.tape, [Interval.point(np.zeros(len(tube[0]))), *tube])
+    low, high = np.where(undefined, -np.inf, f.lo.T), np.where(undefined, np.inf, f.hi.T)
+    rates = Interval(low[0], high[0]), Interval(low[1], high[1])
+    margins = wall.margins((tube[0], tube[1]), rates, clock.step, setting.noise * (1 + setting.spread))
+    around = tube[0] - tube[1] * clock.shear
+    found = np.full((sizes.shape[1], len(y) - 1, len(q) - 1), -np.inf)
+    ends = [
+        (np.searchsorted(axis, part.lo, side="right") - 1, np.searchsorted(axis, part.hi))
+        for axis, part in ((y, around), (q, tube[1]))
+    ]
+    for k in range(len(hit[0])):
+        part = tuple(slice(max(int(first[k]), 0), int(last[k])) for first, last in ends)
+        found[(slice(None), *part)] = np.maximum(found[(slice(None), *part)], margins[:, k, None, None])
+    return found
+
+
+def _frame(
+    setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask,
+    index: tuple[Index, Index], live: Mask,
+) -> Frame:  # fmt: skip
+    y, q = axes
+    spread = np.ix_(*index)
     image, radius, known = _images(setting, clock, y, q, live)
-    live &= known
     mean = blocks.strays.mean
     drift = np.stack([mean[0] + abs(clock.shear) * mean[1], mean[1]])
     zero = np.where(usable, 1.0, 0.0)
-    frame = Frame(
+    return Frame(
         y=y, q=q, image=image, radius=radius, slopes=(blocks.slopes * zero)[:, spread[0], spread[1]],
-        bends=(blocks.bends * zero)[:, spread[0], spread[1]], drift=(drift * zero)[:, spread[0], spread[1]], live=live,
+        bends=(blocks.bends * zero)[:, spread[0], spread[1]], drift=(drift * zero)[:, spread[0], spread[1]],
+        live=live & known,
     )  # fmt: skip
-    return frame, inner, safe
 
 
 def _dips(blocks: Blocks, usable: Mask, clock: Clock, p: tuple[float, float], most: list[float]) -> tuple[float, float]:
@@ -220,25 +311,6 @@ def _dips(blocks: Blocks, usable: Mask, clock: Clock, p: tuple[float, float], mo
     dips = blocks.strays.dip
     near = (usable & (low <= p[0] + most[0]), usable & (high >= p[1] - most[1]))
     return float(np.where(near[0], dips[0], 0.0).max()), float(np.where(near[1], dips[1], 0.0).max())
-
-
-def _within_noisy(setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask) -> Mask:
-    """Cells where no path ends that has crossed a noisy face in the step and had its share of noise outward since."""
-    y, q = axes
-    low_face, high_face = setting.faces[1]
-    tubes = blocks.strays.tube
-    low, high = np.full(len(y) - 1, low_face), np.full(len(y) - 1, high_face)
-    inward = blocks.strays.inward
-    around = tubes[0] - tubes[1] * clock.shear
-    box = (around.lo, around.hi, tubes[1].lo, tubes[1].hi)
-    for i, j in zip(*np.nonzero(usable)):
-        first, last = np.searchsorted(y, box[0][i, j], side="right") - 1, np.searchsorted(y, box[1][i, j])
-        part = slice(max(int(first), 0), int(last))
-        if box[3][i, j] >= high_face:
-            high[part] = np.minimum(high[part], high_face - inward[1, i, j] * clock.step * (1 + 1e-12))
-        if box[2][i, j] <= low_face:
-            low[part] = np.maximum(low[part], low_face + inward[0, i, j] * clock.step * (1 + 1e-12))
-    return np.asarray((q[:-1][None] >= low[:, None]) & (q[1:][None] <= high[:, None]))
 
 
 def _images(setting: Setting, clock: Clock, y: Array, q: Array, live: Mask) -> tuple[Array, Array, Mask]:
@@ -290,7 +362,7 @@ def _groups(blocks: Blocks, usable: Mask) -> list[tuple[int, int]]:
     qq = blocks.covariance[2].mid
     rows = np.flatnonzero(usable.any(axis=1))
     if not len(rows):
-        raise InfeasibleError("no part of the safe set could be followed over a step; another engine's answer stands.")
+        raise InfeasibleError("no part of the safe set could be followed over a step; value functions prove nothing.")
     middle = np.array([float(np.median(line[keep])) if keep.any() else 0.0 for line, keep in zip(qq, usable)])
     tolerance = 5e-4
     while True:

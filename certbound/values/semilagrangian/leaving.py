@@ -12,15 +12,16 @@ from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.values.continuous import ExitBounds
-from certbound.values.semilagrangian.backward import back, highest, limited
+from certbound.values.grids import around_nodes
+from certbound.values.semilagrangian.backward import Bounds, back, highest, limited, lowest
 from certbound.values.semilagrangian.groundwork import Layout, Plan, layout_of, nodes_of
 from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
 from certbound.watch import OutOfTime, poll
 
-_RARE = 32
-"""Rare events a step, each of probability ``Plan.spare``, that are paid for; see the package."""
-_TALLEST = 6.0  # the payment for rare events takes U to be at most 8
+_RARE = 12_000
+"""What rare events cost a step in units of ``Plan.spare``: four events, in which a function of at most 3000 is lost."""
+_TALLEST = 2500.0
 _SHARE = 1e-3
 _PLANS = (
     (0.2, (0.7, 0.005, 0.33)), (0.16, (0.6, 0.0035, 0.3)), (0.13, (0.5, 0.0025, 0.25)), (0.1, (0.45, 0.002, 0.22)),
@@ -31,7 +32,7 @@ _PLANS = (
 Shorter steps ask for smaller cells, since every step pays for its interpolation.
 """
 _FIRST = 0.25  # share of the work that a first look may take, which tells how rare failing is
-_SPARE = 1e-13
+_SPARE = 1e-15
 _RATE = 900_000
 """Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes."""
 _PREPARED = 20
@@ -70,11 +71,15 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     begin = time.process_time()
     setting = setting_of(problem)
     turn = _turn(setting)
-    best, failed, done, spare = 1.0, None, [], _SPARE
-    for ratio, cells in _affordable(setting, turn, _RATE * round(seconds, 1)):
+    best, least, failed, done, spare = 1.0, 0.0, None, [], _SPARE
+    chosen = _affordable(setting, turn, _RATE * round(seconds, 1))
+    for k, (ratio, cells) in enumerate(chosen):
         plan = _plan(setting, turn, ratio, cells, spare)
         try:
-            best = min(best, bound_by_steps(setting, plan))
+            layout = layout_of(setting, plan)
+            best = min(best, bound_by_steps(setting, plan, layout))
+            if k == len(chosen) - 1:
+                least = bound_by_steps_below(setting, plan, layout)
         except InfeasibleError as error:  # shorter steps may do
             failed = error
             continue
@@ -88,7 +93,8 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
         raise failed
     words = f"value function along the flow, {', '.join(done)}"
     upper = min(0.0, math.log10(best) * (1 - 1e-15) + 1e-15)
-    return ExitBounds(upper=upper, lower=None, words=words, seconds=time.process_time() - begin)
+    lower = math.log10(least) * (1 + 1e-15) - 1e-15 if least > 0 else None
+    return ExitBounds(upper=upper, lower=lower, words=words, seconds=time.process_time() - begin)
 
 
 def _plan(setting: Setting, turn: float, ratio: float, cells: Cells, spare: float) -> Plan:
@@ -102,7 +108,7 @@ def _affordable(setting: Setting, turn: float, work: float) -> list[tuple[float,
     for ratio, cells in _PLANS:
         plan = _plan(setting, turn, ratio, cells, _SPARE)
         try:
-            needed = nodes_of(setting, plan) * (plan.count + _PREPARED)
+            needed = nodes_of(setting, plan) * (2 * plan.count + _PREPARED)  # from above and from below
         except InfeasibleError:  # shorter steps may do
             continue
         first = min(first, needed)
@@ -112,23 +118,42 @@ def _affordable(setting: Setting, turn: float, work: float) -> list[tuple[float,
     return [_PLANS[0], chosen] if chosen != _PLANS[0] and first < _FIRST * work else [chosen]
 
 
-def bound_by_steps(setting: Setting, plan: Plan) -> float:
+def bound_by_steps(setting: Setting, plan: Plan, layout: Layout | None = None) -> float:
     """Upper bound of the probability of leaving by the horizon, from one plan; at most 1."""
-    layout = layout_of(setting, plan)
-    value = terminal(layout)
-    for _ in range(plan.count):
-        poll("a value function along the flow")
-        value = back(layout.frame, layout.bands, layout.bounds, value)
-        if value.nodal.max() > _TALLEST:
-            return 1.0
-    best = highest(layout.frame, value, setting.starts, layout.clock.shear)
+    layout = layout or layout_of(setting, plan)
+    value = _stepped(layout, layout.above, plan)
+    if value is None:
+        return 1.0
+    best = highest(layout.frame, value, setting, layout.clock.shear)
     return min(1.0, (best + _RARE * plan.count * plan.spare) * (1 + 1e-12))
 
 
-def terminal(layout: Layout) -> Lines:
-    """The function at the horizon: 0 but near the faces."""
-    shape = layout.bounds.level.shape
-    return limited(layout.frame, layout.bounds, np.zeros(shape), np.zeros((shape[0], shape[1] - 1)))
+def bound_by_steps_below(setting: Setting, plan: Plan, layout: Layout | None = None) -> float:
+    """Lower bound of the probability of leaving by the horizon from some start; at least 0."""
+    layout = layout or layout_of(setting, plan)
+    value = _stepped(layout, layout.below, plan)
+    if value is None:
+        return 0.0
+    best = -lowest(layout.frame, value, setting.some_starts(), layout.clock.shear)
+    return max(0.0, best * (1 - 1e-12) - _RARE * plan.count * plan.spare)
+
+
+def _stepped(layout: Layout, bounds: Bounds, plan: Plan) -> Lines | None:
+    """The function at time 0, unless it grows too large."""
+    value = terminal(layout, bounds)
+    for _ in range(plan.count):
+        poll("a value function along the flow")
+        value = back(layout.frame, layout.bands, bounds, value)
+        if np.abs(value.nodal).max() > _TALLEST:
+            return None
+    return value
+
+
+def terminal(layout: Layout, bounds: Bounds) -> Lines:
+    """The function at the horizon: 0 but outside of the safe set."""
+    stepped = around_nodes(layout.frame.live.astype(float), largest=True) > 0
+    shape = stepped.shape
+    return limited(layout.frame, bounds, np.where(stepped, 0.0, -np.inf), np.zeros((shape[0], shape[1] - 1)))
 
 
 def _turn(setting: Setting) -> float:

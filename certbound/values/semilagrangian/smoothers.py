@@ -30,6 +30,7 @@ REACH = 10.0
 WIDER = 1.4
 """Ratio of the standard deviations of the dominating density and of the noise; at least that of ``axis_kernel``."""
 _ROUND = 1 + 1e-9
+_BLOCK = 48  # rows of the q-axis that are multiplied at once
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -48,7 +49,10 @@ class Along:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Across:
-    """Matrices of the q-axis: ``values[a]`` and ``parabolas[a]`` for derivative a = 0, 1, 2; ``sup[a]`` on cells."""
+    """Matrices of the q-axis: ``values[a]`` and ``parabolas[a]`` for derivative a = 0, 1, 2; ``sup[a]`` on cells.
+
+    ``spans`` holds (first row, last row, first column, last column) of blocks outside of which all matrices are 0.
+    """
 
     values: tuple[Array, ...]
     parabolas: tuple[Array, ...]
@@ -57,6 +61,7 @@ class Across:
     mass: Array
     wide: Array
     error: float
+    spans: tuple[tuple[int, int, int, int], ...]
 
 
 def along(nodes: Array, sigma: float, spread: float, rows: slice, lines: slice) -> Along:
@@ -98,10 +103,33 @@ def across(nodes: Array, sigma: float, spread: float, stretch: float) -> Across:
     parabolas = tuple(_dense(kernel, "bubble", len(nodes) - 1, order) for order in range(3))
     sup = _peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma)
     density = _peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma, stretch)[0]
+    wide = _mass(nodes, nodes, sigma, WIDER)
     return Across(
-        values=values, parabolas=parabolas, sup=sup, density=density,
-        mass=np.minimum(density * np.diff(nodes), 1.0), wide=_mass(nodes, nodes, sigma, WIDER), error=kernel.error,
+        values=values, parabolas=parabolas, sup=sup, density=density, mass=np.minimum(density * np.diff(nodes), 1.0),
+        wide=wide, error=kernel.error, spans=_spans([*values, *parabolas, *sup, density, wide]),
     )  # fmt: skip
+
+
+def _spans(matrices: list[Array]) -> tuple[tuple[int, int, int, int], ...]:
+    """Blocks of rows with the columns in which some of the matrices is not 0."""
+    rows, columns = (max(matrix.shape[axis] for matrix in matrices) for axis in (0, 1))
+    found = np.zeros((rows, columns), dtype=bool)
+    for matrix in matrices:
+        found[: matrix.shape[0], : matrix.shape[1]] |= matrix != 0
+    spans = []
+    for first in range(0, rows, _BLOCK):
+        last = min(first + _BLOCK, rows)
+        used = np.flatnonzero(found[first:last].any(axis=0))
+        spans.append((first, last, int(used[0]), int(used[-1]) + 1) if len(used) else (first, last, 0, 0))
+    return tuple(spans)
+
+
+def across_by(lines: Array, matrix: Array, spans: tuple[tuple[int, int, int, int], ...]) -> Array:
+    """``lines @ matrix.T``, block by block: most of a wide matrix is 0."""
+    found = np.zeros((len(lines), len(matrix)))
+    for first, last, left, right in spans:
+        found[:, first:last] = lines[:, left:right] @ matrix[first:last, left:right].T
+    return found
 
 
 def _dense(kernel: AxisKernel, name: str, columns: int, order: int = 0) -> Array:

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.values.semilagrangian.smoothers import Across, Along
+from certbound.values.semilagrangian.smoothers import Across, Along, across_by
 
 _UP = 1 + 1e-9
 
@@ -95,23 +95,27 @@ def smoothed(
     dy, dq, dm = np.diff(y)[:, None], np.diff(q), np.diff(mesh)[:, None]
     eighth = dq**2 / 8 * _UP
     u, b = lines.nodal, lines.bend
-    v, v1, v2 = (u @ value.T + b @ parabola.T for value, parabola in zip(two.values, two.parabolas))
-    fourth = _kinks(u, b, dq) @ two.sup[2].T * eighth
+    spans = two.spans
+    v, v1, v2 = (
+        across_by(u, value, spans) + across_by(b, parabola, spans)
+        for value, parabola in zip(two.values, two.parabolas)
+    )
+    fourth = across_by(_kinks(u, b, dq), two.sup[2], spans) * eighth
     down = _ends(np.maximum, -v2) + fourth
     slope_u, slope_b = np.diff(u, axis=0) / dy, np.diff(b, axis=0) / dy
-    turn = _kinks(slope_u, slope_b, dq) @ two.sup[1].T * eighth
-    tilt = (np.abs(np.diff(slope_u, axis=1)) / dq + np.abs(slope_b) * dq / 2) @ two.mass.T
+    turn = across_by(_kinks(slope_u, slope_b, dq), two.sup[1], spans) * eighth
+    tilt = across_by(np.abs(np.diff(slope_u, axis=1)) / dq + np.abs(slope_b) * dq / 2, two.mass, spans)
     jump = np.diff(np.diff(v, axis=0) / dy, axis=0)
-    wave = _kinks(np.diff(slope_u, axis=0), np.diff(slope_b, axis=0), dq) @ two.sup[0].T * eighth
+    wave = across_by(_kinks(np.diff(slope_u, axis=0), np.diff(slope_b, axis=0), dq), two.sup[0], spans) * eighth
     edge = ((1, 1), (0, 0))
     drop = np.pad(_ends(np.maximum, -jump) + wave, edge)
     bow = _ends(np.maximum, np.abs(np.diff(slope_u, axis=0))) + np.abs(np.diff(slope_b, axis=0)) * eighth
-    size = np.pad(bow @ two.mass.T, edge)
+    size = np.pad(across_by(bow, two.mass, spans), edge)
     rows, rows1, bend = one.rows @ v, one.rows @ v1, one.rows @ down
     cross = np.diff(rows1, axis=0) / dm
     spare = one.mass @ turn
     low, high = _ends(np.minimum, cross) - spare, _ends(np.maximum, cross) + spare
-    bent = one.ceiling @ (_rising(u, b, dq) @ two.density.T) * _UP
+    bent = one.ceiling @ across_by(_rising(u, b, dq), two.density, spans) * _UP
     inner = np.maximum(np.maximum(bend[:-1], bend[1:]), bent)
     rate = np.abs(np.diff(rows, axis=1)) / dq
     return Rows(
@@ -158,4 +162,4 @@ def _sides(b: Array) -> Array:
 
 
 def _wide(cellwise: Array, one: Along, two: Across) -> Array:
-    return np.asarray((one.wide @ cellwise) @ two.wide.T) * _UP
+    return across_by(one.wide @ cellwise, two.wide, two.spans) * _UP

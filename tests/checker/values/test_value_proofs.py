@@ -43,6 +43,7 @@ from certbound.safety.certificate import certificate_text, initial_data, problem
 from certbound.safety.certificates import values_proof_below
 from certbound.safety.certificates.parts import packed
 from certbound.safety.verification import verify_safety
+from certbound.values.continuous import bound_exits
 from tests.checker.conftest import (
     exit_certificate,
     leaving,
@@ -173,7 +174,7 @@ def test_means_after_uniform_noise_hold_everywhere_on_the_images() -> None:
         xi = (2 * y - left - right) / (right - left)
         return np.where(inside, sum(value.coefficients[i, k - 1] * xi**i for i in range(5)), 1.5)
 
-    offsets = (np.arange(40_000) + 0.5) / 20_000 - 1
+    offsets = (np.arange(10_000) + 0.5) / 5_000 - 1
     for xi in (-1.0, -0.4, 0.0, 0.7, 1.0):
         x = (low + high) / 2 + xi * (high - low) / 2
         truth = np.array([u(0.7 * p + 0.2 * np.sin(3 * p) + 0.3 * offsets).mean() for p in x])
@@ -264,6 +265,23 @@ def test_the_two_bounds_of_a_probability_enclose_a_simulation(make: Any) -> None
         assert found.lower <= 10**most.log10_proved
 
 
+@pytest.mark.slow
+def test_a_lower_bound_in_the_plane_is_proved_again() -> None:
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.8 * np.eye(2))
+    room = cb.Inside(cb.Box([-1, -1], [1, 1]))
+    problem = cb.Problem(system, initial=[0, 0], safe=[room], horizon=0.5)
+    found = bound_exits(problem, seconds=0.5)
+    assert found.lower is not None
+    assert len(found.proposed_below) == 1
+    answer = EngineAnswer(log10_delta=found.upper, log10_lower=found.lower, details=found, method="values")
+    verdict = SimpleNamespace(status="UNSAFE", reason="", answers={"values": answer})
+    report = check_data(parse(certificate_text(problem, verdict)), problem_data(problem))
+    assert report.valid
+    seen = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(0))
+    assert report.log10_lower_proved is not None
+    assert found.lower - 0.3 < report.log10_lower_proved <= math.log10(seen.upper)
+
+
 def test_levels_from_below_are_held_to_the_largest_slope_that_is_due() -> None:
     """(1 + q)(3 - q) is 3 at q = 0 and at q = 2, and 4 in between; from above (1 - q)(m - q) is convex."""
     with pytest.raises(Unproved, match="q was not shown"):
@@ -338,7 +356,7 @@ def test_starts_that_are_stated_by_a_box_around_them_have_no_certificate_from_be
     assert initial_data(around) == {"kind": "box", "low": exact([0.0]), "high": exact([1.0]), "around": True}
     answer = EngineAnswer(log10_delta=-0.5, log10_lower=-1.0)
     with pytest.raises(CertificateError, match="a box, a ball or an ellipsoid"):
-        values_proof_below(SimpleNamespace(initial=around), answer)
+        values_proof_below(SimpleNamespace(initial=around, ending=False), answer)
 
 
 def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:

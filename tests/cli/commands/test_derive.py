@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -45,3 +46,55 @@ def test_local_constants_say_where_the_tube_ends(tmp_path, capsys):
     found = derived(tmp_path, capsys, horizon=1.5, law="x**2", sigma=0.01, low=0.2, high=1.0)  # the last escapes at 1
     assert "before 1.5 s, where no guess of its size confirmed itself" in found["domain"]
     assert 0.1 < found["times"][-1] < 1
+
+
+def answer(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any]]:
+    """Exit code and the JSON object."""
+    code = run([*words, "--json"])
+    return code, dict(json.loads(capsys.readouterr().out))
+
+
+def test_only_the_constraint_that_is_asked_for_gets_a_metric(capsys: pytest.CaptureFixture[str]) -> None:
+    code, found = answer(capsys, "derive", "chain_rest", "--constraint", "v3 <= 2")
+    assert code == 0
+    assert [one["constraint"] for one in found["metrics"]] == ["v3 <= 2"]
+    assert found["metrics"][0]["certified"] is True
+    assert answer(capsys, "derive", "chain_rest", "--constraint", "none")[1]["metrics"] == []
+
+
+def test_each_metric_is_printed_as_it_is_found(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["derive", "chain_rest", "--constraint", "v3 <= 2", "--constraint", "p1 >= -1.2", "--jobs", "2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sorted(line.partition(": gain ")[0] for line in lines[:2]) == ["p1 >= -1.2", "v3 <= 2"]
+    assert lines[2].startswith("gain 0.99005 per step, certified")
+
+
+def test_what_was_found_when_the_time_is_over_is_kept(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from certbound.constants import metrics
+    from certbound.watch import OutOfTime
+
+    every = metrics.each_metric
+
+    def cut(*arguments: Any, **options: Any) -> Any:
+        yield next(every(*arguments, **options))
+        raise OutOfTime
+
+    monkeypatch.setattr(metrics, "each_metric", cut)
+    code, found = answer(capsys, "derive", "chain_rest", "--time-limit", "300")
+    assert code == 0
+    assert len(found["metrics"]) == 1
+    assert found["gain"] < 0.9906
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--constraint", "v9 <= 2"], "no constraint is called `v9 <= 2`"),
+        (["--jobs", "0"], "`--jobs` must be positive, got 0"),
+    ],
+)
+def test_derive_refuses_what_it_cannot_do(words: list[str], why: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["derive", "chain_rest", *words]) == 2
+    assert why in capsys.readouterr().err

@@ -29,6 +29,11 @@ MODELS = {
     "calls": lambda x: [np.sin(x[0]) * np.arctan2(x[1], x[0] + 9) + np.hypot(x[0], 1), np.maximum(x[0], -x[1])],
     "shared": lambda x: [np.exp(np.tanh(x[0] * x[1])) + k * np.tanh(x[0] * x[1]) for k in range(3)],
     "deep": lambda x: [deep(x[0]) + x[1]],
+    "jumps": lambda x: [np.sign(x[0]) + np.floor(2.5 * x[1]), 2 * ((x[0] < 1) < (x[1] > 0)) - ~(x[0] < 0) * x[1]],
+    "choices": lambda x: [
+        np.where(x[0] > x[1], x[0] + 1, np.where(x[0] != 0, x[1], 3.0)),
+        np.where((x[0] <= 1) & ~(x[1] == 2) | (x[0] * x[1] < 0.5), x[0], -x[0]),
+    ],
 }
 
 
@@ -57,12 +62,6 @@ def test_twelve_states_keep_their_size():
     weights = np.random.default_rng(0).normal(size=(12, 12))
     tape = trace(lambda x: np.tanh(weights @ x), {"x": [f"x{k}" for k in range(12)]})
     assert len(reread(tape)[0].nodes) == len(tape.nodes)
-
-
-@pytest.mark.parametrize("function", [lambda x: np.sign(x), lambda x: np.where(x > 0, x, 0), lambda x: np.floor(x)])
-def test_what_files_do_not_have_is_named(function):
-    with pytest.raises(ValueError, match="does not exist in problem files; keep the model in Python"):
-        formulas(trace(function, {"x": ["a"]}), iter(["s"]))
 
 
 def test_a_kink_of_a_derivative_is_no_formula():

@@ -1,11 +1,14 @@
 """What is saved is what was read: every law, start, constraint, plan and bundled problem."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import certbound as cb
 from certbound.problem.files.loading import load, loads, save
 from certbound.problem.files.plans import write_plan
+from certbound.problem.model import jacobian, trace
 from tests.problem.toml_files import COURSE, STEPS, changed, same
 
 
@@ -136,9 +139,10 @@ def test_a_function_defined_problem_is_saved_as_expressions(tmp_path):
 
 
 def test_a_model_that_files_cannot_hold_is_refused(tmp_path):
-    system = cb.ContinuousSystem(lambda x: [np.where(x[0] > 0, 1.0, 2.0)], states=1)
+    slope = jacobian(trace(lambda x: [np.abs(x[0])], {"t": ["t"], "x": ["x1"]}), [1])
+    system = cb.ContinuousSystem(replace(slope, shape=(1,)), states=1)
     problem = cb.Problem(system, initial=[0], safe=[], horizon=1)
-    with pytest.raises(ValueError, match="does not exist in problem files"):
+    with pytest.raises(ValueError, match="kink does not exist in problem files"):
         save(problem, tmp_path / "model.toml")
     assert not (tmp_path / "model.toml").exists()
     with pytest.raises(ValueError, match=r"`path` must end in \.toml"):

@@ -202,7 +202,7 @@ def test_chain_labels_name_the_gaps():
         ({"masses": 2}, "`masses` must be a whole number, at least 3, got 2"),
         ({"masses": 3.5}, "`masses` must be a whole number"),
         ({"reaction": 2}, "`reaction` must be 0 or 1"),
-        ({"sigma": -1}, "`std` must not be negative"),
+        ({"sigma": -1}, "`sigma` must not be negative"),
         ({"input_bound": 10}, "`plan` must stay in the input bounds"),
     ],
 )

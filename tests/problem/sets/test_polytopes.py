@@ -122,7 +122,7 @@ polygon = { vertices = { py = [-0.5, 0.5, 0], px = [-0.5, -0.5, 0.5] } }
     ("table", "message"),
     [
         ("[[avoid]]\nall = [ { ball = { center = [1, 1], radius = 0.2 } } ]", "the ball is round"),
-        ("[[avoid]]\nall = []", "at least 1 item"),
+        ("[[avoid]]\nall = []", "at least 1 entries"),
         ("[[avoid]]\nall = [ { box = { px = [0.5, 1] }, during = [0, 1] } ]", "unknown key 'during' in a part of all"),
         ("[[avoid]]\nbox = { px = [0.5, 1] }\nall = [ { box = { px = [0.5, 1] } } ]", "needs exactly one of"),
         ("[[avoid]]\npolygon = { vertices = { px = [1, 2, 3] } }", "two of the states px, py by name"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -55,7 +57,7 @@ def test_a_hardening_spring_is_certified_at_large_noise() -> None:
     assert verdict.method == "barrier"
     barrier = verdict.answers["barrier"].details
     rng = np.random.default_rng(3)
-    x = rng.uniform([-3, -3], [3, 2.25], (100_000, 2))
+    x = rng.uniform([-3, -3], [3, 2.25], (30_000, 2))
     step = 1e-4
     slope = np.stack([(values(barrier, x + e) - values(barrier, x - e)) / (2 * step) for e in step * np.eye(2)], axis=1)
     up = np.array([0.0, step])
@@ -64,7 +66,7 @@ def test_a_hardening_spring_is_certified_at_large_noise() -> None:
     generator = np.sum(slope * drift, axis=1) + 0.125 * bend + 0.125 * slope[:, 1] ** 2
     assert generator.max() <= barrier.growth + 1e-4
     assert generator.max() > barrier.growth - 0.05
-    assert values(barrier, rng.uniform(-1, 1, (50_000, 2))).max() <= barrier.start
+    assert values(barrier, rng.uniform(-1, 1, (20_000, 2))).max() <= barrier.start
     sides = np.concatenate([
         np.stack([rng.uniform(-3, 3, 5000), np.full(5000, 2.25)], axis=1),
         np.stack([np.full(5000, 3.0), rng.uniform(-3, 2.25, 5000)], axis=1),
@@ -205,3 +207,21 @@ def test_of_many_points_only_those_that_bind_enter_the_program(monkeypatch: pyte
     found = barrier_engine(oscillator(0.4))
     assert found.log10_delta < -2
     assert max(asked) < 0.8 * engine._FINE[2] ** 2
+
+
+def test_a_further_degree_that_cannot_reach_the_target_is_given_up_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    hopes: list[tuple[int, float]] = []
+    program = engine._Work._program
+
+    def noted(self: Any, exponents: Any, *points: Any) -> Any:
+        found = program(self, exponents, *points)
+        hopes.append((int(exponents.sum(axis=1).max()), found[1]))
+        return found
+
+    monkeypatch.setattr(engine._Work, "_program", noted)
+    system = cb.ContinuousSystem(lambda x: [x[0] - x[0] ** 3, -x[1]], states=2, diffusion=0.3 * np.eye(2))
+    room = cb.Inside(cb.Box([-0.4, -1.5], [2, 1.5]))
+    problem = cb.Problem(system, initial=cb.Box([0.9, -0.1], [1.0, 0.1]), safe=[room], horizon=3)
+    assert barrier_engine(problem).log10_delta < -1
+    assert [degree for degree, _ in hopes].count(6) == 1
+    assert hopes[-1][1] > -3

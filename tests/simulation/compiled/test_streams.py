@@ -45,7 +45,7 @@ def test_streams_differ_between_blocks_seeds_and_from_the_generator_of_starts():
 
 
 def test_normal_variates_follow_the_normal_law():
-    sample = np.empty(2_000_000)
+    sample = np.empty(1_000_000)
     fill_normal(seed_stream(1, 0), sample)
     assert kstest(sample, "norm").pvalue > 1e-3
     moments = [np.mean(sample**k) for k in (1, 2, 3, 4, 6)]
@@ -73,7 +73,7 @@ def test_each_layer_is_hit_in_proportion_to_its_share_of_the_law():
 
 
 def test_uniform_variates_fill_the_open_interval():
-    sample = np.empty(500_000)
+    sample = np.empty(1_000_000)
     fill_uniform(seed_stream(1, 0), sample)
     assert kstest(sample, "uniform", (-1, 2)).pvalue > 1e-3
     stream = seed_stream(1, 0)

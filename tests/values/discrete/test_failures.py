@@ -10,8 +10,8 @@ from scipy.stats import beta, norm
 
 import certbound as cb
 from certbound.problem.model.evaluation import compile_numpy
-from certbound.values.discrete.effort import without_hopeless
 from certbound.values.discrete.failures import bound_failure
+from certbound.values.discrete.layout import without_hopeless
 from certbound.values.discrete.shocks import Inapplicable
 
 

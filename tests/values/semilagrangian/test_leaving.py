@@ -13,14 +13,16 @@ from scipy.special import ndtr
 
 import certbound as cb
 from certbound.problem.model import compile_numpy
+from certbound.rigor.intervals import Interval
 from certbound.safety.engines import values
 from certbound.values.semilagrangian import bound_exits_by_steps, leaving
-from certbound.values.semilagrangian.groundwork import Plan
-from certbound.values.semilagrangian.leaving import bound_by_steps
+from certbound.values.semilagrangian.groundwork import Plan, layout_of
+from certbound.values.semilagrangian.leaving import bound_by_steps, bound_by_steps_below
+from certbound.values.semilagrangian.mirrors import Mirror
 from certbound.values.semilagrangian.noisy_axis import setting_of
 from certbound.watch import OutOfTime, Watch
 
-COARSE = Plan(count=20, fine=1.0, wide=0.012, cell=0.4, spare=1e-7)
+COARSE = Plan(count=20, fine=1.0, wide=0.012, cell=0.4, spare=1e-12)
 
 
 def mechanical(force, s: float, low, high, horizon: float, start) -> cb.Problem:
@@ -59,27 +61,101 @@ def simulated(problem: cb.Problem, paths: int, rng: np.random.Generator) -> tupl
 )
 def test_the_bound_is_above_what_simulation_counts_and_near_it(force, s, low, high, start, most) -> None:
     problem = mechanical(force, s, low, high, 1.5, start)
-    bound = bound_by_steps(setting_of(problem), COARSE)
+    setting = setting_of(problem)
+    layout = layout_of(setting, COARSE)
+    bound, below = (side(setting, COARSE, layout) for side in (bound_by_steps, bound_by_steps_below))
     share, error = simulated(problem, 8000, np.random.default_rng(1))
     assert bound >= share - 4 * error
     assert bound <= most * (share + 4 * error)
+    assert share / most <= below <= 1.05 * share + 4 * error  # exits between the times seen are missed
+
+
+def wiener_exit(s: float, horizon: float) -> float:
+    """P(|s W| reaches 1 by the horizon)."""
+    rates = [(2 * k + 1) * math.pi / 2 for k in range(40)]
+    parts = (math.exp(-(r**2) * s**2 * horizon / 2) * (-1) ** k / r for k, r in enumerate(rates))
+    return 1 - 2 * sum(parts)
+
+
+def test_at_a_face_of_the_noise_hardly_anything_is_lost_on_either_side() -> None:
+    setting = setting_of(mechanical(lambda x: 0.0 * x[0], 0.8, [-2, -1], [2, 1], 0.5, (0.0, 0.0)))
+    plan = Plan(count=8, fine=2.0, wide=0.02, cell=0.4, spare=1e-15)
+    layout = layout_of(setting, plan)
+    exact = wiener_exit(0.8, 0.5)
+    assert exact < bound_by_steps(setting, plan, layout) < 1.12 * exact
+    assert exact > bound_by_steps_below(setting, plan, layout) > 0.85 * exact
+
+
+def pulled(safe: list[cb.Inside], s: float = 0.8) -> cb.Problem:
+    system = cb.ContinuousSystem(lambda x: [x[1], -x[0] - 0.5 * x[1]], states=2, diffusion=[[0.0], [s]])
+    return cb.Problem(system, initial=[0.1, 0.0], safe=safe, horizon=1.2)
+
+
+@pytest.mark.parametrize(
+    ("safe", "most"),
+    [
+        ([cb.Inside(cb.HalfSpace([0, 1], 0.9))], 1.6),  # nothing bounds the other side, nor the position
+        pytest.param([cb.Inside(cb.HalfSpace([1, 1], 0.9))], 3.5, marks=pytest.mark.slow),
+        pytest.param([cb.Inside(cb.Ball([0, 0], 1.0))], 3.5, marks=pytest.mark.slow),
+        pytest.param([cb.Outside(cb.Box([0.2, 0.1], [0.7, 0.9]))], 3.5, marks=pytest.mark.slow),
+    ],
+)
+def test_limits_of_other_shapes_are_bounded_from_both_sides(safe, most) -> None:
+    problem = pulled(safe)
+    setting = setting_of(problem)
+    plan = Plan(count=24, fine=1.0, wide=0.01, cell=0.4, spare=1e-15)
+    layout = layout_of(setting, plan)
+    upper, lower = bound_by_steps(setting, plan, layout), bound_by_steps_below(setting, plan, layout)
+    rng, d = np.random.default_rng(2), 1.2 / 600
+    x, failed = np.tile([0.1, 0.0], (8000, 1)), np.zeros(8000, dtype=bool)
+    for _ in range(600):
+        kick = 0.8 * math.sqrt(d) * rng.standard_normal(8000)
+        x = x + d * np.stack([x[:, 1], -x[:, 0] - 0.5 * x[:, 1]], axis=1) + np.stack([0 * kick, kick], axis=1)
+        failed |= ~safe[0].satisfied(x)
+    share = failed.mean()
+    error = math.sqrt(share * (1 - share) / 8000)
+    assert share - 4 * error <= upper <= most * share
+    assert share / most <= lower <= 1.06 * share + 4 * error
+
+
+def test_a_wall_knows_what_is_safe_near_it() -> None:
+    walls = setting_of(pulled([cb.Inside(cb.Ellipsoid([0, 0], [[1.0, 0.0], [0.0, 4.0]]))])).walls
+    box = Interval(np.array([0.0, 0.95, 2.0]), np.array([0.1, 1.05, 2.1]))
+    sizes = walls[0].sizes(box, Interval.point(np.zeros(3)))
+    assert walls[0].safe(sizes, np.zeros((1, 1))).tolist() == [True, False, False]
+    assert walls[0].broken(sizes).tolist() == [False, False, True]
+    still = Interval.point(np.zeros(3))
+    outward = walls[0].margins((box, still), (Interval.point(np.ones(3)), still), 0.1, 0.5)
+    inward = walls[0].margins((box, still), (-Interval.point(np.ones(3)), still), 0.1, 0.5)
+    assert outward.max() < 1e-8  # a drift outward only helps
+    assert inward[0, 1] == pytest.approx(1 - (1 - 0.21) ** 2, rel=1e-6)  # at most 1.05 / 1 inward, twice over
+
+
+def test_starts_in_a_ball_are_narrower_than_its_box() -> None:
+    setting = setting_of(pulled([cb.Inside(cb.HalfSpace([0, 1], 3.0))]).replace(initial=cb.Ball([1.0, 0.0], 0.5)))
+    assert setting.starts_between(0.4, 0.5) == pytest.approx((0.7, 1.3), abs=1e-6)
+    assert setting.starts_between(-0.1, 0.5) == pytest.approx((0.5, 1.5), abs=1e-4)
+    points = setting.some_starts()
+    assert np.hypot(points[:, 0] - 1, points[:, 1]).max() <= 0.5
 
 
 def test_states_may_come_in_either_order() -> None:
-    problem = mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.5, (0.1, 0.0))
+    problem = mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.25, (0.5, 0.4))
     system = cb.ContinuousSystem(lambda x: [-2 * x[1] - x[0], x[0]], states=2, diffusion=[[0.8], [0.0]])
-    turned = cb.Problem(system, initial=[0.0, 0.1], safe=[cb.Inside(cb.Box([-3, -0.8], [3, 0.8]))], horizon=0.5)
-    plan = Plan(count=8, fine=1.0, wide=0.02, cell=0.5, spare=1e-7)
-    assert bound_by_steps(setting_of(problem), plan) == bound_by_steps(setting_of(turned), plan)
+    turned = cb.Problem(system, initial=[0.4, 0.5], safe=[cb.Inside(cb.Box([-3, -0.8], [3, 0.8]))], horizon=0.25)
+    plan = Plan(count=4, fine=1.0, wide=0.02, cell=0.5, spare=1e-7)
+    bound = bound_by_steps(setting_of(problem), plan)
+    assert bound == bound_by_steps(setting_of(turned), plan)
+    assert bound > 1e-4  # ten times what is paid for rare events
 
 
 def test_a_start_that_runs_into_a_face_is_sure_to_fail_and_a_longer_horizon_never_safer() -> None:
     force = (lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3])
-    short, long = (replace(COARSE, count=count) for count in (12, 16))
-    doomed = setting_of(mechanical(*force, 0.75, (0.79, 2.0)))
+    short, long = (replace(COARSE, count=count) for count in (6, 8))
+    doomed = setting_of(mechanical(*force, 0.375, (0.79, 2.0)))
     assert bound_by_steps(doomed, short) == pytest.approx(1.0, rel=1e-3)
-    safer, riskier = (setting_of(mechanical(*force, horizon, (0.1, 0.0))) for horizon in (0.75, 1.0))
-    assert bound_by_steps(safer, short) < bound_by_steps(riskier, long) < 0.1
+    safer, riskier = (setting_of(mechanical(*force, horizon, (0.5, 0.4))) for horizon in (0.375, 0.5))
+    assert 0.01 < bound_by_steps(safer, short) < bound_by_steps(riskier, long) < 0.1
 
 
 def exit_at_the_end() -> float:
@@ -100,6 +176,7 @@ def test_the_engine_answers_mechanical_problems(monkeypatch) -> None:
     assert "along the flow" in answer.reason
     exact = exit_at_the_end()
     assert math.log10(exact) < answer.log10_delta < math.log10(60 * exact)
+    assert answer.log10_lower is None or answer.log10_lower < answer.log10_delta
 
 
 def test_bad_arguments_are_named() -> None:
@@ -111,13 +188,16 @@ def test_bad_arguments_are_named() -> None:
     )
     with pytest.raises(cb.InfeasibleError, match="neither disturbances nor plans"):
         bound_exits_by_steps(problem.replace(system=disturbed))
+    windowed = problem.replace(safe=[cb.Inside(cb.Box([-0.8, -3], [0.8, 3]), during=(0.1, 0.6))])
+    with pytest.raises(cb.InfeasibleError, match="neither moving sets nor windows"):
+        bound_exits_by_steps(windowed)
 
 
 def test_more_work_buys_finer_plans_and_the_clock_is_not_asked() -> None:
     setting = setting_of(mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.5, (0.1, 0.0)))
     turn = leaving._turn(setting)
     assert leaving._affordable(setting, turn, 1.0) == [leaving._PLANS[0]]
-    first, chosen = leaving._affordable(setting, turn, 7.3e6)
+    first, chosen = leaving._affordable(setting, turn, 1.2e7)
     assert first == leaving._PLANS[0]
     assert chosen in leaving._PLANS[1:-1]
 
@@ -127,3 +207,13 @@ def test_the_steps_end_when_the_time_is_over() -> None:
     ticks = itertools.count()
     with pytest.raises(OutOfTime), Watch(limit=3.0, clock=lambda: next(ticks)).running():
         bound_by_steps(setting, COARSE)
+
+
+def test_beyond_a_face_nobody_counts_less_than_once() -> None:
+    mirror = Mirror(
+        inside=np.array([2, 1, 0]), beyond=np.array([2, 3, 4]), depths=np.array([0.0, 0.1, 0.2]),
+        places=np.array([2, 3, 4]), rate=np.zeros(1), factor=np.ones(1), window=(np.zeros(1, int), np.ones(1, int)),
+    )  # fmt: skip
+    found = mirror.above(np.array([[0.5, 0.9, 1.2, 0.0, 0.0]]), np.zeros((1, 4)), np.full(4, 0.1))
+    assert np.allclose(found, [[1.0, 1.1, 1.5]], atol=1e-9)
+    assert np.all(found >= 1)

@@ -246,7 +246,7 @@ def test_a_step_back_lies_above_the_mean_of_any_function_on_the_grid(force, rng)
     frame = layout.frame
     y, q = np.meshgrid(frame.y, frame.q, indexing="ij")
     value = Lines(nodal=np.exp(2 * (q - 2 * y)) / 40, bend=np.full((y.shape[0], y.shape[1] - 1), -0.05))
-    free = Bounds(level=np.zeros_like(y), reach=layout.bounds.reach)
+    free = unbound(y.shape, layout.above.reach)
     found = back(frame, layout.bands, free, value)
     ratios = []
     for i, j in zip(*np.nonzero(frame.live)):
@@ -276,6 +276,11 @@ def reading(frame: Frame, value: Lines, y, q):
     return (1 - t) * low + t * high
 
 
+def unbound(shape, reach) -> Bounds:
+    nowhere = np.zeros(shape, dtype=bool)
+    return Bounds(level=np.zeros(shape), fixed=nowhere, free=nowhere, reach=reach)
+
+
 def test_the_dominating_density_is_wide_enough_for_the_kernels() -> None:
     assert WIDER >= KAPPA
 
@@ -285,7 +290,7 @@ def test_values_are_cut_down_to_one_only_where_all_around_is_at_least_one() -> N
     shape = layout.frame.y.size, layout.frame.q.size
     nodal = np.full(shape, 1.5)
     nodal[10, 10] = 0.5
-    free = Bounds(level=np.zeros(shape), reach=(1, 1))
+    free = unbound(shape, (1, 1))
     cut = limited(layout.frame, free, nodal, np.full((shape[0], shape[1] - 1), -1.0))
     assert [cut.nodal[10, 10], cut.nodal[9, 10], cut.nodal[8, 8], cut.bend[8, 8]] == [0.5, 1.5, 1.0, 0.0]
 

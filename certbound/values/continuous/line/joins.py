@@ -6,14 +6,13 @@ V <= V_next where it may pass. Both are read on pieces of the cells of V, with e
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
-from certbound.rigor.intervals import Interval
+from certbound.rigor.intervals import Interval, stack
 from certbound.values.continuous.line.phases import Gate, Phase
 from certbound.values.continuous.polynomials import HERMITE
 from certbound.values.continuous.surface import Surface
@@ -60,19 +59,21 @@ class Profile:
         left = Interval.point(self.nodes[cell])
         ends = [(Interval.point(end) - left) / width for end in (low, high)]
         b = [part[cell] for part in self.coefficients]
-        parts = [_blossom(b, [ends[0]] * (5 - k) + [ends[1]] * k) for k in range(6)]
-        value = _range(parts)
         slopes = [(b[k + 1] - b[k]) * 5.0 / width for k in range(5)]
-        return value, _range([_blossom(slopes, [ends[0]] * (4 - k) + [ends[1]] * k) for k in range(5)])
+        return _range(_blossoms(b, *ends)), _range(_blossoms(slopes, *ends))
 
 
-def _blossom(coefficients: Sequence[Interval], arguments: Sequence[Interval]) -> Interval:
-    """The polar form: de Casteljau's algorithm with another argument in each round."""
-    level = list(coefficients)
-    for s in arguments:
-        rest = Interval.point(1.0) - s
-        level = [rest * a + s * b for a, b in itertools.pairwise(level)]
-    return level[0]
+def _blossoms(coefficients: Sequence[Interval], first: Interval, second: Interval) -> list[Interval]:
+    """The polar form at k times ``second`` after ``first``, for every k: de Casteljau's algorithm."""
+    level, found = stack(coefficients), list[Interval]()
+    rests = Interval.point(1.0) - first, Interval.point(1.0) - second
+    for left in range(len(coefficients) - 1, -1, -1):
+        inner = level
+        for _ in range(left):
+            inner = rests[1] * inner[:-1] + second * inner[1:]
+        found.append(inner[0])
+        level = rests[0] * level[:-1] + first * level[1:]
+    return found
 
 
 def _range(parts: Sequence[Interval]) -> Interval:

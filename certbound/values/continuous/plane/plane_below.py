@@ -14,6 +14,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.values.continuous.hypotheses import Model, covers, extreme_over, prove_lower, sampled_residual
+from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.surface import Surface
@@ -25,6 +26,7 @@ _PASSES = 2
 _GRANTED = 0.01  # eps that the proof may pay, in units of the bound, summed over the horizon
 _VARIED = 1.0
 _CAP = 50.0
+_HOPELESS = (60.0, 5.0)  # so far below the floor a first proposal, or a later one, is the last
 
 
 def plan_below(plane: Plane, level: float, patches: float) -> Plan:
@@ -37,22 +39,27 @@ def plan_below(plane: Plane, level: float, patches: float) -> Plan:
     return plan
 
 
-def bound_plane_below(plane: Plane, model: Model, plan: Plan, starts: list[Pair]) -> float | None:
-    """A lower bound of log P by the most promising of a few proposals; None where there is none."""
-    surface, source, best = propose_plane(plane, plan), None, None
-    for _ in range(_PASSES + 1):
+def bound_plane_below(
+    plane: Plane, model: Model, plan: Plan, starts: list[Pair]
+) -> tuple[Surface, Payment] | None:
+    """The most promising of a few proposals, and what it pays for its lower bound of log P; None where that is none."""
+    source: Source | None = None
+    best: _Sketch | None = None
+    for number in range(_PASSES + 1):
+        surface = propose_plane(plane, plan, source)
         if surface is None or not covers(surface, plane.horizon, plane.low, plane.high, within=False):
             break
         sketch = _Sketch.of(surface, model, starts)
         if best is None or sketch.estimate() > best.estimate():
             best = sketch
+        if best.estimate() < plan.floor - _HOPELESS[min(number, 1)]:
+            break
         more = Source.above(surface, _FACTOR * np.minimum(sketch.excess, _CAP))
         source = more if source is None else source.plus(more)
-        surface = propose_plane(plane, plan, source)
-    if best is None:
+    if best is None or best.estimate() < plan.floor:  # what is subtracted at last would leave nothing
         return None
     payment = prove_lower(best.surface, model, starts)
-    return None if payment is None else payment.log
+    return None if payment is None else (best.surface, payment)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.values.continuous.proposal import through
+from certbound.values.continuous.residual import along
 from certbound.values.continuous.surface import Surface
 
 Pair = tuple[float, float]
@@ -46,9 +47,9 @@ class Plan:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Source:
-    """What V's equation gets in addition, at the nodes of a surface: linear between them in t, x and y.
+    """What V's equation gets in addition, at the nodes of a surface: linear between them in time and in each state.
 
-    ``values`` has shape (K + 1, N_1 + 1, N_2 + 1), times forward.
+    ``values`` has shape (K + 1, N_1 + 1, N_2 + 1, ...), times forward.
     """
 
     times: Array
@@ -57,11 +58,10 @@ class Source:
 
     @classmethod
     def above(cls, surface: Surface, needed: Array) -> Source:
-        """At least ``needed`` (K, N_1, N_2), which must not be negative, on each patch: at nodes the largest around."""
-        slabs, rows, columns = needed.shape
-        values = np.zeros((slabs + 1, rows + 1, columns + 1))
-        for a, b, c in itertools.product((0, 1), repeat=3):
-            part = values[a : a + slabs, b : b + rows, c : c + columns]
+        """At least ``needed`` (K, N_1, ...), which must not be negative, on each patch: at nodes the largest around."""
+        values = np.zeros(tuple(size + 1 for size in needed.shape))
+        for corner in itertools.product((0, 1), repeat=needed.ndim):
+            part = values[tuple(slice(first, first + size) for first, size in zip(corner, needed.shape))]
             np.maximum(part, needed, out=part)
         return cls(times=surface.times, axes=surface.axes, values=values)
 
@@ -71,8 +71,10 @@ class Source:
 
     def at(self, points: list[Array]) -> Array:
         """Values at the ends of the slabs and the products of points along the axes."""
-        x, y = (_linear(nodes, place) for nodes, place in zip(self.axes, points))
-        return np.asarray(np.einsum("pi,kij,qj->kpq", x, self.values, y, optimize=True))
+        found = self.values
+        for axis, (nodes, place) in enumerate(zip(self.axes, points)):
+            found = along(_linear(nodes, place), found, 1 + axis)
+        return np.ascontiguousarray(found)
 
 
 def _linear(nodes: Array, points: Array) -> Array:

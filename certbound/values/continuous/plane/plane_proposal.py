@@ -15,6 +15,7 @@ _OUTSIDE = 12  # cells of the margin around the box, for lower bounds
 _MARGIN = 4.0  # its width, in units of 1/k
 _DRAWN = 400.0  # how fast V is drawn there, in units of the speed at which it rises
 _STIFF = 20.0  # by how much that may exceed one over a step
+_CARELESS = 4.0  # times the cells that V may move by in a step there
 _DEEPER = 3.0  # below what V is on the faces at T, for lower bounds
 
 
@@ -79,6 +80,10 @@ class SolverBelow(Solver):
 
     def steps(self, tau: float, value: Array, span: float) -> int:
         return max(super().steps(tau, value, span), math.ceil(span * float(self.drawn.max()) / _STIFF))
+
+    def _reaches(self) -> list[Array]:
+        """In the margin, where nothing has to be accurate, V may move by more cells in a step."""
+        return [np.where(self.drawn > 0, _CARELESS * width, width) for width in self.widths]
 
     def surface(self, times: Array, values: list[Array], first: list[Array], last: list[Array]) -> Surface:
         """What lies in the box."""

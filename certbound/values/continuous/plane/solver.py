@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -39,7 +40,26 @@ _ZONE = 0.88  # of the width over the number of cells: how far from a face the i
 _FALL = 0.5  # half of what V may fall by over the cell beside a face, where the drift is inward
 
 
-def integrated(solver: Solver) -> Surface | None:
+class _Timed(Protocol):
+    @property
+    def horizon(self) -> float: ...
+
+
+class Stepper(Protocol):
+    """What `integrated` asks for: V as an array, its rate, steps, and the surface through what was found."""
+
+    @property
+    def plane(self) -> _Timed: ...
+    @property
+    def plan(self) -> Plan: ...
+    def start(self) -> Array: ...
+    def rate(self, tau: float, value: Array) -> Array: ...
+    def steps(self, tau: float, value: Array, span: float) -> int: ...
+    def step(self, tau: float, value: Array, h: float) -> Array: ...
+    def surface(self, times: Array, values: list[Array], first: list[Array], last: list[Array]) -> Surface: ...
+
+
+def integrated(solver: Stepper) -> Surface | None:
     """What a solver makes of its start; None where that breaks down or needs too many steps."""
     plane, plan = solver.plane, solver.plan
     times = slab_times(plane.horizon, plan)
@@ -177,8 +197,12 @@ class Solver:
     def steps(self, tau: float, value: Array, span: float) -> int:
         """How many steps a slab needs, so that nothing moves by more than a few cells in one."""
         _, speed_x, speed_y, _ = self._right(tau, value)
-        fastest = max(float(np.max(np.abs(v) / w)) for v, w in zip((speed_x, speed_y), self.widths))
+        fastest = max(float(np.max(np.abs(v) / w)) for v, w in zip((speed_x, speed_y), self._reaches()))
         return max(4, math.ceil(min(span * fastest / _COURANT, 1e6)) if math.isfinite(fastest) else 4)
+
+    def _reaches(self) -> list[Array]:
+        """The width of a cell along both axes, of which V may not move by more than a few in a step."""
+        return list(self.widths)
 
     def _divided(self, right: Array, speeds: tuple[Array, Array], a: Array, step: float, fed: Array) -> Array:
         """(I - g h J_x)^-1 (I - g h J_y)^-1 (I - g h J_s)^-1 applied, J_s = -``fed`` being the source's part."""
@@ -188,7 +212,7 @@ class Solver:
             line = np.ascontiguousarray(right if axis == 0 else right.T)
             speed = np.ascontiguousarray(speeds[axis] if axis == 0 else speeds[axis].T)
             half = np.ascontiguousarray(0.5 * (a[0, 0] if axis == 0 else a[1, 1].T) * np.ones(line.shape))
-            _solve_lines(own.at[0], own.at[1], own.at[2], speed, half, _GAMMA * step, line)
+            solve_lines(own.at[0], own.at[1], own.at[2], speed, half, _GAMMA * step, line)
             line = own.dense[0] @ line
             right = line if axis == 0 else line.T
         return right
@@ -245,7 +269,7 @@ def weakened(plane: Plane, plan: Plan, drift: Array, a: Array, places: tuple[Arr
 
 
 @njit(cache=True)
-def _solve_lines(mass: Array, slope: Array, bend: Array, speed: Array, half: Array, step: float, right: Array) -> None:
+def solve_lines(mass: Array, slope: Array, bend: Array, speed: Array, half: Array, step: float, right: Array) -> None:
     """Solve (mass - step (speed slope + half bend)) k = right along the first axis, line by line, in place.
 
     The three matrices are given by the rows of their bands (entry (i, k) belongs to column i + k - band); the first and

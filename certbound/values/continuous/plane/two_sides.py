@@ -37,6 +37,8 @@ from certbound.values.continuous.room import Room, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
+Proposed = tuple[Surface, Payment]
+
 _FACTOR = 1.12
 _TOPS = (-0.02, -0.1)  # where V is above, the proof may lift it over 0 instead
 _CAP = 50.0
@@ -52,33 +54,35 @@ _BELOW = 0.6  # of as many patches again, for a lower bound
 
 def two_states(
     problem: Problem, model: Model, room: Room, deadline: float, wanted: float
-) -> tuple[float, float | None, str, list[tuple[Surface, Payment]]]:
+) -> tuple[float, float | None, str, tuple[list[Proposed], list[Proposed]]]:
     """The upper bound on one grid after another, and the lower one where the upper one is above ``wanted``.
 
     The seconds until the deadline are turned into a number of patches, so that the bound does not depend on the clock.
-    What certificates state comes last.
+    What certificates state of both sides comes last.
     """
     starts = starts_of(problem)
     inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
     patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     level = rough_level(inner)
     upper, done, proposed = bound_plane_above(inner, model, level, patches)
-    lower = None
+    below: list[Proposed] = []
     if upper > wanted:
         outer = _plane(problem, model, room.outer_low, room.outer_high, starts)
         plan = plan_below(outer, min(level, upper), _BELOW * patches)
         with contextlib.suppress(OutOfTime):
-            lower = bound_plane_below(outer, model, plan, starts)
+            found = bound_plane_below(outer, model, plan, starts)
+            below += [] if found is None else [found]
         done.append(f"{plan.cells}^2 below")
-    return upper, lower, f"value function in two states, cells: {', '.join(done)}", proposed
+    lower = max((payment.log for _, payment in below), default=None)
+    return upper, lower, f"value function in two states, cells: {', '.join(done)}", (proposed, below)
 
 
 def bound_plane_above(
     plane: Plane, model: Model, level: float, patches: float
-) -> tuple[float, list[str], list[tuple[Surface, Payment]]]:
+) -> tuple[float, list[str], list[Proposed]]:
     """An upper bound of log P(leaving the box) on one grid after another, what was done, and what was proved."""
     upper, done = 0.0, []
-    proposed: list[tuple[Surface, Payment]] = []
+    proposed: list[Proposed] = []
     for share in _SHARES:
         plan = _plan(plane, level, share * patches)
         try:

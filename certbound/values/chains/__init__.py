@@ -1,0 +1,10 @@
+"""Discrete time, one or two states, noise in pieces: bounds that are constant on the cells of a grid.
+
+Coarser than ``discrete``, and for what that does not serve: noise that multiplies the state or leaves one without any,
+laws given by tables, targets that are to be stayed in. From the bottom: ``pieces`` (the noise as boxes with
+probabilities), ``extremes`` (the largest value over many boxes of cells), ``abstraction`` (the answer).
+"""
+
+from certbound.values.chains.abstraction import bound_chain
+
+__all__ = ["bound_chain"]

@@ -1,0 +1,271 @@
+"""Beyond a face of the noise: what a function must be there (upper bounds), and may be there (lower bounds).
+
+A path that meets the face q = c at the time tau is at the depth d = q_h - c beyond it (d < 0: back inside) at the end
+of the step. Were d's drift a constant -gamma, its density p would have p(-d) = e^{rate d} p(d), rate = 2 gamma/s^2. So
+if m(d) is what is counted at the depth -d inside, and
+
+    1 + e^{rate d} (1 - m(d))
+
+at the depth d beyond, the mean of what is counted is exactly 1, whatever tau is. *Upper bounds:* with gamma >= 0 the
+largest inward drift, and m falling with d and below the function inside, this rises with d, so that a larger drift
+only counts more: the path is counted at least once. *Lower bounds:* with gamma the least inward drift and m above the
+function inside, it is counted at most once (where this does not rise with d, it is made smaller until it does).
+
+The inside is looked at within a window of y that a path may cross in a step. The drift is bounded within w standard
+deviations of the face; a share of at most 6 Phi(-w) of the paths comes farther or leaves the window (after the turn of
+the drift, which e^{rate d} is: 6 Phi(-(w - 2 gamma sqrt(h)/s))), which a factor makes up for. From above e^{rate d} is
+cut off at `_MOST`, and what is lost beyond the last node before is made up for as well. Where all this is too much, 2
+is put from gamma h before the face on: the noise of the rest points outward with probability at least 1/2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from certbound.arrays import Array, Index, Mask
+from certbound.problem.model import jacobian
+from certbound.rigor.intervals import Interval
+from certbound.values.discrete import evaluate
+from certbound.values.semilagrangian.confines import TWICE
+from certbound.values.semilagrangian.local_steps import Blocks, Clock
+from certbound.values.semilagrangian.noisy_axis import Setting
+from certbound.values.semilagrangian.remainders import upper_tail
+
+_WIDE = ((3.5, 0.015), (4.25, 0.025), (5.0, 0.08))  # and the share that a factor may make up for
+_MOST = 2000.0
+_SPARED = 8e-3  # more than 6 times (1 + e) Phi(-3.5)
+_UP = 1 + 1e-9
+_SLACK = 1e-11  # for nodes that are mirror images up to rounding
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Mirror:
+    """One face of q: what happens beyond it is read from inside.
+
+    Attributes
+    ----------
+    inside, beyond : ndarray of int, shape (K,)
+        Nodes of q at the same depths, rising from 0.
+    depths : ndarray, shape (K,)
+    places : ndarray of int, shape (P,)
+        All nodes beyond; what has no image inside takes the value of the last that has.
+    rate, factor : ndarray, shape (ny,)
+        On every line of y; the rate is nan where nothing is asked or known, where the inside is not looked at.
+    window : (ndarray of int, ndarray of int), shapes (ny,)
+        First and last line (excluded) that a path may come to.
+    """
+
+    inside: Index
+    beyond: Index
+    depths: Array
+    places: Index
+    rate: Array
+    factor: Array
+    window: tuple[Index, Index]
+
+    def above(self, nodal: Array, bend: Array, dq: Array) -> Array:
+        """Values at ``places``, shape (ny, P), for upper bounds."""
+        value = self._inside(nodal, bend, dq, sign=-1.0)
+        least = np.minimum.accumulate(self._extreme(value, np.minimum), axis=1)
+        share = 1 - np.clip(least - _SLACK, 0.0, 1.0)  # beyond, never less than 1: else a larger drift might count less
+        rate = np.nan_to_num(self.rate)[:, None]
+        power = np.exp(np.minimum(rate * self.depths, math.log(_MOST)) * _UP)
+        power = np.where(np.isnan(self.rate)[:, None], 0.0, power)
+        return self._all((1 + power * share) * self.factor[:, None])
+
+    def below(self, nodal: Array, bend: Array, dq: Array) -> Array:
+        """Values at ``places``, shape (ny, P), for lower bounds; ``nodal`` and ``bend`` are L's own."""
+        value = self._inside(nodal, bend, dq, sign=1.0)
+        most = np.maximum.accumulate(self._extreme(value, np.maximum)[:, ::-1], axis=1)[:, ::-1]
+        share = np.maximum(1 - most - _SLACK, 0.0)
+        rate = np.nan_to_num(self.rate)[:, None]
+        power = np.exp(np.minimum(rate * self.depths, 1.0)) / _UP
+        widths = np.diff(self.depths)
+        slope = np.diff(share, axis=1) / widths
+        steep = 2 * np.abs(rate) * slope + rate**2 * share[:, 1:]
+        sag = np.zeros(share.shape)
+        sag[:, 1:] = widths**2 / 8 * steep * np.maximum(power[:, 1:], power[:, :-1])
+        sag[:, :-1] = np.maximum(sag[:, :-1], sag[:, 1:])
+        gain = np.where(np.isnan(self.rate)[:, None], 0.0, np.maximum(power * share - sag * _UP, 0.0))
+        gain = np.minimum.accumulate(gain[:, ::-1], axis=1)[:, ::-1]
+        return self._all((1 + gain) / self.factor[:, None])
+
+    def _all(self, found: Array) -> Array:
+        more = len(self.places) - found.shape[1]
+        return np.pad(found, ((0, 0), (0, more)), mode="edge")
+
+    def _inside(self, nodal: Array, bend: Array, dq: Array, *, sign: float) -> Array:
+        """The function at the depths, moved by what it may be off its chords towards ``sign``."""
+        arch = np.maximum(sign * bend, 0.0) * dq**2 / 8 * _UP
+        around = np.zeros(nodal.shape)
+        around[:, :-1] = arch
+        around[:, 1:] = np.maximum(around[:, 1:], arch)
+        return (nodal + sign * around)[:, self.inside]
+
+    def _extreme(self, value: Array, pick: np.ufunc) -> Array:
+        """The least (largest) value in the window of every line."""
+        found = value.copy()
+        for line in np.flatnonzero(~np.isnan(self.rate)):
+            found[line] = pick.reduce(value[self.window[0][line] : self.window[1][line]], axis=0)
+        return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Face:
+    """What paths do that end on the lines of y and have met a face of q in the step, shape (ny,) each.
+
+    ``inward``: the range of q's drift since then; ``window``: how far apart paths from one place end.
+    """
+
+    inward: Interval
+    window: Array
+
+
+def mirrors_of(
+    setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask
+) -> tuple[list[Mirror], list[Mirror], Array]:
+    """Mirrors for upper and for lower bounds, and the least values where there is none for upper bounds (ny, nq)."""
+    y, q = axes
+    above, below = [], []
+    levels = np.zeros((len(y), len(q)))
+    for side, end in enumerate(setting.faces[1]):
+        drift = _met(clock, blocks, usable, y, (side, end))
+        faces = [_face(setting, clock, y, (side, end), wide) for wide, _ in _WIDE]
+        window = np.maximum.reduce([face.window for face in faces])
+        inside, beyond = _pairs(q, end, side)
+        places = np.arange(beyond[0], len(q) if side else -1, 1 if side else -1)
+        depths = np.abs(q[beyond] - end)
+        rates, factors = np.full((2, len(y)), np.nan), np.ones((2, len(y)))
+        for line in np.flatnonzero(np.isfinite(drift)):
+            most = [float(face.inward.hi[line]) for face in faces]
+            options = (_paid(most[k], setting.noise, clock.step, depths, _WIDE[k]) for k in range(len(_WIDE)))
+            found = next((option for option in options if option), None)
+            if found is None:
+                margin = max(min(most[-1], float(drift[line])), 0.0) * clock.step * _UP
+                levels[line, _from(q, end, side, margin)] = TWICE
+            else:
+                rates[0, line], factors[0, line] = found
+            least = float(faces[0].inward.lo[line])
+            rates[1, line], factors[1, line] = _granted(least, setting.noise, clock.step, depths)
+        mirror = Mirror(
+            inside=inside, beyond=beyond, depths=depths, places=places, rate=rates[0], factor=factors[0],
+            window=_window(y, window),
+        )  # fmt: skip
+        above.append(mirror)
+        if math.isfinite(setting.beyond[1][side]):
+            below.append(replace(mirror, rate=rates[1], factor=factors[1]))
+    return above, below, levels
+
+
+def _window(y: Array, spread: Array) -> tuple[Index, Index]:
+    """First and last line (excluded) that a path may be on, if another from the same place is next to a line."""
+    before, after = np.concatenate([y[:1], y[:-1]]), np.concatenate([y[1:], y[-1:]])
+    first = np.searchsorted(y, before - spread, side="right") - 1
+    last = np.searchsorted(y, after + spread) + 1
+    return np.maximum(first, 0), np.minimum(last, len(y))
+
+
+def _pairs(q: Array, face: float, side: int) -> tuple[Index, Index]:
+    """Nodes inside and beyond a face at equal depths, as far as the grid was made so."""
+    start = int(np.searchsorted(q, face))
+    step = 1 if side else -1
+    beyond = np.arange(start, len(q) if side else -1, step)
+    inside = start - step * np.arange(len(beyond))
+    fine = (inside >= 0) & (inside < len(q))
+    beyond, inside = beyond[fine], inside[fine]
+    apart = np.abs(np.abs(q[beyond] - face) - np.abs(q[inside] - face)) <= 1e-13 * (1 + np.abs(face))
+    count = len(apart) if apart.all() else int(np.argmin(apart))
+    return inside[:count], beyond[:count]
+
+
+def _from(q: Array, face: float, side: int, margin: float) -> slice:
+    """Nodes of all cells that reach beyond the face moved inward."""
+    if side:
+        return slice(max(int(np.searchsorted(q, face - margin, side="right")) - 1, 0), None)
+    return slice(None, int(np.searchsorted(q, face + margin)) + 1)
+
+
+def _paid(
+    inward: float, s: float, step: float, depths: Array, wide: tuple[float, float]
+) -> tuple[float, float] | None:
+    """The rate, and the factor that makes up for what is lost; None where that is too much."""
+    inward = max(inward, 0.0)
+    rate = 2 * inward / s**2 * _UP
+    turn = inward * math.sqrt(step) / s * _UP
+    if not math.isfinite(rate):
+        return None
+    last = float(depths[rate * depths <= math.log(_MOST)][-1])
+    lost = 6 * upper_tail(wide[0]) + 6 * upper_tail(wide[0] - 2 * turn)
+    lost += upper_tail(last / (s * math.sqrt(step)) - turn)
+    lost /= upper_tail(turn) / _UP**2  # only what is beyond makes up for it, and that counts at least P(d >= 0)
+    return (rate, _UP / (1 - lost)) if lost < wide[1] else None
+
+
+def _granted(inward: float, s: float, step: float, depths: Array) -> tuple[float, float]:
+    """The rate from below and the factor; (nan, 1) where paths may come too far, beyond the mirrored nodes."""
+    outward = max(-inward, 0.0) * math.sqrt(step) / s
+    if not math.isfinite(inward) or 4 * upper_tail(float(depths[-1]) / (s * math.sqrt(step)) - outward) > _SPARED / 2:
+        return math.nan, 1.0
+    share = _SPARED / (upper_tail(max(inward, 0.0) * math.sqrt(step) / s) / _UP**2)
+    rate = 2 * inward / s**2
+    return (rate - 1e-9 * abs(rate), 1 / (1 - share)) if share < 0.2 else (math.nan, 1.0)
+
+
+def _face(setting: Setting, clock: Clock, y: Array, where: tuple[int, float], wide: float) -> _Face:
+    """See `_Face`; not finite where the step is too long for the bounds."""
+    side, face = where
+    h = clock.step
+    swing = wide * setting.noise * (1 + setting.spread) * math.sqrt(h) * _UP
+    ends = np.concatenate([y[:1], y[:-1]]), np.concatenate([y[1:], y[-1:]])
+    along, away = np.full(len(y), 1e-9), np.full(len(y), 1.1 * swing)
+    fine = np.zeros(len(y), dtype=bool)
+    for _ in range(12):
+        near = Interval(face - away, face + away)
+        end = Interval(*ends) + near * clock.shear
+        f, good = _rates(setting, Interval(end.lo - along, end.hi + along), near)
+        rise, fall = np.maximum(f.hi[:, 0], 0.0), np.minimum(f.lo[:, 0], 0.0)
+        travel, needed = (rise - fall) * h * _UP, swing + h * f[:, 1].mag * _UP
+        fine = good & (travel <= along) & (needed <= away)
+        if fine.all():
+            break
+        grow = ~fine & good
+        along, away = np.where(grow, 1.05 * travel, along), np.where(grow, np.maximum(away, 1.05 * needed), away)
+    apart = (f.hi[:, 0] - f.lo[:, 0]) * h * _UP
+    path = Interval(
+        end.lo - np.where(rise > 0, travel, apart), end.hi + np.where(fall < 0, travel, apart)
+    )
+    f, good = _rates(setting, path, near)
+    slopes, bad, _ = evaluate(jacobian(setting.tape, (1, 2)), [Interval.point(np.zeros(len(y))), path, near])
+    fine = fine & good & ~bad & np.isfinite(slopes.mag).reshape(len(y), -1).all(axis=1)
+    slope, width = slopes[:, 1], (f.hi[:, 1] - f.lo[:, 1])
+    middle = np.abs(slope.mid)
+    deviation = setting.noise * np.sqrt(h**3 / 3 * middle**2 + abs(clock.shear) * h**2 * middle + clock.shear**2 * h)
+    spread = middle * h**2 / 2 * width + 2 * (wide + 1) * deviation + h * abs(clock.shear) * width
+    spread += h * (2 * slopes[:, 0].mag * travel + 2 * slope.rad * away)
+    inward = -f[:, 1] if side else f[:, 1]
+    inward = Interval(np.where(fine, inward.lo, -np.inf), np.where(fine, inward.hi, np.inf))
+    return _Face(inward=inward, window=np.where(fine, spread, 0.0) * _UP)
+
+
+def _rates(setting: Setting, p: Interval, q: Interval) -> tuple[Interval, Mask]:
+    f, undefined, jumps = evaluate(setting.tape, [Interval.point(np.zeros(len(p.lo))), p, q])
+    fine = ~undefined & ~jumps & np.isfinite(f.mag).all(axis=1)
+    return Interval(np.where(fine[:, None], f.lo, -1e9), np.where(fine[:, None], f.hi, 1e9)), fine
+
+
+def _met(clock: Clock, blocks: Blocks, usable: Mask, y: Array, where: tuple[int, float]) -> Array:
+    """The largest inward drift on tubes that meet the face, by lines next to which their paths may end; else -inf."""
+    side, face = where
+    tubes = blocks.strays.tube
+    hit = usable & (tubes[1].lo <= face) & (tubes[1].hi >= face)
+    around = (tubes[0] - tubes[1] * clock.shear)[hit]
+    first = np.searchsorted(y, around.lo, side="right") - 1
+    last = np.searchsorted(y, around.hi) + 1
+    found = np.full(len(y), -np.inf)
+    for a, b, drift in zip(first, last, blocks.strays.inward[side][hit]):
+        part = slice(max(int(a), 0), int(b))
+        found[part] = np.maximum(found[part], drift)
+    return found

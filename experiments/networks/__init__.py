@@ -1,0 +1,1 @@
+"""Learned controllers: how the policies are trained, and what is proved with them."""

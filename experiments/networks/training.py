@@ -1,0 +1,170 @@
+"""Small policies for standard tasks, trained with NumPy alone: the same seed gives the same weights.
+
+A policy imitates a saturated feedback law by least squares (Adam on random batches). What is certified is the network,
+whatever it was taught: how well it imitates only matters for how large the certified probability is.
+
+``python -m experiments.networks.training FOLDER`` writes every policy and its problem file there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import certbound as cb
+from certbound.arrays import Array
+from certbound.problem.networks import write_network
+
+__all__ = ["TASKS", "Task", "train", "write"]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task: the box that states are drawn from, the law that is imitated, and its problem file."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    law: Callable[[Array], Array]
+    problem: str
+
+
+LINEAR = """# linear-sys of the RASM, logRASM and NeuralStoc papers: github LAVA-LAB/logRASM models/linearsystem.py.
+name = "linear-sys with a learned policy"
+time = "discrete"
+horizon = 100
+delta = 1e-6
+states = ["x", "v"]
+networks = {{ policy = "{file}" }}
+
+[dynamics]
+x = "x + 0.045*v + 0.45*policy(x, v)[0]"
+v = "0.9*v + 0.5*policy(x, v)[0]"
+
+[noise]
+law = "triangular"
+halfwidth = [0.01, 0.005]
+
+[[initial]]
+box = [[-0.25, -0.2], [-0.1, 0.1]]
+
+[[initial]]
+box = [[0.2, 0.25], [-0.1, 0.1]]
+
+[[avoid]]
+box = {{ x = [-1.5, -1.4], v = [-1.5, 0] }}
+
+[[avoid]]
+box = {{ x = [1.4, 1.5], v = [0, 1.5] }}
+"""
+
+PENDULUM = """# inverted pendulum of logRASM (models/pendulum.py): torque 2 clip(u), gravity 10, length .5, mass .15.
+name = "inverted pendulum with a learned policy"
+time = "discrete"
+horizon = 100
+delta = 1e-6
+states = ["x", "v"]
+networks = {{ policy = "{file}" }}
+
+[definitions]
+next = "0.9*v + 0.75*sin(x) + 8*policy(x, v)[0]"
+
+[dynamics]
+x = "x + 0.05*next"
+v = "next"
+
+[noise]
+law = "triangular"
+halfwidth = [0.01, 0.02]
+
+[initial]
+box = [[-0.3, 0.3], [-0.3, 0.3]]
+
+[[avoid]]
+box = {{ x = [-0.7, -0.6], v = [-0.7, 0] }}
+
+[[avoid]]
+box = {{ x = [0.6, 0.7], v = [0, 0.7] }}
+"""
+
+
+def _linear_law(points: Array) -> Array:
+    return np.clip(-1.2 * points[:, :1] - 0.5 * points[:, 1:], -1.0, 1.0)
+
+
+def _pendulum_law(points: Array) -> Array:
+    x, v = points[:, :1], points[:, 1:]
+    return np.clip(-(0.75 * np.sin(x) + 1.5 * x + 0.5 * v) / 8, -1.0, 1.0)
+
+
+TASKS: dict[str, Task] = {
+    "linear-sys": Task((-1.5, -1.5), (1.5, 1.5), _linear_law, LINEAR),
+    "pendulum": Task((-0.7, -0.7), (0.7, 0.7), _pendulum_law, PENDULUM),
+}
+
+
+def train(task: Task, *, width: int, activation: str, seed: int = 0, steps: int = 2000) -> list[dict[str, Any]]:
+    """Layers (two hidden ones of ``width``) that imitate the task's law, by Adam on batches of 256."""
+    rng = np.random.default_rng(seed)
+    sizes = [len(task.low), width, width, 1]
+    values = []
+    for k, p in itertools.pairwise(sizes):
+        values += [rng.normal(size=(p, k)) / np.sqrt(k), np.zeros(p)]
+    moments = [(np.zeros_like(value), np.zeros_like(value)) for value in values]
+    for step in range(1, steps + 1):
+        points = rng.uniform(task.low, task.high, (256, sizes[0]))
+        for number, gradient in enumerate(_gradients(values, points, task.law(points), activation)):
+            first, second = moments[number]
+            first += 0.1 * (gradient - first)
+            second += 0.001 * (gradient**2 - second)
+            size = 3e-3 * (1 - step / steps) * np.sqrt(1 - 0.999**step) / (1 - 0.9**step)
+            values[number] -= size * first / (np.sqrt(second) + 1e-8)
+    kinds = [activation, activation, "linear"]
+    return [
+        {"weights": values[2 * k], "bias": values[2 * k + 1], "activation": kind} for k, kind in enumerate(kinds)
+    ]
+
+
+def _gradients(values: list[Array], points: Array, wanted: Array, activation: str) -> list[Array]:
+    """Of the mean squared error by every weight and bias, layer by layer."""
+    outputs = [points]
+    for k in range(0, len(values), 2):
+        z = outputs[-1] @ values[k].T + values[k + 1]
+        outputs.append(z if k == len(values) - 2 else np.tanh(z) if activation == "tanh" else np.maximum(z, 0.0))
+    error = 2 * (outputs[-1] - wanted) / len(points)
+    found: list[Array] = []
+    for k in range(len(values) - 2, -1, -2):
+        found = [error.T @ outputs[k // 2], error.sum(axis=0), *found]
+        before = outputs[k // 2]
+        error = (error @ values[k]) * (1 - before**2 if activation == "tanh" else before > 0)
+    return found
+
+
+def write(folder: Path, task: str, *, width: int, activation: str) -> Path:
+    """Train a policy and write it, with its problem file, which is returned."""
+    folder.mkdir(parents=True, exist_ok=True)
+    stem = f"{task}-{activation}{width}"
+    policy = cb.network(train(TASKS[task], width=width, activation=activation), name="policy")
+    write_network(policy, folder / f"{stem}.npz")
+    path = folder / f"{stem}.toml"
+    path.write_text(TASKS[task].problem.format(file=f"{stem}.npz"), encoding="utf-8")
+    return path
+
+
+def main() -> None:
+    """Write all policies."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.networks.training")
+    parser.add_argument("folder", type=Path, help="where the policies and problem files are written")
+    folder = parser.parse_args().folder
+    for task in TASKS:
+        for activation, width in (("tanh", 64), ("tanh", 128), ("relu", 64)):
+            print(write(folder, task, width=width, activation=activation))
+
+
+if __name__ == "__main__":
+    main()

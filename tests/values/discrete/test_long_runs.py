@@ -1,0 +1,145 @@
+"""Long and infinite horizons from a few steps: between Nystroem's truth, and refused where steps differ."""
+
+import math
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.errors import InfeasibleError
+from certbound.values.discrete import bound_failure, bound_long_run
+from certbound.values.discrete.functions import ValueFunction
+from certbound.values.discrete.long_runs import largest_rate, least_rate
+from certbound.values.grids import Grid
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(240)
+
+
+def density(z, std):
+    return np.exp(-0.5 * (z / std) ** 2) / (std * math.sqrt(2 * math.pi))
+
+
+def staying(step, std, horizon, start, low=-1.0, high=1.0):
+    """P(in [low, high] at all steps up to the horizon)."""
+    x, w = (high + low + (high - low) * NODES) / 2, WEIGHTS * (high - low) / 2
+    matrix = density(x[None, :] - step(x)[:, None], std) * w
+    first = density(x - step(start), std) * w
+    return float(first @ np.linalg.matrix_power(matrix, horizon - 1).sum(axis=1))
+
+
+def contraction(std=0.2, gain=0.9, **options):
+    system = cb.DiscreteSystem(lambda x: gain * x, states=["x"], noise=cb.Gaussian(std=std))
+    given = {"initial": [0.2], "safe": [cb.Inside(cb.Box([-1], [1]))], "horizon": 10**6} | options
+    return cb.Problem(system, **given)
+
+
+@pytest.mark.parametrize(("std", "horizon"), [(0.2, 500), (0.12, 10**4), (0.1, 10**5)])
+def test_long_horizons_enclose_the_truth(std, horizon):
+    found = bound_long_run(contraction(std, horizon=horizon), seconds=1)
+    truth = 1 - staying(lambda x: 0.9 * x, std, horizon, 0.2)
+    assert found.lower <= truth <= found.upper <= 1.1 * found.lower
+
+
+def test_a_thousand_million_steps_cost_what_a_hundred_thousand_cost():
+    short, long = (bound_long_run(contraction(0.1, horizon=steps), seconds=1) for steps in (10**5, 10**9))
+    assert short.before[0] == long.before[0] < 5000
+    assert long.upper > short.upper
+
+
+def test_for_ever_noise_leaves_at_a_rate():
+    found = bound_long_run(contraction(horizon=math.inf), seconds=1)
+    rate = 1 - staying(lambda x: 0.9 * x, 0.2, 201, 0.2) / staying(lambda x: 0.9 * x, 0.2, 200, 0.2)
+    steps, least, most = found.before
+    assert found.rate[0] <= rate <= found.rate[1] <= 1.1 * found.rate[0]
+    assert found.lower > 1 - 1e-12
+    assert least <= 1 - staying(lambda x: 0.9 * x, 0.2, steps, 0.2) <= most
+
+
+def test_the_disturbance_is_the_worst_one():
+    system = cb.DiscreteSystem(
+        lambda x, d: 0.8 * x + d, states=["x"], disturbance=cb.Box([-0.1], [0.1]), noise=cb.Gaussian(std=0.15)
+    )
+    wide = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=401)
+    long, steps = bound_long_run(wide, seconds=0.3), bound_failure(wide, seconds=0.3)
+    assert steps.lower <= long.upper
+    assert long.lower <= steps.upper
+    still = 1 - staying(lambda x: 0.8 * x + 0.1, 0.15, 401, 0.0)
+    assert still <= long.upper <= 2.2 * long.lower
+
+
+def walk(**options):
+    system = cb.DiscreteSystem(lambda x: x - 0.05, states=["x"], noise=cb.Gaussian(std=0.3))
+    given = {"initial": [0.0], "safe": [cb.Inside(cb.HalfSpace([1], 1))], "horizon": math.inf}
+    return cb.Problem(system, **(given | {"reach": cb.HalfSpace([1], -1)} | options))
+
+
+def test_for_ever_a_target_is_met_or_missed():
+    found = bound_long_run(walk(), seconds=1)
+    x, w = NODES, WEIGHTS
+    kernel = density(x[None, :] - x[:, None] + 0.05, 0.3) * w
+    over = np.array([0.5 * math.erfc((1 + 0.05 - y) / (0.3 * math.sqrt(2))) for y in x])
+    missed = np.linalg.solve(np.eye(len(x)) - kernel, over)
+    truth = density(x + 0.05, 0.3) * w @ missed + 0.5 * math.erfc(1.05 / (0.3 * math.sqrt(2)))
+    assert found.lower <= truth <= found.upper <= 1.1 * found.lower
+
+
+def test_two_states_for_ever():
+    system = cb.DiscreteSystem(
+        lambda x: [0.8 * x[0] + 0.1 * x[1], 0.7 * x[1]], states=["x", "y"], noise=cb.Gaussian(std=[0.25, 0.25])
+    )
+    problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=30)
+    long = bound_long_run(problem.replace(horizon=math.inf), seconds=1)
+    assert long.lower > 1 - 1e-12
+    steps, least, most = long.before
+    some = bound_failure(problem.replace(horizon=steps), seconds=1)
+    assert (some.lower <= most, least <= some.upper) == (True, True)
+    assert long.rate[1] <= 1.4 * long.rate[0]
+
+
+def test_verdicts_of_infinite_horizons():
+    assert cb.verify_safety(walk(delta=0.25, initial=[-0.5]), method="values", time_limit=10).status == "SAFE"
+    verdict = cb.verify_safety(contraction(horizon=math.inf), time_limit=10)
+    assert verdict.status == "UNSAFE"
+    assert "For every T from" in verdict.answers["values"].reason
+    assert "needs a finite horizon" in verdict.answers["linear"].reason
+
+
+def test_rates_belong_to_their_own_steps():
+    """Of bounds that are put together, no rate is taken from one and the probability from another."""
+    one, other = (bound_long_run(contraction(horizon=math.inf), seconds=s) for s in (0.01, 0.3))
+    for found in (one, other):
+        steps, least, most = found.before
+        for horizon in (steps, 2 * steps, 10 * steps):
+            truth = 1 - staying(lambda x: 0.9 * x, 0.2, horizon, 0.2)
+            assert 1 - (1 - least) * (1 - found.rate[0]) ** (horizon - steps) <= truth
+            assert truth <= 1 - (1 - most) * (1 - found.rate[1]) ** (horizon - steps)
+
+
+def test_a_function_that_is_1_everywhere_says_nothing_of_rates():
+    grid = Grid(axes=(np.linspace(-1, 1, 5),))
+    one = ValueFunction(
+        grid=grid, nodal=np.ones(5), bend=np.zeros((1, 4)), fixed=np.ones(4, dtype=bool), level=np.ones(4)
+    )
+    assert (least_rate(one, one), largest_rate(one, one)) == pytest.approx((1.0, 1.0))
+
+
+def test_steps_that_differ_are_not_taken_for_alike():
+    system = cb.DiscreteSystem(lambda t, x: (0.9 + 0.01 * np.sin(t)) * x, states=["x"], noise=cb.Gaussian(std=0.2))
+    with pytest.raises(InfeasibleError, match="a model and limits that do not change"):
+        bound_long_run(contraction(horizon=math.inf).replace(system=system))
+    with pytest.raises(InfeasibleError, match="limits on both sides of every state"):
+        bound_long_run(contraction(horizon=math.inf, safe=[cb.Inside(cb.HalfSpace([1], 1))]))
+    with pytest.raises(InfeasibleError, match="a limit wherever the target"):
+        bound_long_run(walk(reach=cb.Box([-2], [-1])))
+    assert bound_long_run(walk(horizon=1000)) is None
+    assert bound_long_run(contraction(horizon=400)) is None
+
+
+def test_an_end_is_asked_for_where_it_is_needed():
+    for call in (lambda p: cb.simulate_exits(p, paths=10), cb.bound_exit_times, lambda p: bound_failure(p)):
+        with pytest.raises(InfeasibleError, match="needs an end, and the horizon is infinite"):
+            call(contraction(horizon=math.inf))
+    with pytest.raises(ValueError, match="must have no `during` where the horizon is infinite"):
+        contraction(horizon=math.inf, safe=[cb.Inside(cb.Box([-1], [1]), during=(0, 5))])
+    with pytest.raises(InfeasibleError, match="at most 100000 steps"):
+        bound_failure(contraction(horizon=10**9))
