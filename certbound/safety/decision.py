@@ -136,6 +136,9 @@ class _Search:
             first = self.answers.get(name)
             if first is not None and first.applicable and not first.conclusive:
                 self.ask(name, Request(before=first.details))
+        for name in (name for name in names if self.problem.system.dimension < ENGINES[name].spares):
+            if not self.bounded and name in self.answers:
+                self.ask(name, Request())
 
     def _in_turn(self, names: tuple[str, ...]) -> None:
         """Ask one engine after the other; one that takes long is interrupted for those after it."""

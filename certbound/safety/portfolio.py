@@ -62,6 +62,8 @@ class Engine:
     soon : int
         From so many states on (0: never) it has a first bound after little time, and goes on from it: where the engine
         at work is slow, and there is a limit, it is asked for that in between.
+    spares : int
+        With fewer states it spares itself, as others say more there; where they prove nothing it is asked in full.
     chance : callable, optional
         ``chance(problem)`` says, from a sketch in floating point that takes next to nothing, how far the constraints
         are away in units of what the engine needs: at less than 1 it comes after those that may do better, and has
@@ -84,6 +86,7 @@ class Engine:
     sketch: bool = False
     dear: bool = False
     soon: int = 0
+    spares: int = 0
     chance: Callable[[Problem], float] | None = None
     reaches: bool = False
     endless: bool = False
@@ -151,6 +154,7 @@ ENGINES: dict[str, Engine] = {
             reserve=True,
             dear=True,
             soon=4,
+            spares=3,
         ),
     )
 }

@@ -180,6 +180,19 @@ def test_an_engine_without_a_chance_has_all_the_time_where_nothing_else_proves_a
     assert seconds == pytest.approx(100, abs=1)
 
 
+def test_who_spares_itself_is_asked_in_full_where_nothing_is_proved(
+    monkeypatch: pytest.MonkeyPatch, clock: Time
+) -> None:
+    asked = scripted(monkeypatch, clock, {"quadratic": [(1, 0)]})
+    monkeypatch.setitem(ENGINES, "quadratic", replace(ENGINES["quadratic"], spares=2))
+    run(clock, None)
+    assert asked.count("quadratic") == 2
+    asked = scripted(monkeypatch, clock, {"quadratic": [(1, 0)], "linear": [(1, -1)]})
+    monkeypatch.setitem(ENGINES, "quadratic", replace(ENGINES["quadratic"], spares=2))
+    run(clock, None)
+    assert asked.count("quadratic") == 1
+
+
 def test_a_sketch_of_the_remainder_tells_where_the_linear_response_has_a_chance() -> None:
     def flow(noise: float) -> cb.Problem:
         system = cb.ContinuousSystem(
