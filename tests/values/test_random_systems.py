@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from certbound.errors import EnclosureError, InfeasibleError
-from tests.values.random_systems import KINDS, check, steps, upper_bound, worst_frequency
+from tests.values.random_systems import KINDS, bounds, check, steps, worst_frequency
 
 
 def test_a_bound_that_is_too_small_would_be_seen() -> None:
     problem = steps(np.random.default_rng([4, 10 + KINDS.index("steps")]))
     low, high = worst_frequency(problem, 20_000, np.random.default_rng(0))
-    upper = upper_bound("steps", problem, 0.1)
+    lower, upper = bounds("steps", problem, 0.1)
     assert 0.6 * upper < low < upper
     assert low < high
 
