@@ -126,6 +126,15 @@ def test_cells_and_parts_hold_all_safe_points_and_the_walls(name: str) -> None:
     assert np.all(safe[np.isin(cell, cuts.whole)])
 
 
+def test_an_obstacle_that_no_cell_meets_leaves_whole_cells() -> None:
+    surface, _ = cut_up("ball")
+    cuts = Cuts.of(surface.axes, Walls.of([cb.Outside(cb.Ball([50.0, 0.0], 1.0))]))
+    assert not len(cuts.cut)
+    model = read(lambda t, x: [-x[0], -x[1]], 0.3 * np.eye(2), ["x1", "x2"])
+    found = proof.examine_within(surface, cuts, model, Need(spare=1e-12, start=-1.0, top=np.inf))
+    assert np.array_equal(np.unique(found.cell), cuts.whole)
+
+
 @pytest.mark.parametrize("name", ["ball", "strip"])
 @pytest.mark.parametrize("clock", [0.0, 0.3])
 def test_the_residual_is_enclosed_on_parts_of_cut_cells(name: str, clock: float) -> None:

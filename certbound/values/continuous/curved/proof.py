@@ -140,7 +140,8 @@ def look_over(
 def _interpolants(
     surface: Surface, cuts: Cuts, model: Model, first: int, last: int, counts: tuple[int, ...]
 ) -> list[tuple[list[Interpolant], Interpolant]]:
-    return [interpolants(surface, model, first, last, counts), cuts.interpolants(surface, model, first, last, counts)]
+    whole = interpolants(surface, model, first, last, counts)
+    return [whole, cuts.interpolants(surface, model, first, last, counts) if len(cuts.cut) else whole]
 
 
 def examine_within(surface: Surface, cuts: Cuts, model: Model, need: Need) -> Proof:
