@@ -62,11 +62,9 @@ class Wall:
 
     def _weighed(self, y: Interval) -> Interval:
         """M^-1 y for M = radius^2 shape."""
-        return (self._inverse()[None] * y[:, None, :]).sum(axis=-1)
-
-    def _inverse(self) -> Interval:
         form = self._quadratic()
-        return inverse_of(form.shape) / (Interval.point(form.radius) * form.radius)
+        inverse = inverse_of(form.shape) / (Interval.point(form.radius) * form.radius)
+        return (inverse[None] * y[:, None, :]).sum(axis=-1)
 
     def _quadratic(self) -> Quadratic:
         form = self.region.form
@@ -103,31 +101,29 @@ class Wall:
         -------
         ndarray, shape (m, N)
         """
+        span = np.maximum(rates[0].mag, rates[1].mag) * step * _UP
         swing = _FAR * s * math.sqrt(step) * _UP
         if isinstance(self.region.form, Faces):
             return self._beside_faces(rates, step, swing)
-        more = np.maximum(rates[0].mag, rates[1].mag) * step * _UP * self.outside
+        more = span if self.outside else np.zeros(span.shape)
         grown = [Interval(part.lo - more, part.hi + more) for part in tube]
         w = self._weighed(self.region.relative(self._boxes(*grown), 0.0))
-        outward = (w * self._boxes(*rates)).sum(axis=-1)  # of the gauge |M^-1/2 y|, which is 1 on the wall
-        share = np.maximum(outward.hi if self.outside else -outward.lo, 0.0) * step * _UP
+        f = self._boxes(*rates)
+        outward = (w * f).sum(axis=-1)
+        axes = np.linalg.eigvalsh(self._quadratic().matrix)
+        least, most = math.sqrt(float(axes[0])) / _UP, math.sqrt(float(axes[-1])) * _UP
+        rate = np.maximum(outward.hi if self.outside else -outward.lo, 0.0) * most  # |M^-1 y| >= 1 / most on the wall
+        share = rate * step / least * _UP
         if not self.outside:
             return np.asarray((1 - (1 - np.minimum(share, 1.0)) ** 2) * _UP)[None]
-        return np.asarray(((1 + share) ** 2 - 1 + self._beyond_the_middle(rates, step, swing)) * _UP)[None]
+        tall = self._conditional() / _UP
+        return np.asarray(((1 + share) ** 2 - 1 + (swing + span) ** 2 / tall) * _UP)[None]
 
-    def _beyond_the_middle(self, rates: tuple[Interval, Interval], step: float, swing: float) -> Array | float:
-        """What noise towards the middle of the chord along q adds to the squared gauge once it is past the middle.
-
-        The middle lies at -(M^-1)_qp / (M^-1)_qq times p: the drift moves the path past it by that much too.
-        """
-        (p, q), places = self.order, list(self.region.places(2))
-        if q not in places:
-            return 0.0
-        row = self._inverse()[places.index(q)]
-        across = row[places.index(q)]
-        tilt = float(row[places.index(p)].mag) / float(across.lo) if p in places else 0.0
-        drifted = (rates[1].mag + tilt * rates[0].mag) * step * _UP
-        return np.asarray(float(across.hi) * (swing + drifted) ** 2 * _UP)
+    def _conditional(self) -> float:
+        """The square of half the largest vertical (along q) chord of the ellipse."""
+        matrix = self._quadratic().matrix
+        p, q = self.order
+        return float(matrix[q, q] - matrix[p, q] ** 2 / matrix[p, p])
 
     def _beside_faces(self, rates: tuple[Interval, Interval], step: float, swing: float) -> Array:
         form = self.region.form
