@@ -62,9 +62,11 @@ class Wall:
 
     def _weighed(self, y: Interval) -> Interval:
         """M^-1 y for M = radius^2 shape."""
+        return (self._inverse()[None] * y[:, None, :]).sum(axis=-1)
+
+    def _inverse(self) -> Interval:
         form = self._quadratic()
-        inverse = inverse_of(form.shape) / (Interval.point(form.radius) * form.radius)
-        return (inverse[None] * y[:, None, :]).sum(axis=-1)
+        return inverse_of(form.shape) / (Interval.point(form.radius) * form.radius)
 
     def _quadratic(self) -> Quadratic:
         form = self.region.form
@@ -112,18 +114,27 @@ class Wall:
         outward = (w * f).sum(axis=-1)
         axes = np.linalg.eigvalsh(self._quadratic().matrix)
         least, most = math.sqrt(float(axes[0])) / _UP, math.sqrt(float(axes[-1])) * _UP
-        rate = np.maximum(outward.hi if self.outside else -outward.lo, 0.0) * most  # |M^-1 y| >= 1 / most on the wall
+        rate = np.maximum(outward.hi if self.outside else -outward.lo, 0.0) * most  # the gauge asks for no most / least
         share = rate * step / least * _UP
         if not self.outside:
             return np.asarray((1 - (1 - np.minimum(share, 1.0)) ** 2) * _UP)[None]
-        tall = self._conditional() / _UP
-        return np.asarray(((1 + share) ** 2 - 1 + (swing + span) ** 2 / tall) * _UP)[None]
+        return np.asarray(((1 + share) ** 2 - 1 + self._beyond_the_middle(rates, span, step, swing)) * _UP)[None]
 
-    def _conditional(self) -> float:
-        """The square of half the largest vertical (along q) chord of the ellipse."""
-        matrix = self._quadratic().matrix
-        p, q = self.order
-        return float(matrix[q, q] - matrix[p, q] ** 2 / matrix[p, p])
+    def _beyond_the_middle(
+        self, rates: tuple[Interval, Interval], span: Array, step: float, swing: float
+    ) -> Array | float:
+        """What noise towards the middle of the chord along q adds to the squared gauge once it is past the middle.
+
+        The middle lies at -(M^-1)_qp / (M^-1)_qq times p: the drift moves the path past it by that much too.
+        """
+        (p, q), places = self.order, list(self.region.places(2))
+        if q not in places:
+            return 0.0
+        row = self._inverse()[places.index(q)]
+        across = row[places.index(q)]
+        tilt = float(row[places.index(p)].mag) / float(across.lo) if p in places else 0.0
+        drifted = np.maximum((rates[1].mag + tilt * rates[0].mag) * step * _UP, span)
+        return np.asarray(float(across.hi) * (swing + drifted) ** 2 * _UP)
 
     def _beside_faces(self, rates: tuple[Interval, Interval], step: float, swing: float) -> Array:
         form = self.region.form

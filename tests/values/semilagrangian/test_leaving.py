@@ -16,6 +16,7 @@ from certbound.problem.model import compile_numpy
 from certbound.rigor.intervals import Interval
 from certbound.safety.engines import values
 from certbound.values.semilagrangian import bound_exits_by_steps, leaving
+from certbound.values.semilagrangian.confines import Wall
 from certbound.values.semilagrangian.groundwork import Plan, layout_of
 from certbound.values.semilagrangian.leaving import bound_by_steps, bound_by_steps_below
 from certbound.values.semilagrangian.mirrors import Mirror
@@ -129,6 +130,17 @@ def test_a_wall_knows_what_is_safe_near_it() -> None:
     inward = walls[0].margins((box, still), (-Interval.point(np.ones(3)), still), 0.1, 0.5)
     assert outward.max() < 1e-8  # a drift outward only helps
     assert inward[0, 1] == pytest.approx(1 - (1 - 0.21) ** 2, rel=1e-6)  # at most 1.05 / 1 inward, twice over
+
+
+def test_past_the_middle_of_a_tilted_chord_the_drift_counts_too() -> None:
+    obstacle = Wall(region=cb.Ellipsoid([0, 0], [[0.02, 0.18], [0.18, 2.0]]), outside=True, order=(0, 1))
+    tube = Interval.point(np.zeros(1)), Interval.point(np.zeros(1))
+    rates = Interval.point(np.ones(1)), Interval.point(np.zeros(1))
+    found = obstacle._beyond_the_middle(rates, np.array([0.1]), 0.1, 0.6)
+    across = 0.02 / (0.02 * 2.0 - 0.18**2)  # of the inverse; the middle moves by 9 along q for 1 along p
+    assert found == pytest.approx(across * (0.6 + 9 * 0.1) ** 2, rel=1e-6)
+    strip = Wall(region=cb.Ball([0.5], 0.1, coordinates=[1]), outside=True, order=(0, 1))
+    assert np.isfinite(strip.margins(tube, (Interval.point(np.ones(1)),) * 2, 0.1, 0.5)).all()
 
 
 def test_starts_in_a_ball_are_narrower_than_its_box() -> None:
