@@ -65,7 +65,8 @@ class Setting:
         away = (low - center[q], high - center[q])
         nearest = max(away[0], -away[1], 0.0) * (1 - 1e-9)
         share = math.sqrt(max(1 - nearest**2 / matrix[q, q], 0.0) + 1e-9)
-        half = math.sqrt(max(matrix[p, p] - matrix[p, q] ** 2 / matrix[q, q], 0.0)) * share * (1 + 1e-9)
+        across = matrix[p, p] - matrix[p, q] ** 2 / matrix[q, q] + 1e-14 * matrix[p, p]  # a difference of like numbers
+        half = math.sqrt(max(across, 0.0)) * share * (1 + 1e-9)
         middle = sorted(center[p] + matrix[p, q] / matrix[q, q] * end for end in away)
         slack = 1e-12 * (1 + abs(center[p]) + half)
         return max(ends[0], middle[0] - half - slack), min(ends[1], middle[1] + half + slack)
@@ -80,8 +81,10 @@ class Setting:
         turn = np.linspace(0, 2 * np.pi, 17)
         root = np.linalg.cholesky(self.region.form.matrix + 1e-300 * np.eye(2))
         rim = self.region.center_at() + (1 - 1e-9) * np.stack([np.cos(turn), np.sin(turn)], axis=1) @ root.T
-        inside = np.concatenate([self.region.center_at()[None], rim])
-        return np.asarray(inside[:, list(self.order)])
+        points = np.concatenate([self.region.center_at()[None], rim])[:, list(self.order)]
+        ball = Wall(region=self.region, outside=False, order=self.order)
+        sizes = ball.sizes(*(Interval.point(ends) for ends in points.T))
+        return np.asarray(points[sizes.hi.max(axis=1) <= 0])  # the rim is in floats: what is kept surely is a start
 
 
 def serves(problem: Problem) -> bool:

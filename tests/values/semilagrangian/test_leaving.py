@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -149,6 +150,22 @@ def test_starts_in_a_ball_are_narrower_than_its_box() -> None:
     assert setting.starts_between(-0.1, 0.5) == pytest.approx((0.5, 1.5), abs=1e-4)
     points = setting.some_starts()
     assert np.hypot(points[:, 0] - 1, points[:, 1]).max() <= 0.5
+
+
+def test_starts_of_a_thin_ellipse_surely_lie_in_it_and_between_its_ends() -> None:
+    rng = np.random.default_rng(0)
+    for thin in 1e-9 * rng.uniform(1, 3, 10):
+        shape = np.array([[0.04, 0.04 * (1 - thin)], [0.04 * (1 - thin), 0.04]])
+        start = cb.Ellipsoid([0, 0], shape)
+        setting = setting_of(pulled([cb.Inside(cb.HalfSpace([0, 1], 3.0))]).replace(initial=start))
+        a, b, c = (Fraction(float(shape[k])) for k in ((0, 0), (0, 1), (1, 1)))
+        for p, q in setting.some_starts():
+            x, y = Fraction(float(p)), Fraction(float(q))
+            assert c * x * x - 2 * b * x * y + a * y * y <= a * c - b * b
+            low, high = setting.starts_between(float(q), float(q))
+            assert low <= p <= high
+        ends = np.sqrt(float(a - b * b / c))  # of the chord at q = 0, exactly but for one rounding
+        assert setting.starts_between(0.0, 0.0)[1] >= ends
 
 
 def test_states_may_come_in_either_order() -> None:
