@@ -59,7 +59,7 @@ def test_without_a_disturbance_there_is_nothing_to_name(name: str, request: pyte
     assert "disturbance" not in check_data(request.getfixturevalue(name).data).claim
 
 
-def test_a_bound_for_disturbances_that_react_says_nothing_from_below_of_an_unknown_constant(valuing_below: Case) -> None:
+def test_a_bound_for_disturbances_that_react_says_nothing_from_below_of_a_constant(valuing_below: Case) -> None:
     fixed = valuing_below.problem.replace(unknown=valuing_below.problem.system.disturbance_names)
     report = check_data(parse(valuing_below.text), json.loads(json.dumps(problem_data(fixed))))
     assert not report.valid
