@@ -188,10 +188,11 @@ class _Run:
             rate = rates(transition, zones, *pair)
         upper, lower = work.at_random(*pair) if work.random else work.over_start(*pair, share)
         lower -= (n + 1) * self.leak * (1 + 1e-9)
-        upper, lower = min(max(upper, 0.0), 1.0), min(max(lower, 0.0), 1.0)
-        before = (n + self.first, lower, upper)
+        upper = min(max(upper, 0.0), 1.0)
+        before = (n + self.first, lower if rate is not None and rate[0] > 0 else max(lower, 0.0), upper)
         if rate is not None:
             upper, lower = later(upper, rate[1], more, up=True), later(lower, rate[0], more, up=False)
+        lower = min(max(lower, 0.0), 1.0)
         return FailureBounds(
             upper=upper, lower=lower, cells=pair[0].grid.shape, share=share, seconds=0.0, tried=(), rate=rate,
             before=before,
@@ -245,7 +246,7 @@ def largest_rate(value: ValueFunction, after: ValueFunction) -> float:
 def least_rate(value: ValueFunction, after: ValueFunction) -> float:
     """At most (after - value)/(1 - value) wherever value is below 1."""
     rise, _ = _rises(value, after)
-    left = 1 - np.clip(value.range()[0], 0.0, 1.0)
+    left = 1 - np.minimum(value.range()[0], 1.0)  # more than 1 where the function is negative
     certain = _certain(value) & _certain(after)
     ratio = np.where(certain, 1.0, np.maximum(rise, 0.0) / np.maximum(left * (1 + 1e-12), 1e-300))
     return float(min(max(ratio.min() * (1 - 1e-12), 0.0), 1.0))

@@ -123,6 +123,18 @@ def test_a_function_that_is_1_everywhere_says_nothing_of_rates():
     assert (least_rate(one, one), largest_rate(one, one)) == pytest.approx((1.0, 1.0))
 
 
+def test_rates_below_count_from_a_function_that_is_negative():
+    """1 - f falls from 1.5 to 1.45: a thirtieth of it, not a twentieth."""
+    grid = Grid(axes=(np.linspace(-1, 1, 5),))
+    one, after = (
+        ValueFunction(
+            grid=grid, nodal=np.full(5, value), bend=np.zeros((1, 4)), fixed=None, level=np.zeros(4)
+        )
+        for value in (-0.5, -0.45)
+    )
+    assert 0.999 * 0.05 / 1.5 < least_rate(one, after) <= 0.05 / 1.5
+
+
 def test_steps_that_differ_are_not_taken_for_alike():
     system = cb.DiscreteSystem(lambda t, x: (0.9 + 0.01 * np.sin(t)) * x, states=["x"], noise=cb.Gaussian(std=0.2))
     with pytest.raises(InfeasibleError, match="a model and limits that do not change"):
