@@ -187,8 +187,8 @@ def _local(subject: Problem) -> tuple[Constants, str]:
         odds = "with no room for the noise, for no tube with noise confirmed itself"
     if not reach.end > 0:
         raise InfeasibleError(
-            "no constants hold everywhere, and no reach tube was proved beyond the start, along which others might: the "
-            "dynamics jump there, or grow too fast; state a smaller `domain`, or a smaller initial set."
+            "no constants hold everywhere, and no reach tube was proved beyond the start, along which others might: "
+            "the dynamics jump there, or grow too fast; state a smaller `domain`, or a smaller initial set."
         )
     kind = "reach set + tube" if reach.noise else "noise-free reach set"
     unit = "s" if reach.curve.continuous else "steps"
