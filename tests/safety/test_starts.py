@@ -160,15 +160,23 @@ def test_no_start_is_safe_for_a_problem_with_a_target_whose_paths_end_at_the_dom
         bound_safe_starts(problem, {})
 
 
-def test_pictures_have_no_lower_bounds_where_paths_end_at_the_domain() -> None:
+def test_pictures_have_no_lower_bounds_where_paths_end_at_the_domain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leaving the domain counts as failing in the value function: a bound from above alone."""
     system = cb.ContinuousSystem(lambda x: 0.0 * x, states=1, diffusion=0.5)
     problem = cb.Problem(
         system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=0.2, delta=0.1,
         domain=cb.Box([-0.5], [2]), leaving="ends",
     )  # fmt: skip
-    assert bound_safe_starts(problem, {}, pictured=True).charts.lower == ()
-    assert bound_safe_starts(problem.replace(leaving="unsafe"), {}, pictured=True).charts.lower != ()
+    asked = []
+
+    def charted(problem: Problem, *, levels: list[float], times: int, lower: bool) -> Charts:
+        asked.append(lower)
+        return Charts(upper=(), lower=())
+
+    monkeypatch.setattr("certbound.safety.starts.chart_exits", charted)
+    bound_safe_starts(problem, {}, pictured=True)
+    bound_safe_starts(problem.replace(leaving="unsafe"), {}, pictured=True)
+    assert asked == [False, True]
 
 
 def test_what_cannot_be_had_is_said_with_the_cure() -> None:
