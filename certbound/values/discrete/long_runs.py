@@ -30,7 +30,7 @@ from certbound.values.discrete.failures import Work
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import AnyTransition, Zones, assembled, back_above, back_below, final
 from certbound.values.discrete.kernels import REACH
-from certbound.values.discrete.layout import FailureBounds, shares_of
+from certbound.values.discrete.layout import FailureBounds, shares_of, start_box
 from certbound.values.discrete.shocks import Inapplicable
 from certbound.values.discrete.steps import Dynamics
 from certbound.values.grids import Grid, over_corners
@@ -295,7 +295,7 @@ def _bounded(problem: Problem, parts: int) -> Problem:
     below, above = around.dynamics.step(0, Grid(axes=(np.linspace(first, last, 257),))).hull()
     reach = REACH * np.sqrt(around.shocks.sigma.hi**2 + around.shocks.factor.mag**2) * (1 + 1e-12)
     ends = Interval(below, above) + Interval(-reach, reach)
-    hull = problem.initial.hull() if not problem.initial.random else ends
-    edge = min(float(ends.lo[0]), first, float(hull.lo[0])), max(float(ends.hi[0]), last, float(hull.hi[0]))
+    start = start_box(problem)  # of a random one what lies beyond it is paid for as the tail of one more step
+    edge = min(float(ends.lo[0]), first, float(start[0][0])), max(float(ends.hi[0]), last, float(start[1][0]))
     sides = [edge[0] if not np.isfinite(low[0]) else -np.inf], [edge[1] if not np.isfinite(high[0]) else np.inf]
     return plain.replace(safe=[*plain.safe, Inside(Box(*sides))])
