@@ -105,6 +105,8 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
     """
     if lower and model.ends:
         raise CertificateError("`claim.log10_lower` must not be there where a path ends as it leaves the domain.")
+    if lower and model.unknown:
+        raise CertificateError("`claim.log10_lower` must not be there for an unknown constant, which does not react.")
     if lower and (model.members or model.target is not None):
         raise CertificateError("`claim.log10_lower` must not be there for a union of starts, or beside a target.")
     for engine, _, part in _parts(model, proof):

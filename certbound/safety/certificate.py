@@ -199,6 +199,7 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "dynamics": tape_data(tape),
         "plan": None if rows is None else exact(rows if continuous else rows[: int(problem.horizon)]),
         "disturbance_set": [] if box is None else _ranges(zip(box.low, box.high)),
+        **({"unknown": list(problem.unknown)} if problem.unknown else {}),
         "noise": _noise(system),
         "initial": initial_data(problem.initial),
         "constraints": [_constraint(constraint) for constraint in problem.safe],

@@ -218,7 +218,7 @@ def _charted(problem: Problem, answer: EngineAnswer | None, target: float, pictu
     if pictured:
         proved = [] if answer is None else [answer.log10_delta]
         levels += [*_DECADES, *(max(level, _DEEPEST) for level in proved if level < 0)]
-    return chart_exits(problem, levels=levels, times=times, lower=pictured and not problem.unknown)
+    return chart_exits(problem, levels=levels, times=times, lower=pictured and not (problem.unknown or problem.ending))
 
 
 def _threshold(delta: float) -> float:

@@ -210,7 +210,9 @@ def _faces(
         return lines
 
     def out(names: list[str]) -> str:
-        return (" or " if barrier.stay else " and ").join(f"{name} < 0.0" for name in names)
+        if barrier.stay:
+            return " or ".join(f"{name} < 0.0" for name in names)
+        return " and ".join(f"{name} <= 0.0" for name in names)  # sets are closed: an edge belongs to the obstacle
 
     start = [*gaps(old, "x", "0"), if_all(starts_at_once(number, barrier), f"({out(old)})"), f"    left = {number}"]
     step = [
@@ -273,7 +275,7 @@ def _round(
             lines += [f"{leg} = {value} - {center}"]
         return [*lines, f"{target} = {' + '.join(f'{leg} * {leg}' for leg in legs)}"]
 
-    beyond = f"{'>' if barrier.stay else '<'} {radius} * {radius}"
+    beyond = f"{'>' if barrier.stay else '<='} {radius} * {radius}"
     start = distance(old, "x", "0")
     start += [if_all(starts_at_once(number, barrier), f"{old} {beyond}"), f"    left = {number}"]
     step = distance(new, "y", "k + 1")

@@ -18,7 +18,7 @@ from certbound.checker import Report, check_data, parse
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.cli.app import run
 from certbound.errors import CertificateError
-from certbound.safety.certificate import certificate_text
+from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
 from tests.checker.conftest import Case
 
@@ -57,6 +57,17 @@ def test_the_claim_names_the_disturbances_that_its_engine_covers(stepping: Case,
 @pytest.mark.parametrize("name", ["flowing", "springing"])
 def test_without_a_disturbance_there_is_nothing_to_name(name: str, request: pytest.FixtureRequest) -> None:
     assert "disturbance" not in check_data(request.getfixturevalue(name).data).claim
+
+
+def test_a_bound_for_disturbances_that_react_says_nothing_from_below_of_a_constant(valuing_below: Case) -> None:
+    fixed = valuing_below.problem.replace(unknown=valuing_below.problem.system.disturbance_names)
+    report = check_data(parse(valuing_below.text), json.loads(json.dumps(problem_data(fixed))))
+    assert not report.valid
+    assert "unknown differs" in report.reason
+    data = parse(valuing_below.text)
+    data["problem"]["unknown"] = ["something else"]
+    with pytest.raises(CertificateError, match="names of disturbances"):
+        check_data(data)
 
 
 def test_a_barrier_and_noise_that_depends_on_the_state_need_a_disturbance_without_foresight() -> None:

@@ -76,6 +76,11 @@ def _(data: Data) -> None:
     data["proof"]["side"] = "lower"
 
 
+@forges("of an unknown constant no lower bound is stated", "valued below", "claims.py", "check_side", "does not react")
+def _(data: Data) -> None:
+    data["problem"]["unknown"] = list(data["problem"]["disturbances"])
+
+
 @forges("a start from below lies in its set", "valued below", "statement/partition.py", "starts_of", "initial set")
 def _(data: Data) -> None:
     data["problem"]["initial"]["high"] = exact([0.19])

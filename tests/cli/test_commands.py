@@ -145,6 +145,19 @@ def test_derive_gives_the_constants(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(found["metrics"]) == 1
 
 
+def test_derive_says_that_a_jump_at_the_start_leaves_no_constants(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "jump.toml").write_text(
+        'time = "discrete"\nhorizon = 3\nstates = ["x"]\ninitial = {box = [[-0.1, 0.1]]}\n'
+        'dynamics = {x = "x - 0.3*sign(x)"}\nnoise = {law = "gaussian", std = 0.1}\nstay = [{box = {x = [-1, 1]}}]\n'
+    )
+    assert run(["derive", str(tmp_path / "jump.toml")]) == 3
+    said = capsys.readouterr().err
+    assert "no reach tube was proved beyond the start" in said
+    assert "ValueError" not in said
+
+
 def test_tune_gives_every_method_and_the_radii_that_are_known(capsys: pytest.CaptureFixture[str]) -> None:
     code, found = answer(capsys, "tune", "ou")
     assert code == 0

@@ -433,7 +433,8 @@ class Run:
         from certbound.safety.falsification import find_violation
 
         draft, rng = self.draft, self.rng(6)
-        violation = find_violation(self.problem)
+        members = (self.problem.replace(initial=start) for start in self.problem.starts)
+        violation = next(filter(None, map(find_violation, members)), None)
         points = oracle.starts(draft, rng, 400) if draft.start[0] != "gaussian" else np.tile(draft.start[1], (2, 1))
         if violation is not None:
             points = np.vstack([points, violation.start / draft.units.state])

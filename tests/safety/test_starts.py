@@ -149,6 +149,36 @@ def test_the_threshold_is_delta_itself() -> None:
         assert SafeStarts(problem=well(), delta=1e-3, charts=Charts(upper=(chart,))).contains(0.5) is inside
 
 
+def test_no_start_is_safe_for_a_problem_with_a_target_whose_paths_end_at_the_domain() -> None:
+    """Not to get to the target is to fail, which a chart of the limits alone does not count."""
+    system = cb.DiscreteSystem(lambda x: 1.0 * x, states=["x"], noise=cb.Gaussian(std=0.3))
+    problem = cb.Problem(
+        system, initial=[0.1], safe=[cb.Inside(cb.Box([-5], [5]))], reach=cb.Box([1.0], [1.5]), horizon=4, delta=0.1,
+        domain=cb.Box([-2], [3]), leaving="ends",
+    )  # fmt: skip
+    with pytest.raises(InfeasibleError, match="has a target"):
+        bound_safe_starts(problem, {})
+
+
+def test_pictures_have_no_lower_bounds_where_paths_end_at_the_domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leaving the domain counts as failing in the value function: a bound from above alone."""
+    system = cb.ContinuousSystem(lambda x: 0.0 * x, states=1, diffusion=0.5)
+    problem = cb.Problem(
+        system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=0.2, delta=0.1,
+        domain=cb.Box([-0.5], [2]), leaving="ends",
+    )  # fmt: skip
+    asked = []
+
+    def charted(problem: Problem, *, levels: list[float], times: int, lower: bool) -> Charts:
+        asked.append(lower)
+        return Charts(upper=(), lower=())
+
+    monkeypatch.setattr("certbound.safety.starts.chart_exits", charted)
+    bound_safe_starts(problem, {}, pictured=True)
+    bound_safe_starts(problem.replace(leaving="unsafe"), {}, pictured=True)
+    assert asked == [False, True]
+
+
 def test_what_cannot_be_had_is_said_with_the_cure() -> None:
     problem = logistic()
     with pytest.raises(InfeasibleError, match=r'none was proved: .*method="values"'):

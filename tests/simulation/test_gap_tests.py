@@ -193,3 +193,20 @@ def test_discrete_time_counts_steps_only():
 
 def agrees_count(count, probability):
     return abs(count / PATHS - probability) < 5 * np.sqrt(probability / PATHS)
+
+
+@pytest.mark.parametrize("region", [cb.Box([1.0], [2.0]), cb.Ball([1.5], 0.5), cb.HalfSpace([-1.0], -1.0)])
+def test_edges_belong_to_sets_in_simulation_as_anywhere(region):
+    walk = cb.DiscreteSystem(lambda x: 1.0 * x, states=["x"], noise=cb.Rademacher(scale=1.0))
+    stay = [cb.Inside(cb.Box([-1.0], [1.0]))]
+    assert exits(walk, stay, steps=None, horizon=1).exits == 0
+    avoid = exits(walk, [cb.Outside(region)], steps=None, horizon=1)
+    missed = exits(walk, stay, steps=None, horizon=1, reach=region)
+    assert avoid.probability == pytest.approx(0.5, abs=0.02)
+    assert missed.probability == pytest.approx(0.5, abs=0.02)
+
+
+def test_the_edge_of_a_disc_belongs_to_it():
+    turn = cb.DiscreteSystem(lambda x: [x[0], x[1]], states=2, noise=cb.Rademacher(scale=[1.0, 0.0]))
+    avoid = exits(turn, [cb.Outside(cb.Ball([2.0, 0.0], 1.0))], steps=None, horizon=1)
+    assert avoid.probability == pytest.approx(0.5, abs=0.02)

@@ -75,6 +75,16 @@ def test_before_a_window_the_line_ends_where_the_drift_lets_no_path_pass() -> No
     assert least * 0.995 <= 10 ** bound_exits(asked, seconds=0.01, lower=False).upper <= 1.15 * most
 
 
+def test_between_two_limits_it_does_not_matter_that_paths_beyond_them_leave_every_bound() -> None:
+    """x' = -x + 6 x^3 leaves [-1.2, 1.2] within 1 with a probability in [.0322, .0332] (10^6 simulated paths)."""
+    system = cb.ContinuousSystem(lambda x: -x + 6 * x**3, states=1, diffusion=0.3)
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.2], [1.2]))], horizon=1.0)
+    found = bound_exits(problem, seconds=0.5)
+    assert found.lower is not None
+    assert math.log10(0.031) < found.lower < math.log10(0.0332)
+    assert math.log10(0.0322) < found.upper < math.log10(0.0345)
+
+
 def test_a_window_may_have_a_limit_on_one_side_alone() -> None:
     asked = problem([cb.Inside(cb.Box([-0.6], [np.inf]), during=(0.3, 0.4)), cb.Inside(BOX, during=(0.8, 1))])
     least, most = bracket(asked, -4.0, 4.0, 1000, 300)

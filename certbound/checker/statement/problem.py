@@ -86,6 +86,7 @@ class Model:
     domain: list[tuple[float | None, float | None]] | None
     states: tuple[str, ...] = field(default=())
     target: Constraint | None = None  # then a path fails that breaks a constraint before it is there, or never is
+    unknown: tuple[str, ...] = ()  # disturbances that do not change: one that reacts to the state says nothing of them
     ends: bool = False  # where the domain is left: that is no failure, and counting it as one bounds from above only
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
@@ -113,7 +114,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     CertificateError where a field is missing, has the wrong size, or makes no sense; Unproved where it is too large for
     the budget.
     """
-    record = Record(value, path, _FIELDS, ("reach", "leaving"))
+    record = Record(value, path, _FIELDS, ("reach", "leaving", "unknown"))
     time = record["time"]
     if time not in ("continuous", "discrete"):
         raise CertificateError(f"`{path}.time` must be \"continuous\" or \"discrete\".")
@@ -127,6 +128,9 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     inputs, disturbances = _names(record, "inputs", 0), _names(record, "disturbances", 0)
     n = len(states)
     dynamics = read_tape(record["dynamics"], record.at("dynamics"), ("t", *states, *inputs, *disturbances), (n,))
+    unknown = _names(record, "unknown", 1) if "unknown" in record.value else ()
+    if not set(unknown) <= set(disturbances):
+        raise CertificateError(f"`{path}.unknown` must hold names of disturbances.")
     if record["leaving"] not in (None, "ends"):
         raise CertificateError(f"`{path}.leaving` must be \"ends\" or absent.")
     domain = _ranges(record["domain"], record.at("domain"), n) if record["domain"] is not None else None
@@ -141,7 +145,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     return Model(
         name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
         ends=record["leaving"] == "ends", plan=_plan(record, len(inputs), continuous, horizon), states=states,
-        disturbance=_disturbance(record, len(disturbances)),
+        disturbance=_disturbance(record, len(disturbances)), unknown=unknown,
         noise=_noise(record["noise"], path + ".noise", states, time, budget),
         initial=initial, members=members, target=_target(record, n, horizon, budget),
         constraints=tuple(constraints), domain=domain,

@@ -185,6 +185,11 @@ def _local(subject: Problem) -> tuple[Constants, str]:
         _log.info("no tube with noise: %s", error)
         reach = bound_reach(subject, noise=False)
         odds = "with no room for the noise, for no tube with noise confirmed itself"
+    if not reach.end > 0:
+        raise InfeasibleError(
+            "no constants hold everywhere, and no reach tube was proved beyond the start, along which others might: "
+            "the dynamics jump there, or grow too fast; state a smaller `domain`, or a smaller initial set."
+        )
     kind = "reach set + tube" if reach.noise else "noise-free reach set"
     unit = "s" if reach.curve.continuous else "steps"
     where = f"the {kind}, box by box in time, up to {reach.end:g} {unit}, {odds}"

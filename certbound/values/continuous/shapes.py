@@ -54,7 +54,8 @@ def _cut(line: Line, side: int, barrier: float) -> float | None:
 def either(first: Array, second: Array) -> Array:
     """log(1 - (1 - e^first)(1 - e^second)): 0 exactly wherever one of them is."""
     most, least = np.maximum(first, second), np.minimum(first, second)
-    return np.asarray(most + np.log1p(np.exp(least - most) - np.exp(least)))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # of a proposal that is of no use, or its start
+        return np.asarray(most + np.log1p(np.exp(least - most) - np.exp(least)))
 
 
 def _distance(line: Line, x: Array, side: int) -> Array:

@@ -193,7 +193,8 @@ class Work:
             raise Inapplicable(f"a step by step induction takes at most {_MOST_STEPS} steps, not {problem.horizon}.")
         self.problem, self.target, self.n, self.since = problem, target, system.dimension, since
         self.horizon, self.ending = int(problem.horizon), target if since == 0 else None
-        self.limits = problem.safe if problem.ending else problem.constraints
+        asked = problem.constraints  # which refuses a problem with a target of its own
+        self.limits = problem.safe if problem.ending else asked
         self.beyond = 0.0 if problem.ending else 1.0
         self.shocks = shocks_of(system.noise, system.noise_matrix)
         self.dynamics = Dynamics(problem, parts)

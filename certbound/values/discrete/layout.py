@@ -51,7 +51,7 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
         return _of_domain(problem, np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (REACH * (1 + 1e-12)))
     low, high = np.empty((horizon + 1, n)), np.empty((horizon + 1, n))
     spread = REACH * (np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (1 + 1e-12))
-    reach = _start_box(problem, spread)
+    reach = start_box(problem)
     leak = 0.0
     for t in range(horizon + 1):
         low[t], high[t] = box_around(active_at(problem.constraints, t), n, t)
@@ -77,7 +77,8 @@ def _of_domain(problem: Problem, spread: Array) -> Boxes:
     return Boxes(np.tile(low, steps), np.tile(high, steps), 0.0)
 
 
-def _start_box(problem: Problem, spread: Array) -> tuple[Array, Array]:
+def start_box(problem: Problem) -> tuple[Array, Array]:
+    """Ends of a box around the starts; of random ones but for tails."""
     initial = problem.initial
     if initial.random:
         away = REACH * np.sqrt(np.diag(initial.covariance)) * (1 + 1e-12)

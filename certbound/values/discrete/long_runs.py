@@ -30,7 +30,7 @@ from certbound.values.discrete.failures import Work
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import AnyTransition, Zones, assembled, back_above, back_below, final
 from certbound.values.discrete.kernels import REACH
-from certbound.values.discrete.layout import FailureBounds, shares_of
+from certbound.values.discrete.layout import FailureBounds, shares_of, start_box
 from certbound.values.discrete.shocks import Inapplicable
 from certbound.values.discrete.steps import Dynamics
 from certbound.values.grids import Grid, over_corners
@@ -188,10 +188,11 @@ class _Run:
             rate = rates(transition, zones, *pair)
         upper, lower = work.at_random(*pair) if work.random else work.over_start(*pair, share)
         lower -= (n + 1) * self.leak * (1 + 1e-9)
-        upper, lower = min(max(upper, 0.0), 1.0), min(max(lower, 0.0), 1.0)
-        before = (n + self.first, lower, upper)
+        upper = min(max(upper, 0.0), 1.0)
+        before = (n + self.first, lower if rate is not None and rate[0] > 0 else max(lower, 0.0), upper)
         if rate is not None:
             upper, lower = later(upper, rate[1], more, up=True), later(lower, rate[0], more, up=False)
+        lower = min(max(lower, 0.0), 1.0)
         return FailureBounds(
             upper=upper, lower=lower, cells=pair[0].grid.shape, share=share, seconds=0.0, tried=(), rate=rate,
             before=before,
@@ -245,7 +246,7 @@ def largest_rate(value: ValueFunction, after: ValueFunction) -> float:
 def least_rate(value: ValueFunction, after: ValueFunction) -> float:
     """At most (after - value)/(1 - value) wherever value is below 1."""
     rise, _ = _rises(value, after)
-    left = 1 - np.clip(value.range()[0], 0.0, 1.0)
+    left = 1 - np.minimum(value.range()[0], 1.0)  # more than 1 where the function is negative
     certain = _certain(value) & _certain(after)
     ratio = np.where(certain, 1.0, np.maximum(rise, 0.0) / np.maximum(left * (1 + 1e-12), 1e-300))
     return float(min(max(ratio.min() * (1 - 1e-12), 0.0), 1.0))
@@ -294,7 +295,7 @@ def _bounded(problem: Problem, parts: int) -> Problem:
     below, above = around.dynamics.step(0, Grid(axes=(np.linspace(first, last, 257),))).hull()
     reach = REACH * np.sqrt(around.shocks.sigma.hi**2 + around.shocks.factor.mag**2) * (1 + 1e-12)
     ends = Interval(below, above) + Interval(-reach, reach)
-    hull = problem.initial.hull() if not problem.initial.random else ends
-    edge = min(float(ends.lo[0]), first, float(hull.lo[0])), max(float(ends.hi[0]), last, float(hull.hi[0]))
+    start = start_box(problem)  # of a random one what lies beyond it is paid for as the tail of one more step
+    edge = min(float(ends.lo[0]), first, float(start[0][0])), max(float(ends.hi[0]), last, float(start[1][0]))
     sides = [edge[0] if not np.isfinite(low[0]) else -np.inf], [edge[1] if not np.isfinite(high[0]) else np.inf]
     return plain.replace(safe=[*plain.safe, Inside(Box(*sides))])

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 import certbound as cb
 from certbound.errors import InfeasibleError
@@ -121,6 +122,32 @@ def test_a_function_that_is_1_everywhere_says_nothing_of_rates():
         grid=grid, nodal=np.ones(5), bend=np.zeros((1, 4)), fixed=np.ones(4, dtype=bool), level=np.ones(4)
     )
     assert (least_rate(one, one), largest_rate(one, one)) == pytest.approx((1.0, 1.0))
+
+
+def test_a_random_start_beyond_the_face_of_an_endless_target_has_arrived():
+    """X_0 ~ N(2, 1), a walk with drift .05 and noise .3 from there: to 1 and beyond before it is below -1."""
+    system = cb.DiscreteSystem(lambda x: x + 0.05, states=["x"], noise=cb.Gaussian(std=0.3))
+    problem = cb.Problem(
+        system, initial=cb.GaussianStart([2.0], [[1.0]]), safe=[cb.Inside(cb.Box([-1], [np.inf]))],
+        reach=cb.Box([1.0], [np.inf]), horizon=math.inf,
+    )  # fmt: skip
+    matrix = density(NODES[None, :] - NODES[:, None] - 0.05, 0.3) * WEIGHTS
+    failing = np.linalg.solve(np.eye(len(NODES)) - matrix, ndtr((-1 - NODES - 0.05) / 0.3))
+    truth = ndtr(-3.0) + float((density(NODES - 2.0, 1.0) * WEIGHTS) @ failing)
+    found = bound_long_run(problem, seconds=0.2)
+    assert 0.9 * truth < found.lower <= truth <= found.upper < 1.1 * truth
+
+
+def test_rates_below_count_from_a_function_that_is_negative():
+    """1 - f falls from 1.5 to 1.45: a thirtieth of it, not a twentieth."""
+    grid = Grid(axes=(np.linspace(-1, 1, 5),))
+    one, after = (
+        ValueFunction(
+            grid=grid, nodal=np.full(5, value), bend=np.zeros((1, 4)), fixed=None, level=np.zeros(4)
+        )
+        for value in (-0.5, -0.45)
+    )
+    assert 0.999 * 0.05 / 1.5 < least_rate(one, after) <= 0.05 / 1.5
 
 
 def test_steps_that_differ_are_not_taken_for_alike():

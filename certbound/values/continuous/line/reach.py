@@ -33,7 +33,9 @@ def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]
         Paths get beyond any bound, so that no cut helps.
     """
     places = []
-    for limit, _ in limits_of(problem, inner=False):
+    always: set[int] = set()  # the sides that are never without a limit
+    for limit, window in limits_of(problem, inner=False):
+        always |= {limit.side} if window[0] <= 0 and window[1] >= last_instant(problem) else set()
         times = [0.0, last_instant(problem)] if limit.center is None else np.linspace(0, last_instant(problem), 9)
         for t in times:
             moved = 0.0 if limit.center is None else float(value_at(limit.center, float(t)).mid)
@@ -41,6 +43,8 @@ def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]
     scale = max(1.0, *(abs(place) for place in (start.low, start.high, *places)))
     if not scale < _LARGEST:
         raise InfeasibleError(f"value functions need states below {_LARGEST:g}: write the state in another unit.")
+    if len(always) == 2:
+        return min(places), max(places)  # nothing is cut
     low, high = _spread(problem, model, start, _FARTHEST * scale)
     low, high = min([low, *places]), max([high, *places])
     square = compile_numpy(model.square.tape)
