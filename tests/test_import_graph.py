@@ -28,6 +28,7 @@ problem.model
 problem.sets problem.noise
 problem.table_laws
 problem.adapters problem.networks
+problem.signals
 problem.systems
 problem.ingredients
 problem.problem
