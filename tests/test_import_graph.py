@@ -485,5 +485,10 @@ def test_importing_the_package_loads_nothing_heavy(statement: str) -> None:
     assert loaded_by(statement, HEAVY) == set()
 
 
+def test_a_verdict_begins_before_what_single_engines_need_is_loaded() -> None:
+    parts = {f"scipy.{part}" for part in ("interpolate", "linalg", "ndimage", "optimize", "sparse", "special")}
+    assert loaded_by("import certbound.cli.app, certbound.safety.verification", parts) == set()
+
+
 def test_importing_the_checker_loads_nothing_that_it_checks() -> None:
     assert loaded_by("import certbound.checker", HEAVY | {"numpy", "scipy", "certbound.rigor"}) == set()
