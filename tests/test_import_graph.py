@@ -28,6 +28,7 @@ problem.model
 problem.sets problem.noise
 problem.table_laws
 problem.adapters problem.networks
+problem.signals
 problem.systems
 problem.ingredients
 problem.problem
@@ -482,6 +483,11 @@ def loaded_by(statement: str, names: set[str]) -> set[str]:
 )
 def test_importing_the_package_loads_nothing_heavy(statement: str) -> None:
     assert loaded_by(statement, HEAVY) == set()
+
+
+def test_a_verdict_begins_before_what_single_engines_need_is_loaded() -> None:
+    parts = {f"scipy.{part}" for part in ("interpolate", "linalg", "ndimage", "optimize", "sparse", "special")}
+    assert loaded_by("import certbound.cli.app, certbound.safety.verification", parts) == set()
 
 
 def test_importing_the_checker_loads_nothing_that_it_checks() -> None:

@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
-from certbound.checks import assign, frozen, matrix, names, number, vector
+from certbound.checks import assign, frozen, matrix, vector
 from certbound.errors import InfeasibleError
 from certbound.problem import table_laws  # noqa: F401  (its laws enter the list of laws)
-from certbound.problem.adapters import import_control, is_control_system, is_symbolic, read_model, symbol_names
-from certbound.problem.model import Tape, compile_numpy
+from certbound.problem.adapters import import_control, is_control_system, read_model, symbol_names
+from certbound.problem.model import Tape
 from certbound.problem.noise import Gaussian, Law, known_laws
 from certbound.problem.sets import Box
+from certbound.problem.signals import diffusion_of, signal_box, signal_names, state_names
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -65,17 +66,17 @@ class System:
         options = {name: symbol_names(value) if name.endswith("names") else value for name, value in options.items()}
         if states is None:
             raise TypeError("`states` must be given: a number, or the states' names.")
-        assign(self, states=_state_names(states))
-        assign(self, inputs=_signal_box("inputs", options["inputs"], "u"))
-        assign(self, disturbance=_signal_box("disturbance", options["disturbance"], "d"))
+        assign(self, states=state_names(states))
+        assign(self, inputs=signal_box("inputs", options["inputs"], "u"))
+        assign(self, disturbance=signal_box("disturbance", options["disturbance"], "d"))
         if self.disturbance is not None and not self.disturbance.bounded:
             ends = ", ".join(f"[{low:g}, {high:g}]" for low, high in zip(self.disturbance.low, self.disturbance.high))
             raise ValueError(f"`disturbance` must be a bounded box, got the sides {ends}; give each finite ends.")
-        input_names = _signal_names("input_names", options["input_names"], self.inputs, "u", self.states)
+        input_names = signal_names("input_names", options["input_names"], self.inputs, "u", self.states)
         assign(self, input_names=input_names)
         taken = (*self.states, *input_names)
         given = options["disturbance_names"]
-        disturbance_names = _signal_names("disturbance_names", given, self.disturbance, "d", taken)
+        disturbance_names = signal_names("disturbance_names", given, self.disturbance, "d", taken)
         assign(self, disturbance_names=disturbance_names)
         assign(self, dynamics=self._traced(f))
 
@@ -148,7 +149,7 @@ class ContinuousSystem(System):
             "disturbance_names": disturbance_names,
         }
         self._common(f, states, options)
-        assign(self, diffusion=_diffusion(diffusion, self.states))
+        assign(self, diffusion=diffusion_of(diffusion, self.states))
 
     @property
     def noise_dimension(self) -> int:
@@ -221,7 +222,7 @@ class DiscreteSystem(System):
                 f"{known_laws()}."
             )
         matrix_value = np.eye(self.dimension) if noise_matrix is None else noise_matrix
-        gain = _diffusion(matrix_value, self.states, "noise_matrix")
+        gain = diffusion_of(matrix_value, self.states, "noise_matrix")
         moves = isinstance(gain, Tape)
         assign(self, gain=gain if moves else None, fixed_gain=frozen(np.full(gain.shape, np.nan)) if moves else gain)
         assign(self, noise=law.resolve(gain.shape[1]))
@@ -327,76 +328,3 @@ def from_control(system: Any, **options: Any) -> ContinuousSystem | DiscreteSyst
         raise TypeError(f"`system` must be a python-control system with states, got {system!r}.")
     build = DiscreteSystem if system.isdtime(strict=True) else ContinuousSystem
     return build(system, **options)
-
-
-def _state_names(states: Any) -> tuple[str, ...]:
-    if isinstance(states, (int, np.integer)) and not isinstance(states, bool):
-        if states < 1:
-            raise ValueError(f"`states` must be at least 1, got {states}.")
-        return tuple(f"x{k}" for k in range(1, states + 1))
-    if isinstance(states, str) or not isinstance(states, Sequence) or not states:
-        raise TypeError(f"`states` must be a number or a list of names, got {states!r}.")
-    return names("states", states)
-
-
-def _signal_box(name: str, value: Any, symbol: str) -> Box | None:
-    if value is None or (isinstance(value, Box) and value.coordinates is None and not value.moving):
-        return value
-    raise TypeError(f"`{name}` must be a Box that bounds {symbol}, got {value!r}; use cb.Box(low, high).")
-
-
-def _signal_names(
-    name: str, given: Sequence[str] | None, box: Box | None, symbol: str, taken: Sequence[str]
-) -> tuple[str, ...]:
-    if box is None:
-        if given:
-            raise ValueError(f"`{name}` must come with bounds, got {list(given)} alone.")
-        return ()
-    if given is not None:
-        if len(given) != box.dimension:
-            raise ValueError(f"`{name}` must hold {box.dimension} names, got {list(given)}.")
-        return names(name, given, taken)
-    while any(entry.startswith(symbol) for entry in taken):
-        symbol = f"{symbol}_"
-    count = box.dimension
-    return (symbol,) if count == 1 else tuple(f"{symbol}{k}" for k in range(1, count + 1))
-
-
-def _noise_matrix(name: str, value: Any, states: Sequence[str]) -> Array:
-    n = len(states)
-    array = np.asarray(value, dtype=float) if not isinstance(value, (int, float)) else np.array(float(value))
-    if array.ndim < 2 and n == 1:
-        array = array.reshape(1, -1)
-    if array.ndim == 0:
-        raise ValueError(
-            f"`{name}` must be a matrix with {n} rows (one per state), got the scalar "
-            f"{number(name, value):g}; write {float(value):g} * np.eye({n}) for independent noise."
-        )
-    if array.ndim == 1:
-        raise ValueError(
-            f"`{name}` must be a matrix with {n} rows (one per state), got a vector; write np.diag([...]) "
-            "for independent noise on every state, or a column [[...], [...]] for one common noise."
-        )
-    return matrix(name, array, rows=n)
-
-
-def _diffusion(value: Any, states: Sequence[str], name: str = "diffusion") -> Array | Tape:
-    n = len(states)
-    if value is None:
-        return frozen(np.zeros((n, 1)))
-    if not callable(value) and not isinstance(value, Tape) and not is_symbolic(value):
-        return _noise_matrix(name, value, states)
-    tape = value if isinstance(value, Tape) else read_model(value, {"t": ["t"], "x": states}, matrix=True)
-    if tape.inputs != ("t", *states):
-        raise ValueError(f"`{name}` must be a tape over {('t', *states)}, got {tape.inputs}.")
-    shape = tape.shape if len(tape.shape) == 2 else (1, *tape.shape)
-    if len(tape.shape) == 1 and n > 1:
-        raise ValueError(
-            f"`{name}` must return a matrix with {n} rows (one per state), got shape {tape.shape}; write "
-            "np.diag([...]) for independent noise on every state, or a column [[...], [...]]."
-        )
-    if shape[0] != n:
-        raise ValueError(f"`{name}` must return {n} rows (one per state), got shape {shape}.")
-    if all(node.op != "input" for node in tape.nodes):
-        return frozen(compile_numpy(tape)(*np.zeros(n + 1)).reshape(shape))
-    return Tape(inputs=tape.inputs, nodes=tape.nodes, outputs=tape.outputs, shape=shape)

@@ -12,7 +12,6 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import sparse
 
 from certbound.arrays import Array, Integers
 
@@ -52,6 +51,8 @@ def _solver_module() -> Any:
     alarms = {signal.SIGALRM} if hasattr(signal, "SIGALRM") else set()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, alarms) if alarms else set()
     try:
+        from scipy import sparse
+
         clarabel = importlib.import_module("clarabel")
         settings = clarabel.DefaultSettings()
         settings.verbose = False
@@ -105,6 +106,8 @@ class Program:
 
     def minimise(self, column: int, *, seconds: float) -> Array | None:
         """The variables at about the least value of one of them; None where the solver came to nothing."""
+        from scipy import sparse
+
         rows, columns, values = (np.concatenate(parts) for parts in zip(*self.entries))
         matrix = sparse.csc_matrix((values, (rows, columns)), shape=(self.height, self.width))
         objective = np.zeros(self.width)

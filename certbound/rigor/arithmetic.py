@@ -99,8 +99,8 @@ class Interval:
         """A finite number in each interval, the midpoint up to rounding; see `rad`."""
         lo, hi = np.maximum(self.lo, -LARGEST), np.minimum(self.hi, LARGEST)
         result: Array = np.clip(0.5 * lo + 0.5 * hi, lo, hi)
-        if not np.isfinite(self.lo).all() or not np.isfinite(self.hi).all():
-            infinite = ~(np.isfinite(self.lo) & np.isfinite(self.hi))
+        infinite = ~(np.isfinite(self.lo) & np.isfinite(self.hi))
+        if np.count_nonzero(infinite):
             result = np.where(infinite, np.clip(0.0, lo, hi), result)
         return result
 
@@ -108,7 +108,10 @@ class Interval:
     @quiet
     def rad(self) -> Array:
         """Radii with [mid - rad, mid + rad] containing the interval (+inf where unbounded)."""
-        mid = self.mid
+        return self.rad_about(self.mid)
+
+    def rad_about(self, mid: Array) -> Array:
+        """`rad`, where `mid` is known."""
         return upper(np.maximum(self.hi - mid, mid - self.lo))
 
     @property
@@ -237,15 +240,36 @@ def subtract(a: Interval, b: Interval) -> Interval:
 
 def _outward(lo: Array, hi: Array, a: Interval, b: Interval) -> Interval:
     """Widen products or quotients; where one underflows to 0, keep the sign that the factors give."""
-    exact = bool(lo.all() and hi.all())
+    if _without_zero(lo, hi):
+        return Interval._raw(lower(lo, tiny=TINY), upper(hi, tiny=TINY))
+    a_above, a_below, b_above, b_below = a.lo >= 0, a.hi <= 0, b.lo >= 0, b.hi <= 0
+    zero = (a_above & a_below) | (b_above & b_below)
+    same = (a_above & b_above) | (a_below & b_below) | zero
+    opposite = (a_above & b_below) | (a_below & b_above) | zero
+    return _signed(lo, hi, same, opposite)
+
+
+def _without_zero(lo: Array, hi: Array) -> bool:
+    return bool(np.count_nonzero(lo) == lo.size and np.count_nonzero(hi) == hi.size)
+
+
+def _signed(lo: Array, hi: Array, positive: Mask, negative: Mask) -> Interval:
+    """Widened, but for ends at which the sign of the exact result is known (neither below nor above 0)."""
     lo, hi = lower(lo, tiny=TINY), upper(hi, tiny=TINY)
-    if not exact:
-        zero = ((a.lo == 0) & (a.hi == 0)) | ((b.lo == 0) & (b.hi == 0))
-        same = ((a.lo >= 0) & (b.lo >= 0)) | ((a.hi <= 0) & (b.hi <= 0)) | zero
-        opposite = ((a.lo >= 0) & (b.hi <= 0)) | ((a.hi <= 0) & (b.lo >= 0)) | zero
-        lo = np.where(same, np.maximum(lo, 0.0), lo)
-        hi = np.where(opposite, np.minimum(hi, 0.0), hi)
-    return Interval._raw(lo, hi)
+    return Interval._raw(
+        np.where(positive, np.maximum(lo, 0.0), lo), np.where(negative, np.minimum(hi, 0.0), hi)
+    )
+
+
+def _times(factor: float, x: Interval) -> Interval:
+    """A number other than 0 times an interval."""
+    first, second = (x.lo, x.hi) if factor > 0 else (x.hi, x.lo)
+    lo, hi = factor * first, factor * second
+    if _without_zero(lo, hi):
+        return Interval._raw(lower(lo, tiny=TINY), upper(hi, tiny=TINY))
+    if factor > 0:
+        return _signed(lo, hi, first >= 0, second <= 0)
+    return _signed(lo, hi, first <= 0, second >= 0)
 
 
 @quiet
@@ -260,12 +284,11 @@ def multiply(a: Interval, b: Interval) -> Interval:
         if factor == 0.0:
             zero = np.zeros(b.shape)
             return Interval._raw(zero, zero)
-        first, second = (b.lo, b.hi) if factor > 0 else (b.hi, b.lo)
-        return _outward(factor * first, factor * second, a, b)
+        return _times(factor, b)
     ll, lh, hl, hh = a.lo * b.lo, a.lo * b.hi, a.hi * b.lo, a.hi * b.hi
     lo = np.minimum(np.minimum(ll, lh), np.minimum(hl, hh))
     hi = np.maximum(np.maximum(ll, lh), np.maximum(hl, hh))
-    if np.isnan(lo).any():
+    if np.count_nonzero(np.isnan(lo)):
         four = [np.where(np.isnan(p), 0.0, p) for p in (ll, lh, hl, hh)]
         lo, hi = np.minimum.reduce(four), np.maximum.reduce(four)
     return _outward(lo, hi, a, b)
@@ -279,14 +302,14 @@ def divide(a: Interval, b: Interval) -> Interval:
     hi = np.maximum(np.maximum(ll, lh), np.maximum(hl, hh))
     undefined = (b.lo <= 0) & (b.hi >= 0)
     bad = np.isnan(lo)
-    if bad.any():  # inf / inf: through the reciprocal, whose unbounded end gives 0
+    if np.count_nonzero(bad):  # inf / inf: through the reciprocal, whose unbounded end gives 0
         one = np.ones(b.shape)
         inverse = _outward(one / b.hi, one / b.lo, Interval._raw(one, one), b)
         safe = Interval._raw(np.where(undefined, 0.0, inverse.lo), np.where(undefined, 0.0, inverse.hi))
         other = multiply(a, safe)
         lo, hi = np.where(bad, other.lo, lo), np.where(bad, other.hi, hi)
     result = _outward(lo, hi, a, b)
-    if undefined.any():
+    if np.count_nonzero(undefined):
         lo, hi = np.where(undefined, -np.inf, result.lo), np.where(undefined, np.inf, result.hi)
         return Interval._raw(lo, hi)
     return result
@@ -361,7 +384,7 @@ def matmul(a: IntervalLike, b: IntervalLike) -> Interval:
         return wide.sum(axis=-2)
     gamma, eta = product_error(x.shape[-1])
     mx, my = x.mid, y.mid
-    rx, ry = x.rad, y.rad
+    rx, ry = x.rad_about(mx), y.rad_about(my)
     absolute_y: Array = np.abs(my)
     spread = upper(absolute_y + ry)
     product_mid: Array = mx @ my

@@ -23,6 +23,7 @@ LIBRARY_ULPS = 8
 """Units in the last place granted to exp, log, sin, ... of NumPy."""
 STEP = 2.0**-52
 LARGEST = float(np.finfo(np.float64).max)
+_STEP, _MOST, _LEAST = np.array(STEP), np.array(LARGEST), np.array(-LARGEST)  # NumPy takes these faster than floats
 
 quiet = np.errstate(all="ignore")
 """Decorator and context: infinite ends overflow, and 0 * inf is dealt with by hand."""
@@ -38,14 +39,14 @@ def up(x: ArrayLike) -> Array:
     return np.nextafter(np.asarray(x, dtype=np.float64), np.inf)
 
 
-def lower(value: Array, *, step: float = STEP, tiny: float = 0.0) -> Array:
+def lower(value: Array, *, step: float | Array = _STEP, tiny: float = 0.0) -> Array:
     """A lower bound of every number that rounds to ``value``.
 
     Proves: lower(fl(a op b)) <= a op b for + - * / sqrt. With the default ``step`` = 2u the subtrahend
     exceeds half a unit in the last place also where it is subnormal; sums underflow exactly, so that 0 stays
     0 unless ``tiny`` asks for more. A result of +inf is an overflow and gives the largest float.
     """
-    value = np.minimum(value, LARGEST)
+    value = np.minimum(value, _MOST)
     slack = np.abs(value)
     slack *= step
     if tiny:
@@ -54,9 +55,9 @@ def lower(value: Array, *, step: float = STEP, tiny: float = 0.0) -> Array:
     return result
 
 
-def upper(value: Array, *, step: float = STEP, tiny: float = 0.0) -> Array:
+def upper(value: Array, *, step: float | Array = _STEP, tiny: float = 0.0) -> Array:
     """An upper bound of every number that rounds to ``value``; see `lower`."""
-    value = np.maximum(value, -LARGEST)
+    value = np.maximum(value, _LEAST)
     slack = np.abs(value)
     slack *= step
     if tiny:

@@ -13,10 +13,11 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from flint import ctx
+from flint import arb, ctx
 
 import certbound as cb
 from certbound.checker import parse
+from certbound.checker.values import step_back
 from certbound.quadratic import bound_quadratic
 from certbound.quadratic.refinement import Search
 from certbound.quadratic.wall_attempts import SPLIT, log10_up, total
@@ -217,6 +218,24 @@ def drifting() -> cb.Problem:
 def precise() -> Iterator[None]:
     """The working precision of a check."""
     with ctx.workprec(128):
+        yield
+
+
+@pytest.fixture(scope="module")
+def kept_tables() -> Iterator[None]:
+    """Integrals of the noise that many changed copies of one certificate have in common are computed once."""
+    tables: dict[Any, Any] = {}
+    compute = step_back.axis_table
+
+    def kept(points: Any, edges: Any, deviation: arb, degree: int, budget: Any) -> Any:
+        budget.check()
+        ball = deviation.mid().man_exp(), deviation.rad().man_exp(), ctx.prec
+        key = points.tobytes(), np.asarray(edges).tobytes(), ball, degree
+        if key not in tables:
+            tables[key] = compute(points, edges, deviation, degree, budget)
+        return tables[key]
+
+    with patch.object(step_back, "axis_table", kept):
         yield
 
 

@@ -17,6 +17,8 @@ from tests.checker.forgeries import FORGERIES, forged, text
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "certificate.md"
 SECONDS = 2.0
 
+pytestmark = pytest.mark.usefixtures("kept_tables")
+
 
 @pytest.mark.parametrize("base", sorted({forgery.base for forgery in FORGERIES.values()}))
 def test_what_is_forged_is_proved_before(base: str) -> None:

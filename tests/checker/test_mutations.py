@@ -29,6 +29,8 @@ from tests.checker.mutations import (
     stronger_claim,
 )
 
+pytestmark = pytest.mark.usefixtures("kept_tables")
+
 
 def survivors(data: Any, problem: Any, changes: Any, count: int, seed: int) -> list[str]:
     """Names of the weakening changes that were accepted."""

@@ -21,38 +21,7 @@ import pytest
 
 import certbound as cb
 from certbound.cli.app import run
-
-SWING = """
-time = "continuous"
-horizon = 1.0
-delta = 1e-3
-states = ["angle", "speed"]
-[parameters]
-sigma = 0.05
-[dynamics]
-angle = "speed"
-speed = "-sin(angle) - speed"
-[noise]
-diffusion = [[0], ["sigma"]]
-[initial]
-box = [[-0.1, 0.1], [-0.1, 0.1]]
-[[stay]]
-box = { angle = [-1, 1] }
-"""
-STEPS = """
-time = "discrete"
-horizon = 5
-states = ["x"]
-[dynamics]
-x = "0.5*x"
-[noise]
-law = "gaussian"
-std = 0.1
-[initial]
-point = [0]
-[[stay]]
-box = { x = [-1, 1] }
-"""
+from tests.cli.problem_files import GOOD, STEPS
 
 # What is changed in a file that is right: the old text, the new one, and a word that the message has to hold.
 SWINGS = [
@@ -149,12 +118,12 @@ PYTHON: list[tuple[Callable[[], Any], str]] = [
 
 def cases() -> Iterator[tuple[str, list[str], str, str]]:
     """A name, the words of a command, the file that it reads, and a word of the message."""
-    for text, changes in ((SWING, SWINGS), (STEPS, STEPPED)):
+    for text, changes in ((GOOD, SWINGS), (STEPS, STEPPED)):
         for old, new, word in changes:
             assert old in text
             yield f"{old!r} -> {new!r}", ["verify", "problem.toml"], text.replace(old, new, 1), word
     for line, word in LINES:
-        yield line, line.split(), SWING, word
+        yield line, line.split(), GOOD, word
 
 
 CASES = {name: rest for name, *rest in cases()}

@@ -11,40 +11,8 @@ from typing import Any
 import pytest
 
 from certbound.cli.app import run
+from tests.cli.problem_files import GOOD, STEPS, change
 
-GOOD = """
-name = "swing"
-time = "continuous"
-horizon = 1.0
-delta = 1e-3
-states = ["angle", "speed"]
-[parameters]
-sigma = 0.05
-[dynamics]
-angle = "speed"
-speed = "-sin(angle) - speed"
-[noise]
-diffusion = [[0], ["sigma"]]
-[initial]
-box = [[-0.1, 0.1], [-0.1, 0.1]]
-[[stay]]
-box = { angle = [-1, 1] }
-"""
-STEPS = """
-name = "steps"
-time = "discrete"
-horizon = 5
-states = ["x"]
-[dynamics]
-x = "0.5*x"
-[noise]
-law = "gaussian"
-std = 0.1
-[initial]
-point = [0]
-[[stay]]
-box = { x = [-1, 1] }
-"""
 MODULE = """
 import math
 import numpy as np
@@ -89,11 +57,6 @@ def refused(capsys: pytest.CaptureFixture[str], words: list[str], code: int = 2)
     assert [lines[0][:11], lines[1][:7], lines[2][:7]] == ["certbound: ", "  why: ", "  try: "]
     assert all(len(line) > 15 for line in lines)
     return lines
-
-
-def change(old: str, new: str, text: str = GOOD) -> str:
-    assert old in text
-    return text.replace(old, new)
 
 
 FILES = {

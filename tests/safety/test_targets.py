@@ -190,10 +190,9 @@ def test_what_does_not_know_targets_says_so():
 
 
 def test_to_arrive_by_some_time_is_to_arrive_at_any():
-    system = cb.ContinuousSystem(lambda x: -x, states=4, diffusion=0.01 * np.eye(4))
+    system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=0.01)
     problem = cb.Problem(
-        system, initial=0.5 * np.ones(4), safe=[cb.Inside(cb.Ball(np.zeros(4), 2))], horizon=np.inf,
-        reach=cb.Ball(np.zeros(4), 0.2),
+        system, initial=[0.5], safe=[cb.Inside(cb.Ball([0], 2))], horizon=np.inf, reach=cb.Ball([0], 0.2),
     )  # fmt: skip
     verdict = cb.verify_safety(problem, method="linear")
     assert verdict.status == "SAFE"

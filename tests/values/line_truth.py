@@ -6,7 +6,7 @@ import itertools
 import math
 
 import numpy as np
-from scipy.linalg import solve_banded
+from scipy.linalg.lapack import dgtsv
 from scipy.stats import norm
 
 import certbound as cb
@@ -65,7 +65,9 @@ class _Scheme:
     def step(self, u: np.ndarray, before: float, after: float, bad: np.ndarray) -> np.ndarray:
         t, dt, x = 0.5 * (before + after), _GAMMA * (after - before), self.x
         drifts = np.array([np.broadcast_to(self.drift(t, x, *corner)[..., 0], x.shape) for corner in self.corners])
-        f = drifts[np.argmax(drifts * np.gradient(u, x), axis=0), np.arange(len(x))]
+        f = drifts[0]
+        if len(drifts) > 1:
+            f = drifts[np.argmax(drifts * np.gradient(u, x), axis=0), np.arange(len(x))]
         a = np.maximum(np.broadcast_to(self.square(t, x)[..., 0, 0], x.shape), 1e-12)
         q = np.clip(2 * f * self.h / a, -500, 500)
         q = np.where(np.abs(q) < 1e-9, 1e-9, q)
@@ -73,11 +75,10 @@ class _Scheme:
         right = np.maximum(left + f / self.h, 0.0)
         left[0] = right[-1] = 0.0
         left, right = np.where(bad, 0.0, left), np.where(bad, 0.0, right)
-        bands = np.zeros((3, len(x)))
-        bands[0, 1:], bands[1], bands[2, :-1] = -dt * right[:-1], 1 + dt * (left + right), -dt * left[1:]
+        bands = -dt * left[1:], 1 + dt * (left + right), -dt * right[:-1]
         u = np.where(bad, 1.0, u)
-        stage = solve_banded((1, 1), bands, u)
-        return np.maximum(solve_banded((1, 1), bands, u + (1 / _GAMMA - 1) * (stage - u)), 0.0)
+        stage = dgtsv(*bands, u)[3]
+        return np.maximum(dgtsv(*bands, u + (1 / _GAMMA - 1) * (stage - u))[3], 0.0)
 
     def over_start(self, u: np.ndarray) -> float:
         start = self.problem.initial

@@ -129,7 +129,7 @@ def proposal():
     problem = brownian()
     model = read(lambda t, x: [0 * x[0], 0 * x[1], 0 * x[2]], np.diag([0.6] * 3))
     space = space_bounds._space(problem, model)
-    return model, space, integrated(SpaceSolver(space, Plan(cells=6, growth=0.6, lead=0.05), None))
+    return model, space, integrated(SpaceSolver(space, Plan(cells=4, growth=0.6, lead=0.05), None))
 
 
 @pytest.mark.parametrize(("size", "factor"), [(0.0, 1.0), (0.03, 1.0), (0.3, 1.0), (0.0, 1.3), (0.0, 3.0)])

@@ -126,7 +126,7 @@ def _jump(node: Node) -> Callable[..., Mask] | None:
 
 def _undefined(node: Node, args: Sequence[Interval]) -> Mask | None:
     mask = undefined_where(node, args) if _jump(node) is None else None
-    return mask if np.any(mask) else None
+    return mask if mask is not None and np.any(mask) else None
 
 
 def _inherited(node: Node, args: Sequence[Interval], masks: Sequence[Mask | None]) -> Mask | None:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.constants.programs.centers import Block, Pairs
+from certbound.constants.programs.barrier_blocks import Block, Pairs
 from certbound.constants.programs.least_erosion import (
     Fit,
     RadiusModel,
@@ -219,10 +219,7 @@ class ErosionBarrier:
         W = np.linalg.inv(block.matrix(value, point.P, point.multipliers))
         W = (W + W.T) / 2
         here = slice(size, size + k)
-        WC, WQ = W @ block.Chat.T, W @ block.Qhat.T
-        cc, cq, qq = block.Chat @ WC, block.Chat @ WQ, block.Qhat @ WQ
-        gradient[here] -= np.diag(qq) - np.diag(cc)
-        hessian[here, here] += cc**2 - cq**2 - cq.T**2 + qq**2
+        block.add_barrier(value, W, pairs, here, gradient, hessian)
         rate = (2.0 if block.continuous else 1.0) * (value - self.least)  # d(v)/d(shift), times the factor of E'PE
         WE = W[:n] @ np.eye(n, n + k).T
         gain = rate * float(np.sum(WE * point.P))
@@ -231,19 +228,8 @@ class ErosionBarrier:
         hessian[-1, -1] += rate * float(np.sum(V[:n, :n] * point.P)) - gain
         hessian[here, -1] += np.diag(block.Qhat @ V @ block.Qhat.T) - np.diag(block.Chat @ V @ block.Chat.T)
         hessian[:size, -1] -= rate * pairs.gradient(WE)
-        terms = block.terms(value)
-        for a, (c, X, Y) in enumerate(terms):
-            gradient[:size] -= c * pairs.gradient(Y @ W @ X.T)
+        for c, X, Y in block.terms(value):
             hessian[:size, -1] += c * pairs.gradient(Y @ V @ X.T)
-            for b in range(a + 1):
-                d, U, Z = terms[b]
-                part = pairs.hessian(Z @ W @ X.T, Y @ W @ U.T)
-                part *= c * d
-                hessian[:size, :size] += part if a == b else part + part.T
-            for sign, factor in ((1.0, WQ), (-1.0, WC)):
-                left, right = X @ factor, Y @ factor
-                cross = left[pairs.i] * right[pairs.j] + left[pairs.j] * right[pairs.i]
-                hessian[:size, here] += sign * c * pairs.scale[:, None] * cross
 
     def _add_noise(self, point: Point, gradient: Array, hessian: Array) -> None:
         """-log det(t I - G'PG) with respect to P and t (upper triangle)."""

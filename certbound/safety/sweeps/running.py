@@ -22,7 +22,7 @@ from certbound.safety.verification import verify_safety
 from certbound.watch import Progress, Watch, poll
 
 _TRIES = 3  # of a point whose process is lost
-_HEAVY = ("cvxpy", "scipy.integrate", "scipy.linalg", "scipy.optimize")
+_HEAVY = ("cvxpy", "scipy.integrate", "scipy.interpolate", "scipy.linalg", "scipy.ndimage", "scipy.optimize")
 """What engines import when they first need it, and copies of this process once for all."""
 
 
@@ -78,7 +78,7 @@ def sweep(
 
     Examples
     --------
-    >>> sweep("ou", {"sigma": [0.1, 0.5]}, jobs=1, boundary="sigma").boundaries[0].safe
+    >>> sweep("ou", {"sigma": [0.1, 0.5]}, method="linear", jobs=1, boundary="sigma").boundaries[0].safe
     0.1
     """
     grid, family = Grid.of(over), Family(source, parameters or {})

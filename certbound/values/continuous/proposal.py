@@ -15,9 +15,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.linalg import solve_banded
-from scipy.linalg.lapack import dgbtrf, dgbtrs
 
 from certbound.arrays import Array
 from certbound.values.continuous.surface import Surface
@@ -64,6 +61,8 @@ def sketch(
 
     u is 0 at the horizon unless ``begin`` says what it is.
     """
+    from scipy.linalg import solve_banded
+
     x = graded(line, cells, [0.002 * (line.high - line.low)] * 2)
     left, right = np.diff(x)[:-1], np.diff(x)[1:]
     u = np.zeros(len(x)) if begin is None else begin(x)
@@ -141,6 +140,8 @@ class Splines:
     """Collocation matrices of splines with given nodes, quintic if nothing is said, banded."""
 
     def __init__(self, nodes: Array, degree: int = _DEGREE) -> None:
+        from scipy.interpolate import BSpline
+
         knots = np.concatenate([[nodes[0]] * degree, nodes, [nodes[-1]] * degree])
         self.count = len(knots) - degree - 1
         self.points = np.array([knots[k + 1 : k + degree + 1].mean() for k in range(self.count)])
@@ -171,6 +172,8 @@ class _Banded:
     """An LU factorisation of a matrix given by the rows of its band."""
 
     def __init__(self, band: Array) -> None:
+        from scipy.linalg.lapack import dgbtrf
+
         size = len(band)
         storage = np.zeros((3 * _BAND + 1, size))
         for offset in range(-_BAND, _BAND + 1):
@@ -181,6 +184,8 @@ class _Banded:
             raise FloatingPointError("singular")
 
     def solve(self, right: Array) -> Array:
+        from scipy.linalg.lapack import dgbtrs
+
         return np.asarray(dgbtrs(self.lu, _BAND, _BAND, right, self.pivots)[0])
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from certbound.arrays import Array, Mask
 from certbound.values.grids import around_nodes, corners
@@ -94,6 +93,8 @@ def _mirrored(mirror: Mirror, bounds: Bounds, nodal: Array, bend: Array, dq: Arr
 
 def _slopes(frame: Frame, value: Lines, reach: tuple[int, int]) -> tuple[Array, Array]:
     """Bounds of |d_y U| and |d_q U| on all cells that a remainder may reach from a cell."""
+    from scipy.ndimage import maximum_filter
+
     dy, dq = np.diff(frame.y)[:, None], np.diff(frame.q)
     along_y = np.abs(np.diff(value.nodal, axis=0)) / dy
     first = np.maximum(along_y[:, 1:], along_y[:, :-1]) + np.abs(np.diff(value.bend, axis=0)) / dy * dq**2 / 8

@@ -18,12 +18,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from certbound.arrays import Array, Mask
 from certbound.values.discrete import AxisKernel, axis_kernel
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 REACH = 10.0
 """Standard deviations beyond which smoothing neglects what it meets; the neglected mass is below 2e-23."""
@@ -89,6 +92,8 @@ def along(nodes: Array, sigma: float, spread: float, rows: slice, lines: slice) 
     bend[1:-1] = 1 / widths[:-1] + 1 / widths[1:]
     lift = np.minimum(cells[:, None] ** 2 / 8 * density, cells[:, None] / 4 * np.minimum(whole * _ROUND, 1.0)) * bend
     ceiling = np.maximum(hats[:-1], hats[1:]) + lift
+    from scipy.sparse import csr_array
+
     return Along(
         rows=csr_array(hats), spread=csr_array(kinks), cells=csr_array(whole), ceiling=csr_array(ceiling),
         density=csr_array(density), mass=csr_array(_mass(mesh, source, sigma)),

@@ -19,7 +19,7 @@ from certbound.constants.programs import (
     rooms_of,
 )
 from certbound.constants.programs import erosion_search as searching
-from certbound.constants.programs.centers import Pairs
+from certbound.constants.programs.barrier_blocks import Pairs
 from certbound.constants.programs.erosion_barrier import ErosionBarrier
 from certbound.constants.programs.least_erosion import tighten
 

@@ -31,7 +31,7 @@ def contraction(law, **more):
 @pytest.mark.parametrize("name", LAWS)
 def test_every_law_is_bounded_around_its_simulation(name):
     problem = contraction(LAWS[name])
-    found = bound_chain(problem, seconds=0.5)
+    found = bound_chain(problem, seconds=0.2)
     counts = cb.simulate_exits(problem, paths=50_000, rng=0, confidence=0.9999)
     assert found.lower <= counts.upper
     assert counts.lower <= found.upper <= 4 * found.lower
@@ -97,7 +97,7 @@ box = { x = [-1, 1], y = [-1, 1] }
 def test_noise_that_multiplies_the_state(tmp_path):
     problem = loads(MULTIPLIED)
     assert problem.system.gain.inputs == ("t", "x", "y")
-    bounds = bound_chain(problem, seconds=3)
+    bounds = bound_chain(problem, seconds=0.8)
     counts = cb.simulate_exits(problem, paths=50_000, rng=0, confidence=0.9999)
     rng = np.random.default_rng(1)
     x = np.tile([0.6, 0.5], (50_000, 1))
@@ -172,7 +172,7 @@ def staying_truth(horizon=10):
 
 def test_a_target_that_is_to_be_stayed_in(tmp_path):
     problem, truth = loads(STAYING), staying_truth()
-    found = bound_chain(problem, seconds=2)
+    found = bound_chain(problem, seconds=1)
     assert found.lower <= truth <= found.upper <= 1.5 * found.lower
     counts = cb.simulate_exits(problem, paths=50_000, rng=0, confidence=0.9999)
     assert counts.lower <= truth <= counts.upper
@@ -189,7 +189,7 @@ def test_arriving_late_or_before_the_window_does_not_count():
     late = problem.replace(reach=cb.Reach(cb.Box([-0.25], [0.25]), during=(6, 10), then="stay"))
     early = problem.replace(reach=cb.Reach(cb.Box([-0.25], [0.25]), during=(0, 3), then="stay"))
     for case in (late, early):
-        found = bound_chain(case, seconds=1)
+        found = bound_chain(case, seconds=0.3)
         counts = cb.simulate_exits(case, paths=30_000, rng=0, confidence=0.9999)
         assert found.lower <= counts.upper
         assert counts.lower <= found.upper
@@ -222,7 +222,7 @@ def test_targets_disturbances_and_domains_agree_with_finer_functions():
         leaving="ends", reach=cb.Box([-0.1], [0.1]),
     )  # fmt: skip
     exact = cb.verify_safety(problem, method="values", time_limit=5)
-    found = bound_chain(problem, seconds=1)
+    found = bound_chain(problem, seconds=0.3)
     assert found.lower <= 10**exact.log10_delta
     assert 10**exact.log10_lower <= found.upper <= 1.7 * found.lower
 

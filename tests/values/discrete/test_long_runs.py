@@ -36,19 +36,19 @@ def contraction(std=0.2, gain=0.9, **options):
 
 @pytest.mark.parametrize(("std", "horizon"), [(0.2, 500), (0.12, 10**4), (0.1, 10**5)])
 def test_long_horizons_enclose_the_truth(std, horizon):
-    found = bound_long_run(contraction(std, horizon=horizon), seconds=1)
+    found = bound_long_run(contraction(std, horizon=horizon), seconds=0.3)
     truth = 1 - staying(lambda x: 0.9 * x, std, horizon, 0.2)
     assert found.lower <= truth <= found.upper <= 1.1 * found.lower
 
 
 def test_a_thousand_million_steps_cost_what_a_hundred_thousand_cost():
-    short, long = (bound_long_run(contraction(0.1, horizon=steps), seconds=1) for steps in (10**5, 10**9))
+    short, long = (bound_long_run(contraction(0.1, horizon=steps), seconds=0.3) for steps in (10**5, 10**9))
     assert short.before[0] == long.before[0] < 5000
     assert long.upper > short.upper
 
 
 def test_for_ever_noise_leaves_at_a_rate():
-    found = bound_long_run(contraction(horizon=math.inf), seconds=1)
+    found = bound_long_run(contraction(horizon=math.inf), seconds=0.3)
     rate = 1 - staying(lambda x: 0.9 * x, 0.2, 201, 0.2) / staying(lambda x: 0.9 * x, 0.2, 200, 0.2)
     steps, least, most = found.before
     assert found.rate[0] <= rate <= found.rate[1] <= 1.1 * found.rate[0]
@@ -75,7 +75,7 @@ def walk(**options):
 
 
 def test_for_ever_a_target_is_met_or_missed():
-    found = bound_long_run(walk(), seconds=1)
+    found = bound_long_run(walk(), seconds=0.6)
     x, w = NODES, WEIGHTS
     kernel = density(x[None, :] - x[:, None] + 0.05, 0.3) * w
     over = np.array([0.5 * math.erfc((1 + 0.05 - y) / (0.3 * math.sqrt(2))) for y in x])
@@ -92,7 +92,7 @@ def test_two_states_for_ever():
     long = bound_long_run(problem.replace(horizon=math.inf), seconds=1)
     assert long.lower > 1 - 1e-12
     steps, least, most = long.before
-    some = bound_failure(problem.replace(horizon=steps), seconds=1)
+    some = bound_failure(problem.replace(horizon=steps), seconds=0.3)
     assert (some.lower <= most, least <= some.upper) == (True, True)
     assert long.rate[1] <= 1.4 * long.rate[0]
 

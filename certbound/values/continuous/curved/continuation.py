@@ -10,14 +10,17 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from certbound.arrays import Array, Index, Mask
 from certbound.values.continuous.curved.boundaries import Walls
 from certbound.values.continuous.plane import Plan, Plane, Solver, Source, integrated, spread_nodes
 from certbound.values.continuous.surface import Surface
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 _NEAR = 0.02  # points so near a wall, in cells, count as outside: the polynomial is better there than the equation
 _FIT, _FADE = 2.5, 6.5  # depths, in cells, down to which V is continued by a cubic, and at which it is 0
@@ -161,6 +164,8 @@ class _Limits:
 
 def _filling(limits: _Limits, x: Array, y: Array, widths: Sequence[Array], outside: Mask) -> csr_array:
     """The matrix from V at inner points to V at the points outside that lie near a wall."""
+    from scipy.sparse import csr_array
+
     points, cells = np.stack([x.ravel(), y.ravel()], axis=1), np.stack([one.ravel() for one in widths], axis=1)
     inner, distances, across = np.flatnonzero(~outside), limits.distances(*points.T), cells.min(axis=1)
     on_wall = limits.labels < len(limits.group) - 4

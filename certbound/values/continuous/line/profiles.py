@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import BPoly
 
 from certbound.arrays import Array
 from certbound.values.continuous.proposal import Boundary, Line, Sketch, propose
@@ -36,6 +35,8 @@ class End:
 
 def values_of(surface: Surface) -> Values:
     """V at the surface's beginning as a function of its coordinate; 0 beyond its faces."""
+    from scipy.interpolate import BPoly
+
     nodes = surface.axes[0]
     curve = BPoly.from_derivatives(nodes, surface.values[0])
 

@@ -23,7 +23,6 @@ from typing import Protocol
 
 import numpy as np
 from numba import njit
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from certbound.arrays import Array
 from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, layer_rate, slab_times, spread_nodes
@@ -175,6 +174,8 @@ class Solver:
 
     def _viscosity(self, a: Array, slopes: tuple[Array, Array], bends: tuple[Array, Array]) -> Array:
         """What is added to a (on its diagonal) where V has convex kinks along an axis that its cells cannot hold."""
+        from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
         found = np.zeros((2, 2, *self.x.shape))
         for axis, (slope, bend) in enumerate(zip(slopes, bends)):
             jump = maximum_filter1d(slope, 5, axis=axis) - minimum_filter1d(slope, 5, axis=axis)

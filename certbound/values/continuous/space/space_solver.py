@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from certbound.arrays import Array
 from certbound.values.continuous.plane import Plan, Source, solve_lines
@@ -126,6 +125,8 @@ class SpaceSolver:
 
     def _kinked(self, a: Array, slope: Array, bend: Array, axis: int) -> Array:
         """What is added to a_ii, with V_ii alone, at convex kinks that the cells cannot hold."""
+        from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
         jump = maximum_filter1d(slope, 5, axis=axis) - minimum_filter1d(slope, 5, axis=axis)
         more = a * np.maximum(self.gaps[axis] * jump / _BENT - 1, 0.0)
         return np.where(bend > 0, more, 0.0)

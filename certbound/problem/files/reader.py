@@ -1,0 +1,123 @@
+"""Numbers, matrices and functions of a problem file, in its states and parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.checks import names as checked_names
+from certbound.checks import nearest
+from certbound.problem.files.parser import RESERVED, constant, parse
+from certbound.problem.files.schema import Specification
+from certbound.problem.model import Graph, Tape
+from certbound.problem.networks import network
+
+
+class _ForbiddenError(ValueError):
+    """An expression uses a name that exists, but not here."""
+
+
+class Reader:
+    """What every part of a problem file is read with: its names, the values of its parameters, its folder."""
+
+    def __init__(self, spec: Specification, folder: Path | None) -> None:
+        self.spec, self.folder = spec, folder
+        self.states = checked_names("states", spec.states, RESERVED)
+        self.inputs = checked_names("inputs", list(spec.inputs), {*RESERVED, *self.states})
+        taken = {*RESERVED, *self.states, *self.inputs}
+        self.disturbances = checked_names("disturbances", [*spec.disturbances, *spec.uncertain], taken)
+        taken |= set(self.disturbances)
+        self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
+        self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
+        taken |= set(self.parameters)
+        checked_names("networks", list(spec.networks), taken)
+        paths = {name: self.file(value, f"networks.{name}") for name, value in spec.networks.items()}
+        self.networks = {name: network(path, name=name).data for name, path in paths.items()}
+        checked_names("definitions", list(spec.definitions), taken | set(self.networks))
+
+    def number(self, value: float | str, where: str) -> float:
+        """A number, or the value of an expression in the parameters."""
+        if not isinstance(value, str):
+            if np.isnan(value):
+                raise ValueError(f"`{where}` must be a number, got nan.")
+            return float(value)
+        graph = Graph(())
+        node = parse(value, graph, {name: graph.const(p) for name, p in self.parameters.items()}, where)
+        result = constant(graph, node)
+        if result is None or not np.isfinite(result):
+            raise ValueError(f"`{where}` must be finite, got {value!r} = {result}.")
+        return result
+
+    def array(self, value: Any, where: str) -> Any:
+        """A number, vector or matrix of numbers or expressions in the parameters."""
+        if isinstance(value, list):
+            return [self.array(entry, f"{where}.{k}") for k, entry in enumerate(value)]
+        return self.number(value, where)
+
+    def matrix(self, value: Any, where: str) -> Array:
+        rows = self.array(value, where)
+        if isinstance(rows, list) and len({len(row) if isinstance(row, list) else 0 for row in rows}) > 1:
+            raise ValueError(f"`{where}` must have rows of equal length.")
+        return np.array(rows, dtype=float)
+
+    def function(
+        self, texts: Sequence[float | str], inputs: Sequence[str], where: Sequence[str], shape: tuple[int, ...]
+    ) -> Tape:
+        """The tape of expressions over ``inputs``, with the parameters put in and the definitions used."""
+        graph = Graph(inputs)
+        names: dict[str, int | Callable[[], int]] = {}
+        for name in ("t", *self.states, *self.inputs, *self.disturbances):
+            slot = graph.inputs.index(name) if name in graph.inputs else None
+            names[name] = _forbidden(name, inputs) if slot is None else graph.input(slot)
+        names |= {name: graph.const(value) for name, value in self.parameters.items()}
+        for name, text in self.spec.definitions.items():
+            try:
+                names[name] = self._node(text, graph, names, f"definitions.{name}")
+            except _ForbiddenError as error:
+                names[name] = _raise(error)
+        nodes = [self._node(text, graph, names, place) for text, place in zip(texts, where)]
+        return graph.tape(nodes, shape)
+
+    def _node(
+        self, text: float | str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str
+    ) -> int:
+        try:
+            return parse(text, graph, names, where, self.networks) if isinstance(text, str) else graph.const(text)
+        except _ForbiddenError as error:
+            raise _ForbiddenError(f"`{where}`: {error}") from None
+
+    def by_state(self, table: Any, where: str) -> tuple[list[Any], tuple[int, ...] | None]:
+        """Entries given by state name or as a list, and the states' indices (None: all, in order)."""
+        if isinstance(table, list):
+            if len(table) != len(self.states):
+                raise ValueError(f"`{where}` must have {len(self.states)} entries, got {len(table)}.")
+            return table, None
+        for key in table:
+            if key not in self.states:
+                known = nearest(key, self.states)
+                raise ValueError(f"`{where}` must use the states' names, got {key!r}{known}")
+        indices = tuple(self.states.index(key) for key in table)
+        if not indices:
+            raise ValueError(f"`{where}` must not be empty.")
+        return list(table.values()), None if indices == tuple(range(len(self.states))) else indices
+
+    def file(self, value: Any, where: str) -> Path:
+        path = Path(str(value))
+        if self.folder is None or path.is_absolute() or ".." in path.parts or not isinstance(value, str):
+            raise ValueError(f"`{where}` must be a file in the problem file's folder, got {value!r}.")
+        return self.folder / path
+
+
+def _forbidden(name: str, inputs: Sequence[str]) -> Callable[[], int]:
+    return _raise(_ForbiddenError(f"{name!r} must not be used here, only {', '.join(inputs)}"))
+
+
+def _raise(error: ValueError) -> Callable[[], int]:
+    def use() -> int:
+        raise error
+
+    return use
