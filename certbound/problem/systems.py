@@ -103,7 +103,8 @@ class ContinuousSystem(System):
     Parameters
     ----------
     f : function, SymPy or CasADi expressions, casadi.Function, Tape, or python-control system
-        Takes any of t, x, u, d by name and returns n values; expressions are read by their symbols' names.
+        Takes any of t, x, u, d by name, or of the states, inputs and disturbances by theirs, and returns n values;
+        expressions are read by their symbols' names.
     states : int or sequence of str
         Number of states (named x1, x2, ...) or their names; symbols will do.
     inputs : Box, optional

@@ -104,6 +104,8 @@ class EngineAnswer:
         Whatever a certificate needs of the engine.
     conclusive : bool
         Whether no other engine can do much better: slow refinements of others may be left out.
+    truncated : bool
+        Whether an ellipsoid of starts stands for a random start, whose other values count as failing.
     """
 
     log10_delta: float = 0.0
@@ -124,6 +126,7 @@ class EngineAnswer:
     hit: float | None = None
     details: Any = None
     conclusive: bool = False
+    truncated: bool = False
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

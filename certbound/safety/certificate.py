@@ -80,6 +80,8 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
             write = ENGINES[name].write
             if write is None:
                 raise CertificateError("certificates do not state what this engine proves.")
+            if answer.truncated:
+                raise CertificateError("certificates do not state what an ellipsoid of starts says of a random one.")
             found = write(problem, answer, attempt) if problem.reach is None else _met(problem, answer, attempt, write)
         except CertificateError as error:
             refusals.append(f"{name}: {error}")

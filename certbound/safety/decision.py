@@ -26,6 +26,7 @@ from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import best_time, find_miss, window_of
 from certbound.safety.portfolio import ENGINES, Engine, engine_named
+from certbound.safety.truncated import prove_truncated
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
@@ -241,7 +242,7 @@ class _Search:
                 if not row.reaches and self.problem.reach is not None and self.problem.reach.stays:
                     raise EngineError("this engine does not serve targets that are to be stayed in.")
                 if self.problem.reach is None or (row.reaches and not self.fixed):
-                    return self._without(row.prove(self.problem, asked) if not self.late else self._in_time(row, asked))
+                    return self._without(self._plainly(row, asked) if not self.late else self._in_time(row, asked))
                 return self._without(self._meeting(name, asked))
         except EngineError as error:
             return EngineAnswer(applicable=False, reason=str(error), method=name)
@@ -249,6 +250,13 @@ class _Search:
             whole = perf_counter() - begun
             self.spent[name] = self.spent.get(name, 0.0) + whole - self._inner
             self._inner = outer + whole
+
+    def _plainly(self, row: Engine, request: Request) -> EngineAnswer:
+        """What an engine answers; from most of a random start where it serves sets only."""
+        answer = row.prove(self.problem, request)
+        if answer.applicable or not self.problem.initial.random:
+            return answer
+        return prove_truncated(row, self.problem, request)
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
         """The answer without its lower bound where that is of disturbances that may change, or counts too much.

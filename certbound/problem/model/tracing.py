@@ -25,8 +25,9 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) 
     Parameters
     ----------
     function : callable
-        Takes any of the arguments, by name. Parameters that have a default and are not among ``arguments``
-        keep it.
+        Takes any of the arguments, by name: ``lambda t, x``; or their entries, by theirs: ``lambda angle, speed``.
+        Where one is called by the name of an entry, all are that can be. Parameters that have a default and are not
+        among ``arguments`` keep it.
     arguments : mapping
         Argument name to the names of its scalar entries. ``t`` is passed as a scalar, everything else as an
         array of one dimension. The order fixes the input slots.
@@ -50,6 +51,8 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) 
     >>> tape = trace(lambda t, x: [x[1], -np.sin(x[0])], {"t": ["t"], "x": ["angle", "speed"]})
     >>> tape.inputs, tape.shape
     (('t', 'angle', 'speed'), (2,))
+    >>> trace(lambda angle, speed: [speed, -np.sin(angle)], {"t": ["t"], "x": ["angle", "speed"]}).shape
+    (2,)
     """
     inputs = [name for names in arguments.values() for name in names]
     if len(set(inputs)) != len(inputs):
@@ -57,13 +60,18 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) 
         raise ValueError(f"names must be distinct, got {repeated} more than once.")
     graph = Graph(inputs)
     values: dict[str, Any] = {}
+    scalars: dict[str, Any] = {}
     slot = 0
     for key, names in arguments.items():
         entries = [Scalar(graph, graph.input(slot + k)) for k in range(len(names))]
         slot += len(names)
+        scalars |= dict(zip(names, entries))
         values[key] = entries[0] if key == "t" else _array(entries).view(Traced)
     name = getattr(function, "__name__", type(function).__name__)
-    chosen = {key: values[key] for key in _parameters(function, name, list(arguments))}
+    chosen = _parameters(function, name, arguments)
+    if any(key not in arguments for key in chosen):
+        values |= scalars
+    chosen = {key: values[key] for key in chosen}
     try:
         result = function(**chosen)
     except UntraceableError as error:
@@ -82,7 +90,9 @@ def _array(entries: Sequence[Any]) -> np.ndarray[Any, np.dtype[Any]]:
     return array
 
 
-def _parameters(function: Callable[..., Any], name: str, known: list[str]) -> list[str]:
+def _parameters(function: Callable[..., Any], name: str, arguments: Mapping[str, Sequence[str]]) -> list[str]:
+    known = list(arguments)
+    entries = [entry for names in arguments.values() for entry in names]
     if not callable(function):
         raise TypeError(f"`{name}` must be a function of {', '.join(known)}, got {function!r}.")
     try:
@@ -96,11 +106,13 @@ def _parameters(function: Callable[..., Any], name: str, known: list[str]) -> li
             parameter.VAR_POSITIONAL,
             parameter.VAR_KEYWORD,
         )
-        if parameter.name in known and not positional:
+        needed = parameter.default is parameter.empty
+        if not positional and (parameter.name in known or (parameter.name in entries and needed)):
             chosen.append(parameter.name)
-        elif positional or parameter.default is parameter.empty:
+        elif positional or needed:
             raise TypeError(
-                f"`{name}` must take its arguments by name, from {', '.join(known)}; got `{parameter}`"
+                f"`{name}` must take its arguments by name, from {', '.join(known)} or the names of their entries"
+                f"{_named(entries)}; got `{parameter}`"
                 + (
                     " (a system with u needs `inputs=`, one with d needs `disturbance=`)."
                     if parameter.name in "ud"
@@ -108,6 +120,11 @@ def _parameters(function: Callable[..., Any], name: str, known: list[str]) -> li
                 )
             )
     return chosen
+
+
+def _named(entries: list[str], most: int = 8) -> str:
+    named = [entry for entry in entries if entry != "t"]
+    return f" ({', '.join(named[:most])}{', ...' if len(named) > most else ''})"
 
 
 def _place(error: Exception) -> str:

@@ -157,6 +157,8 @@ class Inclusion:
                 return None
             old = low, high
             sample = self.sampled(polytope)
+            if not self._all_finite(*sample):
+                return None
             pad = share * (sample[1] - sample[0])
             low, high = sample[0] - widening[0] - pad, sample[1] + widening[1] + pad
             if not self._all_finite(low, high):

@@ -26,7 +26,7 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     def found(answer: LinearAnswer) -> None:
         asked.found(EngineAnswer(
             log10_delta=answer.log10_delta, method="linear", details=answer, foresight=foresight,
-            reason="the linear response had proved this much when its time was over.",
+            reason="a first bound of the linear response; its largest parts were not made smaller after it.",
         ))  # fmt: skip
 
     answer = linear_answer(problem, cells=asked.cells, thorough=asked.thorough, before=asked.before, found=found)

@@ -92,8 +92,8 @@ def _continuous(found: ExitBounds) -> EngineAnswer:
 def _answer(problem: Problem, found: FailureBounds) -> EngineAnswer:
     cells = " x ".join(str(count) for count in found.cells)
     least, most = rounded(found.lower, up=False, digits=4), rounded(found.upper, up=True, digits=4)
-    below = f"at least {least}" if found.lower > 0 else "no lower bound"
-    reason = f"the probability of failing is at most {most} and {below}, on a grid of {cells} cells"
+    below = f" and at least {least}" if found.lower > 0 else ""
+    reason = f"the probability of failing is at most {most}{below}, on a grid of {cells} cells"
     if found.rate is not None and found.before is not None:
         reason += f". {_for_all(found.rate, found.before)}"
     if found.lower > problem.delta:

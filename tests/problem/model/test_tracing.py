@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import certbound as cb
 from certbound.problem.model.evaluation import compile_numpy
 from certbound.problem.model.tracing import trace
 
@@ -144,6 +145,28 @@ def test_what_cannot_be_traced_is_refused_with_the_cure(function, cure):
         trace(function, {"x": ["a", "b"]})
 
 
+@pytest.mark.parametrize(
+    ("function", "same"),
+    [
+        (lambda x, v: [v, -x], lambda x: [x[1], -x[0]]),
+        (lambda t, v, u: [v * t, u], lambda t, x, u: [x[1] * t, u[0]]),
+        (lambda v, x, k=2.0: [x, k * v], lambda x: [x[0], 2.0 * x[1]]),
+        (lambda x, v=3.0: v * x, lambda x: 3.0 * x),
+    ],
+)
+def test_entries_may_be_taken_by_their_own_names(function, same):
+    arguments = {"t": ["t"], "x": ["x", "v"], "u": ["u"]}
+    places = np.random.default_rng(1).normal(size=(4, 4))
+    found, expected = (compile_numpy(trace(one, arguments)) for one in (function, same))
+    assert np.array_equal(found(*places), expected(*places))
+
+
+def test_a_system_whose_states_are_named_takes_them_by_name():
+    pendulum = cb.ContinuousSystem(lambda th, w: [w, -np.sin(th)], states=["th", "w"], diffusion=lambda w: [[0.0], [w]])
+    assert np.array_equal(compile_numpy(pendulum.dynamics)(0.0, 0.3, 0.5), [0.5, -np.sin(0.3)])
+    assert np.array_equal(compile_numpy(pendulum.diffusion)(0.0, 0.3, 0.5), [[0.0], [0.5]])
+
+
 def test_a_refusal_names_the_line():
     with pytest.raises(TypeError, match=r"`untraceable_branch` .*\(line \d+ of test_tracing.py: if x\[0\] > 0:\)"):
         trace(untraceable_branch, {"x": ["a", "b"]})
@@ -153,7 +176,7 @@ def test_a_refusal_names_the_line():
     ("function", "message"),
     [
         (lambda x, u: x, "a system with u needs `inputs=`"),
-        (lambda x, q: x, "must take its arguments by name, from t, x; got `q`"),
+        (lambda x, q: x, r"by name, from t, x or the names of their entries \(a, b\); got `q`"),
         (lambda *x: x, r"got `\*x`"),
         (lambda **x: x, r"got `\*\*x`"),
         (max, "must be a Python function|must take its arguments by name"),

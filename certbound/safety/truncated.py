@@ -1,0 +1,66 @@
+"""A normal start as a set of starts: nearly all of its mass in an ellipsoid, and the rest counted as failing.
+
+P(failing) <= P(X_0 outside E) + sup over x in E of P(failing from x), for every E. With (X_0 - m)' S^-1 (X_0 - m) a
+chi-squared variable of n degrees of freedom, P(X_0 outside E) = Q(n / 2, r^2 / 2) for E = {that is at most r^2}.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from flint import arb
+from scipy.stats import chi2
+
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Box, Ellipsoid
+from certbound.rigor.balls import precision, upper
+from certbound.safety.answers import EngineAnswer, Request
+from certbound.safety.portfolio import Engine
+
+_SHARE = 0.1  # of delta, at most, for starts outside the ellipsoid
+_WIDER = (1e-9, 1e-12)  # of the covariance, of its trace: more than rounding can take away
+
+
+def truncated(problem: Problem) -> tuple[Problem, float]:
+    """The problem from an ellipsoid of starts, with what is left of delta, and the mass outside, rounded up.
+
+    Examples
+    --------
+    >>> import certbound as cb
+    >>> system = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=0.1 * np.eye(2))
+    >>> safe = [cb.Inside(cb.Ball([0, 0], 1))]
+    >>> start = cb.GaussianStart([0, 0], 0.01 * np.eye(2))
+    >>> inner, outside = truncated(cb.Problem(system, initial=start, safe=safe, horizon=1, delta=1e-3))
+    >>> round(float(np.sqrt(inner.initial.shape[0, 0])), 4), 0.998e-4 < outside < 1e-4
+    (0.4292, True)
+    """
+    start, delta = problem.initial, float(problem.delta)
+    covariance, trace = start.covariance, float(np.trace(start.covariance))
+    if trace == 0:
+        return problem.replace(initial=Box(start.mean, start.mean)), 0.0
+    square = float(chi2.isf(0.999 * _SHARE * delta, start.dimension))
+    shape = square * ((1 + _WIDER[0]) * covariance + _WIDER[1] * trace * np.eye(start.dimension))
+    with precision():
+        outside = upper((arb(square) / 2).gamma_upper(arb(start.dimension) / 2, 1))
+    return problem.replace(initial=Ellipsoid(start.mean, shape), delta=float(f"{(1 - _SHARE) * delta:.12g}")), outside
+
+
+def prove_truncated(row: Engine, problem: Problem, request: Request) -> EngineAnswer:
+    """What an engine that serves no random start proves of a problem that has one."""
+    inner, outside = truncated(problem)
+
+    def of_all(answer: EngineAnswer) -> EngineAnswer:
+        if not answer.applicable:
+            return answer
+        total = math.nextafter(10.0**answer.log10_delta * (1 + 1e-14) + outside, math.inf)
+        log10 = min(0.0, math.log10(total) + 1e-14) if answer.log10_delta < 0 else 0.0
+        words = answer.reason.rstrip(".")
+        reason = f"{words}. That is from an ellipsoid of starts; those outside it have probability {outside:.3g}."
+        return replace(
+            answer, log10_delta=log10, log10_lower=None, reason=reason, conclusive=False, truncated=True
+        )
+
+    found = request.found
+    return of_all(row.prove(inner, replace(request, before=None, found=lambda answer: found(of_all(answer)))))

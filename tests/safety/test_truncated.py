@@ -1,0 +1,47 @@
+"""A random start where an engine serves sets: an ellipsoid that holds nearly all of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.errors import CertificateError
+from certbound.safety.certificate import certificate_data
+from certbound.safety.truncated import truncated
+
+
+def spinning(covariance: np.ndarray, delta: float = 1e-2) -> cb.Problem:
+    system = cb.ContinuousSystem(lambda x: [-x[0] - x[1], x[0] - x[1]], states=2, diffusion=0.3 * np.eye(2))
+    start = cb.GaussianStart([0.1, 0.0], covariance)
+    return cb.Problem(system, initial=start, safe=[cb.Inside(cb.Box([-1.5] * 2, [1.5] * 2))], horizon=1, delta=delta)
+
+
+@pytest.mark.parametrize(
+    ("covariance", "rank"), [([[0.04, 0.01], [0.01, 0.02]], 2), ([[1e-12, 0], [0, 0.04]], 2), ([[0.04, 0.04]] * 2, 1)]
+)
+def test_what_lies_outside_is_as_rare_as_stated(covariance, rank: int) -> None:
+    problem = spinning(np.array(covariance), 0.2)
+    inner, outside = truncated(problem)
+    points = problem.initial.sample(np.random.default_rng(0), 400_000)
+    missed = 1 - np.mean(inner.initial.contains(points))
+    assert missed <= outside + 4 * np.sqrt(outside / len(points))
+    assert missed >= 0.9 * outside or rank < 2
+    assert outside + inner.delta <= problem.delta
+
+
+def test_a_start_that_is_not_random_after_all_is_a_point() -> None:
+    inner, outside = truncated(spinning(np.zeros((2, 2))))
+    assert outside == 0
+    assert inner.initial.is_point
+
+
+def test_an_engine_for_sets_bounds_what_simulation_finds_and_no_certificate_says_more() -> None:
+    problem = spinning(0.04 * np.eye(2), 0.05)
+    verdict = cb.verify_safety(problem, method="quadratic")
+    assert verdict.status == "SAFE"
+    assert "from an ellipsoid" in verdict.reason
+    assert verdict.log10_lower is None
+    assert 10**verdict.log10_delta > cb.simulate_exits(problem, paths=20_000).lower
+    with pytest.raises(CertificateError, match="says of a random one"):
+        certificate_data(problem, verdict)
