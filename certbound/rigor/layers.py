@@ -19,28 +19,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.rigor.activations import ACTIVATIONS, Constants
+from certbound.rigor.activations import chord
 from certbound.rigor.arithmetic import Interval
+from certbound.rigor.planes import Relaxed, Weights, bound_arguments, relax
 from certbound.rigor.rounding import STEP, TINY, product_error, quiet, upper
 from certbound.rigor.series import ZERO, Series
 
-CHUNK = 512
-"""Boxes carried through a network at a time."""
+_CHUNK, _NUMBERS = 512, 4_000_000  # boxes carried through a network at a time, and numbers of its planes
 _FAR = 1e100  # boxes that reach beyond are taken for unbounded
-
-
-class Weights:
-    """A layer's numbers: ``weights`` (p, k), ``bias`` (p,), and its activation by name, with constants."""
-
-    def __init__(self, weights: Array, bias: Array, activation: str, constants: Constants = ()) -> None:
-        self.weights, self.bias = np.asarray(weights, dtype=float), np.asarray(bias, dtype=float)
-        self.size = np.abs(self.weights)
-        self.row, self.constants = ACTIVATIONS[activation], constants
-
-    @property
-    def kinked(self) -> bool:
-        """Whether its activation has kinks."""
-        return self.row.kinks is not None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -86,14 +72,20 @@ def bound_network(layers: Sequence[Weights], box: Interval, order: int) -> Enclo
     >>> bool(found.value.contains([[0.0]]).all() and found.slopes.contains(np.array([[[1.0], [-1.0]]])).all())
     True
     """
-    parts = [
-        _bound(layers, box[:, start : start + CHUNK], order)[0] for start in range(0, max(box.shape[1], 1), CHUNK)
-    ]
+    parts = [_bound(layers, part, order)[0] for part in _portions(layers, box)]
     return parts[0] if len(parts) == 1 else Enclosure(
         _joined([part.value for part in parts]), _joined([part.slopes for part in parts if part.slopes is not None]),
         _joined([part.bends for part in parts if part.bends is not None]),
         np.concatenate([part.kinked for part in parts]),
     )  # fmt: skip
+
+
+def _portions(layers: Sequence[Weights], box: Interval) -> list[Interval]:
+    """Boxes to be carried through a network at a time: so many that the planes of no layer need more memory."""
+    widths = [len(layer.bias) for layer in layers]
+    most = max((a * b for a, b in zip(widths, widths[2:])), default=1)
+    chunk = max(min(_CHUNK, _NUMBERS // (2 * most)), 1)
+    return [box[:, start : start + chunk] for start in range(0, max(box.shape[1], 1), chunk)]
 
 
 def _joined(parts: Sequence[Interval]) -> Interval:
@@ -113,14 +105,26 @@ def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclos
     mid[:, 0] = mid[:, 1] = box.mid
     rad[:, 1] = radius
     mid[:, 2 : 2 + n] = np.eye(n)[:, :, None]
-    kinked, arguments = lost.copy(), []
-    for layer in layers:
+    kinked = lost.copy()
+    arguments: list[tuple[Interval, Interval]] = []
+    passed: list[Relaxed] = []
+    size = radius
+    for number, layer in enumerate(layers):
         mid, rad = _affine(layer, mid, rad)
         bad = np.asarray(~(np.isfinite(mid) & np.isfinite(rad)).all(axis=(0, 1)))
         if bad.any():
             lost = np.asarray(lost | bad)
             mid, rad = np.where(bad, 0.0, mid), np.where(bad, 0.0, rad)
         centre, over = _ranges(mid, rad, radius)
+        planar = over
+        if passed:
+            found = bound_arguments(layer, passed, arguments[0][0], radius)
+            unknown = lost | ~(np.isfinite(found.lo) & np.isfinite(found.hi))
+            planar = Interval(np.where(unknown, over.lo, found.lo), np.where(unknown, over.hi, found.hi))
+        if number < len(layers) - 1:  # lines of planes alone: nearer ranges may have lines that are worse further on
+            passed.append(relax(layer, planar, size, None if number else centre))
+            size = layer.row.value(planar, *layer.constants).mag
+        over = _meet(over, planar)
         arguments.append((centre, over))
         kinked = kinked | layer.row.kinked(over, layer.constants).any(axis=0)
         mid, rad = _activated(layer, mid, rad, (centre, over), pairs)
@@ -131,8 +135,7 @@ def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclos
             place[i, j] = place[j, i] = 2 + n + number
         bends = _without(Interval.around(mid[:, place], rad[:, place]), lost)
     first = _without(Interval.around(mid[:, 2 : 2 + n], rad[:, 2 : 2 + n]), lost) if order else None
-    found = Enclosure(_without(value, lost), first, bends, np.asarray(kinked | lost))
-    return found, arguments
+    return Enclosure(_without(value, lost), first, bends, np.asarray(kinked | lost)), arguments
 
 
 def _affine(layer: Weights, mid: Array, rad: Array) -> tuple[Array, Array]:
@@ -215,7 +218,7 @@ def relax_network(layers: Sequence[Weights], box: Interval) -> tuple[Array, Inte
     >>> bool(slopes[0, 0, 0] == 0.5 and abs(rest.width[0, 0] - 0.5) < 1e-12)
     True
     """
-    parts = [_relax(layers, box[:, start : start + CHUNK]) for start in range(0, max(box.shape[1], 1), CHUNK)]
+    parts = [_relax(layers, part) for part in _portions(layers, box)]
     return np.concatenate([part[0] for part in parts], -1), _joined([part[1] for part in parts])
 
 
@@ -244,19 +247,19 @@ def _relax(layers: Sequence[Weights], box: Interval) -> tuple[Array, Interval]:
         flat = turned.reshape(width, p * count)
         rows, error = _product(layer.weights.T, layer.size.T, flat, missed.reshape(width, p * count) * (number == 0))
         rows, error = rows.reshape(k, p, count), error.reshape(k, p, count)
+        lost = np.asarray(lost | ~(np.isfinite(rows) & np.isfinite(error)).all(axis=(0, 1)))
+        rows, error = np.where(lost, 0.0, rows), np.where(lost, 0.0, error)
         rest = rest + (Interval(-error, error) * Interval.point(size)[:, None]).sum(axis=0)
-    lost = np.asarray(lost | ~np.isfinite(rows).all(axis=(0, 1)))
-    return np.where(lost, 0.0, np.swapaxes(rows, 0, 1)), _without(rest, lost)
+    return np.swapaxes(rows, 0, 1), _without(rest, lost)
 
 
 def _chord(layer: Weights, over: Interval) -> Array:
-    """A slope of lines close around the activation: that of its chord, in floats."""
-    low, high = over.lo, over.hi
-    rise = layer.row.numpy(high, *layer.constants) - layer.row.numpy(low, *layer.constants)
-    thin = high - low < 1e-9 * (1 + np.abs(low))
-    middle = layer.row.slope(Interval.point(over.mid), *layer.constants).mid
-    slope = np.where(thin, middle, rise / np.where(thin, 1.0, high - low))
-    return np.where(np.isfinite(slope) & (np.abs(slope) > 1e-9), slope, 0.0)
+    """A slope of parallel lines close around the activation: that of its chord, in floats."""
+    slope = chord(layer.row.numpy, over.lo, over.hi, *layer.constants)
+    thin = over.hi - over.lo < 1e-9 * (1 + np.abs(over.lo))
+    if thin.any():
+        slope = np.where(thin, layer.row.slope(Interval.point(over.mid), *layer.constants).mid, slope)
+    return np.where(np.abs(slope) > 1e-9, slope, 0.0)
 
 
 def expand_network(layers: Sequence[Weights], inputs: Sequence[Series], order: int) -> list[Series]:
