@@ -5,10 +5,8 @@ and second derivatives) stands side by side as the columns of one matrix, in mid
 floating-point matrix products: W times the midpoints, |W| times the radii. What the products round off is covered by a
 bound that holds in any order of summation, so that BLAS and its threads are free to choose theirs.
 
-The lines around a network are those of linear relaxation: every activation lies between two parallel lines over the
-range of its argument, and the lines are put together backwards, from the output to the input. Sources: Rump, Fast and
-parallel interval arithmetic, BIT 39 (1999); Zhang et al., Efficient neural network robustness certification with
-general activation functions, NeurIPS 2018.
+The lines around a network are those of linear relaxation, put together backwards (`certbound.rigor.planes`). Source:
+Rump, Fast and parallel interval arithmetic, BIT 39 (1999).
 """
 
 from __future__ import annotations
@@ -19,9 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.rigor.activations import chord
 from certbound.rigor.arithmetic import Interval
-from certbound.rigor.planes import Relaxed, Weights, bound_arguments, relax
+from certbound.rigor.planes import Relaxed, Weights, bound_arguments, parallel_planes, relax
 from certbound.rigor.rounding import STEP, TINY, product_error, quiet, upper
 from certbound.rigor.series import ZERO, Series
 
@@ -62,8 +59,8 @@ def _columns(count: int) -> list[tuple[int, int]]:
 def bound_network(layers: Sequence[Weights], box: Interval, order: int) -> Enclosure:
     """Enclose a network over boxes (n, M), with its derivatives up to ``order`` (0, 1 or 2).
 
-    The range over the box is the better of what the layers' ranges and the first derivatives (mean value form) say,
-    layer by layer.
+    The range over the box is the best of what the layers' ranges, planes to the inputs (`certbound.rigor.planes`) and,
+    where they are asked for, the first derivatives (mean value form) say, layer by layer.
 
     Examples
     --------
@@ -101,10 +98,11 @@ def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclos
     lost: Mask = np.asarray(~((box.lo > -_FAR) & (box.hi < _FAR)).all(axis=0))
     box = Interval(np.where(lost, 0.0, box.lo), np.where(lost, 0.0, box.hi))
     radius, pairs = box.rad, _columns(n) if order > 1 else []
-    mid, rad = np.zeros((n, 2 + n + len(pairs), count)), np.zeros((n, 2 + n + len(pairs), count))
+    width = 2 + (n if order else 0) + len(pairs)
+    mid, rad = np.zeros((n, width, count)), np.zeros((n, width, count))
     mid[:, 0] = mid[:, 1] = box.mid
     rad[:, 1] = radius
-    mid[:, 2 : 2 + n] = np.eye(n)[:, :, None]
+    mid[:, 2 : 2 + n] = np.eye(n)[:, : width - 2, None]
     kinked = lost.copy()
     arguments: list[tuple[Interval, Interval]] = []
     passed: list[Relaxed] = []
@@ -149,8 +147,10 @@ def _affine(layer: Weights, mid: Array, rad: Array) -> tuple[Array, Array]:
 
 
 def _ranges(mid: Array, rad: Array, radius: Array) -> tuple[Interval, Interval]:
-    """What the first column says of the centres, and the second and the mean value form together of the boxes."""
+    """What the first column says of the centres, and the second and the mean value form (if any) of the boxes."""
     n = len(radius)
+    if mid.shape[1] == 2:
+        return Interval.around(mid[:, 0], rad[:, 0]), Interval.around(mid[:, 1], rad[:, 1])
     reach = ((np.abs(mid[:, 2 : 2 + n]) + rad[:, 2 : 2 + n]) * radius).sum(axis=1)
     reach = upper(reach, step=(n + 8) * STEP, tiny=TINY)
     centre = Interval.around(mid[:, 0], rad[:, 0])
@@ -225,41 +225,15 @@ def relax_network(layers: Sequence[Weights], box: Interval) -> tuple[Array, Inte
 @quiet
 def _relax(layers: Sequence[Weights], box: Interval) -> tuple[Array, Interval]:
     found, arguments = _bound(layers, box, 0)
-    lost: Mask = np.asarray(~np.isfinite(found.value.lo).all(axis=0))
-    p, count = found.value.shape
-    rows = np.repeat(np.eye(p)[:, :, None], count, axis=2)  # (width, p, M): coefficients of what a layer gives
-    rest = Interval.point(np.zeros((p, count)))
-    for number in range(len(layers) - 1, -1, -1):
-        layer, (centre, over) = layers[number], arguments[number]
-        slope = _chord(layer, over)
-        rest = rest + (Interval.point(rows) * layer.row.rest(over, slope, *layer.constants)[:, None]).sum(axis=0)
-        turned = rows * slope[:, None]
-        missed = STEP * np.abs(turned) + TINY  # what rounding the product leaves of coefficients
-        width, k = layer.weights.shape
-        if number == 0:
-            rest = rest + (Interval(turned - missed, turned + missed) * centre[:, None]).sum(axis=0)
-            size = np.where(lost, 0.0, box.rad)
-        else:
-            rest = rest + (Interval(-missed, missed) * over[:, None]).sum(axis=0)
-            rest = rest + (Interval.point(turned) * layer.bias[:, None, None]).sum(axis=0)
-            before, (_, inner) = layers[number - 1], arguments[number - 1]
-            size = before.row.value(inner, *before.constants).mag
-        flat = turned.reshape(width, p * count)
-        rows, error = _product(layer.weights.T, layer.size.T, flat, missed.reshape(width, p * count) * (number == 0))
-        rows, error = rows.reshape(k, p, count), error.reshape(k, p, count)
-        lost = np.asarray(lost | ~(np.isfinite(rows) & np.isfinite(error)).all(axis=(0, 1)))
-        rows, error = np.where(lost, 0.0, rows), np.where(lost, 0.0, error)
-        rest = rest + (Interval(-error, error) * Interval.point(size)[:, None]).sum(axis=0)
-    return np.swapaxes(rows, 0, 1), _without(rest, lost)
-
-
-def _chord(layer: Weights, over: Interval) -> Array:
-    """A slope of parallel lines close around the activation: that of its chord, in floats."""
-    slope = chord(layer.row.numpy, over.lo, over.hi, *layer.constants)
-    thin = over.hi - over.lo < 1e-9 * (1 + np.abs(over.lo))
-    if thin.any():
-        slope = np.where(thin, layer.row.slope(Interval.point(over.mid), *layer.constants).mid, slope)
-    return np.where(np.abs(slope) > 1e-9, slope, 0.0)
+    lost = np.asarray(~np.isfinite(found.value.lo).all(axis=0))
+    size = np.where(np.isfinite(box.rad), box.rad, 0.0)
+    radius = size
+    passed: list[Relaxed] = []
+    for number, (layer, (centre, over)) in enumerate(zip(layers, arguments)):
+        passed.append(relax(layer, over, size, None if number else centre, parallel=True))
+        size = layer.row.value(over, *layer.constants).mag
+    slopes, rest = parallel_planes(passed, arguments[0][0], radius)
+    return np.where(lost, 0.0, slopes), _without(rest, lost)
 
 
 def expand_network(layers: Sequence[Weights], inputs: Sequence[Series], order: int) -> list[Series]:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.rigor.activations import ACTIVATIONS, Constants
+from certbound.rigor.activations import ACTIVATIONS, Constants, chord
 from certbound.rigor.arithmetic import Interval
 from certbound.rigor.rounding import STEP, lower, product_error, upper
 
@@ -58,7 +58,9 @@ class Relaxed:
     inputs: Array
 
 
-def relax(layer: Weights, over: Interval, inputs: Array, centre: Interval | None = None) -> Relaxed:
+def relax(
+    layer: Weights, over: Interval, inputs: Array, centre: Interval | None = None, *, parallel: bool = False
+) -> Relaxed:
     """Lines around the activations of a layer.
 
     Parameters
@@ -69,10 +71,14 @@ def relax(layer: Weights, over: Interval, inputs: Array, centre: Interval | None
         Sizes of what the layer takes; of the first one, half-widths of the boxes.
     centre : Interval, shape (width, M), optional
         Of the first layer, what its activations take at the middles of the boxes; lines count from its own middle.
+    parallel : bool
+        Whether both lines have the slope of the chord.
     """
     row, constants = layer.row, layer.constants
-    below, above = row.lines(over.lo, over.hi, *constants)
-    low, high = row.rest(over, below, *constants).lo, row.rest(over, above, *constants).hi
+    below, above = (_chord(layer, over),) * 2 if parallel else row.lines(over.lo, over.hi, *constants)
+    below, above = (np.where(np.isfinite(slope), slope, 0.0) for slope in (below, above))
+    rest = row.rest(over, below, *constants)
+    low, high = rest.lo, rest.hi if parallel else row.rest(over, above, *constants).hi
     offset = np.abs(layer.bias)[:, None]
     if centre is not None:
         offset = centre.mag
@@ -83,6 +89,15 @@ def relax(layer: Weights, over: Interval, inputs: Array, centre: Interval | None
     return Relaxed(layer, below, above, low, high, reach, upper(inputs.sum(axis=0), step=gamma))
 
 
+def _chord(layer: Weights, over: Interval) -> Array:
+    """The slope of the chord, in floats; that at the middle where the range is thin."""
+    slope = chord(layer.row.numpy, over.lo, over.hi, *layer.constants)
+    thin = over.hi - over.lo < 1e-9 * (1 + np.abs(over.lo))
+    if thin.any():
+        slope = np.where(thin, layer.row.slope(Interval.point(over.mid), *layer.constants).mid, slope)
+    return np.where(np.abs(slope) > 1e-9, slope, 0.0)
+
+
 def bound_arguments(layer: Weights, before: Sequence[Relaxed], centre: Interval, radius: Array) -> Interval:
     """Ranges (p, M) of what a layer's activations take, by planes over the inputs; infinite where floats overflow.
 
@@ -90,9 +105,43 @@ def bound_arguments(layer: Weights, before: Sequence[Relaxed], centre: Interval,
     the middles of the boxes, ``radius`` (n, M) are the half-widths of these.
     """
     rows = np.concatenate([layer.weights, -layer.weights])  # bounds from above, of z and of -z
-    total = np.concatenate([layer.bias, -layer.bias])[:, None]
+    factors, top = _planes_above(rows, np.concatenate([layer.bias, -layer.bias]), before, centre, radius)
+    spread = np.einsum("rnm,nm->rm", np.abs(factors), radius)
+    return _ends(upper(top + spread, step=4 * product_error(len(radius))[0], tiny=_FLOOR))
+
+
+def parallel_planes(before: Sequence[Relaxed], centre: Interval, radius: Array) -> tuple[Array, Interval]:
+    """Slopes (p, n, M) of planes around the last layer's activations, and what is left of these (p, M).
+
+    ``before`` are all layers, with parallel lines; where floats overflow slopes are 0 and what is left is unbounded.
+    """
+    count = len(before[-1].layer.bias)
+    factors, top = _planes_above(
+        np.concatenate([np.eye(count), -np.eye(count)]), np.zeros(2 * count), before, centre, radius
+    )
+    slopes = factors[:count]
+    turned = np.einsum("rnm,nm->rm", np.abs(factors[count:] + slopes), radius)  # products may differ by their order
+    top[count:] = upper(top[count:] + turned, step=4 * product_error(len(radius))[0], tiny=_FLOOR)
+    lost = ~np.isfinite(slopes).all(axis=(0, 1))
+    top[:, lost] = np.inf
+    return np.where(lost, 0.0, slopes), _ends(top)
+
+
+def _ends(top: Array) -> Interval:
+    """Intervals from bounds of z and of -z, one below the other."""
+    top = np.where(np.isnan(top), np.inf, top)
+    count = len(top) // 2
+    return Interval(-top[count:], top[:count])
+
+
+def _planes_above(
+    rows: Array, bias: Array, before: Sequence[Relaxed], centre: Interval, radius: Array
+) -> tuple[Array, Array]:
+    """factors (R, n, M) and top (R, M): rows . a + bias <= factors . (x - c) + top, of the last activations a."""
+    total = bias[:, None]
     size, floor = np.abs(total), 1.0
-    factors: Array | None = None
+    # few rows are those of each box from the start
+    factors: Array | None = rows[:, :, None] if len(rows) < before[-1].layer.weights.shape[1] else None
     for number in range(len(before) - 1, -1, -1):
         own = before[number]
         shift = own.layer.bias[:, None] if number else centre.mid
@@ -102,13 +151,10 @@ def bound_arguments(layer: Weights, before: Sequence[Relaxed], centre: Interval,
             added, grown, factors = _further(factors, own, shift)
         total, size, floor = total + added, size + grown, floor + own.reach.sum(axis=0) + own.inputs
     assert factors is not None
-    spread = np.einsum("rnm,nm->rm", np.abs(factors), radius)
-    terms = sum(len(own.reach) for own in before) + len(radius) + 16 * (len(before) + 1)
-    error = 4 * product_error(terms)[0] * (size + spread) + _FLOOR * floor
-    found = upper(total + spread + error, step=8 * STEP)
-    found = np.where(np.isnan(found), np.inf, found)
-    count = len(layer.bias)
-    return Interval(-found[count:], found[:count])
+    # roundings that meet a summand of one layer: those of its sums, of its lines, and of adding the layers up
+    terms = max(max(own.layer.weights.shape) for own in before) + 8 * (len(before) + 1)
+    error = product_error(terms)[0] * size + _FLOOR * floor
+    return factors, upper(total + error, step=4 * STEP)
 
 
 def _first(rows: Array, own: Relaxed, shift: Array) -> tuple[Array, Array, Array]:
@@ -129,7 +175,7 @@ def _first(rows: Array, own: Relaxed, shift: Array) -> tuple[Array, Array, Array
 
 
 def _further(factors: Array, own: Relaxed, shift: Array) -> tuple[Array, Array, Array]:
-    """The same through a lower layer, with coefficients (R, width, M) of each box."""
+    """The same with coefficients (R, width, M) of each box."""
     positive = factors > 0
     held = np.where(positive, own.high, own.low)
     added, grown = (factors * held).sum(axis=1), (np.abs(factors) * np.abs(held)).sum(axis=1)
