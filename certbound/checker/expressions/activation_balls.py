@@ -21,8 +21,8 @@ class Activation:
     """One activation; every function takes its constants last.
 
     ``value``, ``slope`` and ``bend`` enclose phi, phi' and phi'' (generalised at kinks) over balls; ``series`` are its
-    Taylor coefficients; ``expansion`` gives phi, phi' and phi''/2 at a ball and phi''' over another, where it is
-    smooth; ``knots`` are the kinks of a piecewise linear one.
+    Taylor coefficients; ``expansion`` gives phi, phi' and phi''/2 at a ball and phi''', with its sign, over another,
+    where it is smooth; ``knots`` are the kinks of a piecewise linear one.
     """
 
     value: Callable[..., arb]
