@@ -189,7 +189,9 @@ class _Columns:
         self.smooth = network.smooth
         found = sorted({a for x in args for a in x.linear} | {a for x in args for pair in x.squares for a in pair})
         self.linear = found
-        self.squares = [(a, b) for i, a in enumerate(found) for b in found[i:]]
+        held = {pair for x in args for pair in x.squares}
+        pairs = [(a, b) for i, a in enumerate(found) for b in found[i:]]
+        self.squares = pairs if self.smooth else [pair for pair in pairs if pair in held]
         self.cubes = [
             (a, b, c) for i, a in enumerate(found) for k, b in enumerate(found[i:], i) for c in found[k:]
         ] if self.smooth and len(found) <= _MOST_CUBIC else []
@@ -208,21 +210,28 @@ class _Columns:
         self.start = self.errors = [x.error for x in args]
         self.passed: list[tuple[arb_mat, list[arb], list[arb]]] = []  # weights, slopes and errors of every layer
 
-    def errors_behind(self, rows: arb_mat) -> list[arb]:
-        """All errors in ``rows`` times the last layer: each by its way through the layers between."""
+    def errors_behind(self, rows: arb_mat, sizes: arb_mat) -> list[arb]:
+        """All errors in ``rows`` (``sizes`` without signs) times the last layer: each by its way through the layers."""
         total = [_ZERO] * rows.nrows()
-        for weights, slopes, errors in reversed(self.passed):
-            total = [a + b for a, b in zip(total, _sizes_times(rows, errors))]
+        errors = [self.start, *(own for *_, own in self.passed)]
+        while True:
+            total = [a + b for a, b in zip(total, (sizes * arb_mat([[x] for x in errors.pop()])).entries())]
+            if all(error.is_zero() for below in errors for error in below):
+                break
+            weights, slopes, _ = self.passed[len(errors) - 1]
             rows = arb_mat([[x * s for x, s in zip(row, slopes)] for row in rows.tolist()]) * weights
-        return [(a + b).upper() for a, b in zip(total, _sizes_times(rows, self.start))]
+            sizes = arb_mat(rows.nrows(), rows.ncols(), [abs(x) for x in rows.entries()])
+        return [x.upper() for x in total]
 
     def through(self, weights: arb_mat, size: arb_mat, bias: Sequence[arb]) -> None:
         """W times everything (|W|, ``size``, times the errors), and the bias."""
         self.rows = (weights * arb_mat(self.rows)).tolist()
         for row, b in zip(self.rows, bias):
             row[0] += b
-        known = (size * arb_mat([[x] for x in self.errors])).entries() if self.smooth else self.errors_behind(weights)
-        self.errors = [x.upper() for x in known]
+        if self.smooth:
+            self.errors = [x.upper() for x in (size * arb_mat([[x] for x in self.errors])).entries()]
+        else:
+            self.errors = self.errors_behind(weights, size)
 
     def activated(self, weights: arb_mat, row: Activation, constants: Constants) -> None:
         """Everything behind the activation of the layer with these ``weights``."""
@@ -246,7 +255,11 @@ class _Columns:
         if row.expansion is None:
             slope_, level = line(row, whole, constants)
             middle = arb(level.mid())
-            return [slope_ * own[0] + middle, *(slope_ * x for x in own[1:])], slope_, arb(level.rad())
+            if slope_.is_zero():
+                return [middle, *[_ZERO] * (len(own) - 1)], _ZERO, arb(level.rad())
+            found = list(own) if slope_ == 1 else [slope_ * x for x in own]
+            found[0] += middle
+            return found, slope_, arb(level.rad())
         value, first, half, third = row.expansion(own[0], whole)
         size = abs(half).upper()
         sixth = third / 6
@@ -287,7 +300,8 @@ class _Columns:
     def models(self, weights: Sequence[float]) -> list[tm.Model]:
         """The outputs as models; ``weights`` split their errors between the coordinates."""
         count = len(self.rows)
-        behind = self.errors_behind(arb_mat([[arb(int(i == j)) for j in range(count)] for i in range(count)]))
+        unit = arb_mat([[arb(int(i == j)) for j in range(count)] for i in range(count)])
+        behind = self.errors_behind(unit, unit)
         return [self._model(own, error, weights) for own, error in zip(self.rows, behind)]
 
     def _model(self, own: Sequence[arb], error: arb, weights: Sequence[float]) -> tm.Model:
@@ -317,13 +331,6 @@ class _Columns:
 def _size(terms: Sequence[arb]) -> arb:
     """A bound of a sum of terms times numbers in [-1, 1]."""
     return sum(map(abs, terms), _ZERO)
-
-
-def _sizes_times(rows: arb_mat, errors: Sequence[arb]) -> list[arb]:
-    """|rows| times errors."""
-    sizes = arb_mat(rows.nrows(), rows.ncols(), [abs(x) for x in rows.entries()])
-    found: list[arb] = (sizes * arb_mat([[x] for x in errors])).entries()
-    return found
 
 
 def _models(network: Network, args: Sequence[tm.Model]) -> list[tm.Model]:
