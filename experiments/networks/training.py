@@ -93,7 +93,7 @@ box = {{ x = [0.6, 0.7], v = [0, 0.7] }}
 """
 
 
-COLLISION = """# collision avoidance of logRASM (models/collision_avoidance.py): the state is pushed near (0, 1) and (0, -1).
+COLLISION = """# collision avoidance of logRASM (models/collision_avoidance.py): pushed near (0, 1), (0, -1).
 # Reach the middle within 20 steps (published: at any time) with probability .999.
 name = "collision avoidance with a learned policy"
 time = "discrete"
