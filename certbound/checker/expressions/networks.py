@@ -166,7 +166,7 @@ def model(part: Part, args: Sequence[tm.Model]) -> tm.Model | None:
 
 _MODELS: dict[Any, list[tm.Model]] = {}
 """Models by the very digits of their arguments: outputs of the dynamics that call one network ask the same."""
-_MOST_MODELS = 300
+_MOST_MODELS = 4000
 
 
 def _digits(x: tm.Model) -> tuple[Any, ...]:
