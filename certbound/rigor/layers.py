@@ -92,8 +92,13 @@ def _joined(parts: Sequence[Interval]) -> Interval:
 
 
 @quiet
-def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclosure, list[tuple[Interval, Interval]]]:
-    """The enclosure, and the arguments of every layer's activation at the centre and over the box, (width, M)."""
+def _bound(
+    layers: Sequence[Weights], box: Interval, order: int, *, parallel: bool = False
+) -> tuple[Enclosure, list[Relaxed], Interval]:
+    """The enclosure, lines around the activations, and what the first layer's take at the centres, (width, M).
+
+    ``parallel`` lines are those of all layers; others of hidden ones.
+    """
     n, count = box.shape
     lost: Mask = np.asarray(~((box.lo > -_FAR) & (box.hi < _FAR)).all(axis=0))
     box = Interval(np.where(lost, 0.0, box.lo), np.where(lost, 0.0, box.hi))
@@ -103,8 +108,7 @@ def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclos
     mid[:, 0] = mid[:, 1] = box.mid
     rad[:, 1] = radius
     mid[:, 2 : 2 + n] = np.eye(n)[:, : width - 2, None]
-    kinked = lost.copy()
-    arguments: list[tuple[Interval, Interval]] = []
+    kinked, first_centre = lost.copy(), Interval.point(0.0)
     passed: list[Relaxed] = []
     size = radius
     for number, layer in enumerate(layers):
@@ -114,16 +118,17 @@ def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclos
             lost = np.asarray(lost | bad)
             mid, rad = np.where(bad, 0.0, mid), np.where(bad, 0.0, rad)
         centre, over = _ranges(mid, rad, radius)
-        planar = over
+        planar, first_centre = over, first_centre if number else centre
         if passed:
-            found = bound_arguments(layer, passed, arguments[0][0], radius)
+            found = bound_arguments(layer, passed, first_centre, radius)
             unknown = lost | ~(np.isfinite(found.lo) & np.isfinite(found.hi))
             planar = Interval(np.where(unknown, over.lo, found.lo), np.where(unknown, over.hi, found.hi))
-        if number < len(layers) - 1:  # lines of planes alone: nearer ranges may have lines that are worse further on
-            passed.append(relax(layer, planar, size, None if number else centre))
-            size = layer.row.value(planar, *layer.constants).mag
         over = _meet(over, planar)
-        arguments.append((centre, over))
+        if parallel or number < len(layers) - 1:
+            # where lines differ, those of planes alone: nearer ranges may have lines that are worse further on
+            where = over if parallel else planar
+            passed.append(relax(layer, where, size, None if number else centre, parallel=parallel))
+            size = layer.row.value(where, *layer.constants).mag
         kinked = kinked | layer.row.kinked(over, layer.constants).any(axis=0)
         mid, rad = _activated(layer, mid, rad, (centre, over), pairs)
     value, bends = _ranges(mid, rad, radius)[1], None
@@ -133,7 +138,7 @@ def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclos
             place[i, j] = place[j, i] = 2 + n + number
         bends = _without(Interval.around(mid[:, place], rad[:, place]), lost)
     first = _without(Interval.around(mid[:, 2 : 2 + n], rad[:, 2 : 2 + n]), lost) if order else None
-    return Enclosure(_without(value, lost), first, bends, np.asarray(kinked | lost)), arguments
+    return Enclosure(_without(value, lost), first, bends, np.asarray(kinked | lost)), passed, first_centre
 
 
 def _affine(layer: Weights, mid: Array, rad: Array) -> tuple[Array, Array]:
@@ -224,15 +229,9 @@ def relax_network(layers: Sequence[Weights], box: Interval) -> tuple[Array, Inte
 
 @quiet
 def _relax(layers: Sequence[Weights], box: Interval) -> tuple[Array, Interval]:
-    found, arguments = _bound(layers, box, 0)
+    found, passed, centre = _bound(layers, box, 0, parallel=True)
     lost = np.asarray(~np.isfinite(found.value.lo).all(axis=0))
-    size = np.where(np.isfinite(box.rad), box.rad, 0.0)
-    radius = size
-    passed: list[Relaxed] = []
-    for number, (layer, (centre, over)) in enumerate(zip(layers, arguments)):
-        passed.append(relax(layer, over, size, None if number else centre, parallel=True))
-        size = layer.row.value(over, *layer.constants).mag
-    slopes, rest = parallel_planes(passed, arguments[0][0], radius)
+    slopes, rest = parallel_planes(passed, centre, np.where(np.isfinite(box.rad), box.rad, 0.0))
     return np.where(lost, 0.0, slopes), _without(rest, lost)
 
 
