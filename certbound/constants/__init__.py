@@ -8,6 +8,7 @@ What a user may want of it, each name loaded when it is first used:
 - ``matrix_measure``, ``induced_norm``, ``diagonal_weights``: the norms 1, 2 and infinity, weighted or not.
 - ``jacobian_set`` and the sets ``AffineSet``, ``SectorSet``, ``VertexPolytope``, ``IntervalMatrixSet``, ``UnionSet``.
 - ``certify_rate``, ``certify_gain``: c or L of a set of Jacobians in a given metric, proved.
+- ``bound_network_gain``: a Lipschitz constant of a network.
 - ``design_feedback``: a feedback gain and its metric together.
 """
 
@@ -22,6 +23,7 @@ _HOME = {
     "jacobians": "matrix_measure induced_norm diagonal_weights "
     "AffineSet SectorSet VertexPolytope IntervalMatrixSet UnionSet",
     "recheck": "certify_rate certify_gain",
+    "network_gains": "bound_network_gain",
     "programs": "design_feedback",
 }
 

@@ -41,6 +41,8 @@ class Activation:
         Enclose phi, phi' and phi'' over intervals.
     rest : callable
         ``rest(x, slope)``: encloses phi(z) - slope z over x, for floats ``slope``; exact lines touch phi.
+    lines : callable
+        ``lines(low, high)``: slopes, in floats, of a line close below phi and of one close above between two ends.
     series : callable
         Taylor coefficients: those of its argument and the highest order.
     kinks : callable, optional
@@ -54,6 +56,7 @@ class Activation:
     slope: OfInterval
     bend: OfInterval
     rest: Callable[..., Interval]
+    lines: Callable[..., tuple[Array, Array]]
     series: Callable[..., ts.Series]
     kinks: Callable[..., tuple[float, ...]] | None = None
     constants: int = 0
@@ -89,6 +92,13 @@ def _at_ends(function: OfInterval, x: Interval, slope: Array, *constants: float)
     return (function(low, *constants) - low * slope).hull(function(high, *constants) - high * slope)
 
 
+def chord(numpy: Callable[..., Any], low: Array, high: Array, *constants: float) -> Array:
+    """The slope of the chord between two ends, in floats; 0 where there is none."""
+    with np.errstate(all="ignore"):
+        slope = (numpy(high, *constants) - numpy(low, *constants)) / (high - low)
+    return np.where(np.isfinite(slope), slope, 0.0)
+
+
 # ---- tanh and what is made of it -----------------------------------------------------------------------------------
 
 
@@ -120,6 +130,33 @@ def _tanh_rest(x: Interval, slope: Array) -> Interval:
     top = t - s * place
     found = _hull_where(found, inner & (place.lo <= x.hi) & (place.hi >= x.lo), top)
     return _hull_where(found, inner & (-place.hi <= x.hi) & (-place.lo >= x.lo), -top)
+
+
+def _tanh_lines(low: Array, high: Array) -> tuple[Array, Array]:
+    """The chord on the hollow side and the tangent at the middle on the other; across 0 tangents through the ends."""
+    through, flat = chord(np.tanh, low, high), 1 - np.tanh((low + high) / 2) ** 2
+    crossing = (low < 0) & (high > 0)
+    below, above = np.where(high <= 0, flat, through), np.where(low >= 0, flat, through)
+    return (
+        np.where(crossing, _tanh_tangent(-high, -low, through), below),
+        np.where(crossing, _tanh_tangent(low, high, through), above),
+    )
+
+
+def _tanh_tangent(low: Array, high: Array, otherwise: Array) -> Array:
+    """The slope of the tangent at a d > 0 through tanh's point at ``low`` < 0, for d < ``high``: Newton's steps."""
+    start = np.clip(low, -40.0, -1e-9)
+    end, d = np.tanh(start), np.minimum(-start / 2, 0.5 * np.log1p(-4 * start))
+    for _ in range(5):
+        t = np.tanh(d)
+        slope = 1 - t * t
+        d = np.clip(d - (t - end - slope * (d - start)) / (2 * t * slope * (d - start)), 1e-9, 20.0)
+    return np.where(d < high, 1 - np.tanh(d) ** 2, otherwise)
+
+
+def _sigmoid_lines(low: Array, high: Array) -> tuple[Array, Array]:
+    below, above = _tanh_lines(low / 2, high / 2)
+    return below / 4, above / 4
 
 
 def _sigmoid(x: Interval) -> Interval:
@@ -158,6 +195,21 @@ def _softplus_rest(x: Interval, slope: Array) -> Interval:
 def _softplus_series(x: ts.Series, order: int) -> ts.Series:
     outer = ts.product(_sigmoid_series(x, order), ts.derivative(x, order), order)
     return ts.integral(_softplus(x[0]), outer, [_ONE], order)
+
+
+def _convex_lines(
+    numpy: Callable[..., Any], slope: Callable[[Array], Array]
+) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """The tangent at the middle below, the chord above."""
+    return lambda low, high: (slope((low + high) / 2), chord(numpy, low, high))
+
+
+def _softplus_at(z: Array) -> Any:
+    return np.logaddexp(z, 0.0)
+
+
+def _elu_at(z: Array) -> Any:
+    return np.where(z > 0, z, np.expm1(np.minimum(z, 0.0)))
 
 
 # ---- piecewise ones ------------------------------------------------------------------------------------------------
@@ -222,6 +274,31 @@ def _leaky_series(x: ts.Series, order: int, left: float = 0.0) -> ts.Series:
     return ts.add(ts.maximum(x, zero, order), scaled, order)
 
 
+def _leaky_at(z: Array, left: float = 0.0) -> Any:
+    return np.where(z > 0, z, left * z)
+
+
+def _leaky_lines(low: Array, high: Array, left: float = 0.0) -> tuple[Array, Array]:
+    """Across the kink the chord on the hollow side, on the other the line of the longer part."""
+    crossing, alone = (low < 0) & (high > 0), np.where(low >= 0, 1.0, left)
+    hollow = np.where(crossing, chord(_leaky_at, low, high, left), alone)
+    other = np.where(crossing, np.where(high > -low, 1.0, left), alone)
+    return (other, hollow) if left <= 1 else (hollow, other)
+
+
+def _clip_lines(low: Array, high: Array, bottom: float, top: float) -> tuple[Array, Array]:
+    """As for one kink; across both, lines through an end and the kink beyond it."""
+    through = chord(np.clip, low, high, bottom, top)
+    lower, upper = (low < bottom) & (high > bottom), (low < top) & (high > top)
+    with np.errstate(all="ignore"):
+        below = np.where(lower & upper, (top - bottom) / (high - bottom), through)
+        above = np.where(lower & upper, (top - bottom) / (top - low), through)
+    inside = (low >= bottom) & (high <= top)
+    below = np.where(lower & ~upper, np.where(high - bottom > bottom - low, 1.0, 0.0), np.where(inside, 1.0, below))
+    above = np.where(upper & ~lower, np.where(top - low > high - top, 1.0, 0.0), np.where(inside, 1.0, above))
+    return below, above
+
+
 def _clip(x: Interval, low: float, high: float) -> Interval:
     return Interval(np.clip(x.lo, low, high), np.clip(x.hi, low, high))
 
@@ -272,36 +349,50 @@ def _at_both(low: float, high: float) -> tuple[float, ...]:
     return low, high
 
 
+def _chords(numpy: Callable[..., Any]) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """The same slope on both sides."""
+
+    def lines(low: Array, high: Array) -> tuple[Array, Array]:
+        slope = chord(numpy, low, high)
+        return slope, slope
+
+    return lines
+
+
 ACTIVATIONS: dict[str, Activation] = {
     "linear": Activation(
         lambda z: z, lambda x: x, lambda x: Interval.point(np.ones(x.shape)), _straight,
-        lambda x, slope: _at_ends(lambda z: z, x, slope), lambda x, order: x,
+        lambda x, slope: _at_ends(lambda z: z, x, slope), lambda low, high: (np.ones(low.shape),) * 2,
+        lambda x, order: x,
     ),
-    "tanh": Activation(np.tanh, iv.tanh, _tanh_slope, _tanh_bend, _tanh_rest, ts.tanh),
+    "tanh": Activation(np.tanh, iv.tanh, _tanh_slope, _tanh_bend, _tanh_rest, _tanh_lines, ts.tanh),
     "sigmoid": Activation(
         lambda z: 0.5 + 0.5 * np.tanh(0.5 * z), _sigmoid, _sigmoid_slope, lambda x: _tanh_bend(x / 2.0) / 8.0,
-        lambda x, slope: (_tanh_rest(x / 2.0, 4.0 * slope) + 1.0) / 2.0, _sigmoid_series,
+        lambda x, slope: (_tanh_rest(x / 2.0, 4.0 * slope) + 1.0) / 2.0, _sigmoid_lines, _sigmoid_series,
     ),
     "softplus": Activation(
-        lambda z: np.logaddexp(z, 0.0), _softplus, _sigmoid, _sigmoid_slope, _softplus_rest, _softplus_series
+        _softplus_at, _softplus, _sigmoid, _sigmoid_slope, _softplus_rest,
+        _convex_lines(_softplus_at, lambda z: 0.5 + 0.5 * np.tanh(0.5 * z)), _softplus_series,
     ),
     "elu": Activation(
-        lambda z: np.where(z > 0, z, np.expm1(np.minimum(z, 0.0))), _elu, _elu_slope, _elu_bend, _elu_rest, _elu_series
+        _elu_at, _elu, _elu_slope, _elu_bend, _elu_rest,
+        _convex_lines(_elu_at, lambda z: np.exp(np.minimum(z, 0.0))), _elu_series,
     ),
     "sin": Activation(
-        np.sin, iv.sin, iv.cos, lambda x: -iv.sin(x), _mean_value_rest(iv.sin, iv.cos),
+        np.sin, iv.sin, iv.cos, lambda x: -iv.sin(x), _mean_value_rest(iv.sin, iv.cos), _chords(np.sin),
         lambda x, order: ts.circular(x, order)[0],
     ),
     "relu": Activation(
-        lambda z: np.maximum(z, 0.0), _leaky, _leaky_slope, _straight, _knotted(_leaky, _at_zero), _leaky_series,
-        kinks=_at_zero,
+        lambda z: np.maximum(z, 0.0), _leaky, _leaky_slope, _straight, _knotted(_leaky, _at_zero), _leaky_lines,
+        _leaky_series, kinks=_at_zero,
     ),
     "leaky_relu": Activation(
-        lambda z, left: np.where(z > 0, z, left * z), _leaky, _leaky_slope, _straight, _knotted(_leaky, _at_zero),
-        _leaky_series, kinks=_at_zero, constants=1,
+        _leaky_at, _leaky, _leaky_slope, _straight, _knotted(_leaky, _at_zero), _leaky_lines, _leaky_series,
+        kinks=_at_zero, constants=1,
     ),
     "clip": Activation(
-        np.clip, _clip, _clip_slope, _straight, _knotted(_clip, _at_both), _clip_series, kinks=_at_both, constants=2
+        np.clip, _clip, _clip_slope, _straight, _knotted(_clip, _at_both), _clip_lines, _clip_series, kinks=_at_both,
+        constants=2,
     ),
 }  # fmt: skip
 """Activation name to its row."""

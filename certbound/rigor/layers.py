@@ -5,10 +5,8 @@ and second derivatives) stands side by side as the columns of one matrix, in mid
 floating-point matrix products: W times the midpoints, |W| times the radii. What the products round off is covered by a
 bound that holds in any order of summation, so that BLAS and its threads are free to choose theirs.
 
-The lines around a network are those of linear relaxation: every activation lies between two parallel lines over the
-range of its argument, and the lines are put together backwards, from the output to the input. Sources: Rump, Fast and
-parallel interval arithmetic, BIT 39 (1999); Zhang et al., Efficient neural network robustness certification with
-general activation functions, NeurIPS 2018.
+The lines around a network are those of linear relaxation, put together backwards (`certbound.rigor.planes`). Source:
+Rump, Fast and parallel interval arithmetic, BIT 39 (1999).
 """
 
 from __future__ import annotations
@@ -19,28 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.rigor.activations import ACTIVATIONS, Constants
 from certbound.rigor.arithmetic import Interval
+from certbound.rigor.planes import Relaxed, Weights, bound_arguments, parallel_planes, relax
 from certbound.rigor.rounding import STEP, TINY, product_error, quiet, upper
 from certbound.rigor.series import ZERO, Series
 
-CHUNK = 512
-"""Boxes carried through a network at a time."""
+_CHUNK, _NUMBERS = 512, 4_000_000  # boxes carried through a network at a time, and numbers of its planes
 _FAR = 1e100  # boxes that reach beyond are taken for unbounded
-
-
-class Weights:
-    """A layer's numbers: ``weights`` (p, k), ``bias`` (p,), and its activation by name, with constants."""
-
-    def __init__(self, weights: Array, bias: Array, activation: str, constants: Constants = ()) -> None:
-        self.weights, self.bias = np.asarray(weights, dtype=float), np.asarray(bias, dtype=float)
-        self.size = np.abs(self.weights)
-        self.row, self.constants = ACTIVATIONS[activation], constants
-
-    @property
-    def kinked(self) -> bool:
-        """Whether its activation has kinks."""
-        return self.row.kinks is not None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -76,8 +59,8 @@ def _columns(count: int) -> list[tuple[int, int]]:
 def bound_network(layers: Sequence[Weights], box: Interval, order: int) -> Enclosure:
     """Enclose a network over boxes (n, M), with its derivatives up to ``order`` (0, 1 or 2).
 
-    The range over the box is the better of what the layers' ranges and the first derivatives (mean value form) say,
-    layer by layer.
+    The range over the box is the best of what the layers' ranges, planes to the inputs (`certbound.rigor.planes`) and,
+    where they are asked for, the first derivatives (mean value form) say, layer by layer.
 
     Examples
     --------
@@ -86,14 +69,20 @@ def bound_network(layers: Sequence[Weights], box: Interval, order: int) -> Enclo
     >>> bool(found.value.contains([[0.0]]).all() and found.slopes.contains(np.array([[[1.0], [-1.0]]])).all())
     True
     """
-    parts = [
-        _bound(layers, box[:, start : start + CHUNK], order)[0] for start in range(0, max(box.shape[1], 1), CHUNK)
-    ]
+    parts = [_bound(layers, part, order)[0] for part in _portions(layers, box)]
     return parts[0] if len(parts) == 1 else Enclosure(
         _joined([part.value for part in parts]), _joined([part.slopes for part in parts if part.slopes is not None]),
         _joined([part.bends for part in parts if part.bends is not None]),
         np.concatenate([part.kinked for part in parts]),
     )  # fmt: skip
+
+
+def _portions(layers: Sequence[Weights], box: Interval) -> list[Interval]:
+    """Boxes to be carried through a network at a time: so many that the planes of no layer need more memory."""
+    widths = [len(layer.bias) for layer in layers]
+    most = max((a * b for a, b in zip(widths, widths[2:])), default=1)
+    chunk = max(min(_CHUNK, _NUMBERS // (2 * most)), 1)
+    return [box[:, start : start + chunk] for start in range(0, max(box.shape[1], 1), chunk)]
 
 
 def _joined(parts: Sequence[Interval]) -> Interval:
@@ -103,25 +92,43 @@ def _joined(parts: Sequence[Interval]) -> Interval:
 
 
 @quiet
-def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclosure, list[tuple[Interval, Interval]]]:
-    """The enclosure, and the arguments of every layer's activation at the centre and over the box, (width, M)."""
+def _bound(
+    layers: Sequence[Weights], box: Interval, order: int, *, parallel: bool = False
+) -> tuple[Enclosure, list[Relaxed], Interval]:
+    """The enclosure, lines around the activations, and what the first layer's take at the centres, (width, M).
+
+    ``parallel`` lines are those of all layers; others of hidden ones.
+    """
     n, count = box.shape
     lost: Mask = np.asarray(~((box.lo > -_FAR) & (box.hi < _FAR)).all(axis=0))
     box = Interval(np.where(lost, 0.0, box.lo), np.where(lost, 0.0, box.hi))
     radius, pairs = box.rad, _columns(n) if order > 1 else []
-    mid, rad = np.zeros((n, 2 + n + len(pairs), count)), np.zeros((n, 2 + n + len(pairs), count))
+    width = 2 + (n if order else 0) + len(pairs)
+    mid, rad = np.zeros((n, width, count)), np.zeros((n, width, count))
     mid[:, 0] = mid[:, 1] = box.mid
     rad[:, 1] = radius
-    mid[:, 2 : 2 + n] = np.eye(n)[:, :, None]
-    kinked, arguments = lost.copy(), []
-    for layer in layers:
+    mid[:, 2 : 2 + n] = np.eye(n)[:, : width - 2, None]
+    kinked, first_centre = lost.copy(), Interval.point(0.0)
+    passed: list[Relaxed] = []
+    size = radius
+    for number, layer in enumerate(layers):
         mid, rad = _affine(layer, mid, rad)
         bad = np.asarray(~(np.isfinite(mid) & np.isfinite(rad)).all(axis=(0, 1)))
         if bad.any():
             lost = np.asarray(lost | bad)
             mid, rad = np.where(bad, 0.0, mid), np.where(bad, 0.0, rad)
         centre, over = _ranges(mid, rad, radius)
-        arguments.append((centre, over))
+        planar, first_centre = over, first_centre if number else centre
+        if passed:
+            found = bound_arguments(layer, passed, first_centre, radius)
+            unknown = lost | ~(np.isfinite(found.lo) & np.isfinite(found.hi))
+            planar = Interval(np.where(unknown, over.lo, found.lo), np.where(unknown, over.hi, found.hi))
+        over = _meet(over, planar)
+        if parallel or number < len(layers) - 1:
+            # where lines differ, those of planes alone: nearer ranges may have lines that are worse further on
+            where = over if parallel else planar
+            passed.append(relax(layer, where, size, None if number else centre, parallel=parallel))
+            size = layer.row.value(where, *layer.constants).mag
         kinked = kinked | layer.row.kinked(over, layer.constants).any(axis=0)
         mid, rad = _activated(layer, mid, rad, (centre, over), pairs)
     value, bends = _ranges(mid, rad, radius)[1], None
@@ -131,8 +138,7 @@ def _bound(layers: Sequence[Weights], box: Interval, order: int) -> tuple[Enclos
             place[i, j] = place[j, i] = 2 + n + number
         bends = _without(Interval.around(mid[:, place], rad[:, place]), lost)
     first = _without(Interval.around(mid[:, 2 : 2 + n], rad[:, 2 : 2 + n]), lost) if order else None
-    found = Enclosure(_without(value, lost), first, bends, np.asarray(kinked | lost))
-    return found, arguments
+    return Enclosure(_without(value, lost), first, bends, np.asarray(kinked | lost)), passed, first_centre
 
 
 def _affine(layer: Weights, mid: Array, rad: Array) -> tuple[Array, Array]:
@@ -146,8 +152,10 @@ def _affine(layer: Weights, mid: Array, rad: Array) -> tuple[Array, Array]:
 
 
 def _ranges(mid: Array, rad: Array, radius: Array) -> tuple[Interval, Interval]:
-    """What the first column says of the centres, and the second and the mean value form together of the boxes."""
+    """What the first column says of the centres, and the second and the mean value form (if any) of the boxes."""
     n = len(radius)
+    if mid.shape[1] == 2:
+        return Interval.around(mid[:, 0], rad[:, 0]), Interval.around(mid[:, 1], rad[:, 1])
     reach = ((np.abs(mid[:, 2 : 2 + n]) + rad[:, 2 : 2 + n]) * radius).sum(axis=1)
     reach = upper(reach, step=(n + 8) * STEP, tiny=TINY)
     centre = Interval.around(mid[:, 0], rad[:, 0])
@@ -215,48 +223,16 @@ def relax_network(layers: Sequence[Weights], box: Interval) -> tuple[Array, Inte
     >>> bool(slopes[0, 0, 0] == 0.5 and abs(rest.width[0, 0] - 0.5) < 1e-12)
     True
     """
-    parts = [_relax(layers, box[:, start : start + CHUNK]) for start in range(0, max(box.shape[1], 1), CHUNK)]
+    parts = [_relax(layers, part) for part in _portions(layers, box)]
     return np.concatenate([part[0] for part in parts], -1), _joined([part[1] for part in parts])
 
 
 @quiet
 def _relax(layers: Sequence[Weights], box: Interval) -> tuple[Array, Interval]:
-    found, arguments = _bound(layers, box, 0)
-    lost: Mask = np.asarray(~np.isfinite(found.value.lo).all(axis=0))
-    p, count = found.value.shape
-    rows = np.repeat(np.eye(p)[:, :, None], count, axis=2)  # (width, p, M): coefficients of what a layer gives
-    rest = Interval.point(np.zeros((p, count)))
-    for number in range(len(layers) - 1, -1, -1):
-        layer, (centre, over) = layers[number], arguments[number]
-        slope = _chord(layer, over)
-        rest = rest + (Interval.point(rows) * layer.row.rest(over, slope, *layer.constants)[:, None]).sum(axis=0)
-        turned = rows * slope[:, None]
-        missed = STEP * np.abs(turned) + TINY  # what rounding the product leaves of coefficients
-        width, k = layer.weights.shape
-        if number == 0:
-            rest = rest + (Interval(turned - missed, turned + missed) * centre[:, None]).sum(axis=0)
-            size = np.where(lost, 0.0, box.rad)
-        else:
-            rest = rest + (Interval(-missed, missed) * over[:, None]).sum(axis=0)
-            rest = rest + (Interval.point(turned) * layer.bias[:, None, None]).sum(axis=0)
-            before, (_, inner) = layers[number - 1], arguments[number - 1]
-            size = before.row.value(inner, *before.constants).mag
-        flat = turned.reshape(width, p * count)
-        rows, error = _product(layer.weights.T, layer.size.T, flat, missed.reshape(width, p * count) * (number == 0))
-        rows, error = rows.reshape(k, p, count), error.reshape(k, p, count)
-        rest = rest + (Interval(-error, error) * Interval.point(size)[:, None]).sum(axis=0)
-    lost = np.asarray(lost | ~np.isfinite(rows).all(axis=(0, 1)))
-    return np.where(lost, 0.0, np.swapaxes(rows, 0, 1)), _without(rest, lost)
-
-
-def _chord(layer: Weights, over: Interval) -> Array:
-    """A slope of lines close around the activation: that of its chord, in floats."""
-    low, high = over.lo, over.hi
-    rise = layer.row.numpy(high, *layer.constants) - layer.row.numpy(low, *layer.constants)
-    thin = high - low < 1e-9 * (1 + np.abs(low))
-    middle = layer.row.slope(Interval.point(over.mid), *layer.constants).mid
-    slope = np.where(thin, middle, rise / np.where(thin, 1.0, high - low))
-    return np.where(np.isfinite(slope) & (np.abs(slope) > 1e-9), slope, 0.0)
+    found, passed, centre = _bound(layers, box, 0, parallel=True)
+    lost = np.asarray(~np.isfinite(found.value.lo).all(axis=0))
+    slopes, rest = parallel_planes(passed, centre, np.where(np.isfinite(box.rad), box.rad, 0.0))
+    return np.where(lost, 0.0, slopes), _without(rest, lost)
 
 
 def expand_network(layers: Sequence[Weights], inputs: Sequence[Series], order: int) -> list[Series]:

@@ -93,6 +93,46 @@ box = {{ x = [0.6, 0.7], v = [0, 0.7] }}
 """
 
 
+COLLISION = """# collision avoidance of logRASM (models/collision_avoidance.py): pushed near (0, 1), (0, -1).
+# Reach the middle within 20 steps (published: at any time) with probability .999.
+name = "collision avoidance with a learned policy"
+time = "discrete"
+horizon = 20
+delta = 1e-3
+states = ["x", "y"]
+networks = {{ policy = "{file}" }}
+
+[definitions]
+above = "min(hypot(x, y - 1)/0.3, 1)"
+below = "min(hypot(x, y + 1)/0.3, 1)"
+right = "2*min(max(policy(x, y)[0], -1), 1)"
+up = "2*min(max(policy(x, y)[1], -1), 1)"
+
+[dynamics]
+x = "x + 0.2*below*above*right"
+y = "y + 0.2*(below*(above*up + (1 - above)) - (1 - below))"
+
+[noise]
+law = "triangular"
+halfwidth = [0.05, 0.05]
+
+[[initial]]
+box = [[-1.0, -0.9], [-0.6, 0.6]]
+
+[[initial]]
+box = [[0.9, 1.0], [-0.6, 0.6]]
+
+[[avoid]]
+box = {{ x = [-0.3, 0.3], y = [0.7, 1.0] }}
+
+[[avoid]]
+box = {{ x = [-0.3, 0.3], y = [-1.0, -0.7] }}
+
+[[reach]]
+box = {{ x = [-0.2, 0.2], y = [-0.2, 0.2] }}
+"""
+
+
 def _linear_law(points: Array) -> Array:
     return np.clip(-1.2 * points[:, :1] - 0.5 * points[:, 1:], -1.0, 1.0)
 
@@ -102,16 +142,21 @@ def _pendulum_law(points: Array) -> Array:
     return np.clip(-(0.75 * np.sin(x) + 1.5 * x + 0.5 * v) / 8, -1.0, 1.0)
 
 
+def _collision_law(points: Array) -> Array:
+    return np.clip(-1.5 * points, -1.0, 1.0)
+
+
 TASKS: dict[str, Task] = {
     "linear-sys": Task((-1.5, -1.5), (1.5, 1.5), _linear_law, LINEAR),
     "pendulum": Task((-0.7, -0.7), (0.7, 0.7), _pendulum_law, PENDULUM),
+    "collision": Task((-1.2, -1.2), (1.2, 1.2), _collision_law, COLLISION),
 }
 
 
 def train(task: Task, *, width: int, activation: str, seed: int = 0, steps: int = 2000) -> list[dict[str, Any]]:
     """Layers (two hidden ones of ``width``) that imitate the task's law, by Adam on batches of 256."""
     rng = np.random.default_rng(seed)
-    sizes = [len(task.low), width, width, 1]
+    sizes = [len(task.low), width, width, task.law(np.zeros((1, len(task.low)))).shape[1]]
     values = []
     for k, p in itertools.pairwise(sizes):
         values += [rng.normal(size=(p, k)) / np.sqrt(k), np.zeros(p)]

@@ -9,8 +9,10 @@ from certbound.arrays import Array
 from certbound.problem.model.network_rows import weights_of
 from certbound.rigor.activations import ACTIVATIONS
 from certbound.rigor.arithmetic import Interval
-from certbound.rigor.layers import Weights, bound_network, expand_network, relax_network
+from certbound.rigor.layers import bound_network, expand_network, relax_network
+from certbound.rigor.planes import Weights
 from tests.networks import random_network
+from tests.rigor.crown import crown
 
 BOXES = 200
 
@@ -81,7 +83,21 @@ def test_planes_are_as_tight_as_the_curvature_lets_them_be() -> None:
         widths.append(relax_network(network, box)[1].width.max())
     assert widths[1] < widths[0] / 80
     line = Weights(np.eye(1), np.zeros(1), "relu")
-    assert relax_network([line], Interval([[1.0]], [[2.0]]))[1].width[0, 0] < 1e-14
+    assert relax_network([line], Interval([[1.0]], [[2.0]]))[1].width[0, 0] < 3e-14
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("sizes", [(2, 16, 16, 1), (3, 8, 8, 8, 2)])
+def test_ranges_are_hardly_wider_than_those_of_crown_in_floats(activation: str, sizes: tuple[int, ...]) -> None:
+    """Hidden layers are bounded by planes to the inputs too: intervals there are up to 1.6 times as wide."""
+    network, rng = weights_of(random_network(activation, 1, sizes=sizes).data), np.random.default_rng(2)
+    for radius in (0.02, 0.5, 2.0):
+        centre = rng.normal(size=(sizes[0], 4))
+        box = Interval(centre - radius, centre + radius)
+        width = bound_network(network, box, 0).value.width
+        for number in range(4):
+            low, high = crown(network, box.lo[:, number], box.hi[:, number])
+            assert (width[:, number] <= 1.05 * (high - low)).all()
 
 
 def test_rounding_in_the_products_is_covered() -> None:
@@ -98,6 +114,16 @@ def test_an_unbounded_box_has_an_unbounded_range() -> None:
     assert np.isinf(found.value.lo[:, 0]).all()
     assert np.isinf(rest.hi[:, 0]).all()
     assert np.isfinite(found.value.lo[:, 1]).all()
+
+
+def test_networks_that_overflow_have_unbounded_ranges() -> None:
+    rows = [np.full((3, 2), 1e8), *[np.full((3, 3), 1e308)] * 4, np.full((1, 3), 1e8)]
+    network = [Weights(w, np.ones(len(w)), "relu" if len(w) > 1 else "linear") for w in rows]
+    box = Interval(np.array([[1.0, -1e99], [2.0, 1.0]]), np.array([[1.5, 1e99], [2.0, 1.0]]))
+    found, (slopes, rest) = bound_network(network, box, 2), relax_network(network, box)
+    assert np.isinf(found.value.hi).all()
+    assert np.isinf(rest.hi).all()
+    assert np.isfinite(slopes).all()
 
 
 @every_activation

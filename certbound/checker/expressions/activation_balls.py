@@ -21,8 +21,8 @@ class Activation:
     """One activation; every function takes its constants last.
 
     ``value``, ``slope`` and ``bend`` enclose phi, phi' and phi'' (generalised at kinks) over balls; ``series`` are its
-    Taylor coefficients; ``expansion`` gives phi, phi' and phi''/2 at a ball and phi''' over another, where it is
-    smooth; ``knots`` are the kinks of a piecewise linear one.
+    Taylor coefficients; ``expansion`` gives phi, phi' and phi''/2 at a ball and phi''', with its sign, over another,
+    where it is smooth; ``knots`` are the kinks of a piecewise linear one.
     """
 
     value: Callable[..., arb]
@@ -186,6 +186,9 @@ def line(row: Activation, x: arb, constants: Constants) -> tuple[arb, arb]:
     """
     assert row.knots is not None
     low, high = x.lower(), x.upper()
+    if not kinked(row, x, constants):
+        slope = row.slope(x, *constants)
+        return slope, row.value(low, *constants) - slope * low
     places = [low, high, *(arb(place) for place in row.knots(*constants) if x.contains(place))]
     slope = arb(((row.value(high, *constants) - row.value(low, *constants)) / (high - low)).mid()) if low < high else (
         arb(row.slope(x, *constants).mid()))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from flint import arb, arb_mat
 
@@ -18,8 +18,11 @@ from certbound.problem.model import Layer, Network, Part
 _ZERO = arb(0)
 Rows = list[list[arb]]
 _Layers = list[tuple[arb_mat, arb_mat, list[arb], Activation, Constants]]
-_SMALL = 0.25
-"""A reach below which the second order is not worse than the first."""
+_SMALL, _LONG = 0.25, 1
+"""A reach below which the second order is not worse than the first, and one beyond which it is not better."""
+_MOST_CUBIC = 4
+"""Coordinates up to which terms of third order are carried."""
+_Triple = tuple[int, int, int]
 
 
 class Builder(Protocol):
@@ -163,7 +166,7 @@ def model(part: Part, args: Sequence[tm.Model]) -> tm.Model | None:
 
 _MODELS: dict[Any, list[tm.Model]] = {}
 """Models by the very digits of their arguments: outputs of the dynamics that call one network ask the same."""
-_MOST_MODELS = 300
+_MOST_MODELS = 4000
 
 
 def _digits(x: tm.Model) -> tuple[Any, ...]:
@@ -175,112 +178,159 @@ def _digits(x: tm.Model) -> tuple[Any, ...]:
 
 
 class _Columns:
-    """What is carried through the layers: one row a neuron, with columns for the value, terms and symbols of errors.
+    """What is carried through the layers: one row a neuron, with columns for the value and the terms of a polynomial.
 
-    In networks with kinks every error keeps a symbol of its own, so that errors cancel behind the next layer as the
-    weights say; in smooth ones, where errors are of third order, one bound a neuron stands for all.
+    Errors stay apart: a layer's own ones reach further layers through its linear coefficients (`errors_behind`), so
+    that weights cancel. In networks with kinks that bounds every layer; in smooth ones, where errors are of fourth
+    order, only the outputs, and the layers between take the sum of all sizes.
     """
 
     def __init__(self, network: Network, args: Sequence[tm.Model]) -> None:
-        self.apart = not network.smooth
-        self.linear = sorted({a for x in args for a in x.linear})
-        self.squares = sorted({pair for x in args for pair in x.squares} | {
-            (a, b) for i, a in enumerate(self.linear) for b in self.linear[i:]})  # fmt: skip
-        place = {a: 1 + k for k, a in enumerate(self.linear)}
-        self.bends = [
-            (number, place[a], place[b]) for number, (a, b) in enumerate(self.squares, 1 + len(self.linear))
-            if a in place and b in place
-        ]  # fmt: skip
+        self.smooth = network.smooth
+        found = sorted({a for x in args for a in x.linear} | {a for x in args for pair in x.squares for a in pair})
+        self.linear = found
+        held = {pair for x in args for pair in x.squares}
+        pairs = [(a, b) for i, a in enumerate(found) for b in found[i:]]
+        self.squares = pairs if self.smooth else [pair for pair in pairs if pair in held]
+        self.cubes = [
+            (a, b, c) for i, a in enumerate(found) for k, b in enumerate(found[i:], i) for c in found[k:]
+        ] if self.smooth and len(found) <= _MOST_CUBIC else []
+        place = {a: 1 + k for k, a in enumerate(found)}
+        self.second, self.third = 1 + len(found), 1 + len(found) + len(self.squares)
+        self.bends = [(place[a], place[b], 1 if a == b else 2) for a, b in self.squares]
+        number = {triple: k for k, triple in enumerate(self.cubes, self.third)}
+        self.turns = [
+            (number[cast(_Triple, tuple(sorted((a, *pair))))], place[a], k)
+            for a in found for k, pair in enumerate(self.squares)
+        ] if self.cubes else []
         self.rows: Rows = [
-            [x.value, *(x.linear.get(a, _ZERO) for a in self.linear),
-             *(x.squares.get(pair, _ZERO) for pair in self.squares)] for x in args
+            [x.value, *(x.linear.get(a, _ZERO) for a in found), *(x.squares.get(pair, _ZERO) for pair in self.squares),
+             *[_ZERO] * len(self.cubes)] for x in args
         ]  # fmt: skip
-        self.errors = [x.error for x in args]
-        self.symbols = 0
-        if self.apart:
-            self.spread([_ZERO] * len(args), self.errors)
+        self.start = self.errors = [x.error for x in args]
+        self.passed: list[tuple[arb_mat, list[arb], list[arb]]] = []  # weights, slopes and errors of every layer
 
-    def spread(self, old: Sequence[arb], errors: Sequence[arb]) -> None:
-        """Errors as symbols of their own."""
-        new = [i for i, error in enumerate(errors) if not error.is_zero()]
-        for i, row in enumerate(self.rows):
-            row += [errors[i] if i == j else _ZERO for j in new]
-        self.symbols += len(new)
-        self.errors = list(old)
+    def errors_behind(self, rows: arb_mat, sizes: arb_mat) -> list[arb]:
+        """All errors in ``rows`` (``sizes`` without signs) times the last layer: each by its way through the layers."""
+        total = [_ZERO] * rows.nrows()
+        errors = [self.start, *(own for *_, own in self.passed)]
+        while True:
+            total = [a + b for a, b in zip(total, (sizes * arb_mat([[x] for x in errors.pop()])).entries())]
+            if all(error.is_zero() for below in errors for error in below):
+                break
+            weights, slopes, _ = self.passed[len(errors) - 1]
+            rows = arb_mat([[x * s for x, s in zip(row, slopes)] for row in rows.tolist()]) * weights
+            sizes = arb_mat(rows.nrows(), rows.ncols(), [abs(x) for x in rows.entries()])
+        return [x.upper() for x in total]
 
     def through(self, weights: arb_mat, size: arb_mat, bias: Sequence[arb]) -> None:
         """W times everything (|W|, ``size``, times the errors), and the bias."""
-        if not self.apart:
-            self.errors = (size * arb_mat([[x] for x in self.errors])).entries()
         self.rows = (weights * arb_mat(self.rows)).tolist()
         for row, b in zip(self.rows, bias):
             row[0] += b
-        if not self.apart:
-            return
-        self.errors = [_ZERO] * len(self.rows)
+        if self.smooth:
+            self.errors = [x.upper() for x in (size * arb_mat([[x] for x in self.errors])).entries()]
+        else:
+            self.errors = self.errors_behind(weights, size)
 
-    def norms(self, row: Sequence[arb], error: arb) -> tuple[arb, arb, arb]:
-        """Bounds of the linear and the quadratic part and of all errors."""
-        first, second = 1 + len(self.linear), 1 + len(self.linear) + len(self.squares)
-        one, two, rest = (
-            sum((abs(x) for x in part), _ZERO).upper() for part in (row[1:first], row[first:second], row[second:])
-        )
-        return one, two, (rest + error).upper()
-
-    def activated(self, row: Activation, constants: Constants) -> None:
-        """Everything behind an activation."""
-        made, errors, fresh = [], [], []
+    def activated(self, weights: arb_mat, row: Activation, constants: Constants) -> None:
+        """Everything behind the activation of the layer with these ``weights``."""
+        made, slopes, fresh = [], [], []
         for own, error in zip(self.rows, self.errors):
-            found, old, new = self._composed(own, error, row, constants)
+            found, slope_, new = self._composed(own, error, row, constants)
             made.append(found)
-            errors.append(old)
+            slopes.append(slope_)
             fresh.append(new)
         self.rows = made
-        if self.apart:
-            self.spread(errors, fresh)
-        else:
-            self.errors = [a + b for a, b in zip(errors, fresh)]
+        self.passed.append((weights, slopes, fresh))
+        self.errors = [abs(s) * old + new for s, old, new in zip(slopes, self.errors, fresh)]
 
     def _composed(
         self, own: Sequence[arb], error: arb, row: Activation, constants: Constants
     ) -> tuple[list[arb], arb, arb]:
-        """phi of one neuron: its columns, what was its error, and the new one."""
-        one, two, rest = self.norms(own, error)
-        reach = one + two + rest
+        """phi of one neuron: its columns, what its error is multiplied by, and the new one."""
+        one, two, three = _size(own[1 : self.second]), _size(own[self.second : self.third]), _size(own[self.third :])
+        reach = (one + two + three + error).upper()
         whole = own[0] + arb(0, 1) * reach
         if row.expansion is None:
             slope_, level = line(row, whole, constants)
             middle = arb(level.mid())
-            return [slope_ * own[0] + middle, *(slope_ * x for x in own[1:])], abs(slope_) * error, arb(level.rad())
+            if slope_.is_zero():
+                return [middle, *[_ZERO] * (len(own) - 1)], _ZERO, arb(level.rad())
+            found = list(own) if slope_ == 1 else [slope_ * x for x in own]
+            found[0] += middle
+            return found, slope_, arb(level.rad())
         value, first, half, third = row.expansion(own[0], whole)
-        cross = two * (2 * one + two) + rest * (2 * (one + two) + rest)
-        cubic = abs(half) * cross + abs(third) * reach * reach * reach / 6
-        if not (reach < _SMALL and cubic.is_finite()):
+        size = abs(half).upper()
+        sixth = third / 6
+        if self.cubes:
+            # h = p1 + q with q = p2 + p3 + error: h^2 less p1^2 + 2 p1 p2, and h^3 less p1^3
+            q = two + three + error
+            left = size * (2 * one * (three + error) + q * q)
+            left += abs(sixth) * q * (3 * one * (one + q) + q * q) + arb(sixth.rad()) * one * one * one
+        else:
+            left = size * (two * (2 * one + two) + error * (2 * (one + two) + error))
+            left += abs(sixth) * reach * reach * reach
+        left = left.upper()
+        if not (reach < _SMALL and left.is_finite()):
             slopes = row.slope(whole, *constants)
             plain = (arb(slopes.rad()) * reach).upper()  # to first order, by the mean value theorem
             level = row.value(whole, *constants)
-            if level.rad() < plain and not cubic < level.rad():  # a constant
+            if level.rad() < plain and not left < level.rad():  # a constant
                 return [arb(level.mid()), *[_ZERO] * (len(own) - 1)], _ZERO, arb(level.rad())
-            if not cubic.is_finite() or plain < cubic or reach > 1:
+            if not left.is_finite() or plain < left or reach > _LONG:
                 middle = arb(slopes.mid())
-                return [value, *(middle * x for x in own[1:])], abs(middle) * error, plain
+                return [value, *(middle * x for x in own[1:])], middle, plain
+        return self._polynomial(own, (value, first, half, arb(sixth.mid()))), first, left
+
+    def _polynomial(self, own: Sequence[arb], coefficients: tuple[arb, arb, arb, arb]) -> list[arb]:
+        """value + first h + half h^2 + sixth h^3 of the polynomial h, up to its third order."""
+        value, first, half, sixth = coefficients
         found = [value, *(first * x for x in own[1:])]
-        for number, a, b in self.bends:
-            found[number] += half * own[a] * own[b] * (1 if a == b else 2)
-        return found, abs(first) * error, cubic.upper()
+        squares = [own[a] * own[b] if factor == 1 else 2 * own[a] * own[b] for a, b, factor in self.bends]
+        if self.turns:
+            twice = 2 * half
+            mixed = [twice * x + sixth * y for x, y in zip(own[self.second : self.third], squares)]
+            for number, a, k in self.turns:
+                found[number] += own[a] * mixed[k]
+        for number, x in enumerate(squares, self.second):
+            found[number] += half * x
+        return found
 
     def models(self, weights: Sequence[float]) -> list[tm.Model]:
         """The outputs as models; ``weights`` split their errors between the coordinates."""
-        result = []
-        for own, error in zip(self.rows, self.errors):
-            _, _, rest = self.norms(own, error)
-            linear = {a: x for a, x in zip(self.linear, own[1:]) if not x.is_zero()}
-            quadratic = own[1 + len(self.linear) :]
-            squares = {pair: x for pair, x in zip(self.squares, quadratic) if not x.is_zero()}
-            size, total = float(rest), sum(weights)
-            blame = {a: size * w / total for a, w in zip(self.linear, weights)} if total > 0 else {}
-            result.append(tm.Model(own[0], linear, squares, rest, blame))
-        return result
+        count = len(self.rows)
+        unit = arb_mat([[arb(int(i == j)) for j in range(count)] for i in range(count)])
+        behind = self.errors_behind(unit, unit)
+        return [self._model(own, error, weights) for own, error in zip(self.rows, behind)]
+
+    def _model(self, own: Sequence[arb], error: arb, weights: Sequence[float]) -> tm.Model:
+        """One output; terms of third order join those of first, for |x| <= 1.
+
+        x^3 is within 1/4 of 3x/4, and x^2 y within 1/2 of y/2.
+        """
+        linear = dict(zip(self.linear, own[1:]))
+        for (a, b, c), x in zip(self.cubes, own[self.third :]):
+            if a == b == c:
+                linear[a] += 3 * x / 4
+                error += abs(x) / 4
+            elif a == b or b == c:
+                linear[c if a == b else a] += x / 2
+                error += abs(x) / 2
+            else:
+                error += abs(x)
+        rest = error.upper()
+        size, total = float(rest), sum(weights)
+        blame = {a: size * w / total for a, w in zip(self.linear, weights)} if total > 0 else {}
+        return tm.Model(
+            own[0], {a: x for a, x in linear.items() if not x.is_zero()},
+            {pair: x for pair, x in zip(self.squares, own[self.second :]) if not x.is_zero()}, rest, blame,
+        )  # fmt: skip
+
+
+def _size(terms: Sequence[arb]) -> arb:
+    """A bound of a sum of terms times numbers in [-1, 1]."""
+    return sum(map(abs, terms), _ZERO)
 
 
 def _models(network: Network, args: Sequence[tm.Model]) -> list[tm.Model]:
@@ -290,5 +340,5 @@ def _models(network: Network, args: Sequence[tm.Model]) -> list[tm.Model]:
         columns.through(weights, size, bias)
         if number == 0:
             shares = [sum(float(abs(own[1 + k]).mid()) for own in columns.rows) for k in range(len(shares))]
-        columns.activated(row, constants)
+        columns.activated(weights, row, constants)
     return columns.models(shares)

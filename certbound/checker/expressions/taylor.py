@@ -172,7 +172,7 @@ def log(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
 
 def sin(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
     s, c = v.sin_cos()
-    return s, c, -s / 2, r.cos()
+    return s, c, -s / 2, -r.cos()
 
 
 def cos(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:

@@ -18,10 +18,11 @@ from certbound.arrays import Array, Mask
 from certbound.problem.model.network_data import Network, Part
 from certbound.rigor import layers as ly
 from certbound.rigor.arithmetic import Interval
+from certbound.rigor.planes import Weights
 from certbound.rigor.series import Series
 
 _KEPT = 4
-_WEIGHTS: WeakKeyDictionary[Network, list[ly.Weights]] = WeakKeyDictionary()
+_WEIGHTS: WeakKeyDictionary[Network, list[Weights]] = WeakKeyDictionary()
 
 
 class _Recent(threading.local):
@@ -43,12 +44,12 @@ class _Recent(threading.local):
 _RECENT = _Recent()
 
 
-def weights_of(network: Network) -> list[ly.Weights]:
+def weights_of(network: Network) -> list[Weights]:
     """The layers as arrays."""
     found = _WEIGHTS.get(network)
     if found is None:
         found = _WEIGHTS[network] = [
-            ly.Weights(np.array(layer.weights), np.array(layer.bias), layer.activation, layer.constants)
+            Weights(np.array(layer.weights), np.array(layer.bias), layer.activation, layer.constants)
             for layer in network.layers
         ]
     return found
@@ -137,7 +138,7 @@ def numpy(*given: Any) -> Any:
     return columns[(part.output, *part.by)].reshape(shape)[()]
 
 
-def _float_columns(layers: Sequence[ly.Weights], points: Array, order: int) -> Array:
+def _float_columns(layers: Sequence[Weights], points: Array, order: int) -> Array:
     """Values (p, M), derivatives (p, n, M), or second ones (p, n, n, M), in floats."""
     if order:
         known = np.isfinite(points).all(axis=0)

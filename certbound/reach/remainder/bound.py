@@ -169,7 +169,8 @@ class Remainder(Derivatives):
             else:
                 excess = asked.excess(lo, hi, inner_lo, inner_hi, items)
             largest = excess.max(axis=1)
-            worst = (largest > 0) & ((largest < _STALLED * before) | np.isinf(before))
+            moving = np.isinf(before) | expansion.model.planar  # planes may need cuts on both sides to come closer
+            worst = (largest > 0) & ((largest < _STALLED * before) | moving)
             if worst.sum() > _MOST * m:
                 worst &= largest > np.partition(largest, -_MOST * m)[-_MOST * m]
             done = ~worst
@@ -177,7 +178,8 @@ class Remainder(Derivatives):
             np.maximum.at(upper, items[done], hi[done])
             if not worst.any():
                 break
-            boxes = boxes[worst].halved(_costliest(expansion, parts, boxes.radius, excess)[worst])
+            whole = np.maximum(asked.inner[1] - asked.inner[0], 1e-300)[items]
+            boxes = boxes[worst].halved(_costliest(expansion, parts, boxes.radius, boxes.radius / whole, excess)[worst])
             before = np.tile(largest[worst], 2)
         # a polytope without any box left is empty: nothing can leave it, and 0 stands for the empty set
         empty = lower > upper
@@ -195,11 +197,17 @@ class Remainder(Derivatives):
         return boxes if asked.only is None else boxes[np.isin(items, asked.only)]
 
 
-def _costliest(expansion: Expansion, parts: Parts, radius: Array, excess: Array) -> Index:
-    """The coordinate of every box whose width costs most in the output that exceeds most."""
+def _costliest(expansion: Expansion, parts: Parts, radius: Array, share: Array, excess: Array) -> Index:
+    """The coordinate of every box whose width costs most in the output that exceeds most.
+
+    What planes leave is owed to no coordinate in particular: it counts for each by its ``share`` of the whole.
+    """
     worst = np.argmax(excess, axis=1)
     number = np.arange(len(radius))
     cost = np.where(np.isfinite(parts.spend[number, worst]), parts.spend[number, worst], 0.0)
+    if expansion.model.planar:
+        gap = (parts.upper - parts.lower)[number, worst]
+        cost += np.where(np.isfinite(gap), gap, 0.0)[:, None] * share / np.maximum(share.sum(axis=1), 1e-300)[:, None]
     for entry, (i, a) in enumerate(expansion.entries):
         linear = (0.25 * np.abs(parts.gradient[:, entry]) + parts.blur[:, entry]) * radius[:, a]
         cost[:, a] += np.where((worst == i) & np.isfinite(linear), linear, 0.0)

@@ -71,6 +71,16 @@ def test_taylor_models_hold_points(activation: str, radius: float) -> None:
             assert abs(first + a * second - value) <= size + 1e-12
 
 
+@pytest.mark.parametrize("activation", sorted(ACTIVATIONS.keys() - KINKED))
+@pytest.mark.parametrize("place", [-1.7, -0.3, 0.4, 2.0])
+def test_expansions_hold_third_derivatives_with_their_sign(activation: str, place: float) -> None:
+    row, step = ACTIVATIONS[activation], 1e-4
+    assert row.expansion is not None
+    *_, third = row.expansion(arb(place), arb(place, 0.01))
+    bends = [float(2 * row.expansion(arb(x), arb(x))[2]) for x in (place - step, place + step)]
+    assert (third + arb(0, 1e-6)).contains(arb((bends[1] - bends[0]) / (2 * step)))
+
+
 def test_second_derivatives_of_kinks_are_undecided_and_third_ones_are_refused() -> None:
     graph, outputs, box = included("relu", 1.0)
     second = graph.derivative(graph.derivative(outputs[0], 0), 1)

@@ -7,8 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import certbound as cb
 from certbound.problem.model import compile_numpy, trace
+from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.remainder.lines import follow_lines
+from certbound.reach.remainder.samples import sampled_range
 from certbound.rigor.intervals import Interval
 from tests.networks import random_network
 
@@ -44,3 +47,22 @@ def test_what_is_undefined_is_unbounded() -> None:
     (line,) = follow_lines(tape, [Interval.point([1.0, 1.0])], {0: np.array([0.5, 2.0])})
     assert np.isfinite(line.rest.lo[0])
     assert np.isinf(line.rest.lo[1])
+
+
+def test_kinks_of_one_coordinate_are_cut_where_the_slope_of_another_changes_most() -> None:
+    """A staircase of 17 kinks in v beside one kink in x: cutting x alone stalled at a sixth of the range too much."""
+    places = np.linspace(-0.4, 0.4, 17)
+    policy = cb.network([
+        {"weights": np.array([[1.0, 0.0], *[[0.0, 1.0]] * 17]), "bias": [-0.2, *-places], "activation": "relu"},
+        {"weights": np.array([[1.0, 3.0, *np.tile([-6.0, 6.0], 8)]])},
+    ])  # fmt: skip
+    system = cb.DiscreteSystem(
+        lambda x: [0.5 * x[0] + 0.1 * x[1], 0.4 * x[1] + policy(x)[0]], states=2, noise=cb.Gaussian(std=0.01)
+    )
+    engine = Linearisation(cb.Problem(system, initial=[0.1, 0.1], safe=[], horizon=1), pieces=1)
+    half, rows = np.full((1, 2), 0.5), np.zeros((1, 0, 2))
+    low, high = sampled_range(engine.model, engine.frame, -half, half, rows)
+    room = 0.05 * (high - low) + 1e-12
+    found = engine.model.bound(engine.frame, -half, half, rows, 1, (low - room, high + room))
+    assert (found[0] >= low - room).all()
+    assert (found[1] <= high + room).all()

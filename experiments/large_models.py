@@ -59,4 +59,4 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
 
 
 if __name__ == "__main__":
-    main("networks", compute)
+    main("large_models", compute)
