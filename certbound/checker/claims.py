@@ -17,7 +17,7 @@ from certbound.checker.constants import check_constants
 from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, number
 from certbound.checker.report import Budget
-from certbound.checker.statement import Model, met_at
+from certbound.checker.statement import Model, jumps_of, met_at, with_time_pieces
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
@@ -121,7 +121,9 @@ def prove(model: Model, proof: object, budget: Budget, *, lower: bool = False) -
     found = arb(0)
     for engine, one, part in _parts(model, proof):
         row = ENGINES[engine]
-        bound = (row.below if lower and row.below is not None else row.prove)(one, part, budget)
+        count, numbers = jumps_of(part)
+        one = one if count is None else with_time_pieces(one, count, budget)
+        bound = (row.below if lower and row.below is not None else row.prove)(one, numbers, budget)
         if not bound.is_finite() or lower:
             return bound
         found = found.max(bound)

@@ -14,6 +14,7 @@ from certbound.safety.answers import EngineAnswer, Proof
 from certbound.safety.certificates import (
     barrier_proof,
     constants_proof,
+    in_time_pieces,
     quadratic_proof,
     response_proof,
     values_proof,
@@ -106,7 +107,7 @@ ENGINES: dict[str, Engine] = {
             when="always; says most where the noise is small against the curvature of the model, and where there are "
             "many states",
             prove=linear_engine,
-            write=response_proof,
+            write=in_time_pieces(response_proof),
             again=True,
             chance=linear_chance,
         ),
@@ -116,7 +117,7 @@ ENGINES: dict[str, Engine] = {
             when="always, but beyond 60 states only while `linear` has not settled the question; takes over where the "
             "noise is too large for a linearisation, and takes constants that you state",
             prove=constants_engine,
-            write=constants_proof,
+            write=in_time_pieces(constants_proof),
             methods=True,
             sketch=True,
             chance=linear_chance,

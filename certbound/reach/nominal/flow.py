@@ -19,6 +19,7 @@ from certbound.constants.enclosures import enclose
 from certbound.problem.goals import check_end
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
+from certbound.problem.time_pieces import in_pieces
 from certbound.reach.nominal.series import expand
 from certbound.rigor.intervals import Interval, stack
 from certbound.rigor.series import Series
@@ -41,6 +42,7 @@ class Flow:
 
     def __post_init__(self) -> None:
         check_end(self.problem, "a noise-free trajectory")
+        object.__setattr__(self, "problem", in_pieces(self.problem))
         object.__setattr__(self, "tape", self.problem.closed_loop)
         object.__setattr__(self, "dimension", self.problem.system.dimension)
 

@@ -10,6 +10,8 @@ from typing import Any
 from certbound.arrays import Array
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside
+from certbound.problem.time_pieces import in_pieces
+from certbound.safety.answers import EngineAnswer, Proof
 
 
 def separations(problem: Problem, stated: Callable[[int, Inside], Any]) -> list[Any]:
@@ -25,3 +27,14 @@ def packed(numbers: Array) -> str:
     """Numbers as exact hexadecimal notation, compressed and in base 64."""
     words = " ".join(value.hex() for value in numbers.ravel().tolist())
     return base64.b64encode(zlib.compress(words.encode("ascii"), 9)).decode("ascii")
+
+
+def in_time_pieces(write: Callable[[Problem, EngineAnswer, int], Proof]) -> Callable[[Problem, EngineAnswer, int], Proof]:
+    """A writer for a model that jumps at known times: ``jumps`` is the number of pieces that end there."""
+
+    def written(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
+        pieces = in_pieces(problem)
+        proof, log10, assumptions = write(pieces, answer, attempt)
+        return (proof if pieces is problem else proof | {"jumps": len(pieces.plan)}), log10, assumptions
+
+    return written
