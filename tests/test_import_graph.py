@@ -31,6 +31,7 @@ problem.adapters problem.networks
 problem.systems
 problem.ingredients
 problem.problem
+problem.jumps_as_plan
 problem problem.library
 problem.export problem.files
 gaussian.scalar
@@ -83,7 +84,7 @@ CHECKER_ORDER = """
 report reading words
 balls expressions
 statement
-constants linear barrier values
+constants linear barrier values time_pieces
 claims
 check
 """

@@ -17,7 +17,8 @@ from certbound.checker.constants import check_constants
 from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, number
 from certbound.checker.report import Budget
-from certbound.checker.statement import Model, jumps_of, met_at, with_time_pieces
+from certbound.checker.statement import Model, met_at
+from certbound.checker.time_pieces import jumps_of, with_time_pieces
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape

@@ -8,8 +8,8 @@ import numpy as np
 
 from certbound.constants.bounds import bound_constants
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, contained
+from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
-from certbound.problem.time_pieces import in_pieces
 from certbound.reach.contraction import (
     contraction_tube,
     local_contraction_tube,

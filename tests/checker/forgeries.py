@@ -131,6 +131,11 @@ def _rising() -> Data:
     }  # fmt: skip
 
 
+def _switched() -> cb.Problem:
+    system = cb.ContinuousSystem(lambda t, x: [-x[0] + np.where(t < 1, 0.2, -0.2)], states=["x"], diffusion=0.1)
+    return cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=2)
+
+
 def _stated(build: Callable[[], cb.Problem], method: str) -> Callable[[], str]:
     def text() -> str:
         problem = build()
@@ -168,6 +173,7 @@ _BASES: dict[str, Callable[[], str]] = {
     "still": _stated(_still, "constants"),
     "random": _stated(_random, "constants"),
     "bounded": _stated(_bounded, "constants"),
+    "switched": _stated(_switched, "linear"),
     "planned": _stated(_planned, "constants"),
     "rising": lambda: json.dumps(_rising()),
     "valued": _sharp(_stated(conftest.valued, "values")),
@@ -268,6 +274,13 @@ def _(data: Data) -> None:
 @forges("every jump is decided", "straight", "linear/proof.py", "_Cell._check_remainder", "may jump with x")
 def _(data: Data) -> None:
     jumping(data, "sign", 1, 0.2)
+
+
+@forges("a jump in time lies between two pieces", "switched", "time_pieces.py", "_step", "decides no jump")
+def _(data: Data) -> None:
+    constants = [node for node in data["problem"]["dynamics"]["nodes"] if node == ["const", exact(1.0)]]
+    for node in constants:
+        node[1] = exact(0.75)
 
 
 @forges("a constant derivative is defined", "straight", "statement/structure.py", "_values", "is not defined")

@@ -8,14 +8,12 @@ from certbound.checker.statement.problem import Model, met_at, read_model
 from certbound.checker.statement.rooms import Grid, demands, round_demands
 from certbound.checker.statement.safe_set import SafeSet, StepSet
 from certbound.checker.statement.structure import Structure, structure_of
-from certbound.checker.statement.time_pieces import jumps_of, with_time_pieces
 
 __all__ = [
     "cells_of",
     "demands",
     "first_difference",
     "Grid",
-    "jumps_of",
     "met_at",
     "Model",
     "read_model",
@@ -25,5 +23,4 @@ __all__ = [
     "StepSet",
     "Structure",
     "structure_of",
-    "with_time_pieces",
 ]

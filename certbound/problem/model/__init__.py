@@ -36,7 +36,7 @@ if TYPE_CHECKING:
         undefined_where,
     )
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
-    from certbound.problem.model.time_jumps import TimeJumps, cut_at_jumps
+    from certbound.problem.model.time_jumps import cut_at_jumps
     from certbound.problem.model.tracing import trace
 
 _HOME = {
@@ -49,7 +49,7 @@ _HOME = {
     "network_data": "PARTS Layer Network Part",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
-    "time_jumps": "TimeJumps cut_at_jumps",
+    "time_jumps": "cut_at_jumps",
     "tracing": "trace",
 }
 
@@ -83,7 +83,6 @@ __all__ = [
     "sources",
     "substitute",
     "Tape",
-    "TimeJumps",
     "trace",
     "undefined_where",
     "varying_outputs",

@@ -9,6 +9,7 @@ A time is read as the decimal number that it is written as (the shortest one tha
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,10 +21,12 @@ from certbound.problem.model.tape import JUMPS, Node, Tape
 
 _MOST_JUMPS = 500
 _MOST_PIECES = 1000
-_KEPT = frozenset(["if_else_zero"])  # decided once its condition is
+_CHOICE = "if_else_zero"
+_TRUTHS = JUMPS - {_CHOICE, "sign", "floor"}  # 0 or 1
 
 Line = tuple[Fraction, Fraction]
 """Slope and offset of a function of t that is a straight line on a piece."""
+_NOTHING: Line = (Fraction(0), Fraction(0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -104,7 +107,7 @@ def _jumps_within(tape: Tape, own: Sequence[int], first: Fraction, last: Fractio
 def _compared(node: Node, lines: Mapping[int, Line | None]) -> Line:
     """What a jump compares with 0 (``floor``: with whole numbers)."""
     given = [line for line in (lines[arg] for arg in node.args) if line is not None]
-    if len(given) == 1 or node.op in ("and", "or", "if_else_zero"):
+    if len(given) == 1 or node.op in ("and", "or", _CHOICE):
         return given[0]
     return given[0][0] - given[1][0], given[0][1] - given[1][1]
 
@@ -134,10 +137,10 @@ def _line(node: Node, lines: Mapping[int, Line | None], middle: Fraction) -> Lin
     if len(given) != len(node.args) or node.part is not None:
         return None
     if node.op in ("and", "or", "not"):
-        holds = [line != (0, 0) for line in given]
+        holds = [line != _NOTHING for line in given]
         return Fraction(0), Fraction({"and": all(holds), "or": any(holds), "not": not holds[0]}[node.op])
-    if node.op == "if_else_zero":
-        return given[1] if given[0] != (0, 0) else (Fraction(0), Fraction(0))
+    if node.op == _CHOICE:
+        return given[1] if given[0] != _NOTHING else _NOTHING
     if node.op in JUMPS:
         slope, offset = _compared(node, lines)
         return Fraction(0), _jumped(node.op, slope * middle + offset)
@@ -171,14 +174,14 @@ def _sum(op: str, given: Sequence[Line]) -> Line | None:
 def _values(tape: Tape, own: Sequence[int], breaks: Sequence[Fraction]) -> dict[int, list[float]]:
     """The value of every jump of ``own`` on every piece, of those that are known on all of them."""
     pieces: list[dict[int, Line | None]] = []
-    for first, last in zip(breaks, breaks[1:]):
+    for first, last in itertools.pairwise(breaks):
         lines: dict[int, Line | None] = {}
         for index in own:
             lines[index] = _line(tape.nodes[index], lines, (first + last) / 2)
         pieces.append(lines)
-    jumps = [index for index in own if tape.nodes[index].op in JUMPS - _KEPT]
+    jumps = [index for index in own if tape.nodes[index].op in JUMPS - {_CHOICE}]
     known = [index for index in jumps if all(lines[index] is not None for lines in pieces)]
-    return {index: [float((lines[index] or (0, 0))[1]) for lines in pieces] for index in known}
+    return {index: [float((lines[index] or _NOTHING)[1]) for lines in pieces] for index in known}
 
 
 def _frontier(tape: Tape, values: Mapping[int, Sequence[float]]) -> list[int]:
@@ -191,7 +194,10 @@ def _frontier(tape: Tape, values: Mapping[int, Sequence[float]]) -> list[int]:
 
 
 def _with_inputs(tape: Tape, states: int, values: Mapping[int, Sequence[float]]) -> TimeJumps | None:
-    """The tape with inputs for those of the values that change, and constants for the others."""
+    """The tape with inputs for those of the values that change, and constants for the others.
+
+    What is chosen by 0 or 1 is a product from then on: nothing is left that jumps.
+    """
     changing = {index: tuple(row) for index, row in values.items() if len(set(row)) > 1}
     columns = list(dict.fromkeys(changing.values()))
     if not columns:
@@ -211,6 +217,8 @@ def _with_inputs(tape: Tape, states: int, values: Mapping[int, Sequence[float]])
             made.append(graph.input(slot if slot < first else slot + len(names)))
         elif node.op == "const":
             made.append(graph.const(node.value))
+        elif node.op == _CHOICE and node.args[0] in values and tape.nodes[node.args[0]].op in _TRUTHS:
+            made.append(graph.apply("mul", made[node.args[0]], made[node.args[1]]))
         else:
             args = [made[arg] for arg in node.args]
             more = [node.part] if node.part is not None else [node.value] if node.op == "pow" else []

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.problem.goals import check_end
+from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.time_pieces import in_pieces
 from certbound.reach.nominal.series import expand
 from certbound.rigor.intervals import Interval, stack
 from certbound.rigor.series import Series

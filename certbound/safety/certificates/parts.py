@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 from certbound.arrays import Array
+from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside
-from certbound.problem.time_pieces import in_pieces
 from certbound.safety.answers import EngineAnswer, Proof
 
 
@@ -29,7 +29,10 @@ def packed(numbers: Array) -> str:
     return base64.b64encode(zlib.compress(words.encode("ascii"), 9)).decode("ascii")
 
 
-def in_time_pieces(write: Callable[[Problem, EngineAnswer, int], Proof]) -> Callable[[Problem, EngineAnswer, int], Proof]:
+Writer = Callable[[Problem, EngineAnswer, int], Proof]
+
+
+def in_time_pieces(write: Writer) -> Writer:
     """A writer for a model that jumps at known times: ``jumps`` is the number of pieces that end there."""
 
     def written(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:

@@ -28,8 +28,8 @@ from certbound.constants.metrics import bound_metrics
 from certbound.constants.stated import proved_or_stated, refuse_contradiction
 from certbound.display import log10_text, rounded
 from certbound.errors import CertboundError, EnclosureError, InfeasibleError
+from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
-from certbound.problem.time_pieces import in_pieces
 from certbound.reach.contraction import (
     contraction_tube,
     local_constants,

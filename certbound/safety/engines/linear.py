@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
-from certbound.problem.time_pieces import in_pieces
 from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state, linear_answer
 from certbound.reach.remainder import hidden_jump
 from certbound.safety.answers import AS_IT_IS, SPARED, Deviation, EngineAnswer, Request

@@ -13,13 +13,15 @@ from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 
-from certbound.checker.report import Budget
-from certbound.checker.statement.problem import Model
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.statement import Model
 from certbound.errors import CertificateError
 from certbound.problem.model import JUMPS, Node, Tape
 
 MOST_PIECES = 1000
-_ARITY_OF_TRUTH = frozenset(["and", "or", "not", "if_else_zero"])
+_CHOICE = "if_else_zero"
+_OF_TRUTHS = frozenset(["and", "or", "not", _CHOICE])
+_TRUTHS = JUMPS - {_CHOICE, "sign", "floor"}
 
 Ends = tuple[Fraction, Fraction]
 """The values of a straight line at the two ends of a piece."""
@@ -46,7 +48,7 @@ def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
                 found[index].append(float(value[0]) if value is not None and value[0] == value[1] else None)
     values = {
         index: [value for value in row if value is not None]
-        for index, row in found.items() if None not in row and tape.nodes[index].op != "if_else_zero"
+        for index, row in found.items() if None not in row and tape.nodes[index].op != _CHOICE
     }  # fmt: skip
     return _replaced(model, values, count)
 
@@ -72,7 +74,7 @@ def _line(node: Node, lines: Mapping[int, Ends | None], first: Fraction, last: F
     given = [line for line in (lines[arg] for arg in node.args) if line is not None]
     if len(given) < len(node.args) or node.part is not None:
         return None
-    if node.op in _ARITY_OF_TRUTH:
+    if node.op in _OF_TRUTHS:
         return _chosen(node.op, given)
     if node.op in JUMPS:
         return _step(node.op, given)
@@ -95,10 +97,10 @@ def _flat(line: Ends) -> bool:
 
 def _chosen(op: str, given: Sequence[Ends]) -> Ends | None:
     """Truths, and what is chosen by one; conditions have to be constant."""
-    if not all(_flat(line) for line in (given[:1] if op == "if_else_zero" else given)):
+    if not all(_flat(line) for line in (given[:1] if op == _CHOICE else given)):
         return None
     holds = [line[0] != 0 for line in given]
-    if op == "if_else_zero":
+    if op == _CHOICE:
         return given[1] if holds[0] else (Fraction(0), Fraction(0))
     truth = Fraction({"and": all(holds), "or": any(holds), "not": not holds[0]}[op])
     return truth, truth
@@ -125,7 +127,7 @@ def _replaced(model: Model, values: Mapping[int, Sequence[float]], count: int) -
     tape, first = model.dynamics, 1 + model.dimension
     rows = list(dict.fromkeys(tuple(row) for row in values.values() if len(set(row)) > 1))
     if not rows:
-        raise CertificateError("`proof.jumps` must be left out: time alone decides no jump of the dynamics.")
+        raise Unproved(f"time alone decides no jump of the dynamics at the ends of {count} pieces")
     nodes = []
     for index, node in enumerate(tape.nodes):
         row = tuple(values.get(index, ()))
@@ -133,6 +135,8 @@ def _replaced(model: Model, values: Mapping[int, Sequence[float]], count: int) -
             nodes.append(Node("input", (first + rows.index(row),)))
         elif row:
             nodes.append(Node("const", (), row[0]))
+        elif node.op == _CHOICE and node.args[0] in values and tape.nodes[node.args[0]].op in _TRUTHS:
+            nodes.append(Node("mul", node.args))  # by 0 or 1
         elif node.op == "input" and node.args[0] >= first:
             nodes.append(Node("input", (node.args[0] + len(rows),)))
         else:
