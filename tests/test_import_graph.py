@@ -115,7 +115,7 @@ MANY_DOORS = {
     "values.continuous": (8, "bounds and charts, and the surfaces that certificates state, with what they were paid"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
-    "problem.model": (33, "the one description of functions, which every room reads, differentiates and evaluates"),
+    "problem.model": (34, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),
     "reach.linear": (16, "certificates state the records of the search: its linearisation, shares, levels, references"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),

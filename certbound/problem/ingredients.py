@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.checks import number, positive_definite, vector
+from certbound.checks import nearest, number, positive_definite, vector
+from certbound.problem.random_constants import Random
 from certbound.problem.sets import Box, GaussianStart, Region, StartUnion
 
 
@@ -82,3 +83,25 @@ def checked_weight(name: str, value: Any, size: int, *, strict: bool) -> Array:
     """A matrix of weights, or a diagonal as one."""
     matrix = np.diag(vector(name, value, size)) if np.ndim(value) == 1 else value
     return positive_definite(name, matrix, size, strict=strict)
+
+
+def checked_unknown(value: Any, known: Sequence[str]) -> tuple[str, ...]:
+    """Names of disturbances."""
+    found = (value,) if isinstance(value, str) else tuple(value)
+    for name in found:
+        if name not in known:
+            raise ValueError(f"`unknown` must name disturbances of the system, got {name!r}{nearest(str(name), known)}")
+    return found
+
+
+def checked_random(value: Any, known: Sequence[str], unknown: Sequence[str]) -> dict[str, Random]:
+    """Constants that are drawn, by the names of their disturbances."""
+    found: dict[str, Random] = dict(value or {})
+    for name, constant in found.items():
+        if name not in known:
+            raise ValueError(f"`random` must name disturbances of the system, got {name!r}{nearest(str(name), known)}")
+        if name in unknown:
+            raise ValueError(f"`random` must not name {name!r}, which is unknown; it is one or the other.")
+        if not isinstance(constant, Random):
+            raise TypeError(f"`random[{name!r}]` must be cb.Random(law=..., mean=...), got {constant!r}.")
+    return found

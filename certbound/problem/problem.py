@@ -14,7 +14,15 @@ from certbound.arrays import Array
 from certbound.checks import assign, frozen, nearest
 from certbound.display import Shown, ask_later_room, name_text
 from certbound.errors import InfeasibleError
-from certbound.problem.ingredients import check_dimension, checked_delta, checked_horizon, checked_start, checked_weight
+from certbound.problem.ingredients import (
+    check_dimension,
+    checked_delta,
+    checked_horizon,
+    checked_random,
+    checked_start,
+    checked_unknown,
+    checked_weight,
+)
 from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.sets import (
     Box,
@@ -54,6 +62,9 @@ class Problem(Shown):
         A target: then a path fails if it breaks a constraint before it has entered the target, or never enters it.
     unknown : sequence of str, optional
         Names of disturbances that are constants: unknown, but the same at all times.
+    random : mapping of str to Random, optional
+        Disturbances that are constants drawn once, independent of each other and of the noise. What is drawn outside
+        of the disturbance's box counts as failing.
     plan : array_like of shape (K, m), function u(t, x), or Tape, optional
         Inputs: one row a step (DT; rows beyond the horizon are ignored), constant on K equal pieces of the
         horizon (CT), or a feedback law. A system with inputs may go without, for synthesis.
@@ -94,6 +105,7 @@ class Problem(Shown):
     delta: Any = field(default=1e-3, kw_only=True)
     reach: Any = field(default=None, kw_only=True)
     unknown: Any = field(default=(), kw_only=True)
+    random: Any = field(default=None, kw_only=True)
     plan: Any = field(default=None, kw_only=True)
     cost: Any = field(default=None, kw_only=True)
     domain: Any = field(default=None, kw_only=True)
@@ -115,7 +127,8 @@ class Problem(Shown):
         assign(self, domain=self._domain())
         assign(self, reach=self._target())
         assign(self, initial=checked_start(self.initial, self.system.dimension))
-        assign(self, parameters=dict(self.parameters or {}), unknown=self._constants())
+        assign(self, parameters=dict(self.parameters or {}), unknown=checked_unknown(self.unknown, self.system.disturbance_names))
+        assign(self, random=checked_random(self.random, self.system.disturbance_names, self.unknown))
         assign(self, plan=self._checked_plan())
         assign(self, cost=self._cost())
         for member in self.starts:
@@ -132,8 +145,14 @@ class Problem(Shown):
         Raises
         ------
         InfeasibleError
-            If the problem has a target: these constraints do not say what failing is then (``kept`` has them).
+            If the problem has a target: these constraints do not say what failing is then (``kept`` has them); or
+            constants that are drawn, over which only ``verify_safety`` and simulations average.
         """
+        if self.random:
+            raise InfeasibleError(
+                f"the problem has constants that are drawn ({', '.join(self.random)}), over which this cannot average; "
+                "give them values, make them unknown, or use verify_safety or simulate_exits."
+            )
         if self.reach is not None:
             raise InfeasibleError(
                 f"the problem has a target ('{self.reach.label}'), and this serves constraints only; leave `reach` "
@@ -285,14 +304,6 @@ class Problem(Shown):
             )
         if self.system.time == "discrete" and any(end != int(end) for end in window):
             raise ValueError(f"`{name}` must have whole steps in `during`, got {list(window)}; round them.")
-
-    def _constants(self) -> tuple[str, ...]:
-        names = (self.unknown,) if isinstance(self.unknown, str) else tuple(self.unknown)
-        for name in names:
-            if name not in self.system.disturbance_names:
-                known = nearest(str(name), self.system.disturbance_names)
-                raise ValueError(f"`unknown` must name disturbances of the system, got {name!r}{known}")
-        return names
 
     def _target(self) -> Reach | None:
         target: Any = Reach(self.reach) if isinstance(self.reach, Region) else self.reach

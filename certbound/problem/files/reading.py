@@ -14,6 +14,7 @@ from certbound.checks import names as checked_names
 from certbound.checks import nearest
 from certbound.problem import sets
 from certbound.problem.files.parser import RESERVED, constant, parse
+from certbound.problem.files.constants_drawn import read_random
 from certbound.problem.files.plans import read_plan
 from certbound.problem.files.schema import Constraint, Cost, Part, PolygonTable, Specification, Start
 from certbound.problem.model import Graph, Tape, sources
@@ -21,6 +22,9 @@ from certbound.problem.networks import network
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
+
+
+_OUTSIDE = 1e-3  # of delta
 
 
 class _ForbiddenError(ValueError):
@@ -42,7 +46,7 @@ class _Reader:
         self.states = checked_names("states", spec.states, RESERVED)
         self.inputs = checked_names("inputs", list(spec.inputs), {*RESERVED, *self.states})
         taken = {*RESERVED, *self.states, *self.inputs}
-        self.disturbances = checked_names("disturbances", [*spec.disturbances, *spec.uncertain], taken)
+        self.disturbances = checked_names("disturbances", [*spec.disturbances, *spec.uncertain, *spec.random], taken)
         taken |= set(self.disturbances)
         self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
         self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
@@ -51,6 +55,8 @@ class _Reader:
         paths = {name: self.file(value, f"networks.{name}") for name, value in spec.networks.items()}
         self.networks = {name: network(path, name=name).data for name, path in paths.items()}
         checked_names("definitions", list(spec.definitions), taken | set(self.networks))
+
+        self.random = {name: read_random(table, self.array, f"random.{name}") for name, table in spec.random.items()}
 
     def problem(self, source: Mapping[str, Any] | None) -> Problem:
         spec = self.spec
@@ -61,7 +67,7 @@ class _Reader:
         return Problem(
             system,
             initial=self.starts(spec.initial),
-            safe=safe, unknown=list(spec.uncertain),
+            safe=safe, unknown=list(spec.uncertain), random=self.random,
             reach=targets[0] if targets else None,
             horizon=self.number(spec.horizon, "horizon"),
             delta=self.number(spec.delta, "delta"),
@@ -149,7 +155,7 @@ class _Reader:
         options: dict[str, Any] = {
             "states": self.states,
             "inputs": self.signal(spec.inputs, "inputs"),
-            "disturbance": self.signal({**spec.disturbances, **spec.uncertain}, "disturbances"),
+            "disturbance": self.signal(self.bounds(), "disturbances"),
             "input_names": self.inputs or None,
             "disturbance_names": self.disturbances or None,
         }
@@ -171,6 +177,12 @@ class _Reader:
         texts = [spec.dynamics[name] for name in self.states]
         tape = self.function(texts, inputs, where, (len(self.states),))
         return (ContinuousSystem if spec.time == "continuous" else DiscreteSystem)(tape, **options)
+
+    def bounds(self) -> dict[str, list[Any]]:
+        """Ends of the disturbances; of what is drawn, ends that leave next to nothing outside."""
+        tail = _OUTSIDE * self.number(self.spec.delta, "delta")
+        drawn = {name: list(law.ends(tail)) for name, law in self.random.items()}
+        return {**self.spec.disturbances, **self.spec.uncertain, **drawn}
 
     def signal(self, table: Mapping[str, list[Any]], where: str) -> sets.Box | None:
         if not table:

@@ -42,6 +42,8 @@ class Flow:
 
     def __post_init__(self) -> None:
         check_end(self.problem, "a noise-free trajectory")
+        if self.problem.random:
+            _ = self.problem.constraints  # which refuses them
         object.__setattr__(self, "problem", in_pieces(self.problem))
         object.__setattr__(self, "tape", self.problem.closed_loop)
         object.__setattr__(self, "dimension", self.problem.system.dimension)
