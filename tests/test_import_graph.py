@@ -29,6 +29,7 @@ problem.sets problem.noise
 problem.table_laws
 problem.adapters problem.networks
 problem.systems
+problem.random_constants
 problem.ingredients
 problem.problem
 problem.jumps_as_plan
@@ -65,7 +66,7 @@ safety.certificates
 safety.portfolio
 safety.certificate
 safety.verdict
-safety.members safety.misses
+safety.members safety.misses safety.averages
 safety.decision
 safety
 safety.sweeps
@@ -123,7 +124,7 @@ MANY_DOORS = {
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
     "problem.sets": (18, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
-    "checker.statement": (13, "what a certificate states is read once and asked by five proofs"),
+    "checker.statement": (14, "what a certificate states is read once and asked by five proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
     "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),

@@ -30,6 +30,8 @@ def problem_section(problem: Problem) -> str:
     rows += [("parameters", _list(content["parameters"]))] if content.get("parameters") else []
     for key, word in (("inputs", "inputs"), ("disturbances", "disturbances"), ("uncertain", "unknown constants")):
         rows += [(word, _signals(content[key]))] if content.get(key) else []
+    rows += [("drawn constants", ", ".join(f"{name} = {law.describe()}" for name, law in problem.random.items()))] \
+        if problem.random else []
     rows.append(("noise", Markup("<br>".join(_noise(content.get("noise", {}), unit)))))
     starts = content.get("initial", {})
     for start in starts if isinstance(starts, list) else [starts]:

@@ -127,8 +127,9 @@ class Problem(Shown):
         assign(self, domain=self._domain())
         assign(self, reach=self._target())
         assign(self, initial=checked_start(self.initial, self.system.dimension))
-        assign(self, parameters=dict(self.parameters or {}), unknown=checked_unknown(self.unknown, self.system.disturbance_names))
-        assign(self, random=checked_random(self.random, self.system.disturbance_names, self.unknown))
+        constants = self.system.disturbance_names
+        assign(self, parameters=dict(self.parameters or {}), unknown=checked_unknown(self.unknown, constants))
+        assign(self, random=checked_random(self.random, constants, self.unknown))
         assign(self, plan=self._checked_plan())
         assign(self, cost=self._cost())
         for member in self.starts:
@@ -145,14 +146,12 @@ class Problem(Shown):
         Raises
         ------
         InfeasibleError
-            If the problem has a target: these constraints do not say what failing is then (``kept`` has them); or
+            If the problem has a target (these constraints do not say what failing is then, ``kept`` has them), or
             constants that are drawn, over which only ``verify_safety`` and simulations average.
         """
         if self.random:
-            raise InfeasibleError(
-                f"the problem has constants that are drawn ({', '.join(self.random)}), over which this cannot average; "
-                "give them values, make them unknown, or use verify_safety or simulate_exits."
-            )
+            what = f"the problem has constants that are drawn ({', '.join(self.random)})"
+            raise InfeasibleError(f"{what}; only verify_safety and simulate_exits average over them: give them values.")
         if self.reach is not None:
             raise InfeasibleError(
                 f"the problem has a target ('{self.reach.label}'), and this serves constraints only; leave `reach` "
@@ -234,6 +233,7 @@ class Problem(Shown):
         signals = {"states": self.system.states, "inputs": self.system.input_names}
         signals["disturbances"] = self.system.disturbance_names
         found = [(name, ", ".join(values)) for name, values in signals.items() if values]
+        found += [("drawn", f"{name} = {law.describe()}") for name, law in self.random.items()]
         starts = ["a point" if start.is_point else type(start).__name__ for start in self.starts]
         found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))
         found += [("constraint", constraint.label) for constraint in self.kept]

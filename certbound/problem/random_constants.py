@@ -62,16 +62,19 @@ class Random:
         find = _ATOMS.get(self.law.name)
         return None if find is None else [(self.mean + float(value), p) for value, p in find(self.law)]
 
-    def probability(self, low: float, high: float) -> tuple[float, float]:
-        """A lower and an upper bound of P(low <= constant <= high)."""
-        atoms = self.atoms
+    def weight(self, low: float, high: float) -> arb:
+        """P(low <= constant <= high) as a ball."""
+        atoms, shift = self.atoms, Fraction(self.mean)
         with precision():
             if atoms is not None:
-                found = _ball(sum((p for value, p in atoms if low <= value <= high), Fraction(0)))
-                return max(lower(found), 0.0), min(max(upper(found), 0.0), 1.0)
+                return _ball(sum((p for value, p in atoms if low <= value <= high), Fraction(0)))
             below = _DENSE[self.law.name]
-            shift = Fraction(self.mean)
-            value = below(self.law, Fraction(high) - shift) - below(self.law, Fraction(low) - shift)
+            return below(self.law, Fraction(high) - shift) - below(self.law, Fraction(low) - shift)
+
+    def probability(self, low: float, high: float) -> tuple[float, float]:
+        """A lower and an upper bound of P(low <= constant <= high)."""
+        with precision():
+            value = self.weight(low, high)
             return max(lower(value), 0.0), min(max(upper(value), 0.0), 1.0)
 
     def outside(self, low: float, high: float) -> float:
@@ -115,6 +118,11 @@ class Random:
             weights = np.array([float(weight) for _, weight in atoms])
             return rng.choice([value for value, _ in atoms], size, p=weights / weights.sum())
         return np.asarray(self.mean + self.law.sample(rng, size)[:, 0])
+
+    def describe(self) -> str:
+        """The law in words, such as ``0.4 + gaussian (std 0.02)``."""
+        level = self.data()[self.law.level]
+        return f"{self.mean:g} + {self.law.name} ({self.law.level} {level:g})"
 
     def data(self) -> dict[str, Any]:
         """Its table in a problem file."""

@@ -15,6 +15,7 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from flint import arb
 
 from certbound.arrays import Array
 from certbound.checks import assign
@@ -29,9 +30,17 @@ _SHARE, _SECONDS = 0.15, 10.0  # of the time that is left, for one of them, and 
 _FAIR = 0.5  # of delta, in proportion to the weights; the rest in equal parts to so many cells
 _PARTS = 20
 _NEAR = (-3.0, -1.5, 0.0, 1.5, 3.0)  # in units of the scale
+_GAIN, _HALF = 0.9, 0.5  # of the bound of the cell that it was cut from, where that says something
 _LARGEST = 0.3  # delta of a cell, where the whole problem's is not larger
 _ENOUGH = 0.02  # of delta: cells whose values are rarer in sum are not asked
 _UP, _DOWN, _TINY = 1 + 1e-12, 1 - 1e-12, 1e-300
+
+
+def bounds_of(problem: Problem) -> Box:
+    """The box of the disturbances, which a problem with drawn constants has."""
+    box = problem.system.disturbance
+    assert box is not None
+    return box
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -47,6 +56,7 @@ class Cell:
     high: Array
     verdict: Verdict | None = None
     asked: bool = False
+    gained: bool = True  # whether its bound is better than that of the cell it was cut from
 
     @cached_property
     def weights(self) -> tuple[float, float]:
@@ -58,10 +68,19 @@ class Cell:
         return least, min(most, 1.0)
 
     @property
+    def weight(self) -> arb:
+        """The probability that all constants lie here, as a ball."""
+        found = arb(1)
+        for law, low, high in zip(self.problem.random.values(), self.low.tolist(), self.high.tolist()):
+            found *= law.weight(low, high)
+        return found
+
+    @property
     def plain(self) -> Problem:
         """The problem with these values as unknown constants; as plain constants where each is one number."""
         system, names = self.problem.system, list(self.problem.random)
-        low, high = np.array(system.disturbance.low), np.array(system.disturbance.high)
+        box = bounds_of(self.problem)
+        low, high = np.array(box.low), np.array(box.high)
         places = [system.disturbance_names.index(name) for name in names]
         low[places], high[places] = self.low, self.high
         moving = [name for name, a, b in zip(names, self.low, self.high) if a < b]
@@ -106,7 +125,7 @@ class Cell:
     @classmethod
     def of(cls, problem: Problem) -> Cell:
         """All values of the disturbances' box."""
-        names, box = problem.system.disturbance_names, problem.system.disturbance
+        names, box = problem.system.disturbance_names, bounds_of(problem)
         places = [names.index(name) for name in problem.random]
         ends = [law.hull(float(box.low[k]), float(box.high[k])) for k, law in zip(places, problem.random.values())]
         low, high = np.array(ends).T
@@ -153,17 +172,20 @@ def _asked(cell: Cell, watch: Watch, decided: Callable[[Problem], Verdict]) -> C
     watch.log10_delta, watch.log10_lower = 0.0, None  # what is told is about this cell
     with watch.share(_SHARE, _SECONDS):
         found = decided(cell.plain)
-    if cell.verdict is not None and found.log10_delta > cell.verdict.log10_delta:
-        found = replace(found, log10_delta=cell.verdict.log10_delta)
-    return replace(cell, verdict=found, asked=True)
+    before = 0.0 if cell.verdict is None else cell.verdict.log10_delta
+    gained = before > math.log10(_HALF) or found.log10_delta < before + math.log10(_GAIN)
+    if found.log10_delta > before:
+        found = replace(found, log10_delta=before)
+    return replace(cell, verdict=found, asked=True, gained=gained)
 
 
 def _refined(cells: Sequence[Cell], watch: Watch, decided: Callable[[Problem], Verdict]) -> list[Cell]:
     """The cells with the one that weighs most in halves, which are asked where they can matter."""
-    able = [cell for cell in cells if np.any(cell.low < cell.high)]
-    worst = max(able, key=lambda cell: cell.most)
+    worst = max(filter(_open, cells), key=lambda cell: cell.most)
     rest = [cell for cell in cells if cell is not worst]
-    return [*rest, *(_asked(half, watch, decided) for half in worst.halves())]
+    halves = [_asked(half, watch, decided) for half in worst.halves()]
+    gained = any(half.gained for half in halves)  # the worst value of all may lie in one of them
+    return [*rest, *(replace(half, gained=gained) for half in halves)]
 
 
 def _ends(problem: Problem, cells: Sequence[Cell]) -> tuple[float, float]:
@@ -174,7 +196,7 @@ def _ends(problem: Problem, cells: Sequence[Cell]) -> tuple[float, float]:
 
 def _outside(problem: Problem) -> float:
     """What is drawn outside of the disturbances' box, which no cell holds."""
-    names, box = problem.system.disturbance_names, problem.system.disturbance
+    names, box = problem.system.disturbance_names, bounds_of(problem)
     ends = [(law, names.index(name)) for name, law in problem.random.items()]
     return math.fsum(law.outside(float(box.low[k]), float(box.high[k])) for law, k in ends) * _UP
 
@@ -183,7 +205,12 @@ def _settled(problem: Problem, cells: Sequence[Cell]) -> bool:
     """Whether the bounds decide, or no cell can be cut any more."""
     least, most = _ends(problem, cells)
     decided = most <= problem.delta * _DOWN or least > problem.delta * _UP
-    return decided or not any(np.any(cell.low < cell.high) for cell in cells)
+    return decided or not any(map(_open, cells))
+
+
+def _open(cell: Cell) -> bool:
+    """Whether halves of a cell may be better than the whole."""
+    return cell.gained and bool(np.any(cell.low < cell.high))
 
 
 def _verdict(problem: Problem, cells: Sequence[Cell]) -> Verdict:

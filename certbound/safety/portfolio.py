@@ -14,7 +14,6 @@ from certbound.safety.answers import EngineAnswer, Proof
 from certbound.safety.certificates import (
     barrier_proof,
     constants_proof,
-    in_time_pieces,
     quadratic_proof,
     response_proof,
     values_proof,
@@ -107,7 +106,7 @@ ENGINES: dict[str, Engine] = {
             when="always; says most where the noise is small against the curvature of the model, and where there are "
             "many states",
             prove=linear_engine,
-            write=in_time_pieces(response_proof),
+            write=response_proof,
             again=True,
             chance=linear_chance,
         ),
@@ -117,7 +116,7 @@ ENGINES: dict[str, Engine] = {
             when="always, but beyond 60 states only while `linear` has not settled the question; takes over where the "
             "noise is too large for a linearisation, and takes constants that you state",
             prove=constants_engine,
-            write=in_time_pieces(constants_proof),
+            write=constants_proof,
             methods=True,
             sketch=True,
             chance=linear_chance,

@@ -62,10 +62,10 @@ class Verdict(Shown):
         The time that every engine took, by its name.
     members : tuple of Verdict
         Where the start is a union, the verdict on every member; this one is the worst of them.
-    cells : tuple of Cell
-        Where constants are drawn, the cells of their values over which the bounds were averaged.
     reserves : dict
         What engines answered that only a certificate had to ask, by name: kept, so that none is asked twice.
+    cells : tuple of Cell
+        Where constants are drawn, the cells of their values over which the bounds were averaged.
     """
 
     pictured: ClassVar[bool] = True

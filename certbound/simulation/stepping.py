@@ -167,9 +167,9 @@ def _disturbance(
             raise ValueError("`disturbance` must be left out: this system has none.")
         return {}
     moving = choice == "switching" if isinstance(choice, str) else callable(choice) or np.ndim(choice) > 1
-    fixed = [*problem.unknown, *problem.random]
-    if fixed and moving:
-        raise ValueError(f"`disturbance` must be constant: {', '.join(fixed)} is a constant of the problem.")
+    for word, names in (("an unknown", problem.unknown), ("a drawn", problem.random)):
+        if names and moving:
+            raise ValueError(f"`disturbance` must be constant: {', '.join(names)} is {word} constant of the problem.")
     box = system.disturbance
     fields: dict[str, Any] = {"low": np.asarray(box.low), "high": np.asarray(box.high)}
     if isinstance(choice, str):

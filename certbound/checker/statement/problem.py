@@ -10,6 +10,7 @@ from certbound.checker.balls import diagonal, is_positive_definite, matrix
 from certbound.checker.reading import Record, number, text
 from certbound.checker.reading import entries as listed
 from certbound.checker.report import Budget
+from certbound.checker.statement.drawn import Drawn, read_drawn
 from certbound.checker.statement.laws import LAWS, Law
 from certbound.checker.statement.regions import Constraint, read_constraint
 from certbound.checker.statement.tapes import read_tape
@@ -87,6 +88,7 @@ class Model:
     states: tuple[str, ...] = field(default=())
     target: Constraint | None = None  # then a path fails that breaks a constraint before it is there, or never is
     ends: bool = False  # where the domain is left: that is no failure, and counting it as one bounds from above only
+    drawn: tuple[Drawn, ...] = ()  # constants, over whose values the probability is an average
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
     @property
@@ -113,7 +115,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     CertificateError where a field is missing, has the wrong size, or makes no sense; Unproved where it is too large for
     the budget.
     """
-    record = Record(value, path, _FIELDS, ("reach", "leaving"))
+    record = Record(value, path, _FIELDS, ("reach", "leaving", "random"))
     time = record["time"]
     if time not in ("continuous", "discrete"):
         raise CertificateError(f"`{path}.time` must be \"continuous\" or \"discrete\".")
@@ -142,6 +144,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
         ends=record["leaving"] == "ends", plan=_plan(record, len(inputs), continuous, horizon), states=states,
         disturbance=_disturbance(record, len(disturbances)),
+        drawn=read_drawn(record["random"], record.at("random"), disturbances),
         noise=_noise(record["noise"], path + ".noise", states, time, budget),
         initial=initial, members=members, target=_target(record, n, horizon, budget),
         constraints=tuple(constraints), domain=domain,

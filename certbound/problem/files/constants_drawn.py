@@ -37,7 +37,8 @@ def read_random(table: RandomTable, read: Callable[[Any, str], Any], where: str)
                 scale = float(fields.get(kind.levels[0], 1.0))
                 fields[kind.tables[0]], mean = places - own, mean + scale * own
     if not kind.tables and len(fields) != 1:
+        given = ", ".join(fields) or "none"
         raise ValueError(
-            f"`{where}` with law {table.law!r} needs exactly one of {', '.join(kind.levels)}; got {list(fields) or 'none'}."
+            f"`{where}` with law {table.law!r} needs exactly one of {', '.join(kind.levels)}; got {given}."
         )
     return Random(law=kind(**fields), mean=mean)

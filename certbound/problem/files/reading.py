@@ -13,8 +13,8 @@ from certbound.arrays import Array
 from certbound.checks import names as checked_names
 from certbound.checks import nearest
 from certbound.problem import sets
-from certbound.problem.files.parser import RESERVED, constant, parse
 from certbound.problem.files.constants_drawn import read_random
+from certbound.problem.files.parser import RESERVED, constant, parse
 from certbound.problem.files.plans import read_plan
 from certbound.problem.files.schema import Constraint, Cost, Part, PolygonTable, Specification, Start
 from certbound.problem.model import Graph, Tape, sources
@@ -22,7 +22,6 @@ from certbound.problem.networks import network
 from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
-
 
 _OUTSIDE = 1e-3  # of delta
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from certbound.safety.certificates.barrier import barrier_proof
 from certbound.safety.certificates.constants import constants_proof
 from certbound.safety.certificates.diffusion import response_proof
-from certbound.safety.certificates.parts import in_time_pieces
 from certbound.safety.certificates.quadratic import quadratic_proof
 from certbound.safety.certificates.values import values_proof, values_proof_below
 
 __all__ = [
     "barrier_proof",
     "constants_proof",
-    "in_time_pieces",
     "quadratic_proof",
     "response_proof",
     "values_proof",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import zlib
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 from certbound.arrays import Array
@@ -35,6 +36,7 @@ Writer = Callable[[Problem, EngineAnswer, int], Proof]
 def in_time_pieces(write: Writer) -> Writer:
     """A writer for a model that jumps at known times: ``jumps`` is the number of pieces that end there."""
 
+    @wraps(write)
     def written(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
         pieces = in_pieces(problem)
         proof, log10, assumptions = write(pieces, answer, attempt)
