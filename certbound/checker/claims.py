@@ -221,7 +221,6 @@ def claim_below(model: Model, level: float, assumed: Sequence[str]) -> str:
 
 
 def _sentence(model: Model, start: str, bound: str, assumed: Sequence[str]) -> str:
-    unit = "s" if model.continuous else "steps"
     kept = f"breaks one of its {len(model.constraints)} constraints"
     if model.drawn:
         kept += f" ({len(model.drawn)} of its constants being drawn)"
@@ -229,7 +228,7 @@ def _sentence(model: Model, start: str, bound: str, assumed: Sequence[str]) -> s
         kept += f" before it is in its target ({quoted(model.target.label)}), or is not in it"
     words = (
         f"from {start} the problem {quoted(model.name)} {kept} "
-        f"within {plainly(model.horizon)} {unit} with probability {bound} delta = {plainly(model.delta)})"
+        f"within {plainly(model.horizon)} {model.unit} with probability {bound} delta = {plainly(model.delta)})"
     )
     return words + "".join(f"; assuming that {item}" for item in assumed)
 

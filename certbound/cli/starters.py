@@ -223,6 +223,7 @@ time = "continuous"
 horizon = 6
 delta = 1e-3
 states = ["room", "wall"]
+units = { time = "h", room = "K", wall = "K" }   # for humans: texts, axes and tables name them
 
 [definitions]
 heating = "where(t - 2*floor(t/2) < 1.25, 1, 0)"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.checks import assign, frozen, nearest
+from certbound.checks import assign, nearest
 from certbound.display import Shown, ask_later_room, name_text
 from certbound.errors import InfeasibleError
 from certbound.problem.ingredients import (
@@ -19,9 +19,12 @@ from certbound.problem.ingredients import (
     checked_delta,
     checked_horizon,
     checked_random,
+    checked_rows,
     checked_start,
+    checked_units,
     checked_unknown,
     checked_weight,
+    described,
 )
 from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.sets import (
@@ -75,6 +78,8 @@ class Problem(Shown):
     leaving : str
         "unsafe", or "ends": a path that leaves the domain ends there, and does not fail. Value functions in discrete
         time and simulations count that; other bounds, which hold all the same, count it as failing.
+    units : mapping of str to str, optional
+        For humans: the unit of ``time`` and of states, inputs and disturbances, by name.
     name : str
         For humans.
     parameters : mapping, optional
@@ -110,6 +115,7 @@ class Problem(Shown):
     cost: Any = field(default=None, kw_only=True)
     domain: Any = field(default=None, kw_only=True)
     leaving: str = field(default="unsafe", kw_only=True)
+    units: Any = field(default=None, kw_only=True)
     name: str = field(default="problem", kw_only=True)
     parameters: Any = field(default=None, kw_only=True)
     source: Any = field(default=None, kw_only=True, repr=False)
@@ -120,6 +126,7 @@ class Problem(Shown):
             raise TypeError(f"`system` must be a ContinuousSystem or DiscreteSystem, got {self.system!r}.")
         if not isinstance(self.name, str):
             raise TypeError(f"`name` must be text, got {self.name!r}.")
+        assign(self, units=checked_units(self.units, self.system))
         discrete = self.system.time == "discrete"
         assign(self, horizon=checked_horizon(self.horizon, discrete))
         assign(self, delta=checked_delta(self.delta))
@@ -167,8 +174,22 @@ class Problem(Shown):
     @property
     def span(self) -> str:
         """The horizon in words."""
-        unit = "s" if self.system.time == "continuous" else "steps"
-        return "at any time" if self.endless else f"within {self.horizon:g} {unit}"
+        return "at any time" if self.endless else f"within {self.horizon:g} {self.time_unit}"
+
+    @property
+    def time_unit(self) -> str:
+        """The unit of time: ``s`` or ``steps``, unless another one is given."""
+        usual = "s" if self.system.time == "continuous" else "steps"
+        return str(self.units.get("time", usual))
+
+    @property
+    def time_axis(self) -> str:
+        """What stands at an axis of time."""
+        return f"time ({self.time_unit})"
+
+    def axis(self, name: str) -> str:
+        """A state's name with its unit, where it has one."""
+        return f"{name} ({self.units[name]})" if name in self.units else name
 
     @property
     def failing(self) -> str:
@@ -230,14 +251,7 @@ class Problem(Shown):
 
     def rows(self) -> list[tuple[str, str]]:
         """Signals, start and constraints."""
-        signals = {"states": self.system.states, "inputs": self.system.input_names}
-        signals["disturbances"] = self.system.disturbance_names
-        found = [(name, ", ".join(values)) for name, values in signals.items() if values]
-        found += [("drawn", f"{name} = {law.describe()}") for name, law in self.random.items()]
-        starts = ["a point" if start.is_point else type(start).__name__ for start in self.starts]
-        found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))
-        found += [("constraint", constraint.label) for constraint in self.kept]
-        return found if self.reach is None else [*found, ("target", self.reach.label)]
+        return described(self)
 
     def to_dict(self) -> dict[str, Any]:
         """The content of the problem file that ``cb.save`` writes.
@@ -356,30 +370,7 @@ class Problem(Shown):
                     f"got shape {tape.shape} over {tape.inputs}."
                 )
             return tape
-        return self._array_plan(plan, system.inputs, count)
-
-    def _array_plan(self, plan: Any, box: Box, count: int) -> Array:
-        if self.endless:
-            raise ValueError("`plan` must be a feedback law where the horizon is infinite, got an array.")
-        rows = np.asarray(plan, dtype=float)
-        rows = rows[:, None] if rows.ndim == 1 and count == 1 else rows
-        if rows.ndim != 2 or rows.shape[1] != count or not len(rows) or not np.all(np.isfinite(rows)):
-            raise ValueError(f"`plan` must be a finite array (steps, {count}), got shape {rows.shape}.")
-        if self.system.time == "discrete":
-            if len(rows) < self.horizon:
-                raise ValueError(f"`plan` must have {self.horizon} rows, one a step, got {len(rows)}.")
-            rows = rows[: self.horizon]
-        width = box.high - box.low
-        slack = 1e-9 * (np.abs(rows) + np.where(np.isfinite(width), width, 0.0))
-        outside = (rows < box.low - slack) | (rows > box.high + slack)
-        if np.any(outside):
-            row, column = (int(k) for k in np.argwhere(outside)[0])
-            name, value = self.system.input_names[column], rows[row, column]
-            raise ValueError(
-                f"`plan` must stay in the input bounds, got {name} = {value:g} in row {row}, outside "
-                f"[{box.low[column]:g}, {box.high[column]:g}]."
-            )
-        return frozen(np.clip(rows, box.low, box.high))
+        return checked_rows(plan, system, self.horizon)
 
     def _cost(self) -> tuple[Array, Array] | None:
         if self.cost is None:

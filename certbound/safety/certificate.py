@@ -234,6 +234,7 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "noise": _noise(system),
         "initial": initial_data(problem.initial),
         "constraints": [_constraint(constraint) for constraint in problem.safe],
+        **({"units": dict(problem.units)} if problem.units else {}),
         **({"leaving": problem.leaving} if problem.ending else {}),
         "domain": None if problem.domain is None else _ranges(zip(problem.domain.low, problem.domain.high)),
         **({"random": {name: _drawn(one) for name, one in problem.random.items()}} if problem.random else {}),

@@ -80,7 +80,7 @@ class ExitTimes(Shown):
 
     def summary(self) -> str:
         """The end of the curves and the mean, in one line."""
-        unit = "s" if self.problem.system.time == "continuous" else "steps"
+        unit = self.problem.time_unit
         low, high = _ends_text(self.lower[-1], self.upper[-1])
         most = "" if self.mean_upper is None else f" ... {rounded(self.mean_upper, up=True, digits=5)}"
         least = rounded(self.mean_lower, up=False, digits=5)

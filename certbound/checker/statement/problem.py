@@ -87,6 +87,7 @@ class Model:
     domain: list[tuple[float | None, float | None]] | None
     states: tuple[str, ...] = field(default=())
     target: Constraint | None = None  # then a path fails that breaks a constraint before it is there, or never is
+    unit: str = ""  # of time, for humans
     ends: bool = False  # where the domain is left: that is no failure, and counting it as one bounds from above only
     drawn: tuple[Drawn, ...] = ()  # constants, over whose values the probability is an average
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
@@ -115,7 +116,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     CertificateError where a field is missing, has the wrong size, or makes no sense; Unproved where it is too large for
     the budget.
     """
-    record = Record(value, path, _FIELDS, ("reach", "leaving", "random"))
+    record = Record(value, path, _FIELDS, ("reach", "leaving", "random", "units"))
     time = record["time"]
     if time not in ("continuous", "discrete"):
         raise CertificateError(f"`{path}.time` must be \"continuous\" or \"discrete\".")
@@ -144,11 +145,21 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
         ends=record["leaving"] == "ends", plan=_plan(record, len(inputs), continuous, horizon), states=states,
         disturbance=_disturbance(record, len(disturbances)),
+        unit=_unit(record, continuous),
         drawn=read_drawn(record["random"], record.at("random"), disturbances),
         noise=_noise(record["noise"], path + ".noise", states, time, budget),
         initial=initial, members=members, target=_target(record, n, horizon, budget),
         constraints=tuple(constraints), domain=domain,
     )
+
+
+def _unit(record: Record, continuous: bool) -> str:
+    """The unit of time, for the words of the claim; of the others nothing is made."""
+    units = record["units"] or {}
+    if not isinstance(units, dict) or len(units) > MOST_STATES:
+        raise CertificateError(f"`{record.at('units')}` must be texts by names.")
+    own = {name: text(unit, record.at("units"), 20) for name, unit in units.items()}
+    return own.get("time", "s" if continuous else "steps")
 
 
 def _plan(record: Record, inputs: int, continuous: bool, horizon: float) -> list[list[float]] | None:

@@ -186,7 +186,7 @@ def _local(subject: Problem) -> tuple[Constants, str]:
         reach = bound_reach(subject, noise=False)
         odds = "with no room for the noise, for no tube with noise confirmed itself"
     kind = "reach set + tube" if reach.noise else "noise-free reach set"
-    unit = "s" if reach.curve.continuous else "steps"
+    unit = subject.time_unit
     where = f"the {kind}, box by box in time, up to {reach.end:g} {unit}, {odds}"
     if reach.end < horizon:
         where += f"; it ends before {horizon:g} {unit}, where no guess of its size confirmed itself"

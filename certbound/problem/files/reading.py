@@ -74,7 +74,7 @@ class _Reader:
             cost=None if spec.cost is None else self.weights(spec.cost),
             domain=None if spec.domain is None else self.box(spec.domain.box, "domain.box", np.inf),
             leaving="unsafe" if spec.domain is None else spec.domain.leaving,
-            name=spec.name,
+            name=spec.name, units=spec.units,
             parameters=self.parameters,
             source=source,
         )

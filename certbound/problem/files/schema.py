@@ -218,6 +218,7 @@ class Specification(_Table):
     initial: Starts
     name: str = "problem"
     delta: Number = 1e-3
+    units: dict[str, str] = {}
     parameters: dict[str, Annotated[float, BeforeValidator(_no_boolean)]] = {}
     inputs: dict[str, Pair] = {}
     disturbances: dict[str, Pair] = {}

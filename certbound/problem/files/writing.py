@@ -103,6 +103,7 @@ class _Writer:
             "time": system.time,
             "horizon": problem.horizon,
             "delta": problem.delta,
+            "units": dict(problem.units),
             "states": list(self.states),
             "inputs": self.signal(system.inputs, system.input_names),
             "disturbances": {name: ends for name, ends in bounded.items() if not fixed & {name}},
