@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.problem.noise import Triangular as Triangular
     from certbound.problem.noise import Uniform as Uniform
     from certbound.problem.problem import Problem as Problem
+    from certbound.problem.random_constants import Random as Random
     from certbound.problem.sets import Ball as Ball
     from certbound.problem.sets import Box as Box
     from certbound.problem.sets import Ellipsoid as Ellipsoid
@@ -78,6 +79,7 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 _HOME = {
     "problem.systems": "ContinuousSystem DiscreteSystem linear_system from_control",
+    "problem.random_constants": "Random",
     "problem.noise": "Gaussian Uniform Triangular Rademacher Bounded SubGaussian",
     "problem.table_laws": "Discrete Histogram Laplace",
     "problem.sets": "Box Ball Ellipsoid HalfSpace Polytope GaussianStart Inside Outside Reach",

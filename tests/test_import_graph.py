@@ -30,8 +30,10 @@ problem.table_laws
 problem.adapters problem.networks
 problem.signals
 problem.systems
+problem.random_constants
 problem.ingredients
 problem.problem
+problem.jumps_as_plan
 problem problem.library
 problem.export problem.files
 gaussian.scalar
@@ -65,7 +67,7 @@ safety.certificates
 safety.portfolio
 safety.certificate
 safety.verdict
-safety.members safety.misses
+safety.members safety.misses safety.averages
 safety.decision
 safety
 safety.sweeps
@@ -84,7 +86,7 @@ CHECKER_ORDER = """
 report reading words
 balls expressions
 statement
-constants linear barrier values
+constants linear barrier values time_pieces
 claims
 check
 """
@@ -112,10 +114,10 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
-    "values.continuous": (8, "bounds and charts, and the surfaces that certificates state, with what they were paid"),
+    "values.continuous": (9, "bounds and charts, and the surfaces that certificates state, with what they were paid"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
-    "problem.model": (33, "the one description of functions, which every room reads, differentiates and evaluates"),
+    "problem.model": (34, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),
     "reach.linear": (16, "certificates state the records of the search: its linearisation, shares, levels, references"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
@@ -123,7 +125,7 @@ MANY_DOORS = {
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
     "problem.sets": (18, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
-    "checker.statement": (13, "what a certificate states is read once and asked by five proofs"),
+    "checker.statement": (14, "what a certificate states is read once and asked by five proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
     "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),

@@ -17,7 +17,8 @@ from certbound.checker.constants import check_constants
 from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, number
 from certbound.checker.report import Budget
-from certbound.checker.statement import Model, met_at
+from certbound.checker.statement import Model, met_at, weights_of
+from certbound.checker.time_pieces import jumps_of, with_time_pieces
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
@@ -25,11 +26,16 @@ from certbound.problem.model import Tape
 UNION = "union"
 """The engine that a proof names where the start is a union: it has one proof a member."""
 
+RANDOM = "random"
+"""The engine that a proof names where constants are drawn: it has one proof a cell of their values."""
+
 REACH = "reach"
 """The engine that a proof names where the problem has a target: it meets the target at one time."""
 
 STATED = "the stated constants hold"
 """How a certificate's own list names what `assumptions` derives from the proof."""
+
+MOST_CELLS = 200
 
 _ANY = "for every disturbance in its set, even one that sees coming noise"
 _BLIND = "for every disturbance in its set that does not see coming noise"
@@ -65,7 +71,7 @@ class Engine:
 
 def engine_of(proof: object, method: str) -> str:
     """The engine that a proof names, which ``claim.method`` must name too."""
-    engine = _named(proof, "proof", (*ENGINES, UNION, REACH))
+    engine = _named(proof, "proof", (*ENGINES, UNION, RANDOM, REACH))
     if method != engine:
         raise CertificateError(f"`claim.method` must be \"{engine}\", the proof's engine, got {quoted(method)}.")
     return engine
@@ -90,12 +96,34 @@ def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[s
         rows = Record(proof, path, ("engine", "members")).items("members", count, count)
         for index, (member, row) in enumerate(zip(model.members, rows)):
             yield from _parts(replace(model, initial=member, members=()), row, f"{path}.members[{index}]")
+    elif model.drawn:
+        for one, row, place, _ in _cells(model, proof, path):
+            if row is not None:
+                yield from _parts(one, row, place)
     elif model.target is not None:
         _named(proof, path, (REACH,))
         record = Record(proof, path, ("engine", "time", "proof"))
         yield from _parts(met_at(model, record.number("time")), record["proof"], f"{path}.proof")
     else:
         yield _named(proof, path, tuple(ENGINES)), model, proof  # type: ignore[misc]  # a mapping: it names an engine
+
+
+def _cells(
+    model: Model, proof: object, path: str
+) -> Iterator[tuple[Model, object, str, arb]]:
+    """The plain model of every cell of what is drawn, its proof (None: it may fail), where it stands, its weight."""
+    _named(proof, path, (RANDOM,))
+    rows = Record(proof, path, ("engine", "cells")).items("cells", 1, MOST_CELLS)
+    records = [Record(row, f"{path}.cells[{index}]", ("low", "high", "proof")) for index, row in enumerate(rows)]
+    count = len(model.drawn)
+    ranges = [list(zip(record.array("low", count), record.array("high", count))) for record in records]
+    if any(low > high for cell in ranges for low, high in cell):
+        raise CertificateError(f"`{path}.cells` must have ends that rise.")
+    for record, cell, weight in zip(records, ranges, weights_of(model.drawn, ranges)):
+        values = list(model.disturbance)
+        for constant, ends in zip(model.drawn, cell):
+            values[constant.place] = ends
+        yield replace(model, disturbance=values, drawn=()), record["proof"], record.at("proof"), weight
 
 
 def check_side(model: Model, proof: object, lower: bool) -> None:
@@ -107,7 +135,7 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
         raise CertificateError("`claim.log10_lower` must not be there where a path ends as it leaves the domain.")
     if lower and model.unknown:
         raise CertificateError("`claim.log10_lower` must not be there for an unknown constant, which does not react.")
-    if lower and (model.members or model.target is not None):
+    if lower and (model.members or model.drawn or model.target is not None):
         raise CertificateError("`claim.log10_lower` must not be there for a union of starts, or beside a target.")
     for engine, _, part in _parts(model, proof):
         side = part.get("side")
@@ -120,14 +148,28 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
 def prove(model: Model, proof: object, budget: Budget, *, lower: bool = False) -> arb:
     """The probability that a proof bounds, from above or below; where the start is a union, the largest of all."""
     check_side(model, proof, lower)
+    if model.drawn and not model.members:
+        return _average(model, proof, budget)
     found = arb(0)
     for engine, one, part in _parts(model, proof):
         row = ENGINES[engine]
-        bound = (row.below if lower and row.below is not None else row.prove)(one, part, budget)
+        count, numbers = jumps_of(part)
+        one = one if count is None else with_time_pieces(one, count, budget)
+        bound = (row.below if lower and row.below is not None else row.prove)(one, numbers, budget)
         if not bound.is_finite() or lower:
             return bound
         found = found.max(bound)
     return found
+
+
+def _average(model: Model, proof: object, budget: Budget) -> arb:
+    """1 - sum P(cell) (1 - b), b the bound that holds for every value of a cell."""
+    kept = arb(0)
+    for one, row, _, weight in _cells(model, proof, "proof"):
+        if row is not None:
+            bound = prove(one, row, budget)
+            kept += weight * (1 - bound) if bound.is_finite() and bound < 1 else arb(0)
+    return 1 - kept
 
 
 def words_of(model: Model, proof: object) -> str:
@@ -167,7 +209,7 @@ def claim(model: Model, proof: object, level: float, assumed: Sequence[str]) -> 
     start = "a normal start" if model.initial.covariance is not None else "every start in the initial set"
     start += f" (a union of {len(model.members)})" if model.members else ""
     foresees = all(ENGINES[engine].foresees(one) for engine, one, _ in _parts(model, proof))
-    whose = "" if not model.disturbance else f", {_ANY if foresees else _BLIND},"
+    whose = f", {_ANY if foresees else _BLIND}," if len(model.disturbance) > len(model.drawn) else ""
     safe = "at most" if arb(level) <= arb(model.delta).log() / arb(10).log() else "more than"
     return _sentence(model, f"{start}{whose}", f"at most 10^{rounded(level, up=True)} ({safe}", assumed)
 
@@ -181,13 +223,14 @@ def claim_below(model: Model, level: float, assumed: Sequence[str]) -> str:
 
 
 def _sentence(model: Model, start: str, bound: str, assumed: Sequence[str]) -> str:
-    unit = "s" if model.continuous else "steps"
     kept = f"breaks one of its {len(model.constraints)} constraints"
+    if model.drawn:
+        kept += f" ({len(model.drawn)} of its constants being drawn)"
     if model.target is not None:
         kept += f" before it is in its target ({quoted(model.target.label)}), or is not in it"
     words = (
         f"from {start} the problem {quoted(model.name)} {kept} "
-        f"within {plainly(model.horizon)} {unit} with probability {bound} delta = {plainly(model.delta)})"
+        f"within {plainly(model.horizon)} {model.unit} with probability {bound} delta = {plainly(model.delta)})"
     )
     return words + "".join(f"; assuming that {item}" for item in assumed)
 

@@ -188,6 +188,59 @@ box = { x = [1.6, 1.8] }
 box = { x = [0.2, 3] }
 leaving = "ends"           # or "unsafe"
 """,
+    "drawn": """\
+# Constants that are drawn once and then stay, and constants of which only bounds are known.
+name = "NAME"
+time = "discrete"
+horizon = 12
+delta = 0.01
+states = ["level"]
+
+[random]                   # one law a constant: gaussian, uniform, triangular, laplace, discrete, histogram
+leak = { law = "uniform", halfwidth = 0.1, mean = 0.3 }
+load = { law = "discrete", values = [0, 0.2], probabilities = [0.9, 0.1] }
+
+[uncertain]                # anywhere between, the same at all times
+offset = [-0.01, 0.01]
+
+[dynamics]
+level = "(1 - leak)*level + 0.1*load + offset"
+
+[noise]
+law = "gaussian"
+std = 0.1
+
+[initial]
+point = [0]
+
+[[stay]]
+box = { level = [-0.7, 0.7] }
+""",
+    "switching": """\
+# A model that changes at known times: the clock decides, and every change is the end of a piece of time.
+name = "NAME"
+time = "continuous"
+horizon = 6
+delta = 1e-3
+states = ["room", "wall"]
+units = { time = "h", room = "K", wall = "K" }   # for humans: texts, axes and tables name them
+
+[definitions]
+heating = "where(t - 2*floor(t/2) < 1.25, 1, 0)"
+
+[dynamics]
+room = "-0.8*room + 0.5*wall + 0.6*heating - 0.3"
+wall = "-wall + 0.3*tanh(room)"
+
+[noise]
+diffusion = [[0.08, 0], [0, 0.08]]
+
+[initial]
+box = [[-0.05, 0.05], [-0.05, 0.05]]
+
+[[stay]]
+box = { room = [-1.2, 1.2] }
+""",
     "staying": """\
 # A target that is not left again: from the first entry on the state stays in it, until the horizon.
 name = "NAME"

@@ -76,7 +76,7 @@ def _plan_legend(scene: Scene) -> list[Entry]:
 
 
 def _unit(scene: Scene) -> str:
-    return "s" if scene.problem.system.time == "continuous" else "steps"
+    return scene.problem.time_unit
 
 
 # ---- the plane -----------------------------------------------------------------------------------------------

@@ -81,7 +81,7 @@ def _head(title: str, script: str) -> str:
 
 
 def _verdict_section(problem: Problem, verdict: Verdict, probability: str) -> str:
-    unit = "s" if problem.system.time == "continuous" else "steps"
+    unit = problem.time_unit
     bound = probability or f"10^{rounded(verdict.log10_delta, up=True, digits=4)}"
     rows = [
         ("certified bound on the probability of leaving", bound),
@@ -128,7 +128,8 @@ def _constants_section(verdict: Verdict) -> str:
     found = verdict.constants
     if found is None:
         return ""
-    name, unit = ("rate", "1/s") if found.continuous else ("gain", "per step")
+    time = "s" if verdict.problem is None else verdict.problem.time_unit
+    name, unit = ("rate", f"1/{time}") if found.continuous else ("gain", "per step")
     rows = [
         (f"{name} ({unit})", _range(getattr(found, name))),
         ("noise level sigma", _range(found.sigma)),

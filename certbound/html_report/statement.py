@@ -25,11 +25,15 @@ MOST = 14  # equations before the rest are folded away
 def problem_section(problem: Problem) -> str:
     """Dynamics, noise, start, disturbance, sets and parameters of a problem."""
     content = _content(problem)
-    unit, states = ("s" if problem.system.time == "continuous" else "steps"), problem.system.states
+    unit, states = problem.time_unit, problem.system.states
     rows: list[tuple[object, object]] = []
     rows += [("parameters", _list(content["parameters"]))] if content.get("parameters") else []
+    units = [f"{name} ({problem.units[name]})" for name in problem.units if name != "time"]
+    rows += [("units", ", ".join(units))] if units else []
     for key, word in (("inputs", "inputs"), ("disturbances", "disturbances"), ("uncertain", "unknown constants")):
         rows += [(word, _signals(content[key]))] if content.get(key) else []
+    rows += [("drawn constants", ", ".join(f"{name} = {law.describe()}" for name, law in problem.random.items()))] \
+        if problem.random else []
     rows.append(("noise", Markup("<br>".join(_noise(content.get("noise", {}), unit)))))
     starts = content.get("initial", {})
     for start in starts if isinstance(starts, list) else [starts]:

@@ -106,7 +106,7 @@ class _Trace:
     def __init__(self, axes: Axes, scene: Scene) -> None:
         (panel,) = tightest(scene, panels_of(scene.problem), 1)
         draw_panel(axes, scene, panel)
-        axes.set_xlabel("time (s)" if scene.problem.system.time == "continuous" else "time (steps)")
+        axes.set_xlabel(scene.problem.time_axis)
         self.line = axes.axvline(0.0, color=BLUE, linewidth=1.6, zorder=8)
 
     def show(self, t: float) -> list[Any]:

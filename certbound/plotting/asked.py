@@ -45,6 +45,7 @@ class Panel:
 def panels_of(problem: Problem) -> list[Panel]:
     """Half-spaces that share a direction share a panel; every other constraint has one of its own."""
     found: list[Panel] = []
+    names = tuple(problem.axis(name) for name in problem.system.states)
     for number, constraint in enumerate(problem.safe):
         region = constraint.region
         if constraint.outside or region.moving or isinstance(region.form, Quadratic):
@@ -54,7 +55,7 @@ def panels_of(problem: Problem) -> list[Panel]:
         form = region.form
         rows, bounds = region.lifted(form.normals, problem.system.dimension), form.bounds
         for row, b in zip(rows, bounds if region.center is None else bounds + form.normals @ region.center_at()):
-            _add_face(found, row, float(b), problem.system.states, constraint.during, number)
+            _add_face(found, row, float(b), names, constraint.during, number)
     return found
 
 

@@ -49,7 +49,7 @@ def draw_scene(scene: Scene) -> Figure:
         for column in range(grid.shape[1]):
             lowest = grid.flat[column + grid.shape[1] * ((len(shown) - 1 - column) // grid.shape[1])]
             lowest.tick_params(labelbottom=True)
-            lowest.set_xlabel("time (s)" if scene.problem.system.time == "continuous" else "time (steps)")
+            lowest.set_xlabel(scene.problem.time_axis)
         rest = len(every) - len(shown)
         words = f"  (the {len(shown)} constraints with the least room, of {len(every)})" if rest else ""
         figure.suptitle(scene.title + words, fontsize=9)

@@ -65,7 +65,7 @@ def draw_plane(axes: Axes, scene: Scene, plane: Plane) -> None:
     target = scene.problem.reach
     if target is not None and lives_in(target.region, plane):
         draw_set(axes, target, plane, limits, style=TARGET)
-    names = scene.problem.system.states
+    names = [scene.problem.axis(name) for name in scene.problem.system.states]
     axes.set(xlim=limits[:2], ylim=limits[2:], xlabel=names[plane[0]], ylabel=names[plane[1]])
     if any(c.region.form.even and lives_in(c.region, plane) for c in scene.problem.safe):
         axes.set_aspect("equal", adjustable="box")

@@ -68,7 +68,7 @@ def _draw_states(scene: Scene, axes: Axes, states: States, times: tuple[float, f
         row = np.eye(len(names))[numbers[0]]
         known = [one for one in panels_of(scene.problem) if one.direction is not None and (one.direction == row).all()]
         draw_panel(axes, scene, known[0] if known else Panel(label=names[numbers[0]], direction=row))
-        axes.set(xlabel=_time(scene.reach.curve.continuous), ylabel=names[numbers[0]])
+        axes.set(xlabel=scene.problem.time_axis, ylabel=scene.problem.axis(names[numbers[0]]))
         axes.set_title("")
     else:
         raise ValueError(f"`states` must be one state over time or two in their plane, got {len(numbers)}.")
@@ -138,7 +138,7 @@ def _verdict(result: Verdict, axes: Axes) -> None:
     else:
         (panel,) = tightest(scene, panels_of(scene.problem), 1)
         draw_panel(axes, scene, panel)
-        axes.set(xlabel=_time(scene.reach.curve.continuous), ylabel=panel.label)
+        axes.set(xlabel=scene.problem.time_axis, ylabel=panel.label)
     axes.set_title(result.summary(), fontsize="small")
 
 
@@ -154,11 +154,11 @@ def _starts(result: SafeStarts, axes: Axes) -> None:
 
 @draw.register(ExitTimes)
 def _exit_times(result: ExitTimes, axes: Axes) -> None:
-    continuous = result.problem.system.time == "continuous"
+    axis = result.problem.time_axis
     axes.step(result.times, result.upper, where="pre", color=OUTER, linewidth=1.4, label="at most")
     axes.step(result.times, result.lower, where="post", color=BLUE, linewidth=1.4, linestyle=(0, (4, 1.5)),
               label="at least")  # fmt: skip
-    axes.set(xlabel=_time(continuous), ylabel="P(exit before)", ylim=(0, 1.02), xlim=(0, float(result.problem.horizon)))
+    axes.set(xlabel=axis, ylabel="P(exit before)", ylim=(0, 1.02), xlim=(0, float(result.problem.horizon)))
     axes.legend()
     axes.set_title(result.summary(), fontsize="small")
 
@@ -180,7 +180,7 @@ def _problem(result: Problem, axes: Axes) -> None:
         draw_plane(axes, scene, plane)
     else:
         draw_panel(axes, scene, panels_of(result)[0])
-        axes.set_xlabel(_time(reach.curve.continuous))
+        axes.set_xlabel(result.time_axis)
     axes.set_title(result.summary(), fontsize="small")
 
 

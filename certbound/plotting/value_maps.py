@@ -57,7 +57,7 @@ def draw_values(starts: SafeStarts, title: str = "") -> Figure:
 
 def _horizon(starts: SafeStarts) -> str:
     problem = starts.problem
-    return f"{problem.horizon:g} {'s' if problem.system.time == 'continuous' else 'steps'}"
+    return f"{problem.horizon:g} {problem.time_unit}"
 
 
 # ---- one state -----------------------------------------------------------------------------------------------
@@ -66,9 +66,9 @@ def _horizon(starts: SafeStarts) -> str:
 def draw_curves(axes: Axes, starts: SafeStarts) -> None:
     """Upper and lower bounds over the state at several times; delta, the safe starts and the stated ones."""
     problem, charts = starts.problem, starts.charts
-    unit, name = ("s" if problem.system.time == "continuous" else "steps"), problem.system.states[0]
+    name, continuous = problem.axis(problem.system.states[0]), problem.system.time == "continuous"
     for colour, chart in zip(TIMES, charts.upper):
-        label = f"from t = {chart.time:.4g} {unit} on" if unit == "s" else f"from step {chart.time:g} on"
+        label = f"from t = {chart.time:.4g} {problem.time_unit} on" if continuous else f"from step {chart.time:g} on"
         axes.plot(*steps_of(chart, DEEPEST), color=colour, linewidth=1.5, label=label)
     for number, (colour, chart) in enumerate(zip(_of_times(starts), charts.lower)):
         axes.plot(*steps_of(chart, -np.inf), color=colour, linewidth=1.0, linestyle=(0, (4, 1.5)),
@@ -160,7 +160,7 @@ def _frame(axes: Axes, starts: SafeStarts, plane: Plane, chart: Chart) -> None:
     for constraint in starts.problem.safe:
         if lives_in(constraint.region, plane):
             draw_set(axes, constraint, plane, limits, 0.0)
-    names = starts.problem.system.states
+    names = [starts.problem.axis(name) for name in starts.problem.system.states]
     axes.set(xlim=limits[:2], ylim=limits[2:], xlabel=names[plane[0]], ylabel=names[plane[1]])
     if any(c.region.form.even and lives_in(c.region, plane) for c in starts.problem.safe):
         axes.set_aspect("equal", adjustable="box")

@@ -31,7 +31,7 @@ def value_figures(starts: SafeStarts) -> Iterator[tuple[str, str, list[Trace], T
 
 
 def _map_figure(starts: SafeStarts, plane: Plane, where: str, chart: Chart) -> tuple[str, str, list[Trace], Trace]:
-    first, second = (starts.problem.system.states[k] for k in plane)
+    first, second = (starts.problem.axis(starts.problem.system.states[k]) for k in plane)
     lowest = max(float(np.floor(chart.log10.min())), DEEPEST)
     heat = {
         "type": "heatmap", "x": numbers(chart.axes[0]), "y": numbers(chart.axes[1]),
@@ -52,7 +52,7 @@ def _map_figure(starts: SafeStarts, plane: Plane, where: str, chart: Chart) -> t
 
 
 def _curves_figure(starts: SafeStarts) -> tuple[str, str, list[Trace], Trace]:
-    unit = "s" if starts.problem.system.time == "continuous" else "steps"
+    unit = starts.problem.time_unit
     traces: list[Trace] = []
     for colour, chart in zip(TIMES, starts.charts.upper):
         x, y = steps_of(chart, DEEPEST)
@@ -68,7 +68,8 @@ def _curves_figure(starts: SafeStarts) -> tuple[str, str, list[Trace], Trace]:
     level = {"x": numbers(ends), "y": [starts.delta, starts.delta], "mode": "lines", "line": dashes}
     traces.append({**level, "name": f"delta = {starts.delta:g}"})
     name = starts.problem.system.states[0]
-    layout = {"xaxis": {"title": {"text": name}}, "yaxis": {"type": "log", "title": {"text": "P(leaving)"}}}
+    across = {"title": {"text": starts.problem.axis(name)}}
+    layout = {"xaxis": across, "yaxis": {"type": "log", "title": {"text": "P(leaving)"}}}
     words = "Certified bounds of the probability of leaving by the horizon, over the state, from several times on."
     return f"Probability of leaving over {name}", words, traces, layout
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.checks import number, positive_definite, vector
+from certbound.checks import frozen, nearest, number, positive_definite, vector
+from certbound.problem.random_constants import Random
 from certbound.problem.sets import Box, GaussianStart, Region, StartUnion
+from certbound.problem.systems import System
+
+_LONGEST_UNIT = 20
 
 
 def checked_horizon(value: Any, discrete: bool) -> float | int:
@@ -82,3 +86,76 @@ def checked_weight(name: str, value: Any, size: int, *, strict: bool) -> Array:
     """A matrix of weights, or a diagonal as one."""
     matrix = np.diag(vector(name, value, size)) if np.ndim(value) == 1 else value
     return positive_definite(name, matrix, size, strict=strict)
+
+
+def checked_unknown(value: Any, known: Sequence[str]) -> tuple[str, ...]:
+    """Names of disturbances."""
+    found = (value,) if isinstance(value, str) else tuple(value)
+    for name in found:
+        if name not in known:
+            raise ValueError(f"`unknown` must name disturbances of the system, got {name!r}{nearest(str(name), known)}")
+    return found
+
+
+def checked_random(value: Any, known: Sequence[str], unknown: Sequence[str]) -> dict[str, Random]:
+    """Constants that are drawn, by the names of their disturbances."""
+    found: dict[str, Random] = dict(value or {})
+    for name, constant in found.items():
+        if name not in known:
+            raise ValueError(f"`random` must name disturbances of the system, got {name!r}{nearest(str(name), known)}")
+        if name in unknown:
+            raise ValueError(f"`random` must not name {name!r}, which is unknown; it is one or the other.")
+        if not isinstance(constant, Random):
+            raise TypeError(f"`random[{name!r}]` must be cb.Random(law=..., mean=...), got {constant!r}.")
+    return found
+
+
+def checked_units(value: Any, system: System) -> dict[str, str]:
+    """Units by the names of signals, and of ``time``: short printable texts."""
+    known = ("time", *system.states, *system.input_names, *system.disturbance_names)
+    found = dict(value or {})
+    for name, unit in found.items():
+        if name not in known:
+            raise ValueError(f"`units` must name time or signals, got {name!r}{nearest(str(name), known)}")
+        if not isinstance(unit, str) or not unit.isprintable() or not 0 < len(unit) <= _LONGEST_UNIT:
+            raise ValueError(f"`units.{name}` must be a text of 1 to {_LONGEST_UNIT} characters, got {unit!r}.")
+    return found
+
+
+def described(problem: Any) -> list[tuple[str, str]]:
+    """Signals, start and constraints of a problem, for its summary."""
+    system = problem.system
+    signals = {"states": system.states, "inputs": system.input_names, "disturbances": system.disturbance_names}
+    found = [(word, ", ".join(map(problem.axis, names))) for word, names in signals.items() if names]
+    found += [("drawn", f"{name} = {law.describe()}") for name, law in problem.random.items()]
+    starts = ["a point" if start.is_point else type(start).__name__ for start in problem.starts]
+    found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))
+    found += [("constraint", constraint.label) for constraint in problem.kept]
+    return found if problem.reach is None else [*found, ("target", problem.reach.label)]
+
+
+def checked_rows(plan: Any, system: System, horizon: float) -> Array:
+    """A plan that is an array: one row a step, or equal pieces of the horizon, inside the inputs' bounds."""
+    count, box, discrete = len(system.input_names), system.inputs, system.time == "discrete"
+    assert box is not None
+    if np.isinf(horizon):
+        raise ValueError("`plan` must be a feedback law where the horizon is infinite, got an array.")
+    rows = np.asarray(plan, dtype=float)
+    rows = rows[:, None] if rows.ndim == 1 and count == 1 else rows
+    if rows.ndim != 2 or rows.shape[1] != count or not len(rows) or not np.all(np.isfinite(rows)):
+        raise ValueError(f"`plan` must be a finite array (steps, {count}), got shape {rows.shape}.")
+    if discrete:
+        if len(rows) < horizon:
+            raise ValueError(f"`plan` must have {horizon} rows, one a step, got {len(rows)}.")
+        rows = rows[: int(horizon)]
+    width = box.high - box.low
+    slack = 1e-9 * (np.abs(rows) + np.where(np.isfinite(width), width, 0.0))
+    outside = (rows < box.low - slack) | (rows > box.high + slack)
+    if np.any(outside):
+        row, column = (int(k) for k in np.argwhere(outside)[0])
+        name, value = system.input_names[column], rows[row, column]
+        raise ValueError(
+            f"`plan` must stay in the input bounds, got {name} = {value:g} in row {row}, outside "
+            f"[{box.low[column]:g}, {box.high[column]:g}]."
+        )
+    return frozen(np.clip(rows, box.low, box.high))

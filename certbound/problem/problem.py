@@ -11,10 +11,21 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.checks import assign, frozen, nearest
+from certbound.checks import assign, nearest
 from certbound.display import Shown, ask_later_room, name_text
 from certbound.errors import InfeasibleError
-from certbound.problem.ingredients import check_dimension, checked_delta, checked_horizon, checked_start, checked_weight
+from certbound.problem.ingredients import (
+    check_dimension,
+    checked_delta,
+    checked_horizon,
+    checked_random,
+    checked_rows,
+    checked_start,
+    checked_units,
+    checked_unknown,
+    checked_weight,
+    described,
+)
 from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.sets import (
     Box,
@@ -54,6 +65,9 @@ class Problem(Shown):
         A target: then a path fails if it breaks a constraint before it has entered the target, or never enters it.
     unknown : sequence of str, optional
         Names of disturbances that are constants: unknown, but the same at all times.
+    random : mapping of str to Random, optional
+        Disturbances that are constants drawn once, independent of each other and of the noise. What is drawn outside
+        of the disturbance's box counts as failing.
     plan : array_like of shape (K, m), function u(t, x), or Tape, optional
         Inputs: one row a step (DT; rows beyond the horizon are ignored), constant on K equal pieces of the
         horizon (CT), or a feedback law. A system with inputs may go without, for synthesis.
@@ -64,6 +78,8 @@ class Problem(Shown):
     leaving : str
         "unsafe", or "ends": a path that leaves the domain ends there, and does not fail. Value functions in discrete
         time and simulations count that; other bounds, which hold all the same, count it as failing.
+    units : mapping of str to str, optional
+        For humans: the unit of ``time`` and of states, inputs and disturbances, by name.
     name : str
         For humans.
     parameters : mapping, optional
@@ -94,10 +110,12 @@ class Problem(Shown):
     delta: Any = field(default=1e-3, kw_only=True)
     reach: Any = field(default=None, kw_only=True)
     unknown: Any = field(default=(), kw_only=True)
+    random: Any = field(default=None, kw_only=True)
     plan: Any = field(default=None, kw_only=True)
     cost: Any = field(default=None, kw_only=True)
     domain: Any = field(default=None, kw_only=True)
     leaving: str = field(default="unsafe", kw_only=True)
+    units: Any = field(default=None, kw_only=True)
     name: str = field(default="problem", kw_only=True)
     parameters: Any = field(default=None, kw_only=True)
     source: Any = field(default=None, kw_only=True, repr=False)
@@ -108,6 +126,7 @@ class Problem(Shown):
             raise TypeError(f"`system` must be a ContinuousSystem or DiscreteSystem, got {self.system!r}.")
         if not isinstance(self.name, str):
             raise TypeError(f"`name` must be text, got {self.name!r}.")
+        assign(self, units=checked_units(self.units, self.system))
         discrete = self.system.time == "discrete"
         assign(self, horizon=checked_horizon(self.horizon, discrete))
         assign(self, delta=checked_delta(self.delta))
@@ -115,7 +134,9 @@ class Problem(Shown):
         assign(self, domain=self._domain())
         assign(self, reach=self._target())
         assign(self, initial=checked_start(self.initial, self.system.dimension))
-        assign(self, parameters=dict(self.parameters or {}), unknown=self._constants())
+        constants = self.system.disturbance_names
+        assign(self, parameters=dict(self.parameters or {}), unknown=checked_unknown(self.unknown, constants))
+        assign(self, random=checked_random(self.random, constants, self.unknown))
         assign(self, plan=self._checked_plan())
         assign(self, cost=self._cost())
         for member in self.starts:
@@ -132,8 +153,12 @@ class Problem(Shown):
         Raises
         ------
         InfeasibleError
-            If the problem has a target: these constraints do not say what failing is then (``kept`` has them).
+            If the problem has a target (these constraints do not say what failing is then, ``kept`` has them), or
+            constants that are drawn, over which only ``verify_safety`` and simulations average.
         """
+        if self.random:
+            what = f"the problem has constants that are drawn ({', '.join(self.random)})"
+            raise InfeasibleError(f"{what}; only verify_safety and simulate_exits average over them: give them values.")
         if self.reach is not None:
             raise InfeasibleError(
                 f"the problem has a target ('{self.reach.label}'), and this serves constraints only; leave `reach` "
@@ -149,8 +174,22 @@ class Problem(Shown):
     @property
     def span(self) -> str:
         """The horizon in words."""
-        unit = "s" if self.system.time == "continuous" else "steps"
-        return "at any time" if self.endless else f"within {self.horizon:g} {unit}"
+        return "at any time" if self.endless else f"within {self.horizon:g} {self.time_unit}"
+
+    @property
+    def time_unit(self) -> str:
+        """The unit of time: ``s`` or ``steps``, unless another one is given."""
+        usual = "s" if self.system.time == "continuous" else "steps"
+        return str(self.units.get("time", usual))
+
+    @property
+    def time_axis(self) -> str:
+        """What stands at an axis of time."""
+        return f"time ({self.time_unit})"
+
+    def axis(self, name: str) -> str:
+        """A state's name with its unit, where it has one."""
+        return f"{name} ({self.units[name]})" if name in self.units else name
 
     @property
     def failing(self) -> str:
@@ -212,13 +251,7 @@ class Problem(Shown):
 
     def rows(self) -> list[tuple[str, str]]:
         """Signals, start and constraints."""
-        signals = {"states": self.system.states, "inputs": self.system.input_names}
-        signals["disturbances"] = self.system.disturbance_names
-        found = [(name, ", ".join(values)) for name, values in signals.items() if values]
-        starts = ["a point" if start.is_point else type(start).__name__ for start in self.starts]
-        found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))
-        found += [("constraint", constraint.label) for constraint in self.kept]
-        return found if self.reach is None else [*found, ("target", self.reach.label)]
+        return described(self)
 
     def to_dict(self) -> dict[str, Any]:
         """The content of the problem file that ``cb.save`` writes.
@@ -286,14 +319,6 @@ class Problem(Shown):
         if self.system.time == "discrete" and any(end != int(end) for end in window):
             raise ValueError(f"`{name}` must have whole steps in `during`, got {list(window)}; round them.")
 
-    def _constants(self) -> tuple[str, ...]:
-        names = (self.unknown,) if isinstance(self.unknown, str) else tuple(self.unknown)
-        for name in names:
-            if name not in self.system.disturbance_names:
-                known = nearest(str(name), self.system.disturbance_names)
-                raise ValueError(f"`unknown` must name disturbances of the system, got {name!r}{known}")
-        return names
-
     def _target(self) -> Reach | None:
         target: Any = Reach(self.reach) if isinstance(self.reach, Region) else self.reach
         if target is None:
@@ -345,30 +370,7 @@ class Problem(Shown):
                     f"got shape {tape.shape} over {tape.inputs}."
                 )
             return tape
-        return self._array_plan(plan, system.inputs, count)
-
-    def _array_plan(self, plan: Any, box: Box, count: int) -> Array:
-        if self.endless:
-            raise ValueError("`plan` must be a feedback law where the horizon is infinite, got an array.")
-        rows = np.asarray(plan, dtype=float)
-        rows = rows[:, None] if rows.ndim == 1 and count == 1 else rows
-        if rows.ndim != 2 or rows.shape[1] != count or not len(rows) or not np.all(np.isfinite(rows)):
-            raise ValueError(f"`plan` must be a finite array (steps, {count}), got shape {rows.shape}.")
-        if self.system.time == "discrete":
-            if len(rows) < self.horizon:
-                raise ValueError(f"`plan` must have {self.horizon} rows, one a step, got {len(rows)}.")
-            rows = rows[: self.horizon]
-        width = box.high - box.low
-        slack = 1e-9 * (np.abs(rows) + np.where(np.isfinite(width), width, 0.0))
-        outside = (rows < box.low - slack) | (rows > box.high + slack)
-        if np.any(outside):
-            row, column = (int(k) for k in np.argwhere(outside)[0])
-            name, value = self.system.input_names[column], rows[row, column]
-            raise ValueError(
-                f"`plan` must stay in the input bounds, got {name} = {value:g} in row {row}, outside "
-                f"[{box.low[column]:g}, {box.high[column]:g}]."
-            )
-        return frozen(np.clip(rows, box.low, box.high))
+        return checked_rows(plan, system, self.horizon)
 
     def _cost(self) -> tuple[Array, Array] | None:
         if self.cost is None:

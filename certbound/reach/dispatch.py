@@ -8,6 +8,7 @@ import numpy as np
 
 from certbound.constants.bounds import bound_constants
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, contained
+from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
 from certbound.reach.contraction import (
     contraction_tube,
@@ -75,6 +76,7 @@ def bound_reach(
         raise ValueError(f"`{name}` must be left out for the method {method!r}; it belongs to 'sampled' and 'learned'.")
     initial_cells(problem, cells)  # with the plan, what can be wrong with the input
     _ = problem.closed_loop
+    problem = in_pieces(problem)
     best: ReachTube | None = None
     failure = EngineError("no engine fits the problem.")
     for name in _ENGINES if method == "auto" else (method,):

@@ -12,14 +12,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from flint import arb
 
 from certbound.errors import CertificateError
 from certbound.problem.goals import met_at
 from certbound.problem.model import Network, Tape
 from certbound.problem.noise import Law, check_law
 from certbound.problem.problem import Problem
+from certbound.problem.random_constants import Random
 from certbound.problem.sets import Inside, StartUnion
 from certbound.problem.systems import ContinuousSystem
+from certbound.rigor.balls import precision, upper
 from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most
 from certbound.safety.portfolio import ENGINES
 
@@ -68,7 +71,14 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     """
     if problem.endless:
         raise CertificateError("certificates state finite horizons; verify a finite `horizon`.")
-    members = getattr(verdict, "members", ())
+    members, cells = getattr(verdict, "members", ()), getattr(verdict, "cells", ())
+    if problem.random and not members:
+        if verdict.status == "UNSAFE":
+            raise CertificateError("certificates state no lower bounds where constants are drawn.")
+        return averaged(
+            problem, cells,
+            [certificate_data(one.plain, one.verdict, attempt=attempt) if one.asked else None for one in cells],
+        )
     if verdict.status == "UNSAFE" or any(one.status == "UNSAFE" for one in members):
         return _lower_data(problem, verdict, attempt)
     if members:
@@ -120,6 +130,28 @@ def united(problem: Problem, members: Sequence[Mapping[str, Any]]) -> dict[str, 
     assumed = dict.fromkeys(item for member in members for item in member["claim"]["assumptions"])
     claim = {"log10_delta": exact(max(levels)), "method": "union", "assumptions": list(assumed)}
     return _whole(problem, claim, {"engine": "union", "members": [member["proof"] for member in members]})
+
+
+def averaged(problem: Problem, cells: Sequence[Any], found: Sequence[Mapping[str, Any] | None]) -> dict[str, Any]:
+    """The certificate of a problem with drawn constants, from those of the cells of their values (None: none).
+
+    The claim is 1 - sum P(cell) (1 - claim), in balls: what is in no cell, or has no certificate, counts as failing.
+    """
+    assumed = dict.fromkeys(item for one in found if one is not None for item in one["claim"]["assumptions"])
+    rows = []
+    with precision():
+        kept = arb(0)
+        for cell, one in zip(cells, found):
+            proof = None if one is None else one["proof"]
+            rows.append({"low": exact(cell.low), "high": exact(cell.high), "proof": proof})
+            if one is not None:
+                kept += cell.weight * (1 - arb(10) ** arb(float.fromhex(one["claim"]["log10_delta"])))
+        most = 1 - kept
+        level = min(upper(most.log() / arb(10).log()) + _ROUNDING, 0.0) if most.upper() > 0 else 0.0
+    if not level < 0:
+        raise CertificateError("what is certified of the cells of the drawn constants gives no bound below 1.")
+    claim = {"log10_delta": exact(level), "method": "random", "assumptions": list(assumed)}
+    return _whole(problem, claim, {"engine": "random", "cells": rows})
 
 
 def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, Any]:
@@ -205,10 +237,21 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "noise": _noise(system),
         "initial": initial_data(problem.initial),
         "constraints": [_constraint(constraint) for constraint in problem.safe],
+        **({"units": dict(problem.units)} if problem.units else {}),
         **({"leaving": problem.leaving} if problem.ending else {}),
         "domain": None if problem.domain is None else _ranges(zip(problem.domain.low, problem.domain.high)),
+        **({"random": {name: _drawn(one) for name, one in problem.random.items()}} if problem.random else {}),
         **({} if problem.reach is None else {"reach": _constraint(problem.reach)}),
     }
+
+
+def _drawn(constant: Random) -> dict[str, Any]:
+    law = constant.law
+    return {
+        "law": law.name, "level": law.level, "mean": exact(constant.mean),
+        "value": exact(float(np.ravel(getattr(law, law.level))[0])),
+        **({"tables": {name: exact(getattr(law, name)) for name in law.tables}} if law.tables else {}),
+    }  # fmt: skip
 
 
 def _constraint(constraint: Inside) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from certbound.problem.goals import met_at
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
 from certbound.safety.answers import EngineAnswer, Request, is_more_than
+from certbound.safety.averages import average_verdict
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import best_time, find_miss, window_of
@@ -58,9 +59,11 @@ def decide(
     watch = watch or current_watch() or Watch()
     for start in problem.starts:
         _checked(problem.replace(initial=start) if len(problem.starts) > 1 else problem, request)
+    options: dict[str, Any] = {"method": method, "cells": cells, "constants": constants, "watch": watch}
     if len(problem.starts) > 1:
-        options: dict[str, Any] = {"method": method, "cells": cells, "constants": constants, "watch": watch}
         return worst_verdict(problem, watch, lambda member: decide(member, **options))
+    if problem.random:
+        return average_verdict(problem, watch, lambda cell: decide(cell, **options))
     search = _Search(problem, request, watch)
     try:
         with search.watch.running():

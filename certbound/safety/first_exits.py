@@ -25,7 +25,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Chart
-from certbound.values.continuous import chart_slabs_of
+from certbound.values.continuous import bound_mean_time, chart_slabs_of
 from certbound.values.discrete import chart_failures
 from certbound.watch import poll
 
@@ -53,7 +53,7 @@ class ExitTimes(Shown):
     mean_lower : float
         The mean time of leaving is at least this, from every start and under every disturbance.
     mean_upper : float or None
-        It is at most this from every start; None where nothing was proved (a horizon that is too short).
+        It is at most this from every start; None where nothing was proved.
     """
 
     problem: Problem
@@ -80,7 +80,7 @@ class ExitTimes(Shown):
 
     def summary(self) -> str:
         """The end of the curves and the mean, in one line."""
-        unit = "s" if self.problem.system.time == "continuous" else "steps"
+        unit = self.problem.time_unit
         low, high = _ends_text(self.lower[-1], self.upper[-1])
         most = "" if self.mean_upper is None else f" ... {rounded(self.mean_upper, up=True, digits=5)}"
         least = rounded(self.mean_lower, up=False, digits=5)
@@ -154,7 +154,7 @@ def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> 
     grid = np.unique([s for s, *_ in (*upper, *lower)] + [0.0])
     above = _above(upper, grid)
     below, least = (_below(lower, grid, k) for k in (1, 2))
-    mean_lower, mean_upper = _means(problem, grid, above, least, share)
+    mean_lower, mean_upper = _sharper(problem, *_means(problem, grid, above, least, share))
     found = ExitTimes(
         problem=problem, times=grid, lower=below, upper=above, mean_lower=mean_lower, mean_upper=mean_upper
     )
@@ -264,6 +264,18 @@ def _below(curve: Curve, grid: Array, place: int) -> Array:
     for row in curve:
         found[grid >= row[0]] = np.maximum(found[grid >= row[0]], row[place])
     return found
+
+
+def _sharper(problem: Problem, low: float, high: float | None) -> tuple[float, float | None]:
+    """The better of these bounds of the mean and of those by one function of the state, where that proves anything."""
+    try:
+        with contained("mean time"):
+            found = bound_mean_time(problem)
+    except EngineError:
+        found = None
+    if found is None:
+        return low, high
+    return max(low, found[0]), min((end for end in (high, found[1]) if end is not None), default=None)
 
 
 def _means(problem: Problem, grid: Array, above: Array, least: Array, share: float) -> tuple[float, float | None]:

@@ -64,6 +64,8 @@ class Verdict(Shown):
         Where the start is a union, the verdict on every member; this one is the worst of them.
     reserves : dict
         What engines answered that only a certificate had to ask, by name: kept, so that none is asked twice.
+    cells : tuple of Cell
+        Where constants are drawn, the cells of their values over which the bounds were averaged.
     """
 
     pictured: ClassVar[bool] = True
@@ -86,6 +88,7 @@ class Verdict(Shown):
     seconds: Mapping[str, float] = field(default_factory=dict, repr=False)
     members: tuple[Verdict, ...] = field(default=(), repr=False)
     reserves: dict[str, EngineAnswer] = field(default_factory=dict, repr=False)
+    cells: tuple[Any, ...] = field(default=(), repr=False)
 
     @property
     def worst(self) -> Verdict:

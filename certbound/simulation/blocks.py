@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.arrays import Array
+from certbound.problem.random_constants import Random
 
 Counts = NDArray[np.int64]
 
@@ -69,6 +70,7 @@ class Work:
     # (q,): box of the disturbance that each path draws
     low: Array
     high: Array
+    constants: tuple[tuple[int, Random], ...] = ()  # places of those that have a law, and the law
     # tables over the steps
     inputs: Array
     moving: Array
@@ -104,6 +106,7 @@ class Work:
         arrays = (self.p, starts, self.low, self.high, self.inputs, self.moving, self.nominal, self.windows)
         for array in (*arrays, self.profile, self.marks):
             state.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        state.update("".join(f"{place} {law.data()}" for place, law in self.constants).encode())
         state.update(f"{self.source} {self.steps} {self.interval!r} {self.counts_shape} {self.block}".encode())
         return state.hexdigest()
 
@@ -118,7 +121,10 @@ class Work:
         generator = start_generator(self.entropy, block)
         count = min(self.block, self.paths - block * self.block)
         starts = np.ascontiguousarray(self.sample_start(generator, self.block)[:count], dtype=float)
-        signals = generator.uniform(self.low, self.high, (self.block, len(self.low)))[:count]
+        signals = generator.uniform(self.low, self.high, (self.block, len(self.low)))
+        for place, law in self.constants:
+            signals[:, place] = law.sample(generator, self.block)
+        signals = signals[:count]
         return self._call(starts, signals, block, tally, out)
 
     def _call(self, starts: Array, signals: Array, block: int, tally: Tally, out: Array | None) -> int:

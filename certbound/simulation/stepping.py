@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from certbound.arrays import Array
 from certbound.problem.model import Node, Tape, compile_numpy, edged, is_zero, jacobian, substitute, trace
 from certbound.problem.noise import Law, check_law
+from certbound.problem.random_constants import Random
 from certbound.simulation.tape_text import live_nodes
 from certbound.simulation.transition import exact_transition
 
@@ -75,6 +76,7 @@ class StepModel:
     # (disturbance_count,): the disturbance's box
     low: Array = field(default_factory=lambda: np.zeros(0))
     high: Array = field(default_factory=lambda: np.zeros(0))
+    constants: tuple[tuple[int, Random], ...] = ()  # places of the disturbances that are drawn by a law
     switching: float = 0.0  # mean number of steps between two jumps of a switching disturbance; 0: constant
     # (steps, input_count + disturbances given as an array): inputs that all paths share, one row a step
     table: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -108,7 +110,7 @@ def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
     disturbances = len(tape.inputs) - 1 - system.dimension - inputs
     rows = [] if sequence is None else [_table(sequence, steps)]
     fields: dict[str, Any] = {"dimension": system.dimension}
-    fields |= _disturbance(system, disturbances, steps, scenario, problem.unknown)
+    fields |= _disturbance(system, disturbances, steps, scenario, problem)
     if "row" in fields:
         rows.append(_table(fields.pop("row"), steps))
         inputs, disturbances = inputs + disturbances, 0
@@ -157,7 +159,7 @@ def _unit(law: Law) -> Tape | None:
 
 
 def _disturbance(
-    system: Any, count: int, steps: int, scenario: Scenario, unknown: tuple[str, ...]
+    system: Any, count: int, steps: int, scenario: Scenario, problem: Any
 ) -> dict[str, Any]:
     choice = scenario.disturbance
     if count == 0:
@@ -165,11 +167,13 @@ def _disturbance(
             raise ValueError("`disturbance` must be left out: this system has none.")
         return {}
     moving = choice == "switching" if isinstance(choice, str) else callable(choice) or np.ndim(choice) > 1
-    if unknown and moving:
-        raise ValueError(f"`disturbance` must be constant: {', '.join(unknown)} is an unknown constant of the problem.")
+    for word, names in (("an unknown", problem.unknown), ("a drawn", problem.random)):
+        if names and moving:
+            raise ValueError(f"`disturbance` must be constant: {', '.join(names)} is {word} constant of the problem.")
     box = system.disturbance
     fields: dict[str, Any] = {"low": np.asarray(box.low), "high": np.asarray(box.high)}
     if isinstance(choice, str):
+        fields["constants"] = tuple((system.disturbance_names.index(name), law) for name, law in problem.random.items())
         return fields | {"switching": steps / 10.0 if choice == "switching" else 0.0}
     if callable(choice):
         signal = trace(choice, {"t": ["t"], "x": list(system.states)})

@@ -131,6 +131,22 @@ def _rising() -> Data:
     }  # fmt: skip
 
 
+def _drawn() -> cb.Problem:
+    system = cb.DiscreteSystem(
+        lambda x, d: [d[0] * x[0]], states=["x"], disturbance=cb.Box([0.4], [0.8]), disturbance_names=["gain"],
+        noise=cb.Gaussian(std=0.25),
+    )
+    law = {"gain": cb.Random(law=cb.Uniform(halfwidth=0.2), mean=0.6)}
+    return cb.Problem(
+        system, initial=[0.3], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=4, delta=0.008, random=law
+    )
+
+
+def _switched() -> cb.Problem:
+    system = cb.ContinuousSystem(lambda t, x: [-x[0] + np.where(t < 1, 0.2, -0.2)], states=["x"], diffusion=0.1)
+    return cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=2)
+
+
 def _stated(build: Callable[[], cb.Problem], method: str) -> Callable[[], str]:
     def text() -> str:
         problem = build()
@@ -168,6 +184,8 @@ _BASES: dict[str, Callable[[], str]] = {
     "still": _stated(_still, "constants"),
     "random": _stated(_random, "constants"),
     "bounded": _stated(_bounded, "constants"),
+    "switched": _stated(_switched, "linear"),
+    "drawn": _stated(_drawn, "values"),
     "planned": _stated(_planned, "constants"),
     "rising": lambda: json.dumps(_rising()),
     "valued": _sharp(_stated(conftest.valued, "values")),
@@ -268,6 +286,24 @@ def _(data: Data) -> None:
 @forges("every jump is decided", "straight", "linear/proof.py", "_Cell._check_remainder", "may jump with x")
 def _(data: Data) -> None:
     jumping(data, "sign", 1, 0.2)
+
+
+@forges("a jump in time lies between two pieces", "switched", "time_pieces.py", "_step", "decides no jump")
+def _(data: Data) -> None:
+    constants = [node for node in data["problem"]["dynamics"]["nodes"] if node == ["const", exact(1.0)]]
+    for node in constants:
+        node[1] = exact(0.75)
+
+
+@forges("cells of drawn constants do not overlap", "drawn", "statement/drawn.py", "weights_of", "must not overlap")
+def _(data: Data) -> None:
+    for cell in data["proof"]["cells"]:
+        cell["high"] = [exact(0.8)]
+
+
+@forges("what lies in no cell counts as failing", "drawn", "claims.py", "_average", MORE)
+def _(data: Data) -> None:
+    data["problem"]["random"]["gain"]["mean"] = exact(0.62)
 
 
 @forges("a constant derivative is defined", "straight", "statement/structure.py", "_values", "is not defined")

@@ -10,6 +10,7 @@ from certbound.cli.app import run
 from certbound.errors import InfeasibleError
 from certbound.problem.files import save
 from certbound.safety import first_exits
+from certbound.values.continuous import bound_mean_time
 
 
 def brownian(horizon=2.0, drift=0.0, start=0.0):
@@ -53,6 +54,34 @@ def test_the_curves_hold_the_closed_form_closely(found):
     late = times > 1.0
     assert np.max(upper[late] / truth[late]) < 1.03
     assert np.min(lower[late] / truth[late]) > 0.97
+
+
+@pytest.mark.parametrize(
+    ("drift", "mean"),
+    [(lambda x: [0 * x[0]], 1.0), (lambda x: [-x[0]], 1.44524563), (lambda x: [0 * x[0] + 0.5], 2 * np.tanh(0.5))],
+)
+def test_means_are_within_a_fraction_of_a_per_cent_of_the_closed_form(drift, mean):
+    """Of Ornstein-Uhlenbeck: the double integral of exp(y^2 - z^2) over 0 < z < y < 1, twice."""
+    system = cb.ContinuousSystem(drift, states=["x"], diffusion=1.0)
+    problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=6)
+    low, high = bound_mean_time(problem)
+    assert low <= mean <= high
+    assert high / low < 1.003
+    wide = bound_mean_time(problem.replace(initial=cb.Box([-0.2], [0.3])))
+    assert wide[0] < low
+    assert wide[1] > high
+
+
+def test_means_hold_for_every_disturbance_and_no_clock():
+    push, safe = cb.Box([-0.1], [0.1]), [cb.Inside(cb.Box([-1], [1]))]
+    system = cb.ContinuousSystem(lambda x, d: [-x[0] + d[0]], states=["x"], disturbance=push, diffusion=1.0)
+    low, high = bound_mean_time(cb.Problem(system, initial=[0], safe=safe, horizon=6))
+    assert low < 1.40 < 1.4453 < high
+    clock = cb.ContinuousSystem(lambda t, x: [-x[0] * (1 + t)], states=["x"], diffusion=1.0)
+    assert bound_mean_time(cb.Problem(clock, initial=[0], safe=safe, horizon=6)) is None
+    ring = [*safe, cb.Outside(cb.Ball([0.5], 0.1))]
+    still = cb.ContinuousSystem(lambda x: [-x[0]], states=["x"], diffusion=1.0)
+    assert bound_mean_time(cb.Problem(still, initial=[0], safe=ring, horizon=6)) is None
 
 
 def test_the_curves_rise_and_are_read_between_their_times(found):

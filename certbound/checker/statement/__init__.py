@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from certbound.checker.statement.comparison import first_difference
+from certbound.checker.statement.drawn import weights_of
 from certbound.checker.statement.partition import cells_of, starts_of
 from certbound.checker.statement.problem import Model, met_at, read_model
 from certbound.checker.statement.rooms import Grid, demands, round_demands
@@ -23,4 +24,5 @@ __all__ = [
     "StepSet",
     "Structure",
     "structure_of",
+    "weights_of",
 ]

@@ -7,7 +7,7 @@ from typing import Any
 
 from certbound.checker.statement.tapes import canonical
 
-_FOR_HUMANS = {"name", "label"}
+_FOR_HUMANS = {"name", "label", "units"}
 
 
 def first_difference(mine: Any, theirs: Any, path: str = "") -> str:

@@ -10,6 +10,7 @@ from certbound.checker.balls import diagonal, is_positive_definite, matrix
 from certbound.checker.reading import Record, number, text
 from certbound.checker.reading import entries as listed
 from certbound.checker.report import Budget
+from certbound.checker.statement.drawn import Drawn, read_drawn
 from certbound.checker.statement.laws import LAWS, Law
 from certbound.checker.statement.regions import Constraint, read_constraint
 from certbound.checker.statement.tapes import read_tape
@@ -87,7 +88,9 @@ class Model:
     states: tuple[str, ...] = field(default=())
     target: Constraint | None = None  # then a path fails that breaks a constraint before it is there, or never is
     unknown: tuple[str, ...] = ()  # disturbances that do not change: one that reacts to the state says nothing of them
+    unit: str = ""  # of time, for humans
     ends: bool = False  # where the domain is left: that is no failure, and counting it as one bounds from above only
+    drawn: tuple[Drawn, ...] = ()  # constants, over whose values the probability is an average
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
     @property
@@ -114,7 +117,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     CertificateError where a field is missing, has the wrong size, or makes no sense; Unproved where it is too large for
     the budget.
     """
-    record = Record(value, path, _FIELDS, ("reach", "leaving", "unknown"))
+    record = Record(value, path, _FIELDS, ("reach", "leaving", "unknown", "random", "units"))
     time = record["time"]
     if time not in ("continuous", "discrete"):
         raise CertificateError(f"`{path}.time` must be \"continuous\" or \"discrete\".")
@@ -146,10 +149,21 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
         ends=record["leaving"] == "ends", plan=_plan(record, len(inputs), continuous, horizon), states=states,
         disturbance=_disturbance(record, len(disturbances)), unknown=unknown,
+        unit=_unit(record, continuous),
+        drawn=read_drawn(record["random"], record.at("random"), disturbances),
         noise=_noise(record["noise"], path + ".noise", states, time, budget),
         initial=initial, members=members, target=_target(record, n, horizon, budget),
         constraints=tuple(constraints), domain=domain,
     )
+
+
+def _unit(record: Record, continuous: bool) -> str:
+    """The unit of time, for the words of the claim; of the others nothing is made."""
+    units = record["units"] or {}
+    if not isinstance(units, dict) or len(units) > MOST_STATES:
+        raise CertificateError(f"`{record.at('units')}` must be texts by names.")
+    own = {name: text(unit, record.at("units"), 20) for name, unit in units.items()}
+    return own.get("time", "s" if continuous else "steps")
 
 
 def _plan(record: Record, inputs: int, continuous: bool, horizon: float) -> list[list[float]] | None:

@@ -98,6 +98,8 @@ def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float]
     spent = [] if checking is None else checking
     if verdict.members and not any(member.status == "UNSAFE" for member in verdict.members):
         return _united(problem, verdict, spent)
+    if problem.random:
+        return _whole_again(problem, _averaged(problem, verdict, spent), spent)
     left, reasons = dict(verdict.answers), list[str]()
     while left:
         try:
@@ -118,11 +120,35 @@ def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float]
 
 def _united(problem: Problem, verdict: Verdict, spent: list[float]) -> str:
     """The certificate of a union of starts, from those of its members, proved again as a whole."""
-    from certbound.checker import check_data, parse
-    from certbound.safety.certificate import problem_data, united
+    from certbound.checker import parse
+    from certbound.safety.certificate import united
 
     members = [parse(proved_certificate(one.problem, one, spent)) for one in verdict.members if one.problem is not None]
-    text = json.dumps(united(problem, members), separators=(",", ":")) + "\n"
+    return _whole_again(problem, united(problem, members), spent)
+
+
+def _averaged(problem: Problem, verdict: Verdict, spent: list[float]) -> dict[str, Any]:
+    """The certificate of drawn constants, from those of the cells of their values that have one."""
+    from certbound.checker import parse
+    from certbound.safety.certificate import averaged
+
+    if verdict.status == "UNSAFE":
+        raise CertificateError("certificates state no lower bounds where constants are drawn.")
+    found: list[dict[str, Any] | None] = []
+    for cell in verdict.cells:
+        try:
+            found.append(parse(proved_certificate(cell.plain, cell.verdict, spent)) if cell.asked else None)
+        except CertificateError:
+            found.append(None)
+    return averaged(problem, verdict.cells, found)
+
+
+def _whole_again(problem: Problem, data: dict[str, Any], spent: list[float]) -> str:
+    """A certificate made of others, proved again as a whole."""
+    from certbound.checker import check_data, parse
+    from certbound.safety.certificate import problem_data
+
+    text = json.dumps(data, separators=(",", ":")) + "\n"
     poll("checking the certificate")
     begun = time.perf_counter()
     report = check_data(parse(text), problem_data(problem), allow_assumptions=True)

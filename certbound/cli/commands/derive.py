@@ -191,7 +191,7 @@ def _local(subject: Problem) -> tuple[Constants, str]:
             "the dynamics jump there, or grow too fast; state a smaller `domain`, or a smaller initial set."
         )
     kind = "reach set + tube" if reach.noise else "noise-free reach set"
-    unit = "s" if reach.curve.continuous else "steps"
+    unit = subject.time_unit
     where = f"the {kind}, box by box in time, up to {reach.end:g} {unit}, {odds}"
     if reach.end < horizon:
         where += f"; it ends before {horizon:g} {unit}, where no guess of its size confirmed itself"

@@ -11,6 +11,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.checks import names as checked_names
 from certbound.checks import nearest
+from certbound.problem.files.constants_drawn import read_random
 from certbound.problem.files.parser import RESERVED, constant, parse
 from certbound.problem.files.schema import Specification
 from certbound.problem.model import Graph, Tape
@@ -29,7 +30,7 @@ class Reader:
         self.states = checked_names("states", spec.states, RESERVED)
         self.inputs = checked_names("inputs", list(spec.inputs), {*RESERVED, *self.states})
         taken = {*RESERVED, *self.states, *self.inputs}
-        self.disturbances = checked_names("disturbances", [*spec.disturbances, *spec.uncertain], taken)
+        self.disturbances = checked_names("disturbances", [*spec.disturbances, *spec.uncertain, *spec.random], taken)
         taken |= set(self.disturbances)
         self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
         self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
@@ -38,6 +39,7 @@ class Reader:
         paths = {name: self.file(value, f"networks.{name}") for name, value in spec.networks.items()}
         self.networks = {name: network(path, name=name).data for name, path in paths.items()}
         checked_names("definitions", list(spec.definitions), taken | set(self.networks))
+        self.random = {name: read_random(table, self.array, f"random.{name}") for name, table in spec.random.items()}
 
     def number(self, value: float | str, where: str) -> float:
         """A number, or the value of an expression in the parameters."""

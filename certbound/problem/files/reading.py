@@ -19,6 +19,8 @@ from certbound.problem.noise import LAWS
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, linear_system
 
+_OUTSIDE = 1e-3  # of delta
+
 
 def read_problem(spec: Specification, folder: Path | None, source: Mapping[str, Any] | None = None) -> Problem:
     """Build the problem that a validated specification describes; ``source``, the raw content, is kept for saving.
@@ -39,7 +41,7 @@ class _ProblemReader(SetReader):
         return Problem(
             system,
             initial=self.starts(spec.initial),
-            safe=safe, unknown=list(spec.uncertain),
+            safe=safe, unknown=list(spec.uncertain), random=self.random,
             reach=targets[0] if targets else None,
             horizon=self.number(spec.horizon, "horizon"),
             delta=self.number(spec.delta, "delta"),
@@ -47,7 +49,7 @@ class _ProblemReader(SetReader):
             cost=None if spec.cost is None else self.weights(spec.cost),
             domain=None if spec.domain is None else self.box(spec.domain.box, "domain.box", np.inf),
             leaving="unsafe" if spec.domain is None else spec.domain.leaving,
-            name=spec.name,
+            name=spec.name, units=spec.units,
             parameters=self.parameters,
             source=source,
         )
@@ -59,7 +61,7 @@ class _ProblemReader(SetReader):
         options: dict[str, Any] = {
             "states": self.states,
             "inputs": self.signal(spec.inputs, "inputs"),
-            "disturbance": self.signal({**spec.disturbances, **spec.uncertain}, "disturbances"),
+            "disturbance": self.signal(self.bounds(), "disturbances"),
             "input_names": self.inputs or None,
             "disturbance_names": self.disturbances or None,
         }
@@ -81,6 +83,12 @@ class _ProblemReader(SetReader):
         texts = [spec.dynamics[name] for name in self.states]
         tape = self.function(texts, inputs, where, (len(self.states),))
         return (ContinuousSystem if spec.time == "continuous" else DiscreteSystem)(tape, **options)
+
+    def bounds(self) -> dict[str, list[Any]]:
+        """Ends of the disturbances; of what is drawn, ends that leave next to nothing outside."""
+        tail = _OUTSIDE * self.number(self.spec.delta, "delta")
+        drawn = {name: list(law.ends(tail)) for name, law in self.random.items()}
+        return {**self.spec.disturbances, **self.spec.uncertain, **drawn}
 
     def signal(self, table: Mapping[str, list[Any]], where: str) -> sets.Box | None:
         if not table:

@@ -197,6 +197,17 @@ class Noise(_Table):
     matrix: Matrix | Number | Vector | None = None
 
 
+class RandomTable(_Table):
+    """A constant that is drawn once: a law, its one level, and a mean."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Number | Vector]
+    title: ClassVar[str] = "[random]"
+    more_keys = staticmethod(lambda: [key for law in LAWS.values() for key in (*law.levels, *law.tables)])
+    law: str
+    mean: Number = 0.0
+
+
 class Specification(_Table):
     """A problem file."""
 
@@ -207,10 +218,12 @@ class Specification(_Table):
     initial: Starts
     name: str = "problem"
     delta: Number = 1e-3
+    units: dict[str, str] = {}
     parameters: dict[str, Annotated[float, BeforeValidator(_no_boolean)]] = {}
     inputs: dict[str, Pair] = {}
     disturbances: dict[str, Pair] = {}
     uncertain: dict[str, Pair] = {}
+    random: dict[str, RandomTable] = {}
     networks: dict[str, str] = {}
     definitions: dict[str, Number] = {}
     plan: dict[str, Number] | None = None
@@ -225,8 +238,9 @@ class Specification(_Table):
 def json_schema() -> dict[str, Any]:
     """The JSON schema of problem files, for editors; what values mean is checked when a file is read."""
     schema: dict[str, Any] = Specification.model_json_schema()
-    schema["$defs"]["Noise"]["properties"] |= {key: {} for key in Noise.more_keys()}
-    schema["$defs"]["Noise"]["additionalProperties"] = False
+    for name, table in (("Noise", Noise), ("RandomTable", RandomTable)):
+        schema["$defs"][name]["properties"] |= {key: {} for key in table.more_keys()}
+        schema["$defs"][name]["additionalProperties"] = False
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "certbound problem"}
 
 

@@ -94,6 +94,7 @@ class _Writer:
         dynamics = dict(zip(self.states, self.texts(system.dynamics)))
         noise, plan, cost = self.noise(), self.plan(), problem.cost
         bounded = self.signal(system.disturbance, system.disturbance_names)
+        fixed = {*problem.unknown, *problem.random}
         starts = [self.start(member) for member in problem.starts]
         stay = [self.constraint(c) for c in problem.safe if not c.outside]
         avoid = [self.constraint(c) for c in problem.safe if c.outside]
@@ -102,10 +103,12 @@ class _Writer:
             "time": system.time,
             "horizon": problem.horizon,
             "delta": problem.delta,
+            "units": dict(problem.units),
             "states": list(self.states),
             "inputs": self.signal(system.inputs, system.input_names),
-            "disturbances": {name: ends for name, ends in bounded.items() if name not in problem.unknown},
+            "disturbances": {name: ends for name, ends in bounded.items() if not fixed & {name}},
             "uncertain": {name: ends for name, ends in bounded.items() if name in problem.unknown},
+            "random": {name: constant.data() for name, constant in problem.random.items()},
             "networks": network_files(problem, self.plan_file),
             "definitions": self.definitions,
             "dynamics": dynamics,

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         undefined_where,
     )
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
+    from certbound.problem.model.time_jumps import cut_at_jumps
     from certbound.problem.model.tracing import trace
 
 _HOME = {
@@ -48,6 +49,7 @@ _HOME = {
     "network_data": "PARTS Layer Network Part",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
+    "time_jumps": "cut_at_jumps",
     "tracing": "trace",
 }
 
@@ -58,6 +60,7 @@ __all__ = [
     "call_network",
     "compile_numpy",
     "compile_scalar",
+    "cut_at_jumps",
     "deciding",
     "edged",
     "enclosed",

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
 from certbound.problem.goals import check_end
+from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.model import Tape, compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.reach.nominal.series import expand
@@ -41,6 +42,9 @@ class Flow:
 
     def __post_init__(self) -> None:
         check_end(self.problem, "a noise-free trajectory")
+        if self.problem.random:
+            _ = self.problem.constraints  # which refuses them
+        object.__setattr__(self, "problem", in_pieces(self.problem))
         object.__setattr__(self, "tape", self.problem.closed_loop)
         object.__setattr__(self, "dimension", self.problem.system.dimension)
 

@@ -21,7 +21,7 @@ from certbound.reach.nominal import Curve, Flow, initial_cells
 from certbound.reach.sets import ReachTube, polyhedral_weights, round_directions
 from certbound.rigor.norms import Norm
 from certbound.safety.answers import EngineAnswer, Proof, exact
-from certbound.safety.certificates.parts import separations
+from certbound.safety.certificates.parts import in_time_pieces, separations
 from certbound.safety.engines import Erosion, erode, joined
 from certbound.tubes.constants import Constants
 from certbound.tubes.kummer import Search, exit_level, moderate_parameters
@@ -35,6 +35,7 @@ _ROOM = (1e-3, 0.1, 3.0)
 _SLACK = 0.005
 
 
+@in_time_pieces
 def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
     """The proof's data, the claimed log10 of the probability, and the assumptions it rests on.
 

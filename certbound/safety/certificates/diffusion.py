@@ -28,6 +28,7 @@ from certbound.safety.certificates.linear import (
     proof_data,
     widened,
 )
+from certbound.safety.certificates.parts import in_time_pieces
 
 _ROUNDS = 10
 _WIDER = 0.03  # H beyond what it must hold, the first time
@@ -38,6 +39,7 @@ _LOG10 = math.log(10.0)
 _ALL = 1e3
 
 
+@in_time_pieces
 def response_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
     """The linear response as data: `diffusion_proof` where the noise depends on the state, else `linear_proof`."""
     write = diffusion_proof if depends_on_state(problem) else linear_proof

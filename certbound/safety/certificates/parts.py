@@ -5,11 +5,14 @@ from __future__ import annotations
 import base64
 import zlib
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 from certbound.arrays import Array
+from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside
+from certbound.safety.answers import EngineAnswer, Proof
 
 
 def separations(problem: Problem, stated: Callable[[int, Inside], Any]) -> list[Any]:
@@ -25,3 +28,18 @@ def packed(numbers: Array) -> str:
     """Numbers as exact hexadecimal notation, compressed and in base 64."""
     words = " ".join(value.hex() for value in numbers.ravel().tolist())
     return base64.b64encode(zlib.compress(words.encode("ascii"), 9)).decode("ascii")
+
+
+Writer = Callable[[Problem, EngineAnswer, int], Proof]
+
+
+def in_time_pieces(write: Writer) -> Writer:
+    """A writer for a model that jumps at known times: ``jumps`` is the number of pieces that end there."""
+
+    @wraps(write)
+    def written(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
+        pieces = in_pieces(problem)
+        proof, log10, assumptions = write(pieces, answer, attempt)
+        return (proof if pieces is problem else proof | {"jumps": len(pieces.plan)}), log10, assumptions
+
+    return written

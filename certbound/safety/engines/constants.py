@@ -28,6 +28,7 @@ from certbound.constants.metrics import bound_metrics
 from certbound.constants.stated import proved_or_stated, refuse_contradiction
 from certbound.display import log10_text, rounded
 from certbound.errors import CertboundError, EnclosureError, InfeasibleError
+from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
 from certbound.reach.contraction import (
     contraction_tube,
@@ -78,6 +79,7 @@ def constants_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     the Jacobian is unbounded or undefined on the domain that the user gave, EngineError where the nominal is lost
     before the horizon.
     """
+    problem = in_pieces(problem)
     method, constants, quick = asked.method, asked.constants, asked.quick
     if constants is not None:
         refuse_contradiction(problem, constants)

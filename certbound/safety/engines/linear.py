@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
 from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state, linear_answer
 from certbound.reach.remainder import hidden_jump
@@ -16,6 +17,7 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     With additive noise it covers every disturbance, even one that sees coming noise; with noise that depends on the
     state, those that do not.
     """
+    problem = in_pieces(problem)
     hidden = hidden_jump(problem)
     if hidden is not None:
         return EngineAnswer(applicable=False, reason=hidden, method="linear")

@@ -68,6 +68,7 @@ class Setting:
             "sample_start": self.start,
             "low": model.low if drawn and model.disturbance_count else np.zeros(model.disturbance_count),
             "high": model.high if drawn and model.disturbance_count else np.zeros(model.disturbance_count),
+            "constants": model.constants if drawn else (),
             "inputs": model.table,
             "moving": np.zeros((0, 0)),
             "nominal": np.zeros((0, 0)),

@@ -161,7 +161,7 @@ def test_user_stated_constants_are_named_as_an_assumption():
 
 
 def test_the_tube_ends_where_the_closed_loop_is_undefined():
-    system = ContinuousSystem(lambda t, x: [np.where(t < 1.0, 1.0, -1.0)], states=1, diffusion=0.1)
+    system = ContinuousSystem(lambda t, x: [np.where(t * t < 1.0, 1.0, -1.0)], states=1, diffusion=0.1)
     problem = Problem(system, initial=[0.0], safe=[], horizon=2.0)
     tube = contraction_tube(problem, Constants(rate=0.0, sigma=0.1, dimension=1))
     assert tube.end <= 1.0

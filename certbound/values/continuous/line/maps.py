@@ -33,7 +33,7 @@ def chart_line(problem: Problem, model: Model, levels: list[float], times: int, 
     rough = ladder.sketches(inner)
     least = max(levels[0], float(rough[0].values.min()))
     levels = sorted({max(level, least) for level in levels})
-    _, (fineness, tolerance, lead), *_ = ladder.LADDER
+    fineness, tolerance, lead = ladder.LADDER[2]
     share = lead / max(rough[0].growth, 1.0)
     above: list[Chart] = []
     for level in (_UNSEALED, levels[0]):  # a shorter line gives smaller bounds on it, the longer one more room
@@ -72,7 +72,7 @@ def chart_slabs(problem: Problem, model: Model, levels: list[float], slabs: int,
     rough = ladder.sketches(inner)
     levels = sorted({max(level, float(rough[0].values.min())) for level in levels})
     rough = [dataclasses.replace(rough[0], level=levels[0])]
-    _, (fineness, tolerance, lead), *_ = ladder.LADDER
+    fineness, tolerance, lead = ladder.LADDER[2]
     share, longest = lead / max(rough[0].growth, 1.0), float(problem.horizon) / slabs
     above = ladder.surfaces_above(inner, start, rough, (share, fineness, tolerance, lead))
     below = ladder.surfaces_below(outer, start, rough, (share, fineness, 0.5 * tolerance, lead))

@@ -1,0 +1,157 @@
+"""Jumps of the dynamics that time alone decides: on equal pieces of the horizon they are constants.
+
+A proof names the number of pieces. That no such jump lies inside one is looked at piece by piece, in fractions; what
+jumps at their ends is an input from then on, as the rows of a plan are. The one time of a jump has no weight. A time is
+the decimal number that its float is written as.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from itertools import pairwise
+
+from certbound.checker.report import Budget, Unproved
+from certbound.checker.statement import Model
+from certbound.errors import CertificateError
+from certbound.problem.model import JUMPS, Node, Tape
+
+MOST_PIECES = 1000
+_CHOICE = "if_else_zero"
+_OF_TRUTHS = frozenset(["and", "or", "not", _CHOICE])
+_TRUTHS = JUMPS - {_CHOICE, "sign", "floor"}
+
+Ends = tuple[Fraction, Fraction]
+"""The values of a straight line at the two ends of a piece."""
+
+
+def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
+    """The same problem on ``count`` equal pieces, with the jumps that time alone decides as rows of a plan.
+
+    CertificateError where the problem has no such jumps, or no room for the pieces.
+    """
+    if not model.continuous or model.plan is not None or not 1 <= count <= MOST_PIECES:
+        raise CertificateError("`proof.jumps` must be left out: time is discrete, the plan is an array, or too many.")
+    tape, horizon = model.dynamics, _decimal(model.horizon)
+    timed = _timed(tape)
+    ends = [horizon * k / count for k in range(count + 1)]
+    found: dict[int, list[float | None]] = {index: [] for index in timed if tape.nodes[index].op in JUMPS}
+    for first, last in pairwise(ends):
+        budget.check()
+        lines: dict[int, Ends | None] = {}
+        for index in timed:
+            lines[index] = _line(tape.nodes[index], lines, first, last)
+            if index in found:
+                value = lines[index]
+                found[index].append(float(value[0]) if value is not None and value[0] == value[1] else None)
+    values = {
+        index: [value for value in row if value is not None]
+        for index, row in found.items() if None not in row and tape.nodes[index].op != _CHOICE
+    }  # fmt: skip
+    return _replaced(model, values, count)
+
+
+def _decimal(value: float) -> Fraction:
+    return Fraction(repr(value))
+
+
+def _timed(tape: Tape) -> list[int]:
+    """Operations that no other input than t has a part in."""
+    own: list[bool] = []
+    for node in tape.nodes:
+        own.append(node.args == (0,) if node.op == "input" else all(own[arg] for arg in node.args))
+    return [index for index, timed in enumerate(own) if timed]
+
+
+def _line(node: Node, lines: Mapping[int, Ends | None], first: Fraction, last: Fraction) -> Ends | None:
+    """An operation inside a piece, where it is one straight line; None elsewhere."""
+    if node.op == "const":
+        return _decimal(node.value), _decimal(node.value)
+    if node.op == "input":
+        return first, last
+    given = [line for line in (lines[arg] for arg in node.args) if line is not None]
+    if len(given) < len(node.args) or node.part is not None:
+        return None
+    if node.op in _OF_TRUTHS:
+        return _chosen(node.op, given)
+    if node.op in JUMPS:
+        return _step(node.op, given)
+    a, b = given[0], given[-1]
+    if node.op == "neg":
+        return -a[0], -a[1]
+    if node.op in ("add", "sub"):
+        sign = 1 if node.op == "add" else -1
+        return a[0] + sign * b[0], a[1] + sign * b[1]
+    if node.op == "mul" and (_flat(a) or _flat(b)):
+        return a[0] * b[0], a[1] * b[1]
+    if node.op == "div" and _flat(b) and b[0] != 0:
+        return a[0] / b[0], a[1] / b[0]
+    return None
+
+
+def _flat(line: Ends) -> bool:
+    return line[0] == line[1]
+
+
+def _chosen(op: str, given: Sequence[Ends]) -> Ends | None:
+    """Truths, and what is chosen by one; conditions have to be constant."""
+    if not all(_flat(line) for line in (given[:1] if op == _CHOICE else given)):
+        return None
+    holds = [line[0] != 0 for line in given]
+    if op == _CHOICE:
+        return given[1] if holds[0] else (Fraction(0), Fraction(0))
+    truth = Fraction({"and": all(holds), "or": any(holds), "not": not holds[0]}[op])
+    return truth, truth
+
+
+def _step(op: str, given: Sequence[Ends]) -> Ends | None:
+    """A jump between the ends of a piece; None where it may lie inside."""
+    low, high = (a - b for a, b in zip(*given)) if len(given) == 2 else given[0]
+    low, high = min(low, high), max(low, high)
+    if op == "floor":
+        value = Fraction(math.floor(low))
+        return (value, value) if high <= value + 1 else None
+    if low < 0 < high:
+        return None
+    sign = 0 if low == high == 0 else 1 if low >= 0 else -1
+    if op == "sign":
+        return Fraction(sign), Fraction(sign)
+    truth = Fraction({"lt": sign < 0, "le": sign <= 0, "eq": sign == 0, "ne": sign != 0}[op])
+    return truth, truth
+
+
+def _replaced(model: Model, values: Mapping[int, Sequence[float]], count: int) -> Model:
+    """The model with jumps as constants, or as inputs behind the states."""
+    tape, first = model.dynamics, 1 + model.dimension
+    rows = list(dict.fromkeys(tuple(row) for row in values.values() if len(set(row)) > 1))
+    if not rows:
+        raise Unproved(f"time alone decides no jump of the dynamics at the ends of {count} pieces")
+    nodes = []
+    for index, node in enumerate(tape.nodes):
+        row = tuple(values.get(index, ()))
+        if row in rows:
+            nodes.append(Node("input", (first + rows.index(row),)))
+        elif row:
+            nodes.append(Node("const", (), row[0]))
+        elif node.op == _CHOICE and node.args[0] in values and tape.nodes[node.args[0]].op in _TRUTHS:
+            nodes.append(Node("mul", node.args))  # by 0 or 1
+        elif node.op == "input" and node.args[0] >= first:
+            nodes.append(Node("input", (node.args[0] + len(rows),)))
+        else:
+            nodes.append(node)
+    names = (*tape.inputs[:first], *(f"jump {k + 1}" for k in range(len(rows))), *tape.inputs[first:])
+    new = Tape(inputs=names, nodes=tuple(nodes), outputs=tape.outputs, shape=tape.shape)
+    plan = [[row[k] for row in rows] for k in range(count)]
+    return replace(model, dynamics=new, plan=plan)
+
+
+def jumps_of(proof: object) -> tuple[int | None, object]:
+    """The number of pieces that a proof names, and the proof without it."""
+    if not isinstance(proof, Mapping) or "jumps" not in proof:
+        return None, proof
+    count = proof["jumps"]
+    if not isinstance(count, int) or isinstance(count, bool):
+        raise CertificateError("`proof.jumps` must be a whole number.")
+    return count, {name: value for name, value in proof.items() if name != "jumps"}

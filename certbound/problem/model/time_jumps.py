@@ -1,0 +1,231 @@
+"""Jumps that the clock alone decides: ``where(t < 5, a, b)`` is a constant on either side of t = 5.
+
+In continuous time such a jump is no hindrance: what the model says at the one time of the jump has no weight. The
+horizon is cut into equal pieces that have the jumps at their ends, and what jumps becomes an input with a value a
+piece, as the rows of an array plan are.
+
+A time is read as the decimal number that it is written as (the shortest one that names its float): 0.3 is 3/10.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+from certbound.problem.model.analysis import reads
+from certbound.problem.model.graph import Graph
+from certbound.problem.model.tape import JUMPS, Node, Tape
+
+_MOST_JUMPS = 500
+_MOST_PIECES = 1000
+_CHOICE = "if_else_zero"
+_TRUTHS = JUMPS - {_CHOICE, "sign", "floor"}  # 0 or 1
+
+Line = tuple[Fraction, Fraction]
+"""Slope and offset of a function of t that is a straight line on a piece."""
+_NOTHING: Line = (Fraction(0), Fraction(0))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TimeJumps:
+    """A function whose jumps at known times are inputs.
+
+    ``tape`` has the inputs ``names`` behind the first ``1 + states`` of the function; ``rows`` holds their values on
+    equal pieces of the horizon, a row a piece.
+    """
+
+    tape: Tape
+    names: tuple[str, ...]
+    rows: tuple[tuple[float, ...], ...]
+
+
+def cut_at_jumps(tape: Tape, states: int, horizon: float) -> TimeJumps | None:
+    """The function without the jumps that t alone decides; None where it has none, or they fit into no equal pieces.
+
+    A jump counts where its argument is, piece by piece, a straight line in t: ``t < 5``, ``sign(t - 3)``,
+    ``floor(t/2)``, ``t - 2*floor(t/2) < 1``.
+
+    Parameters
+    ----------
+    tape : Tape
+        Over t, the states, and whatever else.
+    states : int
+        Number of states.
+    horizon : float
+        The length of time, finite.
+    """
+    found = reads(tape)
+    own = [index for index in range(len(tape.nodes)) if found[index] <= {0}]
+    if not any(tape.nodes[index].op in JUMPS and found[index] for index in own):
+        return None
+    breaks = _breaks(tape, own, decimal(horizon))
+    if breaks is None:
+        return None
+    count = math.lcm(*((end / breaks[-1]).denominator for end in breaks))
+    if count > _MOST_PIECES:
+        return None
+    values = _values(tape, own, breaks)
+    wanted = [index for index in _frontier(tape, values) if found[index]]
+    middles = [(Fraction(2 * k + 1, 2 * count)) * breaks[-1] for k in range(count)]
+    places = [sum(end < middle for end in breaks) - 1 for middle in middles]
+    return _with_inputs(tape, states, {index: [values[index][place] for place in places] for index in wanted})
+
+
+def decimal(value: float) -> Fraction:
+    """The decimal number that a float is written as."""
+    return Fraction(repr(float(value)))
+
+
+def _breaks(tape: Tape, own: Sequence[int], horizon: Fraction) -> list[Fraction] | None:
+    """0, the times where something of ``own`` jumps, and the horizon; None where there are too many."""
+    breaks = [Fraction(0), horizon]
+    piece = 0
+    while piece + 1 < len(breaks):
+        new = next(_jumps_within(tape, own, breaks[piece], breaks[piece + 1]), None)
+        if new is None:
+            piece += 1
+            continue
+        breaks.insert(piece + 1, new)
+        if len(breaks) > _MOST_JUMPS:
+            return None
+    return breaks
+
+
+def _jumps_within(tape: Tape, own: Sequence[int], first: Fraction, last: Fraction) -> Iterator[Fraction]:
+    """Times inside a piece at which a node of ``own`` jumps, as far as that can be said."""
+    lines: dict[int, Line | None] = {}
+    for index in own:
+        node = tape.nodes[index]
+        if node.op in JUMPS and all(lines[arg] is not None for arg in node.args):
+            yield from _crossings(node.op, _compared(node, lines), first, last)
+        lines[index] = _line(node, lines, (first + last) / 2)
+
+
+def _compared(node: Node, lines: Mapping[int, Line | None]) -> Line:
+    """What a jump compares with 0 (``floor``: with whole numbers)."""
+    given = [line for line in (lines[arg] for arg in node.args) if line is not None]
+    if len(given) == 1 or node.op in ("and", "or", _CHOICE):
+        return given[0]
+    return given[0][0] - given[1][0], given[0][1] - given[1][1]
+
+
+def _crossings(op: str, line: Line, first: Fraction, last: Fraction) -> Iterator[Fraction]:
+    slope, offset = line
+    if slope == 0:
+        return
+    levels = [Fraction(0)]
+    if op == "floor":
+        ends = sorted((slope * first + offset, slope * last + offset))
+        low, high = math.floor(ends[0]), math.ceil(ends[1])
+        levels = [Fraction(low + k) for k in range(min(high - low + 1, _MOST_JUMPS))]
+    yield from (time for time in ((level - offset) / slope for level in levels) if first < time < last)
+
+
+def _line(node: Node, lines: Mapping[int, Line | None], middle: Fraction) -> Line | None:
+    """A node as a straight line on a piece with this middle, on which no node before it jumps; None where it is none.
+
+    A jump has its value at the middle.
+    """
+    if node.op == "const":
+        return Fraction(0), decimal(node.value)
+    if node.op == "input":
+        return Fraction(1), Fraction(0)
+    given = [line for line in (lines[arg] for arg in node.args) if line is not None]
+    if len(given) != len(node.args) or node.part is not None:
+        return None
+    if node.op in ("and", "or", "not"):
+        holds = [line != _NOTHING for line in given]
+        return Fraction(0), Fraction({"and": all(holds), "or": any(holds), "not": not holds[0]}[node.op])
+    if node.op == _CHOICE:
+        return given[1] if given[0] != _NOTHING else _NOTHING
+    if node.op in JUMPS:
+        slope, offset = _compared(node, lines)
+        return Fraction(0), _jumped(node.op, slope * middle + offset)
+    return _sum(node.op, given)
+
+
+def _jumped(op: str, value: Fraction) -> Fraction:
+    if op == "floor":
+        return Fraction(math.floor(value))
+    if op == "sign":
+        return Fraction((value > 0) - (value < 0))
+    return Fraction({"lt": value < 0, "le": value <= 0, "eq": value == 0, "ne": value != 0}[op])
+
+
+def _sum(op: str, given: Sequence[Line]) -> Line | None:
+    (a, b), (c, d) = given[0], given[-1]
+    match op:
+        case "neg":
+            return -a, -b
+        case "add":
+            return a + c, b + d
+        case "sub":
+            return a - c, b - d
+        case "mul" if a == 0 or c == 0:
+            return a * d + b * c, b * d
+        case "div" if c == 0 and d != 0:
+            return a / d, b / d
+    return None
+
+
+def _values(tape: Tape, own: Sequence[int], breaks: Sequence[Fraction]) -> dict[int, list[float]]:
+    """The value of every jump of ``own`` on every piece, of those that are known on all of them."""
+    pieces: list[dict[int, Line | None]] = []
+    for first, last in itertools.pairwise(breaks):
+        lines: dict[int, Line | None] = {}
+        for index in own:
+            lines[index] = _line(tape.nodes[index], lines, (first + last) / 2)
+        pieces.append(lines)
+    jumps = [index for index in own if tape.nodes[index].op in JUMPS - {_CHOICE}]
+    known = [index for index in jumps if all(lines[index] is not None for lines in pieces)]
+    return {index: [float((lines[index] or _NOTHING)[1]) for lines in pieces] for index in known}
+
+
+def _frontier(tape: Tape, values: Mapping[int, Sequence[float]]) -> list[int]:
+    """The known jumps that something else than a known jump needs."""
+    needed = set(tape.outputs)
+    for index, node in enumerate(tape.nodes):
+        if index not in values and node.op != "input":
+            needed |= set(node.args)
+    return [index for index in values if index in needed]
+
+
+def _with_inputs(tape: Tape, states: int, values: Mapping[int, Sequence[float]]) -> TimeJumps | None:
+    """The tape with inputs for those of the values that change, and constants for the others.
+
+    What is chosen by 0 or 1 is a product from then on: nothing is left that jumps.
+    """
+    changing = {index: tuple(row) for index, row in values.items() if len(set(row)) > 1}
+    columns = list(dict.fromkeys(changing.values()))
+    if not columns:
+        return None
+    names = tuple(_fresh(tape.inputs, len(columns)))
+    first = 1 + states
+    graph = Graph((*tape.inputs[:first], *names, *tape.inputs[first:]))
+    copy = graph.arithmetic()
+    made: list[int] = []
+    for index, node in enumerate(tape.nodes):
+        if index in changing:
+            made.append(graph.input(first + columns.index(changing[index])))
+        elif index in values:
+            made.append(graph.const(values[index][0]))
+        elif node.op == "input":
+            slot = node.args[0]
+            made.append(graph.input(slot if slot < first else slot + len(names)))
+        elif node.op == "const":
+            made.append(graph.const(node.value))
+        elif node.op == _CHOICE and node.args[0] in values and tape.nodes[node.args[0]].op in _TRUTHS:
+            made.append(graph.apply("mul", made[node.args[0]], made[node.args[1]]))
+        else:
+            args = [made[arg] for arg in node.args]
+            more = [node.part] if node.part is not None else [node.value] if node.op == "pow" else []
+            made.append(copy[node.op](*args, *more))
+    new = graph.tape([made[output] for output in tape.outputs], tape.shape)
+    return TimeJumps(tape=new, names=names, rows=tuple(zip(*columns)))
+
+
+def _fresh(taken: Sequence[str], count: int) -> list[str]:
+    return [name for k in range(count + len(taken)) if (name := f"jump_{k + 1}") not in taken][:count]
