@@ -90,7 +90,7 @@ def test_an_actuator_that_is_far_from_its_limits_in_spread_leaves_no_remainder()
     safe = cb.Inside(cb.Box([10, -np.inf], [80, np.inf]))
     problem = cb.Problem(system, initial=cb.Box([38, 10], [42, 10]), safe=[safe], horizon=52, delta=1e-4)
     engine = Linearisation.of(problem)
-    rows, extra = inner_rows(engine)
+    _, extra = inner_rows(engine)
     assert extra.shape[2] == 1
     normal = extra[0, 20, 0] / extra[0, 20, 0, 0]
     np.testing.assert_allclose(normal, [1.0, 1.2], rtol=1e-6)
