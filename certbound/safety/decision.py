@@ -38,7 +38,7 @@ _TURN = 0.5  # of the time that is left then, for all of them
 _LAST = 0.2  # of the time that is left then, where none of them has much of a chance
 _SOON = 0.5  # seconds after which those that have a first bound soon are asked for it, under a limit
 _UNLIKELY = 2.0  # seconds for an engine that has hardly a chance, once there is a bound
-_THOROUGH, _LONGER = 20.0, 4.0  # seconds for an engine that is asked once more without a limit, or times those so far
+_THOROUGH, _LONGER = 120.0, 1.0  # seconds for an engine asked once more without a limit, or times those so far
 _LASTING = 100_000  # steps
 _EXTRA = 0.2  # of the time that is left, for a bound that can no longer change the verdict
 

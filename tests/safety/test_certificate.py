@@ -193,8 +193,8 @@ def test_who_was_only_asked_for_a_certificate_is_asked_once_and_may_fail(monkeyp
 
     verdict = verify_safety(small())
     assert verdict.status == "SAFE"
-    for name in ENGINES:
-        monkeypatch.setitem(ENGINES, name, replace(ENGINES[name], write=refusing, reserve=name in ("barrier", "values")))
+    for name, row in ENGINES.items():
+        monkeypatch.setitem(ENGINES, name, replace(row, write=refusing, reserve=name in ("barrier", "values")))
     monkeypatch.setitem(ENGINES, "barrier", replace(ENGINES["barrier"], prove=failing))
     monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=proving, write=writing))
     for attempt in range(2):

@@ -214,18 +214,18 @@ def test_once_unsafe_is_proved_nobody_is_asked_in_full(monkeypatch: pytest.Monke
 def test_without_a_limit_a_second_asking_is_in_proportion_to_the_first(
     monkeypatch: pytest.MonkeyPatch, clock: Time
 ) -> None:
-    for first, most in ((1.0, 20.0), (10.0, 40.0)):
+    for first, most in ((1.0, 120.0), (200.0, 200.0)):
         scripted(monkeypatch, clock, {"constants": [(first, -1)]})
 
         def endless(problem: cb.Problem, request: Request) -> EngineAnswer:
             if request.thorough:
-                clock.work(1e4, "halving")  # noqa: B023
+                clock.work(1e4, "halving")
             return EngineAnswer(method="linear", log10_delta=-0.5)
 
         monkeypatch.setitem(ENGINES, "linear", replace(ENGINES["linear"], prove=endless, again=True))
         verdict, seconds = run(clock, None)
         assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", -1)
-        assert seconds == pytest.approx(first + most, abs=0.3)
+        assert seconds == pytest.approx(first + most, abs=0.5)
 
 
 def test_what_a_sketch_proves_is_told(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.reach.linear.linearisation import Linearisation
-from certbound.reach.remainder import turned_gradients
 
 _POINTS = 64
 _FARTHEST = 2.0  # times the spread, for points at which kinks are looked for
@@ -68,7 +67,7 @@ def _jumps(engine: Linearisation, root: Array) -> Array:
     unit = np.random.default_rng(0).normal(size=(_POINTS, count))
     unit *= (_FARTHEST * np.linspace(0, 1, _POINTS) / np.linalg.norm(unit, axis=1))[:, None]
     shift = np.einsum("bkij,pj->bkpi", root, unit).reshape(-1, _POINTS, count)
-    turned = turned_gradients(engine.model, engine.frame, shift)
+    turned = engine.model.turned_gradients(engine.frame, shift)
     found = np.einsum("mpoi,mpoj->moij", turned, turned).reshape(*root.shape[:2], -1, count, count)
     return np.asarray(found + 1e-6 * found.mean(axis=1, keepdims=True))
 

@@ -5,6 +5,6 @@ from __future__ import annotations
 from certbound.reach.remainder.bound import Remainder
 from certbound.reach.remainder.frame import Frame
 from certbound.reach.remainder.jumps import hidden_jump
-from certbound.reach.remainder.samples import fitted_slopes, sampled_range, turned_gradients
+from certbound.reach.remainder.samples import fitted_slopes, sampled_range
 
-__all__ = ["fitted_slopes", "Frame", "hidden_jump", "Remainder", "sampled_range", "turned_gradients"]
+__all__ = ["fitted_slopes", "Frame", "hidden_jump", "Remainder", "sampled_range"]

@@ -89,35 +89,9 @@ def _points(
     return shift + step, half
 
 
-def turned_gradients(model: Derivatives, frame: Frame, shift: Array) -> Array:
-    """How far gradients at deviations ``shift`` (M, K, active) are from their mean: (M, K, outputs, active).
-
-    Of the outputs with an entry of the Jacobian that varies; where it jumps at a kink, along the normal of that.
-    """
-    with np.errstate(all="ignore"):
-        values = np.asarray(compile_numpy(model.varying)(*_slots(model, frame, shift))).reshape(*shift.shape[:2], -1)
-        values = values - values.mean(axis=1, keepdims=True)
-    outputs = sorted({i for i, _ in model.entries})
-    result = np.zeros((*shift.shape[:2], len(outputs), len(model.active)))
-    for column, (i, j) in enumerate(model.entries):
-        result[:, :, outputs.index(i), int(np.searchsorted(model.active, j))] = values[..., column]
-    return np.where(np.isfinite(result), result, 0.0)
-
-
-def _slots(model: Derivatives, frame: Frame, shift: Array) -> list[Array]:
-    """The inputs of the dynamics' tape at the middle of the pieces, one row a deviation."""
-    m, points = shift.shape[:2]
-    n = frame.spread.shape[1]
-    state = np.repeat(frame.middle.mid[:, None], points, axis=1)
-    state[..., model.active] += shift
-    fixed = [np.repeat(column, points) for column in (frame.middle_time.mid, *frame.inputs.T)]
-    noisy = (np.full(m * points, d) for d in frame.disturbance_middle)
-    return [fixed[0], *state.reshape(-1, n).T, *fixed[1:], *noisy]
-
-
 def _remainder(model: Derivatives, frame: Frame, shift: Array) -> Array:
     """beta in floats at the middle of the pieces for deviations ``shift`` (M, K, active): (M, K, n)."""
     with np.errstate(all="ignore"):
-        value = np.asarray(compile_numpy(model.value)(*_slots(model, frame, shift))).reshape(*shift.shape[:2], -1)
+        value = np.asarray(compile_numpy(model.value)(*model.shifted(frame, shift))).reshape(*shift.shape[:2], -1)
         linear = shift @ np.swapaxes(frame.slope.mid[:, :, model.active], 1, 2)
         return np.asarray(value - frame.middle_velocity.mid[:, None] - linear)
