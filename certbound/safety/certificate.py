@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from flint import arb
 
-from certbound.errors import CertificateError
+from certbound.errors import CertificateError, EngineError, contained
 from certbound.problem.goals import met_at
 from certbound.problem.model import Network, Tape
 from certbound.problem.noise import Law, check_law
@@ -196,10 +196,18 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
         if problem.reach is not None or verdict.status != "SAFE" or asked is None or asked.applicable:
             continue
         if row.reserve and row.write:
-            answer = known[name] if name in known else row.prove(problem)
-            known[name] = answer
+            answer = known[name] = known[name] if name in known else _asked_now(problem, name)
             if answer.applicable and answer.log10_delta < 0:
                 yield name, answer
+
+
+def _asked_now(problem: Problem, name: str) -> EngineAnswer:
+    """What an engine answers; that it does not apply where it fails."""
+    try:
+        with contained(name):
+            return ENGINES[name].prove(problem)
+    except EngineError as error:
+        return EngineAnswer(applicable=False, method=name, reason=str(error))
 
 
 # ---- the problem -------------------------------------------------------------------------------------------

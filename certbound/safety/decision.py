@@ -40,6 +40,7 @@ _TURN = 0.5  # of the time that is left then, for all of them
 _LAST = 0.2  # of the time that is left then, where none of them has much of a chance
 _SOON = 0.5  # seconds after which those that have a first bound soon are asked for it, under a limit
 _UNLIKELY = 2.0  # seconds for an engine that has hardly a chance, once there is a bound
+_THOROUGH, _LONGER = 120.0, 1.0  # seconds for an engine asked once more without a limit, or times those so far
 _LASTING = 100_000  # steps
 _EXTRA = 0.2  # of the time that is left, for a bound that can no longer change the verdict
 
@@ -103,15 +104,19 @@ class _Search:
         return any(is_safe(answer, self.problem) for answer in (*self.answers.values(), *self.sketches.values()))
 
     @property
+    def refuted(self) -> bool:
+        """Whether UNSAFE is proved."""
+        below = best_lower(self.answers)
+        return below is not None and is_more_than(below, self.problem.delta)
+
+    @property
     def bounded(self) -> bool:
         """Whether any probability below 1 is proved."""
         return any(answer.applicable and answer.log10_delta < 0 for answer in self.answers.values())
 
     def spared(self, name: str) -> bool:
         """Whether an engine may be quick: not where it alone could prove UNSAFE of what is near the truth."""
-        below = best_lower(self.answers)
-        refuted = below is not None and is_more_than(below, self.problem.delta)
-        return self.settled and (self.safe or refuted or ENGINES[name].write_below is None)
+        return self.settled and (self.safe or self.refuted or ENGINES[name].write_below is None)
 
     def violation(self) -> Violation | None:
         """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
@@ -131,18 +136,26 @@ class _Search:
         """Sketches, all engines in turn, and thoroughly those that spared themselves."""
         if self.problem.system.dimension <= _LARGE and self.request.constants is None:
             for name in (name for name in names if ENGINES[name].sketch):
-                self.sketches[name] = self._asked(name, replace(self.request, quick=True))
+                found = self.sketches[name] = self._asked(name, replace(self.request, quick=True))
+                if found.applicable and found.certified:
+                    self.watch.noted(found.log10_delta, found.log10_lower)
         names = tuple(sorted(names, key=lambda name: not self._likely(name)))
         self._in_turn(names)
-        if self.safe or self.request.cells is not None:
+        if self.safe or self.refuted or self.request.cells is not None:
             return
         for name in (name for name in names if ENGINES[name].again and (self._likely(name) or not self.bounded)):
             first = self.answers.get(name)
             if first is not None and first.applicable and not first.conclusive:
-                self.ask(name, Request(before=first.details))
+                self._thoroughly(name, Request(before=first.details))
         for name in (name for name in names if self.problem.system.dimension < ENGINES[name].spares):
             if not self.bounded and name in self.answers:
-                self.ask(name, Request())
+                self._thoroughly(name, Request())
+
+    def _thoroughly(self, name: str, request: Request) -> None:
+        """Ask once more; where nobody set a limit, only as long as that is in proportion to what it all took so far."""
+        most = max(_THOROUGH, _LONGER * self.watch.spent) if self.watch.limit is None else math.inf
+        with self.watch.share(1.0, most):
+            self.ask(name, request)
 
     def _in_turn(self, names: tuple[str, ...]) -> None:
         """Ask one engine after the other; one that takes long is interrupted for those after it."""

@@ -12,6 +12,7 @@ import pytest
 
 import certbound as cb
 from certbound.checker import check_data, parse
+from certbound.cli.commands.check import proved_certificate
 from certbound.errors import CertificateError
 from certbound.safety.answers import EngineAnswer, exact
 from certbound.safety.certificate import certificate_data, certificate_text, problem_data, restated
@@ -171,6 +172,49 @@ def test_windows_of_a_linear_flow_cost_little_of_a_small_probability() -> None:
     claim = float.fromhex(certificate_data(problem, verdict)["claim"]["log10_delta"])
     assert verdict.log10_delta < -7
     assert claim < 0.85 * verdict.log10_delta
+
+
+def test_who_was_only_asked_for_a_certificate_is_asked_once_and_may_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def refusing(*_: Any) -> Any:
+        raise CertificateError("not today.")
+
+    def failing(problem: cb.Problem) -> EngineAnswer:
+        asked.append("barrier")
+        raise ZeroDivisionError
+
+    def proving(problem: cb.Problem) -> EngineAnswer:
+        asked.append("values")
+        return EngineAnswer(log10_delta=-4.0, method="values", details="a proof")
+
+    def writing(problem: cb.Problem, answer: EngineAnswer, attempt: int) -> Any:
+        return {"engine": answer.details}, -3.5, []
+
+    verdict = verify_safety(small())
+    assert verdict.status == "SAFE"
+    for name, row in ENGINES.items():
+        monkeypatch.setitem(ENGINES, name, replace(row, write=refusing, reserve=name in ("barrier", "values")))
+    monkeypatch.setitem(ENGINES, "barrier", replace(ENGINES["barrier"], prove=failing))
+    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=proving, write=writing))
+    for attempt in range(2):
+        claim = certificate_data(small(), verdict, attempt=attempt)["claim"]
+        assert claim == {"log10_delta": exact(-3.5), "method": "values", "assumptions": []}
+    assert asked == ["barrier", "values"]
+
+
+def test_a_certificate_that_proves_less_than_safe_is_written_again_with_more_effort() -> None:
+    unit = 1e-5
+    system = cb.ContinuousSystem(
+        lambda x: [1.29 * x[1], -1.29 * x[0] - 0.49 * x[1]], states=2, diffusion=[[0.0], [0.162 * unit]]
+    )
+    post = cb.Outside(cb.Box([-1.1747 * unit, 0.28755 * unit], [1.5026 * unit, 2.9649 * unit]), during=(0.378, 2.126))
+    problem = cb.Problem(system, initial=[0.5 * unit, 0.0], safe=[post], horizon=2.29, delta=3.03e-3)
+    verdict = verify_safety(problem)
+    assert verdict.status == "SAFE"
+    least = np.log10(problem.delta)
+    assert float.fromhex(certificate_data(problem, verdict)["claim"]["log10_delta"]) > least
+    assert float.fromhex(parse(proved_certificate(problem, verdict))["claim"]["log10_delta"]) <= least
 
 
 def test_a_law_of_an_unknown_class_is_stated_by_no_certificate() -> None:

@@ -193,6 +193,52 @@ def test_who_spares_itself_is_asked_in_full_where_nothing_is_proved(
     assert asked.count("quadratic") == 1
 
 
+def test_once_unsafe_is_proved_nobody_is_asked_in_full(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    asked = scripted(monkeypatch, clock, {"linear": [(1, 0)], "values": [(1, 0)], "quadratic": [(1, 0)]})
+    proves = ENGINES["values"].prove
+
+    def from_below(problem: cb.Problem, request: Request) -> EngineAnswer:
+        return replace(proves(problem, request), log10_lower=-1.0)
+
+    monkeypatch.setitem(ENGINES, "linear", replace(ENGINES["linear"], again=True))
+    monkeypatch.setitem(ENGINES, "quadratic", replace(ENGINES["quadratic"], spares=2))
+    run(clock, 60)
+    assert [asked.count(name) for name in ("linear", "quadratic")] == [2, 2]
+    asked.clear()
+    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=from_below))
+    verdict, _ = run(clock, 60)
+    assert verdict.status == "UNSAFE"
+    assert [asked.count(name) for name in ("linear", "quadratic")] == [1, 1]
+
+
+def test_without_a_limit_a_second_asking_is_in_proportion_to_the_first(
+    monkeypatch: pytest.MonkeyPatch, clock: Time
+) -> None:
+    for first, most in ((1.0, 120.0), (200.0, 200.0)):
+        scripted(monkeypatch, clock, {"constants": [(first, -1)]})
+
+        def endless(problem: cb.Problem, request: Request) -> EngineAnswer:
+            if request.thorough:
+                clock.work(1e4, "halving")
+            return EngineAnswer(method="linear", log10_delta=-0.5)
+
+        monkeypatch.setitem(ENGINES, "linear", replace(ENGINES["linear"], prove=endless, again=True))
+        verdict, seconds = run(clock, None)
+        assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", -1)
+        assert seconds == pytest.approx(first + most, abs=0.5)
+
+
+def test_what_a_sketch_proves_is_told(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    def sketched(problem: cb.Problem, request: Request) -> EngineAnswer:
+        return EngineAnswer(method="constants", log10_delta=-1.0)
+
+    scripted(monkeypatch, clock, {"linear": [(3, -2)]})
+    monkeypatch.setitem(ENGINES, "constants", replace(ENGINES["constants"], prove=sketched, sketch=True))
+    told: list[Progress] = []
+    run(clock, 30, told)
+    assert next(p.seconds for p in told if p.log10_delta == -1.0) < 0.5
+
+
 def test_a_sketch_of_the_remainder_tells_where_the_linear_response_has_a_chance() -> None:
     def flow(noise: float) -> cb.Problem:
         system = cb.ContinuousSystem(

@@ -10,6 +10,9 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.reach.linear.linearisation import Linearisation
 
+_POINTS = 64
+_FARTHEST = 2.0  # times the spread, for points at which kinks are looked for
+
 
 def inner_rows(engine: Linearisation) -> tuple[Array, Array]:
     """All rows (B, N, D, n), the active coordinates first, and the others over the active coordinates alone."""
@@ -31,7 +34,8 @@ def _curved(engine: Linearisation) -> Array:
     if not 2 <= count <= 6 or len(blocks) != 1 or len(blocks[0]) != 1:
         return nothing
     hessians = engine.model.reference_hessians(engine.frame).reshape(cells, engine.pieces, -1, count, count)
-    if not hessians.shape[2]:
+    kinks = not hessians.any() and engine.model.kinked and not engine.model.planar
+    if not hessians.shape[2] and not kinks:
         return nothing
     node = slice(1, None) if engine.continuous else slice(0, -1)
     spread = 16 * engine.response.covariance[:, node] + _spread(engine)[:, node]
@@ -40,8 +44,10 @@ def _curved(engine: Linearisation) -> Array:
     spread = spread + (1e-9 * trace + 1e-30 * float(engine.sizes.max()) ** 2 + 1e-300) * np.eye(count)
     root = np.linalg.cholesky(spread)
     inverse = np.linalg.inv(root)
+    if kinks:
+        hessians = _jumps(engine, root)
     _, vectors = np.linalg.eigh(np.swapaxes(root, -1, -2)[:, :, None] @ hessians @ root[:, :, None])
-    chosen = np.swapaxes(vectors, -1, -2)[..., [0, -1], :] @ inverse[:, :, None]
+    chosen = np.swapaxes(vectors, -1, -2)[..., [-1] if kinks else [0, -1], :] @ inverse[:, :, None]
     rows = chosen.reshape(cells, engine.pieces, -1, count)
     # what the remainder does not depend on must not help to cull its boxes
     rows[..., np.setdiff1d(np.arange(count), blocks[0][0])] = 0.0
@@ -53,6 +59,17 @@ def _curved(engine: Linearisation) -> Array:
     sign = np.cumprod(np.where(flips < 0, -1.0, 1.0), axis=1)
     rows[:, 1:] *= sign[..., None]
     return rows
+
+
+def _jumps(engine: Linearisation, root: Array) -> Array:
+    """Squares of how gradients turn within the spread, summed over points: largest along the normals of kinks."""
+    count = root.shape[-1]
+    unit = np.random.default_rng(0).normal(size=(_POINTS, count))
+    unit *= (_FARTHEST * np.linspace(0, 1, _POINTS) / np.linalg.norm(unit, axis=1))[:, None]
+    shift = np.einsum("bkij,pj->bkpi", root, unit).reshape(-1, _POINTS, count)
+    turned = engine.model.turned_gradients(engine.frame, shift)
+    found = np.einsum("mpoi,mpoj->moij", turned, turned).reshape(*root.shape[:2], -1, count, count)
+    return np.asarray(found + 1e-6 * found.mean(axis=1, keepdims=True))
 
 
 def _carried(rows: Array, engine: Linearisation) -> Array:

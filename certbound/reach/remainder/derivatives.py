@@ -11,6 +11,7 @@ from certbound.constants.enclosures import enclose
 from certbound.problem.model import (
     JUMPS,
     Tape,
+    compile_numpy,
     deciding,
     is_zero,
     jacobian,
@@ -193,6 +194,30 @@ class Derivatives:
                     if self.folded(entry, state):
                         result[:, outputs.index(i), position[state], position[j]] = middle[..., column]
         return (result + np.swapaxes(result, -1, -2)) / 2
+
+    def turned_gradients(self, frame: Frame, shift: Array) -> Array:
+        """How far gradients at deviations ``shift`` (M, K, active) are from their mean: (M, K, outputs, active).
+
+        Of the outputs with an entry of the Jacobian that varies; where it jumps at a kink, along the normal of that.
+        """
+        with np.errstate(all="ignore"):
+            values = np.asarray(compile_numpy(self.varying)(*self.shifted(frame, shift)))
+            values = values.reshape(*shift.shape[:2], -1)
+            values = values - values.mean(axis=1, keepdims=True)
+        outputs = sorted({i for i, _ in self.entries})
+        result = np.zeros((*shift.shape[:2], len(outputs), len(self.active)))
+        for column, (i, j) in enumerate(self.entries):
+            result[:, :, outputs.index(i), int(np.searchsorted(self.active, j))] = values[..., column]
+        return np.where(np.isfinite(result), result, 0.0)
+
+    def shifted(self, frame: Frame, shift: Array) -> list[Array]:
+        """The inputs of the tape at the middle of the pieces, one row a deviation ``shift`` (M, K, active)."""
+        m, points = shift.shape[:2]
+        state = np.repeat(frame.middle.mid[:, None], points, axis=1)
+        state[..., self.active] += shift
+        fixed = [np.repeat(column, points) for column in (frame.middle_time.mid, *frame.inputs.T)]
+        noisy = (np.full(m * points, d) for d in frame.disturbance_middle)
+        return [fixed[0], *state.reshape(m * points, -1).T, *fixed[1:], *noisy]
 
     @staticmethod
     def slots(

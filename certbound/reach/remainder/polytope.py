@@ -60,7 +60,8 @@ class Polytope:
 def linear_range(matrix: Array, radius: Array, normals: Array, room: Array) -> Array:
     """Upper bounds of g . d over |d| <= e and one of normals_k . d <= room_k at a time, the least over k.
 
-    For alpha >= 0, g . d <= |g - alpha w| . e + alpha room: the least value over the kinks alpha = g_j / w_j counts.
+    For alpha >= 0, g . d <= |g - alpha w| . e + alpha room, which is convex in alpha: the kink alpha = g_j / w_j where
+    it begins to grow serves best, and a face for which it grows from 0 on is of no use.
 
     ``matrix`` (Q, n, a) holds the rows g, ``radius`` (Q, a) is e, ``normals`` (Q, D, a) and ``room`` (Q, D) are the
     faces. The bounds (Q, n) are rounded up.
@@ -75,16 +76,34 @@ def linear_range(matrix: Array, radius: Array, normals: Array, room: Array) -> A
     result = np.einsum("qna,qa->qn", np.abs(matrix), radius) * _WIDE + _LEAST
     reach = np.einsum("qda,qa->qd", np.abs(normals), radius)
     box, face = np.nonzero(room < reach * (1 - 1e-12))
-    g, w, e, b = matrix[box], normals[box, face][:, None], radius[box][:, None], room[box, face][:, None]
-    for j in range(matrix.shape[2]):
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            alpha = g[:, :, j] / w[:, :, j]
-        alpha = np.where((alpha > 0) & (alpha < 1e100), alpha, 0.0)[..., None]
-        left = np.abs(g - alpha * w)
-        value = (left * e).sum(axis=-1) + alpha[..., 0] * b
-        size = ((np.abs(g) + alpha * np.abs(w)) * e).sum(axis=-1) + alpha[..., 0] * np.abs(b)
-        np.minimum.at(result, box, value + 1e-13 * size + _LEAST)
+    if not len(box):
+        return np.asarray(result)
+    g, w, b = matrix[box], normals[box, face], room[box, face]
+    weight = np.abs(w) * radius[box]
+    falls = g * w[:, None] > 0
+    slope = b[:, None] + reach[box, face][:, None] - 2 * np.einsum("pna,pa->pn", falls, weight)
+    pair, row = np.nonzero(slope < 0)
+    g, w, b, e = g[pair, row], w[pair], b[pair], radius[box[pair]]
+    alpha = _turning(g, w, falls[pair, row], weight[pair], slope[pair, row])
+    value = (np.abs(g - alpha[:, None] * w) * e).sum(axis=-1) + alpha * b
+    size = (np.abs(g) * e).sum(axis=-1) + alpha * (weight[pair].sum(axis=-1) + np.abs(b))
+    np.minimum.at(result, (box[pair], row), value + 1e-13 * size + _LEAST)
     return np.asarray(result)
+
+
+def _turning(g: Array, w: Array, falls: Mask, weight: Array, slope: Array) -> Array:
+    """Where sum |g - alpha w| e + alpha b begins to grow: (P,), of rows (P, a); ``slope`` < 0 at 0, ``weight`` |w| e.
+
+    At a kink of a coordinate that ``falls`` the slope grows by twice its weight. 0 where numbers are out of range.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        kinks = np.where(falls, g / w, np.inf)
+    order = np.argsort(kinks, axis=-1)
+    grown = slope[:, None] + 2 * np.cumsum(np.take_along_axis(weight, order, axis=-1), axis=-1)
+    last = np.maximum(falls.sum(axis=-1) - 1, 0)
+    place = np.minimum(np.where((grown >= 0).any(axis=-1), np.argmax(grown >= 0, axis=-1), last), last)
+    alpha = np.take_along_axis(np.take_along_axis(kinks, order, axis=-1), place[:, None], axis=-1)[:, 0]
+    return np.where(alpha < 1e100, alpha, 0.0)
 
 
 def grid(low: Array, high: Array, block: list[int], divisions: int) -> tuple[Array, Array]:

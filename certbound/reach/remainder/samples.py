@@ -91,13 +91,7 @@ def _points(
 
 def _remainder(model: Derivatives, frame: Frame, shift: Array) -> Array:
     """beta in floats at the middle of the pieces for deviations ``shift`` (M, K, active): (M, K, n)."""
-    m, points = shift.shape[:2]
-    n = frame.spread.shape[1]
-    state = np.repeat(frame.middle.mid[:, None], points, axis=1)
-    state[..., model.active] += shift
-    fixed = [np.repeat(column, points) for column in (frame.middle_time.mid, *frame.inputs.T)]
-    slots = [fixed[0], *state.reshape(-1, n).T, *fixed[1:], *(np.full(m * points, d) for d in frame.disturbance_middle)]
     with np.errstate(all="ignore"):
-        value = np.asarray(compile_numpy(model.value)(*slots)).reshape(m, points, n)
+        value = np.asarray(compile_numpy(model.value)(*model.shifted(frame, shift))).reshape(*shift.shape[:2], -1)
         linear = shift @ np.swapaxes(frame.slope.mid[:, :, model.active], 1, 2)
         return np.asarray(value - frame.middle_velocity.mid[:, None] - linear)

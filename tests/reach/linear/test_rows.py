@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -10,6 +12,7 @@ import certbound as cb
 from certbound.gaussian.response.events import WindowEvent, WindowEvents
 from certbound.gaussian.response.levels import level_along, level_scale
 from certbound.gaussian.response.linear_response import LinearResponse, continuous_response
+from certbound.reach.linear.answer import linear_answer
 from certbound.reach.linear.linearisation import WINDOW, Linearisation
 from certbound.reach.linear.rows import inner_rows
 
@@ -74,3 +77,21 @@ def test_rows_that_move_with_the_flow_cost_little_in_every_window(share: float) 
         own = rows[0, :, d]
         deviation = np.sqrt(np.einsum("ki,kij,kj->k", own, covariance, own))
         assert np.median(windows.along(own).cost / deviation) < 0.5
+
+
+def test_an_actuator_that_is_far_from_its_limits_in_spread_leaves_no_remainder() -> None:
+    """Stock and orders: the box around both deviations reaches the limits of the orders, what is likely does not."""
+
+    def step(x: list[Any]) -> list[Any]:
+        orders = 10 + 0.5 * (40 - x[0]) + 0.6 * (10 - x[1])
+        return [x[0] + x[1] - 10, np.maximum(0, np.minimum(30, orders))]
+
+    system = cb.DiscreteSystem(step, states=2, noise=cb.Gaussian(std=[3.0]), noise_matrix=[[1.0], [0.0]])
+    safe = cb.Inside(cb.Box([10, -np.inf], [80, np.inf]))
+    problem = cb.Problem(system, initial=cb.Box([38, 10], [42, 10]), safe=[safe], horizon=52, delta=1e-4)
+    engine = Linearisation.of(problem)
+    _, extra = inner_rows(engine)
+    assert extra.shape[2] == 1
+    normal = extra[0, 20, 0] / extra[0, 20, 0, 0]
+    np.testing.assert_allclose(normal, [1.0, 1.2], rtol=1e-6)
+    assert linear_answer(problem).log10_delta < -4
