@@ -18,12 +18,13 @@ from certbound.quadratic.corners import Dynamics, curved_axes
 from certbound.quadratic.inequality import corner_levels, prove
 from certbound.quadratic.setting import Setting, Wall, make_setting, refuse
 from certbound.quadratic.surroundings import moved_sides, working_box
-from certbound.quadratic.wall_attempts import APART, PIECES, SPLIT, Attempt, apart, log10_up, log_sum, total
+from certbound.quadratic.wall_attempts import APART, PAIRS, PIECES, SPLIT, Attempt, apart, log10_up, log_sum, total
 from certbound.quadratic.wall_program import StatedCells, propose
 from certbound.watch import poll
 
 _MOST_STATES = 12
-_LOOSE = 0.1  # remainder, in working boxes within the horizon, that is small
+_LOOSE, _LARGE = 0.1, 0.5  # remainders, in working boxes within the horizon: small; large enough to be made small
+_SINGLE = 0.6  # of the time of a group's program that one wall's takes
 _FIRST_SLABS, _FEWER_SLABS, _SMALL_DIMENSION = 8, 4, 4  # at first, up to so many states and beyond
 _MOST_BLOCKS = 12_000
 _MARGINS = (4.0, 7.0, 2.5)
@@ -200,12 +201,14 @@ class Search:
         self.attempts = [Attempt(wall=one[0], others=one[1:], slabs=slabs, during=whole) for one in groups]
 
     def _first_slabs(self) -> tuple[int, ...]:
-        """Slabs that make the remainder small, as far as a few do: without them many a bound is 1."""
+        """Slabs that make a large remainder small, as far as a few do: without them many a bound is 1."""
         held, n = self.dynamics.held, self.setting.dimension
         slabs = [1] * len(held)
         least, most = self.dynamics.remainder(*_grid(n, held, slabs)), _FIRST_SLABS
         if n > _SMALL_DIMENSION:
             most = _FEWER_SLABS
+        if least <= _LARGE:  # the walls by themselves gain more
+            return tuple(slabs)
         while least > _LOOSE and math.prod(slabs) < most:
             trials = [[2 * count if k == axis else count for k, count in enumerate(slabs)] for axis in range(len(held))]
             values = [self.dynamics.remainder(*_grid(n, held, trial)) for trial in trials]
@@ -274,13 +277,14 @@ class Search:
         options = [PIECES, SPLIT, *range(len(attempt.slabs))]
         if attempt.proved is None:  # windows are no cure
             options.remove(SPLIT)
+        left = until - time.perf_counter()
         if attempt.others and attempt.gains.get(APART, math.inf) > 0:
-            options = [APART]
+            many = _SINGLE * len(attempt.finer(APART)) * attempt.seconds
+            options = [APART if many < left or not attempt.paired else PAIRS]
         hopes = {k: attempt.gains.get(k, self.gains.get(k, math.inf)) for k in options}
         children = {k: attempt.finer(k) for k in options}
         sizes = {k: sum(child.blocks for child in children[k]) for k in options}
-        grown = {k: 1.3 * sizes[k] / attempt.blocks for k in options}
-        left = until - time.perf_counter()
+        grown = {k: (_SINGLE if k in (APART, PAIRS) else 1.3) * sizes[k] / attempt.blocks for k in options}
         options = [k for k in options if hopes[k] > _GAIN and sizes[k] <= _MOST_BLOCKS]
         options = [k for k in options if grown[k] * attempt.seconds < left]
         if not options:

@@ -13,8 +13,9 @@ from certbound.quadratic.inequality import Proved
 from certbound.quadratic.setting import Wall
 from certbound.rigor.balls import precision, upper
 
-PIECES, SPLIT, APART = -1, -2, -3
-"""Refinements besides slabs of the held coordinates: more pieces of time, two windows in place of one, fewer walls."""
+PIECES, SPLIT, APART, PAIRS = -1, -2, -3, -4
+"""Refinements besides slabs of the held coordinates: more pieces of time, two windows in place of one, every wall by
+itself, opposite sides by themselves."""
 _FIRST_PIECES = 4
 _GROWTH = 1.5  # of the pieces before a window, backward: what is long ago is smooth
 _SMALLEST = -300.0
@@ -72,10 +73,18 @@ class Attempt:
             before.append(place)
         return np.concatenate([np.array(before[::-1], dtype=float), inner]), len(before)
 
+    @property
+    def paired(self) -> int:
+        """How many fewer programs opposite sides take together than by themselves, all being more than one pair."""
+        walls = (self.wall, *self.others)
+        pairs = paired(walls)
+        return len(apart(walls)) - len(pairs) if len(pairs) > 1 else 0
+
     def finer(self, option: int) -> list[Attempt]:
         """Not yet tried: walls by themselves, two windows, twice the pieces, or more slabs (two are seldom enough)."""
-        if option == APART:
-            return [self._changed(walls=group) for group in apart((self.wall, *self.others))]
+        if option in (APART, PAIRS):
+            groups = (apart if option == APART else paired)((self.wall, *self.others))
+            return [self._changed(walls=group) for group in groups]
         if option == SPLIT:
             start, end = self.during
             middle = (start + end) / 2
@@ -107,6 +116,16 @@ def apart(walls: Sequence[Wall]) -> list[tuple[Wall, ...]]:
     far = tuple(wall for wall in walls if wall.far)
     alone = [(wall,) for wall in walls if not wall.far]
     return alone + ([far] if alone and far else [(wall,) for wall in far])
+
+
+def paired(walls: Sequence[Wall]) -> list[tuple[Wall, ...]]:
+    """`apart`, but opposite sides of the working box together."""
+    found: dict[object, tuple[Wall, ...]] = {}
+    for group in apart(walls):
+        side = group[0].side
+        key = group if side is None or len(group) > 1 else side[0]
+        found[key] = found.get(key, ()) + group
+    return list(found.values())
 
 
 def total(attempts: Sequence[Attempt]) -> tuple[float, Array]:
