@@ -14,12 +14,13 @@ from certbound.arrays import Array
 from certbound.display import rounded
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.quadratic.corners import Dynamics, curved_axes
+from certbound.quadratic.corners import Cells, Dynamics, curved_axes
 from certbound.quadratic.inequality import corner_levels, prove
+from certbound.quadratic.mirrors import Mirror, mirrors
 from certbound.quadratic.setting import Setting, Wall, make_setting, refuse
 from certbound.quadratic.surroundings import moved_sides, working_box
 from certbound.quadratic.wall_attempts import APART, PAIRS, PIECES, SPLIT, Attempt, apart, log10_up, log_sum, total
-from certbound.quadratic.wall_program import StatedCells, propose
+from certbound.quadratic.wall_program import Proposal, StatedCells, propose
 from certbound.watch import poll
 
 _MOST_STATES = 12
@@ -32,6 +33,8 @@ _GAIN = 0.03  # of a wall's logarithm: a refinement that gains less is not repea
 _DONE = 1e-3  # share of the bound that a wall may have without being looked at again
 _LEAST = 1e-300
 _MOVES, _WORTH = 2, 0.1  # how often the box's sides are moved, and what log10 must gain by it to go on
+_MIRRORED = 0.1  # of the time of a program: a mirrored proposal, and its proof
+_SAME = 0.02  # of the logarithm: what a mirrored bound may lose
 _RESCUES = 2  # refinements of a wall that proves nothing, before the working box is given up
 
 
@@ -194,6 +197,8 @@ class Search:
         self.setting, self.horizon = setting, float(problem.horizon)
         self.dynamics = Dynamics(problem, setting)
         self.kept: dict[tuple[object, ...], list[StatedCells]] = {}
+        self.mirrors: dict[tuple[int, ...], list[Mirror]] = {}
+        self.solved: dict[tuple[object, ...], Attempt] = {}
         self.gains: dict[int, float] = {}  # of pieces and windows, at the wall that was refined last
         slabs = self._first_slabs()
         whole = (0.0, self.horizon)
@@ -285,6 +290,10 @@ class Search:
         children = {k: attempt.finer(k) for k in options}
         sizes = {k: sum(child.blocks for child in children[k]) for k in options}
         grown = {k: (_SINGLE if k in (APART, PAIRS) else 1.3) * sizes[k] / attempt.blocks for k in options}
+        for k in options:
+            twins = [twin for child in children[k] for _, twin in self._twins(child)]
+            if len(twins) == len(children[k]):
+                hopes[k], grown[k] = attempt.level - log_sum([twin.level for twin in twins]), _MIRRORED
         options = [k for k in options if hopes[k] > _GAIN and sizes[k] <= _MOST_BLOCKS]
         options = [k for k in options if grown[k] * attempt.seconds < left]
         if not options:
@@ -320,14 +329,43 @@ class Search:
         begin = time.perf_counter()
         times, first = attempt.times
         cells = self.cells(times, attempt.slabs)
-        left = max(until - begin, 1.0)
-        others = attempt.others
-        proposal = propose(self.setting, attempt.wall, times, cells, seconds=left, first=first, others=others)
-        if proposal is not None:
-            known = [one.cells for one in cells]
-            attempt.proved = prove(self.setting, attempt.wall, proposal, known, others=others)
-            attempt.corners = corner_levels(self.setting, attempt.proved)
-        attempt.seconds = time.perf_counter() - begin
+        if not self._mirrored(attempt, cells):
+            left = max(until - begin, 1.0)
+            others = attempt.others
+            proposal = propose(self.setting, attempt.wall, times, cells, seconds=left, first=first, others=others)
+            if proposal is not None:
+                self._prove(attempt, proposal, cells)
+            attempt.seconds = time.perf_counter() - begin
+        self.solved[attempt.key] = attempt
+
+    def _prove(self, attempt: Attempt, proposal: Proposal, cells: Sequence[StatedCells]) -> None:
+        known = [one.cells for one in cells]
+        attempt.proved = prove(self.setting, attempt.wall, proposal, known, others=attempt.others)
+        attempt.corners = corner_levels(self.setting, attempt.proved)
+
+    def _mirrored(self, attempt: Attempt, cells: Sequence[StatedCells]) -> bool:
+        """Whether the mirror image of what was found for other walls proves about the same here."""
+        self._mirrors(attempt.slabs, cells[0].cells)
+        for mirror, twin in self._twins(attempt):
+            if twin.proved is not None:
+                self._prove(attempt, mirror.of(twin.proved.proposal), cells)
+                if attempt.level <= twin.level + _SAME:
+                    attempt.seconds = twin.seconds
+                    return True
+        return False
+
+    def _twins(self, attempt: Attempt) -> list[tuple[Mirror, Attempt]]:
+        """The first of the same attempts at walls that are mapped to these, with the mirror."""
+        walls, (_, *rest) = (attempt.wall, *attempt.others), attempt.key
+        for mirror in self.mirrors.get(attempt.slabs, ()):
+            images = tuple(id(mirror.wall(wall, self.setting.walls)) for wall in walls)
+            if (images, *rest) in self.solved:
+                return [(mirror, self.solved[(images, *rest)])]
+        return []
+
+    def _mirrors(self, slabs: tuple[int, ...], cells: Cells) -> None:
+        if slabs not in self.mirrors:
+            self.mirrors[slabs] = mirrors(self.setting, cells)
 
 
 def _groups(setting: Setting, *, together: bool) -> list[tuple[Wall, ...]]:

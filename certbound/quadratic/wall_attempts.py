@@ -61,6 +61,11 @@ class Attempt:
         return 0.0 if self.proved is None else min(self.proved.level, 0.0)
 
     @property
+    def key(self) -> tuple[object, ...]:
+        """What is tried: walls, window, pieces and slabs."""
+        return tuple(map(id, (self.wall, *self.others))), self.during, self.pieces, self.slabs
+
+    @property
     def times(self) -> tuple[Array, int]:
         """The ends of the pieces of time, and how many of these lie before the window."""
         start, end = self.during
