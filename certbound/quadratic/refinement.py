@@ -33,7 +33,6 @@ _GAIN = 0.03  # of a wall's logarithm: a refinement that gains less is not repea
 _DONE = 1e-3  # share of the bound that a wall may have without being looked at again
 _LEAST = 1e-300
 _MOVES, _WORTH = 2, 0.1  # how often the box's sides are moved, and what log10 must gain by it to go on
-_MIRRORED = 0.1  # of the time of a program: a mirrored proposal, and its proof
 _SAME = 0.02  # of the logarithm: what a mirrored bound may lose
 _RESCUES = 2  # refinements of a wall that proves nothing, before the working box is given up
 
@@ -290,27 +289,31 @@ class Search:
         children = {k: attempt.finer(k) for k in options}
         sizes = {k: sum(child.blocks for child in children[k]) for k in options}
         grown = {k: (_SINGLE if k in (APART, PAIRS) else 1.3) * sizes[k] / attempt.blocks for k in options}
-        for k in options:
-            twins = [twin for child in children[k] for _, twin in self._twins(child)]
-            if len(twins) == len(children[k]):
-                hopes[k], grown[k] = attempt.level - log_sum([twin.level for twin in twins]), _MIRRORED
         options = [k for k in options if hopes[k] > _GAIN and sizes[k] <= _MOST_BLOCKS]
         options = [k for k in options if grown[k] * attempt.seconds < left]
         if not options:
             return False
         option = max(options, key=lambda k: hopes[k] / grown[k])
         poll(f"refining {attempt.wall.label}")
-        for child in children[option]:
-            self._solve(child, until)
-        gain = attempt.level - log_sum([child.level for child in children[option]])
-        attempt.gains[option] = max(gain, 0.0)
-        if option < 0:  # which coordinate's slabs help differs from wall to wall
-            self.gains[option] = max(gain, 0.0)
-        if gain > 0:
-            for child in children[option]:
-                child.gains = dict(attempt.gains)
-            self.attempts[place : place + 1] = children[option]
+        self._adopt(attempt, option, until)
+        for image in [one for one in self.attempts if any(twin is attempt for _, twin in self._twins(one))]:
+            self._adopt(image, option, until)
         return True
+
+    def _adopt(self, attempt: Attempt, option: int, until: float) -> None:
+        """Refine an attempt; it stays if that gains nothing."""
+        children = attempt.finer(option)
+        for child in children:
+            self._solve(child, until)
+        gain = max(attempt.level - log_sum([child.level for child in children]), 0.0)
+        attempt.gains[option] = gain
+        if option < 0:  # which coordinate's slabs help differs from wall to wall
+            self.gains[option] = gain
+        if gain > 0:
+            for child in children:
+                child.gains = dict(attempt.gains)
+            place = next(k for k, one in enumerate(self.attempts) if one is attempt)
+            self.attempts[place : place + 1] = children
 
     def cells(self, times: Array, slabs: tuple[int, ...]) -> list[StatedCells]:
         """The cells of every piece of time."""
