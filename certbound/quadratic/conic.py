@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import signal
+import time
 from collections.abc import Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ import numpy as np
 from certbound.arrays import Array, Integers
 
 _ROOT = float(np.sqrt(2.0))
+_SETTLED = ("Solved", "PrimalInfeasible", "DualInfeasible", "MaxTime")
 
 
 class Part(NamedTuple):
@@ -112,16 +114,25 @@ class Program:
         matrix = sparse.csc_matrix((values, (rows, columns)), shape=(self.height, self.width))
         objective = np.zeros(self.width)
         objective[column] = 1.0
+        nothing, right = sparse.csc_matrix((self.width, self.width)), np.concatenate(self.constants)
+        until, found = time.perf_counter() + seconds, None
+        for careful in (False, True):
+            settings = self._settings(max(until - time.perf_counter(), 0.01), careful=careful)
+            solution = self.clarabel.DefaultSolver(nothing, objective, matrix, right, self.cones, settings).solve()
+            dead = solution.iterations < 5 or str(solution.status) in ("PrimalInfeasible", "DualInfeasible")
+            values = np.array(solution.x)
+            if not dead and np.isfinite(values).all():
+                found = values
+            if str(solution.status) in _SETTLED or time.perf_counter() > until:
+                break
+        return found
+
+    def _settings(self, seconds: float, *, careful: bool) -> Any:
+        """Linear systems are refined only if ``careful``: it takes as long again, and seldom changes the result."""
         settings = self.clarabel.DefaultSettings()
         settings.verbose, settings.max_iter, settings.time_limit = False, 80, float(seconds)
         settings.tol_gap_rel, settings.tol_gap_abs, settings.tol_feas = 1e-4, 1e-4, 1e-7
         settings.max_threads = 1
         settings.equilibrate_enable, settings.static_regularization_constant = False, 1e-7  # else it may break down
-        nothing = sparse.csc_matrix((self.width, self.width))
-        solver = self.clarabel.DefaultSolver(
-            nothing, objective, matrix, np.concatenate(self.constants), self.cones, settings
-        )
-        solution = solver.solve()
-        found = np.array(solution.x)
-        dead = solution.iterations < 5 or str(solution.status) in ("PrimalInfeasible", "DualInfeasible")
-        return None if dead or not np.isfinite(found).all() else found
+        settings.iterative_refinement_enable = careful
+        return settings

@@ -14,16 +14,30 @@ from certbound.arrays import Array
 from certbound.display import rounded
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.quadratic.corners import Dynamics, curved_axes
+from certbound.quadratic.corners import Cells, Dynamics, curved_axes, grid
 from certbound.quadratic.inequality import corner_levels, prove
-from certbound.quadratic.setting import Setting, Wall, make_setting, refuse
+from certbound.quadratic.mirror_images import Mirror, mirrors
+from certbound.quadratic.setting import Setting, make_setting, refuse
 from certbound.quadratic.surroundings import moved_sides, working_box
-from certbound.quadratic.wall_attempts import APART, PIECES, SPLIT, Attempt, apart, log10_up, log_sum, total
-from certbound.quadratic.wall_program import StatedCells, propose
+from certbound.quadratic.wall_attempts import (
+    APART,
+    NOTHING,
+    PAIRS,
+    PIECES,
+    SPLIT,
+    Attempt,
+    Option,
+    groups,
+    log10_up,
+    log_sum,
+    total,
+)  # fmt: skip
+from certbound.quadratic.wall_program import Proposal, StatedCells, propose
 from certbound.watch import poll
 
 _MOST_STATES = 12
-_LOOSE = 0.1  # remainder, in working boxes within the horizon, that is small
+_LOOSE, _LARGE = 0.1, 0.5  # remainders, in working boxes within the horizon: small; large enough to be made small
+_SINGLE = 0.6  # of the time of a group's program that one wall's takes
 _FIRST_SLABS, _FEWER_SLABS, _SMALL_DIMENSION = 8, 4, 4  # at first, up to so many states and beyond
 _MOST_BLOCKS = 12_000
 _MARGINS = (4.0, 7.0, 2.5)
@@ -31,6 +45,9 @@ _GAIN = 0.03  # of a wall's logarithm: a refinement that gains less is not repea
 _DONE = 1e-3  # share of the bound that a wall may have without being looked at again
 _LEAST = 1e-300
 _MOVES, _WORTH = 2, 0.1  # how often the box's sides are moved, and what log10 must gain by it to go on
+_SAME = 0.02  # of the logarithm: what a mirrored bound may lose
+_HOPE, _SLABS = 0.3, 0.7  # of the logarithm: what pieces and windows, or slabs, gain where nothing is known
+_AGAIN = 0.6  # of what a refinement gained: what it gains once more
 _RESCUES = 2  # refinements of a wall that proves nothing, before the working box is given up
 
 
@@ -193,22 +210,26 @@ class Search:
         self.setting, self.horizon = setting, float(problem.horizon)
         self.dynamics = Dynamics(problem, setting)
         self.kept: dict[tuple[object, ...], list[StatedCells]] = {}
+        self.mirrors: dict[tuple[int, ...], list[Mirror]] = {}
+        self.solved: dict[tuple[object, ...], Attempt] = {}
         self.gains: dict[int, float] = {}  # of pieces and windows, at the wall that was refined last
         slabs = self._first_slabs()
         whole = (0.0, self.horizon)
-        groups = _groups(setting, together=together)
-        self.attempts = [Attempt(wall=one[0], others=one[1:], slabs=slabs, during=whole) for one in groups]
+        self.attempts = [Attempt(wall=one[0], others=one[1:], slabs=slabs, during=whole)
+                         for one in groups(setting.walls, together=together)]  # fmt: skip
 
     def _first_slabs(self) -> tuple[int, ...]:
-        """Slabs that make the remainder small, as far as a few do: without them many a bound is 1."""
+        """Slabs that make a large remainder small, as far as a few do: without them many a bound is 1."""
         held, n = self.dynamics.held, self.setting.dimension
         slabs = [1] * len(held)
-        least, most = self.dynamics.remainder(*_grid(n, held, slabs)), _FIRST_SLABS
+        least, most = self.dynamics.remainder(*grid(n, held, slabs)), _FIRST_SLABS
         if n > _SMALL_DIMENSION:
             most = _FEWER_SLABS
+        if least <= _LARGE:  # the walls by themselves gain more
+            return tuple(slabs)
         while least > _LOOSE and math.prod(slabs) < most:
             trials = [[2 * count if k == axis else count for k, count in enumerate(slabs)] for axis in range(len(held))]
-            values = [self.dynamics.remainder(*_grid(n, held, trial)) for trial in trials]
+            values = [self.dynamics.remainder(*grid(n, held, trial)) for trial in trials]
             if not values or min(values) > 0.9 * least:
                 break
             slabs, least = trials[int(np.argmin(values))], min(values)
@@ -223,7 +244,7 @@ class Search:
                 break
             self._solve(attempt, until)
             for _ in range(_RESCUES):
-                if self.attempts[place].level < 0 or not self._refined(place, until):
+                if self.attempts[place].level < 0 or not self._refined(self._option(place, until), until):
                     break
             if not self.attempts[place].level < 0:
                 break
@@ -231,29 +252,28 @@ class Search:
         yield self._answer(level)
         place = len(self.attempts) - 1
         unsettled = _log10(target) < level / math.log(10) < 0 and self.attempts[place].others
-        if unsettled and parts[place] >= level + math.log(_DONE) and self._refined(place, until):
+        large = parts[place] >= level + math.log(_DONE)
+        if unsettled and large and self._refined(self._option(place, until), until):
             yield self._answer(total(self.attempts)[0])
 
     def run(self, target: float, share: float, found: Callable[[QuadraticBound], object]) -> None:
         """Refine the wall that counts most until the target or the time is reached; each better bound is told."""
         until = time.perf_counter() + share
-        level = parts = None
         while True:
             level, parts = total(self.attempts)
             found(self._answer(level))
             if level / math.log(10) <= _log10(target) or time.perf_counter() > until:
                 return
-            order = [place for place in np.argsort(-parts) if parts[place] >= level + math.log(_DONE)]
-            if not any(self._refined(int(place), until) for place in order):
+            places = np.flatnonzero(parts >= level + math.log(_DONE)).tolist()
+            options = [self._option(place, until) for place in places]
+            if not self._refined(max(options, key=lambda one: one.worth(parts), default=NOTHING), until):
                 return
 
     def by_wall(self) -> tuple[Array, float]:
         """The logarithm of every wall's bound, and of their sum."""
         walls = self.setting.walls
-        levels = []
-        for wall in walls:
-            levels.append(log_sum([one.level for one in self.attempts if wall in (one.wall, *one.others)]))
-        return np.array(levels), log_sum([one.level for one in self.attempts])
+        levels = [[one.level for one in self.attempts if wall in (one.wall, *one.others)] for wall in walls]
+        return np.array([log_sum(one) for one in levels]), log_sum([one.level for one in self.attempts])
 
     def _answer(self, level: float) -> QuadraticBound:
         finest = max(self.attempts, key=lambda attempt: attempt.blocks, default=None)
@@ -268,43 +288,64 @@ class Search:
         return QuadraticBound(upper=log10_up(level), words=words, seconds=0.0, setting=self.setting,
                               walls=tuple(self.attempts))  # fmt: skip
 
-    def _refined(self, place: int, until: float) -> bool:
-        """One refinement of an attempt that may gain by it and has the time; False where there is none."""
+    def _option(self, place: int, until: float) -> Option:
+        """The refinement of an attempt that promises most for its time."""
         attempt = self.attempts[place]
-        options = [PIECES, SPLIT, *range(len(attempt.slabs))]
+        hopes = {PIECES: _HOPE, SPLIT: _HOPE} | self._slabs(attempt)
         if attempt.proved is None:  # windows are no cure
-            options.remove(SPLIT)
-        if attempt.others and attempt.gains.get(APART, math.inf) > 0:
-            options = [APART]
-        hopes = {k: attempt.gains.get(k, self.gains.get(k, math.inf)) for k in options}
-        children = {k: attempt.finer(k) for k in options}
-        sizes = {k: sum(child.blocks for child in children[k]) for k in options}
-        grown = {k: 1.3 * sizes[k] / attempt.blocks for k in options}
+            del hopes[SPLIT]
         left = until - time.perf_counter()
-        options = [k for k in options if hopes[k] > _GAIN and sizes[k] <= _MOST_BLOCKS]
-        options = [k for k in options if grown[k] * attempt.seconds < left]
-        if not options:
+        if attempt.others and attempt.gains.get(APART, math.inf) > 0:
+            many = _SINGLE * len(attempt.finer(APART)) * attempt.seconds
+            hopes = {APART if many < left or not attempt.paired else PAIRS: 1.0}
+        found = []
+        for kind, hope in hopes.items():
+            blocks = sum(child.blocks for child in attempt.finer(kind))
+            seconds = (_SINGLE if kind in (APART, PAIRS) else 1.3) * blocks / attempt.blocks * attempt.seconds
+            gain = _AGAIN * attempt.gains[kind] if kind in attempt.gains else self.gains.get(kind, hope)
+            if gain > _GAIN and blocks <= _MOST_BLOCKS and seconds < left:
+                found.append(Option(int(place), kind, gain, max(seconds, 1e-3)))
+        return max(found, key=lambda option: option.gain / option.seconds, default=NOTHING)
+
+    def _refined(self, option: Option, until: float) -> bool:
+        """Refine an attempt and its mirror images; False where there is no option."""
+        if option.place < 0:
             return False
-        option = max(options, key=lambda k: hopes[k] / grown[k])
+        attempt = self.attempts[option.place]
         poll(f"refining {attempt.wall.label}")
-        for child in children[option]:
-            self._solve(child, until)
-        gain = attempt.level - log_sum([child.level for child in children[option]])
-        attempt.gains[option] = max(gain, 0.0)
-        if option < 0:  # which coordinate's slabs help differs from wall to wall
-            self.gains[option] = max(gain, 0.0)
-        if gain > 0:
-            for child in children[option]:
-                child.gains = dict(attempt.gains)
-            self.attempts[place : place + 1] = children[option]
+        self._adopt(attempt, option.kind, until)
+        for image in [one for one in self.attempts if any(twin is attempt for _, twin in self._twins(one))]:
+            self._adopt(image, option.kind, until)
         return True
+
+    def _slabs(self, attempt: Attempt) -> dict[int, float]:
+        """What slabs of each held coordinate may gain: those of the wall's own, and that bend its drift, most."""
+        side, held = attempt.wall.side, self.dynamics.held
+        near = set() if side is None or attempt.others else {side[0], *self.dynamics.bending(side[0])}
+        known = near & set(held)
+        return {k: _SLABS if axis in near or not known else _SLABS / 8 for k, axis in enumerate(held)}
+
+    def _adopt(self, attempt: Attempt, option: int, until: float) -> None:
+        """Refine an attempt; it stays if that gains nothing."""
+        children = attempt.finer(option)
+        for child in children:
+            self._solve(child, until)
+        gain = max(attempt.level - log_sum([child.level for child in children]), 0.0)
+        if option < 0 and option not in attempt.gains:  # which coordinate's slabs help differs from wall to wall
+            self.gains[option] = gain
+        attempt.gains[option] = gain
+        if gain > 0:
+            for child in children:
+                child.gains = dict(attempt.gains)
+            place = next(k for k, one in enumerate(self.attempts) if one is attempt)
+            self.attempts[place : place + 1] = children
 
     def cells(self, times: Array, slabs: tuple[int, ...]) -> list[StatedCells]:
         """The cells of every piece of time."""
         pieces = len(times) - 1
         key = slabs if self.dynamics.autonomous else (*slabs, times.tobytes())
         if key not in self.kept:
-            low, high = _grid(self.setting.dimension, self.dynamics.held, slabs)
+            low, high = grid(self.setting.dimension, self.dynamics.held, slabs)
             spans = [(0.0, self.horizon)] if self.dynamics.autonomous else list(itertools.pairwise(times))
             cells = [self.dynamics.over(low, high, *span) for span in spans]
             self.kept[key] = [StatedCells(self.setting, one) for one in cells]
@@ -316,29 +357,43 @@ class Search:
         begin = time.perf_counter()
         times, first = attempt.times
         cells = self.cells(times, attempt.slabs)
-        left = max(until - begin, 1.0)
-        others = attempt.others
-        proposal = propose(self.setting, attempt.wall, times, cells, seconds=left, first=first, others=others)
-        if proposal is not None:
-            known = [one.cells for one in cells]
-            attempt.proved = prove(self.setting, attempt.wall, proposal, known, others=others)
-            attempt.corners = corner_levels(self.setting, attempt.proved)
-        attempt.seconds = time.perf_counter() - begin
+        if not self._mirrored(attempt, cells):
+            left = max(until - begin, 1.0)
+            others = attempt.others
+            proposal = propose(self.setting, attempt.wall, times, cells, seconds=left, first=first, others=others)
+            if proposal is not None:
+                self._prove(attempt, proposal, cells)
+            attempt.seconds = time.perf_counter() - begin
+        self.solved[attempt.key] = attempt
 
+    def _prove(self, attempt: Attempt, proposal: Proposal, cells: Sequence[StatedCells]) -> None:
+        known = [one.cells for one in cells]
+        attempt.proved = prove(self.setting, attempt.wall, proposal, known, others=attempt.others)
+        attempt.corners = corner_levels(self.setting, attempt.proved)
 
-def _groups(setting: Setting, *, together: bool) -> list[tuple[Wall, ...]]:
-    """The walls, but sides of the working box as one at first: few are worth programs of their own."""
-    sides = tuple(wall for wall in setting.walls if wall.side is not None)
-    alone = [(wall,) for wall in setting.walls if wall.side is None]
-    return alone + ([sides] if together and sides else apart(sides))
+    def _mirrored(self, attempt: Attempt, cells: Sequence[StatedCells]) -> bool:
+        """Whether the mirror image of what was found for other walls proves about the same here."""
+        self._mirrors(attempt.slabs, cells[0].cells)
+        for mirror, twin in self._twins(attempt):
+            if twin.proved is not None:
+                self._prove(attempt, mirror.of(twin.proved.proposal), cells)
+                if attempt.level <= twin.level + _SAME:
+                    attempt.seconds = twin.seconds
+                    return True
+        return False
 
+    def _twins(self, attempt: Attempt) -> list[tuple[Mirror, Attempt]]:
+        """The first of the same attempts at walls that are mapped to these, with the mirror."""
+        walls, (_, *rest) = (attempt.wall, *attempt.others), attempt.key
+        for mirror in self.mirrors.get(attempt.slabs, ()):
+            images = tuple(id(mirror.wall(wall, self.setting.walls)) for wall in walls)
+            if (images, *rest) in self.solved:
+                return [(mirror, self.solved[(images, *rest)])]
+        return []
 
-def _grid(n: int, held: Sequence[int], slabs: Sequence[int]) -> tuple[Array, Array]:
-    """Cells that cover [-1, 1]^n: slabs of the held coordinates."""
-    cuts = [np.linspace(-1.0, 1.0, slabs[held.index(axis)] + 1 if axis in held else 2) for axis in range(n)]
-    low = np.stack([axis.ravel() for axis in np.meshgrid(*(cut[:-1] for cut in cuts), indexing="ij")], axis=1)
-    high = np.stack([axis.ravel() for axis in np.meshgrid(*(cut[1:] for cut in cuts), indexing="ij")], axis=1)
-    return low, high
+    def _mirrors(self, slabs: tuple[int, ...], cells: Cells) -> None:
+        if slabs not in self.mirrors:
+            self.mirrors[slabs] = mirrors(self.setting, cells)
 
 
 def _log10(target: float) -> float:

@@ -20,6 +20,7 @@ _SHARE = 0.25  # of the bound that the box's own sides may cost together
 _FACTORS = 0.6, 1.6  # by which a side's distance is changed at once
 _LITTLE = 0.1
 _FAR = 1.75  # what the margin is multiplied by along coordinates in which the model is affine
+_NEARLY = 1.25
 _CLEAR = 0.1  # least distance from the starts, in half widths of the box
 _NEAR = 1.5  # own sides are taken up to this multiple of the distance at which a side would be chosen
 
@@ -47,13 +48,23 @@ def working_box(problem: Problem, margin: float) -> tuple[Array, Array]:
     least = _LEAST * np.maximum(top - bottom, 1e-6 * np.maximum(np.abs(top), 1.0))
     reach = np.maximum(margins * spread, least)
     own_low, own_high = bottom - low <= _NEAR * reach, high - top <= _NEAR * reach
-    found = np.where(own_low, low, bottom - reach), np.where(own_high, high, top + reach)
+    found = _evened(problem, bottom - reach, top + reach)
+    found = np.where(own_low, low, found[0]), np.where(own_high, high, found[1])
     for axis in range(len(low)):  # a state that stays positive
         if found[0][axis] < 0 <= bottom[axis] and not own_low[axis] and low[axis] <= 0:
             box = Interval(*found)
             if never_crossed(problem, box, axis, 0.0):
                 found[0][axis] = 0.0
     return found
+
+
+def _evened(problem: Problem, low: Array, high: Array) -> tuple[Array, Array]:
+    """Ends as far from the middle of the starts on both sides, where they nearly are: a mirrored bound serves both."""
+    middle = problem.initial.hull().mid
+    below, above = middle - low, high - middle
+    near = np.maximum(below, above) <= _NEARLY * np.minimum(below, above)
+    reach = np.maximum(below, above)
+    return np.where(near, middle - reach, low), np.where(near, middle + reach, high)
 
 
 def moved_sides(problem: Problem, setting: Setting, levels: Array, level: float) -> tuple[Array, Array] | None:

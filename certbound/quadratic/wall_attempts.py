@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,8 +14,9 @@ from certbound.quadratic.inequality import Proved
 from certbound.quadratic.setting import Wall
 from certbound.rigor.balls import precision, upper
 
-PIECES, SPLIT, APART = -1, -2, -3
-"""Refinements besides slabs of the held coordinates: more pieces of time, two windows in place of one, fewer walls."""
+PIECES, SPLIT, APART, PAIRS = -1, -2, -3, -4
+"""Refinements besides slabs of the held coordinates: more pieces of time, two windows in place of one, every wall by
+itself, opposite sides by themselves."""
 _FIRST_PIECES = 4
 _GROWTH = 1.5  # of the pieces before a window, backward: what is long ago is smooth
 _SMALLEST = -300.0
@@ -60,6 +62,11 @@ class Attempt:
         return 0.0 if self.proved is None else min(self.proved.level, 0.0)
 
     @property
+    def key(self) -> tuple[object, ...]:
+        """What is tried: walls, window, pieces and slabs."""
+        return tuple(map(id, (self.wall, *self.others))), self.during, self.pieces, self.slabs
+
+    @property
     def times(self) -> tuple[Array, int]:
         """The ends of the pieces of time, and how many of these lie before the window."""
         start, end = self.during
@@ -72,10 +79,18 @@ class Attempt:
             before.append(place)
         return np.concatenate([np.array(before[::-1], dtype=float), inner]), len(before)
 
+    @property
+    def paired(self) -> int:
+        """How many fewer programs opposite sides take together than by themselves, all being more than one pair."""
+        walls = (self.wall, *self.others)
+        pairs = paired(walls)
+        return len(apart(walls)) - len(pairs) if len(pairs) > 1 else 0
+
     def finer(self, option: int) -> list[Attempt]:
         """Not yet tried: walls by themselves, two windows, twice the pieces, or more slabs (two are seldom enough)."""
-        if option == APART:
-            return [self._changed(walls=group) for group in apart((self.wall, *self.others))]
+        if option in (APART, PAIRS):
+            groups = (apart if option == APART else paired)((self.wall, *self.others))
+            return [self._changed(walls=group) for group in groups]
         if option == SPLIT:
             start, end = self.during
             middle = (start + end) / 2
@@ -102,11 +117,45 @@ class Attempt:
         return int(3 * (len(self.times[0]) - 1) * math.prod(self.slabs) * 2 ** len(self.slabs))
 
 
+class Option(NamedTuple):
+    """A refinement of the attempt at a place: what of its logarithm it may gain, and the seconds that it may take."""
+
+    place: int
+    kind: int
+    gain: float
+    seconds: float
+
+    def worth(self, parts: Array) -> float:
+        """What it may take off the sum each second; ``parts`` are logarithms."""
+        part = math.exp(parts[self.place] - parts.max())
+        return -part * math.expm1(-self.gain) / self.seconds if self.place >= 0 else -1.0
+
+
+NOTHING = Option(-1, 0, 0.0, math.inf)
+
+
+def groups(walls: Sequence[Wall], *, together: bool) -> list[tuple[Wall, ...]]:
+    """The walls, but sides of the working box as one at first: few are worth programs of their own."""
+    sides = tuple(wall for wall in walls if wall.side is not None)
+    alone = [(wall,) for wall in walls if wall.side is None]
+    return alone + ([sides] if together and sides else apart(sides))
+
+
 def apart(walls: Sequence[Wall]) -> list[tuple[Wall, ...]]:
     """Walls by themselves, but sides along which the model is affine as one at first, as they can be far."""
     far = tuple(wall for wall in walls if wall.far)
     alone = [(wall,) for wall in walls if not wall.far]
     return alone + ([far] if alone and far else [(wall,) for wall in far])
+
+
+def paired(walls: Sequence[Wall]) -> list[tuple[Wall, ...]]:
+    """`apart`, but opposite sides of the working box together."""
+    found: dict[object, tuple[Wall, ...]] = {}
+    for group in apart(walls):
+        side = group[0].side
+        key = group if side is None or len(group) > 1 else side[0]
+        found[key] = found.get(key, ()) + group
+    return list(found.values())
 
 
 def total(attempts: Sequence[Attempt]) -> tuple[float, Array]:
