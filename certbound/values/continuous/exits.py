@@ -103,7 +103,12 @@ def bound_exits(
     model = _model(problem)
     proposed: Sequence[tuple[Surface, Payment]] = ()
     below: Sequence[tuple[Surface, Payment]] = ()
-    if target is not None:
+    if target is not None and problem.system.dimension == 2:
+        from certbound.values.continuous.plane import bound_failing
+
+        _refuse_random(problem)
+        upper, least, words = bound_failing(problem, model, target, begin + seconds)
+    elif target is not None:
         from certbound.values.continuous.line import bound_arrival
 
         most, rest, words = bound_arrival(problem, model, target)
@@ -234,8 +239,8 @@ def _check(problem: Problem, target: Any, seconds: float, most: int = 2) -> None
         raise InfeasibleError(
             f"value functions in continuous time serve {count} states here, the problem has {problem.system.dimension}."
         )
-    if target is not None and problem.system.dimension > 1:
-        raise InfeasibleError("value functions in continuous time serve targets in one state only.")
+    if target is not None and problem.system.dimension > 2:
+        raise InfeasibleError("value functions in continuous time serve targets in one or two states only.")
     if problem.input_sequence is not None:
         raise InfeasibleError("value functions in continuous time need a feedback law; the plan is an array.")
 

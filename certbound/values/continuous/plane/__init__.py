@@ -1,13 +1,16 @@
 """Two states: V on a tensor grid, proposed for both sides and proved by `hypotheses`.
 
-From the bottom: ``plane_grids``, ``solver``, ``plane_proposal``, ``plane_below``, ``two_sides``.
+From the bottom: ``plane_grids``, ``solver``, ``plane_proposal``, ``plane_below``, ``two_sides``; ``target_proposal`` and
+``targets`` for targets.
 """
 
 from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, slab_times, spread_nodes
+from certbound.values.continuous.plane.reach import Floats, reach_of
 from certbound.values.continuous.plane.solver import Solver, integrated, solve_lines
+from certbound.values.continuous.plane.targets import bound_failing
 from certbound.values.continuous.plane.two_sides import bound_plane_above, chart_plane, rough_level, two_states
 
 __all__ = [
-    "Plan", "Plane", "Solver", "Source", "bound_plane_above", "chart_plane", "integrated", "rough_level", "slab_times",
-    "solve_lines", "spread_nodes", "two_states",
+    "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_plane_above", "chart_plane", "integrated",
+    "reach_of", "rough_level", "slab_times", "solve_lines", "spread_nodes", "two_states",
 ]

@@ -43,7 +43,7 @@ _FACTOR = 1.12
 _TOPS = (-0.02, -0.1)  # where V is above, the proof may lift it over 0 instead
 _CAP = 50.0
 _GRANTED = 0.005  # eps that the proof may pay, in units of the bound, summed over the horizon
-_RATE = 7_000  # patches that are proposed and proved in a second
+RATE = 7_000  # patches that are proposed and proved in a second
 _PASSES = 2
 _CLOSE = 0.15
 _HOPELESS = 60.0  # what a first proposal may lose (log P): sources make that ten times less, not a hundred
@@ -61,13 +61,13 @@ def two_states(
     What certificates state of both sides comes last.
     """
     starts = starts_of(problem)
-    inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
-    patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
+    inner = plane_of(problem, model, room.inner_low, room.inner_high, starts)
+    patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     level = rough_level(inner)
     upper, done, proposed = bound_plane_above(inner, model, level, patches)
     below: list[Proposed] = []
     if upper > wanted:
-        outer = _plane(problem, model, room.outer_low, room.outer_high, starts)
+        outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
         plan = plan_below(outer, min(level, upper), _BELOW * patches)
         with contextlib.suppress(OutOfTime):
             found = bound_plane_below(outer, model, plan, starts)
@@ -84,7 +84,7 @@ def bound_plane_above(
     upper, done = 0.0, []
     proposed: list[Proposed] = []
     for share in _SHARES:
-        plan = _plan(plane, level, share * patches)
+        plan = plan_above(plane, level, share * patches)
         try:
             surface = _promising(plane, model, plan)
             if surface is not None:
@@ -100,7 +100,7 @@ def bound_plane_above(
     return upper, done, proposed
 
 
-def _plan(plane: Plane, level: float, patches: float) -> Plan:
+def plan_above(plane: Plane, level: float, patches: float) -> Plan:
     """The finest grid with about so many patches; slabs grow fewer as fast as cells do.
 
     Where failing is rare (log P the ``level``) a longer lead costs little, and makes for fronts that are less steep.
@@ -121,10 +121,10 @@ def rough_level(plane: Plane) -> float:
 
 def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], seconds: float) -> list[Chart]:
     """Upper bounds from every cell at t = 0, sharp at the levels of log P; none where no proposal comes to an end."""
-    plane = _plane(problem, model, room.inner_low, room.inner_high, starts_of(problem))
+    plane = plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem))
     least = rough_level(plane)
     levels = sorted({max(level, least) for level in levels})
-    plan = _plan(plane, levels[0], _SHARES[0] * _RATE * seconds)
+    plan = plan_above(plane, levels[0], _SHARES[0] * RATE * seconds)
     surface = _promising(plane, model, plan, levels[-1])
     return [] if surface is None else chart_above(surface, model, levels, [0])
 
@@ -180,7 +180,7 @@ class _Sketch:
         return self.start + min(lift + float(rate @ self.surface.steps) for lift, rate in zip(LIFTS, worst))
 
 
-def _plane(
+def plane_of(
     problem: Problem, model: Model, low: tuple[float, ...], high: tuple[float, ...], starts: list[Pair]
 ) -> Plane:
     drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
