@@ -17,11 +17,14 @@ from certbound.values.continuous.plane.solver import Solver, integrated
 from certbound.values.continuous.surface import Surface
 
 _RAMP = 3.0  # cells over which V falls into the target at the horizon
-_DRAWN = 1.0  # how fast V is drawn in the target, in units of the noise over a cell
-_SOFT = 1.5  # cells over which that sets in
+_DRAWN = 2.0  # how fast V is drawn in the target, in units of the noise over a cell
+_SOFT = 2.5  # cells over which that sets in
 _APART = 1.5  # cells between a target's edge and where V is drawn, if that edge does not lie on the grid's lines
-_CROWD = 0.6  # how many cells lie near each end of the target, in units of the evenly spread ones
-_NEAR = 0.02  # of the box: how near
+_ROUND = 1.0  # cells by which a corner is rounded, about
+_EARLY = 0.5  # cells outside of the target from which on V is low for lower bounds
+_CROWD = 1.3  # how many cells lie near each end of the target, in units of the evenly spread ones
+_NEAR = 0.006  # of the box: how near
+_CORNER = 3.0  # cells from a corner of the box within which there is no source
 _STIFF = 20.0  # by how much what V is drawn by may exceed one over a step
 _BENT = 0.05  # what a cell may lose of its width where nodes are moved to places
 
@@ -36,16 +39,27 @@ def propose_to_target(
 class SolverToTarget(Solver):
     """V is ``plan.floor`` in the target and 0 at the horizon outside of it."""
 
+    gamma = 1 - 0.5**0.5  # steps that damp what is stiff: cells beside the target are small
+
     def __init__(self, plane: Plane, plan: Plan, source: Source | None, target: Region, *, upper: bool) -> None:
         self.target, self.upper = target, upper
         super().__init__(plane, plan, source)
         depth = self._depth()
-        offset = 0.0 if target.form.axial else _APART
+        offset = (0.0 if upper else _EARLY) if target.form.axial else _APART
         begin = offset if upper else -offset - _RAMP
         self.profile = plan.floor * smooth((depth - begin) / _RAMP)
         fast = [np.abs(self._model(plane.horizon)[1][k, k]) / self.widths[k] ** 2 for k in (0, 1)]
+        self.spared = self._beside_corners()
         begin = offset if upper else -offset - _SOFT
         self.drawn = _DRAWN * np.maximum(*fast) * np.clip((depth - begin) / _SOFT, 0.0, 1.0) ** 2
+
+    def _beside_corners(self) -> Array:
+        """0 at the box's corners, where V = 0 along both faces lets nothing change V; 1 from a few cells on."""
+        shares = [
+            np.clip(np.minimum(place - low, high - place) / (_CORNER * width), 0.0, 1.0)
+            for place, low, high, width in zip((self.x, self.y), self.plane.low, self.plane.high, self.widths)
+        ]
+        return np.asarray(1 - (1 - shares[0]) * (1 - shares[1]))
 
     def _depth(self) -> Array:
         """How deep in the target the points lie, in cells; negative outside."""
@@ -58,7 +72,10 @@ class SolverToTarget(Solver):
                 (bound - y @ normal) / np.sqrt(((h * normal) ** 2).sum(axis=-1))
                 for normal, bound in zip(form.normals, form.bounds)
             ]
-            return np.asarray(np.min(reach, axis=0))
+            if self.upper:  # rounded corners inside of the target's
+                return np.asarray(-_ROUND * np.logaddexp.reduce([-depth / _ROUND for depth in reach]))
+            beyond = np.sqrt(np.sum(np.minimum(reach, 0.0) ** 2, axis=0))  # and outside of them
+            return np.asarray(np.where(beyond > 0, -beyond, np.min(reach, axis=0)))
         inverse = form.root.T @ form.root / max(form.radius, 1e-300) ** 2
         pulled = y @ inverse
         gauge = np.sqrt(np.maximum((y * pulled).sum(axis=-1), 1e-12))
@@ -96,6 +113,9 @@ class SolverToTarget(Solver):
     def _fed(self, tau: float, value: Array) -> Array:
         given = super()._fed(tau, value) if self.upper else -self._source(tau)
         return np.asarray(given + self.drawn * (self.plan.floor - value))
+
+    def _source(self, tau: float) -> Array:
+        return np.asarray(self.spared * super()._source(tau))
 
     def _falls(self, tau: float, value: Array) -> Array:
         given = super()._falls(tau, value) if self.upper else np.zeros(value.shape)

@@ -36,10 +36,10 @@ from certbound.values.continuous.hypotheses import (
     up,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment, pay_lower
-from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source
+from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.reach import reach_of
 from certbound.values.continuous.plane.target_proposal import propose_to_target
-from certbound.values.continuous.plane.two_sides import RATE, plan_above, plane_of
+from certbound.values.continuous.plane.two_sides import RATE, plane_of
 from certbound.values.continuous.residual import value_range
 from certbound.values.continuous.room import Room, limits_of, starts_of
 from certbound.values.continuous.surface import Surface
@@ -52,10 +52,13 @@ _CAP = 50.0
 _GRANTED = 0.005
 _VARIED = 1.0
 _PASSES = 2
-_SHARE = 0.5  # w in units of the probability of failing
+_SHARE = 1.0  # w in units of the probability of failing
+_GROWTH = 0.2
+_LEAD = 0.32  # of the horizon over the number of cells
+_HIGHEST = math.log(0.5)  # of log w
 _ROUNDS = 4  # of coarse proposals that find out about it
 _COARSE = 24
-_SHARES = (0.12, 0.4)  # of the patches, for one grid after the other
+_SHARES = (0.12, 0.5)  # of the patches, for one grid after the other
 _BEYOND = 0.6  # of the paths' extent, where nothing bounds a state
 _DEEP = 0.25  # of the box's width: how deep the box reaches into a target that takes up one of its sides
 
@@ -240,7 +243,7 @@ def bound_failing(
     floor = _floor(aims[0])
     upper, lower, done = 0.0, -math.inf, list[str]()
     for share in _SHARES:
-        plan = replace(plan_above(aims[0].plane, floor, share * patches), floor=floor)
+        plan = _plan(aims[0].plane.horizon, floor, share * patches)
         with contextlib.suppress(OutOfTime):
             surface = _promising(aims[0], plan)
             if surface is not None:
@@ -251,6 +254,15 @@ def bound_failing(
         done.append(f"{plan.cells}^2")
     words = f"value function with a target in two states, cells: {', '.join(done)}"
     return upper, None if lower == -math.inf else lower, words
+
+
+def _plan(horizon: float, floor: float, patches: float) -> Plan:
+    """The finest grid with about so many patches."""
+    for cells in itertools.count(20):
+        plan = Plan(cells=cells, growth=_GROWTH, lead=_LEAD / cells * horizon, floor=floor)
+        if cells**2 * len(slab_times(horizon, plan)) > patches:
+            break
+    return plan
 
 
 def _simplified(target: Region) -> Region:
@@ -299,7 +311,7 @@ def _floor(aim: _Aim) -> float:
         fate = Fate.of(surface.axes, aim.target)
         level, least = extreme_over(surface, aim.plane.starts, upper=True), _over(surface, fate.beside)[0]
         share = max(-math.expm1(min(least - level, 0.0)), 1e-3)  # of e^V that is not w
-        found = min(max(level + math.log(share), -40.0), 0.0) + math.log(_SHARE)
+        found = min(max(level + math.log(share * _SHARE), -40.0), _HIGHEST)
         if abs(found - floor) < 0.3:
             break
         floor = found

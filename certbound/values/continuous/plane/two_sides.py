@@ -84,7 +84,7 @@ def bound_plane_above(
     upper, done = 0.0, []
     proposed: list[Proposed] = []
     for share in _SHARES:
-        plan = plan_above(plane, level, share * patches)
+        plan = _plan(plane, level, share * patches)
         try:
             surface = _promising(plane, model, plan)
             if surface is not None:
@@ -100,7 +100,7 @@ def bound_plane_above(
     return upper, done, proposed
 
 
-def plan_above(plane: Plane, level: float, patches: float) -> Plan:
+def _plan(plane: Plane, level: float, patches: float) -> Plan:
     """The finest grid with about so many patches; slabs grow fewer as fast as cells do.
 
     Where failing is rare (log P the ``level``) a longer lead costs little, and makes for fronts that are less steep.
@@ -124,7 +124,7 @@ def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float],
     plane = plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem))
     least = rough_level(plane)
     levels = sorted({max(level, least) for level in levels})
-    plan = plan_above(plane, levels[0], _SHARES[0] * RATE * seconds)
+    plan = _plan(plane, levels[0], _SHARES[0] * RATE * seconds)
     surface = _promising(plane, model, plan, levels[-1])
     return [] if surface is None else chart_above(surface, model, levels, [0])
 
