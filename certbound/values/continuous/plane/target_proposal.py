@@ -24,6 +24,8 @@ _ROUND = 1.0  # cells by which a corner is rounded, about
 _EARLY = 0.5  # cells outside of the target from which on V is low for lower bounds
 _CROWD = 1.3  # how many cells lie near each end of the target, in units of the evenly spread ones
 _NEAR = 0.006  # of the box: how near
+_FACE = 3.0  # cells from a face of the box within which V leaves what it is in the target
+_WIDER = 3.0  # how much more slowly V rises beside the target there, for lower bounds
 _CORNER = 3.0  # cells from a corner of the box within which there is no source
 _STIFF = 20.0  # by how much what V is drawn by may exceed one over a step
 _BENT = 0.05  # what a cell may lose of its width where nodes are moved to places
@@ -44,14 +46,26 @@ class SolverToTarget(Solver):
     def __init__(self, plane: Plane, plan: Plan, source: Source | None, target: Region, *, upper: bool) -> None:
         self.target, self.upper = target, upper
         super().__init__(plane, plan, source)
-        depth = self._depth()
+        depth, kept = self._depth(), self._off_faces()
         offset = (0.0 if upper else _EARLY) if target.form.axial else _APART
-        begin = offset if upper else -offset - _RAMP
-        self.profile = plan.floor * smooth((depth - begin) / _RAMP)
+        ramp = _RAMP if upper else _RAMP * (1 + _WIDER * (1 - kept))
+        falls = smooth((depth - offset) / ramp) * kept if upper else smooth((depth + offset + ramp) / ramp)
+        self.profile = plan.floor * falls
         fast = [np.abs(self._model(plane.horizon)[1][k, k]) / self.widths[k] ** 2 for k in (0, 1)]
-        self.spared = self._beside_corners()
         begin = offset if upper else -offset - _SOFT
-        self.drawn = _DRAWN * np.maximum(*fast) * np.clip((depth - begin) / _SOFT, 0.0, 1.0) ** 2
+        share = np.clip((depth - begin) / _SOFT, 0.0, 1.0) ** 2 * (kept if upper else 1.0)
+        self.drawn = _DRAWN * np.maximum(*fast) * share
+        self.spared = self._beside_corners()
+
+    def _off_faces(self) -> Array:
+        """0 on the box's faces and 1 from a few cells on, but for faces that lie wholly in the target."""
+        found = np.ones(self.x.shape)
+        for axis, place in enumerate((self.x, self.y)):
+            for side, distance in ((0, place - self.plane.low[axis]), (1, self.plane.high[axis] - place)):
+                face = np.take(self._depth(), -side, axis=axis)
+                if face.min() < 0:
+                    found = found * smooth(distance / (_FACE * self.widths[axis]))
+        return found
 
     def _beside_corners(self) -> Array:
         """0 at the box's corners, where V = 0 along both faces lets nothing change V; 1 from a few cells on."""
@@ -61,12 +75,19 @@ class SolverToTarget(Solver):
         ]
         return np.asarray(1 - (1 - shares[0]) * (1 - shares[1]))
 
+    def _width_at_edge(self, axis: int) -> float:
+        """A cell's width at the target's ends along a state, in the middle where it has none."""
+        nodes = self.nodes[axis]
+        ends = [end for end in ends_of(self.target, axis) if nodes[0] <= end <= nodes[-1]]
+        places = ends or [0.5 * (nodes[0] + nodes[-1])]
+        return float(np.interp(places, nodes, np.gradient(nodes)).max())
+
     def _depth(self) -> Array:
         """How deep in the target the points lie, in cells; negative outside."""
         form, places = self.target.form, self.target.places(2)
         center = self.target.center_at()
         y = np.stack([(self.x, self.y)[place] for place in places], axis=-1) - center
-        h = np.stack([self.widths[place] for place in places], axis=-1)
+        h = np.array([self._width_at_edge(place) for place in places])
         if isinstance(form, Faces):
             reach = [
                 (bound - y @ normal) / np.sqrt(((h * normal) ** 2).sum(axis=-1))
