@@ -23,6 +23,7 @@ from certbound.values.continuous.coefficients import Reader, squared_diffusion
 from certbound.values.continuous.curved import bound_region, walled
 from certbound.values.continuous.hypotheses import Model, check_noise
 from certbound.values.continuous.payment import Payment
+from certbound.values.continuous.plane import bound_windows, windowed
 from certbound.values.continuous.room import safe_room
 from certbound.values.continuous.surface import Surface
 
@@ -122,6 +123,9 @@ def bound_exits(
 
         _refuse_random(problem)
         (upper, words), least = three_states(problem, model, begin + seconds), None
+    elif windowed(problem):
+        _refuse_random(problem)
+        upper, least, words = bound_windows(problem, model, begin + seconds)
     elif walled(problem):
         _refuse_random(problem)
         upper, least, words, proposed = bound_region(problem, model, begin + seconds)

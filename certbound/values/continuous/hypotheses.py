@@ -360,6 +360,17 @@ def patched_of(proof: Proof, excess: Array, need: Need, steps: Array, lift: floa
     )  # fmt: skip
 
 
+def chained(parts: Sequence[Patched], surfaces: Sequence[Surface], need: Need) -> Patched:
+    """The patches of surfaces that follow each other, their slabs numbered through."""
+    before = np.cumsum([0, *(surface.slabs for surface in surfaces)])[:-1]
+    together = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in ("excess", "low", "high", "energy")
+    }
+    slab = np.concatenate([part.slab + count for part, count in zip(parts, before)])
+    steps = np.concatenate([surface.steps for surface in surfaces])
+    return Patched(**together, slab=slab, steps=steps, spare=need.spare)
+
+
 def extreme_over(
     surface: Surface, starts: Sequence[tuple[float, float]], *, upper: bool, points: Array | None = None
 ) -> float:

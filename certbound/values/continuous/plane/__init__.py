@@ -7,10 +7,13 @@ From the bottom: ``plane_grids``, ``solver``, ``plane_proposal``, ``plane_below`
 from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, slab_times, spread_nodes
 from certbound.values.continuous.plane.reach import Floats, reach_of
 from certbound.values.continuous.plane.solver import Solver, integrated, solve_lines
+from certbound.values.continuous.plane.stages import windowed
 from certbound.values.continuous.plane.targets import bound_failing
 from certbound.values.continuous.plane.two_sides import bound_plane_above, chart_plane, rough_level, two_states
+from certbound.values.continuous.plane.windows import bound_windows
 
 __all__ = [
-    "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_plane_above", "chart_plane", "integrated",
-    "reach_of", "rough_level", "slab_times", "solve_lines", "spread_nodes", "two_states",
+    "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_plane_above", "bound_windows",
+    "chart_plane", "integrated", "reach_of", "rough_level", "slab_times", "solve_lines", "spread_nodes", "two_states",
+    "windowed",
 ]

@@ -19,7 +19,7 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Plane:
-    """The problem in floats: drift (branches, 2, ...) and a (2, 2, ...) at (t, x, y), on a box."""
+    """The problem in floats: drift (branches, 2, ...) and a (2, 2, ...) at (t, x, y), on a box, perhaps with nodes."""
 
     low: Pair
     high: Pair
@@ -28,6 +28,7 @@ class Plane:
     square: Callable[[float, Array, Array], Array]
     starts: list[Pair]
     autonomous: bool
+    nodes: tuple[Array, Array] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -96,6 +97,8 @@ def slab_times(horizon: float, plan: Plan) -> Array:
 
 def spread_nodes(plane: Plane, plan: Plan, axis: int, more: Callable[[Array], Array] | None = None) -> Array:
     """Nodes where the noise is small, and at the faces or as ``more`` weighs places; bent to the starts."""
+    if plane.nodes is not None:
+        return plane.nodes[axis]
     low, high = plane.low[axis], plane.high[axis]
     fine = np.linspace(low, high, 4001)
     density = 1 / mean_deviation(plane, axis, fine)

@@ -24,6 +24,7 @@ _ROUND = 1.0  # cells by which a corner is rounded, about
 _EARLY = 0.5  # cells outside of the target from which on V is low for lower bounds
 _CROWD = 1.3  # how many cells lie near each end of the target, in units of the evenly spread ones
 _NEAR = 0.006  # of the box: how near
+_UNITS = 3.0  # how much wider than at the edge a cell may be that depths are measured by
 _FACE = 3.0  # cells from a face of the box within which V leaves what it is in the target
 _WIDER = 3.0  # how much more slowly V rises beside the target there, for lower bounds
 _CORNER = 3.0  # cells from a corner of the box within which there is no source
@@ -87,7 +88,9 @@ class SolverToTarget(Solver):
         form, places = self.target.form, self.target.places(2)
         center = self.target.center_at()
         y = np.stack([(self.x, self.y)[place] for place in places], axis=-1) - center
-        h = np.array([self._width_at_edge(place) for place in places])
+        h = np.stack(
+            [np.minimum(self.widths[k], _UNITS * self._width_at_edge(k)) for k in places], axis=-1
+        )
         if isinstance(form, Faces):
             reach = [
                 (bound - y @ normal) / np.sqrt(((h * normal) ** 2).sum(axis=-1))

@@ -41,7 +41,7 @@ from certbound.values.continuous.plane.reach import reach_of
 from certbound.values.continuous.plane.target_proposal import propose_to_target
 from certbound.values.continuous.plane.two_sides import RATE, plane_of
 from certbound.values.continuous.residual import value_range
-from certbound.values.continuous.room import Room, limits_of, starts_of
+from certbound.values.continuous.room import limits_of, points_of, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.values.sets import contains
 from certbound.watch import OutOfTime
@@ -113,6 +113,7 @@ class _Aim:
     target: Region
     open: tuple[tuple[int, int], ...]
     upper: bool
+    points: Array | None
 
 
 def prove_failing_above(surface: Surface, aim: _Aim) -> Payment:
@@ -137,7 +138,7 @@ def prove_failing_below(surface: Surface, aim: _Aim) -> Payment | None:
     fate = Fate.of(surface.axes, aim.target)
     highest = _over(surface, fate.alive)[1]
     surface = surface.raised(-highest - 1e-12 * (1 + highest)) if highest > 0 else surface
-    start = extreme_over(surface, aim.plane.starts, upper=False)
+    start = extreme_over(surface, aim.plane.starts, upper=False, points=aim.points)
     ceiling = max(_over(surface, fate.met)[1], *_on_faces(surface, fate, aim.open)[1], -700.0)
     if not start > ceiling:
         return None
@@ -186,7 +187,7 @@ class _Sketch:
 
     @classmethod
     def of(cls, surface: Surface, aim: _Aim) -> _Sketch:
-        start = extreme_over(surface, aim.plane.starts, upper=aim.upper)
+        start = extreme_over(surface, aim.plane.starts, upper=aim.upper, points=aim.points)
         worst, level = sampled_residual(surface, aim.model, upper=aim.upper)
         paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - level - _VARIED, 50.0))
         excess = np.maximum(worst - paid, 0.0) * Fate.of(surface.axes, aim.target).alive
@@ -297,7 +298,7 @@ def _aim(problem: Problem, model: Model, target: Region, *, upper: bool) -> _Aim
     if not all(low < high for low, high in zip(*ends)):
         raise InfeasibleError("the safe set has no interior.")
     plane = replace(floats, low=(ends[0][0], ends[0][1]), high=(ends[1][0], ends[1][1]))
-    return _Aim(plane=plane, model=model, target=target, open=tuple(open_faces), upper=upper)
+    return _Aim(plane=plane, model=model, target=target, open=tuple(open_faces), upper=upper, points=points_of(problem))
 
 
 def _floor(aim: _Aim) -> float:

@@ -134,7 +134,7 @@ def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = Non
     surface = propose_plane(plane, plan)
     if surface is None:
         return None
-    first = best = _Sketch.of(surface, model, plane.starts, level)
+    first = best = Sketch.of(surface, model, plane.starts, level)
     if first.estimate() > first.start + _HOPELESS:
         return None
     for top in _TOPS:
@@ -145,7 +145,7 @@ def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = Non
             surface = propose_plane(plane, plan, source)
             if surface is None:
                 break
-            sketch = _Sketch.of(surface, model, plane.starts, level)
+            sketch = Sketch.of(surface, model, plane.starts, level)
             best = min(best, sketch, key=lambda one: one.estimate())
         if best.estimate() < best.start + _CLOSE:
             break
@@ -155,7 +155,7 @@ def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = Non
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Sketch:
+class Sketch:
     """A proposal with samples of what its proof would pay for: R, but for what eps pays, and V's least values."""
 
     surface: Surface
@@ -164,7 +164,7 @@ class _Sketch:
     low: Array
 
     @classmethod
-    def of(cls, surface: Surface, model: Model, starts: list[Pair], level: float | None = None) -> _Sketch:
+    def of(cls, surface: Surface, model: Model, starts: list[Pair], level: float | None = None) -> Sketch:
         start = extreme_over(surface, starts, upper=True) if level is None else level
         highest, low = sampled_residual(surface, model)
         paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - low - _VARIED, 50.0))
