@@ -23,7 +23,7 @@ from certbound.values.continuous.coefficients import Reader, squared_diffusion
 from certbound.values.continuous.curved import bound_region, walled
 from certbound.values.continuous.hypotheses import Model, check_noise
 from certbound.values.continuous.payment import Payment
-from certbound.values.continuous.plane import bound_windows, windowed
+from certbound.values.continuous.plane import bound_moving, bound_windows, moving, windowed
 from certbound.values.continuous.room import safe_room
 from certbound.values.continuous.surface import Surface
 
@@ -123,6 +123,10 @@ def bound_exits(
 
         _refuse_random(problem)
         (upper, words), least = three_states(problem, model, begin + seconds), None
+    elif moving(problem) and all(not c.outside for c in problem.constraints):
+        _refuse_random(problem)
+        wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
+        upper, least, words = bound_moving(problem, model, begin + seconds, wanted)
     elif windowed(problem):
         _refuse_random(problem)
         upper, least, words = bound_windows(problem, model, begin + seconds)

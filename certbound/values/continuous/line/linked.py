@@ -79,7 +79,8 @@ def prove_above(links: Sequence[Link], start: Start) -> Payment:
             break
         parts = [patched_of(proof, proof.ranges.residual_high, need, steps, lift) for proof in proofs]
         lowest = floor + lift - 1e-15 * (1 + abs(floor))
-        payment = pay_upper(chained(parts, [link.surface for link in ready], need), up(level + lift), lowest, whole=start.random)
+        joined = chained(parts, [link.surface for link in ready], need)
+        payment = pay_upper(joined, up(level + lift), lowest, whole=start.random)
         best = min(best, replace(payment, lift=lift), key=lambda one: one.log)
     return best
 

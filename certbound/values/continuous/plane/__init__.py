@@ -1,9 +1,11 @@
 """Two states: V on a tensor grid, proposed for both sides and proved by `hypotheses`.
 
-From the bottom: ``plane_grids``, ``solver``, ``plane_proposal``, ``plane_below``, ``two_sides``; ``target_proposal`` and
-``targets`` for targets.
+From the bottom: ``plane_grids``, ``solver``, ``plane_proposal``, ``plane_below``, ``two_sides``; then
+``target_proposal``, ``targets`` for targets, ``stages``, ``later``, ``windows``
+for windows, and ``frames`` for limits that move.
 """
 
+from certbound.values.continuous.plane.frames import bound_moving, moving
 from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, slab_times, spread_nodes
 from certbound.values.continuous.plane.reach import Floats, reach_of
 from certbound.values.continuous.plane.solver import Solver, integrated, solve_lines
@@ -13,7 +15,7 @@ from certbound.values.continuous.plane.two_sides import bound_plane_above, chart
 from certbound.values.continuous.plane.windows import bound_windows
 
 __all__ = [
-    "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_plane_above", "bound_windows",
-    "chart_plane", "integrated", "reach_of", "rough_level", "slab_times", "solve_lines", "spread_nodes", "two_states",
+    "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above", "bound_windows",
+    "chart_plane", "integrated", "moving", "reach_of", "rough_level", "slab_times", "solve_lines", "spread_nodes", "two_states",
     "windowed",
 ]

@@ -108,7 +108,7 @@ class LaterBelow(SolverBelow):
             return super().start()
         return np.asarray(self.plan.floor * rest)
 
-    def face(self, tau: float) -> tuple[Array, Array]:  # type: ignore[override]  # arrays where one number would do
+    def face(self, tau: float) -> tuple[Array | float, Array | float]:
         s, begun = min(tau / self.plan.lead, 1.0), self.begun[self.edge]
         risen = s**3 * (10 - 15 * s + 6 * s * s)
         return begun * (1 - risen), -begun * 30 * (s * (1 - s)) ** 2 / self.plan.lead

@@ -139,7 +139,7 @@ class Solver:
         bend = np.clip((0.5 - share) / np.maximum(1 - share, 0.1), 0.0, 0.9)
         return rate, bend, np.clip(2 * share - 1, 0.0, 2.0)
 
-    def face(self, tau: float) -> tuple[float, float]:
+    def face(self, tau: float) -> tuple[Array | float, Array | float]:
         """V and its rate on the faces."""
         return 0.0, 0.0
 

@@ -1,8 +1,8 @@
 """The safe box of two states piece by piece of time, as the windows of constraints come and go.
 
-Between the ends of windows the box is that of one set of constraints: a `Stage`. At its end all constraints whose closed
-windows touch that instant hold: a gate, in which a path has to be. All grids take their nodes from one master list an
-axis, on which the ends of all boxes and gates lie, so that cells of neighbouring stages are the same.
+Between the ends of windows the box is that of one set of constraints: a `Stage`. At its end all constraints whose
+closed windows touch that instant hold: a gate, in which a path has to be. All grids take their nodes from one master
+list an axis, on which the ends of all boxes and gates lie, so that cells of neighbouring stages are the same.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Proposals of V = log(w + (1 - w) P(failing)) with a target: 0 on the box's faces and at the horizon, low in the target.
+"""Proposals of V = log(w + (1 - w) P(failing)) with a target: 0 on the box's faces and at the horizon, low within it.
 
-Inside the target nothing is asked of V, so that it is drawn to log w there: from its faces on for upper bounds, and from
-a little outside for lower ones. Depths are measured in cells.
+Inside the target nothing is asked of V, so that it is drawn to log w there: from its faces on for upper bounds, and
+from a little outside for lower ones. Depths are measured in cells.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class SolverToTarget(Solver):
     def start(self) -> Array:
         return self.profile.copy()
 
-    def face(self, tau: float) -> tuple[Array, float]:
+    def face(self, tau: float) -> tuple[Array | float, Array | float]:
         return self.profile[self.edge], 0.0
 
     def _eased(self, force: Array, a: Array, slopes: tuple[Array, Array], value: Array) -> Array:

@@ -54,6 +54,7 @@ _VARIED = 1.0
 _PASSES = 2
 _SHARE = 1.0  # w in units of the probability of failing
 _GROWTH = 0.2
+_FEWEST = 16  # cells along each axis
 _LEAD = 0.32  # of the horizon over the number of cells
 _HIGHEST = math.log(0.5)  # of log w
 _ROUNDS = 4  # of coarse proposals that find out about it
@@ -122,7 +123,8 @@ def prove_failing_above(surface: Surface, aim: _Aim) -> Payment:
     if not fate.beside.any():
         return Payment(log=0.0)
     for _ in range(3):
-        missing = -min(0.0, float(surface.range_at(-1)[0][fate.alive].min(initial=0.0)), *_on_faces(surface, fate, _FACES)[0])
+        late = float(surface.range_at(-1)[0][fate.alive].min(initial=0.0))
+        missing = -min(0.0, late, *_on_faces(surface, fate, _FACES)[0])
         surface = surface.raised(up(missing)) if missing > 0 else surface
     if missing > 0:
         return Payment(log=0.0)
@@ -243,8 +245,8 @@ def bound_failing(
     patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     floor = _floor(aims[0])
     upper, lower, done = 0.0, -math.inf, list[str]()
-    for share in _SHARES:
-        plan = _plan(aims[0].plane.horizon, floor, share * patches)
+    for cells in sorted({_cells(aims[0].plane.horizon, share * patches) for share in _SHARES}):
+        plan = _plan(aims[0].plane.horizon, floor, cells)
         with contextlib.suppress(OutOfTime):
             surface = _promising(aims[0], plan)
             if surface is not None:
@@ -257,13 +259,16 @@ def bound_failing(
     return upper, None if lower == -math.inf else lower, words
 
 
-def _plan(horizon: float, floor: float, patches: float) -> Plan:
-    """The finest grid with about so many patches."""
-    for cells in itertools.count(20):
-        plan = Plan(cells=cells, growth=_GROWTH, lead=_LEAD / cells * horizon, floor=floor)
-        if cells**2 * len(slab_times(horizon, plan)) > patches:
-            break
-    return plan
+def _plan(horizon: float, floor: float, cells: int) -> Plan:
+    return Plan(cells=cells, growth=_GROWTH, lead=_LEAD / cells * horizon, floor=floor)
+
+
+def _cells(horizon: float, patches: float) -> int:
+    """How many cells an axis about so many patches allow."""
+    cells = _FEWEST
+    while cells**2 * len(slab_times(horizon, _plan(horizon, 0.0, cells))) < patches:
+        cells += 1
+    return cells
 
 
 def _simplified(target: Region) -> Region:

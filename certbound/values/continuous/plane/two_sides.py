@@ -49,7 +49,7 @@ _CLOSE = 0.15
 _HOPELESS = 60.0  # what a first proposal may lose (log P): sources make that ten times less, not a hundred
 _VARIED = 1.0  # about how much V varies on a patch
 _SHARES = (0.12, 0.8)  # of the patches, for one grid after the other
-_BELOW = 0.6  # of as many patches again, for a lower bound
+BELOW = 0.6  # of as many patches again, for a lower bound
 
 
 def two_states(
@@ -68,7 +68,7 @@ def two_states(
     below: list[Proposed] = []
     if upper > wanted:
         outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
-        plan = plan_below(outer, min(level, upper), _BELOW * patches)
+        plan = plan_below(outer, min(level, upper), BELOW * patches)
         with contextlib.suppress(OutOfTime):
             found = bound_plane_below(outer, model, plan, starts, points_of(problem))
             below += [] if found is None else [found]

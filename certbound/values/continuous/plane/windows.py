@@ -1,8 +1,8 @@
 """Two states and windows: one surface a stage, joined at gates, from both sides.
 
 Where a stage ends, V may jump in one direction. Above, V >= min(V_next, 0) where a path may pass the gate, and V >= 0
-where it may not; below, V <= V_next where it may pass. The grids share their nodes, so that on a cell of both V_next - V
-is one polynomial with the differences of the data.
+where it may not; below, V <= V_next where it may pass. The grids share their nodes, so that on a cell of both the gap
+V_next - V is one polynomial with the differences of the data.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ from certbound.watch import OutOfTime
 
 _SHARES = (0.12, 0.5)  # of the patches, for one grid after the other
 _COARSE = 24
+_FEWEST = 16  # cells along each axis
 _GROWTH = 0.25
 _LEAD = 0.32  # of a stage over the number of cells
 _LEAD_BELOW = 100.0  # of a stage over the square of that number
@@ -89,8 +90,7 @@ def bound_windows(problem: Problem, model: Model, deadline: float) -> tuple[floa
     rough = _surfaces(above, _COARSE, 0.0, passes=0)
     level = 0.0 if rough is None else min(0.0, extreme_over(rough[0], starts, upper=True))
     upper, lower, done = 0.0, -math.inf, list[str]()
-    for share in _SHARES:
-        cells = _cells(above.stages, share * patches)
+    for cells in sorted({_cells(above.stages, share * patches) for share in _SHARES}):
         with contextlib.suppress(OutOfTime):
             surfaces = _surfaces(above, cells, level, passes=_PASSES)
             upper = min(upper, 0.0 if surfaces is None else prove_chain_above(surfaces, above).log)
@@ -106,7 +106,7 @@ def bound_windows(problem: Problem, model: Model, deadline: float) -> tuple[floa
 
 def _cells(stages: Sequence[Stage], patches: float) -> int:
     """How many cells an axis so many patches allow."""
-    cells = 20
+    cells = _FEWEST
     while cells**2 * sum(len(slab_times(s.end - s.start, _plan(s, cells, 0.0, upper=True))) for s in stages) < patches:
         cells += 1
     return cells
@@ -144,7 +144,7 @@ def _promising(
     after = None if follows is None else values_of(follows)
     source: Source | None = None
     best: tuple[float, Surface] | None = None
-    for number in range(passes + 1):
+    for _ in range(passes + 1):
         solver = (LaterAbove if chain.upper else LaterBelow)(local, plan, source, stage, after)
         surface = integrated(solver)
         if surface is None:
