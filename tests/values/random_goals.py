@@ -76,14 +76,16 @@ def check(kind: str, seed: int, seconds: float, paths: int = 100_000) -> str:
     bad = upper < counts.lower - GRANTED * counts.probability
     if problem.initial.is_point:
         bad |= lower > counts.upper + GRANTED * counts.probability
-    return f"{'DEFECT' if bad else 'fine'} {kind} {seed}: {lower:.4g} <= {counts.probability:.4g} <= {upper:.4g} in {spent:.1f} s"
+    what = f"{'DEFECT' if bad else 'fine'} {kind} {seed}"
+    return f"{what}: {lower:.4g} <= {counts.probability:.4g} <= {upper:.4g} in {spent:.1f} s"
 
 
 def main() -> None:
     """Print one line a problem."""
     kind, first, last, seconds = (*sys.argv[1:], *("targets", "0", "15", "4")[len(sys.argv) - 1 :])
     for seed in range(int(first), int(last)):
-        print(check(kind, seed, float(seconds)), flush=True)
+        sys.stdout.write(check(kind, seed, float(seconds)) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -66,11 +66,12 @@ def bound_exits(
     ----------
     problem : Problem
         Continuous time, up to three states; noise of full rank in one and two. In one state any limits, windows,
-        moving sets, obstacles and a random start; in two a bounded safe box, or any fixed limits and obstacles, over
-        the whole horizon; in three a safe box, which may leave states unbounded, and an upper bound only.
+        moving sets, obstacles and a random start; in two a bounded safe box, whose sides may move, boxes over windows,
+        or any fixed limits and obstacles over the whole horizon; in three a safe box, which may leave states
+        unbounded, and an upper bound only.
     target : region, optional
-        In one state: then the bounds are those of the probability of breaking a constraint before the target is
-        entered, or of not entering it by the horizon.
+        In one state, and in two within a fixed box: then the bounds are those of the probability of breaking a
+        constraint before the target is entered, or of not entering it by the horizon.
     seconds : float
         How long to refine; the first attempt is finished in any case. In one state seconds stand for so many
         patches of work, so that the bounds do not depend on the machine or its load.

@@ -15,7 +15,7 @@ from certbound.values.continuous.plane.two_sides import bound_plane_above, chart
 from certbound.values.continuous.plane.windows import bound_windows
 
 __all__ = [
-    "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above", "bound_windows",
-    "chart_plane", "integrated", "moving", "reach_of", "rough_level", "slab_times", "solve_lines", "spread_nodes", "two_states",
-    "windowed",
+    "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",
+    "bound_windows", "chart_plane", "integrated", "moving", "reach_of", "rough_level", "slab_times", "solve_lines",
+    "spread_nodes", "two_states", "windowed",
 ]
