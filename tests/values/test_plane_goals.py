@@ -11,7 +11,9 @@ from certbound.errors import InfeasibleError
 from certbound.problem.goals import until
 from certbound.problem.model import compile_numpy
 from certbound.values.continuous import bound_exits, exits
-from certbound.values.continuous.plane import frames, targets, windows
+from certbound.values.continuous.plane import frames
+from certbound.values.continuous.plane import plane_targets as targets
+from certbound.values.continuous.plane import plane_windows as windows
 from certbound.values.continuous.plane.target_proposal import bent, propose_to_target
 from tests.values.random_goals import KINDS, check
 
@@ -189,6 +191,7 @@ def test_what_is_not_served_is_refused_in_words():
     ball = cb.Inside(cb.Ball([0, 0], 0.9), during=(0.5, 1.0))
     for changes, message in (
         ({"safe": [moved, late]}, "not both"),
+        ({"safe": [moved, cb.Inside(cb.Ball([0, 0], 0.9))]}, "moving boxes only"),
         ({"safe": [SQUARE, ball]}, "fixed boxes only"),
         ({"safe": [SQUARE, late], "initial": cb.GaussianStart([0.0, 0.0], 0.01 * np.eye(2))}, "random start"),
     ):

@@ -1,18 +1,18 @@
 """Two states: V on a tensor grid, proposed for both sides and proved by `hypotheses`.
 
 From the bottom: ``plane_grids``, ``solver``, ``plane_proposal``, ``plane_below``, ``two_sides``; then
-``target_proposal``, ``targets`` for targets, ``stages``, ``later``, ``windows``
+``target_proposal``, ``plane_targets`` for targets, ``stages``, ``later``, ``plane_windows``
 for windows, and ``frames`` for limits that move.
 """
 
 from certbound.values.continuous.plane.frames import bound_moving, moving
 from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, slab_times, spread_nodes
-from certbound.values.continuous.plane.reach import Floats, reach_of
+from certbound.values.continuous.plane.plane_reach import Floats, reach_of
+from certbound.values.continuous.plane.plane_targets import bound_failing
+from certbound.values.continuous.plane.plane_windows import bound_windows
 from certbound.values.continuous.plane.solver import Solver, integrated, solve_lines
 from certbound.values.continuous.plane.stages import windowed
-from certbound.values.continuous.plane.targets import bound_failing
 from certbound.values.continuous.plane.two_sides import bound_plane_above, chart_plane, rough_level, two_states
-from certbound.values.continuous.plane.windows import bound_windows
 
 __all__ = [
     "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",

@@ -48,7 +48,8 @@ def frames_of(problem: Problem, *, inner: bool) -> list[Phase]:
     """
     limits: list[list[Limit]] = [[], []]
     for constraint in problem.constraints:
-        if constraint.outside or not (constraint.region.form.axial or not constraint.region.moving):
+        form, moves = constraint.region.form, constraint.region.moving
+        if constraint.outside or form.round or (moves and not form.axial):
             raise InfeasibleError(f"value functions serve moving boxes only, not '{constraint.label}'.")
         if constraint.during is not None and constraint.during != (0.0, float(problem.horizon)):
             raise InfeasibleError("value functions in two states serve moving limits or windows, not both.")

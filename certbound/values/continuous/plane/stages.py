@@ -18,7 +18,7 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.values.continuous.plane.plane_grids import Pair, Plane, mean_deviation
-from certbound.values.continuous.plane.reach import reach_of
+from certbound.values.continuous.plane.plane_reach import reach_of
 from certbound.values.continuous.room import faces_of
 from certbound.values.grids import graded_axis
 

@@ -37,7 +37,7 @@ from certbound.values.continuous.hypotheses import (
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment, pay_lower
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
-from certbound.values.continuous.plane.reach import reach_of
+from certbound.values.continuous.plane.plane_reach import reach_of
 from certbound.values.continuous.plane.target_proposal import propose_to_target
 from certbound.values.continuous.plane.two_sides import RATE, plane_of
 from certbound.values.continuous.residual import value_range

@@ -233,10 +233,13 @@ def prove_chain_above(surfaces: Sequence[Surface], chain: _Chain) -> Payment:
         if not _spans(surface, stage, within=True):
             return Payment(log=0.0)
         surface = raised_above(surface)
-        missing = missing_above(surface, stage, ready[0] if ready else None)
-        if not math.isfinite(missing):
+        for _ in range(3):  # values are rounded when they are raised
+            missing = missing_above(surface, stage, ready[0] if ready else None)
+            if 0 < missing < math.inf:
+                surface = surface.raised(up(missing) + 1e-12)
+        if missing > 0:
             return Payment(log=0.0)
-        ready.insert(0, surface.raised(up(missing)) if missing else surface)
+        ready.insert(0, surface)
     level = up(extreme_over(ready[0], chain.starts, upper=True))
     span = float(ready[-1].times[-1] - ready[0].times[0])
     need = Need(spare=NEGLIGIBLE / span, start=level, top=0.0)
@@ -262,7 +265,10 @@ def prove_chain_below(surfaces: Sequence[Surface], chain: _Chain) -> Payment | N
         highest = max(top_of(surface), missing_below(surface, stage, ready[0]) if ready else -math.inf)
         if not math.isfinite(highest):
             return None
-        ready.insert(0, surface.raised(-highest - 1e-12 * (1 + highest)) if highest > 0 else surface)
+        surface = surface.raised(-highest - 1e-12 * (1 + highest)) if highest > 0 else surface
+        if ready and missing_below(surface, stage, ready[0]) > 0:
+            return None
+        ready.insert(0, surface)
     level = extreme_over(ready[0], chain.starts, upper=False, points=chain.points)
     if level == -math.inf:
         return None
