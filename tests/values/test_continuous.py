@@ -434,7 +434,7 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pyt
     alone = exit_probability(lambda t, x: -x, lambda t, x: 0.8 + 0 * x, -1, 1, 1, 0.0)
     truth = math.log(1 - (1 - alone) ** 2)
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
-    plane = two_sides._plane(problem, model, room.outer_low, room.outer_high, starts)
+    plane = two_sides.plane_of(problem, model, room.outer_low, room.outer_high, starts)
     plan = plan_below(plane, truth, 2500)
     proposals: list[Any] = []
     monkeypatch.setattr(plane_below, "propose_plane", lambda *given: proposals.append(given) or propose_plane(*given))
@@ -443,7 +443,7 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pyt
     bound = found[1].log
     assert len(proposals) == 3  # none that is not looked at
     with monkeypatch.context() as hopeless:
-        hopeless.setattr(plane_below._Sketch, "estimate", lambda self: plan.floor - 100)
+        hopeless.setattr(plane_below.SketchBelow, "estimate", lambda self: plan.floor - 100)
         hopeless.setattr(plane_below, "prove_lower", lambda *given: pytest.fail("nothing can come of this proof"))
         assert bound_plane_below(plane, model, plan, starts, None) is None
     assert len(proposals) == 4
@@ -464,11 +464,11 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pyt
 def test_a_source_of_any_size_never_takes_a_bound_below_the_truth() -> None:
     problem = two_free_states()
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
-    plane = two_sides._plane(problem, model, room.inner_low, room.inner_high, starts)
+    plane = two_sides.plane_of(problem, model, room.inner_low, room.inner_high, starts)
     plan = Plan(cells=10, growth=0.8, lead=0.05, floor=-7.0)
     first = propose_plane(plane, plan)
     assert first is not None
-    needed = Source.above(first, 1.1 * two_sides._Sketch.of(first, model, starts).needed(-0.02))
+    needed = Source.above(first, 1.1 * two_sides.Sketch.of(first, model, starts).needed(-0.02))
     bounds = {}
     for size in (-1.0, 0.0, 1.0, 3.0):
         source = dataclasses.replace(needed, values=size * needed.values)
@@ -504,7 +504,7 @@ def test_noise_that_grows_with_the_state_costs_no_rounding_to_speak_of() -> None
 def test_a_source_is_at_least_what_is_needed_on_every_patch() -> None:
     problem = two_free_states()
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
-    plane = two_sides._plane(problem, model, room.inner_low, room.inner_high, starts)
+    plane = two_sides.plane_of(problem, model, room.inner_low, room.inner_high, starts)
     surface = propose_plane(plane, Plan(cells=8, growth=0.8, lead=0.1, floor=-5.0))
     assert surface is not None
     needed = np.random.default_rng(0).uniform(0.0, 1.0, (surface.slabs, *surface.cells))
@@ -524,7 +524,6 @@ def test_a_source_is_at_least_what_is_needed_on_every_patch() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"safe": [cb.Inside(cb.Box([-1, -1], [1, 1]), during=(0.5, 1.0))]}, "over a window"),
         ({"safe": [cb.Inside(cb.Box([-1, -1], [1, 1], center=lambda t: [0.1 * t, 0.0]))]}, "moving sets"),
         ({"initial": cb.GaussianStart([0.0, 0.0], 0.01 * np.eye(2))}, "random start"),
     ],
@@ -590,7 +589,7 @@ def reversed_van_der_pol(sigma: float) -> two_sides.Plane:
     safe = [cb.Inside(cb.Box([-1.2, -1.2], [1.2, 1.2]))]
     problem = cb.Problem(system, initial=cb.Box([-0.2, -0.2], [0.2, 0.2]), safe=safe, horizon=5)
     room = safe_room(problem)
-    return two_sides._plane(problem, exits._model(problem), room.inner_low, room.inner_high, starts_of(problem))
+    return two_sides.plane_of(problem, exits._model(problem), room.inner_low, room.inner_high, starts_of(problem))
 
 
 def test_a_proposal_whose_fronts_are_steeper_than_its_cells_comes_to_an_end() -> None:
@@ -620,7 +619,7 @@ def test_drift_is_weakened_beside_faces_only_where_it_points_inward_and_cells_ca
 def test_a_proposal_of_two_states_that_does_not_span_the_horizon_proves_nothing(monkeypatch) -> None:
     problem = two_free_states()
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
-    plane = two_sides._plane(problem, model, room.inner_low, room.inner_high, starts)
+    plane = two_sides.plane_of(problem, model, room.inner_low, room.inner_high, starts)
     plan, real = Plan(cells=8, growth=0.8, lead=0.1, floor=-5.0), two_sides.propose_plane
 
     def short(plane, plan, source=None):

@@ -23,6 +23,7 @@ from certbound.values.continuous.coefficients import Reader, squared_diffusion
 from certbound.values.continuous.curved import bound_region, walled
 from certbound.values.continuous.hypotheses import Model, check_noise
 from certbound.values.continuous.payment import Payment
+from certbound.values.continuous.plane import bound_moving, bound_windows, moving, windowed
 from certbound.values.continuous.room import safe_room
 from certbound.values.continuous.surface import Surface
 
@@ -65,11 +66,12 @@ def bound_exits(
     ----------
     problem : Problem
         Continuous time, up to three states; noise of full rank in one and two. In one state any limits, windows,
-        moving sets, obstacles and a random start; in two a bounded safe box, or any fixed limits and obstacles, over
-        the whole horizon; in three a safe box, which may leave states unbounded, and an upper bound only.
+        moving sets, obstacles and a random start; in two a bounded safe box, whose sides may move, boxes over windows,
+        or any fixed limits and obstacles over the whole horizon; in three a safe box, which may leave states
+        unbounded, and an upper bound only.
     target : region, optional
-        In one state: then the bounds are those of the probability of breaking a constraint before the target is
-        entered, or of not entering it by the horizon.
+        In one state, and in two within a fixed box: then the bounds are those of the probability of breaking a
+        constraint before the target is entered, or of not entering it by the horizon.
     seconds : float
         How long to refine; the first attempt is finished in any case. In one state seconds stand for so many
         patches of work, so that the bounds do not depend on the machine or its load.
@@ -103,7 +105,12 @@ def bound_exits(
     model = _model(problem)
     proposed: Sequence[tuple[Surface, Payment]] = ()
     below: Sequence[tuple[Surface, Payment]] = ()
-    if target is not None:
+    if target is not None and problem.system.dimension == 2:
+        from certbound.values.continuous.plane import bound_failing
+
+        _refuse_random(problem)
+        upper, least, words = bound_failing(problem, model, target, begin + seconds)
+    elif target is not None:
         from certbound.values.continuous.line import bound_arrival
 
         most, rest, words = bound_arrival(problem, model, target)
@@ -117,6 +124,13 @@ def bound_exits(
 
         _refuse_random(problem)
         (upper, words), least = three_states(problem, model, begin + seconds), None
+    elif moving(problem) and all(not c.outside for c in problem.constraints):
+        _refuse_random(problem)
+        wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
+        upper, least, words = bound_moving(problem, model, begin + seconds, wanted)
+    elif windowed(problem):
+        _refuse_random(problem)
+        upper, least, words = bound_windows(problem, model, begin + seconds)
     elif walled(problem):
         _refuse_random(problem)
         upper, least, words, proposed = bound_region(problem, model, begin + seconds)
@@ -234,8 +248,8 @@ def _check(problem: Problem, target: Any, seconds: float, most: int = 2) -> None
         raise InfeasibleError(
             f"value functions in continuous time serve {count} states here, the problem has {problem.system.dimension}."
         )
-    if target is not None and problem.system.dimension > 1:
-        raise InfeasibleError("value functions in continuous time serve targets in one state only.")
+    if target is not None and problem.system.dimension > 2:
+        raise InfeasibleError("value functions in continuous time serve targets in one or two states only.")
     if problem.input_sequence is not None:
         raise InfeasibleError("value functions in continuous time need a feedback law; the plan is an array.")
 

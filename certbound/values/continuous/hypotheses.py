@@ -24,7 +24,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from certbound.arrays import Array, Index
+from certbound.arrays import Array, Index, Mask
 from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Chart, from_natural
@@ -100,16 +100,20 @@ class Need:
         return self.spare * (1 + np.exp(np.minimum(self.start - high, 700.0)) * (1 - 1e-13)) * (1 - 1e-13)
 
 
-def examine(surface: Surface, model: Model, need: Need, *, upper: bool, near: Array | None = None) -> Proof:
+def examine(
+    surface: Surface, model: Model, need: Need, *, upper: bool, near: Array | None = None, alive: Mask | None = None
+) -> Proof:
     """Enclose R (closely on one side), V and Q2 on every patch of a surface that needs it.
 
     ``near``, shape (slabs, *cells), says how far from samples of R its bound may lie where that is nothing to lose.
+    Where ``alive``, shape ``cells``, is false nothing is looked at: every path there has come to its end.
     """
     counts = model.counts()
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
     share = _NEAR * (0.5 + 0.5 * surface.times[-1] / (surface.slabs * surface.steps))
     loose = np.zeros(surface.slabs * per) if near is None else near.reshape(-1)
+    over = np.zeros(per, dtype=bool) if alive is None else ~alive.ravel()
 
     def look(ends: tuple[int, int]) -> tuple[Index, Ranges] | None:
         patches = surface.patches(*ends)
@@ -117,7 +121,8 @@ def examine(surface: Surface, model: Model, need: Need, *, upper: bool, near: Ar
         drifts, squares = fixed or interpolants(surface, model, *ends, counts)
         low, high = value_range(patches)
         size = coarse_size(patches, drifts, squares, place)
-        kept = np.flatnonzero(~(low >= need.top) & ~(size <= need.free(high)))  # what is no number is looked at
+        due = ~(low >= need.top) & ~(size <= need.free(high))  # what is no number is looked at
+        kept = np.flatnonzero(due & ~np.tile(over, ends[1] - ends[0]))
         if not len(kept):
             return None
         close = np.maximum(share[ends[0] + kept // per] * need.free(high[kept]), loose[ends[0] * per + kept])
@@ -212,9 +217,14 @@ def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, fl
     return replace(payment, lift=lift)
 
 
-def cheapest(proof: Proof, need: Need, surface: Surface, start: float) -> tuple[Payment, float]:
-    """The payment that bounds log P best where V(0, .) = ``start``, and by how much V was lifted for it."""
-    floor = float(surface.range_at(-1)[0].min())
+def cheapest(
+    proof: Proof, need: Need, surface: Surface, start: float, floor: float | None = None
+) -> tuple[Payment, float]:
+    """The payment that bounds log P best where V(0, .) = ``start``, and by how much V was lifted for it.
+
+    ``floor`` bounds V from below where paths end without having failed; at the last time if nothing is said.
+    """
+    floor = float(surface.range_at(-1)[0].min()) if floor is None else floor
     best: tuple[Payment, float] | None = None
     for lift in LIFTS:  # V + lift has the same residual, and nothing is due where it is positive
         if best is not None and start + lift >= best[0].log:
@@ -348,6 +358,17 @@ def patched_of(proof: Proof, excess: Array, need: Need, steps: Array, lift: floa
         excess=excess[due], low=low[due], high=high[due], energy=ranges.energy[due],
         slab=proof.slab[due], steps=steps, spare=need.spare,
     )  # fmt: skip
+
+
+def chained(parts: Sequence[Patched], surfaces: Sequence[Surface], need: Need) -> Patched:
+    """The patches of surfaces that follow each other, their slabs numbered through."""
+    before = np.cumsum([0, *(surface.slabs for surface in surfaces)])[:-1]
+    together = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in ("excess", "low", "high", "energy")
+    }
+    slab = np.concatenate([part.slab + count for part, count in zip(parts, before)])
+    steps = np.concatenate([surface.steps for surface in surfaces])
+    return Patched(**together, slab=slab, steps=steps, spare=need.spare)
 
 
 def extreme_over(

@@ -172,13 +172,19 @@ class Surface:
 
     def face_range(self, axis: int, side: int) -> tuple[float, float]:
         """Bounds of V on one face of the grid over all times."""
+        low, high = self.face_ranges(axis, side)
+        return float(low.min()), float(high.max())
+
+    def face_ranges(self, axis: int, side: int) -> tuple[Array, Array]:
+        """Bounds of V on the cells of one face of the grid, shape (K, *cells along the other states)."""
         edge = 0 if side == 0 else -1
         index: tuple[Any, ...] = (slice(None), *((slice(None),) * (2 * axis)), edge, 0)
         parts = [self.values[:-1], self.start_rates, self.values[1:], self.end_rates]
         data = np.stack([part[index] for part in parts], axis=1)
         rest = tuple(nodes for k, nodes in enumerate(self.axes) if k != axis)
         low, high = value_range(_patches_of(data, self.steps, rest))
-        return float(low.min()), float(high.max())
+        shape = (self.slabs, *(len(nodes) - 1 for nodes in rest))
+        return low.reshape(shape), high.reshape(shape)
 
     def _patches_at(self, index: int) -> Patches:
         """All cells of a slab at which V is throughout what it is at one end of a slab."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,14 +10,11 @@ from certbound.arrays import Array
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 from certbound.values.continuous.curved.boundaries import Walls
+from certbound.values.continuous.plane import Floats, reach_of
 from certbound.values.continuous.room import faces_of, refuse_windows
 
 _MARGIN = 0.1  # of the walls' extent: the box reaches beyond them, so that V may be continued there
-_PATHS, _STEPS = 400, 200
 _BEYOND = (0.6, 0.25)  # of the paths' extent, where nothing bounds a state, and where the box is to be small
-
-Drift = Callable[[float, Array, Array], Array]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Region:
@@ -43,7 +39,7 @@ def _square(constraint: Inside) -> bool:
     return not isinstance(form, Quadratic) and all(np.count_nonzero(row) == 1 for row in form.normals)
 
 
-def region_of(problem: Problem, drift: Drift, square: Drift, *, near: bool) -> Region:
+def region_of(problem: Problem, drift: Floats, square: Floats, *, near: bool) -> Region:
     """The box and the walls; with ``near`` a box that ends not far beyond simulated paths.
 
     Where the walls bound a state the box reaches beyond them; where nothing does, it ends far beyond simulated paths.
@@ -72,7 +68,7 @@ def region_of(problem: Problem, drift: Drift, square: Drift, *, near: bool) -> R
             ends += own
         else:
             around = [np.maximum(around[0], own[0]), np.minimum(around[1], own[1])]
-    reach = _reach(problem, drift, square, _BEYOND[near])
+    reach = reach_of(problem, drift, square, _BEYOND[near])
     margin = _MARGIN * np.minimum(reach[1] - reach[0], around[1] - around[0])
     outer = [np.maximum(low, around[0] - margin), np.minimum(high, around[1] + margin)]
     far = [np.isinf(outer[0]) | near, np.isinf(outer[1]) | near]
@@ -87,23 +83,3 @@ def _clear(place: Array, ends: list[Array], margin: Array, sign: float) -> Array
     for end in sorted(ends, key=lambda one: sign * float(one.sum())):
         place = np.where(np.abs(place - end) < margin, end + sign * margin, place)
     return place
-
-
-def _reach(problem: Problem, drift: Drift, square: Drift, share: float) -> list[Array]:
-    """Ends of a box that hardly a path leaves, from simulated ones."""
-    rng = np.random.default_rng(0)
-    hull = problem.initial.hull()
-    x = rng.uniform(hull.lo, hull.hi, (_PATHS, 2)).T
-    least, most = x.min(axis=1), x.max(axis=1)
-    step = float(problem.horizon) / _STEPS
-    for k in range(_STEPS):
-        t = k * step
-        a = np.moveaxis(square(t, *x) * np.ones((2, 2, _PATHS)), -1, 0)
-        values, vectors = np.linalg.eigh(a)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-        noise = np.einsum("nij,nj->in", root, rng.standard_normal((_PATHS, 2)))
-        moved = x + step * drift(t, *x)[0] + np.sqrt(step) * noise
-        x = np.where(np.isfinite(moved), moved, x)
-        least, most = np.minimum(least, x.min(axis=1)), np.maximum(most, x.max(axis=1))
-    beyond = share * (most - least)
-    return [least - beyond, most + beyond]

@@ -10,5 +10,9 @@ from certbound.values.continuous.line.arrivals import bound_arrival
 from certbound.values.continuous.line.ladder import bound_line
 from certbound.values.continuous.line.maps import chart_line, chart_slabs
 from certbound.values.continuous.line.mean_time import bound_mean_time
+from certbound.values.continuous.line.phases import Limit, Phase, check_room, phase_of, value_at
 
-__all__ = ["bound_arrival", "bound_line", "bound_mean_time", "chart_line", "chart_slabs"]
+__all__ = [
+    "Limit", "Phase", "bound_arrival", "bound_line", "bound_mean_time", "chart_line", "chart_slabs", "check_room",
+    "phase_of", "value_at",
+]

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from certbound.arrays import Array
 from certbound.values.continuous.hypotheses import (
     NEGLIGIBLE,
     Model,
     Need,
+    chained,
     examine,
     patched_of,
     raised_above,
@@ -29,7 +29,7 @@ from certbound.values.continuous.hypotheses import (
 from certbound.values.continuous.line.initial_law import Start
 from certbound.values.continuous.line.joins import highest_inside, missing_lower, missing_upper
 from certbound.values.continuous.line.phases import Gate, Phase
-from certbound.values.continuous.payment import Patched, Payment, pay_lower, pay_upper
+from certbound.values.continuous.payment import Payment, pay_lower, pay_upper
 from certbound.values.continuous.surface import Surface
 
 _LIFTS = (0.0, 0.003, 0.02, 0.1)
@@ -79,7 +79,8 @@ def prove_above(links: Sequence[Link], start: Start) -> Payment:
             break
         parts = [patched_of(proof, proof.ranges.residual_high, need, steps, lift) for proof in proofs]
         lowest = floor + lift - 1e-15 * (1 + abs(floor))
-        payment = pay_upper(_joined(parts, ready, steps, need), up(level + lift), lowest, whole=start.random)
+        joined = chained(parts, [link.surface for link in ready], need)
+        payment = pay_upper(joined, up(level + lift), lowest, whole=start.random)
         best = min(best, replace(payment, lift=lift), key=lambda one: one.log)
     return best
 
@@ -110,14 +111,4 @@ def prove_below(links: Sequence[Link], start: Start) -> Payment | None:
     for link in ready:
         ends = [link.surface.face_range(0, side)[1] for side in (0, 1) if not link.phase.closed[side]]
         ceiling = max([ceiling, *ends])
-    return pay_lower(_joined(parts, ready, steps, need), level, ceiling, whole=start.random)
-
-
-def _joined(parts: Sequence[Patched], links: Sequence[Link], steps: Array, need: Need) -> Patched:
-    """The patches of all surfaces, their slabs numbered through."""
-    before = np.cumsum([0, *(link.surface.slabs for link in links)])[:-1]
-    together = {
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in ("excess", "low", "high", "energy")
-    }
-    slab = np.concatenate([part.slab + count for part, count in zip(parts, before)])
-    return Patched(**together, slab=slab, steps=steps, spare=need.spare)
+    return pay_lower(chained(parts, [link.surface for link in ready], need), level, ceiling, whole=start.random)

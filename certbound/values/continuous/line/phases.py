@@ -137,7 +137,7 @@ def pieces(
     phases, gates = [], []
     for first, last in itertools.pairwise(instants):
         active = [limit for limit, window in limits if window[0] <= first and last <= window[1]]
-        phases.append(_phase(active, first, last, cuts))
+        phases.append(phase_of(active, first, last, cuts))
         touched = [limit for limit, window in limits if window[0] <= last <= window[1]]
         gates.append(_gate(touched, last, inner))
     return phases, gates
@@ -155,7 +155,8 @@ def _gate(limits: list[Limit], t: float, inner: bool) -> Gate:
     return Gate(time=t, low=ends[0], high=ends[1])
 
 
-def _phase(limits: list[Limit], start: float, end: float, cuts: tuple[float, float]) -> Phase:
+def phase_of(limits: list[Limit], start: float, end: float, cuts: tuple[float, float]) -> Phase:
+    """The phase of some limits of one state; at ``cuts`` where none is on that side."""
     sides = [_strongest([limit for limit in limits if limit.side == side], side) for side in (0, 1)]
     closed = (sides[0] is not None, sides[1] is not None)
     ends = [cut if side is None else side for side, cut in zip(sides, cuts)]

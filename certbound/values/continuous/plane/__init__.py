@@ -1,13 +1,21 @@
 """Two states: V on a tensor grid, proposed for both sides and proved by `hypotheses`.
 
-From the bottom: ``plane_grids``, ``solver``, ``plane_proposal``, ``plane_below``, ``two_sides``.
+From the bottom: ``plane_grids``, ``solver``, ``plane_proposal``, ``plane_below``, ``two_sides``; then
+``target_proposal``, ``plane_targets`` for targets, ``stages``, ``later``, ``plane_windows``
+for windows, and ``frames`` for limits that move.
 """
 
+from certbound.values.continuous.plane.frames import bound_moving, moving
 from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, slab_times, spread_nodes
+from certbound.values.continuous.plane.plane_reach import Floats, reach_of
+from certbound.values.continuous.plane.plane_targets import bound_failing
+from certbound.values.continuous.plane.plane_windows import bound_windows
 from certbound.values.continuous.plane.solver import Solver, integrated, solve_lines
+from certbound.values.continuous.plane.stages import windowed
 from certbound.values.continuous.plane.two_sides import bound_plane_above, chart_plane, rough_level, two_states
 
 __all__ = [
-    "Plan", "Plane", "Solver", "Source", "bound_plane_above", "chart_plane", "integrated", "rough_level", "slab_times",
-    "solve_lines", "spread_nodes", "two_states",
+    "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",
+    "bound_windows", "chart_plane", "integrated", "moving", "reach_of", "rough_level", "slab_times", "solve_lines",
+    "spread_nodes", "two_states", "windowed",
 ]

@@ -47,12 +47,12 @@ def bound_plane_below(
     The starts fill their box, or ``points`` lie among them.
     """
     source: Source | None = None
-    best: _Sketch | None = None
+    best: SketchBelow | None = None
     for number in range(_PASSES + 1):
         surface = propose_plane(plane, plan, source)
         if surface is None or not covers(surface, plane.horizon, plane.low, plane.high, within=False):
             break
-        sketch = _Sketch.of(surface, model, starts, points)
+        sketch = SketchBelow.of(surface, model, starts, points)
         if best is None or sketch.estimate() > best.estimate():
             best = sketch
         if best.estimate() < plan.floor - _HOPELESS[min(number, 1)]:
@@ -66,7 +66,7 @@ def bound_plane_below(
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Sketch:
+class SketchBelow:
     """A proposal with samples of what its proof would pay for: -R, but for what eps pays."""
 
     surface: Surface
@@ -74,8 +74,11 @@ class _Sketch:
     excess: Array
 
     @classmethod
-    def of(cls, surface: Surface, model: Model, starts: list[Pair], points: Array | None) -> _Sketch:
-        start = extreme_over(surface, starts, upper=False, points=points)
+    def of(
+        cls, surface: Surface, model: Model, starts: list[Pair], points: Array | None = None, *,
+        level: float | None = None,
+    ) -> SketchBelow:
+        start = extreme_over(surface, starts, upper=False, points=points) if level is None else level
         deficit, high = sampled_residual(surface, model, upper=False)
         paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - high - _VARIED, 50.0))
         return cls(surface=surface, start=start, excess=np.maximum(deficit - paid, 0.0))

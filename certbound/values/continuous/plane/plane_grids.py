@@ -19,7 +19,7 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Plane:
-    """The problem in floats: drift (branches, 2, ...) and a (2, 2, ...) at (t, x, y), on a box."""
+    """The problem in floats: drift (branches, 2, ...) and a (2, 2, ...) at (t, x, y), on a box, perhaps with nodes."""
 
     low: Pair
     high: Pair
@@ -28,6 +28,7 @@ class Plane:
     square: Callable[[float, Array, Array], Array]
     starts: list[Pair]
     autonomous: bool
+    nodes: tuple[Array, Array] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -96,9 +97,11 @@ def slab_times(horizon: float, plan: Plan) -> Array:
 
 def spread_nodes(plane: Plane, plan: Plan, axis: int, more: Callable[[Array], Array] | None = None) -> Array:
     """Nodes where the noise is small, and at the faces or as ``more`` weighs places; bent to the starts."""
+    if plane.nodes is not None:
+        return plane.nodes[axis]
     low, high = plane.low[axis], plane.high[axis]
     fine = np.linspace(low, high, 4001)
-    density = 1 / _mean_deviation(plane, axis, fine)
+    density = 1 / mean_deviation(plane, axis, fine)
     density = density / np.trapezoid(density, fine)
     for side, distance in ((0, fine - low), (1, high - fine)) if more is None else ():
         weight = 1 / (distance + 1 / layer_rate(plane, plan, axis, side))
@@ -110,7 +113,7 @@ def spread_nodes(plane: Plane, plan: Plan, axis: int, more: Callable[[Array], Ar
     return through(nodes, plane.starts[axis])
 
 
-def _mean_deviation(plane: Plane, axis: int, places: Array) -> Array:
+def mean_deviation(plane: Plane, axis: int, places: Array) -> Array:
     """The root of a's diagonal along an axis, averaged over the other one, and kept from being too small."""
     others = np.linspace(plane.low[1 - axis], plane.high[1 - axis], 17)
     x, y = np.meshgrid(places, others, indexing="ij") if axis == 0 else np.meshgrid(others, places, indexing="ij")

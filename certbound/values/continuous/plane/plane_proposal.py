@@ -67,7 +67,7 @@ class SolverBelow(Solver):
         least = math.exp(-_DEEPER)
         return np.asarray(self.plan.floor + np.log(least + (1 - least) * (1 - product)))
 
-    def face(self, tau: float) -> tuple[float, float]:
+    def face(self, tau: float) -> tuple[Array | float, Array | float]:
         s, top = min(tau / self.plan.lead, 1.0), self.plan.floor
         rise = s**3 * (10 - 15 * s + 6 * s * s)
         return top * (1 - rise), -top * 30 * (s * (1 - s)) ** 2 / self.plan.lead

@@ -84,6 +84,8 @@ def integrated(solver: Stepper) -> Surface | None:
 class Solver:
     """V at Greville's points of both axes, shape (count_x, count_y)."""
 
+    gamma = _GAMMA
+
     def __init__(self, plane: Plane, plan: Plan, source: Source | None) -> None:
         self.plane, self.plan = plane, plan
         self.nodes = [self.grid(axis) for axis in (0, 1)]
@@ -136,7 +138,7 @@ class Solver:
         bend = np.clip((0.5 - share) / np.maximum(1 - share, 0.1), 0.0, 0.9)
         return rate, bend, np.clip(2 * share - 1, 0.0, 2.0)
 
-    def face(self, tau: float) -> tuple[float, float]:
+    def face(self, tau: float) -> tuple[Array | float, Array | float]:
         """V and its rate on the faces."""
         return 0.0, 0.0
 
@@ -207,13 +209,13 @@ class Solver:
 
     def _divided(self, right: Array, speeds: tuple[Array, Array], a: Array, step: float, fed: Array) -> Array:
         """(I - g h J_x)^-1 (I - g h J_y)^-1 (I - g h J_s)^-1 applied, J_s = -``fed`` being the source's part."""
-        right = right / (1 + _GAMMA * step * fed)
+        right = right / (1 + self.gamma * step * fed)
         for axis in (1, 0):
             own = self.splines[axis]
             line = np.ascontiguousarray(right if axis == 0 else right.T)
             speed = np.ascontiguousarray(speeds[axis] if axis == 0 else speeds[axis].T)
             half = np.ascontiguousarray(0.5 * (a[0, 0] if axis == 0 else a[1, 1].T) * np.ones(line.shape))
-            solve_lines(own.at[0], own.at[1], own.at[2], speed, half, _GAMMA * step, line)
+            solve_lines(own.at[0], own.at[1], own.at[2], speed, half, self.gamma * step, line)
             line = own.dense[0] @ line
             right = line if axis == 0 else line.T
         return right

@@ -43,13 +43,13 @@ _FACTOR = 1.12
 _TOPS = (-0.02, -0.1)  # where V is above, the proof may lift it over 0 instead
 _CAP = 50.0
 _GRANTED = 0.005  # eps that the proof may pay, in units of the bound, summed over the horizon
-_RATE = 7_000  # patches that are proposed and proved in a second
+RATE = 7_000  # patches that are proposed and proved in a second
 _PASSES = 2
 _CLOSE = 0.15
 _HOPELESS = 60.0  # what a first proposal may lose (log P): sources make that ten times less, not a hundred
 _VARIED = 1.0  # about how much V varies on a patch
 _SHARES = (0.12, 0.8)  # of the patches, for one grid after the other
-_BELOW = 0.6  # of as many patches again, for a lower bound
+BELOW = 0.6  # of as many patches again, for a lower bound
 
 
 def two_states(
@@ -61,14 +61,14 @@ def two_states(
     What certificates state of both sides comes last.
     """
     starts = starts_of(problem)
-    inner = _plane(problem, model, room.inner_low, room.inner_high, starts)
-    patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
+    inner = plane_of(problem, model, room.inner_low, room.inner_high, starts)
+    patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     level = rough_level(inner)
     upper, done, proposed = bound_plane_above(inner, model, level, patches)
     below: list[Proposed] = []
     if upper > wanted:
-        outer = _plane(problem, model, room.outer_low, room.outer_high, starts)
-        plan = plan_below(outer, min(level, upper), _BELOW * patches)
+        outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
+        plan = plan_below(outer, min(level, upper), BELOW * patches)
         with contextlib.suppress(OutOfTime):
             found = bound_plane_below(outer, model, plan, starts, points_of(problem))
             below += [] if found is None else [found]
@@ -121,10 +121,10 @@ def rough_level(plane: Plane) -> float:
 
 def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], seconds: float) -> list[Chart]:
     """Upper bounds from every cell at t = 0, sharp at the levels of log P; none where no proposal comes to an end."""
-    plane = _plane(problem, model, room.inner_low, room.inner_high, starts_of(problem))
+    plane = plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem))
     least = rough_level(plane)
     levels = sorted({max(level, least) for level in levels})
-    plan = _plan(plane, levels[0], _SHARES[0] * _RATE * seconds)
+    plan = _plan(plane, levels[0], _SHARES[0] * RATE * seconds)
     surface = _promising(plane, model, plan, levels[-1])
     return [] if surface is None else chart_above(surface, model, levels, [0])
 
@@ -134,7 +134,7 @@ def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = Non
     surface = propose_plane(plane, plan)
     if surface is None:
         return None
-    first = best = _Sketch.of(surface, model, plane.starts, level)
+    first = best = Sketch.of(surface, model, plane.starts, level)
     if first.estimate() > first.start + _HOPELESS:
         return None
     for top in _TOPS:
@@ -145,7 +145,7 @@ def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = Non
             surface = propose_plane(plane, plan, source)
             if surface is None:
                 break
-            sketch = _Sketch.of(surface, model, plane.starts, level)
+            sketch = Sketch.of(surface, model, plane.starts, level)
             best = min(best, sketch, key=lambda one: one.estimate())
         if best.estimate() < best.start + _CLOSE:
             break
@@ -155,7 +155,7 @@ def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = Non
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Sketch:
+class Sketch:
     """A proposal with samples of what its proof would pay for: R, but for what eps pays, and V's least values."""
 
     surface: Surface
@@ -164,7 +164,7 @@ class _Sketch:
     low: Array
 
     @classmethod
-    def of(cls, surface: Surface, model: Model, starts: list[Pair], level: float | None = None) -> _Sketch:
+    def of(cls, surface: Surface, model: Model, starts: list[Pair], level: float | None = None) -> Sketch:
         start = extreme_over(surface, starts, upper=True) if level is None else level
         highest, low = sampled_residual(surface, model)
         paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - low - _VARIED, 50.0))
@@ -180,7 +180,7 @@ class _Sketch:
         return self.start + min(lift + float(rate @ self.surface.steps) for lift, rate in zip(LIFTS, worst))
 
 
-def _plane(
+def plane_of(
     problem: Problem, model: Model, low: tuple[float, ...], high: tuple[float, ...], starts: list[Pair]
 ) -> Plane:
     drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)

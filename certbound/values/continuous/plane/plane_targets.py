@@ -1,0 +1,324 @@
+"""Targets of two states: the probability of failing to get there in time, before a limit, from both sides.
+
+A path ends where it first meets the target, and fails if it leaves the box or the horizon comes before. V is looked at
+on cells that do not lie in the target. Above, V >= 0 on the faces and at the horizon, off the target; below, V <= 0. On
+the target's edge e^V >= w, or <= W, which is subtracted at last, as V's floor at the horizon is elsewhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from certbound.arrays import Array, Mask
+from certbound.errors import InfeasibleError
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Box, Faces, Region
+from certbound.rigor.intervals import Interval
+from certbound.values.continuous.hypotheses import (
+    LIFTS,
+    NEGLIGIBLE,
+    Model,
+    Need,
+    cheapest,
+    check_noise,
+    covers,
+    examine,
+    extreme_over,
+    patched_of,
+    sampled_residual,
+    up,
+)  # fmt: skip
+from certbound.values.continuous.payment import Payment, pay_lower
+from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
+from certbound.values.continuous.plane.plane_reach import reach_of
+from certbound.values.continuous.plane.target_proposal import propose_to_target
+from certbound.values.continuous.plane.two_sides import RATE, plane_of
+from certbound.values.continuous.residual import value_range
+from certbound.values.continuous.room import limits_of, points_of, starts_of
+from certbound.values.continuous.surface import Surface
+from certbound.values.sets import contains
+from certbound.watch import OutOfTime
+
+_FACTOR = 1.12
+_TOP = -0.02
+_CAP = 50.0
+_GRANTED = 0.005
+_VARIED = 1.0
+_PASSES = 2
+_SHARE = 1.0  # w in units of the probability of failing
+_GROWTH = 0.2
+_FEWEST = 16  # cells along each axis
+_LEAD = 0.32  # of the horizon over the number of cells
+_HIGHEST = math.log(0.5)  # of log w
+_ROUNDS = 4  # of coarse proposals that find out about it
+_COARSE = 24
+_SHARES = (0.12, 0.5)  # of the patches, for one grid after the other
+_BEYOND = 0.6  # of the paths' extent, where nothing bounds a state
+_DEEP = 0.25  # of the box's width: how deep the box reaches into a target that takes up one of its sides
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Fate:
+    """What becomes of the paths in the cells of a grid, shape ``cells``.
+
+    ``alive``: not all of the cell lies in the target; ``beside``: these of them that touch it; ``met``: cells that
+    hold all points of the target.
+    """
+
+    alive: Mask
+    beside: Mask
+    met: Mask
+
+    @classmethod
+    def of(cls, axes: tuple[Array, ...], target: Region) -> Fate:
+        low = np.meshgrid(*(axis[:-1] for axis in axes), indexing="ij")
+        high = np.meshgrid(*(axis[1:] for axis in axes), indexing="ij")
+        cells = Interval(*(np.stack([side.ravel() for side in ends], axis=1) for ends in (low, high)))
+        inside, outside = (mask.reshape(low[0].shape) for mask in contains(target, cells, 0))
+        met = ~outside
+        if target.form.axial:
+            met &= np.logical_and.outer(*(_holding(axis, *ends) for axis, ends in zip(axes, sides_of(target))))
+        return cls(alive=~inside, beside=~inside & ~outside, met=met)
+
+
+def sides_of(target: Region) -> list[Pair]:
+    """The ends of a region along both states; infinite where there is none."""
+    around, places = target.hull(), target.places(2)
+    sides = {place: (float(low), float(high)) for place, low, high in zip(places, around.lo, around.hi)}
+    return [sides.get(axis, (-math.inf, math.inf)) for axis in (0, 1)]
+
+
+def _holding(axis: Array, low: float, high: float) -> Mask:
+    """Cells of an axis that hold an interval's points, without those that a neighbour makes unnecessary."""
+    holding = (axis[:-1] <= high) & (axis[1:] >= low)
+    spare = axis[1:] == low
+    spare[-1] = False
+    other = axis[:-1] == high if low < high else np.zeros(len(axis) - 1, dtype=bool)
+    other[0] = False
+    return np.asarray(holding & ~spare & ~other)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Aim:
+    """A problem with a target, as proofs of one side see it; at ``open`` faces (state, side) the box is only cut."""
+
+    plane: Plane
+    model: Model
+    target: Region
+    open: tuple[tuple[int, int], ...]
+    upper: bool
+    points: Array | None
+
+
+def prove_failing_above(surface: Surface, aim: _Aim) -> Payment:
+    """An upper bound of log P(failing), whatever the surface is."""
+    fate = Fate.of(surface.axes, aim.target)
+    if not fate.beside.any():
+        return Payment(log=0.0)
+    for _ in range(3):
+        late = float(surface.range_at(-1)[0][fate.alive].min(initial=0.0))
+        missing = -min(0.0, late, *_on_faces(surface, fate, _FACES)[0])
+        surface = surface.raised(up(missing)) if missing > 0 else surface
+    if missing > 0:
+        return Payment(log=0.0)
+    start = up(extreme_over(surface, aim.plane.starts, upper=True))
+    need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
+    proof = examine(surface, aim.model, need, upper=True, alive=fate.alive)
+    payment, lift = cheapest(proof, need, surface, start, _over(surface, fate.beside)[0])
+    return replace(payment, lift=lift)
+
+
+def prove_failing_below(surface: Surface, aim: _Aim) -> Payment | None:
+    """A lower bound of log P(failing) from the best start, whatever the surface is; None where none is positive."""
+    fate = Fate.of(surface.axes, aim.target)
+    highest = _over(surface, fate.alive)[1]
+    surface = surface.raised(-highest - 1e-12 * (1 + highest)) if highest > 0 else surface
+    start = extreme_over(surface, aim.plane.starts, upper=False, points=aim.points)
+    ceiling = max(_over(surface, fate.met)[1], *_on_faces(surface, fate, aim.open)[1], -700.0)
+    if not start > ceiling:
+        return None
+    start = -up(-start)
+    need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=np.inf)
+    proof = examine(surface, aim.model, need, upper=False, alive=fate.alive)
+    if np.any(proof.ranges.high > 0):
+        return None
+    return pay_lower(patched_of(proof, -proof.ranges.residual_low, need, surface.steps), start, ceiling)
+
+
+_FACES = tuple(itertools.product((0, 1), (0, 1)))
+
+
+def _over(surface: Surface, cells: Mask) -> tuple[float, float]:
+    """Bounds of V over some cells at all times."""
+    low, high = math.inf, -math.inf
+    for chunk in surface.chunks():
+        ends = value_range(surface.patches(*chunk))
+        within = [part.reshape(-1, *surface.cells)[:, cells] for part in ends]
+        low = min(low, float(within[0].min(initial=np.inf)))
+        high = max(high, float(within[1].max(initial=-np.inf)))
+    return low, high
+
+
+def _on_faces(surface: Surface, fate: Fate, faces: Sequence[tuple[int, int]]) -> tuple[list[float], list[float]]:
+    """Bounds of V on faces of the box, off the target."""
+    lows, highs = [math.inf], [-math.inf]
+    for axis, side in faces:
+        alive = np.take(fate.alive, -side, axis=axis)
+        low, high = (part[:, alive] for part in surface.face_ranges(axis, side))
+        lows.append(float(low.min(initial=np.inf)))
+        highs.append(float(high.max(initial=-np.inf)))
+    return lows, highs
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Sketch:
+    """A proposal with samples of what its proof would pay for."""
+
+    surface: Surface
+    start: float
+    excess: Array
+    level: Array
+    sign: float
+
+    @classmethod
+    def of(cls, surface: Surface, aim: _Aim) -> _Sketch:
+        start = extreme_over(surface, aim.plane.starts, upper=aim.upper, points=aim.points)
+        worst, level = sampled_residual(surface, aim.model, upper=aim.upper)
+        paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - level - _VARIED, 50.0))
+        excess = np.maximum(worst - paid, 0.0) * Fate.of(surface.axes, aim.target).alive
+        return cls(surface=surface, start=start, excess=excess, level=level, sign=1.0 if aim.upper else -1.0)
+
+    def estimate(self) -> float:
+        """About what the proof will find; the smaller the better above, below the larger."""
+        if self.sign < 0:
+            return self.start - float(self.excess.max(axis=(1, 2)) @ self.surface.steps)
+        worst = [np.where(self.level < -lift, self.excess, 0.0).max(axis=(1, 2)) for lift in LIFTS]
+        return self.start + min(lift + float(rate @ self.surface.steps) for lift, rate in zip(LIFTS, worst))
+
+    def needed(self) -> Array:
+        """The source that would do."""
+        due = np.minimum(self.excess, _CAP)
+        return np.where(self.level < _TOP, due, 0.0) if self.sign > 0 else due
+
+
+def _promising(aim: _Aim, plan: Plan) -> Surface | None:
+    """The proposal whose bound will be the best of a few, each with a source made of what the last one would pay."""
+    source: Source | None = None
+    best: _Sketch | None = None
+    for _ in range(_PASSES + 1):
+        surface = propose_to_target(aim.plane, plan, aim.target, source, upper=aim.upper)
+        if surface is None or not covers(surface, aim.plane.horizon, aim.plane.low, aim.plane.high, within=aim.upper):
+            break
+        sketch = _Sketch.of(surface, aim)
+        if best is None or sketch.sign * sketch.estimate() < best.sign * best.estimate():
+            best = sketch
+        more = Source.above(surface, _FACTOR * sketch.needed())
+        source = more if source is None else source.plus(more)
+    return None if best is None else best.surface
+
+
+def bound_failing(
+    problem: Problem, model: Model, target: Region, deadline: float
+) -> tuple[float, float | None, str]:
+    """Natural logarithms of an upper and a lower bound of P(failing) (None: there is none), and words.
+
+    ``problem`` has no target; the arrival has to be within its horizon.
+
+    Raises
+    ------
+    InfeasibleError
+        Windows, moving sets or targets, obstacles, curved limits, random starts, or noise that vanishes.
+    """
+    if target.moving:
+        raise InfeasibleError("value functions in continuous time do not serve moving targets.")
+    target = _simplified(target)
+    aims = [_aim(problem, model, target, upper=side) for side in (True, False)]
+    for aim in aims:
+        check_noise(model, (0.0, aim.plane.horizon), list(zip(aim.plane.low, aim.plane.high)))
+    patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
+    floor = _floor(aims[0])
+    upper, lower, done = 0.0, -math.inf, list[str]()
+    for cells in sorted({_cells(aims[0].plane.horizon, share * patches) for share in _SHARES}):
+        plan = _plan(aims[0].plane.horizon, floor, cells)
+        with contextlib.suppress(OutOfTime):
+            surface = _promising(aims[0], plan)
+            if surface is not None:
+                upper = min(upper, prove_failing_above(surface, aims[0]).log)
+            surface = _promising(aims[1], plan)
+            payment = None if surface is None else prove_failing_below(surface, aims[1])
+            lower = max(lower, -math.inf if payment is None else payment.log)
+        done.append(f"{plan.cells}^2")
+    words = f"value function with a target in two states, cells: {', '.join(done)}"
+    return upper, None if lower == -math.inf else lower, words
+
+
+def _plan(horizon: float, floor: float, cells: int) -> Plan:
+    return Plan(cells=cells, growth=_GROWTH, lead=_LEAD / cells * horizon, floor=floor)
+
+
+def _cells(horizon: float, patches: float) -> int:
+    """How many cells an axis about so many patches allow."""
+    cells = _FEWEST
+    while cells**2 * len(slab_times(horizon, _plan(horizon, 0.0, cells))) < patches:
+        cells += 1
+    return cells
+
+
+def _simplified(target: Region) -> Region:
+    """A half-space along a state as a box, whose ends are exact."""
+    form = target.form
+    if isinstance(form, Faces) and not form.axial and target.center is None:
+        units = (np.count_nonzero(form.normals, axis=1) == 1).all() and np.isin(form.normals, (-1.0, 0.0, 1.0)).all()
+        if units:
+            around = form.hull()
+            return Box(around.lo, around.hi, coordinates=target.coordinates)
+    return target
+
+
+def _aim(problem: Problem, model: Model, target: Region, *, upper: bool) -> _Aim:
+    room = limits_of(problem)
+    ends = [[*room.inner_low], [*room.inner_high]] if upper else [[*room.outer_low], [*room.outer_high]]
+    starts, open_faces = starts_of(problem), list[tuple[int, int]]()
+    goals = sides_of(target) if target.form.axial else [(math.inf, -math.inf)] * 2
+    floats = plane_of(problem, model, (0.0, 0.0), (0.0, 0.0), starts)
+    for axis, side in _FACES:
+        place, (low, high) = ends[side][axis], goals[axis]
+        other = goals[1 - axis]
+        whole = other[0] <= ends[0][1 - axis] and ends[1][1 - axis] <= other[1]
+        if whole and (place <= high if side else low <= place):  # the face lies in the target
+            begin, across = (low, low - starts[axis][0]) if side else (high, starts[axis][1] - high)
+            cut = begin + (1 if side else -1) * max(_DEEP * across, 0.0)
+            ends[side][axis] = min(place, cut) if side else max(place, cut)
+        elif not math.isfinite(place):
+            reached = reach_of(problem, lambda t, x, y: floats.drift(t, x, y), floats.square, _BEYOND)
+            ends[side][axis] = float(reached[side][axis])
+            open_faces.append((axis, side))
+    if not all(low < high for low, high in zip(*ends)):
+        raise InfeasibleError("the safe set has no interior.")
+    plane = replace(floats, low=(ends[0][0], ends[0][1]), high=(ends[1][0], ends[1][1]))
+    return _Aim(plane=plane, model=model, target=target, open=tuple(open_faces), upper=upper, points=points_of(problem))
+
+
+def _floor(aim: _Aim) -> float:
+    """log w, w a share of the probability of failing that coarse proposals find."""
+    floor = math.log(_SHARE)
+    for _ in range(_ROUNDS):
+        plan = Plan(cells=_COARSE, growth=0.4, lead=0.02 * aim.plane.horizon, floor=floor)
+        surface = propose_to_target(aim.plane, plan, aim.target, upper=True)
+        if surface is None:
+            break
+        fate = Fate.of(surface.axes, aim.target)
+        level, least = extreme_over(surface, aim.plane.starts, upper=True), _over(surface, fate.beside)[0]
+        share = max(-math.expm1(min(least - level, 0.0)), 1e-3)  # of e^V that is not w
+        found = min(max(level + math.log(share * _SHARE), -40.0), _HIGHEST)
+        if abs(found - floor) < 0.3:
+            break
+        floor = found
+    return floor
