@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
 
 _BADNESS = ("SAFE", "UNKNOWN", "UNSAFE", "UNSAFE_NOMINAL")
+_ALIKE = 1e-9  # of logarithms: by so much bounds may cross from rounding
 _TAKEN = ("margin", "time", "constraint", "tube", "reach", "constants", "deviation")  # of the best answer
 
 
@@ -240,7 +241,8 @@ def verdict_of(problem: Problem, answers: Mapping[str, EngineAnswer], method: st
         reason = f"{_sentence(reason)} Assumption: {best.assumption}."
     lower = best_lower(answers)
     unsafe = lower is not None and is_more_than(lower, problem.delta)
-    if unsafe and safe:
+    proved = best.certified and not best.assumption
+    if lower is not None and ((unsafe and safe) or (proved and lower > best.log10_delta + _ALIKE)):
         raise SolverError(
             f"two engines contradict each other: {name} proves at most 10^{level:.6g}, another one at least "
             f"10^{lower:.6g}; this is a defect of certbound, and nothing is answered."

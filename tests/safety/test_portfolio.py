@@ -100,3 +100,15 @@ def test_engines_that_contradict_each_other_answer_nothing(monkeypatch: pytest.M
     monkeypatch.setitem(ENGINES, "barrier", replace(ENGINES["barrier"], prove=lying))
     with pytest.raises(SolverError, match="contradict each other"):
         verify_safety(ZOO["decay"](0.5, 1.0))
+
+
+def test_bounds_that_cross_answer_nothing_either_where_both_are_above_delta() -> None:
+    from certbound.errors import SolverError
+    from certbound.safety.answers import EngineAnswer
+    from certbound.safety.verdict import verdict_of
+
+    above, below = EngineAnswer(log10_delta=-1.0), EngineAnswer(log10_delta=-0.5, log10_lower=-0.9)
+    with pytest.raises(SolverError, match="contradict each other"):
+        verdict_of(ZOO["decay"](0.5, 1.0), {"linear": above, "values": below})
+    assumed = EngineAnswer(log10_delta=-1.0, assumption="the stated constants hold")
+    assert verdict_of(ZOO["decay"](0.5, 1.0), {"linear": assumed, "values": below}).log10_lower == -0.9
