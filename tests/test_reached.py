@@ -22,10 +22,6 @@ ALONE = {
     "certbound.constants.recheck.holds_gain": "the proof of a gain at a stated value: says whether a bound is tight",
     "certbound.constants.recheck.holds_rate": "the proof of a rate at a stated value, likewise",
     "certbound.plotting.results.draw_chosen": "what `plot` of results calls, from the package's own door",
-    **{
-        f"certbound.problem.library.large_models.{name}": "a model with many states, loaded by its module and name"
-        for name in ("formation", "heat", "kuramoto")
-    },
 }
 """Functions and classes that nothing but tests reach, and why they are there."""
 

@@ -23,11 +23,11 @@ from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
 from certbound.safety.answers import EngineAnswer, Request, is_more_than
 from certbound.safety.averages import average_verdict
+from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import best_time, find_miss, window_of
 from certbound.safety.portfolio import ENGINES, Engine, engine_named
-from certbound.safety.truncated import prove_truncated
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
@@ -272,7 +272,7 @@ class _Search:
         answer = row.prove(self.problem, request)
         if answer.applicable or not self.problem.initial.random:
             return answer
-        return prove_truncated(row, self.problem, request)
+        return prove_truncated(row.prove, self.problem, request)
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
         """The answer without its lower bound where that is of disturbances that may change, or counts too much.

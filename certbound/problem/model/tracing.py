@@ -68,10 +68,10 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) 
         scalars |= dict(zip(names, entries))
         values[key] = entries[0] if key == "t" else _array(entries).view(Traced)
     name = getattr(function, "__name__", type(function).__name__)
-    chosen = _parameters(function, name, arguments)
-    if any(key not in arguments for key in chosen):
+    names = _parameters(function, name, arguments)
+    if any(key not in arguments for key in names):
         values |= scalars
-    chosen = {key: values[key] for key in chosen}
+    chosen = {key: values[key] for key in names}
     try:
         result = function(**chosen)
     except UntraceableError as error:

@@ -8,6 +8,7 @@ from certbound.safety.engines.erosion import Erosion, erode
 from certbound.safety.engines.linear import linear_engine
 from certbound.safety.engines.linear_sketch import linear_chance
 from certbound.safety.engines.quadratic import quadratic_engine
+from certbound.safety.engines.random_starts import prove_truncated
 from certbound.safety.engines.rooms import joined
 from certbound.safety.engines.values import values_engine
 
@@ -20,6 +21,7 @@ __all__ = [
     "joined",
     "linear_chance",
     "linear_engine",
+    "prove_truncated",
     "quadratic_engine",
     "values_engine",
 ]

@@ -8,7 +8,7 @@ import pytest
 import certbound as cb
 from certbound.errors import CertificateError
 from certbound.safety.certificate import certificate_data
-from certbound.safety.truncated import truncated
+from certbound.safety.engines.random_starts import truncated
 
 
 def spinning(covariance: np.ndarray, delta: float = 1e-2) -> cb.Problem:

@@ -7,17 +7,18 @@ chi-squared variable of n degrees of freedom, P(X_0 outside E) = Q(n / 2, r^2 / 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from flint import arb
-from scipy.stats import chi2
 
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Ellipsoid
 from certbound.rigor.balls import precision, upper
 from certbound.safety.answers import EngineAnswer, Request
-from certbound.safety.portfolio import Engine
+
+Prove = Callable[[Problem, Request], EngineAnswer]
 
 _SHARE = 0.1  # of delta, at most, for starts outside the ellipsoid
 _WIDER = (1e-9, 1e-12)  # of the covariance, of its trace: more than rounding can take away
@@ -36,6 +37,8 @@ def truncated(problem: Problem) -> tuple[Problem, float]:
     >>> round(float(np.sqrt(inner.initial.shape[0, 0])), 4), 0.998e-4 < outside < 1e-4
     (0.4292, True)
     """
+    from scipy.stats import chi2
+
     start, delta = problem.initial, float(problem.delta)
     covariance, trace = start.covariance, float(np.trace(start.covariance))
     if trace == 0:
@@ -47,7 +50,7 @@ def truncated(problem: Problem) -> tuple[Problem, float]:
     return problem.replace(initial=Ellipsoid(start.mean, shape), delta=float(f"{(1 - _SHARE) * delta:.12g}")), outside
 
 
-def prove_truncated(row: Engine, problem: Problem, request: Request) -> EngineAnswer:
+def prove_truncated(prove: Prove, problem: Problem, request: Request) -> EngineAnswer:
     """What an engine that serves no random start proves of a problem that has one."""
     inner, outside = truncated(problem)
 
@@ -63,4 +66,4 @@ def prove_truncated(row: Engine, problem: Problem, request: Request) -> EngineAn
         )
 
     found = request.found
-    return of_all(row.prove(inner, replace(request, before=None, found=lambda answer: found(of_all(answer)))))
+    return of_all(prove(inner, replace(request, before=None, found=lambda answer: found(of_all(answer)))))
