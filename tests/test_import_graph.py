@@ -132,7 +132,7 @@ MANY_DOORS = {
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (7, "to and from each library"),
     "safety.certificates": (6, "a writer an engine, and one for each side where an engine has two"),
-    "safety.engines": (10, "the engines, and the rooms that their certificates restate"),
+    "safety.engines": (11, "the engines, and the rooms that their certificates restate"),
     "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),
     "reach.sets": (7, "tubes, requirements, and directions for the certificate"),
 }
