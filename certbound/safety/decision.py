@@ -8,6 +8,7 @@ for all others, and goes on with what they leave: none starves, and nothing is p
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import logging
 import math
@@ -42,6 +43,7 @@ _SOON = 0.5  # seconds after which those that have a first bound soon are asked 
 _UNLIKELY = 2.0  # seconds for an engine that has hardly a chance, once there is a bound
 _THOROUGH, _LONGER = 120.0, 1.0  # seconds for an engine asked once more without a limit, or times those so far
 _LASTING = 100_000  # steps
+_HOPED = 10.0  # seconds for a proof that noise leads where noise-free trajectories do not
 _EXTRA = 0.2  # of the time that is left, for a bound that can no longer change the verdict
 
 
@@ -69,7 +71,7 @@ def decide(
     try:
         with search.watch.running():
             violation = search.violation()
-            if violation is not None:
+            if violation is not None and not search.arrives_by_noise(names):
                 return unsafe(problem, violation)
             if method == "auto":
                 search.whole(names)
@@ -131,6 +133,15 @@ class _Search:
         except EngineError as error:
             _log.info("no noise-free trajectory was followed: %s", error)
             return None
+
+    def arrives_by_noise(self, names: tuple[str, ...]) -> bool:
+        """Whether a target that noise-free trajectories miss is proved to be met by noise, often enough."""
+        if self.problem.reach is None or self.fixed:
+            return False
+        with contextlib.suppress(OutOfTime), self.watch.share(1.0, _HOPED):
+            for name in (name for name in names if ENGINES[name].reaches):
+                self.ask(name, self.request)
+        return self.safe
 
     def whole(self, names: tuple[str, ...]) -> None:
         """Sketches, all engines in turn, and thoroughly those that spared themselves."""

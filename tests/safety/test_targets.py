@@ -221,3 +221,11 @@ def test_continuous_time_without_an_end_or_a_target_is_not_served():
     verdict = cb.verify_safety(cb.Problem(system, initial=[0, 0], safe=walls, horizon=np.inf))
     assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", 0.0)
     assert "needs an end, and the horizon is infinite" in verdict.answers["values"].reason
+
+
+@pytest.mark.parametrize(("delta", "status"), [(0.5, "SAFE"), (0.2, "UNSAFE_NOMINAL")])
+def test_a_random_walk_may_arrive_where_no_noise_free_path_does(delta: float, status: str) -> None:
+    walk = cb.DiscreteSystem(lambda x: x, states=1, noise=cb.Gaussian(std=0.5))
+    safe, target = [cb.Inside(cb.Box([-6], [6]))], cb.Reach(cb.Box([2.0], [6.0]))
+    problem = cb.Problem(walk, initial=[0.0], safe=safe, reach=target, horizon=100, delta=delta)
+    assert cb.verify_safety(problem).status == status
