@@ -131,19 +131,6 @@ ENGINES: dict[str, Engine] = {
             chance=_polynomials,
         ),
         Engine(
-            name="values",
-            words="the probability itself as a function on a grid, from both sides (Thm K8, up to three states)",
-            when="while nothing else has proved SAFE; the only one with a lower bound, so the only one that answers "
-            "UNSAFE",
-            prove=values_engine,
-            write=values_proof,
-            write_below=values_proof_below,
-            reserve=True,
-            dear=True,
-            reaches=True,
-            endless=True,
-        ),
-        Engine(
             name="quadratic",
             words="one quadratic value bound a wall of the safe set, by semidefinite programming (Thm K9, continuous "
             "time, up to twelve states)",
@@ -155,6 +142,19 @@ ENGINES: dict[str, Engine] = {
             dear=True,
             soon=4,
             spares=3,
+        ),
+        Engine(
+            name="values",
+            words="the probability itself as a function on a grid, from both sides (Thm K8, up to three states)",
+            when="while nothing else has proved SAFE; the only one with a lower bound, so the only one that answers "
+            "UNSAFE",
+            prove=values_engine,
+            write=values_proof,
+            write_below=values_proof_below,
+            reserve=True,
+            dear=True,
+            reaches=True,
+            endless=True,
         ),
     )
 }

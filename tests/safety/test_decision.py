@@ -193,6 +193,14 @@ def test_who_spares_itself_is_asked_in_full_where_nothing_is_proved(
     assert asked.count("quadratic") == 1
 
 
+def test_what_takes_no_grids_is_asked_before_what_does(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
+    scripted(monkeypatch, clock, {"quadratic": [(0.5, -1.5)], "values": [(9, -1)]})
+    told: list[Progress] = []
+    verdict, _ = run(clock, 60, told)
+    assert next(p.seconds for p in told if p.log10_delta < 0) < 1
+    assert verdict.method == "quadratic"
+
+
 def test_once_unsafe_is_proved_nobody_is_asked_in_full(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
     asked = scripted(monkeypatch, clock, {"linear": [(1, 0)], "values": [(1, 0)], "quadratic": [(1, 0)]})
     proves = ENGINES["values"].prove
