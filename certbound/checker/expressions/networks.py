@@ -191,7 +191,10 @@ class _Columns:
         self.linear = found
         held = {pair for x in args for pair in x.squares}
         pairs = [(a, b) for i, a in enumerate(found) for b in found[i:]]
-        self.squares = pairs if self.smooth else [pair for pair in pairs if pair in held]
+        # pieces of straight lines make no squares of their own
+        straight = all(layer.activation == "linear" or ACTIVATIONS[layer.activation].knots for layer in network.layers)
+        self.squares = [pair for pair in pairs if pair in held] if straight else pairs
+        self.partial = len(self.squares) < len(pairs)
         self.cubes = [
             (a, b, c) for i, a in enumerate(found) for k, b in enumerate(found[i:], i) for c in found[k:]
         ] if self.smooth and len(found) <= _MOST_CUBIC else []
@@ -271,6 +274,8 @@ class _Columns:
         else:
             left = size * (two * (2 * one + two) + error * (2 * (one + two) + error))
             left += abs(sixth) * reach * reach * reach
+        if self.partial:  # squares without a column of their own
+            left += size * one * one
         left = left.upper()
         if not (reach < _SMALL and left.is_finite()):
             slopes = row.slope(whole, *constants)

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from flint import arb
 
+import certbound as cb
 from certbound.checker.expressions import Expansion, Graph, Program, Undecided, expand
 from certbound.checker.expressions.activation_balls import ACTIVATIONS
 from certbound.checker.report import Budget, Unproved
 from certbound.problem.model import Part, compile_numpy, jacobian, trace
 from certbound.problem.model.network_data import CONSTANTS, KINKED
 from certbound.rigor.activations import ACTIVATIONS as PROVER
-from tests.networks import random_network
+from tests.networks import CONSTANTS as CONSTANTS_OF
+from tests.networks import random_layers, random_network
 
 every_activation = pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
 CENTRES = [(0.3, -0.2), (-1.0, 0.4)]
@@ -69,6 +71,30 @@ def test_taylor_models_hold_points(activation: str, radius: float) -> None:
                                  ([form.gradient], form.hessian))  # fmt: skip
             value = float(form.value) + (gradient @ xi)[0] + xi @ hessian @ xi / 2
             assert abs(first + a * second - value) <= size + 1e-12
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_taylor_models_of_mixed_layers_hold_points(seed: int) -> None:
+    """Kinked layers before and behind smooth ones, up to four of them, on up to six coordinates, of functions."""
+    rng = np.random.default_rng(seed)
+    n, kinds = int(rng.integers(1, 7)), sorted(ACTIVATIONS)
+    rows = random_layers("tanh", seed, sizes=(n, *rng.integers(2, 7, size=rng.integers(1, 5)), 2))
+    for row in rows[:-1]:
+        row["activation"] = kinds[rng.integers(len(kinds))]
+        row.update(CONSTANTS_OF.get(row["activation"], {}))
+    policy, graph = cb.network(rows), Graph()
+    inputs = [graph.input(slot) for slot in range(n)]
+    turned = [graph.add(graph.mul(x, x), graph.apply("sin", inputs[slot - 1])) for slot, x in enumerate(inputs)]
+    node = graph.part(Part(policy.data, 1), tuple(turned))
+    expansion = Expansion(graph, node, node, variables=n)
+    expansion.prepare([])
+    centre, radius = rng.normal(size=n), 10 ** rng.uniform(-3, 0, size=n)
+    form = expansion.run([(arb(c), {k: arb(r)}) for k, (c, r) in enumerate(zip(centre, radius))], n)
+    gradient, hessian = np.array(form.gradient, dtype=float), np.array(form.hessian, dtype=float)
+    for xi in [*np.sign(rng.uniform(-1, 1, (20, n))), *rng.uniform(-1, 1, (40, n))]:
+        point = centre + radius * xi
+        value = float(form.value) + gradient @ xi + xi @ hessian @ xi / 2
+        assert abs(policy(point**2 + np.sin(np.roll(point, 1)))[1] - value) <= float(form.error) + 1e-11
 
 
 @pytest.mark.parametrize("activation", sorted(ACTIVATIONS.keys() - KINKED))
