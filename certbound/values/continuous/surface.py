@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import comb
 
 from certbound.arrays import Array
 from certbound.values.continuous.polynomials import CUBIC_HERMITE, HERMITE, QUARTERS
@@ -164,7 +163,8 @@ class Surface:
             degree = value.shape[1] - 1
             share = np.clip(share, 0.0, 1.0)[:, None]
             powers = np.arange(degree + 1)
-            weights = comb(degree, powers) * share**powers * (1 - share) ** (degree - powers)
+            binomials = np.array([math.comb(degree, k) for k in range(degree + 1)])
+            weights = binomials * share**powers * (1 - share) ** (degree - powers)
             value = np.einsum("ni,ni...->n...", weights, value)
         off = sum(np.max(np.abs(axis)) / width for axis, width in zip(self.axes, patches.widths))
         slack = 2.0**-53 * (1000 + 40 * off) * (patches.size + np.abs(patches.reference))
