@@ -108,10 +108,7 @@ class Interval:
     @quiet
     def rad(self) -> Array:
         """Radii with [mid - rad, mid + rad] containing the interval (+inf where unbounded)."""
-        return self.rad_about(self.mid)
-
-    def rad_about(self, mid: Array) -> Array:
-        """`rad`, where `mid` is known."""
+        mid = self.mid
         return upper(np.maximum(self.hi - mid, mid - self.lo))
 
     @property
@@ -256,9 +253,7 @@ def _without_zero(lo: Array, hi: Array) -> bool:
 def _signed(lo: Array, hi: Array, positive: Mask, negative: Mask) -> Interval:
     """Widened, but for ends at which the sign of the exact result is known (neither below nor above 0)."""
     lo, hi = lower(lo, tiny=TINY), upper(hi, tiny=TINY)
-    return Interval._raw(
-        np.where(positive, np.maximum(lo, 0.0), lo), np.where(negative, np.minimum(hi, 0.0), hi)
-    )
+    return Interval._raw(np.where(positive, np.maximum(lo, 0.0), lo), np.where(negative, np.minimum(hi, 0.0), hi))
 
 
 def _times(factor: float, x: Interval) -> Interval:
@@ -267,9 +262,7 @@ def _times(factor: float, x: Interval) -> Interval:
     lo, hi = factor * first, factor * second
     if _without_zero(lo, hi):
         return Interval._raw(lower(lo, tiny=TINY), upper(hi, tiny=TINY))
-    if factor > 0:
-        return _signed(lo, hi, first >= 0, second <= 0)
-    return _signed(lo, hi, first <= 0, second >= 0)
+    return _signed(lo, hi, *((first >= 0, second <= 0) if factor > 0 else (first <= 0, second >= 0)))
 
 
 @quiet
@@ -282,8 +275,7 @@ def multiply(a: Interval, b: Interval) -> Interval:
         if factor == 1.0:
             return b
         if factor == 0.0:
-            zero = np.zeros(b.shape)
-            return Interval._raw(zero, zero)
+            return Interval._raw(zero := np.zeros(b.shape), zero)
         return _times(factor, b)
     ll, lh, hl, hh = a.lo * b.lo, a.lo * b.hi, a.hi * b.lo, a.hi * b.hi
     lo = np.minimum(np.minimum(ll, lh), np.minimum(hl, hh))
@@ -384,7 +376,7 @@ def matmul(a: IntervalLike, b: IntervalLike) -> Interval:
         return wide.sum(axis=-2)
     gamma, eta = product_error(x.shape[-1])
     mx, my = x.mid, y.mid
-    rx, ry = x.rad_about(mx), y.rad_about(my)
+    rx, ry = (upper(np.maximum(z.hi - mid, mid - z.lo)) for z, mid in ((x, mx), (y, my)))  # `rad`
     absolute_y: Array = np.abs(my)
     spread = upper(absolute_y + ry)
     product_mid: Array = mx @ my

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -26,15 +27,25 @@ def integrator(**changes: Any) -> cb.Problem:
     return cb.Problem(system, **({"initial": [0.0, 0.0], "safe": safe, "horizon": 30, "delta": 1e-3} | changes))
 
 
-def test_an_input_that_is_safe_passes_unchanged() -> None:
-    guard = cb.SafetyFilter(integrator())
+@functools.cache
+def _built() -> cb.SafetyFilter:
+    return cb.SafetyFilter(integrator())
+
+
+@pytest.fixture
+def guard() -> cb.SafetyFilter:
+    """A filter of the two integrators at its beginning, made once."""
+    _built().reset()
+    return _built()
+
+
+def test_an_input_that_is_safe_passes_unchanged(guard: cb.SafetyFilter) -> None:
     report = guard.step([-0.1, 0.2])
     assert report.changed == 0
     np.testing.assert_array_equal(report.input, [-0.1, 0.2])
 
 
-def test_driving_at_an_obstacle_is_bent_and_stays_guaranteed() -> None:
-    guard = cb.SafetyFilter(integrator())
+def test_driving_at_an_obstacle_is_bent_and_stays_guaranteed(guard: cb.SafetyFilter) -> None:
     reports = [guard.step([1.0, 0.0]) for _ in range(30)]
     assert max(report.changed for report in reports) > 0.1
     assert all(report.feasible and report.room >= -1e-9 for report in reports)
@@ -42,8 +53,8 @@ def test_driving_at_an_obstacle_is_bent_and_stays_guaranteed() -> None:
     assert guard.verify().status == "SAFE"
 
 
-def test_inputs_from_measured_states_keep_the_noisy_system_safe() -> None:
-    guard, rng = cb.SafetyFilter(integrator()), np.random.default_rng(0)
+def test_inputs_from_measured_states_keep_the_noisy_system_safe(guard: cb.SafetyFilter) -> None:
+    rng = np.random.default_rng(0)
     for _ in range(4):
         guard.reset()
         x = np.zeros(2)
@@ -100,8 +111,7 @@ def test_a_decay_out_of_range_is_refused(decay: float) -> None:
         cb.SafetyFilter(integrator(), decay=decay)
 
 
-def test_other_refusals() -> None:
-    guard = cb.SafetyFilter(integrator())
+def test_other_refusals(guard: cb.SafetyFilter) -> None:
     with pytest.raises(ValueError, match="`desired` must hold 2 finite inputs"):
         guard.step([np.nan, 0.0])
     with pytest.raises(ValueError, match="`verify` needs all 30 steps"):
