@@ -10,6 +10,6 @@ from certbound.values.continuous.room import faces_of, starts_of
 from certbound.values.continuous.surface import Surface
 
 __all__ = [
-    "ExitBounds", "Payment", "Surface", "bound_exits", "bound_mean_time", "bound_rate", "chart_exits", "chart_slabs_of", "faces_of",
-    "starts_of",
+    "ExitBounds", "Payment", "Surface", "bound_exits", "bound_mean_time", "bound_rate", "chart_exits",
+    "chart_slabs_of", "faces_of", "starts_of",
 ]
