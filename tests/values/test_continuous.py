@@ -438,14 +438,14 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pyt
     plan = plan_below(plane, truth, 2500)
     proposals: list[Any] = []
     monkeypatch.setattr(plane_below, "propose_plane", lambda *given: proposals.append(given) or propose_plane(*given))
-    found = bound_plane_below(plane, model, plan, starts)
+    found = bound_plane_below(plane, model, plan, starts, None)
     assert found is not None
     bound = found[1].log
     assert len(proposals) == 3  # none that is not looked at
     with monkeypatch.context() as hopeless:
         hopeless.setattr(plane_below._Sketch, "estimate", lambda self: plan.floor - 100)
         hopeless.setattr(plane_below, "prove_lower", lambda *given: pytest.fail("nothing can come of this proof"))
-        assert bound_plane_below(plane, model, plan, starts) is None
+        assert bound_plane_below(plane, model, plan, starts, None) is None
     assert len(proposals) == 4
     assert truth - 1.3 < bound <= truth
     coarse = dataclasses.replace(plan, cells=10, growth=0.6)

@@ -290,12 +290,17 @@ def _above(values: Array, lift: float) -> Array:
     return np.asarray(values + lift + 1e-15 * (np.abs(values) + lift))
 
 
-def prove_lower(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment | None:
-    """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is."""
-    if extreme_over(surface, starts, upper=False) == -math.inf:
+def prove_lower(
+    surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None
+) -> Payment | None:
+    """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is.
+
+    The starts fill their box, or ``points`` lie among them.
+    """
+    if extreme_over(surface, starts, upper=False, points=points) == -math.inf:
         return None
     surface = _sunk(surface)
-    start = -up(-extreme_over(surface, starts, upper=False))
+    start = -up(-extreme_over(surface, starts, upper=False, points=points))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=np.inf)
     proof = examine(surface, model, need, upper=False)
     return _earned(proof, need, surface, start)
@@ -345,14 +350,19 @@ def patched_of(proof: Proof, excess: Array, need: Need, steps: Array, lift: floa
     )  # fmt: skip
 
 
-def extreme_over(surface: Surface, starts: Sequence[tuple[float, float]], *, upper: bool) -> float:
+def extreme_over(
+    surface: Surface, starts: Sequence[tuple[float, float]], *, upper: bool, points: Array | None = None
+) -> float:
     """The supremum of V(0, .) over the starts (upper), or V at the best of the nodes among them, rounded safely.
 
     Starts that are no union of cells are covered by the cells that they touch. Where a start is a node of the grid in
-    every state, V there is one of the data. Starts that stick out of the grid give infinity.
+    every state, V there is one of the data. Starts that stick out of the grid give infinity. Where the starts do not
+    fill their box, only ``points`` among them count from below.
     """
     if any(low < axis[0] or high > axis[-1] for axis, (low, high) in zip(surface.axes, starts)):
         return math.inf if upper else -math.inf
+    if points is not None and not upper:
+        return float(surface.floor_at(0, points).max(initial=-math.inf))
     exact = [
         np.flatnonzero((axis >= low) & (axis <= high)) for axis, (low, high) in zip(surface.axes, starts)
     ]

@@ -6,11 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic, Region
+from certbound.rigor.intervals import Interval
+from certbound.values.sets import contains
 
 Ends = tuple[float, float]
+
+_ALONG = 33
+_WITHIN = 1 - 1e-9  # so that points on the rim pass the test in outward-rounded arithmetic
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -123,6 +129,22 @@ def _rounded(place: float, side: int, size: float) -> Ends:
     """A computed face, moved inward and outward by more than its rounding error."""
     slack = 4e-16 * size
     return (place + slack, place - slack) if side == 0 else (place - slack, place + slack)
+
+
+def points_of(problem: Problem) -> Array | None:
+    """Points that are surely starts, shape (N, n), up to the rim; None where the starts fill their box."""
+    start, around = problem.initial, problem.initial.hull()
+    if start.random or (start.form.axial and start.center is None):
+        return None
+    half = _WITHIN * (around.hi - around.lo) / 2
+    steps = np.meshgrid(*[np.linspace(-1, 1, _ALONG)] * len(half), indexing="ij")
+    points = start.middle + half * np.stack([step.ravel() for step in steps], axis=1)
+    if isinstance(start.form, Quadratic):
+        rows = points - start.middle
+        length = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", rows, np.linalg.pinv(start.form.matrix), rows), 1e-300))
+        rim = start.middle + _WITHIN * rows / length[:, None]
+        points = np.concatenate([points, rim[length > 0.5]])
+    return np.asarray(points[contains(start, Interval.point(points), 0)[0]])
 
 
 def starts_of(problem: Problem) -> list[tuple[float, float]]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import comb
 
 from certbound.arrays import Array
 from certbound.values.continuous.polynomials import CUBIC_HERMITE, HERMITE, QUARTERS
@@ -129,9 +130,7 @@ class Surface:
         if len(self.axes) == 3 and np.prod(self.cells) > _MANY:
             found = [part.range_at(index) for _, part in self.rows(_MANY)]
             return np.concatenate([low for low, _ in found]), np.concatenate([high for _, high in found])
-        data = self.values[index][None, None] * np.ones((1, 4, *([1] * (2 * len(self.axes)))))
-        data[:, 1] = data[:, 3] = 0.0
-        low, high = value_range(self._patches(data, np.ones(1)))
+        low, high = value_range(self._patches_at(index))
         return low.reshape(self.cells), high.reshape(self.cells)
 
     def ceiling_at(self, index: int) -> tuple[tuple[Array, ...], Array]:
@@ -140,9 +139,7 @@ class Surface:
         A node in floats lies within two roundoffs of |x| of where the polynomial is cut, and |V_i| <= 10 Z / h_i; the
         products are convex combinations of at most Z, of six terms each.
         """
-        data = self.values[index][None, None] * np.ones((1, 4, *([1] * (2 * len(self.axes)))))
-        data[:, 1] = data[:, 3] = 0.0
-        patches = self._patches(data, np.ones(1))
+        patches = self._patches_at(index)
         cut = np.einsum("pia,bac,qjc->bpqij", QUARTERS, patches.coefficients[:, 0], QUARTERS, optimize=True)
         off = sum(np.max(np.abs(axis)) / width for axis, width in zip(self.axes, patches.widths))
         slack = 2.0**-53 * (1000 + 40 * off) * (patches.size + np.abs(patches.reference))
@@ -153,6 +150,26 @@ class Surface:
         nodes = [(axis[:-1, None] + np.diff(axis)[:, None] * share).ravel() for axis in self.axes]
         return tuple(np.append(node, axis[-1]) for node, axis in zip(nodes, self.axes)), high
 
+    def floor_at(self, index: int, points: Array) -> Array:
+        """Lower bounds of V at points, shape (N, n), at one end of a slab; -inf off the grid (see `ceiling_at`)."""
+        cells = [
+            np.clip(np.searchsorted(axis, x, side="right") - 1, 0, len(axis) - 2)
+            for axis, x in zip(self.axes, points.T)
+        ]
+        shares = [(x - axis[k]) / (axis[k + 1] - axis[k]) for axis, x, k in zip(self.axes, points.T, cells)]
+        inside = np.all([(x >= axis[0]) & (x <= axis[-1]) for axis, x in zip(self.axes, points.T)], axis=0)
+        patches = self._patches_at(index).take(np.ravel_multi_index(tuple(cells), self.cells))
+        value = patches.coefficients[:, 0]
+        for share in shares:
+            degree = value.shape[1] - 1
+            share = np.clip(share, 0.0, 1.0)[:, None]
+            powers = np.arange(degree + 1)
+            weights = comb(degree, powers) * share**powers * (1 - share) ** (degree - powers)
+            value = np.einsum("ni,ni...->n...", weights, value)
+        off = sum(np.max(np.abs(axis)) / width for axis, width in zip(self.axes, patches.widths))
+        slack = 2.0**-53 * (1000 + 40 * off) * (patches.size + np.abs(patches.reference))
+        return np.where(inside, patches.reference + value - slack, -np.inf)
+
     def face_range(self, axis: int, side: int) -> tuple[float, float]:
         """Bounds of V on one face of the grid over all times."""
         edge = 0 if side == 0 else -1
@@ -162,6 +179,12 @@ class Surface:
         rest = tuple(nodes for k, nodes in enumerate(self.axes) if k != axis)
         low, high = value_range(_patches_of(data, self.steps, rest))
         return float(low.min()), float(high.max())
+
+    def _patches_at(self, index: int) -> Patches:
+        """All cells of a slab at which V is throughout what it is at one end of a slab."""
+        data = self.values[index][None, None] * np.ones((1, 4, *([1] * (2 * len(self.axes)))))
+        data[:, 1] = data[:, 3] = 0.0
+        return self._patches(data, np.ones(1))
 
     def _patches(self, data: Array, steps: Array) -> Patches:
         return _patches_of(data, steps, self.axes)

@@ -43,7 +43,7 @@ def bound_arrival(problem: Problem, model: Model, target: Region) -> tuple[float
         Models, limits or targets that depend on time, disturbances, random starts, starts that are not on one side of
         the target, or a limit between them and it.
     """
-    side, start = _placed(problem, model, target)
+    side, start, spread = _placed(problem, model, target)
     aux = problem.replace(safe=[*problem.safe, Outside(target, label="the target")])
     cuts = cuts_of(aux, model, start)
     inner, outer = (ladder.room_of(aux, model, cuts, start, inner=way) for way in (True, False))
@@ -57,14 +57,14 @@ def bound_arrival(problem: Problem, model: Model, target: Region) -> tuple[float
     late = _between(outer, (small.low, wide.high) if side == 1 else (wide.low, small.high), side, model, start)
     early = _between(outer, (wide.low, small.high) if side == 1 else (small.low, wide.high), side, model, start)
     limited = wide.closed[1 - side]  # a path that passes a mere cut may come back and arrive
-    least, most, done = _bounds(early if limited else None, late, start, side)
+    least, most, done = _bounds(early if limited else None, late, (start, spread), side)
     found = ", ".join(done) or "none came to an end"
     words = f"value function in one state for arriving, cells x slabs of time: {found}"
     return complement(least, up=True), complement(most, up=False), words
 
 
-def _placed(problem: Problem, model: Model, target: Region) -> tuple[int, Start]:
-    """The side of the starts on which the target lies, and the worst of them."""
+def _placed(problem: Problem, model: Model, target: Region) -> tuple[int, Start, Start]:
+    """The side of the starts on which the target lies, the worst of them rounded outward, and an interval around it."""
     if not model.autonomous or target.moving or any(c.during is not None for c in problem.constraints):
         raise InfeasibleError("value functions in continuous time need a target, limits and a model without time.")
     if problem.system.disturbance is not None:
@@ -73,9 +73,9 @@ def _placed(problem: Problem, model: Model, target: Region) -> tuple[int, Start]
         raise InfeasibleError("value functions in continuous time need a set of starts for a target.")
     start, around = start_of(problem), target.hull()
     if start.high < around.lo[0]:
-        return 1, Start(low=start.low, high=start.low)
+        return 1, *start.end(-1)
     if start.low > around.hi[0]:
-        return 0, Start(low=start.high, high=start.high)
+        return 0, *start.end(1)
     raise InfeasibleError("value functions in continuous time need starts on one side of the target.")
 
 
@@ -93,8 +93,11 @@ def _between(
     return dataclasses.replace(room, phases=[phase], lines=[ladder.line_of(phase, model, start)])
 
 
-def _bounds(early: ladder.Room | None, late: ladder.Room, start: Start, side: int) -> tuple[float, float, list[str]]:
-    """Natural logarithms of bounds of P(arriving): at least, at most."""
+def _bounds(
+    early: ladder.Room | None, late: ladder.Room, starts: tuple[Start, Start], side: int
+) -> tuple[float, float, list[str]]:
+    """Natural logarithms of bounds of P(arriving): at least (first start), at most (some of the others)."""
+    start, spread = starts
     rough = ladder.sketches(late)
     least, most, done = -math.inf, 0.0, list[str]()
     for fineness, tolerance, lead in ladder.LADDER[:_RUNGS]:
@@ -102,7 +105,7 @@ def _bounds(early: ladder.Room | None, late: ladder.Room, start: Start, side: in
         try:
             links = early and ladder.surface_of_arrival(early, side, rough, (share, fineness, tolerance, lead), _FLOOR)
             if links and spans(links, upper=True):
-                most = min(most, _prove_above(links[0], start, side))
+                most = min(most, _prove_above(links[0], spread, side))
             links = ladder.surfaces_below(late, start, rough, (share, fineness, 0.5 * tolerance, lead), _FLOOR)
             if links is not None and spans(links, upper=False):
                 payment = prove_below(links, start)

@@ -16,6 +16,7 @@ from certbound.rigor.intervals import Interval
 from certbound.values.continuous.hypotheses import extreme_over
 from certbound.values.continuous.line.joins import Profile
 from certbound.values.continuous.line.phases import Phase
+from certbound.values.continuous.room import points_of
 from certbound.values.continuous.surface import Surface
 
 _PARTS = 24
@@ -23,10 +24,14 @@ _PARTS = 24
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Start:
-    """An interval of starts, or a normal one (``mean``, ``variance``)."""
+    """An interval of starts, or a normal one (``mean``, ``variance``).
+
+    Its ends are rounded outward; where it may be larger than the set by that, ``points`` lie in the set.
+    """
 
     low: float
     high: float
+    points: Array | None = None
     mean: float = 0.0
     variance: float = 0.0
 
@@ -34,6 +39,12 @@ class Start:
     def random(self) -> bool:
         """Whether the start is drawn."""
         return self.variance > 0
+
+    def end(self, side: int) -> tuple[Start, Start]:
+        """The lowest (-1) or highest (1) start, rounded outward; and an interval from it to one of the starts."""
+        place = self.low if side < 0 else self.high
+        near = place if self.points is None else side * float(np.max(side * self.points[:, 0]))
+        return Start(low=place, high=place), Start(low=min(place, near), high=max(place, near))
 
     def highest(self, surface: Surface, phase: Phase) -> float:
         """An upper bound of V(0, .) over the set, or of log E e^V(0, .), starts off the grid counting 1."""
@@ -50,7 +61,7 @@ class Start:
         """A lower bound of V(0, .) at the best start, or of log E e^V(0, .), starts off a closed face counting 1."""
         if not self.random:
             if phase.origin is None and phase.width is None:
-                return extreme_over(surface, [(self.low, self.high)], upper=False)
+                return extreme_over(surface, [(self.low, self.high)], upper=False, points=self.points)
             return float(self._over(surface, phase).lo.max())
         edges, mass = self._masses(surface, phase, most=False)
         value = Profile(surface, 0).over(Interval(edges[:-1], edges[1:]))[0].lo
@@ -95,4 +106,4 @@ def start_of(problem: Problem) -> Start:
     around = initial.hull()
     if not np.isfinite([around.lo[0], around.hi[0]]).all():
         raise InfeasibleError("value functions need a bounded set of starts.")
-    return Start(low=float(around.lo[0]), high=float(around.hi[0]))
+    return Start(low=float(around.lo[0]), high=float(around.hi[0]), points=points_of(problem))

@@ -40,16 +40,19 @@ def plan_below(plane: Plane, level: float, patches: float) -> Plan:
 
 
 def bound_plane_below(
-    plane: Plane, model: Model, plan: Plan, starts: list[Pair]
+    plane: Plane, model: Model, plan: Plan, starts: list[Pair], points: Array | None
 ) -> tuple[Surface, Payment] | None:
-    """The most promising of a few proposals, and what it pays for its lower bound of log P; None where that is none."""
+    """The most promising of a few proposals, and what it pays for its lower bound of log P; None where that is none.
+
+    The starts fill their box, or ``points`` lie among them.
+    """
     source: Source | None = None
     best: _Sketch | None = None
     for number in range(_PASSES + 1):
         surface = propose_plane(plane, plan, source)
         if surface is None or not covers(surface, plane.horizon, plane.low, plane.high, within=False):
             break
-        sketch = _Sketch.of(surface, model, starts)
+        sketch = _Sketch.of(surface, model, starts, points)
         if best is None or sketch.estimate() > best.estimate():
             best = sketch
         if best.estimate() < plan.floor - _HOPELESS[min(number, 1)]:
@@ -58,7 +61,7 @@ def bound_plane_below(
         source = more if source is None else source.plus(more)
     if best is None or best.estimate() < plan.floor:  # what is subtracted at last would leave nothing
         return None
-    payment = prove_lower(best.surface, model, starts)
+    payment = prove_lower(best.surface, model, starts, points)
     return None if payment is None else (best.surface, payment)
 
 
@@ -71,8 +74,8 @@ class _Sketch:
     excess: Array
 
     @classmethod
-    def of(cls, surface: Surface, model: Model, starts: list[Pair]) -> _Sketch:
-        start = extreme_over(surface, starts, upper=False)
+    def of(cls, surface: Surface, model: Model, starts: list[Pair], points: Array | None) -> _Sketch:
+        start = extreme_over(surface, starts, upper=False, points=points)
         deficit, high = sampled_residual(surface, model, upper=False)
         paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - high - _VARIED, 50.0))
         return cls(surface=surface, start=start, excess=np.maximum(deficit - paid, 0.0))

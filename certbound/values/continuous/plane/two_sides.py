@@ -33,7 +33,7 @@ from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.plane_proposal import propose_plane
-from certbound.values.continuous.room import Room, starts_of
+from certbound.values.continuous.room import Room, points_of, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
@@ -70,7 +70,7 @@ def two_states(
         outer = _plane(problem, model, room.outer_low, room.outer_high, starts)
         plan = plan_below(outer, min(level, upper), _BELOW * patches)
         with contextlib.suppress(OutOfTime):
-            found = bound_plane_below(outer, model, plan, starts)
+            found = bound_plane_below(outer, model, plan, starts, points_of(problem))
             below += [] if found is None else [found]
         done.append(f"{plan.cells}^2 below")
     lower = max((payment.log for _, payment in below), default=None)
