@@ -54,8 +54,8 @@ def _lasting(problem: Problem) -> EngineAnswer:
     found = _by_rate(problem)
     if found is None:
         raise InfeasibleError(
-            "a value function in continuous time needs an end, and the horizon is infinite; without one a single state is "
-            "served, between two limits that stand still, for a model that does not depend on time."
+            "a value function in continuous time needs an end, and the horizon is infinite; without one a single state "
+            "is served, between two limits that stand still, for a model that does not depend on time."
         )
     return found
 
