@@ -114,7 +114,7 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
-    "values.continuous": (9, "bounds and charts, and the surfaces that certificates state, with what they were paid"),
+    "values.continuous": (10, "bounds and charts, and the surfaces that certificates state, with what they were paid"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (34, "the one description of functions, which every room reads, differentiates and evaluates"),

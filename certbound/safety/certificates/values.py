@@ -53,6 +53,8 @@ def values_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     """
     if problem.ending:
         raise CertificateError("the checker counts leaving the domain as failing, and this bound does not.")
+    if answer.details is None:
+        raise CertificateError("certificates do not state rates of leaving.")
     effort = min(attempt, len(_ROOMS) - 1)
     flat = isinstance(answer.details, ExitBounds) and problem.system.dimension > 1
     room = _ROOMS[effort] * (_MORE_ROOM if flat else 1)
@@ -71,7 +73,7 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
     effort = min(attempt, len(_ROOMS) - 1)
     if problem.ending:
         raise CertificateError("certificates of lower bounds count leaving the domain as failing.")
-    if answer.log10_lower is None:
+    if answer.log10_lower is None or answer.details is None:
         raise CertificateError("no lower bound was found.")
     if not problem.initial.random and problem.initial.data(_STARTS)["kind"] not in _STARTS:
         raise CertificateError("lower bounds are stated from starts in a box, a ball or an ellipsoid, or normal ones.")

@@ -11,7 +11,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.values.chains import bound_chain
-from certbound.values.continuous import ExitBounds, bound_exits
+from certbound.values.continuous import ExitBounds, bound_exits, bound_rate
 from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
@@ -35,6 +35,8 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     limit = max(min(most if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
     try:
         if problem.system.time == "continuous":
+            if problem.endless and problem.reach is None:
+                return _lasting(problem)
             check_end(problem, "a value function in continuous time")
         if problem.reach is None and serves(problem):
             return _continuous(bound_exits_by_steps(problem, seconds=limit))
@@ -42,8 +44,43 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
             return _continuous(_exits(problem, limit))
         found = _failure(problem, limit)
     except (InfeasibleError, EnclosureError) as error:
-        return EngineAnswer(applicable=False, method="values", reason=str(error))
+        found_rate = _by_rate(problem)
+        return found_rate or EngineAnswer(applicable=False, method="values", reason=str(error))
     return _answer(problem, found)
+
+
+def _lasting(problem: Problem) -> EngineAnswer:
+    """An infinite horizon in continuous time."""
+    found = _by_rate(problem)
+    if found is None:
+        raise InfeasibleError(
+            "a value function in continuous time needs an end, and the horizon is infinite; without one a single state "
+            "is served, between two limits that stand still, for a model that does not depend on time."
+        )
+    return found
+
+
+def _by_rate(problem: Problem) -> EngineAnswer | None:
+    """What the rate of leaving says of the horizon; None where none is proved."""
+    plain = problem.reach is None and not problem.ending and all(
+        one.during in (None, (0.0, float(problem.horizon))) for one in problem.kept
+    )
+    if problem.system.time != "continuous" or problem.system.dimension != 1 or not plain or problem.initial.random:
+        return None
+    rate = bound_rate(problem)
+    if rate is None:
+        return None
+    least, most = rate.before(float(problem.horizon))
+    shares = [rounded(rate.share[0], up=False, digits=4), rounded(rate.share[1], up=True, digits=4)]
+    rates = [rounded(rate.rate[0], up=False, digits=4), rounded(rate.rate[1], up=True, digits=4)]
+    words = f"for every T, P(leaving before T) <= 1 - {shares[0]} exp(-{rates[1]} T)"
+    if rate.rate[0] > 0:
+        words += f", and at least 1 - {shares[1]} exp(-{rates[0]} T): every path leaves in the end"
+    return EngineAnswer(
+        log10_delta=log10_outward(most, up=True),
+        log10_lower=None if least < 10.0**_FLOOR else log10_outward(least, up=False),
+        reason=f"{words}.", method="values",
+    )
 
 
 def _failure(problem: Problem, limit: float) -> FailureBounds:

@@ -1,0 +1,308 @@
+"""The mean time of leaving an interval and its rate, from both sides, by functions of the state alone.
+
+**The mean time** (Dynkin's formula). Let L m = f m' + a m''/2 with a = g^2 >= 0, m twice continuously differentiable
+on [low, high]. Where m >= 0 at the ends and L m <= -(1 - e) < 0 for every disturbance, E tau <= m/(1 - e): m has no
+minimum inside, as L m >= 0 there. Where m <= 0 at the ends and L m >= -(1 + e), E tau >= m/(1 + e).
+
+m is a polynomial that nearly solves L m = -1 (collocation), its coefficients are numbers from there on, and L m is
+enclosed over small cells: m' and m'' at their middles in balls, elsewhere by a bound of the next derivative
+(|T_k^(j)| is largest at 1).
+
+**The rate.** Where v <= 0 at the ends and L v >= -k v for every disturbance, e^{kt} v(X) is a submartingale until the
+exit, so that P(not left before T) >= e^{-kT} v(x)/sup v for every T at once. Where p > 0 on all of [low, high] and
+L p <= -k p, P(not left before T) <= e^{-kT} p(x)/min p. v is the first eigenfunction of L less a little of m (so that
+L v > 0 at the ends, where v vanishes), p that of a slightly longer interval.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from flint import arb, arb_poly, fmpq, fmpq_poly
+from numpy.polynomial import chebyshev
+
+from certbound.arrays import Array
+from certbound.problem.model import Tape, compile_numpy, sources
+from certbound.problem.problem import Problem
+from certbound.problem.systems import ContinuousSystem
+from certbound.rigor.balls import lower, precision, upper
+from certbound.rigor.intervals import Interval
+from certbound.values.continuous.coefficients import enclose, squared_diffusion
+
+_DEGREES = (16, 28, 44)
+_CELLS = (2**11, 2**14)
+_GOOD = 2e-3
+_MOST = 0.5
+_LESS = (1e-3, 1e-2, 0.1)  # of m, in units of what the rate may grow by
+_LONGER = (0.001, 0.003, 0.01, 0.03)  # of the interval, at both ends
+_SLACK = 1 + 1e-9
+
+
+def bound_mean_time(problem: Problem) -> tuple[float, float | None] | None:
+    """Bounds of the mean time of leaving from every start, under every disturbance; None where nothing is proved.
+
+    One state in continuous time, a model without t, and an interval that stays; the upper bound is None where only the
+    lower one is proved. An EnclosureError where the model is undefined somewhere in the interval.
+    """
+    ends, square = _interval(problem), _square(problem)
+    if ends is None or square is None:
+        return None
+    best: tuple[float, Array] | None = None
+    tried = [found for degree in _DEGREES if (found := _proposal(problem, square, *ends, degree)) is not None]
+    for count in _CELLS:
+        cells = _Cells(problem, square, *ends, count)
+        for coefficients in tried:
+            error = cells.error(coefficients)
+            if best is None or error < best[0]:
+                best = error, coefficients
+            if error < _GOOD:
+                return _bounds(problem, *ends, *best)
+    if best is None or not best[0] < _MOST:
+        return None
+    return _bounds(problem, *ends, *best)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """1 - share[1] e^{-rate[0] T} <= P(leaving before T) <= 1 - share[0] e^{-rate[1] T} for every T.
+
+    From every start, under every disturbance; the first share may exceed 1. ``rate[0]`` is 0 where nothing is proved.
+    """
+
+    rate: tuple[float, float]
+    share: tuple[float, float]
+
+    def before(self, time: float) -> tuple[float, float]:
+        """Bounds of the probability of leaving before a time, which may be infinite."""
+        with precision():
+            if np.isinf(time):
+                return (1.0 if self.rate[0] > 0 else 0.0), 1.0
+            still = [arb(share) * (-arb(rate) * arb(time)).exp() for share, rate in zip(self.share, self.rate[::-1])]
+            return max(lower(1 - still[1]), 0.0) if self.rate[0] > 0 else 0.0, min(upper(1 - still[0]), 1.0)
+
+
+def bound_rate(problem: Problem) -> Rate | None:
+    """How fast paths leave, for every horizon at once; None where nothing is proved.
+
+    As `bound_mean_time`: one state in continuous time, a model without t, and an interval that stays.
+    """
+    ends, square = _interval(problem), _square(problem)
+    if ends is None or square is None:
+        return None
+    cells = _Cells(problem, square, *ends, _CELLS[-1])
+    degree = _DEGREES[1]
+    slow = [_slow(problem, square, cells, degree, less) for less in _LESS]
+    above = min((found for found in slow if found is not None), default=None)
+    if above is None:
+        return None
+    fast = [_fast(problem, square, cells, degree, more) for more in _LONGER]
+    below = max((found for found in fast if found is not None), default=(0.0, 1.0))
+    return Rate(rate=(below[0], above[0]), share=(above[1], below[1]))
+
+
+def _slow(problem: Problem, square: Tape, cells: _Cells, degree: int, less: float) -> tuple[float, float] | None:
+    """A rate that is at least as large as the true one, and v(x)/sup v."""
+    m = _proposal(problem, square, cells.low, cells.high, degree)
+    found = _eigenfunction(problem, square, cells.low, cells.high, degree)
+    if m is None or found is None:
+        return None
+    rate, psi = found
+    v = psi - less * rate * m
+    with precision():
+        ends = [upper(arb_poly(_polynomial(v))(arb(end))) for end in (-1, 1)]
+    v[0] = np.nextafter(v[0] - max(*ends, 0.0), -np.inf)
+    drift, size = cells.moved(v), cells.values(v)
+    inside = size.lo > 0
+    needed = float(np.max(np.where(inside, -drift.lo / np.where(inside, size.lo, 1.0), 0.0))) * _SLACK
+    if not 0 < needed < 10 * rate or np.any(drift.lo[~inside] + needed * size.lo[~inside] * _SLACK < 0):
+        return None
+    least, _ = _over_starts(problem, cells.low, cells.high, v)
+    share = least / float(np.max(size.hi)) / _SLACK
+    return (needed, share) if share > 0 else None
+
+
+def _fast(problem: Problem, square: Tape, cells: _Cells, degree: int, more: float) -> tuple[float, float] | None:
+    """A rate that is at most as large as the true one, and p(x)/min p."""
+    wide = more * (cells.high - cells.low)
+    found = _eigenfunction(problem, square, cells.low - wide, cells.high + wide, degree)
+    if found is None:
+        return None
+    y = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    values = chebyshev.chebval(y / (1 + 2 * more), found[1])
+    p = np.asarray(np.linalg.solve(chebyshev.chebvander(y, degree), values), dtype=np.float64)
+    drift, size = cells.moved(p), cells.values(p)
+    if not np.all(size.lo > 0):
+        return None
+    rate = float(np.min(-drift.hi / np.where(drift.hi < 0, size.hi, size.lo))) / _SLACK
+    _, most = _over_starts(problem, cells.low, cells.high, p)
+    return (rate, most / float(np.min(size.lo)) * _SLACK) if rate > 0 else None
+
+
+def _eigenfunction(problem: Problem, square: Tape, low: float, high: float, degree: int) -> tuple[float, Array] | None:
+    """The first eigenvalue k of L v = -k v with v = 0 at the ends, and v with the largest value 1, in floats."""
+    import scipy.linalg
+
+    rows = _collocation(problem, square, low, high, degree)
+    if rows is None:
+        return None
+    inner, ends, y = rows
+    left = np.vstack([inner, ends])
+    right = np.vstack([-chebyshev.chebvander(y, degree), np.zeros((2, degree + 1))])
+    with np.errstate(all="ignore"):
+        values, vectors = scipy.linalg.eig(left, right)
+    good = np.isfinite(values) & (np.abs(values.imag) < 1e-6 * np.abs(values.real)) & (values.real > 0)
+    if not good.any():
+        return None
+    place = int(np.argmin(np.where(good, values.real, np.inf)))
+    v = np.real(vectors[:, place])
+    shape = chebyshev.chebval(np.linspace(-1, 1, 201), v)
+    largest = shape[np.argmax(np.abs(shape))]
+    return (float(values.real[place]), v / largest) if largest != 0 else None
+
+
+def _square(problem: Problem) -> Tape | None:
+    """g^2, of a model in continuous time without t; None elsewhere."""
+    if not isinstance(problem.system, ContinuousSystem):
+        return None
+    square = squared_diffusion(problem.system.diffusion, problem.system.states)
+    clock = any(0 in slots for tape in (problem.closed_loop, square) for slots in sources(tape))
+    return None if clock else square
+
+
+def _interval(problem: Problem) -> tuple[float, float] | None:
+    """The ends of the safe interval, where it is one that is exactly known."""
+    low, high = -np.inf, np.inf
+    for constraint in problem.constraints:
+        if constraint.outside or constraint.region.moving:
+            return None
+        normals, bounds = constraint.region.halfspaces()
+        centre = float(np.ravel(constraint.region.center_at())[0]) if constraint.region.center is not None else 0.0
+        if centre != 0.0 or not np.all(np.abs(normals) == 1.0):
+            return None
+        for normal, bound in zip(normals.ravel().tolist(), bounds.tolist()):
+            low, high = (low, min(high, bound)) if normal > 0 else (max(low, -bound), high)
+    return (low, high) if np.isfinite([low, high]).all() and low < high else None
+
+
+def _proposal(problem: Problem, square: Tape, low: float, high: float, degree: int) -> Array | None:
+    """Chebyshev coefficients over [low, high] of a near solution of L m = -1 that vanishes at the ends."""
+    rows = _collocation(problem, square, low, high, degree)
+    if rows is None:
+        return None
+    inner, ends, _ = rows
+    found = np.linalg.lstsq(np.vstack([inner, ends]), np.concatenate([-np.ones(len(inner)), [0.0, 0.0]]), rcond=None)[0]
+    return found if np.isfinite(found).all() else None
+
+
+def _collocation(
+    problem: Problem, square: Tape, low: float, high: float, degree: int
+) -> tuple[Array, Array, Array] | None:
+    """L T_k at points inside, T_k at the two ends, and the points in [-1, 1]; disturbances in their middle."""
+    middle, half = (low + high) / 2, (high - low) / 2
+    y = np.cos(np.pi * np.arange(1, degree) / degree)
+    x, box = middle + half * y, problem.system.disturbance
+    pushes = [] if box is None else [np.full(x.shape, value) for value in (box.low + box.high) / 2]
+    with np.errstate(all="ignore"):
+        f = np.broadcast_to(compile_numpy(problem.closed_loop)(np.zeros_like(x), x, *pushes)[..., 0], x.shape)
+        a = np.broadcast_to(compile_numpy(square)(np.zeros_like(x), x)[..., 0, 0], x.shape)
+        eye = np.eye(degree + 1)
+        once, twice = (chebyshev.chebval(y, chebyshev.chebder(eye, order)).T for order in (1, 2))
+        inner = f[:, None] * once / half + a[:, None] / 2 * twice / half**2
+    return (inner, chebyshev.chebvander(np.array([-1.0, 1.0]), degree), y) if np.isfinite(inner).all() else None
+
+
+class _Cells:
+    """Enclosures of f and a over equal cells of the interval, once for all polynomials; y in [-1, 1] is the place."""
+
+    def __init__(self, problem: Problem, square: Tape, low: float, high: float, count: int) -> None:
+        box = problem.system.disturbance
+        self.low, self.high, self.count = low, high, count
+        y = 2.0 * np.arange(count + 1) / count - 1.0  # exact: the number of cells is a power of 2
+        ends = Interval.point(low), Interval.point(high)
+        self.half = (ends[1] - ends[0]) * Interval.point(0.5)
+        x = ends[0] + (Interval(y[:-1], y[1:]) + Interval.point(1.0)) * self.half
+        self.middles = (y[:-1] + y[1:]) / 2
+        sides = [] if box is None else zip(box.low, box.high)
+        pushes = [Interval(np.full(count, a), np.full(count, b)) for a, b in sides]
+        time = Interval.point(np.zeros(count))
+        self.f = enclose(problem.closed_loop, [time, x, *pushes])[0][0]
+        self.a = enclose(square, [time, x])[0][0]
+
+    def error(self, coefficients: Array) -> float:
+        """An upper bound of |L m + 1| over the whole interval."""
+        return float(np.max((self.moved(coefficients) + Interval.point(1.0)).mag))
+
+    def moved(self, coefficients: Array) -> Interval:
+        """Ranges of L m over the cells, for every disturbance."""
+        first = _polynomial(coefficients).derivative()
+        slope = self._over(first, _largest(coefficients, 3)) / self.half
+        bend = self._over(first.derivative(), _largest(coefficients, 4)) / (self.half * self.half)
+        return self.f * slope + self.a * bend * Interval.point(0.5)
+
+    def values(self, coefficients: Array) -> Interval:
+        """Ranges of m itself."""
+        return self._over(_polynomial(coefficients), _largest(coefficients, 2))
+
+    def _over(self, function: fmpq_poly, bend: float) -> Interval:
+        """Ranges over the cells, from values and slopes at their middles and a bound of the second derivative."""
+        own, slope = arb_poly(function), arb_poly(function.derivative())
+        with precision():
+            half = arb(1) / self.count
+            room = arb(bend) * half * half / 2
+            low, high = [], []
+            for middle in self.middles.tolist():
+                value, reach = own(arb(middle)), half * abs(slope(arb(middle))) + room
+                low.append(lower(value - reach))
+                high.append(upper(value + reach))
+        return Interval(np.array(low), np.array(high))
+
+
+def _polynomial(coefficients: Array) -> fmpq_poly:
+    """The polynomial of y with these Chebyshev coefficients, exactly."""
+    before, now, y = fmpq_poly([1]), fmpq_poly([0, 1]), fmpq_poly([0, 1])
+    total = fmpq_poly([0])
+    for value in coefficients.tolist():
+        share = Fraction(value)
+        total += before * fmpq(share.numerator, share.denominator)
+        before, now = now, 2 * y * now - before
+    return total
+
+
+def _largest(coefficients: Array, order: int) -> float:
+    """A bound of the derivative of an order over [-1, 1]: of T_k it is prod (k^2 - i^2)/(2 i + 1) over i < order."""
+    total = Fraction(0)
+    for k, value in enumerate(coefficients.tolist()):
+        size = abs(Fraction(value))
+        for i in range(order):
+            size *= Fraction(max(k * k - i * i, 0), 2 * i + 1)
+        total += size
+    return float(np.nextafter(float(total), np.inf))
+
+
+def _bounds(problem: Problem, low: float, high: float, error: float, coefficients: Array) -> tuple[float, float | None]:
+    """m over the starts, lifted to what it has to be at the ends, by what L m may miss -1."""
+    least, most = _over_starts(problem, low, high, coefficients)
+    with precision():
+        ends = [arb_poly(_polynomial(coefficients))(arb(end)) for end in (-1, 1)]
+        below = (arb(least) - ends[0].max(ends[1])) / (1 + arb(error))
+        above = (arb(most) - ends[0].min(ends[1])) / (1 - arb(error))
+        return (max(lower(below), 0.0), upper(above)) if np.isfinite(most) else (0.0, None)
+
+
+def _over_starts(problem: Problem, low: float, high: float, coefficients: Array) -> tuple[float, float]:
+    """Bounds of a polynomial over the starts; nothing where they leave the interval."""
+    around, whole = problem.initial.hull(), Fraction(high) - Fraction(low)
+    first, last = (2 * (Fraction(float(end)) - Fraction(low)) / whole - 1 for end in (around.lo[0], around.hi[0]))
+    if first < -1 or last > 1:
+        return -np.inf, np.inf
+    half = float(np.nextafter(float(last - first) / 2, np.inf)) if last > first else 0.0
+    with precision():
+        middle = arb_poly(_polynomial(coefficients))(_ball((first + last) / 2))
+        room = arb(half) * arb(_largest(coefficients, 1))
+        return lower(middle - room), upper(middle + room)
+
+
+def _ball(value: Fraction) -> arb:
+    return arb(fmpq(value.numerator, value.denominator))
