@@ -125,7 +125,7 @@ class Program:
         return found
 
     def _settings(self, seconds: float, *, careful: bool) -> Any:
-        """Linear systems refined only if ``careful``: it takes as long again, and the result is the same if one comes."""
+        """Linear systems are refined only if ``careful``: it takes as long again, and seldom changes the result."""
         settings = self.clarabel.DefaultSettings()
         settings.verbose, settings.max_iter, settings.time_limit = False, 80, float(seconds)
         settings.tol_gap_rel, settings.tol_gap_abs, settings.tol_feas = 1e-4, 1e-4, 1e-7

@@ -92,6 +92,10 @@ class Dynamics:
         """Whether neither drift nor diffusion reads the time."""
         return self.drift.autonomous and (self.noise is None or self.noise.autonomous)
 
+    def bending(self, row: int) -> set[int]:
+        """Coordinates that carry second-order terms of a state's drift."""
+        return {a for pair in self.drift.pairs_of(row) for a in pair if a < self.n}
+
     def _held(self) -> tuple[int, ...]:
         """Coordinates that meet every second-order term of f, and all that g depends on: a greedy cover."""
         pairs = self.drift.pairs
@@ -272,6 +276,14 @@ class Dynamics:
         return columns @ columns.T
 
 
+def grid(n: int, held: Sequence[int], slabs: Sequence[int]) -> tuple[Array, Array]:
+    """Cells that cover [-1, 1]^n: slabs of the held coordinates."""
+    cuts = [np.linspace(-1.0, 1.0, slabs[held.index(axis)] + 1 if axis in held else 2) for axis in range(n)]
+    low = np.stack([axis.ravel() for axis in np.meshgrid(*(cut[:-1] for cut in cuts), indexing="ij")], axis=1)
+    high = np.stack([axis.ravel() for axis in np.meshgrid(*(cut[1:] for cut in cuts), indexing="ij")], axis=1)
+    return low, high
+
+
 def curved_axes(problem: Problem) -> set[int]:
     """Coordinates on which the drift does not depend affinely, or the diffusion at all."""
     n, diffusion = problem.system.dimension, diffusion_of(problem)
@@ -324,13 +336,16 @@ class _Jet:
         self.curve = jacobian(self.slope, self.slots)
         self.outputs = len(tape.outputs)
         q = count - 1
-        self.pairs = {
-            (min(a, b), max(a, b)) for i in range(self.outputs) for a in range(q) for b in range(q)
-            if not is_zero(self.curve, (i * q + a) * q + b)
-        }  # fmt: skip
+        self.pairs = {pair for i in range(self.outputs) for pair in self.pairs_of(i)}
         self.used = {a for i in range(self.outputs) for a in range(q) if not is_zero(self.slope, i * q + a)}
         moving = jacobian(tape, [0])
         self.autonomous = all(is_zero(moving, i) for i in range(self.outputs))
+
+    def pairs_of(self, i: int) -> set[tuple[int, int]]:
+        """Pairs of inputs along which an output bends."""
+        q = len(self.slots)
+        both = itertools.product(range(q), repeat=2)
+        return {(min(a, b), max(a, b)) for a, b in both if not is_zero(self.curve, (i * q + a) * q + b)}
 
     def at(self, cells: _Boxes) -> tuple[Interval, Interval, Interval]:
         """Value (C, k) and slope (C, k, q) at the middles, second derivatives (C, k, q, q) over the cells."""

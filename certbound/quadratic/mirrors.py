@@ -93,8 +93,8 @@ def _on_cells(cells: Cells, signs: Array, inside: Integers) -> Iterator[Mirror]:
     swapped, corners = _swapped(cells, signs[:n]), stay ^ sum(1 << last - k for k in turned)
     if swapped is not None and _keeps(cells, signs, corners, swapped):
         yield Mirror(signs=signs, corners=corners, cells=swapped, moves=moves, inside=inside)
-    elif swapped is not None and len(cells.low) == 1 and turned and len(turned) == len(cells.held):
-        if _keeps(cells, signs, stay, swapped):
+    elif swapped is not None and len(cells.low) == 1 and 0 < len(turned) == len(cells.held):
+        if _keeps(cells, signs, stay, swapped):  # the corners are the same: each keeps its side
             yield Mirror(signs=signs, corners=stay, cells=swapped, moves=-moves, inside=inside)
 
 

@@ -14,12 +14,24 @@ from certbound.arrays import Array
 from certbound.display import rounded
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.quadratic.corners import Cells, Dynamics, curved_axes
+from certbound.quadratic.corners import Cells, Dynamics, curved_axes, grid
 from certbound.quadratic.inequality import corner_levels, prove
 from certbound.quadratic.mirrors import Mirror, mirrors
-from certbound.quadratic.setting import Setting, Wall, make_setting, refuse
+from certbound.quadratic.setting import Setting, make_setting, refuse
 from certbound.quadratic.surroundings import moved_sides, working_box
-from certbound.quadratic.wall_attempts import APART, PAIRS, PIECES, SPLIT, Attempt, apart, log10_up, log_sum, total
+from certbound.quadratic.wall_attempts import (
+    APART,
+    NOTHING,
+    PAIRS,
+    PIECES,
+    SPLIT,
+    Attempt,
+    Option,
+    groups,
+    log10_up,
+    log_sum,
+    total,
+)  # fmt: skip
 from certbound.quadratic.wall_program import Proposal, StatedCells, propose
 from certbound.watch import poll
 
@@ -34,6 +46,8 @@ _DONE = 1e-3  # share of the bound that a wall may have without being looked at 
 _LEAST = 1e-300
 _MOVES, _WORTH = 2, 0.1  # how often the box's sides are moved, and what log10 must gain by it to go on
 _SAME = 0.02  # of the logarithm: what a mirrored bound may lose
+_HOPE, _SLABS = 0.3, 0.7  # of the logarithm: what pieces and windows, or slabs, gain where nothing is known
+_AGAIN = 0.6  # of what a refinement gained: what it gains once more
 _RESCUES = 2  # refinements of a wall that proves nothing, before the working box is given up
 
 
@@ -201,21 +215,21 @@ class Search:
         self.gains: dict[int, float] = {}  # of pieces and windows, at the wall that was refined last
         slabs = self._first_slabs()
         whole = (0.0, self.horizon)
-        groups = _groups(setting, together=together)
-        self.attempts = [Attempt(wall=one[0], others=one[1:], slabs=slabs, during=whole) for one in groups]
+        self.attempts = [Attempt(wall=one[0], others=one[1:], slabs=slabs, during=whole)
+                         for one in groups(setting.walls, together=together)]  # fmt: skip
 
     def _first_slabs(self) -> tuple[int, ...]:
         """Slabs that make a large remainder small, as far as a few do: without them many a bound is 1."""
         held, n = self.dynamics.held, self.setting.dimension
         slabs = [1] * len(held)
-        least, most = self.dynamics.remainder(*_grid(n, held, slabs)), _FIRST_SLABS
+        least, most = self.dynamics.remainder(*grid(n, held, slabs)), _FIRST_SLABS
         if n > _SMALL_DIMENSION:
             most = _FEWER_SLABS
         if least <= _LARGE:  # the walls by themselves gain more
             return tuple(slabs)
         while least > _LOOSE and math.prod(slabs) < most:
             trials = [[2 * count if k == axis else count for k, count in enumerate(slabs)] for axis in range(len(held))]
-            values = [self.dynamics.remainder(*_grid(n, held, trial)) for trial in trials]
+            values = [self.dynamics.remainder(*grid(n, held, trial)) for trial in trials]
             if not values or min(values) > 0.9 * least:
                 break
             slabs, least = trials[int(np.argmin(values))], min(values)
@@ -230,7 +244,7 @@ class Search:
                 break
             self._solve(attempt, until)
             for _ in range(_RESCUES):
-                if self.attempts[place].level < 0 or not self._refined(place, until):
+                if self.attempts[place].level < 0 or not self._refined(self._option(place, until), until):
                     break
             if not self.attempts[place].level < 0:
                 break
@@ -238,7 +252,8 @@ class Search:
         yield self._answer(level)
         place = len(self.attempts) - 1
         unsettled = _log10(target) < level / math.log(10) < 0 and self.attempts[place].others
-        if unsettled and parts[place] >= level + math.log(_DONE) and self._refined(place, until):
+        large = parts[place] >= level + math.log(_DONE)
+        if unsettled and large and self._refined(self._option(place, until), until):
             yield self._answer(total(self.attempts)[0])
 
     def run(self, target: float, share: float, found: Callable[[QuadraticBound], object]) -> None:
@@ -250,8 +265,10 @@ class Search:
             found(self._answer(level))
             if level / math.log(10) <= _log10(target) or time.perf_counter() > until:
                 return
-            order = [place for place in np.argsort(-parts) if parts[place] >= level + math.log(_DONE)]
-            if not any(self._refined(int(place), until) for place in order):
+            places = np.flatnonzero(parts >= level + math.log(_DONE)).tolist()
+            best = max((self._option(k, until) for k in places),
+                       key=lambda option: option.worth(parts), default=NOTHING)  # fmt: skip
+            if not self._refined(best, until):
                 return
 
     def by_wall(self) -> tuple[Array, float]:
@@ -275,30 +292,42 @@ class Search:
         return QuadraticBound(upper=log10_up(level), words=words, seconds=0.0, setting=self.setting,
                               walls=tuple(self.attempts))  # fmt: skip
 
-    def _refined(self, place: int, until: float) -> bool:
-        """One refinement of an attempt that may gain by it and has the time; False where there is none."""
+    def _option(self, place: int, until: float) -> Option:
+        """The refinement of an attempt that promises most for its time."""
         attempt = self.attempts[place]
-        options = [PIECES, SPLIT, *range(len(attempt.slabs))]
+        hopes = {PIECES: _HOPE, SPLIT: _HOPE} | self._slabs(attempt)
         if attempt.proved is None:  # windows are no cure
-            options.remove(SPLIT)
+            del hopes[SPLIT]
         left = until - time.perf_counter()
         if attempt.others and attempt.gains.get(APART, math.inf) > 0:
             many = _SINGLE * len(attempt.finer(APART)) * attempt.seconds
-            options = [APART if many < left or not attempt.paired else PAIRS]
-        hopes = {k: attempt.gains.get(k, self.gains.get(k, math.inf)) for k in options}
-        children = {k: attempt.finer(k) for k in options}
-        sizes = {k: sum(child.blocks for child in children[k]) for k in options}
-        grown = {k: (_SINGLE if k in (APART, PAIRS) else 1.3) * sizes[k] / attempt.blocks for k in options}
-        options = [k for k in options if hopes[k] > _GAIN and sizes[k] <= _MOST_BLOCKS]
-        options = [k for k in options if grown[k] * attempt.seconds < left]
-        if not options:
+            hopes = {APART if many < left or not attempt.paired else PAIRS: 1.0}
+        found = []
+        for kind, hope in hopes.items():
+            blocks = sum(child.blocks for child in attempt.finer(kind))
+            seconds = (_SINGLE if kind in (APART, PAIRS) else 1.3) * blocks / attempt.blocks * attempt.seconds
+            gain = _AGAIN * attempt.gains[kind] if kind in attempt.gains else self.gains.get(kind, hope)
+            if gain > _GAIN and blocks <= _MOST_BLOCKS and seconds < left:
+                found.append(Option(int(place), kind, gain, max(seconds, 1e-3)))
+        return max(found, key=lambda option: option.gain / option.seconds, default=NOTHING)
+
+    def _refined(self, option: Option, until: float) -> bool:
+        """Refine an attempt and its mirror images; False where there is no option."""
+        if option.place < 0:
             return False
-        option = max(options, key=lambda k: hopes[k] / grown[k])
+        attempt = self.attempts[option.place]
         poll(f"refining {attempt.wall.label}")
-        self._adopt(attempt, option, until)
+        self._adopt(attempt, option.kind, until)
         for image in [one for one in self.attempts if any(twin is attempt for _, twin in self._twins(one))]:
-            self._adopt(image, option, until)
+            self._adopt(image, option.kind, until)
         return True
+
+    def _slabs(self, attempt: Attempt) -> dict[int, float]:
+        """What slabs of each held coordinate may gain: those of the wall's own, and that bend its drift, most."""
+        side, held = attempt.wall.side, self.dynamics.held
+        near = set() if side is None or attempt.others else {side[0], *self.dynamics.bending(side[0])}
+        known = near & set(held)
+        return {k: _SLABS if axis in near or not known else _SLABS / 8 for k, axis in enumerate(held)}
 
     def _adopt(self, attempt: Attempt, option: int, until: float) -> None:
         """Refine an attempt; it stays if that gains nothing."""
@@ -306,9 +335,9 @@ class Search:
         for child in children:
             self._solve(child, until)
         gain = max(attempt.level - log_sum([child.level for child in children]), 0.0)
-        attempt.gains[option] = gain
-        if option < 0:  # which coordinate's slabs help differs from wall to wall
+        if option < 0 and option not in attempt.gains:  # which coordinate's slabs help differs from wall to wall
             self.gains[option] = gain
+        attempt.gains[option] = gain
         if gain > 0:
             for child in children:
                 child.gains = dict(attempt.gains)
@@ -320,7 +349,7 @@ class Search:
         pieces = len(times) - 1
         key = slabs if self.dynamics.autonomous else (*slabs, times.tobytes())
         if key not in self.kept:
-            low, high = _grid(self.setting.dimension, self.dynamics.held, slabs)
+            low, high = grid(self.setting.dimension, self.dynamics.held, slabs)
             spans = [(0.0, self.horizon)] if self.dynamics.autonomous else list(itertools.pairwise(times))
             cells = [self.dynamics.over(low, high, *span) for span in spans]
             self.kept[key] = [StatedCells(self.setting, one) for one in cells]
@@ -369,21 +398,6 @@ class Search:
     def _mirrors(self, slabs: tuple[int, ...], cells: Cells) -> None:
         if slabs not in self.mirrors:
             self.mirrors[slabs] = mirrors(self.setting, cells)
-
-
-def _groups(setting: Setting, *, together: bool) -> list[tuple[Wall, ...]]:
-    """The walls, but sides of the working box as one at first: few are worth programs of their own."""
-    sides = tuple(wall for wall in setting.walls if wall.side is not None)
-    alone = [(wall,) for wall in setting.walls if wall.side is None]
-    return alone + ([sides] if together and sides else apart(sides))
-
-
-def _grid(n: int, held: Sequence[int], slabs: Sequence[int]) -> tuple[Array, Array]:
-    """Cells that cover [-1, 1]^n: slabs of the held coordinates."""
-    cuts = [np.linspace(-1.0, 1.0, slabs[held.index(axis)] + 1 if axis in held else 2) for axis in range(n)]
-    low = np.stack([axis.ravel() for axis in np.meshgrid(*(cut[:-1] for cut in cuts), indexing="ij")], axis=1)
-    high = np.stack([axis.ravel() for axis in np.meshgrid(*(cut[1:] for cut in cuts), indexing="ij")], axis=1)
-    return low, high
 
 
 def _log10(target: float) -> float:

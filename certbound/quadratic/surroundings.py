@@ -59,7 +59,7 @@ def working_box(problem: Problem, margin: float) -> tuple[Array, Array]:
 
 
 def _evened(problem: Problem, low: Array, high: Array) -> tuple[Array, Array]:
-    """Ends as far from the middle of the starts on both sides, where they nearly are: mirrored bounds then serve both."""
+    """Ends as far from the middle of the starts on both sides, where they nearly are: a mirrored bound serves both."""
     middle = problem.initial.hull().mid
     below, above = middle - low, high - middle
     near = np.maximum(below, above) <= _NEARLY * np.minimum(below, above)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -114,6 +115,30 @@ class Attempt:
     def blocks(self) -> int:
         """Matrix inequalities of its program."""
         return int(3 * (len(self.times[0]) - 1) * math.prod(self.slabs) * 2 ** len(self.slabs))
+
+
+class Option(NamedTuple):
+    """A refinement of the attempt at a place: what of its logarithm it may gain, and the seconds that it may take."""
+
+    place: int
+    kind: int
+    gain: float
+    seconds: float
+
+    def worth(self, parts: Array) -> float:
+        """What it may take off the sum each second; ``parts`` are logarithms."""
+        part = math.exp(parts[self.place] - parts.max())
+        return -part * math.expm1(-self.gain) / self.seconds if self.place >= 0 else -1.0
+
+
+NOTHING = Option(-1, 0, 0.0, math.inf)
+
+
+def groups(walls: Sequence[Wall], *, together: bool) -> list[tuple[Wall, ...]]:
+    """The walls, but sides of the working box as one at first: few are worth programs of their own."""
+    sides = tuple(wall for wall in walls if wall.side is not None)
+    alone = [(wall,) for wall in walls if wall.side is None]
+    return alone + ([sides] if together and sides else apart(sides))
 
 
 def apart(walls: Sequence[Wall]) -> list[tuple[Wall, ...]]:
