@@ -16,7 +16,7 @@ from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.quadratic.corners import Cells, Dynamics, curved_axes, grid
 from certbound.quadratic.inequality import corner_levels, prove
-from certbound.quadratic.mirrors import Mirror, mirrors
+from certbound.quadratic.mirror_images import Mirror, mirrors
 from certbound.quadratic.setting import Setting, make_setting, refuse
 from certbound.quadratic.surroundings import moved_sides, working_box
 from certbound.quadratic.wall_attempts import (
@@ -259,25 +259,21 @@ class Search:
     def run(self, target: float, share: float, found: Callable[[QuadraticBound], object]) -> None:
         """Refine the wall that counts most until the target or the time is reached; each better bound is told."""
         until = time.perf_counter() + share
-        level = parts = None
         while True:
             level, parts = total(self.attempts)
             found(self._answer(level))
             if level / math.log(10) <= _log10(target) or time.perf_counter() > until:
                 return
             places = np.flatnonzero(parts >= level + math.log(_DONE)).tolist()
-            best = max((self._option(k, until) for k in places),
-                       key=lambda option: option.worth(parts), default=NOTHING)  # fmt: skip
-            if not self._refined(best, until):
+            options = [self._option(place, until) for place in places]
+            if not self._refined(max(options, key=lambda one: one.worth(parts), default=NOTHING), until):
                 return
 
     def by_wall(self) -> tuple[Array, float]:
         """The logarithm of every wall's bound, and of their sum."""
         walls = self.setting.walls
-        levels = []
-        for wall in walls:
-            levels.append(log_sum([one.level for one in self.attempts if wall in (one.wall, *one.others)]))
-        return np.array(levels), log_sum([one.level for one in self.attempts])
+        levels = [[one.level for one in self.attempts if wall in (one.wall, *one.others)] for wall in walls]
+        return np.array([log_sum(one) for one in levels]), log_sum([one.level for one in self.attempts])
 
     def _answer(self, level: float) -> QuadraticBound:
         finest = max(self.attempts, key=lambda attempt: attempt.blocks, default=None)

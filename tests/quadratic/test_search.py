@@ -81,7 +81,7 @@ def test_a_search_refines_in_windows_that_cover_the_horizon() -> None:
     assert all(bound.upper < 0 for bound in search.first(0.0, 20.0))
     search.gains = {PIECES: 0.0}  # say that pieces are no use
     for _ in range(2):
-        search._refined(0, np.inf)
+        search._refined(search._option(0, np.inf), np.inf)
     windows = sorted(one.during for one in search.attempts if one.wall is search.attempts[0].wall)
     assert len(windows) > 1
     ends = [0.0, *itertools.chain.from_iterable(windows), 6.0]

@@ -91,11 +91,13 @@ def _on_cells(cells: Cells, signs: Array, inside: Integers) -> Iterator[Mirror]:
     moves = _moves(n, cells.held, signs)
     stay, last = np.arange(count), count.bit_length() - 2
     swapped, corners = _swapped(cells, signs[:n]), stay ^ sum(1 << last - k for k in turned)
-    if swapped is not None and _keeps(cells, signs, corners, swapped):
+    if swapped is None:
+        return
+    single = len(cells.low) == 1 and 0 < len(turned) == len(cells.held)
+    if _keeps(cells, signs, corners, swapped):
         yield Mirror(signs=signs, corners=corners, cells=swapped, moves=moves, inside=inside)
-    elif swapped is not None and len(cells.low) == 1 and 0 < len(turned) == len(cells.held):
-        if _keeps(cells, signs, stay, swapped):  # the corners are the same: each keeps its side
-            yield Mirror(signs=signs, corners=stay, cells=swapped, moves=-moves, inside=inside)
+    elif single and _keeps(cells, signs, stay, swapped):  # the corners are the same, so each may keep its side
+        yield Mirror(signs=signs, corners=stay, cells=swapped, moves=-moves, inside=inside)
 
 
 def _moves(n: int, held: Sequence[int], signs: Array) -> Array:
