@@ -123,7 +123,7 @@ def _over_ball(around: Surroundings, wall: _Value) -> arb:
     z = [(arb(c) - m) / w for c, m, w in zip(initial.centre, around.center, around.width)]
     here = wall.matrices[0]
     slope = (here * arb_mat(n + 1, 1, [*z, arb(1)])).entries()[:n]
-    rise = sum(((r * x) ** 2 for r, x in zip(radius, slope)), arb(0)).sqrt()
+    rise = sum(((r * x).abs_upper() ** 2 for r, x in zip(radius, slope)), arb(0)).sqrt()
     bend = largest_eigenvalue(matrix([[radius[i] * radius[j] * here[i, j] for j in range(n)] for i in range(n)]))
     return (wall.paid + wall.at(z) + rise + bend / 2).exp()
 

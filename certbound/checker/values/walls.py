@@ -152,6 +152,6 @@ def value(form: arb_mat, z: Sequence[arb]) -> arb:
     """z' Q z over a box of z."""
     total, size = arb(0), len(z)
     for i in range(size):
-        total += form[i, i] * z[i] ** 2
+        total += form[i, i] * z[i] * z[i]
         total += sum((2 * form[i, j] * z[i] * z[j] for j in range(i)), arb(0))
     return total

@@ -23,7 +23,7 @@ from certbound.checker.reading import Record
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import read_model, starts_of
 from certbound.checker.values import batches as tm
-from certbound.checker.values import check_values_below, quadratic
+from certbound.checker.values import check_values_below, quadratic, walls
 from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.crossing import has_full_rank
 from certbound.checker.values.hermite import Surface
@@ -367,6 +367,14 @@ def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:
     assert data["claim"]["method"] == "quadratic"
     found = bound_quadratic(problem, target=0.5, seconds=60.0).upper
     assert found - 1e-6 <= report.log10_proved < found + 0.1
+
+
+def test_forms_are_bounded_over_boxes_about_zero() -> None:
+    """The square of a ball about 0 by ``**`` is no number: a box of starts in the middle of the working box."""
+    found = walls.value(arb_mat([[1, 0], [0, 2]]), [arb(0, 1), arb(1)])
+    assert found.is_finite()
+    assert found.contains(2)
+    assert found.contains(3)
 
 
 def test_many_quadratic_bounds_are_not_all_unpacked() -> None:
