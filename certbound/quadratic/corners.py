@@ -110,9 +110,10 @@ class Dynamics:
         return tuple(sorted(found))
 
     def remainder(self, low: Array, high: Array) -> float:
-        """The largest remainder of the drift over cells at time 0, in working boxes within the horizon."""
+        """The largest remainders of the drift over cells at time 0, in working boxes within the horizon: their norm."""
         cells = _Boxes(low, high, Interval.point(0.0), self.setting, self.disturbed)
-        return float(np.max(self._drift_parts(cells)[-1].sum(axis=-1).hi)) * self.horizon
+        rows = np.max(self._drift_parts(cells)[-1].sum(axis=-1).hi, axis=0)
+        return float(np.linalg.norm(rows)) * self.horizon
 
     def over(self, low: Array, high: Array, start: float, end: float) -> Cells:
         """The cells [low, high], shape (C, n), of the working box during [start, end].

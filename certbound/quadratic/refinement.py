@@ -230,7 +230,7 @@ class Search:
         while least > _LOOSE and math.prod(slabs) < most:
             trials = [[2 * count if k == axis else count for k, count in enumerate(slabs)] for axis in range(len(held))]
             values = [self.dynamics.remainder(*grid(n, held, trial)) for trial in trials]
-            if not values or min(values) > 0.9 * least:
+            if not values or min(values) > 0.95 * least:
                 break
             slabs, least = trials[int(np.argmin(values))], min(values)
         return tuple(slabs)
@@ -265,14 +265,13 @@ class Search:
             if level / math.log(10) <= _log10(target) or time.perf_counter() > until:
                 return
             places = np.flatnonzero(parts >= level + math.log(_DONE)).tolist()
-            options = [self._option(place, until) for place in places]
+            options = (self._option(place, until) for place in places)
             if not self._refined(max(options, key=lambda one: one.worth(parts), default=NOTHING), until):
                 return
 
     def by_wall(self) -> tuple[Array, float]:
         """The logarithm of every wall's bound, and of their sum."""
-        walls = self.setting.walls
-        levels = [[one.level for one in self.attempts if wall in (one.wall, *one.others)] for wall in walls]
+        levels = [[one.level for one in self.attempts if w in (one.wall, *one.others)] for w in self.setting.walls]
         return np.array([log_sum(one) for one in levels]), log_sum([one.level for one in self.attempts])
 
     def _answer(self, level: float) -> QuadraticBound:
@@ -292,13 +291,12 @@ class Search:
         """The refinement of an attempt that promises most for its time."""
         attempt = self.attempts[place]
         hopes = {PIECES: _HOPE, SPLIT: _HOPE} | self._slabs(attempt)
-        if attempt.proved is None:  # windows are no cure
-            del hopes[SPLIT]
-        left = until - time.perf_counter()
+        if not attempt.level < 0:  # windows are no cure, and pieces seldom
+            hopes = {PIECES: _HOPE / 3} | self._slabs(attempt)
+        left, found = until - time.perf_counter(), []
         if attempt.others and attempt.gains.get(APART, math.inf) > 0:
             many = _SINGLE * len(attempt.finer(APART)) * attempt.seconds
             hopes = {APART if many < left or not attempt.paired else PAIRS: 1.0}
-        found = []
         for kind, hope in hopes.items():
             blocks = sum(child.blocks for child in attempt.finer(kind))
             seconds = (_SINGLE if kind in (APART, PAIRS) else 1.3) * blocks / attempt.blocks * attempt.seconds
@@ -331,6 +329,8 @@ class Search:
         for child in children:
             self._solve(child, until)
         gain = max(attempt.level - log_sum([child.level for child in children]), 0.0)
+        if gain == attempt.level == 0 and len(children) == 1 and children[0].found < math.inf:
+            gain = max(attempt.found - children[0].found, 0.0)
         if option < 0 and option not in attempt.gains:  # which coordinate's slabs help differs from wall to wall
             self.gains[option] = gain
         attempt.gains[option] = gain

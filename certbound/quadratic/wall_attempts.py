@@ -62,6 +62,11 @@ class Attempt:
         return 0.0 if self.proved is None else min(self.proved.level, 0.0)
 
     @property
+    def found(self) -> float:
+        """The level, above 0 too, where it bounds nothing but says how far that is."""
+        return math.inf if self.proved is None else self.proved.level
+
+    @property
     def key(self) -> tuple[object, ...]:
         """What is tried: walls, window, pieces and slabs."""
         return tuple(map(id, (self.wall, *self.others))), self.during, self.pieces, self.slabs

@@ -88,6 +88,30 @@ def test_a_search_refines_in_windows_that_cover_the_horizon() -> None:
     assert ends[::2] == ends[1::2]
 
 
+def test_bends_of_two_coordinates_alike_are_both_cut_before_anything_is_solved() -> None:
+    """Two oscillators with cubes: slabs of one alone leave the largest remainder as it is."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -x[0] - 0.5 * x[0] ** 3 - 1.2 * x[1] + 0.3 * (x[2] - x[0]),
+                   x[3], -x[2] - 0.5 * x[2] ** 3 - 1.2 * x[3] + 0.3 * (x[0] - x[2])],
+        states=4, diffusion=[[0, 0], [0.45, 0], [0, 0], [0, 0.45]],
+    )  # fmt: skip
+    free = cb.Box([-1, -np.inf, -1, -np.inf], [1, np.inf, 1, np.inf])
+    problem = cb.Problem(system, initial=cb.Box([-0.1] * 4, [0.1] * 4), safe=[cb.Inside(free)], horizon=3)
+    search = make_search(problem, *working_box(problem, 4.0), together=True)
+    assert search.attempts[0].slabs == (4, 2)
+
+
+def test_a_refinement_of_what_bounds_nothing_counts_by_how_far_it_is() -> None:
+    """Slabs that bring a level nearer to 0 are kept, though both bound nothing."""
+    search = make_search(problem_of(4.0, 1.0), *working_box(problem_of(4.0, 1.0), 4.0), together=True)
+    attempt = search.attempts[0]
+    search._solve(attempt, np.inf)
+    assert 0 == attempt.level < attempt.found
+    search._adopt(attempt, 0, np.inf)
+    assert search.attempts[0].found < attempt.found
+    assert attempt.gains[0] == attempt.found - search.attempts[0].found
+
+
 def test_sides_move_to_where_they_cost_a_share() -> None:
     problem = problem_of()
     low, high = working_box(problem, 4.0)
