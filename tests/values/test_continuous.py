@@ -435,7 +435,7 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pyt
     truth = math.log(1 - (1 - alone) ** 2)
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
     plane = two_sides._plane(problem, model, room.outer_low, room.outer_high, starts)
-    plan = plan_below(plane, truth, 1200)
+    plan = plan_below(plane, truth, 2500)
     proposals: list[Any] = []
     monkeypatch.setattr(plane_below, "propose_plane", lambda *given: proposals.append(given) or propose_plane(*given))
     found = bound_plane_below(plane, model, plan, starts, None)
