@@ -121,7 +121,7 @@ MANY_DOORS = {
     "gaussian.response": (18, "events in discrete and continuous time, for noise that depends on the state and not"),
     "reach.linear": (16, "certificates state the records of the search: its linearisation, shares, levels, references"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
-    "constants.programs": (15, "one program each for rate, gain and erosion, with what it is asked"),
+    "constants.programs": (16, "one program each for rate, gain and erosion, with what it is asked; the solver"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
     "problem.sets": (18, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),

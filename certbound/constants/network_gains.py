@@ -23,10 +23,10 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.checks import frozen
-from certbound.constants.programs.lmi import solve
+from certbound.constants.programs import solve
 from certbound.errors import CertificateError
-from certbound.problem.model.network_rows import weights_of
-from certbound.problem.networks.network_functions import NetworkFunction
+from certbound.problem.model import weights_of
+from certbound.problem.networks import NetworkFunction
 from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval, matmul
 from certbound.rigor.planes import Weights

@@ -207,7 +207,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="where the policies and problem files are written")
     folder = parser.parse_args().folder
     for task in TASKS:
-        for activation, width in (("tanh", 64), ("tanh", 128), ("relu", 64)):
+        for activation, width in (("tanh", 64), ("tanh", 128), ("tanh", 256), ("relu", 64)):
             print(write(folder, task, width=width, activation=activation))
 
 

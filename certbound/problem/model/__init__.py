@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from certbound.problem.model.evaluation import compile_numpy, compile_scalar
     from certbound.problem.model.graph import Graph, substitute
     from certbound.problem.model.network_data import PARTS, Layer, Network, Part
-    from certbound.problem.model.network_rows import relaxed
+    from certbound.problem.model.network_rows import relaxed, weights_of
     from certbound.problem.model.operations import (
         OPERATIONS,
         ROWS,
@@ -45,7 +45,7 @@ _HOME = {
     "evaluation": "compile_numpy compile_scalar",
     "graph": "Graph substitute",
     "calling": "call_network",
-    "network_rows": "relaxed",
+    "network_rows": "relaxed weights_of",
     "network_data": "PARTS Layer Network Part",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
@@ -87,6 +87,7 @@ __all__ = [
     "undefined_where",
     "varying_outputs",
     "watched",
+    "weights_of",
 ]
 
 __getattr__, __dir__ = lazily(__name__, _HOME, __all__)
