@@ -203,7 +203,10 @@ def test_what_is_not_served_is_refused_in_words():
 
 
 @pytest.mark.slow
-def test_bounds_over_windows_are_close():
+def test_bounds_with_a_target_and_over_windows_are_close():
+    goal = bound_exits(walk(), target=cb.Box([-0.2, -0.2], [0.2, 0.2]), seconds=20.0)
+    assert LATE[0] / math.log(10) <= goal.upper < math.log10(0.65)
+    assert math.log10(0.12) < goal.lower <= LATE[1] / math.log(10)
     narrow = cb.Inside(cb.Box([-0.6, -0.6], [0.6, 0.6]), during=(1.0, 2.0))
     found = bound_exits(walk(initial=[0.1, 0.1], safe=[SQUARE, narrow], horizon=2.0), seconds=5.0)
     assert NARROW[0] / math.log(10) <= found.upper < math.log10(0.5)
