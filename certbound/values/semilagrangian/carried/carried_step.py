@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from certbound.arrays import Array
 from certbound.values.discrete import axis_kernel
@@ -25,6 +26,7 @@ from certbound.values.semilagrangian.remainders import upper_tail
 from certbound.values.semilagrangian.smoothers import across_by, peak, spans_of
 
 _UP = 1 + 1e-9
+_SOFT = 5  # cells: an odd number
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -116,8 +118,17 @@ class Layout:
 
 
 def terminal(layout: Layout) -> Array:
-    """The function at the horizon, half a step ahead: 0 but outside of the safe set."""
-    return around_nodes(layout.level, largest=True)
+    """The function at the horizon, half a step ahead: 1 outside of the safe set, falling to 0 over a few cells in it.
+
+    0 would do in all of the safe set; but fronts as steep as cells are dear.
+    """
+    level = around_nodes(layout.level, largest=True)
+    found = np.minimum(level, 1.0)
+    for axis in (0, 1):
+        found = np.asarray(maximum_filter1d(found, 2 * _SOFT - 1, axis=axis, mode="nearest"))
+        for _ in range(2):
+            found = np.asarray(uniform_filter1d(found, _SOFT, axis=axis, mode="nearest", origin=0))
+    return np.maximum(level, np.maximum(found, 0.0))
 
 
 def back(layout: Layout, value: Array) -> tuple[Array, float]:
