@@ -161,7 +161,7 @@ class Wall:
 
 
 def parts_of(region: Region, *, outside: bool, states: int = 2) -> Iterator[tuple[Region, bool]]:
-    """A constraint on so many states as parts (region, outside): a half-plane to keep out of is one to stay in, faces stand alone."""
+    """A constraint as parts (region, outside): a half-space to keep out of is one to stay in, faces stand alone."""
     form = region.form
     if not isinstance(form, Faces) or np.any(region.center_at()) or (outside and len(form.bounds) != 1):
         yield region, outside

@@ -1,10 +1,10 @@
 """V o Phi on the grid, V multilinear and Phi the noise-free step: values at nodes, allowances on cells; compiled.
 
 Along a side of a cell, with image c(tau), tau in [0, 1], and in the sense of distributions,
-    -(V o c)'' <= -2 sum_{b<e} V_be c_b' c_e' + sum_b |V_b| |c_b''| + sum (-kink of V at a plane)^+ |c_b'| delta(crossing),
+    -(V o c)'' <= -2 sum_{b<e} V_be c_b' c_e' + sum_b |V_b| |c_b''| + sum over planes of (-kink)^+ |c_b'| delta,
 so that V o c exceeds its chord by at most 1/8 of the bounded part and tau (1 - tau) of each mass at tau. Where c_b' may
-vanish, c_b is frozen instead: that costs |V_b| times the range of c_b. Interpolation axis by axis adds up over the axes,
-since interpolation is positive; sides at all places across the cell count.
+vanish, c_b is frozen instead: that costs |V_b| times the range of c_b. Interpolation axis by axis adds up over the
+axes, since interpolation is positive; sides at all places across the cell count.
 """
 
 from __future__ import annotations
@@ -114,7 +114,9 @@ def at_images(
                 r0 = radius[0, a, b, c] + 4e-16 * (abs(u) + abs(x[i]))
                 r1 = radius[1, a, b, c] + 4e-16 * (abs(v) + abs(y[j]))
                 r2 = radius[2, a, b, c] + 4e-16 * (abs(w) + abs(q[k]))
-                if u - r0 < x[0] or u + r0 > x[-1] or v - r1 < y[0] or v + r1 > y[-1] or w - r2 < q[0] or w + r2 > q[-1]:
+                if u - r0 < x[0] or u + r0 > x[-1] or v - r1 < y[0] or v + r1 > y[-1]:
+                    continue
+                if w - r2 < q[0] or w + r2 > q[-1]:
                     continue
                 m, n, o = _cell_of(x, u), _cell_of(y, v), _cell_of(q, w)
                 s = min(max((u - x[m]) / (x[m + 1] - x[m]), 0.0), 1.0)
@@ -190,7 +192,7 @@ def _excess(
     axis: int, start: Array, end: Array, rate: Array, bow: Array, window: Index, x: Array, y: Array, q: Array,
     slopes: Array, crosses: Array, down: Array,
 ) -> float:  # fmt: skip
-    """What V o Phi may exceed its chord by along a side; ranges of both ends and of c' (3, 2), bounds ``bow`` of |c''|."""
+    """What V o Phi may exceed its chord by along a side; ranges (3, 2) of its ends and of c', and ``bow`` >= |c''|."""
     total = 0.0
     moving = np.zeros(3)
     for b in range(3):
@@ -242,8 +244,9 @@ def _sides(part: Array, axis: int, low: Array, high: Array) -> None:
 def over_images(
     x: Array, y: Array, q: Array, shift: Array, radius: Array, known: Mask, blocks: tuple[Index, Index, Index],
     growth: Array, bends: Array, usable: Mask, reach: Array, slopes: Array, crosses: Array, down: Array, around: Array,
+    steep: Array,
 ) -> tuple[Array, Array, Mask]:  # fmt: skip
-    """Per cell: what V o Phi may exceed its interpolation by, ``around`` (m, cells) over its image, and what is unknown.
+    """Per cell: what V o Phi may exceed its interpolation by, ``around`` (m, cells) over its image, what is unknown.
 
     Returns
     -------
@@ -289,7 +292,8 @@ def over_images(
                     if least - reach[b] < mesh[0] or most + reach[b] > mesh[-1]:
                         fine = False
                         break
-                    close[2 * b], close[2 * b + 1] = _cell_of(mesh, least), _cell_of(mesh, most)
+                    spare = min(loose, (most - least) / 4)  # V is followed that far beyond a window by its slopes
+                    close[2 * b], close[2 * b + 1] = _cell_of(mesh, least + 2 * spare), _cell_of(mesh, most - 2 * spare)
                 if not fine:
                     lost[i, j, k] = True
                     continue
@@ -297,6 +301,7 @@ def over_images(
                     nearby[b, i, j, k] = _largest(around[b], close)
                 if nearby[0, i, j, k] + nearby[1, i, j, k] + nearby[2, i, j, k] == 0.0:
                     continue
+                excess[i, j, k] = 8 * loose * (steep[0] + steep[1] + steep[2])
                 for b in range(3):
                     local[b], local[3 + b] = _largest(slopes[b], close), _largest(crosses[b], close)
                 for a in range(3):

@@ -18,6 +18,7 @@ from certbound.values.semilagrangian.carried.carried_step import Layout, kick_of
 from certbound.values.semilagrangian.remainders import upper_tail
 
 _UP = 1 + 1e-9
+_LEAST = 0.1  # of the widest cells
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -47,7 +48,7 @@ class Fineness:
     @property
     def rare(self) -> float:
         """Upper bound of the probability of the events of one step that are not followed."""
-        return 10 * upper_tail(self.omega)
+        return 12 * upper_tail(self.omega)
 
 
 def layout_of(voyage: Voyage, fineness: Fineness) -> Layout:
@@ -85,16 +86,17 @@ def axes_of(voyage: Voyage, fineness: Fineness, step: float) -> tuple[Array, Arr
         beyond = 2.2 * step * fastest + 3 * wide
         depth = np.linspace(0.0, (high - low) / 2, 60)
         blur = most * voyage.noise * (step + depth / max(fastest, 1e-300)) ** 1.5  # of a front that has come that far
-        inside = np.clip(fineness.edge * blur, 1e-2 * wide, wide)
-        places = np.concatenate([[low - beyond, low - 3 * inside[0]], low + depth, (high - depth)[::-1], [high + 3 * inside[0], high + beyond]])
-        widths = np.concatenate([[wide, inside[0]], inside, inside[::-1], [inside[0], wide]])
+        inside = np.clip(fineness.edge * blur, _LEAST * wide, wide)
+        close = 3 * inside[0]
+        half = np.concatenate([[-beyond, -close], depth]), np.concatenate([[wide, inside[0]], inside])
+        places = np.concatenate([low + half[0], (high - half[0])[::-1]])
+        widths = np.concatenate([half[1], half[1][::-1]])
         found.append(graded_axis(low - beyond, high + beyond, places, widths, (low, high)))
     low, high = voyage.ends[2]
     cell = fineness.cell * voyage.noise * math.sqrt(step)
     count = math.ceil((high - low) / cell)
     cell = (high - low) / count
-    found.append(low + cell * np.arange(-3, count + 4))
-    return found[0], found[1], found[2]
+    return found[0], found[1], np.asarray(low + cell * np.arange(-3, count + 4))
 
 
 def _speeds(voyage: Voyage) -> tuple[Array, Array]:
@@ -103,7 +105,8 @@ def _speeds(voyage: Voyage) -> tuple[Array, Array]:
     points, size = [part.ravel() for part in grid], grid[0].size
     with np.errstate(all="ignore"):
         f = np.broadcast_to(compile_numpy(voyage.tape)(0.0, *points), (size, STATES))
-        slope = np.broadcast_to(compile_numpy(jacobian(voyage.tape, (STATES,)))(0.0, *points), (size, STATES, 1))[..., 0]
+        slope = compile_numpy(jacobian(voyage.tape, (STATES,)))(0.0, *points)
+    slope = np.broadcast_to(slope, (size, STATES, 1))[..., 0]
     fine = np.isfinite(f).all(axis=1) & np.isfinite(slope).all(axis=1)
     if not fine.any():
         raise InfeasibleError("the model is undefined all over the safe set; value functions prove nothing here.")
@@ -118,18 +121,19 @@ def _levels(voyage: Voyage, axes: tuple[Array, ...], blocks: Blocks, step: float
     least, most = blocks.noisy
     drift = blocks.inward * step * _UP
     met = blocks.known & (least <= ends[0]), blocks.known & (most >= ends[1])
-    inner = ends[0] + float(np.where(met[0], drift[0], 0.0).max()), ends[1] - float(np.where(met[1], drift[1], 0.0).max())
+    inward = [float(np.where(*pair, 0.0).max()) for pair in zip(met, drift)]
+    inner = ends[0] + inward[0], ends[1] - inward[1]
     level = np.empty(shape)
     for i in range(shape[0]):
         low = np.meshgrid(axes[0][i : i + 1], axes[1][:-1], axes[2][:-1], indexing="ij")
         high = np.meshgrid(axes[0][i + 1 : i + 2], axes[1][1:], axes[2][1:], indexing="ij")
-        place = np.ix_(blocks.index[0][i : i + 1], *blocks.index[1:])
+        place = np.ix_(blocks.index[0][i : i + 1], blocks.index[1], blocks.index[2])
         box = [
             (Interval(a, b) + Interval(blocks.back.lo[k][place], blocks.back.hi[k][place])).reshape(-1)
             for k, (a, b) in enumerate(zip(low, high))
         ]
         known = blocks.known[place].ravel()
-        bow, near = (part[(slice(None), *place)].reshape(2, -1) for part in (blocks.bow, blocks.near))
+        bow, near = ([side[place].ravel() for side in part] for part in (blocks.bow, blocks.near))
         kept = known & voyage.safe(box[:2], bow, near)
         crossed = (box[2].lo <= inner[0]) | (box[2].hi >= inner[1]) | ~known
         level[i] = np.where(crossed, 2.0, np.where(kept, 0.0, 1.0)).reshape(shape[1:])

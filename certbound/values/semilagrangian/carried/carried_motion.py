@@ -8,7 +8,8 @@ tube K that holds all these paths, A >= |Df|, c >= |f_qq|, g >= |f_q'| |f| and G
     |R| <= G [1.5 h A A e s int|D| + (g h/2) s int|D| + c s^2 |W_h| int_{h/2}^h |D| + c s^2/2 int D^2],
     |Z - Zhat| <= G [A e s int|D| + c s^2/2 int D^2].
 Given W_h = z sqrt(h), E D(t)^2 = t(1 - t/h) + z^2 t^2/h before h/2 and the mirror image after it, so that
-    E int D^2 = h^2 (1/6 + z^2/12),   E int|D| <= h^1.5 (.553 + .145 z^2),   |z| E int_{h/2}^h |D| <= h^1.5 (.103 + .248 z^2).
+    E int D^2 = h^2 (1/6 + z^2/12),   E int|D| <= h^1.5 (.553 + .145 z^2),
+    |z| E int_{h/2}^h |D| <= h^1.5 (.103 + .248 z^2).
 On the event that both halves of the noise stay within omega sqrt(h/2), |D| does too, and |W| stays within twice that.
 """
 
@@ -62,7 +63,7 @@ class Blocks:
     known : ndarray of bool
     """
 
-    index: tuple[Index, ...]
+    index: tuple[Index, Index, Index]
     back: Interval
     bow: Array
     near: Array
@@ -97,7 +98,7 @@ def blocks_of(voyage: Voyage, axes: Sequence[Array], step: float, omega: float) 
     rates, fine = _over(voyage.tape, way)
     known = known & fine
     back = rates * Interval.point(-step / 2)
-    start = [Interval(part.lo + d.lo, part.hi + d.hi) for part, d in zip(box, back)]
+    start = [part + back[k] for k, part in enumerate(box)]
     s = voyage.noise * (1 + voyage.spread)
     tube, held = _tube(voyage.tape, start, step, 2 * s * omega * math.sqrt(step / 2) * _UP)
     rates, fine = _over(voyage.tape, tube)
@@ -114,8 +115,9 @@ def blocks_of(voyage: Voyage, axes: Sequence[Array], step: float, omega: float) 
         name: np.where(known, part, 0.0).reshape(*part.shape[:-1], *shape) for name, part in parts.items()
     }
     q = tube[STATES - 1]
+    ends = [np.where(known, end, 0.0).reshape(STATES, *shape) for end in (back.lo, back.hi)]
     return Blocks(
-        index=tuple(index), back=Interval(*(np.where(known, e, 0.0).reshape(STATES, *shape) for e in (back.lo, back.hi))),
+        index=(index[0], index[1], index[2]), back=Interval(*ends),
         noisy=(q.lo.reshape(shape), q.hi.reshape(shape)), known=known.reshape(shape), **shaped,
     )  # fmt: skip
 
@@ -195,7 +197,7 @@ def exponential(matrix: Array) -> Array:
         total += term
     norm = matrix.sum(axis=1).max(axis=0)
     rest = np.where(norm < 6, norm**12 / math.factorial(12) / (1 - np.minimum(norm, 6.0) / 13), np.inf)
-    return np.where(matrix.sum(axis=(0, 1)) > 0, total + rest, total) * _UP
+    return np.where(total > 0, total + rest, 0.0) * _UP  # 0 after so many terms is 0 for good
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

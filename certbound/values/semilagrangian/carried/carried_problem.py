@@ -114,7 +114,9 @@ def voyage_of(problem: Problem) -> Voyage:
 
 def _limits(problem: Problem, noisy: int) -> tuple[list[Region], list[Region], Ends]:
     """Sets of the carried coordinates to stay in and to keep out of, and the limits of q, rounded inward."""
-    stays, obstacles, ends = [], [], [-math.inf, math.inf]
+    stays: list[Region] = []
+    obstacles: list[Region] = []
+    ends = [-math.inf, math.inf]
     for constraint in problem.constraints:
         if constraint.region.moving or constraint.during not in (None, (0.0, float(problem.horizon))):
             raise InfeasibleError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -27,6 +28,8 @@ from certbound.values.semilagrangian.smoothers import across_by, peak, spans_of
 
 _UP = 1 + 1e-9
 _SOFT = 5  # cells: an odd number
+_CUT = 2.0  # above which nothing is kept: a cut at 1 would put a concave kink where the function is steep
+_KEPT = 0.5  # share of what exceeds 1 that is kept each step where all around does
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -75,7 +78,7 @@ def kick_of(q: Array, sigma: float, spread: float, most: float) -> Kick:
     hats[:, 0] = hats[:, -1] = 0.0
     s = sigma * (1 + spread)
     beyond = np.array([
-        upper_tail((q[-2] - high) / s) + upper_tail((low - q[1]) / s) for low, high in zip(q[:-1], q[1:])
+        upper_tail((q[-2] - high) / s) + upper_tail((low - q[1]) / s) for low, high in itertools.pairwise(q)
     ])  # fmt: skip
     widths = np.diff(q)
     bend = peak(q[:-1], q[1:], q, q, sigma)[0] * widths[:, None] ** 2 / 8 * (1 + 4 * spread)
@@ -162,16 +165,17 @@ def _moved(layout: Layout, value: Array, top: float) -> tuple[Array, Array]:
     free = near(layout.level, layout.axes, layout.reach) < 2.0
     most = over_corners(np.maximum, value)
     far = [*slopes, np.where(free, np.minimum(most, 1.0), most), 1.0 - free]
-    around = [near(field, layout.axes, layout.reach) for field in far]
-    around = np.stack([*around, *(near(field, layout.axes, layout.sweep) for field in _swung(layout, beside(up), crosses))])
+    parts = [near(field, layout.axes, layout.reach) for field in far]
+    parts += [near(field, layout.axes, layout.sweep) for field in _swung(layout, beside(up), crosses)]
+    around = np.stack(parts)
     steep = slopes.max(axis=(1, 2, 3))
     moved = at_images(value, *layout.axes, images.shift, images.radius, images.known, steep, top)
     excess, nearby, lost = over_images(
         *layout.axes, images.shift, images.radius, images.known, blocks.index, blocks.growth, blocks.bends,
-        blocks.known, layout.reach, slopes, crosses, down, around,
+        blocks.known, layout.reach, slopes, crosses, down, around, steep,
     )  # fmt: skip
     highest, bound = nearby[3], (nearby[4] > 0) | lost
-    cut = np.where(around_nodes(bound.astype(float), largest=True) > 0, moved, np.minimum(moved, 1.0))
+    cut = np.where(around_nodes(bound.astype(float), largest=True) > 0, moved, np.minimum(moved, _CUT))
     excess += over_corners(np.maximum, moved - cut)
     filled = ~bound & (_lack(cut, np.ones(bound.shape)) < 8 * excess)
     price = sum(nearby[b] * blocks.left[:, b].sum(axis=0).max() for b in range(3))
@@ -184,11 +188,11 @@ def _moved(layout: Layout, value: Array, top: float) -> tuple[Array, Array]:
 
 def _lack(nodal: Array, level: Array) -> Array:
     """By how much the eight corners of cells are below a level, together."""
-    return np.sum([np.maximum(level - corner, 0.0) for corner in corners(nodal)], axis=0)
+    return np.asarray(np.sum([np.maximum(level - corner, 0.0) for corner in corners(nodal)], axis=0))
 
 
 def _swung(layout: Layout, kinks: Array, crosses: Array) -> list[Array]:
-    """On cells: bounds of E V(z + B d) - V(z) for kinks and cross derivatives as large as there: by |d_b|, and the rest."""
+    """On cells: bounds of E V(z + B d) - V(z) for kinks and cross derivatives as there: over |d_b|, and the rest."""
     swing = layout.blocks.swing.max(axis=(1, 2, 3))
     first, square = layout.sway[0], layout.sway[1] ** 2
     found = [
@@ -219,4 +223,4 @@ def _levelled(layout: Layout, found: Array) -> Array:
     found = np.where(live, np.maximum(found, level), level)
     full = over_corners(np.minimum, found) >= 1.0
     capped = (around_nodes(full.astype(float), largest=False) > 0) & (level <= 1.0)
-    return np.where(capped, 1.0, found)
+    return np.where(capped, 1 + _KEPT * (found - 1), found)
