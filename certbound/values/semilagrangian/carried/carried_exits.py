@@ -20,9 +20,9 @@ from certbound.values.semilagrangian.flows import flow
 from certbound.watch import OutOfTime, poll
 
 _TALLEST = 100.0
-_PLANS = ((0.1, 16, 0.6), (0.07, 28, 0.5), (0.05, 40, 0.5), (0.05, 56, 0.5), (0.05, 72, 0.45), (0.04, 100, 0.4))
+_PLANS = ((0.1, 16, 0.6), (0.07, 28, 0.5), (0.05, 40, 0.5), (0.05, 60, 0.5), (0.05, 80, 0.45), (0.04, 110, 0.4))
 """Lengths of the steps, relative to the time in which f turns; cells between faces; cells along q."""
-_RATE = 450_000
+_RATE = 350_000
 """Nodes times steps that are done in a second."""
 _OMEGA = 4.2  # for answers not far below 1; others ask for more
 _LEAST, _MOST = 8, 2000
