@@ -104,22 +104,23 @@ def simulated(problem: cb.Problem, voyage: Voyage, count: int, rng: np.random.Ge
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("safe", "most"),
+    "safe",
     [
-        (None, 6.0),
-        ([cb.Inside(cb.Ball([0, 0], 0.8, coordinates=[0, 1]))], 6.0),
-        ([cb.Inside(cb.Box([-1, -1], [2, 1], coordinates=[0, 1])),
-          cb.Outside(cb.Ball([0.6, 0.3], 0.3, coordinates=[0, 1]))], 6.0),
-        ([cb.Inside(cb.Box([-1, -1, -1.2], [2, 1, 1.2]))], 6.0),
+        None,
+        [cb.Inside(cb.Ball([0, 0], 0.8, coordinates=[0, 1]))],
+        [cb.Inside(cb.Box([-1, -1], [2, 1], coordinates=[0, 1])),
+         cb.Outside(cb.Ball([0.2, 0.7], 0.2, coordinates=[0, 1]))],
+        [cb.Inside(cb.Box([-1, -1, -1.2], [2, 1, 1.4]))],
     ],
 )  # fmt: skip
-def test_bounds_are_above_what_simulation_counts(safe, most) -> None:
-    problem = vehicle(safe=safe)
+def test_bounds_are_above_what_simulation_counts(safe) -> None:
+    problem = vehicle(0.5, f=lambda x: [np.cos(x[2]), np.sin(x[2]), -0.2 * x[2]], safe=safe, start=(0.0, 0.35, 1.1))
     voyage = voyage_of(problem)
     share = simulated(problem, voyage, 8000, np.random.default_rng(1))
     error = math.sqrt(share * (1 - share) / 8000)
-    bound = bound_by_kicks(voyage, Fineness(count=14, cells=20, edge=1.5, cell=0.6, omega=4.2))
-    assert share - 4 * error <= bound <= min(1.0, most * share + 0.2)
+    bound = bound_by_kicks(voyage, Fineness(count=10, cells=16, edge=1.5, cell=0.6, omega=4.2))
+    assert share > 0.01
+    assert bound >= share - 4 * error
 
 
 def test_who_surely_leaves_counts_1(ready) -> None:
