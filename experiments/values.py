@@ -109,6 +109,15 @@ def lorenz() -> cb.Problem:
     return cb.Problem(system, initial=cb.Box([-0.2] * 3, [0.2] * 3), safe=safe, horizon=2)
 
 
+def unicycle() -> cb.Problem:
+    """A vehicle of speed 1 with noise on its heading alone."""
+    system = cb.ContinuousSystem(
+        lambda x: [np.cos(x[2]), np.sin(x[2]), 0 * x[2]], states=3, diffusion=[[0.0], [0.0], [1.0]]
+    )
+    safe = [cb.Inside(cb.Box([-1, -1], [3, 1], coordinates=[0, 1]))]
+    return cb.Problem(system, initial=cb.Box([-0.05] * 3, [0.05] * 3), safe=safe, horizon=2)
+
+
 def cube() -> cb.Problem:
     """Brownian motion in a cube, from its middle: three independent lines."""
     system = cb.ContinuousSystem(lambda x: [0 * x[0], 0 * x[1], 0 * x[2]], states=3, diffusion=0.35 * np.eye(3))
@@ -133,6 +142,7 @@ CASES: tuple[Case, ...] = (
     Case(name="in an ellipse", problem=in_ellipse, truth="paths", upper=1.3, lower=None),
     Case(name="half-disc in its box", problem=half_disc, truth="paths", upper=1.3, lower=None),
     Case(name="Lorenz-like", problem=lorenz, truth="paths", upper=5.0, lower=None),
+    Case(name="unicycle", problem=unicycle, truth="paths", upper=2.0, lower=None),
     Case(name="cube", problem=cube, truth="paths", upper=1.5, lower=None),
     *(Case(name=name, problem=make, truth="paths", upper=1.1, lower=1.1)
       for name, make in values_discrete.PROBLEMS.items()),

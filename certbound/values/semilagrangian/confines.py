@@ -160,12 +160,12 @@ class Wall:
         return bool(upright) and np.count_nonzero(tilts) == 2 and height > 2 * swing * _UP
 
 
-def parts_of(region: Region, *, outside: bool) -> Iterator[tuple[Region, bool]]:
-    """A constraint as parts (region, outside): a half-plane to keep out of is one to stay in, faces stand alone."""
+def parts_of(region: Region, *, outside: bool, states: int = 2) -> Iterator[tuple[Region, bool]]:
+    """A constraint as parts (region, outside): a half-space to keep out of is one to stay in, faces stand alone."""
     form = region.form
     if not isinstance(form, Faces) or np.any(region.center_at()) or (outside and len(form.bounds) != 1):
         yield region, outside
         return
     sign = -1.0 if outside else 1.0
-    for normal, bound in zip(region.lifted(form.normals, 2), form.bounds):
+    for normal, bound in zip(region.lifted(form.normals, states), form.bounds):
         yield HalfSpace(sign * normal, sign * float(bound)), False

@@ -1,4 +1,4 @@
-"""The door: an upper bound of the probability of leaving a box, for noise in one of two coordinates."""
+"""The door: bounds of the probability of leaving, for noise in one coordinate of two or three."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from certbound.problem.problem import Problem
 from certbound.values.continuous import ExitBounds
 from certbound.values.grids import around_nodes
 from certbound.values.semilagrangian.backward import Bounds, back, highest, limited, lowest
+from certbound.values.semilagrangian.carried import bound_carried_exits, carries
 from certbound.values.semilagrangian.groundwork import Layout, Plan, layout_of, nodes_of
 from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
@@ -47,7 +48,7 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     Parameters
     ----------
     problem : Problem
-        Two states in continuous time, constant noise in one of them, a bounded safe box, no time in the model.
+        Two or three states in continuous time, constant noise in one of them, no time in the model.
     seconds : float
         About what may be spent, as a number of nodes and steps: bounds do not depend on the clock. The coarsest grid
         is finished in any case.
@@ -68,6 +69,8 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     """
     if not seconds > 0:
         raise ValueError(f"`seconds` must be positive, got {seconds!r}.")
+    if carries(problem):
+        return bound_carried_exits(problem, seconds=seconds)
     begin = time.process_time()
     setting = setting_of(problem)
     turn = _turn(setting)

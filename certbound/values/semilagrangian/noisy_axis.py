@@ -88,9 +88,9 @@ class Setting:
 
 
 def serves(problem: Problem) -> bool:
-    """Whether a problem has two states in continuous time, and noise that surely leaves one of them alone."""
+    """Whether a problem has two or three states in continuous time, and noise that surely moves one of them only."""
     system = problem.system
-    if not isinstance(system, ContinuousSystem) or system.dimension != 2 or isinstance(system.diffusion, Tape):
+    if not isinstance(system, ContinuousSystem) or system.dimension not in (2, 3) or isinstance(system.diffusion, Tape):
         return False
     moved = np.any(np.asarray(system.diffusion) != 0, axis=1)
     return int(moved.sum()) == 1
@@ -105,7 +105,7 @@ def setting_of(problem: Problem) -> Setting:
         Disturbances, time in the model, windows, moving sets; the message says which.
     """
     system = problem.system
-    if not serves(problem) or not isinstance(system, ContinuousSystem):
+    if not serves(problem) or not isinstance(system, ContinuousSystem) or system.dimension != 2:
         raise InfeasibleError("steps along the flow serve two states with constant noise in one of them.")
     if system.disturbance is not None or problem.input_sequence is not None:
         raise InfeasibleError(

@@ -86,7 +86,7 @@ def along(nodes: Array, sigma: float, spread: float, rows: slice, lines: slice) 
     hats = _dense(forth, "hat", len(source))
     kinks = _dense(back, "hat", len(nodes[around]))[:, 1:-1].T
     whole = _dense(back, "whole", len(nodes[around]) - 1)[:, 1:-1].T
-    density = _peak(mesh[:-1], mesh[1:], source, source, sigma)[0]
+    density = peak(mesh[:-1], mesh[1:], source, source, sigma)[0]
     widths, cells = np.diff(source), np.diff(mesh)
     bend = np.zeros(len(source))
     bend[1:-1] = 1 / widths[:-1] + 1 / widths[1:]
@@ -106,16 +106,16 @@ def across(nodes: Array, sigma: float, spread: float, stretch: float) -> Across:
     kernel = axis_kernel(nodes, nodes, sigma, spread)
     values = tuple(_dense(kernel, "hat", len(nodes), order) for order in range(3))
     parabolas = tuple(_dense(kernel, "bubble", len(nodes) - 1, order) for order in range(3))
-    sup = _peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma)
-    density = _peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma, stretch)[0]
+    sup = peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma)
+    density = peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma, stretch)[0]
     wide = _mass(nodes, nodes, sigma, WIDER)
     return Across(
         values=values, parabolas=parabolas, sup=sup, density=density, mass=np.minimum(density * np.diff(nodes), 1.0),
-        wide=wide, error=kernel.error, spans=_spans([*values, *parabolas, *sup, density, wide]),
+        wide=wide, error=kernel.error, spans=spans_of([*values, *parabolas, *sup, density, wide]),
     )  # fmt: skip
 
 
-def _spans(matrices: list[Array]) -> tuple[tuple[int, int, int, int], ...]:
+def spans_of(matrices: list[Array]) -> tuple[tuple[int, int, int, int], ...]:
     """Blocks of rows with the columns in which some of the matrices is not 0."""
     rows, columns = (max(matrix.shape[axis] for matrix in matrices) for axis in (0, 1))
     found = np.zeros((rows, columns), dtype=bool)
@@ -147,7 +147,7 @@ def _dense(kernel: AxisKernel, name: str, columns: int, order: int = 0) -> Array
     return found
 
 
-def _peak(
+def peak(
     low: Array, high: Array, left: Array, right: Array, sigma: float, stretch: float = 1.0
 ) -> tuple[Array, Array, Array]:
     """sup of |phi_s|, |phi_s'|, |phi_s''| over differences of cells and s in [sigma, sigma stretch]."""
@@ -177,5 +177,5 @@ def _peak(
 
 def _mass(mesh: Array, source: Array, sigma: float, ratio: float = 1.0) -> Array:
     """min(1, D_i sup phi), shape (mesh cells, cells)."""
-    density = _peak(mesh[:-1], mesh[1:], source[:-1], source[1:], sigma * ratio)[0]
+    density = peak(mesh[:-1], mesh[1:], source[:-1], source[1:], sigma * ratio)[0]
     return np.minimum(density * np.diff(source), 1.0)
