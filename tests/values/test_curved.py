@@ -272,7 +272,7 @@ def test_the_worst_point_of_a_ball_of_starts_counts_and_starts_at_a_wall_are_los
 def test_what_is_not_served_is_refused_in_words() -> None:
     moving = cb.Inside(cb.Ball(lambda t: [0.1 * t, 0.0], 1.0))
     window = cb.Inside(cb.Ball([0.0, 0.0], 1.0), during=(0.5, 1.0))
-    for safe, message in ((moving, "moving sets"), (window, "over a window")):
+    for safe, message in ((moving, "moving boxes only"), (window, "over windows serve fixed boxes only")):
         with pytest.raises(InfeasibleError, match=message):
             bound_exits(in_disc(safe=[safe]))
     with pytest.raises(InfeasibleError, match="random start"):

@@ -73,10 +73,12 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
     effort = min(attempt, len(_ROOMS) - 1)
     if problem.ending:
         raise CertificateError("certificates of lower bounds count leaving the domain as failing.")
-    if answer.log10_lower is None or answer.details is None:
+    if answer.log10_lower is None:
         raise CertificateError("no lower bound was found.")
     if not problem.initial.random and problem.initial.data(_STARTS)["kind"] not in _STARTS:
         raise CertificateError("lower bounds are stated from starts in a box, a ball or an ellipsoid, or normal ones.")
+    if answer.details is None:
+        raise CertificateError("certificates do not state rates of leaving.")
     flat = isinstance(answer.details, ExitBounds) and problem.system.dimension > 1
     claim = _claim_below(answer.log10_lower, problem.delta, _ROOMS[effort] * (_MORE_ROOM if flat else 1))
     if isinstance(answer.details, ExitBounds):

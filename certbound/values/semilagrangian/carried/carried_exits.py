@@ -6,7 +6,6 @@ import math
 import time
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from certbound.arrays import Array
 from certbound.problem.model import compile_numpy, jacobian
@@ -106,6 +105,8 @@ def bound_by_kicks(voyage: Voyage, fineness: Fineness) -> float:
 
 def highest(voyage: Voyage, layout: Layout, value: Array, half: float) -> float:
     """Upper bound of the function over where the starts are half a step later."""
+    from scipy.interpolate import RegularGridInterpolator
+
     parts = [np.linspace(low, high, 4 if high > low else 2) for low, high in voyage.starts]
     low = [part.ravel() for part in np.meshgrid(*(part[:-1] for part in parts), indexing="ij")]
     high = [part.ravel() for part in np.meshgrid(*(part[1:] for part in parts), indexing="ij")]

@@ -7,7 +7,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from certbound.arrays import Array
 from certbound.values.discrete import axis_kernel
@@ -125,6 +124,8 @@ def terminal(layout: Layout) -> Array:
 
     0 would do in all of the safe set; but fronts as steep as cells are dear.
     """
+    from scipy.ndimage import maximum_filter1d, uniform_filter1d
+
     level = around_nodes(layout.level, largest=True)
     found = np.minimum(level, 1.0)
     for axis in (0, 1):
