@@ -1,9 +1,8 @@
 """The search for a verdict: which engine is asked when, and what is kept once the time is over.
 
-Sketches come first, since they cost next to nothing; then the engines in turn, until one has proved SAFE, and last
-those of which a sketch says that they have hardly a chance; then those that spared themselves, thoroughly. Under a
-limit of time an engine that takes long is interrupted, early for the first bounds of those that have one soon, later
-for all others, and goes on with what they leave: none starves, and nothing is proved twice.
+Sketches come first, since they cost next to nothing; then the engines in turn, until one has proved SAFE, those that
+have hardly a chance last; then those that spared themselves. Under a limit of time an engine that takes long is
+interrupted, early for first bounds, later for all others, and goes on with what they leave: none starves.
 """
 
 from __future__ import annotations
@@ -92,6 +91,7 @@ class _Search:
         self.sketches: dict[str, EngineAnswer] = {}
         self.chances: dict[Any, float] = {}
         self.spent: dict[str, float] = {}
+        self.full: set[str] = set()
         self._inner = 0.0  # seconds of engines that had a turn inside another one's
 
     @property
@@ -122,8 +122,7 @@ class _Search:
 
     def violation(self) -> Violation | None:
         """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
-        stays = self.problem.reach is not None and self.problem.reach.stays
-        if self.lasting or self.problem.ending or stays:
+        if self.lasting or self.problem.ending or (self.problem.reach is not None and self.problem.reach.stays):
             return None
         self.watch.engine = "noise-free"
         try:
@@ -154,13 +153,21 @@ class _Search:
         self._in_turn(names)
         if self.safe or self.refuted or self.request.cells is not None:
             return
+        if self._in_full(names, 1 - _LAST):
+            return
         for name in (name for name in names if ENGINES[name].again and (self._likely(name) or not self.bounded)):
             first = self.answers.get(name)
             if first is not None and first.applicable and not first.conclusive:
                 self._thoroughly(name, Request(before=first.details))
-        for name in (name for name in names if self.problem.system.dimension < ENGINES[name].spares):
-            if not self.bounded and name in self.answers:
-                self._thoroughly(name, Request())
+
+    def _in_full(self, names: tuple[str, ...], share: float) -> bool:
+        """Ask once those that spared themselves for others' sake, which have proved nothing; whether that says SAFE."""
+        with self.watch.share(share):
+            for name in (name for name in names if self.problem.system.dimension < ENGINES[name].spares):
+                if not self.bounded and name in self.answers and name not in self.full:
+                    self.full.add(name)
+                    self._thoroughly(name, Request())
+        return self.safe
 
     def _thoroughly(self, name: str, request: Request) -> None:
         """Ask once more; where nobody set a limit, only as long as that is in proportion to what it all took so far."""
@@ -180,6 +187,7 @@ class _Search:
             turn.append(True)
             with self.watch.share(share):
                 self._in_turn(names[1:])
+            self._in_full(names[1:], share)
             if self.safe:
                 raise OutOfTime
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
+from certbound.safety import decision
 from certbound.safety.answers import EngineAnswer, Request
 from certbound.safety.decision import decide
 from certbound.safety.engines import linear_chance
@@ -334,3 +335,19 @@ def test_an_upper_bound_near_the_truth_that_is_too_large_is_answered_from_below(
     assert found.log10_lower is not None
     assert -3 < found.log10_lower <= found.log10_delta
     assert not cb.verify_safety(problem()).answers["values"].applicable  # what is SAFE needs no more
+
+
+def test_who_spared_itself_is_asked_in_full_before_others_are_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing is proved: the second turn of the linear response may take all of the time that is left."""
+    asked: list[tuple[str, bool]] = []
+
+    def answer(self: Any, name: str, request: Request) -> EngineAnswer:
+        asked.append((name, request.thorough))
+        return EngineAnswer(method=name, details=object(), applicable=name == "linear")
+
+    monkeypatch.setattr(decision._Search, "_asked", answer)
+    system = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=0.1 * np.eye(2))
+    problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
+    assert cb.verify_safety(problem).status == "UNKNOWN"
+    again = [name for name, thorough in asked if thorough]
+    assert again.index("quadratic") < again.index("linear")
