@@ -303,10 +303,7 @@ def _above(values: Array, lift: float) -> Array:
 def prove_lower(
     surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None
 ) -> Payment | None:
-    """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is.
-
-    The starts fill their box, or ``points`` lie among them.
-    """
+    """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is."""
     if extreme_over(surface, starts, upper=False, points=points) == -math.inf:
         return None
     surface = _sunk(surface)
@@ -384,9 +381,7 @@ def extreme_over(
         return math.inf if upper else -math.inf
     if points is not None and not upper:
         return float(surface.floor_at(0, points).max(initial=-math.inf))
-    exact = [
-        np.flatnonzero((axis >= low) & (axis <= high)) for axis, (low, high) in zip(surface.axes, starts)
-    ]
+    exact = [np.flatnonzero((axis >= low) & (axis <= high)) for axis, (low, high) in zip(surface.axes, starts)]
     index = np.ix_(*itertools.chain.from_iterable((nodes, [0]) for nodes in exact))
     at_nodes = float(surface.values[0][index].max()) if all(len(nodes) for nodes in exact) else -math.inf
     low, high = surface.range_at(0)
