@@ -37,6 +37,7 @@ problem.ingredients
 problem.problem
 problem.jumps_as_plan
 problem problem.library
+problem.foreign
 problem.export problem.files
 gaussian.scalar
 gaussian.response
