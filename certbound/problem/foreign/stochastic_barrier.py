@@ -2,8 +2,8 @@
 
 The problem in such a file: x+ = A x + b + v or x+ = f(x) + v with independent v_i ~ N(0, σ_i^2) (src/system.jl: σ holds
 standard deviations); unsafe is what lies outside of the state space, and the obstacles (sum_of_squares_barrier.jl). The
-lists of A become the columns of the matrix (``hcat(config["A"]...)`` in benchmarks/barrier_synthesis.jl). All else steers
-its search.
+lists of A become the columns of the matrix (``hcat(config["A"]...)`` in benchmarks/barrier_synthesis.jl). All else
+steers its search.
 """
 
 from __future__ import annotations
