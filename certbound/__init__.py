@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.problem.export import export_control as export_control
     from certbound.problem.files import load as load
     from certbound.problem.files import save as save
+    from certbound.problem.loops import estimate_loop as estimate_loop
     from certbound.problem.networks import network as network
     from certbound.problem.noise import Bounded as Bounded
     from certbound.problem.noise import Gaussian as Gaussian
@@ -79,6 +80,7 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 _HOME = {
     "problem.systems": "ContinuousSystem DiscreteSystem linear_system from_control",
+    "problem.loops": "estimate_loop",
     "problem.random_constants": "Random",
     "problem.noise": "Gaussian Uniform Triangular Rademacher Bounded SubGaussian",
     "problem.table_laws": "Discrete Histogram Laplace",

@@ -30,11 +30,14 @@ problem.table_laws
 problem.adapters problem.networks
 problem.signals
 problem.systems
+problem.observers
+problem.loops
 problem.random_constants
 problem.ingredients
 problem.problem
 problem.jumps_as_plan
 problem problem.library
+problem.foreign
 problem.export problem.files
 gaussian.scalar
 gaussian.response
@@ -130,7 +133,7 @@ MANY_DOORS = {
     "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
-    "problem.adapters": (7, "to and from each library"),
+    "problem.adapters": (9, "to and from each library"),
     "safety.certificates": (6, "a writer an engine, and one for each side where an engine has two"),
     "safety.engines": (11, "the engines, and the rooms that their certificates restate"),
     "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),

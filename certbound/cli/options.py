@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from certbound.cli.messages import InputError, split_cure
+from certbound.cli.output import SETTINGS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -66,7 +68,7 @@ ProblemArgument = Annotated[
     str,
     typer.Argument(
         metavar="PROBLEM",
-        help="A bundled problem's name, a TOML file, or module:name.",
+        help="A bundled problem's name, a TOML file (or YAML of LUCID or StochasticBarrier.jl), or module:name.",
         autocompletion=complete_problem,
         show_default=False,
     ),
@@ -119,15 +121,17 @@ def load_problem(
     """The problem that the arguments name, with its parameters, horizon and delta changed as asked."""
     from certbound.problem.files import load
 
-    if source.endswith(".toml") and not Path(source).exists():
+    kind = Path(source).suffix
+    if kind in (".toml", ".yaml", ".yml") and not Path(source).exists():
         folder = Path(source).parent
-        here = sorted(path.name for path in folder.glob("*.toml"))[:3] if folder.is_dir() else []
+        here = sorted(path.name for path in folder.glob(f"*{kind}"))[:3] if folder.is_dir() else []
         cure = f"there is {', '.join(here)} in that folder" if here else "check the path"
         raise InputError(f"`{source}`: No such file or directory", f"{cure}; `certbound new NAME` writes one")
     parameters: dict[str, Any] = dict(settings_of(pairs))
     changes: dict[str, Any] = {} if delta is None else {"delta": delta}
     with _as_input_error(_cure(source), module=":" in source):
         problem = load(source, **parameters)
+        _tell_taken(source)
     if horizon is not None:
         changes["horizon"] = _whole(horizon) if problem.system.time == "discrete" else horizon
     for name, value in changes.items():
@@ -137,7 +141,20 @@ def load_problem(
     return problem
 
 
+def _tell_taken(source: str) -> None:
+    """Say on standard error what was taken for what in a file of another tool."""
+    if SETTINGS.quiet or not source.endswith((".yaml", ".yml")):
+        return
+    from certbound.problem.files import notes
+
+    first, *lines = notes(source)
+    sys.stderr.write("".join([f"certbound: {first}\n", *(f"  {line}\n" for line in lines)]))
+    sys.stderr.flush()
+
+
 def _cure(source: str) -> str:
+    if source.endswith((".yaml", ".yml")):
+        return "mend the file"
     if source.endswith(".toml") or Path(source).is_file():
         return "mend the file; `certbound new NAME` writes one that works"
     if ":" in source:

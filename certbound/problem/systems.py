@@ -18,7 +18,7 @@ from certbound.arrays import Array
 from certbound.checks import assign, frozen, matrix, vector
 from certbound.errors import InfeasibleError
 from certbound.problem import table_laws  # noqa: F401  (its laws enter the list of laws)
-from certbound.problem.adapters import import_control, is_control_system, read_model, symbol_names
+from certbound.problem.adapters import import_control, is_control_system, linear_inputs, read_model, symbol_names
 from certbound.problem.model import Tape
 from certbound.problem.noise import Gaussian, Law, known_laws
 from certbound.problem.sets import Box
@@ -312,20 +312,46 @@ def linear_system(
     return build(f, states=n if states is None else states, inputs=inputs, **options)
 
 
-def from_control(system: Any, **options: Any) -> ContinuousSystem | DiscreteSystem:
-    """A python-control ``StateSpace`` or ``NonlinearIOSystem`` (its outputs are not used).
+def from_control(system: Any, *, input_noise: Any = None, **options: Any) -> ContinuousSystem | DiscreteSystem:
+    """A python-control ``StateSpace``, ``TransferFunction`` or ``NonlinearIOSystem``.
 
     A system with a sampling time becomes a ``DiscreteSystem``. Names of states and inputs are kept as far as
-    they are identifiers; inputs are unbounded unless ``inputs`` says otherwise.
+    they are identifiers; inputs are unbounded unless ``inputs`` says otherwise. Of a state-space model the outputs are
+    not used. The outputs of a transfer function are states, each the first of its row of transfer functions (less what
+    inputs add to it at once); the others are called ``<output>_2`` and so on, and mean nothing by themselves.
 
     Parameters
     ----------
-    system : control.StateSpace or control.NonlinearIOSystem
-        A state-space model.
+    system : control.StateSpace, control.TransferFunction or control.NonlinearIOSystem
+        A model with states.
+    input_noise : array_like of shape (m,) or Law, optional
+        Of a linear model: noise on its inputs, u dt + diag(input_noise) dW in continuous time (a number serves each),
+        u + w with w of the given law in discrete time. In place of ``diffusion``, ``noise`` and ``noise_matrix``.
     **options
         As for ``ContinuousSystem`` and ``DiscreteSystem``.
+
+    Examples
+    --------
+    >>> import control
+    >>> from_control(control.tf([3], [1, 2, 5]), input_noise=0.1).diffusion.tolist()
+    [[0.0], [0.30000000000000004]]
     """
     if not is_control_system(system):
         raise TypeError(f"`system` must be a python-control system with states, got {system!r}.")
-    build = DiscreteSystem if system.isdtime(strict=True) else ContinuousSystem
-    return build(system, **options)
+    discrete = system.isdtime(strict=True)
+    if input_noise is not None:
+        options |= _noisy_inputs(linear_inputs(system), input_noise, discrete, options)
+    return (DiscreteSystem if discrete else ContinuousSystem)(system, **options)
+
+
+def _noisy_inputs(b: Array, noise: Any, discrete: bool, options: dict[str, Any]) -> dict[str, Any]:
+    for name in ("diffusion", "noise", "noise_matrix"):
+        if name in options:
+            raise ValueError(f"`{name}` must be omitted beside `input_noise`; give one of the two.")
+    if not discrete:
+        level = vector("input_noise", noise)
+        level = np.broadcast_to(level, (b.shape[1],)) if len(level) == 1 else vector("input_noise", noise, b.shape[1])
+        return {"diffusion": b * level}
+    if not isinstance(noise, Law):
+        raise TypeError(f"`input_noise` must be a law such as cb.Gaussian(std=0.1) in discrete time, got {noise!r}.")
+    return {"noise": noise, "noise_matrix": b}

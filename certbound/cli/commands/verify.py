@@ -103,6 +103,10 @@ def verify(
     result = _result(subject, verdict, seconds)
     if explain:
         result["engines"] = _engines(verdict)
+    if problem.endswith((".yaml", ".yml")):
+        from certbound.problem.files import notes
+
+        result["taken"] = list(notes(problem))
     if ":" not in problem:
         for told in (result, *result.get("engines", ())):
             told["reason"] = for_files(told["reason"])

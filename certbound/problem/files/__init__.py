@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from certbound.problem.files.loading import load, save
+from certbound.problem.files.loading import load, notes, save
 from certbound.problem.files.schema import json_schema
 from certbound.problem.files.writing import content_of
 
-__all__ = ["content_of", "json_schema", "load", "save"]
+__all__ = ["content_of", "json_schema", "load", "notes", "save"]

@@ -14,22 +14,28 @@ import numpy as np
 from certbound.checks import nearest, number
 from certbound.problem.files.plans import write_plan
 from certbound.problem.files.toml import toml_text
+from certbound.problem.foreign import restate
 from certbound.problem.networks import NetworkFunction, write_network
 from certbound.problem.problem import Problem
+
+YAML = (".yaml", ".yml")
+"""Files of other tools."""
 
 _LARGEST = 20_000_000
 
 
 def load(source: str | Path, **parameters: Any) -> Problem:
-    """A problem from a TOML file, by bundled name, or from a Python module.
+    """A problem from a file, by bundled name, or from a Python module.
 
     A TOML file is only read, never run: its expressions are parsed by a small language that has nothing but
-    arithmetic. A module is imported, which runs it.
+    arithmetic. So are YAML files of LUCID and of StochasticBarrier.jl; ``notes`` says what was taken for what. A module
+    is imported, which runs it.
 
     Parameters
     ----------
     source : str or Path
-        ``file.toml``; a bundled name such as ``unicycle``; or ``package.module:name``, where the name is a
+        ``file.toml`` (or ``file.yaml`` of those tools); a bundled name such as ``unicycle``; or
+        ``package.module:name``, where the name is a
         ``Problem`` or a function that returns one. Modules in the current folder are found.
     **parameters
         Values for the file's ``[parameters]``, or arguments of the bundled problem or function.
@@ -48,7 +54,7 @@ def load(source: str | Path, **parameters: Any) -> Problem:
     2.0
     """
     text = str(source)
-    if text.endswith(".toml") or isinstance(source, Path):
+    if text.endswith((".toml", *YAML)) or isinstance(source, Path):
         return _load_file(Path(source), parameters)
     if ":" in text and not Path(text).exists():
         return _load_module(text, parameters)
@@ -67,17 +73,27 @@ def loads(text: str, *, folder: Path | None = None, **parameters: Any) -> Proble
 
     Errors are those of ``load``.
     """
-    from pydantic import ValidationError
-
-    from certbound.problem.files.reading import read_problem
-    from certbound.problem.files.schema import Specification, explain
-
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"the problem file is not TOML: {error}.") from error
     except RecursionError as error:
         raise ValueError("the problem file is nested too deeply.") from error
+    return _built(content, folder, parameters)
+
+
+def notes(source: str | Path) -> tuple[str, ...]:
+    """What ``load`` takes for what in a file of another tool, a line for each of its keys; nothing for any other."""
+    path = Path(source)
+    return restate(_text_of(path), path.stem).notes if path.suffix in YAML else ()
+
+
+def _built(content: dict[str, Any], folder: Path | None, parameters: Mapping[str, Any]) -> Problem:
+    from pydantic import ValidationError
+
+    from certbound.problem.files.reading import read_problem
+    from certbound.problem.files.schema import Specification, explain
+
     _set_parameters(content, parameters)
     try:
         specification = Specification.model_validate(content)
@@ -121,16 +137,22 @@ def save(problem: Problem, path: str | Path) -> None:
 
 
 def _load_file(path: Path, parameters: Mapping[str, Any]) -> Problem:
+    text = _text_of(path)
+    if path.suffix in YAML:
+        return _built(restate(text, path.stem).content, None, parameters)
+    return loads(text, folder=path.parent, **parameters)
+
+
+def _text_of(path: Path) -> str:
     try:
         if path.stat().st_size > _LARGEST:
             raise ValueError(f"`source` must be smaller than {_LARGEST // 10**6} MB, {str(path)!r} is not.")
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         reason = error.strerror or "no access"
         raise ValueError(f"`source` must be a readable file, got {str(path)!r}: {reason}.") from error
     except UnicodeDecodeError as error:
         raise ValueError(f"`source` must be a text file in UTF-8, got {str(path)!r}.") from error
-    return loads(text, folder=path.parent, **parameters)
 
 
 def _set_parameters(content: dict[str, Any], given: Mapping[str, Any]) -> None:
