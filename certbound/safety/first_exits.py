@@ -2,7 +2,8 @@
 
 Where neither the model nor what it must respect depends on time, P(exit before s | X_0 = x) is the value function of
 the horizon T at time T - s. One value function is proved for T and, since short times lie at the end of its grid, one
-each for T/2, T/4, ..., which are read for the times above the next one.
+each for shorter and shorter horizons, which are read for the times above the next one: in places where log P moves by
+little. The rarer leaving is, the closer the horizons.
 """
 
 from __future__ import annotations
@@ -29,11 +30,9 @@ from certbound.values.continuous import bound_mean_time, chart_slabs_of
 from certbound.values.discrete import chart_failures
 from certbound.watch import poll
 
-_LEVELS = (1e-5, 1e-2, 0.3, 0.9)
-"""Probabilities at which the bounds are sharp."""
-_SLABS = 160
-_FEWER = 2.0  # ratio of a horizon to the next shorter one
-_SHORTEST = 8  # horizons
+_STEP = 0.004  # of log P, between two times at which a curve is read
+_FEWER = {1.0: 1.4, 0.05: 1.27}  # ratio of a horizon to the next shorter one, where P is at most so much
+_SHORTEST = 40  # horizons
 _RARE = -6.0  # log10 of a probability below which no shorter horizon is looked at
 _SHARE = 0.004  # cells of discrete time, as `FailureBounds` has them
 
@@ -194,9 +193,10 @@ def _continuous(problem: Problem) -> tuple[Curve, Curve, float]:
     share, horizon = 0.0, float(problem.horizon)
     for k in range(_SHORTEST):
         poll(f"exit times up to {horizon:g}")
-        shorter, levels = horizon / _FEWER if k + 1 < _SHORTEST else 0.0, [math.log10(p) for p in _LEVELS]
+        ratio = _FEWER[min(p for p in _FEWER if not upper or upper[-1][1] <= p)]
+        shorter = horizon / ratio if k + 1 < _SHORTEST else 0.0
         plain = problem.replace(horizon=horizon)
-        charts = chart_slabs_of(plain, levels=levels, slabs=_SLABS, last=horizon - shorter)
+        charts = chart_slabs_of(plain, step=_STEP, last=horizon - shorter)
         upper += _read(problem, charts.upper, horizon, up=True)
         lower += _read(problem, charts.lower, horizon, up=False)
         if k == 0 and charts.lower:

@@ -32,7 +32,7 @@ def found():
     """From the one horizon alone, without those for short times."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(first_exits, "_SHORTEST", 1)
-        patch.setattr(first_exits, "_SLABS", 80)
+        patch.setattr(first_exits, "_STEP", 0.01)
         return cb.bound_exit_times(brownian())
 
 

@@ -199,17 +199,15 @@ def chart_exits(
     return charts
 
 
-def chart_slabs_of(problem: Problem, *, levels: Sequence[float], slabs: int, last: float) -> Charts:
-    """Charts as `chart_exits` makes them, of one state, at the ends of slabs of time.
+def chart_slabs_of(problem: Problem, *, step: float, last: float) -> Charts:
+    """Charts as `chart_exits` makes them, of one state, at many times; after the first one beside the starts.
 
     Parameters
     ----------
     problem : Problem
         One state; its model must not depend on time.
-    levels : sequence of float
-        log10 of probabilities at which the bounds should be sharp.
-    slabs : int
-        No slab is longer than one of so many equal ones.
+    step : float
+        About by how much log P moves between two charts.
     last : float
         Time after which no chart is made.
 
@@ -227,7 +225,7 @@ def chart_slabs_of(problem: Problem, *, levels: Sequence[float], slabs: int, las
     from certbound.values.continuous.line import chart_slabs
 
     _check(problem, None, 1.0)
-    return chart_slabs(problem, _model(problem), [_LN10 * level for level in levels], slabs, last)
+    return chart_slabs(problem, _model(problem), step, last)
 
 
 def _refuse_random(problem: Problem) -> None:

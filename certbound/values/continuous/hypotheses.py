@@ -42,6 +42,7 @@ from certbound.values.continuous.residual import (
 from certbound.values.continuous.surface import Surface
 
 Found = TypeVar("Found")
+Near = tuple[float, float, float] | None
 
 LIFTS = (0.0, 0.003, 0.01, 0.02, 0.035, 0.06, 0.1, 0.16, 0.25)
 _NEAR = 40.0  # in units of what is granted without being looked at
@@ -276,8 +277,10 @@ def top_of(surface: Surface) -> float:
     return max(float(value_range(surface.patches(*chunk))[1].max()) for chunk in surface.chunks())
 
 
-def chart_above(surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int]) -> list[Chart]:
-    """Upper bounds of P(leaving the box from a cell on), at the start of each of the ``slabs``.
+def chart_above(
+    surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int], near: Near = None
+) -> list[Chart]:
+    """Upper bounds of P(leaving the box from a cell on), at the start of each of the ``slabs``, or ``near`` the starts.
 
     One payment is made for each of the ``levels`` (of log P), at which it is then sharp; every cell takes the best.
     """
@@ -286,13 +289,10 @@ def chart_above(surface: Surface, model: Model, levels: Sequence[float], slabs: 
     proof = examine(surface, model, need, upper=True)
     paid = [cheapest(proof, need, surface, level) for level in levels]
     charts = []
-    for k in slabs:
-        axes, values = (surface.axes, surface.range_at(k)[1]) if len(surface.axes) == 1 else surface.ceiling_at(k)
-        rows = [
-            bound_above(payment.terms, _above(values, lift), k) for payment, lift in paid if payment.terms is not None
-        ]
+    for time, k, axes, values in surface.readings(slabs, near, up=True):
+        rows = [bound_above(one.terms, _above(values, lift), k) for one, lift in paid if one.terms is not None]
         best = np.minimum.reduce([np.zeros(values.shape), *rows])
-        charts.append(Chart(time=float(surface.times[k]), axes=axes, log10=from_natural(best, up=True)))
+        charts.append(Chart(time=time, axes=axes, log10=from_natural(best, up=True)))
     return charts
 
 
@@ -326,7 +326,9 @@ def _earned(proof: Proof, need: Need, surface: Surface, start: float) -> Payment
     return pay_lower(patched, start, float(surface.range_at(-1)[1].max()))
 
 
-def chart_below(surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int]) -> list[Chart]:
+def chart_below(
+    surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int], near: Near = None
+) -> list[Chart]:
     """Lower bounds of P(leaving the box from a cell on), as `chart_above`; -inf where nothing was proved."""
     surface = _sunk(surface)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=np.inf)
@@ -334,10 +336,9 @@ def chart_below(surface: Surface, model: Model, levels: Sequence[float], slabs: 
     found = [_earned(proof, need, surface, level) for level in levels]
     paid = [payment.terms for payment in found if payment is not None and payment.terms is not None]
     charts = []
-    for k in slabs:
-        values = surface.range_at(k)[0]
+    for time, k, axes, values in surface.readings(slabs, near, up=False):
         best = np.maximum.reduce([np.full(values.shape, -np.inf), *(bound_below(terms, values, k) for terms in paid)])
-        charts.append(Chart(time=float(surface.times[k]), axes=surface.axes, log10=from_natural(best, up=False)))
+        charts.append(Chart(time=time, axes=axes, log10=from_natural(best, up=False)))
     return charts
 
 

@@ -11,7 +11,7 @@ second derivatives that are continuous on each cell, which is enough (docs/value
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -100,6 +100,49 @@ class Surface:
             end_rates=np.concatenate(ends),
         )  # fmt: skip
 
+    def readings(
+        self, slabs: Sequence[int], near: tuple[float, float, float] | None, *, up: bool
+    ) -> Iterator[tuple[float, int, tuple[Array, ...], Array]]:
+        """Times at or in some slabs, each with its slab, nodes, and a bound of V over their cells.
+
+        Without ``near`` all cells at the start of every slab. With (longest, low, high), in one state, times that are
+        ``longest`` apart at most, and after the first one only the cells that meet [low, high]. V and its derivatives
+        are cubics in time, of which `refined` makes no more than some roundoffs of the four numbers that each is made
+        of; the time itself is off by one of the last time.
+        """
+        for k in slabs if near is None else slabs[:1]:
+            time = float(self.times[k])
+            if up and len(self.axes) > 1:
+                yield time, k, *self.ceiling_at(k)
+            else:
+                yield time, k, self.axes, self.range_at(k)[up]
+        if near is None:
+            return
+        nodes, (longest, *ends) = self.axes[0], near
+        first = max(int(np.searchsorted(nodes, ends[0])) - 1, 0)
+        part = self._cut(slice(first, int(np.searchsorted(nodes, ends[1], side="right")) + 1))
+        fine, sign = part.refined(longest), 1 if up else -1
+        owners = np.searchsorted(self.times, fine.times[:-1], side="right") - 1
+        for j in np.flatnonzero(np.isin(owners, list(slabs)))[1:].tolist():
+            k = int(owners[j])
+            yield float(fine.times[j]), k, fine.axes, fine.range_at(j)[up] + sign * part._roundoff(k)
+
+    def _cut(self, own: slice) -> Surface:
+        parts = [part[:, own] for part in (self.values, self.start_rates, self.end_rates)]
+        return Surface(
+            axes=(self.axes[0][own], *self.axes[1:]), times=self.times, values=parts[0], start_rates=parts[1],
+            end_rates=parts[2],
+        )  # fmt: skip
+
+    def _roundoff(self, k: int) -> Array:
+        """What V over each cell in a slab may be off by after `refined`; one state."""
+        widths, step = np.diff(self.axes[0]), float(self.steps[k])
+        rates = np.abs(self.start_rates[k]) + np.abs(self.end_rates[k])
+        size = np.abs(self.values[k]) + np.abs(self.values[k + 1]) + step * rates
+        most = np.maximum(size[:-1], size[1:])
+        total = most[:, 0] + widths * most[:, 1] + widths**2 * most[:, 2]
+        return np.asarray(2.0**-53 * (200 + 20 * self.times[-1] / step) * total)
+
     def patches(self, first: int, last: int) -> Patches:
         """All cells of the slabs ``first`` to ``last`` - 1, flattened with time slowest."""
         parts = [self.values[first:last], self.start_rates[first:last],
@@ -110,12 +153,7 @@ class Surface:
         """The surface in slices along the first state, each with its first cell; ``limit`` cells, or one row."""
         stride = max(1, limit // int(np.prod(self.cells[1:])))
         for first in range(0, self.cells[0], stride):
-            own = slice(first, first + stride + 1)
-            parts = [part[:, own] for part in (self.values, self.start_rates, self.end_rates)]
-            yield first, Surface(
-                axes=(self.axes[0][own], *self.axes[1:]), times=self.times, values=parts[0], start_rates=parts[1],
-                end_rates=parts[2],
-            )  # fmt: skip
+            yield first, self._cut(slice(first, first + stride + 1))
 
     def chunks(self, limit: int = 4000) -> Iterator[tuple[int, int]]:
         """Ranges of slabs with at most ``limit`` patches (or one slab)."""

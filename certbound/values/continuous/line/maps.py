@@ -19,6 +19,7 @@ from certbound.values.continuous.line.linked import spans
 from certbound.values.continuous.line.reach import cuts_of
 
 _UNSEALED = -700.0
+_MOST_RATIO = 4.0
 
 
 def chart_line(problem: Problem, model: Model, levels: list[float], times: int, lower: bool) -> Charts:
@@ -54,12 +55,11 @@ def chart_line(problem: Problem, model: Model, levels: list[float], times: int, 
     return Charts(upper=tuple(above), lower=tuple(below))
 
 
-def chart_slabs(problem: Problem, model: Model, levels: list[float], slabs: int, last: float) -> Charts:
-    """Charts at the ends of slabs up to the time ``last``, of one surface above and one below.
+def chart_slabs(problem: Problem, model: Model, step: float, last: float) -> Charts:
+    """Charts at many times up to ``last``, of one surface above and one below: between two log P moves about a step.
 
-    No slab is longer than one of ``slabs`` equal ones.
-
-    Where the model does not depend on time, the chart at t is that of P(leaving by the horizon minus t).
+    Where the model does not depend on time, the chart at t is that of P(leaving by the horizon minus t): of all states
+    at the first time, later on the cells that meet the starts.
 
     Raises
     ------
@@ -69,21 +69,23 @@ def chart_slabs(problem: Problem, model: Model, levels: list[float], slabs: int,
     if not model.autonomous:
         raise InfeasibleError("exit times at all horizons at once need a model that does not depend on time.")
     inner, outer, start = _rooms(problem, model)
-    rough = ladder.sketches(inner)
-    levels = sorted({max(level, float(rough[0].values.min())) for level in levels})
-    rough = [dataclasses.replace(rough[0], level=levels[0])]
+    sketch, horizon = ladder.sketches(inner)[0], float(problem.horizon)
+    ratio, growth = horizon / max(horizon - last, horizon / _MOST_RATIO), max(sketch.growth, 1.0)
+    low = sketch.level - growth * (ratio - 1)  # log P at the shortest time: it falls about like -1/s
+    levels, rough = [low, min(sketch.level, -0.1)], [dataclasses.replace(sketch, level=low)]
     fineness, tolerance, lead = ladder.LADDER[2]
-    share, longest = lead / max(rough[0].growth, 1.0), float(problem.horizon) / slabs
+    share = lead / growth
+    near = (horizon * step / (growth * ratio), start.low, start.high)
     above = ladder.surfaces_above(inner, start, rough, (share, fineness, tolerance, lead))
     below = ladder.surfaces_below(outer, start, rough, (share, fineness, 0.5 * tolerance, lead))
     upper: list[Chart] = []
     lower: list[Chart] = []
     if above is not None and spans(above, upper=True):
-        surface = above[0].surface.refined(longest)
-        upper = chart_above(surface, model, levels, np.flatnonzero(surface.times[:-1] <= last).tolist())
+        surface = above[0].surface
+        upper = chart_above(surface, model, levels, np.flatnonzero(surface.times[:-1] <= last).tolist(), near)
     if below is not None and spans(below, upper=False):
-        surface = below[0].surface.refined(longest)
-        lower = chart_below(surface, model, levels, np.flatnonzero(surface.times[:-1] <= last).tolist())
+        surface = below[0].surface
+        lower = chart_below(surface, model, levels, np.flatnonzero(surface.times[:-1] <= last).tolist(), near)
     return Charts(upper=tuple(upper), lower=tuple(lower))
 
 
