@@ -60,6 +60,8 @@ class Engine:
     below : callable, optional
         As ``prove``, to a lower bound of the probability from some start, for some disturbance that reacts to the
         state.
+    holds : bool
+        Whether it proves anything of inputs that are held. The others do not know that there are any.
     """
 
     words: str
@@ -67,6 +69,7 @@ class Engine:
     foresees: Callable[[Model], bool] = lambda model: False
     assumes: Callable[[Model, Mapping[str, object]], str | None] = lambda model, proof: None
     below: Callable[[Model, object, Budget], arb] | None = None
+    holds: bool = False
 
 
 def engine_of(proof: object, method: str) -> str:
@@ -90,6 +93,8 @@ def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[s
     A target is met at one time, which the proof names. CertificateError where the start is a union, or there is a
     target, and the proof does not say so, or the other way round.
     """
+    if model.hold is not None and model.target is not None:
+        raise CertificateError("`problem.hold` must be left out beside a target.")
     if model.members:
         _named(proof, path, (UNION,))
         count = len(model.members)
@@ -105,7 +110,8 @@ def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[s
         record = Record(proof, path, ("engine", "time", "proof"))
         yield from _parts(met_at(model, record.number("time")), record["proof"], f"{path}.proof")
     else:
-        yield _named(proof, path, tuple(ENGINES)), model, proof  # type: ignore[misc]  # a mapping: it names an engine
+        known = tuple(name for name, row in ENGINES.items() if model.hold is None or row.holds)
+        yield _named(proof, path, known), model, proof  # type: ignore[misc]  # a mapping: it names an engine
 
 
 def _cells(
@@ -255,7 +261,7 @@ def _values_below(model: Model, proof: object, budget: Budget) -> arb:
 
 
 ENGINES = {
-    "linear": Engine(words="linear response (Thm K7)", prove=check_linear, foresees=_additive),
+    "linear": Engine(words="linear response (Thm K7)", prove=check_linear, foresees=_additive, holds=True),
     "constants": Engine(words="contraction constants (Thms K2, K5)", prove=check_constants, assumes=_stated),
     "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
     "values": Engine(words="the value function itself (Thm K8)", prove=_values, below=_values_below),

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
 from certbound.checks import frozen, nearest, number, positive_definite, vector
+from certbound.problem.model import Tape
 from certbound.problem.random_constants import Random
 from certbound.problem.sets import Box, GaussianStart, Region, StartUnion
 from certbound.problem.systems import System
 
 _LONGEST_UNIT = 20
+_MOST_SAMPLES = 1000
 
 
 def checked_horizon(value: Any, discrete: bool) -> float | int:
@@ -34,6 +37,34 @@ def checked_delta(value: Any) -> float:
     if not 0 < delta < 1:
         raise ValueError(f"`delta` must lie in (0, 1), got {delta:g}.")
     return delta
+
+
+def checked_hold(value: Any, plan: Any, system: System, horizon: float) -> float | None:
+    """Seconds between two sampling times, of which the horizon is a whole number; None where nothing is held."""
+    if value is None:
+        return None
+    hold = number("hold", value)
+    if system.time != "continuous":
+        raise ValueError("`hold` must be left out in discrete time, where every step computes the inputs anew.")
+    if not isinstance(plan, Tape):
+        raise ValueError("`hold` must come with a `plan` that is a law of t and x; rows of an array are held already.")
+    if not 0 < hold <= horizon or np.isinf(horizon):
+        raise ValueError(f"`hold` must be positive, and at most the horizon {horizon:g}, which ends; got {hold:g}.")
+    count = samples_of(hold, horizon)
+    if count is None:
+        raise ValueError(
+            f"`hold` must fit into the horizon a whole number of times, got {hold:g} in {horizon:g}; a horizon of "
+            f"{max(round(horizon / hold), 1) * hold:.6g} does."
+        )
+    if count > _MOST_SAMPLES:
+        raise ValueError(f"`hold` must make at most {_MOST_SAMPLES} sampling times, got {count}; shorten the horizon.")
+    return hold
+
+
+def samples_of(hold: float, horizon: float) -> int | None:
+    """How often ``hold`` fits into the horizon, both as the decimal numbers that they are written as; None if not."""
+    found = Fraction(repr(float(horizon))) / Fraction(repr(float(hold)))
+    return int(found) if found.denominator == 1 else None
 
 
 def check_dimension(name: str, region: Any, dimension: int) -> None:
@@ -82,10 +113,22 @@ def _one_start(value: Any, dimension: int) -> Any:
     return start
 
 
-def checked_weight(name: str, value: Any, size: int, *, strict: bool) -> Array:
+def _checked_weight(name: str, value: Any, size: int, *, strict: bool) -> Array:
     """A matrix of weights, or a diagonal as one."""
     matrix = np.diag(vector(name, value, size)) if np.ndim(value) == 1 else value
     return positive_definite(name, matrix, size, strict=strict)
+
+
+def checked_cost(value: Any, system: System) -> tuple[Array, Array] | None:
+    """The weights (Q, R) of a system with inputs."""
+    if value is None:
+        return None
+    if system.inputs is None:
+        raise ValueError("`cost` must be omitted for a system without inputs.")
+    if not isinstance(value, Sequence) or len(value) != 2:
+        raise ValueError(f"`cost` must be the pair (Q, R), got {value!r}.")
+    state = _checked_weight("Q", value[0], system.dimension, strict=False)
+    return state, _checked_weight("R", value[1], len(system.input_names), strict=True)
 
 
 def checked_unknown(value: Any, known: Sequence[str]) -> tuple[str, ...]:
@@ -127,6 +170,7 @@ def described(problem: Any) -> list[tuple[str, str]]:
     system = problem.system
     signals = {"states": system.states, "inputs": system.input_names, "disturbances": system.disturbance_names}
     found = [(word, ", ".join(map(problem.axis, names))) for word, names in signals.items() if names]
+    found += [] if problem.hold is None else [("held for", f"{problem.hold:g} {problem.time_unit}")]
     found += [("drawn", f"{name} = {law.describe()}") for name, law in problem.random.items()]
     starts = ["a point" if start.is_point else type(start).__name__ for start in problem.starts]
     found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))

@@ -29,7 +29,7 @@ def in_pieces(problem: Problem) -> Problem:
     system = problem.system
     if not isinstance(system, ContinuousSystem) or problem.endless or isinstance(problem.plan, np.ndarray):
         return problem
-    if problem.plan is None and system.inputs is not None:
+    if problem.hold is not None or (problem.plan is None and system.inputs is not None):
         return problem
     tape: Tape = problem.closed_loop
     found = cut_at_jumps(tape, system.dimension, float(problem.horizon))

@@ -16,15 +16,17 @@ from certbound.display import Shown, ask_later_room, name_text
 from certbound.errors import InfeasibleError
 from certbound.problem.ingredients import (
     check_dimension,
+    checked_cost,
     checked_delta,
+    checked_hold,
     checked_horizon,
     checked_random,
     checked_rows,
     checked_start,
     checked_units,
     checked_unknown,
-    checked_weight,
     described,
+    samples_of,
 )
 from certbound.problem.model import Tape, substitute, trace
 from certbound.problem.sets import (
@@ -71,6 +73,9 @@ class Problem(Shown):
     plan : array_like of shape (K, m), function u(t, x), or Tape, optional
         Inputs: one row a step (DT; rows beyond the horizon are ignored), constant on K equal pieces of the
         horizon (CT), or a feedback law. A system with inputs may go without, for synthesis.
+    hold : float, optional
+        Seconds between two sampling times (continuous time, a plan that is a law): the inputs are computed at 0, hold,
+        2 hold, ... from the state at that time, and kept in between. The horizon is a whole number of holds.
     cost : (Q, R), optional
         Weights of x' Q x + u' R u: matrices, or vectors of their diagonals.
     domain : Box, optional
@@ -112,6 +117,7 @@ class Problem(Shown):
     unknown: Any = field(default=(), kw_only=True)
     random: Any = field(default=None, kw_only=True)
     plan: Any = field(default=None, kw_only=True)
+    hold: Any = field(default=None, kw_only=True)
     cost: Any = field(default=None, kw_only=True)
     domain: Any = field(default=None, kw_only=True)
     leaving: str = field(default="unsafe", kw_only=True)
@@ -138,12 +144,13 @@ class Problem(Shown):
         assign(self, parameters=dict(self.parameters or {}), unknown=checked_unknown(self.unknown, constants))
         assign(self, random=checked_random(self.random, constants, self.unknown))
         assign(self, plan=self._checked_plan())
-        assign(self, cost=self._cost())
+        assign(self, hold=checked_hold(self.hold, self.plan, self.system, self.horizon))
+        assign(self, cost=checked_cost(self.cost, self.system))
         for member in self.starts:
             check_start(member, self.kept)
         if self.reach is not None:
             check_target(self.reach.region, self.kept, self.system.dimension)
-        if self.plan is not None or self.system.inputs is None:
+        if self.hold is None and (self.plan is not None or self.system.inputs is None):
             assign(self, _closed_loop=self._closed())
 
     @property
@@ -224,7 +231,14 @@ class Problem(Shown):
         ------
         ValueError
             If the system has inputs and no plan.
+        InfeasibleError
+            If the inputs are held: they are no function of the present state.
         """
+        if self.hold is not None:
+            raise InfeasibleError(
+                f"the inputs are held for {self.hold:g} {self.time_unit}: only the linear response, its certificates "
+                "and simulations of exits serve that; leave `hold` out for inputs that follow the state at once."
+            )
         if self._closed_loop is None:
             names = ", ".join(self.system.input_names)
             raise ValueError(
@@ -232,6 +246,11 @@ class Problem(Shown):
                 "or use synthesize."
             )
         return self._closed_loop
+
+    @property
+    def samples(self) -> int:
+        """How often inputs that are held are computed; 0 where none are."""
+        return 0 if self.hold is None else samples_of(self.hold, self.horizon) or 0
 
     @property
     def input_sequence(self) -> Array | None:
@@ -371,16 +390,6 @@ class Problem(Shown):
                 )
             return tape
         return checked_rows(plan, system, self.horizon)
-
-    def _cost(self) -> tuple[Array, Array] | None:
-        if self.cost is None:
-            return None
-        if self.system.inputs is None:
-            raise ValueError("`cost` must be omitted for a system without inputs.")
-        if not isinstance(self.cost, Sequence) or len(self.cost) != 2:
-            raise ValueError(f"`cost` must be the pair (Q, R), got {self.cost!r}.")
-        state = checked_weight("Q", self.cost[0], self.system.dimension, strict=False)
-        return state, checked_weight("R", self.cost[1], len(self.system.input_names), strict=True)
 
     def _closed(self) -> Tape:
         system = self.system

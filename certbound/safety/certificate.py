@@ -225,10 +225,11 @@ def problem_data(problem: Problem) -> dict[str, Any]:
     """
     if problem.reach is not None and problem.reach.stays:
         raise CertificateError("certificates do not state targets that are to be stayed in.")
-    system, tape = problem.system, problem.closed_loop
+    system, held = problem.system, problem.hold is not None
+    tape = system.dynamics if held else problem.closed_loop
     continuous = system.time == "continuous"
     rows = problem.input_sequence
-    inputs = () if rows is None else system.input_names
+    inputs = system.input_names if held or rows is not None else ()
     box = system.disturbance
     return {
         "name": problem.name,
@@ -245,6 +246,7 @@ def problem_data(problem: Problem) -> dict[str, Any]:
         "noise": _noise(system),
         "initial": initial_data(problem.initial),
         "constraints": [_constraint(constraint) for constraint in problem.safe],
+        **({"hold": {"count": problem.samples, "law": tape_data(problem.plan)}} if held else {}),
         **({"units": dict(problem.units)} if problem.units else {}),
         **({"leaving": problem.leaving} if problem.ending else {}),
         "domain": None if problem.domain is None else _ranges(zip(problem.domain.low, problem.domain.high)),

@@ -371,7 +371,7 @@ def _checked(problem: Problem, request: Request) -> None:
     from certbound.tubes.paper import check_method
 
     initial_cells(problem, request.cells)
-    _ = problem.closed_loop
+    _ = problem.hold is None and problem.closed_loop
     continuous, n = problem.system.time == "continuous", problem.system.dimension
     check_method(request.method, continuous=continuous, dimension=n)
     constants = request.constants

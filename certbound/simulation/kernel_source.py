@@ -85,6 +85,7 @@ def module_head(model: StepModel, kind: str, p: Parameters) -> str:
         ("diffusion", model.noise if isinstance(model.noise, Tape) else None),
         ("correction", model.correction),
         ("signal", model.signal),
+        ("law", model.law),
         ("unit", model.unit),
     ):
         if tape is not None:
@@ -116,7 +117,7 @@ def step_lines(model: StepModel, p: Parameters) -> tuple[list[str], Bridge | Non
     states = range(model.dimension)
     lines = [
         f"t = k * {p.add(model.interval)}",
-        *[f"u_{i} = inputs[k, {i}]" for i in range(model.input_count)],
+        *_inputs(model),
         *_disturbance(model, p),
         f"{_targets(vector('f', model.dimension))} = drift(p, {', '.join(_arguments(model, 'x'))})",
         *noise_lines,
@@ -128,6 +129,16 @@ def step_lines(model: StepModel, p: Parameters) -> tuple[list[str], Bridge | Non
         "done += 1",
     ]
     return lines, bridge
+
+
+def _inputs(model: StepModel) -> list[str]:
+    """Lines that set the inputs: those that are held keep what they were at the last sampling time."""
+    held = model.held_count
+    lines = [f"u_{held + i} = inputs[k, {i}]" for i in range(model.input_count - held)]
+    if model.law is None:
+        return lines
+    call = f"{_targets(vector('u', held))} = law(p, t, {', '.join(vector('x', model.dimension))})"
+    return [*lines, f"if k % {model.every} == 0:", f"    {call}"]
 
 
 def nominal_lines(model: StepModel, p: Parameters) -> list[str]:

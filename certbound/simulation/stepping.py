@@ -80,12 +80,20 @@ class StepModel:
     switching: float = 0.0  # mean number of steps between two jumps of a switching disturbance; 0: constant
     # (steps, input_count + disturbances given as an array): inputs that all paths share, one row a step
     table: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    # inputs that are held, the first ones: a function of (t, states), computed every so many steps
+    law: Tape | None = None
+    every: int = 0
     scheme: str = "discrete"  # what was chosen: ``exact``, ``milstein``, ``euler`` or ``discrete``
 
     @property
     def noise_count(self) -> int:
         """Number m of variates that a step needs."""
         return int(self.noise.shape[1])
+
+    @property
+    def held_count(self) -> int:
+        """Number of inputs that are held."""
+        return 0 if self.law is None else len(self.law.outputs)
 
     @property
     def own_disturbance(self) -> bool:
@@ -104,12 +112,17 @@ def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
         If the noise's law has no name, or its ``unit`` cannot be traced.
     """
     system = problem.system
-    tape: Tape = problem.closed_loop
+    held = problem.hold is not None
+    tape: Tape = system.dynamics if held else problem.closed_loop
     sequence = problem.input_sequence
-    inputs = 0 if sequence is None else sequence.shape[1]
+    inputs = len(system.input_names) if held else 0 if sequence is None else sequence.shape[1]
     disturbances = len(tape.inputs) - 1 - system.dimension - inputs
     rows = [] if sequence is None else [_table(sequence, steps)]
     fields: dict[str, Any] = {"dimension": system.dimension}
+    if held:
+        if steps % problem.samples:
+            raise ValueError(f"`steps` must be a multiple of the {problem.samples} sampling times, got {steps}.")
+        fields |= {"law": problem.plan, "every": steps // problem.samples}
     fields |= _disturbance(system, disturbances, steps, scenario, problem)
     if "row" in fields:
         rows.append(_table(fields.pop("row"), steps))

@@ -6,7 +6,8 @@ sub-Gaussian sum_t exp(-z_t^2/(2 s_t^2)).
 Continuous time, in windows [t_a, t_e]: M_s = Phi(t_e, s) Z_s is a Gaussian martingale, so that
 P(a . M_{t_a} <= z, sup a . M > z) = 2 P(a . M_{t_a} <= z, a . M_{t_e} > z). A row r at time s reads r . Z_s = b . M_s
 with b = r Phi(s, t_e), and where |M_i| <= z_i for all i, r . Z_s <= a . M_s + sum_i |b - a|_i z_i. That some
-coordinate of M exceeds its level is paid once, for all rows together.
+coordinate of M exceeds its level is paid once, for all rows together. At a sampling time, where the state jumps, a row
+reads what is there after it; a window may begin with one, and none lies inside.
 """
 
 from __future__ import annotations
@@ -139,6 +140,10 @@ class Windows:
                 try:
                     after = later.inv()
                     earlier = later * pieces[k].transition
+                    if pieces[k].jump:  # it has no inverse: nothing may stand before it in its window
+                        bends.append((after, after, one * 0))
+                        later = earlier
+                        continue
                     bends.append((after, earlier.inv(), _bend(pieces[k], after)))
                 except ZeroDivisionError as error:
                     raise Unproved("a window is too long for this system") from error

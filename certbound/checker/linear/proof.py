@@ -21,6 +21,7 @@ from certbound.checker.balls import column, diagonal, identity, magnitude, row_s
 from certbound.checker.linear.diffusion import Along, Asked, StateNoise, Stopped
 from certbound.checker.linear.events import Windows, chain, sub_gaussian
 from certbound.checker.linear.families import Family, leaving
+from certbound.checker.linear.held import Sampler, raised
 from certbound.checker.linear.remainder import OutputRemainder, PieceData, Polytope, remainders
 from certbound.checker.linear.response import (
     Load,
@@ -30,6 +31,7 @@ from certbound.checker.linear.response import (
     continuous_piece,
     covariances,
     discrete_piece,
+    jump_piece,
     over_piece,
     supports,
 )
@@ -48,7 +50,7 @@ _MILD = 0.25
 """Norm of the slopes times a piece, up to which series run well in the states' own units."""
 
 _PROOF = ("engine", "splits", "pieces", "varying", "moving", "units", "windows", "cells")
-_MAY = ("cuts",)
+_MAY = ("cuts", "sampled")
 _CELL = (
     "nominal", "slopes", "drifts", "gains", "remainder_low", "remainder_high", "rows", "levels", "window_levels",
     "frames", "separations",
@@ -63,16 +65,17 @@ def check_linear(model: Model, value: object, budget: Budget) -> arb:
     inequality could not be proved.
     """
     record = Record(value, "proof", _PROOF, _MAY)
+    model = raised(model)
     if model.continuous and model.dimension > MOST_STATES:
         raise Unproved(f"{model.dimension} states are too many for this proof in continuous time")
-    shared = Shared(model, structure_of(model, budget), record)
+    shared = Shared(model, structure_of(model, budget), record, budget)
     boxes = cells_of(model, record)
     entries = record.items("cells", len(boxes), len(boxes))
     outputs = remainders(model, shared.structure, budget)
     worst = arb(0)
     for index, (entry, box) in enumerate(zip(entries, boxes)):
         with budget.passing():
-            cell = _Cell(shared, Record(entry, f"proof.cells[{index}]", _CELL, ("stopped",)), box, budget)
+            cell = _Cell(shared, Record(entry, f"proof.cells[{index}]", _CELL, ("stopped", "sampled")), box, budget)
             worst = arb.max(worst, cell.probability(outputs))
     return upper(worst)
 
@@ -94,6 +97,8 @@ class _Cell:
             raise CertificateError(f"`{record.at('drifts')}` must be null in discrete time.")
         self.drifts = record.array("drifts", count, varying) if continuous else [[0.0] * varying] * count
         self.gains = record.array("gains", count, moving)
+        sampler = shared.sampler
+        self.sampled = [] if sampler is None else record.array("sampled", sampler.count, len(sampler.varying))
         self.low, self.high = record.array("remainder_low", count, n), record.array("remainder_high", count, n)
         if any(a > b for lows, highs in zip(self.low, self.high) for a, b in zip(lows, highs)):
             raise CertificateError(f"`{record.at('remainder_low')}` must not exceed `remainder_high`.")
@@ -152,8 +157,8 @@ class _Cell:
         return frames
 
     def _grid(self) -> Grid:
-        h, given = self.shared.length, self.nominal
-        times = [(h * k, h * (k + 1)) for k in range(self.shared.count)]
+        given = self.nominal
+        times = [self.shared.span(k) for k in range(self.shared.count)]
         if not self.model.continuous:
             times, given = [(arb(k), arb(k)) for k in range(self.shared.count + 1)], [[item] for item in given]
         return Grid(times=times, hulls=[[[arb(x) for x in point] for point in item] for item in given])
@@ -225,7 +230,11 @@ class _Cell:
         for k, (slope, drifts) in enumerate(zip(map(jacobian.matrix, self.slopes), self.drifts)):
             self.budget.check()
             noise = fixed if state is None else state.noise(k)
-            if self.model.continuous:
+            number_ = shared.sampled(k)
+            if shared.sampler is not None and number_ is not None:
+                matrix = shared.sampler.structure.states.matrix(self.sampled[number_])
+                result.append(jump_piece(matrix, shared.length))
+            elif self.model.continuous:
                 drift = jacobian.matrix(drifts, constants=False)
                 result.append(continuous_piece(slope, drift, shared.length, noise, self.natural))
             else:
@@ -273,7 +282,7 @@ class _Cell:
 
     def _gain(self, k: int) -> tuple[arb_mat, list[arb]] | None:
         """E with its columns scaled by the disturbance's radii, and the bound of |E (d - d0)|."""
-        if not self.reach:
+        if not self.reach or self.shared.sampled(k) is not None:
             return None
         gain = self.shared.structure.disturbances.matrix(self.gains[k])
         n, q = self.model.dimension, len(self.reach)
@@ -299,7 +308,11 @@ class _Cell:
         self, k: int, bounds: Supports, levels: Sequence[arb], outputs: Sequence[OutputRemainder]
     ) -> None:
         """beta lies in B on piece k, where Z and M keep to their levels; s lies in H."""
-        data = self._data(k)
+        sampler, number_ = self.shared.sampler, self.shared.sampled(k)
+        data, hidden_of, scale = self._data(k), self.shared.hidden, arb(1)
+        if sampler is not None and number_ is not None:
+            data, hidden_of, scale = self._at_sample(sampler, k, number_), sampler.hidden, self.shared.length
+            outputs = sampler.outputs
         low, high = [], []
         for d, level in enumerate(levels):
             size = bounds.reach[k][d] + level
@@ -310,23 +323,31 @@ class _Cell:
         sides = {unit: (low[d], high[d]) for d, unit in enumerate(self.shared.units)}
         for i, output in enumerate(outputs):
             output.prepare(data)
-            hidden = self.shared.hidden[i]
+            hidden = hidden_of[i]
             bounded = all(slot > self.model.dimension or slot - 1 in sides for slot in hidden)
             if hidden and not (bounded and output.is_decided(sides)):
                 names = ", ".join(self.model.dynamics.inputs[slot] for slot in hidden)
                 raise Unproved(f"{self.model.states[i]} may jump with {names}, in which it is linear otherwise")
-            polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=self.frames[i])
-            if not output.prove(polytope, arb(self.low[k][i]), arb(self.high[k][i]), self.budget):
+            frame = self.frames[i] if number_ is None else [self.shared.units.index(j) for j in output.states]
+            polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=frame)
+            ends = (self.low[k][i] * scale).upper(), (self.high[k][i] * scale).lower()
+            if not output.prove(polytope, *ends, self.budget):
                 name = self.model.states[i]
                 at = f"piece {k}" if self.model.continuous else f"step {k}"
                 raise Unproved(f"the remainder of {name} was not shown to stay in its box on {at}")
+
+    def _at_sample(self, sampler: Sampler, k: int, number_: int) -> PieceData:
+        """The parameters at a sampling time: its own, the nominal before and after it, and the law's slopes."""
+        before, after = self.nominal[k][0], self.nominal[k][3]
+        values = [sampler.span(k)[0], *map(arb, before), *map(arb, after), *map(arb, self.sampled[number_])]
+        return PieceData(values=values, half=arb(0), disturbance=[], disturbance_radius=[])
 
     def _data(self, k: int) -> PieceData:
         """The parameters of the remainder's expressions."""
         shared, n = self.shared, self.model.dimension
         if self.model.continuous:
-            h = shared.length
-            values = [h * (2 * k + 1) / 2]
+            h, (first, last) = shared.length, shared.span(k)
+            values = [(first + last) / 2]
             for j in range(n):
                 a, b, c, d = (arb(point[j]) for point in self.nominal[k])
                 values += [

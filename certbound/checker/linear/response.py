@@ -41,6 +41,7 @@ class Piece:
     slope: arb_mat
     size: arb_mat
     drift: arb_mat
+    jump: bool = False
 
     @property
     def curvature(self) -> arb_mat:
@@ -143,6 +144,16 @@ def discrete_piece(slope: arb_mat, noise: arb_mat) -> Piece:
     return Piece(
         length=arb(1), transition=slope, gathered=one, noise=noise, deviation=nothing, second=nothing, slope=slope,
         size=magnitude(slope), drift=nothing,
+    )
+
+
+def jump_piece(matrix: arb_mat, length: arb) -> Piece:
+    """A sampling time, at which z jumps to ``matrix`` z plus ``length`` times its remainder."""
+    one = identity(matrix.nrows())
+    nothing = one * 0
+    return Piece(
+        length=length, transition=matrix, gathered=one * length, noise=nothing, deviation=nothing, second=nothing,
+        slope=nothing, size=nothing, drift=nothing, jump=True,
     )
 
 

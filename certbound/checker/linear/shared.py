@@ -6,8 +6,9 @@ from itertools import pairwise
 
 from flint import arb
 
+from certbound.checker.linear.held import sampler_of
 from certbound.checker.reading import Record, wholes
-from certbound.checker.report import Unproved
+from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, Structure
 from certbound.errors import CertificateError
 
@@ -17,7 +18,7 @@ MOST_PIECES = 4000
 class Shared:
     """What all cells have in common: the grid, the windows, which entries of the Jacobians the file states."""
 
-    def __init__(self, model: Model, structure: Structure, record: Record) -> None:
+    def __init__(self, model: Model, structure: Structure, record: Record, budget: Budget) -> None:
         self.model, self.structure = model, structure
         self.count = record.whole("pieces", 1, MOST_PIECES)
         if not model.continuous and self.count != model.steps:
@@ -40,10 +41,24 @@ class Shared:
         elif record["windows"] is not None:
             raise CertificateError("`proof.windows` must be null in discrete time.")
 
+        self.sampler = sampler_of(model, record, self.count, budget)
+
     @property
     def length(self) -> arb:
         """Length of a piece."""
+        if self.sampler is not None:
+            return self.sampler.length
         return arb(self.model.horizon) / self.count if self.model.continuous else arb(1)
+
+    def span(self, k: int) -> tuple[arb, arb]:
+        """Both ends of a piece, in continuous time."""
+        if self.sampler is not None:
+            return self.sampler.span(k)
+        return self.length * k, self.length * (k + 1)
+
+    def sampled(self, k: int) -> int | None:
+        """Which sampling time a piece is; None for a piece that lasts."""
+        return None if self.sampler is None else self.sampler.number(k)
 
     def inputs(self, k: int) -> list[arb]:
         """The plan's inputs on piece k."""

@@ -19,6 +19,7 @@ from certbound.problem.model import Tape
 
 MOST_STATES = 400
 MOST_STEPS = 100_000
+MOST_SAMPLES = 1000
 _SLACK = arb(2) ** -39
 """How far a covariance may miss semidefiniteness where every variance is 1."""
 _FIELDS = (
@@ -71,6 +72,15 @@ class Initial:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Hold:
+    """Inputs that are held: the law (t, states) that computes them at the beginnings of ``count`` equal parts."""
+
+    count: int
+    law: Tape
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Model:
     """A problem as the checker knows it; ``constraints`` ends with the domain where there is one."""
 
@@ -91,6 +101,7 @@ class Model:
     unit: str = ""  # of time, for humans
     ends: bool = False  # where the domain is left: that is no failure, and counting it as one bounds from above only
     drawn: tuple[Drawn, ...] = ()  # constants, over whose values the probability is an average
+    hold: Hold | None = None  # then the inputs of the dynamics are what its law said last
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
     @property
@@ -117,7 +128,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     CertificateError where a field is missing, has the wrong size, or makes no sense; Unproved where it is too large for
     the budget.
     """
-    record = Record(value, path, _FIELDS, ("reach", "leaving", "unknown", "random", "units"))
+    record = Record(value, path, _FIELDS, ("reach", "leaving", "unknown", "random", "units", "hold"))
     time = record["time"]
     if time not in ("continuous", "discrete"):
         raise CertificateError(f"`{path}.time` must be \"continuous\" or \"discrete\".")
@@ -141,13 +152,15 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         read_constraint(item, f"{path}.constraints[{index}]", n, horizon, budget)
         for index, item in enumerate(record.items("constraints", 0, 1000))
     ]
+    hold = _hold(record, states, inputs)
     initial, members = _starts(record["initial"], path + ".initial", n, budget)
     if domain is not None:
         budget.hold(n * n // 4 + 1)
         constraints.append(Constraint.of_domain(domain))
     return Model(
         name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
-        ends=record["leaving"] == "ends", plan=_plan(record, len(inputs), continuous, horizon), states=states,
+        ends=record["leaving"] == "ends", states=states, hold=hold,
+        plan=_plan(record, len(inputs) if hold is None else 0, continuous, horizon),
         disturbance=_disturbance(record, len(disturbances)), unknown=unknown,
         unit=_unit(record, continuous),
         drawn=read_drawn(record["random"], record.at("random"), disturbances),
@@ -164,6 +177,17 @@ def _unit(record: Record, continuous: bool) -> str:
         raise CertificateError(f"`{record.at('units')}` must be texts by names.")
     own = {name: text(unit, record.at("units"), 20) for name, unit in units.items()}
     return own.get("time", "s" if continuous else "steps")
+
+
+def _hold(record: Record, states: tuple[str, ...], inputs: tuple[str, ...]) -> Hold | None:
+    """The law of inputs that are held: {"count": sampling times, "law": tape}."""
+    if "hold" not in record.value:
+        return None
+    inner = Record(record["hold"], record.at("hold"), ("count", "law"))
+    if record["time"] != "continuous" or not inputs:
+        raise CertificateError(f"`{inner.path}` must be left out in discrete time, and without inputs.")
+    count = inner.whole("count", 1, MOST_SAMPLES)
+    return Hold(count=count, law=read_tape(inner["law"], inner.at("law"), ("t", *states), (len(inputs),)), names=inputs)
 
 
 def _plan(record: Record, inputs: int, continuous: bool, horizon: float) -> list[list[float]] | None:

@@ -6,6 +6,7 @@ from certbound.gaussian.response.clocks import ClockEvents, SteadyEvent
 from certbound.gaussian.response.events import WindowEvents
 from certbound.gaussian.response.levels import level_along, level_scale
 from certbound.gaussian.response.linear_response import (
+    Jumps,
     LinearResponse,
     RowResponse,
     continuous_response,
@@ -21,6 +22,7 @@ __all__ = [
     "ClockEvents",
     "continuous_response",
     "discrete_response",
+    "Jumps",
     "level_along",
     "level_scale",
     "LinearResponse",

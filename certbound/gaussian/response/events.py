@@ -10,6 +10,7 @@ sum_i |b - r|_i z_i. The event that some coordinate exceeds z_i is paid once, fo
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -49,8 +50,14 @@ class WindowEvents:
 
     @cached_property
     def bounds(self) -> Integers:
-        """Window borders: node numbers from 0 to N."""
-        return np.append(np.arange(0, self.response.pieces, self.length, dtype=np.int64), self.response.pieces)
+        """Window borders: node numbers from 0 to N. A jump of the state begins a window, before the pieces after it."""
+        pieces, jumps = self.response.pieces, self.response.jumps
+        if not jumps:
+            return np.append(np.arange(0, pieces, self.length, dtype=np.int64), pieces)
+        found = []
+        for first, last in itertools.pairwise((*jumps, pieces)):
+            found += [first, *range(first + 1 + self.length, last, self.length)]
+        return np.array([*found, pieces], dtype=np.int64)
 
     @property
     def back(self) -> tuple[Array, Array]:
@@ -77,6 +84,7 @@ class WindowEvents:
         """G at the end and at the start of every piece, for the row b_t = w G_t of w at time t, and a bound E.
 
         Proves: at every t of the piece b_t lies between w G at its start and at its end, up to |w| E, entry by entry.
+        Of a jump: the row of what is there after it.
         """
         return remembered(self.memory, "chords", self._chords)
 
@@ -93,6 +101,9 @@ class WindowEvents:
             inverse, offset = inverse_of(forward, slack)
             for k in range(end - 1, start - 1, -1):
                 last[k], error[k] = inverse, bend[k] @ (np.abs(inverse) + offset) + offset
+                if k in self.response.jumps:  # the first of its window: a row reads the value after the jump
+                    first[k] = inverse
+                    break
                 forward, slack = longer(forward, slack, f[k], float(phi[k]))
                 inverse, offset = inverse_of(forward, slack)
                 first[k], error[k] = inverse, (error[k] + offset) * (1 + 1e-13)

@@ -60,6 +60,7 @@ class LinearResponse:
     covariance: Array
     covariance_error: Array
     slope_error: float = 0.0  # entrywise bound of the exact slope minus its floats
+    jumps: tuple[int, ...] = ()  # pieces without any length, whose transition is a jump of the state at one time
 
     @property
     def pieces(self) -> int:
@@ -176,8 +177,21 @@ def _propagate(
     return v, w
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Jumps:
+    """Pieces at which the state jumps by z -> S z: their numbers, S (B, J, n, n), and an entrywise error bound.
+
+    They have no slope, no noise, and the length of all others only in what is divided by it.
+    """
+
+    places: tuple[int, ...]
+    matrices: Array
+    error: float
+
+
 def continuous_response(
-    slope: Array, drift: Array, step: float, diffusion: Array, start: Array, *, slope_error: float = 0.0
+    slope: Array, drift: Array, step: float, diffusion: Array, start: Array, *, slope_error: float = 0.0,
+    jumps: Jumps | None = None,
 ) -> LinearResponse:
     """Linear data in continuous time: dZ = (A + tau K) Z dt + g dW on every piece.
 
@@ -191,10 +205,13 @@ def continuous_response(
     noise_error = noise_error + _gamma(diffusion.shape[-1]) * 4 * step * float(
         (np.abs(diffusion) @ _transposed(np.abs(diffusion))).max(initial=0.0)
     )
+    if jumps is not None:
+        own = np.array(jumps.places)
+        transition[:, own], error[:, own], deviation[:, own] = jumps.matrices, jumps.error, 0.0
     v, w = _propagate(transition, error, noise, noise_error, start)
     return LinearResponse(
-        step=step, slope=slope, drift=drift, transition=transition, transition_error=error,
-        deviation=deviation, covariance=v, covariance_error=w, slope_error=slope_error,
+        step=step, slope=slope, drift=drift, transition=transition, transition_error=error, deviation=deviation,
+        covariance=v, covariance_error=w, slope_error=slope_error, jumps=() if jumps is None else jumps.places,
     )
 
 

@@ -45,7 +45,7 @@ class _ProblemReader(SetReader):
             reach=targets[0] if targets else None,
             horizon=self.number(spec.horizon, "horizon"),
             delta=self.number(spec.delta, "delta"),
-            plan=self.plan(),
+            plan=self.plan(), hold=self.hold(),
             cost=None if spec.cost is None else self.weights(spec.cost),
             domain=None if spec.domain is None else self.box(spec.domain.box, "domain.box", np.inf),
             leaving="unsafe" if spec.domain is None else spec.domain.leaving,
@@ -170,17 +170,24 @@ class _ProblemReader(SetReader):
             return None
         if set(table) == {"file"} and "file" not in self.inputs:
             return read_plan(self.file(table["file"], "plan.file"), self.inputs)
+        table = {key: value for key, value in table.items() if key != "hold" or key in self.inputs}
         for key in table:
             if not self.inputs:
                 raise ValueError(f"`plan.{key}` must be an input, and the file has none; give an [inputs] table.")
             if key not in self.inputs:
-                raise ValueError(f"unknown key {key!r} in [plan]{nearest(key, [*self.inputs, 'file'])}")
+                raise ValueError(f"unknown key {key!r} in [plan]{nearest(key, [*self.inputs, 'file', 'hold'])}")
         for name in self.inputs:
             if name not in table:
                 raise ValueError(f"`plan` must give every input, {name!r} is missing.")
         where = [f"plan.{name}" for name in self.inputs]
         texts = [table[name] for name in self.inputs]
         return self.function(texts, ("t", *self.states), where, (len(self.inputs),))
+
+    def hold(self) -> float | None:
+        """Seconds between two sampling times, under ``plan.hold``; an input of that name has its law there."""
+        table = self.spec.plan or {}
+        held = "hold" in table and "hold" not in self.inputs
+        return self.number(table["hold"], "plan.hold") if held else None
 
     def weights(self, cost: Cost) -> tuple[Array, Array]:
         return self.matrix(cost.Q, "cost.Q"), self.matrix(cost.R, "cost.R")

@@ -138,7 +138,10 @@ class _Writer:
         plan = self.problem.plan
         if plan is None or isinstance(plan, np.ndarray):
             return None if plan is None else {"file": self.plan_file}
-        return dict(zip(self.system.input_names, self.texts(plan)))
+        hold = {} if self.problem.hold is None else {"hold": self.problem.hold}
+        if hold and "hold" in self.system.input_names:
+            raise ValueError("an input named 'hold' cannot be written beside a hold; give it another name.")
+        return dict(zip(self.system.input_names, self.texts(plan))) | hold
 
     def noise(self) -> dict[str, Any]:
         system = self.system

@@ -5,6 +5,7 @@ from __future__ import annotations
 from certbound.reach.linear.answer import linear_answer, linear_reach, refusal
 from certbound.reach.linear.answer_tubes import DeviationTube
 from certbound.reach.linear.diffusion import Accepted, DiffusionRun, Reference, depends_on_state
+from certbound.reach.linear.held import HeldLinearisation
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.proved import LinearAnswer, Path, SplitAnswer
 from certbound.reach.linear.run import Events, LinearRun, correlated
@@ -17,6 +18,7 @@ __all__ = [
     "DeviationTube",
     "DiffusionRun",
     "Events",
+    "HeldLinearisation",
     "linear_answer",
     "linear_reach",
     "LinearAnswer",

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from certbound.problem.held import HeldLoop
 from certbound.problem.problem import Problem
 from certbound.reach.linear import shares
 from certbound.reach.linear.bisection import bisected
@@ -29,7 +30,7 @@ def refusal(problem: Problem) -> str | None:
 
 
 def linear_answer(
-    problem: Problem, *, cells: int | None = None, thorough: bool = True, before: LinearAnswer | None = None,
+    problem: Problem | HeldLoop, *, cells: int | None = None, thorough: bool = True, before: LinearAnswer | None = None,
     found: Callable[[LinearAnswer], object] = nobody,
 ) -> LinearAnswer:
     """Bound the probability of leaving the safe set by the linear response (Thm K7').
@@ -49,7 +50,9 @@ def linear_answer(
     run = run_of(problem, cells=1 if cells is None else cells) if before is None else before.run
     best, effort = best_of(run, target, found) if before is None else (before.outcome, shares.HOPED[-1][1])
     unproved = best.log_probability > target.log
-    if thorough and cells is None and unproved and run.curved and not isinstance(run, DiffusionRun):
+    plain = isinstance(problem, Problem) and not isinstance(run, DiffusionRun)
+    if thorough and cells is None and unproved and run.curved and plain:
+        assert isinstance(problem, Problem)
         split = bisected(problem, run, target)
         if split is not None:
             return split
@@ -67,7 +70,7 @@ def linear_answer(
 
 
 def _on_grids(
-    problem: Problem, run: LinearRun, target: Share, found: Callable[[LinearAnswer], object]
+    problem: Problem | HeldLoop, run: LinearRun, target: Share, found: Callable[[LinearAnswer], object]
 ) -> tuple[LinearRun, tuple[Outcome, int]] | None:
     """On the first grid of cells on which the remainder does not feed itself, as long as they are not too many."""
     wide = int(np.count_nonzero(run.engine.radii[0]))

@@ -15,7 +15,6 @@ from certbound.arrays import Array
 from certbound.reach.linear.inclusion import Supports
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.rows import inner_rows
-from certbound.reach.remainder import sampled_range
 from certbound.watch import poll
 
 _LOG = logging.getLogger(__name__)
@@ -176,7 +175,7 @@ class Inclusion:
     def sampled(self, polytope: tuple[Array, Array]) -> list[Array]:
         """Range of beta over sample points: two arrays (B, N, n)."""
         engine = self.engine
-        found = sampled_range(engine.model, engine.frame, *polytope, self.flat_extra)
+        found = engine.model.sampled(engine.frame, *polytope, self.flat_extra)
         return [b.reshape(engine.shape) for b in found]
 
     def _all_finite(self, low: Array, high: Array) -> bool:

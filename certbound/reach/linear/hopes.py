@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from certbound.problem.held import HeldLoop
 from certbound.problem.problem import Problem
 from certbound.reach.linear import shares
 from certbound.reach.linear.diffusion import DiffusionRun, depends_on_state
 from certbound.reach.linear.fit import fitted
+from certbound.reach.linear.held import HeldLinearisation
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.proved import LinearAnswer
 from certbound.reach.linear.run import LinearRun, Outcome
@@ -25,9 +27,12 @@ def nobody(answer: LinearAnswer) -> None:
 
 
 def run_of(
-    problem: Problem, *, cells: int | Cells | None, noise: bool = True, pieces: int | None = None
+    problem: Problem | HeldLoop, *, cells: int | Cells | None, noise: bool = True, pieces: int | None = None
 ) -> LinearRun:
     """The engine for the problem's noise, on a grid that resolves it or on so many pieces."""
+    if isinstance(problem, HeldLoop):
+        assert not isinstance(cells, Cells)
+        return LinearRun(HeldLinearisation.of_loop(problem, cells=cells, noise=noise))
     if pieces is None:
         plain = Linearisation.of(problem, cells=cells, noise=noise)
     else:

@@ -21,8 +21,8 @@ from certbound.reach.sets import NominalPieces
 from certbound.rigor.intervals import Interval
 from certbound.watch import poll
 
-_FEWEST_PIECES, _MOST_PIECES = 50, 2000
-_STEP, _OWN_STEP, _SERIES = 0.1, 0.03, 2.0
+FEWEST_PIECES, MOST_PIECES = 50, 2000
+STEP, OWN_STEP, SERIES = 0.1, 0.03, 2.0
 """||J|| h of a piece: in the states' own units; in those that balance J, where fewer pieces do; and, in the states' own
 again, what the series of a transition matrix need."""
 _LARGE = 40  # states
@@ -76,7 +76,7 @@ class Linearisation:
     def _pieces(self, pieces: int | None) -> int:
         if not self.continuous:
             return int(self.problem.horizon)
-        count = _FEWEST_PIECES if pieces is None else pieces
+        count = FEWEST_PIECES if pieces is None else pieces
         if self.problem.input_sequence is not None:
             rows = len(self.problem.input_sequence)
             count = rows * int(np.ceil(count / rows))
@@ -84,16 +84,16 @@ class Linearisation:
 
     @classmethod
     def of(cls, problem: Problem, *, cells: int | Cells | None = None, noise: bool = True) -> Linearisation:
-        """The linearisation on a grid that resolves the nominal Jacobians: see ``_STEP``."""
+        """The linearisation on a grid that resolves the nominal Jacobians: see ``STEP``."""
         if problem.system.time == "discrete":
             return cls(problem, cells=cells, noise=noise)
         trial = cls(problem, noise=noise)
-        while trial.lost and 4 * trial.pieces <= _MOST_PIECES:  # a coarse grid loses a stiff system's nominal at once
+        while trial.lost and 4 * trial.pieces <= MOST_PIECES:  # a coarse grid loses a stiff system's nominal at once
             trial = cls(problem, pieces=4 * trial.pieces, noise=noise)
         slopes = np.nan_to_num(trial.slopes[0])
         own, whole = (float(np.linalg.norm(found, axis=(-2, -1)).max()) for found in (balanced(slopes), slopes))
-        wanted = problem.horizon * min(whole / _STEP, max(own / _OWN_STEP, whole / _SERIES))
-        pieces = int(np.clip(np.ceil(wanted), _FEWEST_PIECES, _MOST_PIECES))
+        wanted = problem.horizon * min(whole / STEP, max(own / OWN_STEP, whole / SERIES))
+        pieces = int(np.clip(np.ceil(wanted), FEWEST_PIECES, MOST_PIECES))
         alike = (cells is None or cells == 1) and trial._pieces(pieces) == trial.pieces
         return trial if alike else cls(problem, cells=cells, pieces=pieces, noise=noise)
 

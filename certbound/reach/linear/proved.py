@@ -78,7 +78,7 @@ class LinearAnswer:
     @property
     def time(self) -> float:
         """Where the room is least, or where the remainder begins to feed itself."""
-        return float(self._tightest[1] * self.run.engine.step)
+        return float(self.run.engine.times[self._tightest[1]])
 
     @property
     def constraint(self) -> str | None:

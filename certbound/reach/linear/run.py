@@ -8,7 +8,7 @@ to Z is a scalar event, so that P(unsafe) <= delta_N + sum_j P_j (Thm K7').
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ from certbound.reach.linear.shares import Share
 from certbound.reach.sets import Requirement, requirements
 from certbound.watch import poll
 
-Events = StepEvents | ClockEvents | SplitEvents
+Events = StepEvents | ClockEvents | SplitEvents | WindowEvents
 
 _MARGIN = 2.0  # times that width is what a proof is expected to need
 _OVERLAPPING = -8.0  # from which on constraints that are broken together are counted once
@@ -68,6 +68,8 @@ class LinearRun(Inclusion):
         engine = self.engine
         if isinstance(engine.system, ContinuousSystem):
             windows = WindowEvents(engine.response, cell, engine.window, shared.log)
+            if engine.response.jumps:
+                return replace(windows, memory=self.memory.setdefault(cell, {}))
             diffusion = engine.diffusion if engine.diffusion.ndim == 2 else engine.diffusion[cell]
             return ClockEvents(windows, diffusion, self.memory.setdefault(cell, {}))
         if cell not in self.steps:

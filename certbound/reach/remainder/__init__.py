@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from certbound.reach.remainder.bound import Remainder
 from certbound.reach.remainder.frame import Frame
+from certbound.reach.remainder.held import HeldFrame, HeldRemainder
 from certbound.reach.remainder.jumps import hidden_jump
-from certbound.reach.remainder.samples import fitted_slopes, sampled_range
+from certbound.reach.remainder.samples import fitted_slopes
 
-__all__ = ["fitted_slopes", "Frame", "hidden_jump", "Remainder", "sampled_range"]
+__all__ = ["fitted_slopes", "Frame", "HeldFrame", "HeldRemainder", "hidden_jump", "Remainder"]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
-from certbound.arrays import Array
+from certbound.arrays import Array, Integers
 from certbound.rigor.intervals import Interval
 
 
@@ -36,3 +36,9 @@ class Frame:
 
     def __len__(self) -> int:
         return len(self.spread)
+
+    def taken(self, index: Integers) -> Frame:
+        """Some of the pieces."""
+        whole = {"half", "disturbance_middle", "disturbance_low", "disturbance_high"}
+        names = [entry.name for entry in fields(self) if entry.name not in whole]
+        return replace(self, **{name: getattr(self, name)[index] for name in names})

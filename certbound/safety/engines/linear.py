@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from certbound.problem.held import held_loop
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
 from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state, linear_answer
@@ -17,6 +18,8 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     With additive noise it covers every disturbance, even one that sees coming noise; with noise that depends on the
     state, those that do not.
     """
+    if problem.hold is not None:
+        return _held(problem, asked)
     problem = in_pieces(problem)
     hidden = hidden_jump(problem)
     if hidden is not None:
@@ -46,6 +49,27 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         details=answer,
         conclusive=answer.exact and answer.margin > -np.inf,
         foresight=foresight,
+    )
+
+
+def _held(problem: Problem, asked: Request) -> EngineAnswer:
+    """The same where inputs are held: the state that is bounded has them behind it."""
+    loop = held_loop(problem)
+    hidden = hidden_jump(loop.flow) or hidden_jump(loop.sample)
+    if hidden is not None:
+        return EngineAnswer(applicable=False, reason=hidden, method="linear")
+    answer = linear_answer(loop, cells=asked.cells, thorough=asked.thorough)
+    whole, n = answer.tube, problem.system.dimension
+    lasting = np.diff(answer.engine.times) > 0
+    deviation = None
+    if whole is not None:
+        half = whole.half_widths[lasting, :n]
+        times = np.append(whole.times[:-1][lasting], whole.times[-1])
+        deviation = Deviation(times=times, radius=np.linalg.norm(half, axis=1) * (1 + 1e-14), extent=half)
+    return EngineAnswer(
+        log10_delta=answer.log10_delta, margin=answer.margin if np.isfinite(answer.margin) else None,
+        time=answer.time, constraint=answer.constraint, reason=answer.reason, deviation=deviation, method="linear",
+        details=answer, foresight=True,
     )
 
 

@@ -14,7 +14,7 @@ from certbound.arrays import Array
 from certbound.checks import positive_definite
 from certbound.simulation.blocks import MEMORY_LIMIT, Counts, check_count
 from certbound.simulation.checkpoint import seed_of
-from certbound.simulation.estimates.preparation import Setting, prepare
+from certbound.simulation.estimates.preparation import Setting, prepare, refuse_held
 from certbound.simulation.estimates.statistics import bound_binomial, order_ranks
 from certbound.simulation.executors import Progress, run_work
 from certbound.simulation.kernel_source import kernel_source
@@ -147,6 +147,7 @@ def sup_deviation(
         If an argument is malformed, the noise has no law, or the model gives a state that is not finite.
     """
     paths = check_count("paths", paths)
+    refuse_held(problem, "a simulation of deviations")
     setting = prepare(problem, steps, scenario)
     task, profile = _task(setting, measure or Measure(), points != 0)
     rows, bins = 1 if task.directions is None else len(task.directions), _OCTAVES * _COARSE + 2

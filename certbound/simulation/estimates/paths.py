@@ -8,7 +8,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.simulation.blocks import BLOCK, MEMORY_LIMIT, check_count, entropy_of
-from certbound.simulation.estimates.preparation import prepare
+from certbound.simulation.estimates.preparation import prepare, refuse_held
 from certbound.simulation.kernel_source import kernel_source
 from certbound.simulation.stepping import Scenario
 from certbound.simulation.tasks import Task
@@ -59,6 +59,8 @@ def sample_paths(
     (3, 51, 1)
     """
     paths = check_count("paths", paths)
+    if deviation:
+        refuse_held(problem, "a sample of deviations")
     setting = prepare(problem, steps, scenario)
     points = setting.steps if points is None else check_count("points", points)
     if setting.steps % points:

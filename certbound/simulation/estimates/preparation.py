@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.errors import InfeasibleError
 from certbound.problem.goals import check_end
 from certbound.problem.model import compile_scalar
 from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
@@ -95,7 +96,8 @@ def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = 
     if not isinstance(scenario, Scenario):
         raise TypeError(f"`scenario` must be a certbound.simulation.stepping.Scenario, got {scenario!r}.")
     count = _steps(problem, steps)
-    columns = 2 + 2 * problem.system.dimension + len(problem.closed_loop.inputs) + 4 * (len(problem.safe) + 1)
+    signals = len((problem.closed_loop if problem.hold is None else problem.system.dynamics).inputs)
+    columns = 2 + 2 * problem.system.dimension + signals + 4 * (len(problem.safe) + 1)
     fit = MEMORY_LIMIT // (8 * columns)
     if count > fit:
         raise ValueError(
@@ -107,6 +109,12 @@ def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = 
     return Setting(model=step_model(problem, count, scenario), steps=count, times=times, start=start, fixed=fixed)
 
 
+def refuse_held(problem: Any, what: str) -> None:
+    """Refuse inputs that are held, with an InfeasibleError, where ``what`` knows no sampling times."""
+    if problem.hold is not None:
+        raise InfeasibleError(f"{what} knows no inputs that are held: count plain paths, simulate_exits.")
+
+
 def _steps(problem: Any, steps: int | None) -> int:
     check_end(problem, "a simulation")
     if problem.system.time == "discrete":
@@ -116,7 +124,7 @@ def _steps(problem: Any, steps: int | None) -> int:
         return horizon
     if steps is not None:
         return check_count("steps", steps)
-    pieces = 1 if problem.input_sequence is None else len(problem.input_sequence)
+    pieces = problem.samples or (1 if problem.input_sequence is None else len(problem.input_sequence))
     return -(-_DEFAULT_STEPS // pieces) * pieces
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.simulation.blocks import MEMORY_LIMIT, Tally, Work, check_count
 from certbound.simulation.checkpoint import seed_of
-from certbound.simulation.estimates.preparation import Setting, prepare
+from certbound.simulation.estimates.preparation import Setting, prepare, refuse_held
 from certbound.simulation.estimates.score import score_source
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
 from certbound.simulation.executors import Progress, run_work
@@ -110,6 +110,7 @@ def simulate_rare_exits(
     if particles < 20:
         raise ValueError(f"`particles` must be at least 20, got {particles}.")
     replicas = max(10, paths // particles)
+    refuse_held(problem, "splitting")
     setting = prepare(problem, steps, scenario)
     model = setting.model
     if model.switching > 0.0:
