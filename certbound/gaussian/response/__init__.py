@@ -8,6 +8,7 @@ from certbound.gaussian.response.levels import level_along, level_scale
 from certbound.gaussian.response.linear_response import (
     LinearResponse,
     RowResponse,
+    balancing_units,
     continuous_response,
     discrete_response,
 )
@@ -18,6 +19,7 @@ from certbound.gaussian.response.overlaps import log_any_exceedance
 from certbound.gaussian.response.step_events import StepEvents
 
 __all__ = [
+    "balancing_units",
     "ClockEvents",
     "continuous_response",
     "discrete_response",
