@@ -9,6 +9,7 @@ from certbound.gaussian.response.linear_response import (
     Jumps,
     LinearResponse,
     RowResponse,
+    balancing_units,
     continuous_response,
     discrete_response,
 )
@@ -19,6 +20,7 @@ from certbound.gaussian.response.overlaps import log_any_exceedance
 from certbound.gaussian.response.step_events import StepEvents
 
 __all__ = [
+    "balancing_units",
     "ClockEvents",
     "continuous_response",
     "discrete_response",

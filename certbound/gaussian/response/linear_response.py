@@ -22,6 +22,7 @@ from certbound.watch import poll
 _UNIT = 2.0**-53
 _TINY = 1e-300
 _TERMS = 24
+_SWEEPS, _FARTHEST = 20, 60  # of balancing; exponent of a unit
 _LARGE, _SPARSE = 40, 0.1  # states and share of nonzero entries from which on products are sparse
 
 
@@ -197,22 +198,50 @@ def continuous_response(
 
     ``diffusion`` is g (n, m), or one matrix a cell and piece, (B, N, n, m).
     ``slope_error`` bounds entrywise how far the exact slope (the model's constants) is from its floats.
+    The series run in units of the states in which the slopes are balanced, so that units cost no pieces of time.
     """
-    transition, error, deviation = _transition(slope, drift, step, slope_error)
-    gram = diffusion @ _transposed(diffusion)
-    noise, noise_error = _noise_covariance(slope, drift, step, gram)
-    noise_error = noise_error + 4 * slope.shape[-1] * step * slope_error * np.abs(noise).sum(axis=(-1, -2))
+    unit = balancing_units(slope)
+    back, size = unit[:, None] / unit, unit[:, None] * unit  # powers of two: products with them are exact
+    own_error = slope_error * float(1 / back.min())  # of the slope in balanced units, as far as it may grow
+    own_slope, own_drift, own_noise = slope / back, drift / back, diffusion / unit[:, None]
+    transition, error, deviation = _transition(own_slope, own_drift, step, own_error)
+    gram = own_noise @ _transposed(own_noise)
+    noise, noise_error = _noise_covariance(own_slope, own_drift, step, gram)
+    noise_error = noise_error + 4 * slope.shape[-1] * step * own_error * np.abs(noise).sum(axis=(-1, -2))
     noise_error = noise_error + _gamma(diffusion.shape[-1]) * 4 * step * float(
-        (np.abs(diffusion) @ _transposed(np.abs(diffusion))).max(initial=0.0)
+        (np.abs(own_noise) @ _transposed(np.abs(own_noise))).max(initial=0.0)
     )
     if jumps is not None:
         own = np.array(jumps.places)
-        transition[:, own], error[:, own], deviation[:, own] = jumps.matrices, jumps.error, 0.0
-    v, w = _propagate(transition, error, noise, noise_error, start)
+        transition[:, own], error[:, own] = jumps.matrices / back, jumps.error / float(back.min())
+        deviation[:, own] = 0.0
+    v, w = _propagate(transition, error, noise, noise_error, start / size)
     return LinearResponse(
-        step=step, slope=slope, drift=drift, transition=transition, transition_error=error, deviation=deviation,
-        covariance=v, covariance_error=w, slope_error=slope_error, jumps=() if jumps is None else jumps.places,
+        step=step, slope=slope, drift=drift, transition=transition * back, transition_error=error * float(back.max()),
+        deviation=deviation * back + _TINY, covariance=v * size, slope_error=slope_error,
+        covariance_error=w * size + len(unit) * _TINY * np.eye(len(unit)),
+        jumps=() if jumps is None else jumps.places,
     )
+
+
+def balancing_units(slopes: Array) -> Array:
+    """Powers of two, (n,), in units of which rows and columns of slopes (..., n, n) are about equal.
+
+    Any choice serves: it costs accuracy, and no more than that.
+    """
+    size = np.abs(slopes).reshape(-1, *slopes.shape[-2:]).max(axis=0)
+    size = np.where(np.isfinite(size), size, 0.0) * (1 - np.eye(len(size)))
+    exponents = np.zeros(len(size))
+    for _ in range(_SWEEPS):
+        before = exponents.copy()
+        for i in range(len(size)):
+            away = np.exp2(exponents - exponents[i])
+            row, column = float(size[i] @ away), float(size[:, i] @ (1 / away))
+            if row > 0 and column > 0:
+                exponents[i] = np.clip(exponents[i] + np.round(np.log2(row / column) / 2), -_FARTHEST, _FARTHEST)
+        if np.array_equal(before, exponents):
+            break
+    return np.asarray(np.exp2(exponents))
 
 
 def discrete_response(

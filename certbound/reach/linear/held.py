@@ -17,15 +17,7 @@ from certbound.arrays import Array, Integers
 from certbound.gaussian.response import Jumps, LinearResponse, continuous_response
 from certbound.problem.held import HeldLoop
 from certbound.problem.model import compile_numpy
-from certbound.reach.linear.linearisation import (
-    FEWEST_PIECES,
-    MOST_PIECES,
-    OWN_STEP,
-    SERIES,
-    STEP,
-    Linearisation,
-    balanced,
-)
+from certbound.reach.linear.linearisation import FEWEST_PIECES, MOST_PIECES, OWN_STEP, STEP, Linearisation, balanced
 from certbound.reach.nominal import Cells, initial_cells
 from certbound.reach.remainder import Frame, HeldFrame, HeldRemainder, Remainder
 from certbound.rigor.intervals import Interval
@@ -59,7 +51,7 @@ class HeldLinearisation(Linearisation):
             trial = cls(loop, pieces=4 * trial.pieces, noise=noise)
         slopes = np.nan_to_num(trial.slopes[0])
         own, whole = (float(np.linalg.norm(found, axis=(-2, -1)).max()) for found in (balanced(slopes), slopes))
-        wanted = loop.flow.horizon * min(whole / STEP, max(own / OWN_STEP, whole / SERIES))
+        wanted = loop.flow.horizon * min(whole / STEP, own / OWN_STEP)
         return cls(loop, cells=cells, pieces=int(np.clip(np.ceil(wanted), FEWEST_PIECES, MOST_PIECES)), noise=noise)
 
     def on_grid(self, pieces: int) -> HeldLinearisation:

@@ -10,7 +10,7 @@ import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
-from certbound.gaussian.response import LinearResponse, continuous_response, discrete_response
+from certbound.gaussian.response import LinearResponse, balancing_units, continuous_response, discrete_response
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
@@ -22,9 +22,8 @@ from certbound.rigor.intervals import Interval
 from certbound.watch import poll
 
 FEWEST_PIECES, MOST_PIECES = 50, 2000
-STEP, OWN_STEP, SERIES = 0.1, 0.03, 2.0
-"""||J|| h of a piece: in the states' own units; in those that balance J, where fewer pieces do; and, in the states' own
-again, what the series of a transition matrix need."""
+STEP, OWN_STEP = 0.1, 0.03
+"""||J|| h of a piece: in the states' own units; and in those that balance J, where fewer pieces do."""
 _LARGE = 40  # states
 WINDOW, WINDOW_TURN, WINDOW_SPAN = 0.02, 0.1, 8.0
 """The martingale windows that bound rows which turn: their share of the horizon; ||J|| times their time in balanced
@@ -92,7 +91,7 @@ class Linearisation:
             trial = cls(problem, pieces=4 * trial.pieces, noise=noise)
         slopes = np.nan_to_num(trial.slopes[0])
         own, whole = (float(np.linalg.norm(found, axis=(-2, -1)).max()) for found in (balanced(slopes), slopes))
-        wanted = problem.horizon * min(whole / STEP, max(own / OWN_STEP, whole / SERIES))
+        wanted = problem.horizon * min(whole / STEP, own / OWN_STEP)
         pieces = int(np.clip(np.ceil(wanted), FEWEST_PIECES, MOST_PIECES))
         alike = (cells is None or cells == 1) and trial._pieces(pieces) == trial.pieces
         return trial if alike else cls(problem, cells=cells, pieces=pieces, noise=noise)
@@ -385,8 +384,5 @@ class Linearisation:
 
 def balanced(slopes: Array) -> Array:
     """Slopes (..., n, n) in units of the states, powers of two, in which their rows and columns are about equal."""
-    from scipy.linalg import matrix_balance
-
-    largest = np.abs(slopes).reshape(-1, *slopes.shape[-2:]).max(axis=0)
-    units = matrix_balance(largest, permute=False, separate=True)[1][0]
+    units = balancing_units(slopes)
     return np.asarray(slopes / units[:, None] * units)

@@ -118,13 +118,18 @@ def _clock(setting: Setting, plan: Plan) -> Clock:
         chord=chord_level(plan.spare, omega),
     )  # fmt: skip
     blocks = _rough(setting, replace(first, shear=0.0))
-    known = blocks.known
+    known = _some(blocks.known)
+    ratio = blocks.covariance[1].mid[known] / blocks.covariance[2].mid[known]
+    return replace(first, shear=float(np.median(ratio)))
+
+
+def _some(known: Mask) -> Mask:
+    """Where blocks are known; InfeasibleError where none is."""
     if not known.any():
         raise InfeasibleError(
             "the model is undefined, or steps of this length cannot be enclosed; value functions prove nothing here."
         )
-    ratio = blocks.covariance[1].mid[known] / blocks.covariance[2].mid[known]
-    return replace(first, shear=float(np.median(ratio)))
+    return known
 
 
 def _rough(setting: Setting, clock: Clock) -> Blocks:
@@ -137,7 +142,7 @@ def _rough(setting: Setting, clock: Clock) -> Blocks:
 
 def _axes(setting: Setting, clock: Clock, plan: Plan, rough: Blocks) -> tuple[Array, Array]:
     (p0, p1), (q0, q1) = setting.faces
-    known = rough.known
+    known = _some(rough.known)
     yy, qq = rough.covariance[0].mid, rough.covariance[2].mid
     sigma = math.sqrt(max(float(np.median(yy[known])), 0.0)), math.sqrt(float(np.median(qq[known])))
     if not sigma[0] > 1e-7 * (p1 - p0):

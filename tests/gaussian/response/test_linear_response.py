@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from certbound.gaussian.response.linear_response import RowResponse, discrete_response
+from certbound.gaussian.response.linear_response import RowResponse, continuous_response, discrete_response
 from certbound.gaussian.response.step_events import StepEvents
 
 
@@ -43,6 +43,26 @@ def test_chosen_columns_and_repeated_rows_bound_what_is_driven(n: int) -> None:
         best += float(np.maximum(adjoint * low[j], adjoint * high[j]).sum())
         adjoint = adjoint @ slope
     assert bounds[1][1][k, 0] == pytest.approx(best, abs=1e-10)
+
+
+@pytest.mark.parametrize("exponent", [0, 14, 50])
+def test_units_of_single_states_cost_no_accuracy(exponent: int) -> None:
+    """x_2 in units of 2^-exponent: the same response, though the slope's norm times a piece is 2^exponent / 10."""
+    unit = np.array([1.0, 2.0**-exponent])
+    slope, noise = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.diag([0.3, 0.2])
+    start = np.diag([0.01, 0.02])
+    shape = (1, 10, 2, 2)
+    plain = continuous_response(np.broadcast_to(slope, shape), np.zeros(shape), 0.1, noise, start)
+    other = np.broadcast_to(unit[:, None] * slope / unit, shape)
+    moved = continuous_response(
+        other, np.zeros(shape), 0.1, unit[:, None] * noise, unit[:, None] * start * unit
+    )  # fmt: skip
+    np.testing.assert_allclose(moved.transition[0, 0], unit[:, None] * plain.transition[0, 0] / unit, rtol=1e-12)
+    row = np.array([[[1.0, 1.0]]]) / unit
+    bounds = moved.variance(row, np.array([10]))
+    exact = float(plain.variance(np.ones((1, 1, 2)), np.array([10]))[0][0, 0])
+    assert bounds[0][0, 0] <= exact <= bounds[1][0, 0] * (1 + 1e-15)
+    assert bounds[1][0, 0] - bounds[0][0, 0] <= 1e-9 * exact
 
 
 def test_variances_along_few_states_need_only_those() -> None:
