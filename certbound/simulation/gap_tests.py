@@ -186,13 +186,8 @@ def starts_at_once(number: int, barrier: Barrier) -> str:
 
 
 def _touch(exponent: str, number: int) -> list[str]:
-    """Leave with probability exp(-e), which is below 1/(1 + e + e^2/2): that saves most exponentials."""
-    return [
-        f"exponent = {exponent}",
-        "chance = uniform(stream)",
-        "if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0 and chance < math.exp(-exponent):",
-        f"    left = {number}",
-    ]
+    """Leave with probability exp(-e)."""
+    return [f"if touches(stream, {exponent}):", f"    left = {number}"]
 
 
 def _faces(

@@ -158,10 +158,10 @@ def _deviation(task: Task, dimension: int, bridge: Bridge | None, p: Parameters)
     within += ["if mark < marks.shape[0] and marks[mark] == k + 1:"] if task.marked else []
     for j in range(count if task.marked else 0):
         for kind, text in enumerate((value, top)):
-            bin_of = f"bin_of({text.format(j)}, {marginal}, marginals.shape[3])"
+            bin_of = f"bin_of({text.format(j)}, {LOWEST}.0, {marginal}, marginals.shape[3])"
             within += [f"    marginals[{kind}, mark, {j}, {bin_of}] += 1"]
     within += ["    mark += 1"] if task.marked else []
-    finish += [f"counts[{j}, bin_of(top_{j}, {sup}, counts.shape[1])] += 1" for j in range(count)]
+    finish += [f"counts[{j}, bin_of(top_{j}, {LOWEST}.0, {sup}, counts.shape[1])] += 1" for j in range(count)]
     return begin, within, end, finish
 
 
@@ -215,22 +215,14 @@ def _late(task: Task, bridge: Bridge) -> bool:
 
 
 def _bridge_top(j: str, before: str, after: str, spread: str, p: Parameters, tested: bool = False) -> list[str]:
-    """Draw the largest value of the bridge between two values where it can exceed the record.
-
-    It does so when the variate is below exp(-e), and e^-e < 1/(1 + e + e^2/2) saves most logarithms.
-    """
+    """Draw the largest value of the bridge between two values where it can exceed the record."""
     product = f"2.0 * (top_{j} - {before}) * (top_{j} - {after})"
     variance = p.value_of(spread)
     if variance is None:
         exponent = f"{product} / {spread} if {spread} > 0.0 else math.inf"
     else:
         exponent = f"{product} * {p.add(1.0 / variance if variance > 0.0 else np.inf)}"
-    draw = [
-        "chance = uniform(stream)",
-        "if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0:",
-        f"    rise = math.sqrt(({after} - {before}) ** 2 - 2.0 * {spread} * math.log(chance))",
-        f"    top_{j} = max(top_{j}, 0.5 * ({before} + {after} + rise))",
-    ]
+    draw = [f"top_{j} = rise_between(stream, {before}, {after}, exponent, {spread}, top_{j})"]
     if tested:
         return [f"exponent = {exponent}", *draw]
     return [f"exponent = {exponent}", f"if exponent < {EXPONENT}:", *indent(draw)]

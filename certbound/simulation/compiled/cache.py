@@ -97,7 +97,7 @@ def _fingerprint() -> str:
     import numba
 
     here = Path(__file__)
-    names = ("cache.py", "elementary.py", "streams.py", "supremum.py")
+    names = ("cache.py", "elementary.py", "particles.py", "streams.py", "supremum.py")
     helpers = b"".join(here.with_name(name).read_bytes() for name in names)
     return f"{__version__} {numba.__version__} {sys.version} {hashlib.sha256(helpers).hexdigest()}"
 

@@ -49,7 +49,7 @@ def _sincos(x):  # type: ignore[no-untyped-def]
     return (-s, -c) if quarter & 2 else (s, c)
 
 
-sincos = njit(nogil=True, error_model="numpy")(_sincos)
+sincos = njit(nogil=True, error_model="numpy", cache=True)(_sincos)
 
 
 def _atan2(y, x):  # type: ignore[no-untyped-def]
@@ -76,7 +76,7 @@ def _atan2(y, x):  # type: ignore[no-untyped-def]
     return math.copysign(angle, y)
 
 
-atan2 = njit(nogil=True, error_model="numpy")(_atan2)
+atan2 = njit(nogil=True, error_model="numpy", cache=True)(_atan2)
 
 
 def _tanh(x):  # type: ignore[no-untyped-def]
@@ -85,4 +85,4 @@ def _tanh(x):  # type: ignore[no-untyped-def]
     return math.copysign((1.0 - e) / (1.0 + e), x)
 
 
-tanh = njit(nogil=True, error_model="numpy")(_tanh)
+tanh = njit(nogil=True, error_model="numpy", cache=True)(_tanh)

@@ -19,6 +19,10 @@ import numpy as np
 from numba import int64, njit, uint64
 from numpy.typing import NDArray
 
+_UNWRAPPED: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+inner = njit(nogil=True, cache=True, error_model="numpy", **_UNWRAPPED)
+"""For functions that only compiled ones call; numba keeps them, and knows them by the date of their own file."""
+
 _TAIL = 3.6541528853610088  # where the tail of 256 layers of equal area begins
 
 
@@ -77,7 +81,7 @@ def _uniform(stream):  # type: ignore[no-untyped-def]
     return ((next_word(stream) >> _S11) + 0.5) * 2.0**-53
 
 
-uniform = njit(nogil=True)(_uniform)
+uniform = njit(nogil=True, cache=True)(_uniform)
 
 
 def _draw_normal(a, b, c, w):  # type: ignore[no-untyped-def]
@@ -113,8 +117,8 @@ def _normal_slowly(layer, position, a, b, c, w):  # type: ignore[no-untyped-def]
             return position * _SCALE[layer], stream[0], stream[1], stream[2], stream[3]
 
 
-_slowly = njit(nogil=True)(_normal_slowly)
-draw_normal = njit(nogil=True)(_draw_normal)
+_slowly = inner(_normal_slowly)
+draw_normal = inner(_draw_normal)
 
 
 def _draw_uniform(a, b, c, w):  # type: ignore[no-untyped-def]
@@ -124,7 +128,7 @@ def _draw_uniform(a, b, c, w):  # type: ignore[no-untyped-def]
     return value, b ^ (b >> _S11), c + (c << _S3), ((c << _S24) | (c >> _S40)) + word, w + _ONE
 
 
-draw_uniform = njit(nogil=True)(_draw_uniform)
+draw_uniform = inner(_draw_uniform)
 
 
 def _draw_sign(a, b, c, w):  # type: ignore[no-untyped-def]
@@ -134,4 +138,4 @@ def _draw_sign(a, b, c, w):  # type: ignore[no-untyped-def]
     return value, b ^ (b >> _S11), c + (c << _S3), ((c << _S24) | (c >> _S40)) + word, w + _ONE
 
 
-draw_sign = njit(nogil=True)(_draw_sign)
+draw_sign = inner(_draw_sign)

@@ -14,7 +14,7 @@ import math
 
 from numba import njit
 
-from certbound.simulation.compiled.streams import uniform
+from certbound.simulation.compiled.streams import inner, uniform
 
 STRETCH = 1024
 """Steps kept."""
@@ -73,5 +73,41 @@ def _raise_block(stream, track, first, size, exponent, top, spread):  # type: ig
     return top
 
 
+def _touches(stream, exponent):  # type: ignore[no-untyped-def]
+    """True with probability exp(-e), which is below 1/(1 + e + e^2/2): that saves most exponentials."""
+    chance = uniform(stream)
+    return chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0 and chance < math.exp(-exponent)
+
+
+def _rise_between(stream, before, after, exponent, spread, top):  # type: ignore[no-untyped-def]
+    """The record ``top`` with a bridge that exceeds it with probability exp(-e); few need the logarithm."""
+    chance = uniform(stream)
+    if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0:
+        rise = math.sqrt((after - before) ** 2 - 2.0 * spread * math.log(chance))
+        return max(top, 0.5 * (before + after + rise))
+    return top
+
+
+def _fall_between(stream, before, after, floor, spread, low):  # type: ignore[no-untyped-def]
+    """The least value of a bridge where it may lie below ``floor``, else ``low``."""
+    exponent = 2.0 * (before - floor) * (after - floor) / spread
+    chance = uniform(stream)
+    if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0:
+        fall = math.sqrt((before - after) ** 2 - 2.0 * spread * math.log(chance))
+        return 0.5 * (before + after - fall)
+    return low
+
+
+def _bin_of(value, lowest, density, bins):  # type: ignore[no-untyped-def]
+    """The bin of a value in a histogram of ``density`` bins per factor of two above 2**lowest."""
+    if not value > 2.0**lowest:
+        return 0
+    return min(1 + int((math.log2(value) - lowest) * density), bins - 1)
+
+
 _raise_over = njit(inline="always", error_model="numpy", fastmath={"nnan", "nsz"})(_raise_block)
-raise_top = njit(nogil=True, error_model="numpy", fastmath={"nnan", "nsz"})(_raise_top)
+raise_top = njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan", "nsz"})(_raise_top)
+bin_of = inner(_bin_of)
+touches = inner(_touches)
+rise_between = inner(_rise_between)
+fall_between = inner(_fall_between)

@@ -55,11 +55,7 @@ def _unit(
             *spread_lines,
             f"floor = min(floor, {g}, {n})",
             f"if ({g} - floor) * ({n} - floor) < {0.5 * EXPONENT} * ({spread}):",
-            f"    exponent = 2.0 * ({g} - floor) * ({n} - floor) / ({spread})",
-            "    chance = uniform(stream)",
-            "    if chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0:",
-            f"        fall = math.sqrt(({g} - {n}) ** 2 - 2.0 * ({spread}) * math.log(chance))",
-            f"        low = 0.5 * ({g} + {n} - fall)",
+            f"    low = fall_between(stream, {g}, {n}, floor, {spread}, low)",
         ]
         lines += [if_all(f"{free} > 0.0", bridged), *indent(draw)]
     lines += [

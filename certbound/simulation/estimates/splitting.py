@@ -26,6 +26,7 @@ from certbound.simulation.estimates.statistics import bound_binomial, check_conf
 from certbound.simulation.executors import Progress, run_work
 from certbound.simulation.gap_tests import Barrier, barriers_of, tables_of
 from certbound.simulation.kernel_source import (
+    NJIT,
     SIGNATURE,
     close_noise,
     load_lines,
@@ -190,8 +191,13 @@ class RareWork(Work):
         return done
 
 
-_FOLLOW = """
-@njit(nogil=True, error_model="numpy")
+_IMPORTS = """
+from certbound.simulation.compiled.particles import branch, hold, place, ranked, read_scores, survive
+from certbound.simulation.compiled.supremum import fall_between
+"""
+
+_FOLLOW = f"""
+{NJIT}
 def follow(
     stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path, first
 ):
@@ -205,44 +211,17 @@ _REPLICA = """\
     tops = np.zeros((count, steps + 1))
     scores = np.empty(count)
     alive = np.empty(count, dtype=np.int64)
-    done = 0
-    for path in range(count):
-        states[path, 0] = starts[path]
-        if {own}:
-            frees[path, 0] = starts[path]
-        moved = follow(
-            stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path, 0
-        )
-        if moved < 0:
-            return -1
-        done += moved
-        scores[path] = tops[path, steps]
-    weight = 1.0
+    survivors = done = left = 0
+    level, weight = -1.0, 1.0
     while count > 0:
-        level = np.sort(scores)[int({discarded} * count) - 1]
-        if level >= 1.0:
-            break
-        survivors = 0
         for path in range(count):
-            if scores[path] > level:
-                alive[survivors] = path
-                survivors += 1
-        if survivors == 0:
-            break
-        weight *= survivors / count
-        for path in range(count):
-            if scores[path] > level:
+            if survivors > 0 and scores[path] > level:
                 continue
-            parent = alive[min(int(uniform(stream) * survivors), survivors - 1)]
-            first = 0
-            while not tops[parent, first] > level:
-                first += 1
-            signals[path] = signals[parent]
-            for k in range(first + 1):
-                tops[path, k] = tops[parent, k]
-                states[path, k] = states[parent, k]
-                if {own}:
-                    frees[path, k] = frees[parent, k]
+            if survivors > 0:
+                first = branch(stream, alive, survivors, level, path, signals, states, frees, tops)
+            else:
+                first = 0
+                place(starts, path, states, frees)
             moved = follow(
                 stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path,
                 first,
@@ -250,12 +229,14 @@ _REPLICA = """\
             if moved < 0:
                 return -1
             done += moved
-        for path in range(count):
-            scores[path] = tops[path, steps]
-    left = 0
-    for path in range(count):
-        if scores[path] >= 1.0:
-            left += 1
+        left = read_scores(tops, scores)
+        level = ranked(scores, int({discarded} * count) - 1)
+        if level >= 1.0:
+            break
+        survivors = survive(scores, level, alive)
+        if survivors == 0:
+            break
+        weight *= survivors / count
     if count > 0:
         out[0, 0, 0] = weight * left / count
         out[0, 0, 1] = left
@@ -278,13 +259,10 @@ def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tupl
         free = nominal_lines(model, p)
         store += [f"frees[path, k + 1, {i}] = b_{i}" for i in n]
         end = [*end, *[f"a_{i} = b_{i}" for i in n]]
-    full = ["tops[path, k + 1:] = top", "break"]
+    full = ["hold(tops, path, k + 1, top)", "break"]
     loop = [*step, *free, *within, *store, "if top >= 1.0:", *indent(full), *[f"x_{i} = y_{i}" for i in n], *end]
-    out = ["if top >= 1.0:", "    tops[path, first:] = top", "    return done"]
+    out = ["if top >= 1.0:", "    hold(tops, path, first, top)", "    return done"]
     body = [*load, *begin, *out, *open_noise(model), "for k in range(first, steps):", *indent(loop)]
     body += [close_noise(), "return done"]
-    fields = {"{own}": str(own), "{frees}": "count" if own else "0", "{discarded}": str(_DISCARDED)}
-    run = SIGNATURE + _REPLICA
-    for name, value in fields.items():
-        run = run.replace(name, value)
-    return head + _FOLLOW + "\n".join(indent(body)) + "\n" + run, np.array([*p.values, 0.0])
+    run = SIGNATURE + _REPLICA.format(frees="count" if own else "0", discarded=_DISCARDED)
+    return head + _IMPORTS + _FOLLOW + "\n".join(indent(body)) + "\n" + run, np.array([*p.values, 0.0])
