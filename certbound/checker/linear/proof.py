@@ -226,8 +226,7 @@ class _Cell:
         for k, (slope, drifts) in enumerate(zip(map(jacobian.matrix, self.slopes), self.drifts)):
             self.budget.check()
             noise = fixed if state is None else state.noise(k)
-            number_ = shared.sampled(k)
-            if number_ is not None:
+            if (number_ := shared.sampled(k)) is not None:
                 result.append(self.sampler.piece(self.sampled[number_]))
             elif self.model.continuous:
                 drift = jacobian.matrix(drifts, constants=False)
@@ -303,8 +302,8 @@ class _Cell:
         self, k: int, bounds: Supports, levels: Sequence[arb], outputs: Sequence[OutputRemainder]
     ) -> None:
         """beta lies in B on piece k, where Z and M keep to their levels; s lies in H."""
-        number_, data, hidden_of, scale = self.shared.sampled(k), self._data(k), self.shared.hidden, arb(1)
-        if number_ is not None:
+        data, hidden_of, scale = self._data(k), self.shared.hidden, arb(1)
+        if (number_ := self.shared.sampled(k)) is not None:
             data = self.sampler.data(k, self.nominal[k], self.sampled[number_])
             outputs, hidden_of, scale = self.sampler.outputs, self.sampler.hidden, self.sampler.length
         low, high = [], []

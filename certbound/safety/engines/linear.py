@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from certbound.problem.held import held_loop
@@ -11,8 +9,6 @@ from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
 from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state, linear_answer
 from certbound.reach.remainder import hidden_jump
-from certbound.reach.sets import ReachTube
-from certbound.rigor.intervals import Interval
 from certbound.safety.answers import AS_IT_IS, SPARED, Deviation, EngineAnswer, Request
 
 
@@ -63,24 +59,11 @@ def _held(problem: Problem, asked: Request) -> EngineAnswer:
     if hidden is not None:
         return EngineAnswer(applicable=False, reason=hidden, method="linear")
     answer = linear_answer(loop, cells=asked.cells, thorough=asked.thorough)
-    n, lasting = problem.system.dimension, np.diff(answer.engine.times) > 0
-    tube, reach, times = answer.tube, answer.noise_free_reach, answer.engine.times
-    if tube is not None:
-        ends = np.append(times[:-1][lasting], times[-1])
-        tube = replace(tube, times=ends, half_widths=tube.half_widths[lasting, :n])
-    if reach is not None and reach.box is not None:
-        curve, box = reach.curve, reach.box
-        states = replace(
-            curve, starts=curve.starts[lasting], ends=curve.ends[lasting],
-            coefficients=curve.coefficients[:, lasting, :, :n],
-        )
-        box = Interval(box.lo[:, lasting, :n], box.hi[:, lasting, :n])
-        reach = ReachTube(curve=states, box=box, noise=False, log10_delta=reach.log10_delta, method="linear")
+    tube = answer.tube
     return EngineAnswer(
         log10_delta=answer.log10_delta, margin=answer.margin if np.isfinite(answer.margin) else None,
-        time=answer.time, constraint=answer.constraint, reason=answer.reason, tube=tube, reach=reach,
-        deviation=None if tube is None else Deviation(times=tube.times, radius=tube.radii, extent=tube.half_widths),
-        method="linear", details=answer, foresight=True,
+        time=answer.time, constraint=answer.constraint, reason=answer.reason, tube=tube, reach=answer.noise_free_reach,
+        deviation=None if tube is None else _deviation(answer, tube), method="linear", details=answer, foresight=True,
     )
 
 

@@ -47,9 +47,10 @@ class HeldLinearisation(Linearisation):
     def __init__(
         self, loop: HeldLoop, *, cells: int | Cells | None = None, pieces: int | None = None, noise: bool = True,
     ) -> None:
-        self.loop = loop
+        self.loop, self.states = loop, loop.plain.system.dimension
         super().__init__(loop.flow, cells=_raised(loop, cells), pieces=pieces, noise=noise)
         self.step = float(loop.flow.horizon) / (loop.count * self.parts)
+        self.lasting = self.flowing
         self.model = HeldRemainder(flow=Remainder(loop.flow), sample=Remainder(loop.sample))
 
     def _pieces(self, pieces: int | None) -> int:
