@@ -122,7 +122,7 @@ MANY_DOORS = {
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (34, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (19, "events in both times, for noise that depends on the state and not; jumps of the state"),
-    "reach.linear": (17, "certificates state the records of the search: its linearisations, shares, levels, references"),
+    "reach.linear": (17, "certificates state the records of the search: linearisations, shares, levels, references"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
     "constants.programs": (16, "one program each for rate, gain and erosion, with what it is asked; the solver"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),

@@ -80,7 +80,7 @@ def _equations(content: Mapping[str, Any], problem: Problem) -> str:
     if len(rows) > MOST:
         shown += f"<details><summary>{len(rows) - MOST} more</summary>{typeset.block(rows[MOST:])}</details>"
     plan = content.get("plan") or {}
-    plan = [(typeset.name(key), typeset.formula(value)) for key, value in plan.items() if key != "file"]
+    plan = [(typeset.name(key), typeset.formula(str(value))) for key, value in plan.items() if key != "file"]
     words = "Drift of the stochastic equation" if continuous else "The next state, before the noise"
     given = content.get("plan", {}).get("file") if isinstance(content.get("plan"), Mapping) else None
     follows = "<p>The plan is a table of inputs, step by step.</p>" if given else ""

@@ -73,7 +73,8 @@ def held_loop(problem: Problem) -> HeldLoop:
     (('x', 'u'), 4)
     """
     system = problem.system
-    assert isinstance(system, ContinuousSystem) and isinstance(problem.plan, Tape)
+    assert isinstance(system, ContinuousSystem)
+    assert isinstance(problem.plan, Tape)
     if problem.reach is not None:
         raise InfeasibleError("targets are not served where inputs are held: state constraints with `during`.")
     if isinstance(system.diffusion, Tape):

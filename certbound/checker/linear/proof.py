@@ -21,7 +21,6 @@ from certbound.checker.balls import column, diagonal, identity, magnitude, row_s
 from certbound.checker.linear.diffusion import Along, Asked, StateNoise, Stopped
 from certbound.checker.linear.events import Windows, chain, sub_gaussian
 from certbound.checker.linear.families import Family, leaving
-from certbound.checker.linear.held import Sampler, raised
 from certbound.checker.linear.remainder import OutputRemainder, PieceData, Polytope, remainders
 from certbound.checker.linear.response import (
     Load,
@@ -31,10 +30,10 @@ from certbound.checker.linear.response import (
     continuous_piece,
     covariances,
     discrete_piece,
-    jump_piece,
     over_piece,
     supports,
 )
+from certbound.checker.linear.samplers import raised
 from certbound.checker.linear.shared import Shared
 from certbound.checker.reading import Record, number, numbers, wholes
 from certbound.checker.reading import entries as listed
@@ -97,8 +96,8 @@ class _Cell:
             raise CertificateError(f"`{record.at('drifts')}` must be null in discrete time.")
         self.drifts = record.array("drifts", count, varying) if continuous else [[0.0] * varying] * count
         self.gains = record.array("gains", count, moving)
-        sampler = shared.sampler
-        self.sampled = [] if sampler is None else record.array("sampled", sampler.count, len(sampler.varying))
+        if shared.sampler is not None:
+            self.sampler, self.sampled = shared.sampler, shared.sampler.slopes(record)
         self.low, self.high = record.array("remainder_low", count, n), record.array("remainder_high", count, n)
         if any(a > b for lows, highs in zip(self.low, self.high) for a, b in zip(lows, highs)):
             raise CertificateError(f"`{record.at('remainder_low')}` must not exceed `remainder_high`.")
@@ -144,21 +143,18 @@ class _Cell:
 
     def _frames(self) -> list[list[int]]:
         """Rows that serve as coordinates for each output's remainder; null: the unit rows."""
-        record, structure, units = self.record, self.shared.structure, list(self.shared.units)
+        record = self.record
         frames, most = [], len(self.rows[0]) - 1
         for i, item in enumerate(record.items("frames", self.model.dimension, self.model.dimension)):
-            active = structure.states.active(i)
+            active = self.shared.structure.states.active(i)
             if item is not None:
                 frames.append(wholes(item, f"{record.at('frames')}[{i}]", 0, most))
-            elif any(j not in units for j in active):
-                raise Unproved("`proof.units` lacks a state that enters nonlinearly")
             else:
-                frames.append([units.index(j) for j in active])
+                frames.append(self.shared.coordinates(active))
         return frames
 
     def _grid(self) -> Grid:
-        given = self.nominal
-        times = [self.shared.span(k) for k in range(self.shared.count)]
+        given, times = self.nominal, [self.shared.span(k) for k in range(self.shared.count)]
         if not self.model.continuous:
             times, given = [(arb(k), arb(k)) for k in range(self.shared.count + 1)], [[item] for item in given]
         return Grid(times=times, hulls=[[[arb(x) for x in point] for point in item] for item in given])
@@ -230,10 +226,8 @@ class _Cell:
         for k, (slope, drifts) in enumerate(zip(map(jacobian.matrix, self.slopes), self.drifts)):
             self.budget.check()
             noise = fixed if state is None else state.noise(k)
-            number_ = shared.sampled(k)
-            if shared.sampler is not None and number_ is not None:
-                matrix = shared.sampler.structure.states.matrix(self.sampled[number_])
-                result.append(jump_piece(matrix, shared.length))
+            if (number_ := shared.sampled(k)) is not None:
+                result.append(self.sampler.piece(self.sampled[number_]))
             elif self.model.continuous:
                 drift = jacobian.matrix(drifts, constants=False)
                 result.append(continuous_piece(slope, drift, shared.length, noise, self.natural))
@@ -308,11 +302,10 @@ class _Cell:
         self, k: int, bounds: Supports, levels: Sequence[arb], outputs: Sequence[OutputRemainder]
     ) -> None:
         """beta lies in B on piece k, where Z and M keep to their levels; s lies in H."""
-        sampler, number_ = self.shared.sampler, self.shared.sampled(k)
         data, hidden_of, scale = self._data(k), self.shared.hidden, arb(1)
-        if sampler is not None and number_ is not None:
-            data, hidden_of, scale = self._at_sample(sampler, k, number_), sampler.hidden, self.shared.length
-            outputs = sampler.outputs
+        if (number_ := self.shared.sampled(k)) is not None:
+            data = self.sampler.data(k, self.nominal[k], self.sampled[number_])
+            outputs, hidden_of, scale = self.sampler.outputs, self.sampler.hidden, self.sampler.length
         low, high = [], []
         for d, level in enumerate(levels):
             size = bounds.reach[k][d] + level
@@ -328,19 +321,13 @@ class _Cell:
             if hidden and not (bounded and output.is_decided(sides)):
                 names = ", ".join(self.model.dynamics.inputs[slot] for slot in hidden)
                 raise Unproved(f"{self.model.states[i]} may jump with {names}, in which it is linear otherwise")
-            frame = self.frames[i] if number_ is None else [self.shared.units.index(j) for j in output.states]
+            frame = self.frames[i] if number_ is None else self.shared.coordinates(output.states)
             polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=frame)
-            ends = (self.low[k][i] * scale).upper(), (self.high[k][i] * scale).lower()
-            if not output.prove(polytope, *ends, self.budget):
+            least, most = (self.low[k][i] * scale).upper(), (self.high[k][i] * scale).lower()
+            if not output.prove(polytope, least, most, self.budget):
                 name = self.model.states[i]
                 at = f"piece {k}" if self.model.continuous else f"step {k}"
                 raise Unproved(f"the remainder of {name} was not shown to stay in its box on {at}")
-
-    def _at_sample(self, sampler: Sampler, k: int, number_: int) -> PieceData:
-        """The parameters at a sampling time: its own, the nominal before and after it, and the law's slopes."""
-        before, after = self.nominal[k][0], self.nominal[k][3]
-        values = [sampler.span(k)[0], *map(arb, before), *map(arb, after), *map(arb, self.sampled[number_])]
-        return PieceData(values=values, half=arb(0), disturbance=[], disturbance_radius=[])
 
     def _data(self, k: int) -> PieceData:
         """The parameters of the remainder's expressions."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 from flint import arb
 
-from certbound.checker.linear.held import sampler_of
+from certbound.checker.linear.samplers import sampler_of
 from certbound.checker.reading import Record, wholes
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, Structure
@@ -49,6 +50,12 @@ class Shared:
         if self.sampler is not None:
             return self.sampler.length
         return arb(self.model.horizon) / self.count if self.model.continuous else arb(1)
+
+    def coordinates(self, active: Sequence[int]) -> list[int]:
+        """The unit rows of states."""
+        if any(j not in self.units for j in active):
+            raise Unproved("`proof.units` lacks a state that enters nonlinearly")
+        return [self.units.index(j) for j in active]
 
     def span(self, k: int) -> tuple[arb, arb]:
         """Both ends of a piece, in continuous time."""

@@ -171,6 +171,9 @@ def deviation_tube(run: LinearRun, outcome: Outcome, bounds: tuple[Array, Array]
     count = len(half)
     times = engine.times if engine.continuous else np.arange(count + 1.0)
     log10 = min(max(log_probability / np.log(10.0), LEAST) * (1 - 1e-15), 0.0)
+    own = engine.lasting
+    if not isinstance(own, slice):
+        times, half = np.append(times[own], times[-1]), half[own, : engine.states]
     return DeviationTube(times=times, half_widths=half, log10_delta=float(log10))
 
 
@@ -209,6 +212,9 @@ def reach_tube(
         starts = ends = np.arange(engine.pieces + 1.0)
     low = np.stack([b[0] for b in boxes]) - slack
     high = np.stack([b[1] for b in boxes]) + slack
+    own, states = engine.lasting, slice(engine.states)
+    low, high, coefficients = low[:, own, states], high[:, own, states], coefficients[:, own, :, states]
+    starts, ends = starts[own], ends[own]
     curve = Curve(continuous=engine.continuous, starts=starts, ends=ends, coefficients=coefficients)
     return ReachTube(
         curve=curve, box=Interval(np.nextafter(low, -np.inf), np.nextafter(high, np.inf)),

@@ -13,7 +13,6 @@ from certbound.arrays import Array
 from certbound.reach.linear.fixed_point import Inclusion
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.shares import Share
-from certbound.reach.remainder import fitted_slopes
 from certbound.watch import poll
 
 _PICARD = 10
@@ -36,8 +35,8 @@ def fitted(engine: Linearisation, nonlinear: Share) -> Linearisation:
         if tube is None:
             break
         low, high, grown = tube
-        found = fitted_slopes(engine.model, engine.frame, low, high, run.flat_extra)
-        other = engine.corrected(_at_nodes(engine, found))
+        found = engine.model.fitted(engine.frame, low, high, run.flat_extra)
+        other = engine.fitted(found.reshape(*engine.shape, engine.n))
         steepest, plain = (e.step * float(np.abs(s).sum(-1).max()) for e, s in (
             (other, other.slopes[0]), (engine, engine.tangents[0])))
         if not steepest <= _STEEPEST * max(0.5, plain):
@@ -87,13 +86,3 @@ def _levels(run: Inclusion, nonlinear: Share) -> Array:
     if run.engine.continuous:
         deviation[:, :early] = np.maximum(deviation[:, :early], deviation[:, early - 1 : early])
     return np.asarray(np.sqrt(2 * (np.log(4.0 * max(run.rows.shape[2], 1)) - nonlinear.log)) * deviation)
-
-
-def _at_nodes(engine: Linearisation, found: Array) -> Array:
-    """Corrections at the nodes from those of the pieces, on top of the ones that the engine has."""
-    pieces = found.reshape(*engine.shape, engine.n)
-    if engine.continuous:
-        ends = np.concatenate([pieces[:, :1], (pieces[:, 1:] + pieces[:, :-1]) / 2, pieces[:, -1:]], axis=1)
-    else:
-        ends = np.concatenate([pieces, pieces[:, -1:]], axis=1)
-    return np.asarray(ends if engine.correction is None else engine.correction + ends)

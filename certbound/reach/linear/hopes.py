@@ -32,7 +32,8 @@ def run_of(
     """The engine for the problem's noise, on a grid that resolves it or on so many pieces."""
     if isinstance(problem, HeldLoop):
         assert not isinstance(cells, Cells)
-        return LinearRun(HeldLinearisation.of_loop(problem, cells=cells, noise=noise))
+        held = HeldLinearisation.of_loop(problem, cells=cells, noise=noise)
+        return LinearRun(fitted(held, Share.of(problem.delta * shares.FITTED)))
     if pieces is None:
         plain = Linearisation.of(problem, cells=cells, noise=noise)
     else:

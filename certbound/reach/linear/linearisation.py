@@ -46,6 +46,9 @@ class Linearisation:
         False: the noise-free reachable set.
     """
 
+    states: int | None = None  # how many tubes tell of, and on which pieces, where inputs are held
+    lasting: Integers | slice = slice(None)
+
     def __init__(
         self, problem: Problem, *, cells: int | Cells | None = None, pieces: int | None = None, noise: bool = True,
     ) -> None:
@@ -148,8 +151,7 @@ class Linearisation:
     @cached_property
     def nodes(self) -> Array:
         """Nominal states at the nodes: shape (B, N + 1, n)."""
-        nodes = self._followed
-        lost = ~np.isfinite(nodes).all(axis=(0, 2))
+        nodes, lost = self._followed, ~np.isfinite(self._followed).all(axis=(0, 2))
         if lost.any():
             last, sizes = int(np.argmax(lost)) - 1, np.abs(nodes).max(axis=(0, 2))
             while last > 0 and sizes[last] > 100 * (1 + sizes[last - 1]):  # finite, but no longer meant
@@ -218,6 +220,12 @@ class Linearisation:
             vars(other).pop(name, None)
         other.correction = correction
         return other
+
+    def fitted(self, found: Array) -> Linearisation:
+        """The same with what the pieces' slopes lack, (B, N, n, n), added at the nodes."""
+        ends = np.concatenate([found, found[:, -1:]], axis=1)
+        ends[:, 1:-1] = (found[:, 1:] + found[:, :-1]) / 2 if self.continuous else found[:, 1:]
+        return self.corrected(ends if self.correction is None else self.correction + ends)
 
     @cached_property
     def slopes(self) -> tuple[Array, Array, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -63,7 +63,9 @@ class LinearAnswer:
         """
         if self.shown.bounds is None:
             return []
-        return list(zip(self.run.requirements[self.shown.cell], self.run.left(self.shown).T))
+        own, asked = self.engine.lasting, self.run.requirements[self.shown.cell]
+        shown = [replace(one, rows=one.rows[own, : self.engine.states], room=one.room[own]) for one in asked]
+        return list(zip(shown, self.run.left(self.shown)[own].T))
 
     @property
     def margin(self) -> float:

@@ -8,7 +8,7 @@ to Z is a scalar event, so that P(unsafe) <= delta_N + sum_j P_j (Thm K7').
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -67,11 +67,12 @@ class LinearRun(Inclusion):
         """Scalar events of one cell; ``shared`` is what they may cost in common."""
         engine = self.engine
         if isinstance(engine.system, ContinuousSystem):
-            windows = WindowEvents(engine.response, cell, engine.window, shared.log)
-            if engine.response.jumps:
-                return replace(windows, memory=self.memory.setdefault(cell, {}))
+            kept = self.memory.setdefault(cell, {})
+            windows = WindowEvents(engine.response, cell, engine.window, shared.log, kept)
+            if engine.response.jumps:  # which clocks and crossing rates do not know
+                return windows
             diffusion = engine.diffusion if engine.diffusion.ndim == 2 else engine.diffusion[cell]
-            return ClockEvents(windows, diffusion, self.memory.setdefault(cell, {}))
+            return ClockEvents(windows, diffusion, kept)
         if cell not in self.steps:
             self.steps[cell] = StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
         return self.steps[cell]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from certbound.reach.remainder.bound import Remainder
 from certbound.reach.remainder.frame import Frame
-from certbound.reach.remainder.held import HeldFrame, HeldRemainder
+from certbound.reach.remainder.held_remainder import HeldFrame, HeldRemainder
 from certbound.reach.remainder.jumps import hidden_jump
-from certbound.reach.remainder.samples import fitted_slopes
 
-__all__ = ["fitted_slopes", "Frame", "HeldFrame", "HeldRemainder", "hidden_jump", "Remainder"]
+__all__ = ["Frame", "HeldFrame", "HeldRemainder", "hidden_jump", "Remainder"]

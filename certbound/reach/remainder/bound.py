@@ -24,7 +24,7 @@ from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.expansion import Expansion, Parts
 from certbound.reach.remainder.frame import Frame
 from certbound.reach.remainder.polytope import Boxes, Polytope, grid
-from certbound.reach.remainder.samples import sampled_range
+from certbound.reach.remainder.samples import fitted_slopes, sampled_range
 from certbound.rigor.intervals import Interval
 from certbound.watch import poll
 
@@ -107,6 +107,10 @@ class Remainder(Derivatives):
     def sampled(self, frame: Frame, low: Array, high: Array, rows: Array) -> tuple[Array, Array]:
         """Range of beta over sample points, which proves nothing; see `sampled_range`."""
         return sampled_range(self, frame, low, high, rows)
+
+    def fitted(self, frame: Frame, low: Array, high: Array, rows: Array) -> Array:
+        """What to add to the slopes so that they fit beta: see `fitted_slopes`."""
+        return fitted_slopes(self, frame, low, high, rows)
 
     def defect(self, frame: Frame) -> Array:
         """What no cutting of boxes takes off a bound of beta, on either side: its motion over the piece, (M, n)."""

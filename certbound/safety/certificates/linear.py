@@ -66,8 +66,7 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     log10 = best[1].log_probability / _LOG10
     exact_sums = not engine.continuous and effort == 0 and log10 > _LIKELY
     slack = SLACK * (0.01 if exact_sums else 1 + 0.1 * abs(log10))
-    stated_of = problem if problem.hold is None else engine.problem  # with the inputs among its states
-    return proof_data(stated_of, *best, cuts_of(answer)), min(log10 + slack, 0.0), []
+    return proof_data(best[0].engine.problem, *best, cuts_of(answer)), min(log10 + slack, 0.0), []
 
 
 def engine_of(answer: EngineAnswer) -> Linearisation:
@@ -283,7 +282,7 @@ def proof_data(
         "moving": [list(entry) for entry in moving],
         "units": units,
         "windows": None if windows is None else [int(k) for k in windows[:-1]],
-        **({} if not isinstance(engine, HeldLinearisation) else {"sampled": [list(e) for e in _of_law(engine)]}),
+        **({"sampled": [list(entry) for entry in engine.jumping]} if isinstance(engine, HeldLinearisation) else {}),
         "cells": [
             _cell(problem, run, stated, cell, varying=varying, moving=moving) for cell in range(len(engine.centres))
         ],
@@ -320,7 +319,7 @@ def _cell(
         "frames": _frames(problem, run, stated, cell, varying),
         "separations": separations(problem, lambda number, constraint: _separation(constraint, asked[number])),
         **({} if stated.stopped is None else {"stopped": stated.stopped[cell]}),
-        **({} if not isinstance(engine, HeldLinearisation) else {"sampled": chosen(engine.jumps[cell], _of_law(engine))}),
+        **({"sampled": chosen(engine.jumps[cell], engine.jumping)} if isinstance(engine, HeldLinearisation) else {}),
     }
 
 
@@ -330,11 +329,6 @@ def _varying(tape: Tape, columns: range) -> list[tuple[int, int]]:
         return []
     varying = varying_outputs(jacobian(tape, list(columns)))
     return [divmod(o, len(columns)) for o, varies in enumerate(varying) if varies]
-
-
-def _of_law(engine: HeldLinearisation) -> list[tuple[int, int]]:
-    """Entries of the Jacobian of what sampling times do that depend on an input."""
-    return _varying(engine.loop.sample.closed_loop, range(1, engine.n + 1))
 
 
 def _frames(

@@ -59,17 +59,11 @@ def _held(problem: Problem, asked: Request) -> EngineAnswer:
     if hidden is not None:
         return EngineAnswer(applicable=False, reason=hidden, method="linear")
     answer = linear_answer(loop, cells=asked.cells, thorough=asked.thorough)
-    whole, n = answer.tube, problem.system.dimension
-    lasting = np.diff(answer.engine.times) > 0
-    deviation = None
-    if whole is not None:
-        half = whole.half_widths[lasting, :n]
-        times = np.append(whole.times[:-1][lasting], whole.times[-1])
-        deviation = Deviation(times=times, radius=np.linalg.norm(half, axis=1) * (1 + 1e-14), extent=half)
+    tube = answer.tube
     return EngineAnswer(
         log10_delta=answer.log10_delta, margin=answer.margin if np.isfinite(answer.margin) else None,
-        time=answer.time, constraint=answer.constraint, reason=answer.reason, deviation=deviation, method="linear",
-        details=answer, foresight=True,
+        time=answer.time, constraint=answer.constraint, reason=answer.reason, tube=tube, reach=answer.noise_free_reach,
+        deviation=None if tube is None else _deviation(answer, tube), method="linear", details=answer, foresight=True,
     )
 
 

@@ -22,6 +22,11 @@ from certbound.reach.nominal import Cells, initial_cells
 from certbound.reach.remainder import Frame, HeldFrame, HeldRemainder, Remainder
 from certbound.rigor.intervals import Interval
 
+_FEWEST = 200
+"""Pieces between sampling times, at least: so many windows are needed."""
+_WINDOW = 0.005
+"""Share of the horizon."""
+
 
 class HeldLinearisation(Linearisation):
     """`Linearisation` of a `HeldLoop`, in the states (x, u).
@@ -34,13 +39,14 @@ class HeldLinearisation(Linearisation):
     def __init__(
         self, loop: HeldLoop, *, cells: int | Cells | None = None, pieces: int | None = None, noise: bool = True,
     ) -> None:
-        self.loop = loop
+        self.loop, self.states = loop, loop.plain.system.dimension
         super().__init__(loop.flow, cells=_raised(loop, cells), pieces=pieces, noise=noise)
         self.step = float(loop.flow.horizon) / (loop.count * self.parts)
+        self.lasting = self.flowing
         self.model = HeldRemainder(flow=Remainder(loop.flow), sample=Remainder(loop.sample))
 
     def _pieces(self, pieces: int | None) -> int:
-        self.parts = max(1, int(np.ceil((FEWEST_PIECES if pieces is None else pieces) / self.loop.count)))
+        self.parts = int(np.ceil(max(_FEWEST, pieces or 0) / self.loop.count))
         return self.loop.count * (self.parts + 1)
 
     @classmethod
@@ -55,8 +61,39 @@ class HeldLinearisation(Linearisation):
         return cls(loop, cells=cells, pieces=int(np.clip(np.ceil(wanted), FEWEST_PIECES, MOST_PIECES)), noise=noise)
 
     def on_grid(self, pieces: int) -> HeldLinearisation:
-        """The same cells on another grid of pieces."""
-        return HeldLinearisation(self.loop, cells=self.split, pieces=pieces, noise=self.noise)
+        """The same cells and correction on another grid of pieces."""
+        other = HeldLinearisation(self.loop, cells=self.split, pieces=pieces, noise=self.noise)
+        if self.correction is None:
+            return other
+        found = np.empty((self.cells, other.pieces, self.n, self.n))
+        found[:, other.sampling] = self.correction[:, self.sampling]
+        hold, part = np.divmod(np.arange(other.loop.count * other.parts), other.parts)
+        same = hold * self.parts + part * self.parts // other.parts
+        found[:, other.flowing] = self.correction[:, self.flowing[same]]
+        return other.fitted(found)
+
+    def fitted(self, found: Array) -> HeldLinearisation:
+        """The same with ``found`` (B, N, n, n) added to the slopes of the pieces and of the sampling times."""
+        other = self.corrected(found if self.correction is None else self.correction + found)
+        assert isinstance(other, HeldLinearisation)
+        vars(other).pop("jumps", None)
+        vars(other).pop("diffusion", None)
+        return other
+
+    @cached_property
+    def slopes(self) -> tuple[Array, Array, Array]:
+        """A, K and E of every piece."""
+        first, drift, gain = self.tangents
+        if self.correction is None:
+            return first, drift, gain
+        extra = self.correction.copy()
+        extra[:, self.sampling] = 0.0
+        return first + extra, drift, gain
+
+    @property
+    def window(self) -> int:
+        """Pieces of a martingale window: what is held makes rows turn, so that these are short."""
+        return max(1, min(round(_WINDOW * self.loop.count * self.parts), self.parts // 2))
 
     @cached_property
     def sampling(self) -> Integers:
@@ -104,7 +141,13 @@ class HeldLinearisation(Linearisation):
         nodes = self.nodes[:, self.sampling].reshape(cells * count, self.n)
         times = np.tile(self.times[self.sampling], cells)
         found = self.model.sample.reference_slope(times, nodes, np.zeros((len(nodes), 0)), np.zeros(0))
-        return found.reshape(cells, count, self.n, self.n)
+        found = found.reshape(cells, count, self.n, self.n)
+        return found if self.correction is None else found + self.correction[:, self.sampling]
+
+    @property
+    def jumping(self) -> list[tuple[int, int]]:
+        """Entries of these slopes that depend on t or the states."""
+        return self.model.sample.entries
 
     @cached_property
     def diffusion(self) -> Array:

@@ -7,11 +7,13 @@ pieces that follow it; the boxes of its remainder are stated as those of a rate 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from flint import arb, arb_mat
 
-from certbound.checker.linear.remainder import OutputRemainder, remainders
+from certbound.checker.linear.remainder import OutputRemainder, PieceData, remainders
+from certbound.checker.linear.response import Piece, jump_piece
 from certbound.checker.reading import Record, wholes
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, Structure, structure_of
@@ -72,6 +74,20 @@ class Sampler:
         hold, part = divmod(k, self.parts + 1)
         first = hold * self.parts
         return self.length * (first + max(part - 1, 0)), self.length * (first + part)
+
+    def slopes(self, record: Record) -> list[list[float]]:
+        """What a cell states of the entries that vary, one row a sampling time."""
+        found: list[list[float]] = record.array("sampled", self.count, len(self.varying))
+        return found
+
+    def piece(self, slopes: Sequence[float]) -> Piece:
+        """The linear data of a sampling time."""
+        return jump_piece(self.structure.states.matrix(slopes), self.length)
+
+    def data(self, k: int, nominal: Sequence[Sequence[float]], slopes: Sequence[float]) -> PieceData:
+        """The parameters of piece k, a sampling time: when it is, the nominal before and after it, and the slopes."""
+        values = [self.span(k)[0], *map(arb, nominal[0]), *map(arb, nominal[3]), *map(arb, slopes)]
+        return PieceData(values=values, half=arb(0), disturbance=[], disturbance_radius=[])
 
 
 def sampler_of(model: Model, record: Record, pieces: int, budget: Budget) -> Sampler | None:

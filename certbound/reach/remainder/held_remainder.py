@@ -106,6 +106,14 @@ class HeldRemainder:
             lower[places], upper[places] = found[0] / scale, found[1] / scale
         return lower, upper
 
+    def fitted(self, frame: HeldFrame, low: Array, high: Array, rows: Array) -> Array:
+        """What to add to the slopes so that they fit beta, (M, n, n): see `fitted_slopes`."""
+        n = self.flow.problem.system.dimension
+        result = np.zeros((len(frame), n, n))
+        for model, part, places, _ in self._parts(frame):
+            result[places] = model.fitted(part, *self._own(model, low, high, places))
+        return result
+
     def defect(self, frame: HeldFrame) -> Array:
         """What no cutting of boxes takes off a bound of beta: see `Remainder.defect`."""
         result = np.zeros((len(frame), self.flow.problem.system.dimension))

@@ -1,0 +1,118 @@
+"""Certificates of inputs that are held: what is proved again, and what is refused."""
+
+from __future__ import annotations
+
+import copy
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.checker import check_data
+from certbound.errors import CertificateError
+from certbound.safety.certificate import certificate_data, problem_data
+
+
+def lane(hold: float | None = 0.2, gain: float = 0.8) -> cb.Problem:
+    system = cb.ContinuousSystem(
+        lambda x, u: [2 * np.sin(x[1]), np.tan(u[0])], states=["y", "psi"], inputs=cb.Box([-0.6], [0.6]),
+        diffusion=0.03 * np.eye(2),
+    )
+    return cb.Problem(
+        system, initial=[0.2, 0], safe=[cb.Inside(cb.Box([-0.6], [0.6], coordinates=[0]))], horizon=1, delta=1e-3,
+        plan=lambda x: 0.5 * np.tanh(-gain * x[0] - 1.5 * x[1]), hold=hold,
+    )
+
+
+@functools.cache
+def stated() -> dict[str, Any]:
+    return certificate_data(lane(), cb.verify_safety(lane(), method="linear"))
+
+
+def forged(*path: object, value: object) -> dict[str, Any]:
+    data = copy.deepcopy(stated())
+    place: Any = data
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    return data
+
+
+def test_a_certificate_is_proved_again() -> None:
+    report = check_data(stated(), problem_data(lane()))
+    assert report.valid, report.reason
+    assert report.log10_delta < -3
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [(lane(0.1), "hold.count differs"), (lane(None), "inputs differs"), (lane(gain=0.9), "hold.law is another")],
+)
+def test_it_speaks_of_no_other_hold_and_law(other: cb.Problem, words: str) -> None:
+    report = check_data(stated(), problem_data(other))
+    assert not report.valid
+    assert words in report.reason
+
+
+def test_what_a_sampling_time_does_must_be_in_its_box() -> None:
+    data = copy.deepcopy(stated())
+    cell = data["proof"]["cells"][0]
+    jump = 3 * (data["proof"]["pieces"] // 5)
+    cell["remainder_low"][jump] = cell["remainder_high"][jump] = [0.0.hex()] * 3
+    report = check_data(data)
+    assert not report.valid
+    assert "remainder of u was not shown to stay in its box" in report.reason
+
+
+def test_slopes_and_nominal_of_a_sampling_time_are_looked_at() -> None:
+    cell = stated()["proof"]["cells"][0]
+    slopes = [[(2.0).hex() for _ in row] for row in cell["sampled"]]
+    assert not check_data(forged("proof", "cells", 0, "sampled", value=slopes)).valid
+    nominal = copy.deepcopy(cell["nominal"])
+    for k in range(stated()["proof"]["pieces"] // 5):  # of the first hold: another input than the law's
+        for point in nominal[k]:
+            point[2] = (0.4).hex()
+    assert not check_data(forged("proof", "cells", 0, "nominal", value=nominal)).valid
+
+
+def test_a_sampling_time_begins_a_window() -> None:
+    starts = stated()["proof"]["windows"]
+    data = forged("proof", "windows", value=[start for start in starts if start % (stated()["proof"]["pieces"] // 5)])
+    data["proof"]["windows"] = [0, *data["proof"]["windows"]]
+    cell, count = data["proof"]["cells"][0], len(data["proof"]["windows"])
+    cell["window_levels"] = cell["window_levels"][:count]
+    report = check_data(data)
+    assert not report.valid
+    assert "a window is too long for this system" in report.reason
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (("problem", "hold", "count"), 0, "count"),
+        (("problem", "hold", "count"), 7, "must be a multiple of the sampling times"),
+        (("problem", "time"), "discrete", "horizon|hold|law"),
+        (("problem", "inputs"), [], "dynamics|hold|input"),
+    ],
+)
+def test_malformed_holds_are_refused(path: tuple[object, ...], value: object, words: str) -> None:
+    with pytest.raises(CertificateError, match=words):
+        check_data(forged(*path, value=value))
+
+
+def test_the_entries_that_vary_are_the_models_own() -> None:
+    report = check_data(forged("proof", "sampled", value=[]))
+    assert "does not list the entries of the law's Jacobian" in report.reason
+    plain = certificate_data(lane(None), cb.verify_safety(lane(None), method="linear"))
+    plain["proof"]["sampled"] = []
+    with pytest.raises(CertificateError, match="must be left out where no inputs are held"):
+        check_data(plain)
+
+
+def test_a_proof_by_another_engine_is_refused() -> None:
+    data = copy.deepcopy(stated())
+    data["claim"]["method"] = data["proof"]["engine"] = "constants"
+    with pytest.raises(CertificateError, match="engine"):
+        check_data(data)
