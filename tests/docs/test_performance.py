@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from experiments.literature import LITERATURE
 from experiments.performance import BENCHMARKS, benchmark_row, equal_strength, machine, power, table
 from tests.docs.blocks import DOCS, ROOT
 
@@ -37,7 +38,7 @@ def test_every_benchmark_has_its_published_number() -> None:
     files = {path.stem for path in (ROOT / "experiments" / "benchmarks").glob("*.toml")}
     assert files == set(BENCHMARKS)
     page = (DOCS / "benchmarks.md").read_text(encoding="utf-8")
-    assert all(f"`{name}`" in page for name in BENCHMARKS)
+    assert all(f"`{name}`" in page for name in (*BENCHMARKS, *LITERATURE))
 
 
 @pytest.mark.slow
