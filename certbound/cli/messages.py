@@ -121,6 +121,7 @@ _FOR_FILES = (
     (r"`disturbance=`", "a [disturbances] table"),
     (r"`inputs=`", "an [inputs] table"),
     (r"\(`?cells`?\)", "(--cells)"),
+    (r"`smallest=True`", "--smallest"),
     (r"method [\"'](\w+)[\"']", "--method \\1"),
     (r"use cb\.(Box|Ball|Ellipsoid)\(.*?\)", "write a table"),
 )

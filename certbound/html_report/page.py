@@ -22,6 +22,7 @@ from certbound.html_report.markup import table, text
 from certbound.html_report.statement import problem_section
 from certbound.html_report.style import LAYOUT, SCRIPT, SMALL, STYLE
 from certbound.plotting.scene import Scene
+from certbound.safety.answers import SPARED
 from certbound.safety.starts import SafeStarts
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ SENTENCES = {
     "UNSAFE": "Not safe: the probability exceeds what was asked from some start, proved.",
     "UNSAFE_NOMINAL": "Not safe: already without noise some trajectory leaves the safe set, by a rigorous enclosure.",
 }
+_UNANSWERED = {SPARED: "not asked"}
 PACKAGES = ("numpy", "scipy", "casadi", "cvxpy", "clarabel", "python-flint", "numba", "plotly")
 
 
@@ -111,7 +113,7 @@ def _engine_section(verdict: Verdict) -> str:
         (
             name,
             answer.method,
-            log10_text(answer.log10_delta) if answer.applicable else "does not apply",
+            log10_text(answer.log10_delta) if answer.applicable else _UNANSWERED.get(answer.reason, "does not apply"),
             _least(answer.margin),
             f"{spent:.1f} s" if (spent := verdict.seconds.get(name, 0.0)) > 0.05 or answer.applicable else "",
             answer.reason,
@@ -121,7 +123,7 @@ def _engine_section(verdict: Verdict) -> str:
     if not rows:
         return ""
     heading = ("engine", "method", "P at most", "margin", "time", "in words")
-    return f'<section class="whole"><h2>Who proved what</h2>{table(heading, rows)}</section>'
+    return f'<section class="whole" id="engines"><h2>Who proved what</h2>{table(heading, rows)}</section>'
 
 
 def _constants_section(verdict: Verdict) -> str:

@@ -56,8 +56,11 @@ pre {{ overflow-x: auto; background: #f4f5f7; padding: 0.5rem; }}
 :focus-visible {{ outline: 3px solid {BLUE}; }}
 @media (max-width: 480px) {{
   main {{ padding: 0 0.5rem 2rem; }} section {{ padding: 0.5rem 0.6rem 0.75rem; }}
-  #verdict tr, #problem tr {{ display: block; border-bottom: 1px solid #e3e5e8; }}
-  #verdict tr > *, #problem tr > * {{ display: block; border: 0; padding: 0.1rem 0; }}
+  #verdict tr, #problem tr, #engines tr {{ display: block; border-bottom: 1px solid #e3e5e8; }}
+  #verdict tr > *, #problem tr > *, #engines tr > * {{ display: block; border: 0; padding: 0.1rem 0; }}
+  #engines thead, #engines td:nth-child(2), #engines td:empty {{ display: none; }}
+  #engines td:nth-child(3)::before {{ content: "P at most: "; }} #engines td:nth-child(4)::before {{ content: "margin: "; }}
+  #engines td:nth-child(5)::before {{ content: "time: "; }}
 }}
 @media print {{
   body {{ background: white; font-size: 11px; }} main {{ display: block; padding: 0; }}

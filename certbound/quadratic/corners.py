@@ -131,7 +131,10 @@ class Dynamics:
         small = [i for i in range(self.n) if np.max(rest.hi[:, i]) > EXACT]
         count = len(self.held) + len(self.disturbed)
         if 2**count > MOST_CORNERS:
-            raise InfeasibleError(f"the dynamics have {2**count} corners on a cell; at most {MOST_CORNERS} are served.")
+            raise InfeasibleError(
+                f"the slopes of the dynamics take {2**count} extreme cases over a box; at most {MOST_CORNERS} are "
+                "served."
+            )
         worst = Interval(np.zeros(self.n), np.max(rest.hi, axis=0))
         values, drifts, spreads = [], [], []
         noise = self._noise_parts(cells)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.display import rounded
+from certbound.display import log10_text
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.quadratic.corners import Cells, Dynamics, curved_axes, grid
@@ -282,8 +282,8 @@ class Search:
         if self.attempts:
             levels, _ = self.by_wall()
             worst = int(np.argmax(levels))
-            part = rounded(math.exp(levels[worst]), up=True)
-            words += f"; the largest part is {part} ({self.setting.walls[worst].label})"
+            part = log10_text(min(log10_up(float(levels[worst])), 0.0))
+            words += f"; the largest part is {part} for '{self.setting.name_of(self.setting.walls[worst])}'"
         return QuadraticBound(upper=log10_up(level), words=words, seconds=0.0, setting=self.setting,
                               walls=tuple(self.attempts))  # fmt: skip
 

@@ -82,6 +82,15 @@ class Setting:
         """Number of states."""
         return len(self.center)
 
+    def name_of(self, wall: Wall) -> str:
+        """What a wall limits, in words: of a side of the box the inequality that holds within."""
+        if wall.side is None:
+            return wall.label
+        axis, upper = wall.side
+        limit = self.center[axis] + (self.width[axis] if upper else -self.width[axis])
+        words = f"{wall.label.rsplit(' ', 1)[0]} {'<=' if upper else '>='} {limit:.4g}"
+        return f"{words}, a side of a box that certbound chose" if wall.own else words
+
     def over(self, low: Array, high: Array) -> Interval:
         """x over boxes of xi, shape (..., n)."""
         return Interval.point(self.center) + Interval.point(self.width) * Interval(low, high)

@@ -248,7 +248,7 @@ def verdict_of(problem: Problem, answers: Mapping[str, EngineAnswer], method: st
             f"10^{lower:.6g}; this is a defect of certbound, and nothing is answered."
         )
     asked = {other: answer for other, answer in answers.items() if other != name and answer.reason != SPARED}
-    others = [f"By {other}: {_sentence(answer.reason)}" for other, answer in asked.items() if not safe]
+    others = [f"By {one}: {_bounded(answer)}{_sentence(answer.reason)}" for one, answer in asked.items() if not safe]
     return Verdict(
         status="SAFE" if safe else "UNSAFE" if unsafe else "UNKNOWN",
         log10_delta=level,
@@ -265,6 +265,15 @@ def best_lower(answers: Mapping[str, EngineAnswer]) -> float | None:
     """The largest proved lower bound of log10 of the probability, None where no engine has one."""
     found = [answer.log10_lower for answer in answers.values() if answer.applicable and answer.log10_lower is not None]
     return max(found, default=None)
+
+
+def _bounded(answer: EngineAnswer) -> str:
+    """The bound that an engine proved, or that what it found bounds nothing; empty where its reason says why."""
+    if not (answer.applicable and answer.certified):
+        return ""
+    if answer.log10_delta < 0:
+        return f"P <= {log10_text(answer.log10_delta)}; "
+    return "nothing below 1; " if answer.details is not None else ""
 
 
 def _covered(answer: EngineAnswer) -> str:

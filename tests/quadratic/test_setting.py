@@ -37,6 +37,14 @@ def test_a_state_without_bounds_gets_sides_that_are_paid_for() -> None:
     assert seen.lower <= 10**found.upper < 0.5
 
 
+def test_sides_are_named_by_the_inequality_that_holds_within() -> None:
+    setting = make_setting(of([cb.Inside(cb.Box([-1.0, -np.inf], [1.0, np.inf]))]), np.array([-1.0, -2.0]), np.ones(2))
+    assert [setting.name_of(wall) for wall in setting.walls] == [
+        "p >= -1", "p <= 1",
+        "v >= -2, a side of a box that certbound chose", "v <= 1, a side of a box that certbound chose",
+    ]  # fmt: skip
+
+
 def test_a_side_without_noise_is_left_only_where_the_drift_points_outward() -> None:
     setting = make_setting(of([]), -np.ones(2), np.ones(2))
     forms = {wall.label: wall.forms for wall in setting.walls}

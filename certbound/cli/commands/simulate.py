@@ -208,7 +208,8 @@ def _print(result: dict[str, Any]) -> None:
         screen.print(f"{result['exits']} of {result['paths']} paths left, {steps}")
     for label, count in result.get("by_constraint", {}).items():
         screen.print(f"  {count:>9}  {one_line(label)}", markup=False)
-    screen.print(f"a claim of less than {least} is refuted; the smallest delta supported is {most}")
+    against = f"it refutes every bound below {least}" if low > 0 else "it refutes no bound"
+    screen.print(f"{against}, and supports none below {most}")
     if result.get("asked", result["paths"]) != result["paths"]:
         screen.print(f"the time was enough for {result['paths']} of {result['asked']} paths")
     if "against" in result:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from certbound.arrays import Mask
 from certbound.errors import EnclosureError
-from certbound.problem.model import ROWS, Node, Tape, enclosed, jumps_where, undefined_where
+from certbound.problem.model import ROWS, Node, Tape, enclosed, jumps_where, sources, undefined_where
 from certbound.rigor.intervals import Interval
 from certbound.watch import poll
 
@@ -143,8 +144,10 @@ def _inherited(node: Node, args: Sequence[Interval], masks: Sequence[Mask | None
 def _message(tape: Tape, inputs: Sequence[Interval], refusal: Refusal) -> str:
     node = tape.nodes[refusal.node]
     member = int(np.flatnonzero(refusal.mask)[0]) if refusal.mask.ndim else 0
-    box = []
-    for name, x in zip(tape.inputs, inputs, strict=True):
+    box, decides = [], sources(replace(tape, outputs=(refusal.node,), shape=(1,)))[0]
+    for place, (name, x) in enumerate(zip(tape.inputs, inputs, strict=True)):
+        if place not in decides:
+            continue
         lo, hi = (float(end if end.ndim == 0 else end[member]) for end in (x.lo, x.hi))
         box.append(f"{name} in [{lo:.6g}, {hi:.6g}]" if lo < hi else f"{name} = {lo:.6g}")
     what = "may jump (no derivative bounds it)" if _jump(node) else "is undefined somewhere"

@@ -20,6 +20,8 @@ from certbound.reach.nominal import Cells, Curve
 from certbound.reach.sets import ReachTube, Requirement
 from certbound.rigor.intervals import Interval
 
+_LITTLE = 3.0  # natural logarithm, by which parts of a probability are less than what was set aside
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearAnswer:
@@ -106,6 +108,11 @@ class LinearAnswer:
         worst = int(np.argmax(logs))
         part = f"{log10_text(min(logs[worst] / np.log(10.0), 0.0))} for '{asked[worst].label}'"
         left = log10_text(min(self.outcome.nonlinear.log / np.log(10.0), 0.0))
+        if self.run.curved and logs[worst] < self.outcome.nonlinear.log - _LITTLE:
+            return (
+                f"nearly all of that probability is the share of delta set aside for the remainder of the linearisation, "
+                f"which holds; the largest part beside it is {part}. `smallest=True` goes on to less"
+            )
         rest = f", and {left} is spent on bounding the remainder of the linearisation" if self.run.curved else ""
         return f"the largest part of that probability is {part}{rest}"
 

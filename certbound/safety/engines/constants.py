@@ -221,8 +221,7 @@ class _Work:
             tightest = erosion.tightest()
             return replace(
                 answer, margin=tightest.margin, time=tightest.time, constraint=tightest.label,
-                reason="no local constants hold on the reach tube and its surroundings; use more cells or method "
-                '"linear".',
+                reason=f"no local constants hold on the reach tube and its surroundings; {self._narrower} less noise.",
             )  # fmt: skip
         return best
 
@@ -252,17 +251,23 @@ class _Work:
         if reach.end < self.flow.horizon:
             return replace(
                 held, time=reach.end, reach=reach,
-                reason=f"the reach tube could not be proved beyond t = {reach.end:.4g}; use more cells of the initial "
-                "set, a smaller disturbance, or a shorter horizon.",
+                reason=f"the reach tube could not be proved beyond t = {reach.end:.4g}; {self._narrower} a "
+                "smaller disturbance, or a shorter horizon.",
             )  # fmt: skip
         if erosion.broken():
             return replace(
                 held,
                 reason=f"the noise-free reach tube already leaves no room for '{worst.label}' at "
-                f"{self._when(worst.time)} (short by {-worst.margin:.3g}); use more cells of the initial set, or "
-                'method "linear".',
+                f"{self._when(worst.time)} (short by {-worst.margin:.3g}); {self._narrower} a "
+                "smaller disturbance.",
             )
         return None
+
+    @property
+    def _narrower(self) -> str:
+        """The beginning of a cure: cells where the initial set can be split."""
+        hull = self.problem.initial.hull()
+        return "split the initial set (cells), or try" if np.any(hull.lo < hull.hi) else "try"
 
     def _when(self, time: float) -> str:
         return f"t = {time:.4g}" if self.flow.continuous else f"step {time:g}"

@@ -29,9 +29,10 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     foresight = not depends_on_state(problem)
 
     def found(answer: LinearAnswer) -> None:
+        first = "a first bound of the linear response; its largest parts were not made smaller after it"
+        reason = first if answer.log10_delta < 0 else answer.reason
         asked.found(EngineAnswer(
-            log10_delta=answer.log10_delta, method="linear", details=answer, foresight=foresight,
-            reason="a first bound of the linear response; its largest parts were not made smaller after it.",
+            log10_delta=answer.log10_delta, method="linear", details=answer, foresight=foresight, reason=f"{reason}.",
         ))  # fmt: skip
 
     answer = linear_answer(problem, cells=asked.cells, thorough=asked.thorough, before=asked.before, found=found)

@@ -23,7 +23,7 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     if asked.quick:
         return EngineAnswer(applicable=False, method="quadratic", reason=SPARED)
     if not asked.thorough and problem.system.dimension < _FEW:
-        reason = "left out, since something is proved, and value functions on grids say more in one or two states."
+        reason = "left to value functions on grids, which say more in one or two states."
         return EngineAnswer(applicable=False, method="quadratic", reason=reason)
     try:
         most = next((most for n, most in _SPARED.items() if problem.system.dimension <= n), _SECONDS)

@@ -59,7 +59,13 @@ def test_text_for_people_tells_what_is_refuted(capsys):
     text = capsys.readouterr().out
     assert "exit probability" in text
     assert "of 2000 paths left, 1000 steps of the exact scheme" in text
-    assert "is refuted; the smallest delta supported is" in text
+    assert "it refutes every bound below 0." in text
+    assert ", and supports none below 0." in text
+
+
+def test_without_an_exit_no_bound_is_refuted(capsys):
+    assert run(["simulate", "ou", "--paths", "1000", "--seed", "1"]) == 0
+    assert "it refutes no bound, and supports none below 0.005" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("claim", "code"), [(-1, 1), (-0.5, 0), ("-0x1.0p+0", 1)])

@@ -66,7 +66,7 @@ def test_an_undecided_jump_is_refused_and_a_decided_one_is_not(name, derivative)
     tape = trace(JUMPING[name], {"x": ["a", "b"]})
     tape = jacobian(tape) if derivative else tape
     across = [Interval([0.5, -1.0], [0.9, 1.0]), Interval([-2.0, -2.0], [-1.0, -1.0])]
-    with pytest.raises(EnclosureError, match=r"may jump.* on the box a in \[-1, 1\], b in \[-2, -1\]"):
+    with pytest.raises(EnclosureError, match=r"may jump.* on the box a in \[-1, 1\]"):
         enclose(tape, across)
     kept = enclose(tape, across, undefined="infinite")
     assert np.isfinite(kept.lo[0]).all()
@@ -122,3 +122,10 @@ def test_malformed_calls_are_refused():
         enclose(tape, [Interval([0.0], [1.0])] * 2)
     with pytest.raises(ValueError, match='`undefined` must be "raise"'):
         enclose(tape, [Interval([0.0], [1.0])], undefined="ignore")
+
+
+def test_a_refusal_names_only_what_decides_it():
+    tape = trace(lambda x: [x[1] + np.tan(x[2]), x[0]], {"x": ["a", "b", "c"]})
+    wide = [Interval([-np.inf], [np.inf]) for _ in range(3)]
+    with pytest.raises(EnclosureError, match=r"`tan\(c\)` is undefined somewhere on the box c in \[-inf, inf\];"):
+        enclose(tape, wide)

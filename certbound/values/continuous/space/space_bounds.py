@@ -87,7 +87,7 @@ def three_states(problem: Problem, model: Model, deadline: float) -> tuple[float
     if upper == 0.0 and not all(space.noisy(axis) for axis in range(3)):
         raise InfeasibleError(
             "value functions in three states proved nothing: where a state has no noise of its own they have fronts "
-            "that grids of this size do not follow; another engine's answer stands."
+            "that grids of this size do not follow."
         )
     words = f"value function in three states, cells: {', '.join(done)}"
     if level < 0 and upper > level + _FAR:

@@ -121,7 +121,7 @@ def _limits(problem: Problem, noisy: int) -> tuple[list[Region], list[Region], E
         if constraint.region.moving or constraint.during not in (None, (0.0, float(problem.horizon))):
             raise InfeasibleError(
                 "value functions with noise in one coordinate serve neither moving sets nor windows yet "
-                f"('{constraint.label}'); another engine's answer stands."
+                f"('{constraint.label}')."
             )
         for region, outside in parts_of(constraint.region, outside=constraint.outside, states=STATES):
             if not _bounds(region, noisy):
