@@ -7,6 +7,7 @@ assumption: the claim says for which disturbances it holds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,9 +15,10 @@ from flint import arb
 
 from certbound.checker.barrier import check_barrier
 from certbound.checker.constants import check_constants
+from certbound.checker.lasting import check_drift, check_lasting, check_lasting_below
 from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, number
-from certbound.checker.report import Budget
+from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, met_at, weights_of
 from certbound.checker.time_pieces import jumps_of, with_time_pieces
 from certbound.checker.words import plainly, quoted, rounded
@@ -31,6 +33,9 @@ RANDOM = "random"
 
 REACH = "reach"
 """The engine that a proof names where the problem has a target: it meets the target at one time."""
+
+WHOLE = ("lasting", "drift")
+"""The engines that prove targets and infinite horizons themselves."""
 
 STATED = "the stated constants hold"
 """How a certificate's own list names what `assumptions` derives from the proof."""
@@ -105,7 +110,7 @@ def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[s
         for one, row, place, _ in _cells(model, proof, path):
             if row is not None:
                 yield from _parts(one, row, place)
-    elif model.target is not None:
+    elif model.target is not None and not (isinstance(proof, Mapping) and proof.get("engine") in WHOLE):
         _named(proof, path, (REACH,))
         record = Record(proof, path, ("engine", "time", "proof"))
         yield from _parts(met_at(model, record.number("time")), record["proof"], f"{path}.proof")
@@ -141,9 +146,11 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
         raise CertificateError("`claim.log10_lower` must not be there where a path ends as it leaves the domain.")
     if lower and model.unknown:
         raise CertificateError("`claim.log10_lower` must not be there for an unknown constant, which does not react.")
-    if lower and (model.members or model.drawn or model.target is not None):
-        raise CertificateError("`claim.log10_lower` must not be there for a union of starts, or beside a target.")
+    if lower and (model.members or model.drawn):
+        raise CertificateError("`claim.log10_lower` must not be there for a union of starts.")
     for engine, _, part in _parts(model, proof):
+        if lower and model.target is not None and engine not in WHOLE:
+            raise CertificateError("`claim.log10_lower` must not be there beside a target, but in proofs that know it.")
         side = part.get("side")
         if side is not None and (side != "lower" or ENGINES[engine].below is None):
             raise CertificateError("`proof.side` must be \"lower\", in a proof by value functions, or be left out.")
@@ -159,6 +166,8 @@ def prove(model: Model, proof: object, budget: Budget, *, lower: bool = False) -
     found = arb(0)
     for engine, one, part in _parts(model, proof):
         row = ENGINES[engine]
+        if math.isinf(one.horizon) and engine not in WHOLE:
+            raise Unproved("this proof needs a finite horizon")
         count, numbers = jumps_of(part)
         one = one if count is None else with_time_pieces(one, count, budget)
         bound = (row.below if lower and row.below is not None else row.prove)(one, numbers, budget)
@@ -236,9 +245,13 @@ def _sentence(model: Model, start: str, bound: str, assumed: Sequence[str]) -> s
         kept += f" before it is in its target ({quoted(model.target.label)}), or is not in it"
     words = (
         f"from {start} the problem {quoted(model.name)} {kept} "
-        f"within {plainly(model.horizon)} {model.unit} with probability {bound} delta = {plainly(model.delta)})"
+        f"{_when(model)} with probability {bound} delta = {plainly(model.delta)})"
     )
     return words + "".join(f"; assuming that {item}" for item in assumed)
+
+
+def _when(model: Model) -> str:
+    return "at any time" if math.isinf(model.horizon) else f"within {plainly(model.horizon)} {model.unit}"
 
 
 def _values(model: Model, proof: object, budget: Budget) -> arb:
@@ -265,6 +278,8 @@ ENGINES = {
     "constants": Engine(words="contraction constants (Thms K2, K5)", prove=check_constants, assumes=_stated),
     "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
     "values": Engine(words="the value function itself (Thm K8)", prove=_values, below=_values_below),
+    "lasting": Engine(words="a function of the state alone", prove=check_lasting, below=check_lasting_below),
+    "drift": Engine(words="a drift away from the limit (Lundberg's inequality)", prove=check_drift),
     "quadratic": Engine(words="quadratic value bounds (Thm K9)", prove=_quadratic),
 }
 """By the name that a proof gives: all that the checker knows of an engine."""

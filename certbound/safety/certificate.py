@@ -25,6 +25,7 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.balls import precision, upper
 from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most
 from certbound.safety.portfolio import ENGINES
+from certbound.values.continuous import Lasting
 
 FORMAT = "certbound certificate"
 VERSION = 1
@@ -69,8 +70,6 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
-    if problem.endless:
-        raise CertificateError("certificates state finite horizons; verify a finite `horizon`.")
     members, cells = getattr(verdict, "members", ()), getattr(verdict, "cells", ())
     if problem.random and not members:
         if verdict.status == "UNSAFE":
@@ -92,7 +91,8 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
                 raise CertificateError("certificates do not state what this engine proves.")
             if answer.truncated:
                 raise CertificateError("certificates do not state what an ellipsoid of starts says of a random one.")
-            found = write(problem, answer, attempt) if problem.reach is None else _met(problem, answer, attempt, write)
+            whole = problem.reach is None or isinstance(answer.details, Lasting)
+            found = write(problem, answer, attempt) if whole else _met(problem, answer, attempt, write)
         except CertificateError as error:
             refusals.append(f"{name}: {error}")
             continue
@@ -101,9 +101,8 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
         if verdict.status != "SAFE" or is_at_most(min(best[1][1], 0.0), problem.delta):
             break
     if best is not None:
-        name, (proof, log10, assumptions) = best
-        method = name if problem.reach is None else "reach"
-        claim = {"log10_delta": exact(min(log10, 0.0)), "method": method, "assumptions": assumptions}
+        _, (proof, log10, assumptions) = best
+        claim = {"log10_delta": exact(min(log10, 0.0)), "method": proof["engine"], "assumptions": assumptions}
         return _whole(problem, claim, proof)
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
@@ -156,7 +155,8 @@ def averaged(problem: Problem, cells: Sequence[Any], found: Sequence[Mapping[str
 
 def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, Any]:
     """The certificate of UNSAFE: P(some constraint is broken) >= 10**claim from some start, for some disturbance."""
-    if problem.reach is not None or len(problem.starts) > 1:
+    alone = any(isinstance(answer.details, Lasting) for answer in verdict.answers.values())
+    if len(problem.starts) > 1 or (problem.reach is not None and not alone):
         raise CertificateError(
             "certificates state no lower bounds where there is a target, or the start is a union: verify by itself the "
             "member that is UNSAFE."
@@ -172,7 +172,10 @@ def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, 
         except CertificateError as error:
             refusals.append(f"{name}: {error}")
             continue
-        claim = {"log10_delta": exact(0.0), "log10_lower": exact(log10), "method": name, "assumptions": assumptions}
+        claim = {
+            "log10_delta": exact(0.0), "log10_lower": exact(log10), "method": proof["engine"],
+            "assumptions": assumptions,
+        }  # fmt: skip
         return _whole(problem, claim, proof)
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no lower bound was found that a certificate could state: {why}")
@@ -234,7 +237,7 @@ def problem_data(problem: Problem) -> dict[str, Any]:
     return {
         "name": problem.name,
         "time": system.time,
-        "horizon": exact(float(problem.horizon)),
+        "horizon": None if problem.endless else exact(float(problem.horizon)),
         "delta": exact(float(problem.delta)),
         "states": list(system.states),
         "inputs": list(inputs),

@@ -314,6 +314,10 @@ class _Search:
 
     def _in_time(self, row: Engine, request: Request) -> EngineAnswer:
         """What an engine answers about meeting the target by a time; not to meet it by then says nothing from below."""
+        if row.endless:
+            found = row.prove(self.problem, request)
+            if found.applicable:
+                return found
         found = row.prove(self.problem.replace(horizon=self.meeting[0]), request)
         return replace(found, log10_lower=None, conclusive=False)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 from flint import arb, arb_mat
@@ -133,8 +134,10 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     if time not in ("continuous", "discrete"):
         raise CertificateError(f"`{path}.time` must be \"continuous\" or \"discrete\".")
     continuous = time == "continuous"
-    horizon, delta = record.number("horizon"), record.number("delta")
-    if not horizon > 0 or (not continuous and (horizon != int(horizon) or horizon > MOST_STEPS)):
+    horizon = math.inf if record["horizon"] is None else record.number("horizon")
+    delta = record.number("delta")
+    many = math.isfinite(horizon) and (horizon > MOST_STEPS or horizon != int(horizon))
+    if not horizon > 0 or (not continuous and many):
         raise CertificateError(f"`{path}.horizon` must be positive (whole steps in discrete time), got {horizon:g}.")
     if not 0 < delta < 1:
         raise CertificateError(f"`{path}.delta` must lie in (0, 1), got {delta:g}.")
@@ -196,7 +199,7 @@ def _plan(record: Record, inputs: int, continuous: bool, horizon: float) -> list
             raise CertificateError(f"`{record.at('plan')}` must be null: the model has no inputs left.")
         return None
     rows: list[list[float]] = record.array("plan", None, inputs)
-    if not rows or (not continuous and len(rows) != int(horizon)):
+    if not rows or math.isinf(horizon) or (not continuous and len(rows) != int(horizon)):
         raise CertificateError(f"`{record.at('plan')}` must have one row a step.")
     return rows
 

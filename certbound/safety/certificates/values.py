@@ -24,8 +24,8 @@ from certbound.problem.sets import Faces, Inside
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.parts import packed
-from certbound.values.continuous import ExitBounds, Payment, Surface
-from certbound.values.discrete import step_grids
+from certbound.values.continuous import ExitBounds, Lasting, Payment, Surface, bound_lasting
+from certbound.values.discrete import Drifting, step_grids
 from certbound.values.grids import Grid
 from certbound.values.sets import active_at
 
@@ -42,6 +42,7 @@ _LONGEST = 15 * 2**20  # characters of the packed arrays
 _INWARD = 1e-13  # of a side of the grid: its faces must lie in the safe set, whatever has been rounded
 _STARTS = ("box", "ball", "ellipsoid")  # sets of which lower bounds state points
 _ALONG = {1: 9, 2: 5, 3: 3}  # of these, along each side of a box, by the number of states
+_LASTING = (2**9, 2**11, 2**13)  # cells of a function of the state alone
 _MEANS = 4000  # parts over which the mean over a random start is taken
 _FARTHEST = 60.0  # standard deviations of the noise for which a cell reaches beyond the safe set
 
@@ -53,8 +54,16 @@ def values_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     """
     if problem.ending:
         raise CertificateError("the checker counts leaving the domain as failing, and this bound does not.")
+    if isinstance(answer.details, Lasting):
+        return _lasting(problem, attempt, above=True)
+    if isinstance(answer.details, Drifting):
+        drift = answer.details
+        data = {"engine": "drift", "mirrored": drift.mirrored, "limit": exact(drift.limit), "rate": exact(drift.rate)}
+        return data, min(drift.log / math.log(10) * (1 - 1e-12), 0.0), []
     if answer.details is None:
         raise CertificateError("certificates do not state rates of leaving.")
+    if problem.endless:
+        raise CertificateError("certificates state no bounds of infinite horizons that rest on grids.")
     effort = min(attempt, len(_ROOMS) - 1)
     flat = isinstance(answer.details, ExitBounds) and problem.system.dimension > 1
     room = _ROOMS[effort] * (_MORE_ROOM if flat else 1)
@@ -75,6 +84,10 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
         raise CertificateError("certificates of lower bounds count leaving the domain as failing.")
     if answer.log10_lower is None:
         raise CertificateError("no lower bound was found.")
+    if isinstance(answer.details, Lasting):
+        return _lasting(problem, attempt, above=False)
+    if problem.endless:
+        raise CertificateError("certificates state lower bounds over infinite horizons in continuous time only.")
     if not problem.initial.random and problem.initial.data(_STARTS)["kind"] not in _STARTS:
         raise CertificateError("lower bounds are stated from starts in a box, a ball or an ellipsoid, or normal ones.")
     if answer.details is None:
@@ -88,6 +101,20 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
     if not problem.initial.random:
         data["starts"] = exact(_some_starts(problem))
     return data, claim, []
+
+
+def _lasting(problem: Problem, attempt: int, *, above: bool) -> Proof:
+    """A function of the state alone: its slopes from one side."""
+    found = bound_lasting(problem, cells=_LASTING[min(attempt, len(_LASTING) - 1)])
+    low, high = found.slopes
+    tail = found.tail if above else None
+    data = {
+        "engine": "lasting", "mirrored": bool(found.side), "edges": exact(found.edges),
+        "slopes": exact(low if above else high),
+        "tail": None if tail is None else {"kind": tail[0], "rate": exact(tail[1])},
+    } | ({} if above else {"side": "lower"})
+    level, room = (found.upper if above else found.lower) / math.log(10), 1e-9 * (1 + abs(found.upper))
+    return data, (min(level + room, 0.0) if above else level - room), []
 
 
 def _grids(problem: Problem, effort: int) -> list[Grid]:

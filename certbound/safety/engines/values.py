@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from certbound.display import rounded
 from certbound.errors import EnclosureError, InfeasibleError
-from certbound.problem.goals import check_end, until
+from certbound.problem.goals import until
 from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.values.chains import bound_chain
-from certbound.values.continuous import ExitBounds, bound_exits, bound_rate
-from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
+from certbound.values.continuous import ExitBounds, bound_exits, bound_lasting, bound_rate
+from certbound.values.discrete import FailureBounds, bound_drifting, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
 
@@ -34,30 +35,55 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     most = _SPACE if wide else _SECONDS
     limit = max(min(most if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
     try:
-        if problem.system.time == "continuous":
-            if problem.endless and problem.reach is None:
-                return _lasting(problem)
-            check_end(problem, "a value function in continuous time")
+        if problem.system.time == "continuous" and problem.endless:
+            return _lasting(problem)
         if problem.reach is None and serves(problem):
             return _continuous(bound_exits_by_steps(problem, seconds=limit))
         if not isinstance(problem.system, DiscreteSystem):
             return _continuous(_exits(problem, limit))
         found = _failure(problem, limit)
     except (InfeasibleError, EnclosureError) as error:
-        found_rate = _by_rate(problem)
-        return found_rate or EngineAnswer(applicable=False, method="values", reason=str(error))
+        lasting = _by_rate(problem) or _without_end(problem, limit)
+        return lasting or EngineAnswer(applicable=False, method="values", reason=str(error))
     return _answer(problem, found)
 
 
 def _lasting(problem: Problem) -> EngineAnswer:
     """An infinite horizon in continuous time."""
-    found = _by_rate(problem)
-    if found is None:
+    if problem.system.dimension > 1:
         raise InfeasibleError(
             "a value function in continuous time needs an end, and the horizon is infinite; without one a single state "
-            "is served, between two limits that stand still, for a model that does not depend on time."
+            "is served, with limits and targets that stand still, for a model that does not depend on time."
         )
-    return found
+    return _by_rate(problem) or _by_function(problem)
+
+
+def _by_function(problem: Problem) -> EngineAnswer:
+    """What a function of the state alone says of all times; nothing from below of a horizon that ends."""
+    found = bound_lasting(problem)
+    lower = found.lower / math.log(10) if problem.endless and found.lower > -math.inf else None
+    least = "" if lower is None else f" and at least 10^{rounded(lower, up=False, digits=6)}"
+    upper = found.upper / math.log(10)
+    words = f"the probability of ever failing is at most 10^{rounded(upper, up=True, digits=6)}{least}"
+    return EngineAnswer(
+        log10_delta=min(upper * (1 - 1e-15), 0.0), log10_lower=None if lower is None else lower * (1 + 1e-15),
+        reason=f"{words}, by a function of the state alone.", method="values", details=found,
+        conclusive=lower is not None and upper <= lower + math.log10(_CLOSE),
+    )  # fmt: skip
+
+
+def _without_end(problem: Problem, limit: float) -> EngineAnswer | None:
+    """What all times say of a horizon without a target, which may end; None where nothing is proved."""
+    if problem.system.dimension > 1 or problem.reach is not None:
+        return None
+    try:
+        if problem.system.time == "continuous":
+            return _by_function(problem)
+        found, drift = bound_drifting(problem.replace(horizon=math.inf), seconds=limit, delta=problem.delta)
+        answer = replace(_answer(problem, found), details=drift)
+        return answer if problem.endless else replace(answer, log10_lower=None, conclusive=False)
+    except (InfeasibleError, EnclosureError):
+        return None
 
 
 def _by_rate(problem: Problem) -> EngineAnswer | None:
