@@ -8,7 +8,6 @@ interrupted, early for first bounds, later for all others, and goes on with what
 from __future__ import annotations
 
 import contextlib
-import difflib
 import logging
 import math
 from dataclasses import replace
@@ -27,7 +26,7 @@ from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import best_time, find_miss, window_of
-from certbound.safety.portfolio import ENGINES, Engine, engine_named
+from certbound.safety.portfolio import ENGINES, Engine, engines_of
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
@@ -57,7 +56,7 @@ def decide(
     request = Request(
         method="auto" if method in ENGINES else method, cells=cells, constants=constants, thorough=method != "auto"
     )
-    names = _chosen(method)
+    names = engines_of(method)
     watch = watch or current_watch() or Watch()
     for start in problem.starts:
         _checked(problem.replace(initial=start) if len(problem.starts) > 1 else problem, request)
@@ -239,7 +238,8 @@ class _Search:
             return
         most = _UNLIKELY if self.bounded and not self._likely(name) else math.inf
         with self.watch.share(_EXTRA if self.safe else 1.0, most):
-            self.ask(name, replace(self.request, quick=quick, before=None if before is None else before.details))
+            details = None if before is None else before.details
+            self.ask(name, replace(self.request, quick=quick, bounded=self.bounded, before=details))
 
     def ask(self, name: str, request: Request) -> None:
         """Keep the best that an engine finds; ``OutOfTime`` where the time ended it."""
@@ -388,17 +388,3 @@ def _checked(problem: Problem, request: Request) -> None:
     from certbound.constants.stated import refuse_contradiction
 
     refuse_contradiction(problem, constants)
-
-
-def _chosen(method: str) -> tuple[str, ...]:
-    if method == "auto":
-        return tuple(ENGINES)
-    name = engine_named(method)
-    if name is not None:
-        return (name,)
-    from certbound.tubes.tuning import METHODS
-
-    known = ["auto", *ENGINES, *(name for name in METHODS if name != "auto")]
-    near = difflib.get_close_matches(str(method), known, n=1)
-    cure = f"did you mean {near[0]!r}?" if near else "leave it out for the best of all engines."
-    raise ValueError(f"`method` must be one of {', '.join(known)}, got {method!r}; {cure}")

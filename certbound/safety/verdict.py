@@ -242,6 +242,8 @@ def verdict_of(problem: Problem, answers: Mapping[str, EngineAnswer], method: st
     lower = best_lower(answers)
     unsafe = lower is not None and is_more_than(lower, problem.delta)
     proved = best.certified and not best.assumption
+    if lower is not None and best.assumption and ((unsafe and safe) or lower > best.log10_delta + _ALIKE):
+        return _without_assumptions(problem, answers, best, lower)
     if lower is not None and ((unsafe and safe) or (proved and lower > best.log10_delta + _ALIKE)):
         raise SolverError(
             f"two engines contradict each other: {name} proves at most 10^{level:.6g}, another one at least "
@@ -259,6 +261,18 @@ def verdict_of(problem: Problem, answers: Mapping[str, EngineAnswer], method: st
         problem=problem,
         answers=MappingProxyType(dict(answers)),
     )
+
+
+def _without_assumptions(
+    problem: Problem, answers: Mapping[str, EngineAnswer], refuted: EngineAnswer, lower: float
+) -> Verdict:
+    """The verdict of what is proved, where that refutes what was assumed."""
+    found = verdict_of(problem, {name: answer for name, answer in answers.items() if not answer.assumption})
+    words = (
+        f"What was assumed is refuted: with it ({refuted.assumption}) the probability would be at most "
+        f"10^{refuted.log10_delta:.6g}, and at least 10^{lower:.6g} is proved without."
+    )
+    return replace(found, reason=f"{_sentence(found.reason)} {words}")
 
 
 def best_lower(answers: Mapping[str, EngineAnswer]) -> float | None:

@@ -88,6 +88,20 @@ def test_a_probability_that_is_proved_to_exceed_delta_is_unsafe() -> None:
     assert 0.9 * 10**verdict.log10_lower < shown <= 10**verdict.log10_lower
 
 
+def test_an_assumption_that_a_lower_bound_refutes_is_left_out_in_words() -> None:
+    from certbound.safety.answers import EngineAnswer
+    from certbound.safety.verdict import verdict_of
+
+    problem = cb.load("ou")
+    stated = EngineAnswer(log10_delta=-9.0, method="kummer", assumption="the constants are those stated")
+    proved = EngineAnswer(log10_delta=-0.5, log10_lower=-1.0, method="values")
+    found = verdict_of(problem, {"constants": stated, "values": proved})
+    assert (found.status, found.log10_delta, found.method) == ("UNSAFE", -0.5, "values")
+    assert "the constants are those stated" in found.reason
+    assert "refuted" in found.reason
+    assert "defect" not in found.reason
+
+
 def test_engines_that_contradict_each_other_answer_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     from dataclasses import replace
 

@@ -188,3 +188,12 @@ def test_what_is_not_served_is_refused_in_words(safe, match: str) -> None:
     box = safe if n == 3 else cb.Box([-1] * 4, [1] * 4)
     with pytest.raises(InfeasibleError, match=match):
         bound_exits(cb.Problem(system, initial=np.zeros(n), safe=[cb.Inside(box)], horizon=1))
+
+
+def test_what_a_rough_guess_puts_out_of_reach_may_be_left_out() -> None:
+    """Noise as strong as the box is wide: far above delta."""
+    system = cb.ContinuousSystem(lambda x: -x, states=3, diffusion=np.eye(3))
+    safe = [cb.Inside(cb.Box([-1] * 3, [1] * 3))]
+    problem = cb.Problem(system, initial=[0, 0, 0], safe=safe, horizon=0.5)
+    with pytest.raises(InfeasibleError, match="rough guess .* more than is asked"):
+        bound_exits(problem, seconds=1.0, delta=1e-3, spare=True)

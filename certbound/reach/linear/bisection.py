@@ -83,7 +83,7 @@ def bisected(problem: Problem, whole: LinearRun, target: Share) -> SplitAnswer |
     while heap:
         poll(f"cells of the initial set: {len(done)} done, {len(heap)} to do")
         worst = [heapq.heappop(heap) for _ in range(min(_BATCH, len(heap)))]
-        learnt = done[-1][1].run.learnt if done else None
+        learnt = done[-1][1].run.learnt if done else whole.learnt
         found = _side_by_side([run for _, _, _, run in worst if run is not whole], target, learnt)
         for _, _, leaf, run in worst:
             proved = found.get(run)

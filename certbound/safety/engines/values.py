@@ -40,7 +40,7 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         if problem.reach is None and serves(problem):
             return _continuous(bound_exits_by_steps(problem, seconds=limit))
         if not isinstance(problem.system, DiscreteSystem):
-            return _continuous(_exits(problem, limit))
+            return _continuous(_exits(problem, limit, spare=asked.bounded and not asked.thorough))
         found = _failure(problem, limit)
     except (InfeasibleError, EnclosureError) as error:
         lasting = _by_rate(problem) or _without_end(problem, limit)
@@ -130,10 +130,10 @@ def _failure(problem: Problem, limit: float) -> FailureBounds:
         raise InfeasibleError(f"{refused.rstrip('.')}; and {error}") from error
 
 
-def _exits(problem: Problem, limit: float) -> ExitBounds:
+def _exits(problem: Problem, limit: float, *, spare: bool) -> ExitBounds:
     target = problem.reach
     if target is None:
-        return bound_exits(problem, seconds=limit, delta=problem.delta)
+        return bound_exits(problem, seconds=limit, delta=problem.delta, spare=spare)
     first, last = target.during or (0.0, float(problem.horizon))
     if first > 0:
         raise InfeasibleError("value functions in continuous time need a target that counts from the beginning.")

@@ -58,7 +58,8 @@ class ExitBounds:
 
 
 def bound_exits(
-    problem: Problem, *, target: Any = None, seconds: float = 10.0, lower: bool = True, delta: float = 0.0
+    problem: Problem, *, target: Any = None, seconds: float = 10.0, lower: bool = True, delta: float = 0.0,
+    spare: bool = False,
 ) -> ExitBounds:
     """Bound P(X_t leaves the safe set for some t <= T) from above and from below by Theorem K8-CT.
 
@@ -79,6 +80,8 @@ def bound_exits(
         Whether to look for a lower bound too.
     delta : float
         Where the upper bound is at most this, no lower bound is looked for in two states, which takes as long again.
+    spare : bool
+        In three states: stop where a rough guess says that this is out of reach.
 
     Returns
     -------
@@ -123,7 +126,8 @@ def bound_exits(
         from certbound.values.continuous.space import three_states
 
         _refuse_random(problem)
-        (upper, words), least = three_states(problem, model, begin + seconds), None
+        hoped = math.log(delta) if spare and delta > 0 else math.inf
+        (upper, words), least = three_states(problem, model, begin + seconds, hoped), None
     elif moving(problem) and all(not c.outside for c in problem.constraints):
         _refuse_random(problem)
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf

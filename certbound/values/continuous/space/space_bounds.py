@@ -57,9 +57,10 @@ _HOPELESS = 60.0  # what a first proposal may lose (log P)
 _SHARES = (0.05, 0.95)  # of the patches, for one grid after the other
 _FAR = 1.5  # of log P, between the bound and a rough guess
 _FEWEST = 8  # cells along an axis
+_ROUGH = 0.7  # of log P, for the error of a rough guess
 
 
-def three_states(problem: Problem, model: Model, deadline: float) -> tuple[float, str]:
+def three_states(problem: Problem, model: Model, deadline: float, hoped: float = math.inf) -> tuple[float, str]:
     """The upper bound of log P on a small grid and on a large one, and what was done.
 
     The seconds until the deadline are turned into a number of patches, so that the bound does not depend on the clock.
@@ -67,12 +68,18 @@ def three_states(problem: Problem, model: Model, deadline: float) -> tuple[float
     Raises
     ------
     InfeasibleError
-        The safe set is no box; or nothing was proved, and some state has no noise of its own.
+        The safe set is no box; a rough guess of log P is above ``hoped``; or nothing was proved, and some state has no
+        noise of its own.
     """
     space = _space(problem, model)
     patches = min(_RATE * max(1.0, round(deadline - time.perf_counter(), 1)) / _effort(model), _MOST)
     upper, done = 0.0, []
     level = _rough_level(space)
+    if level > hoped + _ROUGH:
+        raise InfeasibleError(
+            f"a rough guess of the probability, which nothing proves, is {math.exp(level):.1g}, more than is asked; "
+            "value functions are left out, since another bound is proved: ask for them by name."
+        )
     plans = {plan.cells: plan for plan in (_plan(space, level, share * patches) for share in _SHARES)}
     for plan in plans.values():
         try:
