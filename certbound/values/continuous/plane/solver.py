@@ -34,6 +34,7 @@ _GAMMA = 0.5
 _COURANT = 1.5
 _GATE = 0.004  # a source weakens where V is above minus this, and ends at 0
 _MOST_STEPS = 40_000
+_PER_SLAB = 80  # on average, beyond which steps are a sign of oscillations
 _BENT = 1.5  # jump of V' over five points, times a cell, above which a is raised
 _ZONE = 0.88  # of the width over the number of cells: how far from a face the inward drift is weakened
 _FALL = 0.5  # half of what V may fall by over the cell beside a face, where the drift is inward
@@ -68,7 +69,7 @@ def integrated(solver: Stepper) -> Surface | None:
         first.append(solver.rate(begin, value))
         steps = solver.steps(begin, value, end - begin)
         taken += steps
-        if taken > _MOST_STEPS:
+        if taken > min(_MOST_STEPS, _PER_SLAB * len(times)):
             return None
         step = (end - begin) / steps
         for part in range(steps):
@@ -85,12 +86,13 @@ class Solver:
     """V at Greville's points of both axes, shape (count_x, count_y)."""
 
     gamma = _GAMMA
+    degree = 5
 
     def __init__(self, plane: Plane, plan: Plan, source: Source | None) -> None:
         self.plane, self.plan = plane, plan
         self.nodes = [self.grid(axis) for axis in (0, 1)]
-        self.splines = [Splines(nodes) for nodes in self.nodes]
-        self.inverse = [np.linalg.inv(one.dense[0]) for one in self.splines]
+        self.splines = [Splines(nodes, self.degree) for nodes in self.nodes]
+        self.inverse = [self.fitted(one.dense[0]) for one in self.splines]
         self.slope = [one.dense[1] @ inverse for one, inverse in zip(self.splines, self.inverse)]
         self.bend = [one.dense[2] @ inverse for one, inverse in zip(self.splines, self.inverse)]
         points = [one.points for one in self.splines]
@@ -105,6 +107,10 @@ class Solver:
         if source is not None:
             places = [np.clip(place, axis[0], axis[-1]) for place, axis in zip(points, source.axes)]
             self.source = source.times, source.at(places)
+
+    def fitted(self, dense: Array) -> Array:
+        """The matrix from V at the points to a spline's coefficients; ``dense`` leads back."""
+        return np.asarray(np.linalg.inv(dense))
 
     def grid(self, axis: int) -> Array:
         """The nodes along an axis."""

@@ -11,7 +11,9 @@ from __future__ import annotations
 import contextlib
 import itertools
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -30,6 +32,7 @@ from certbound.values.continuous.hypotheses import (
     sampled_residual,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
+from certbound.values.continuous.plane.monotone import propose_monotone
 from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.plane_proposal import propose_plane
@@ -38,6 +41,7 @@ from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
 Proposed = tuple[Surface, Payment]
+Propose = Callable[[Plane, Plan, Source | None], Surface | None]
 
 _FACTOR = 1.12
 _TOPS = (-0.02, -0.1)  # where V is above, the proof may lift it over 0 instead
@@ -46,7 +50,9 @@ _GRANTED = 0.005  # eps that the proof may pay, in units of the bound, summed ov
 RATE = 7_000  # patches that are proposed and proved in a second
 _PASSES = 2
 _CLOSE = 0.15
-_HOPELESS = 60.0  # what a first proposal may lose (log P): sources make that ten times less, not a hundred
+_POOR = 0.5  # of log P: where a proof would lose more, monotone proposals are made too
+_RAISED = (0.6, 1.5, 2.5)  # times a: what they keep of it at kinks, one after the other
+_HOPELESS = (60.0, 1000.0)  # what a first proposal may lose (log P); sources make less of it, more so of monotone ones
 _VARIED = 1.0  # about how much V varies on a patch
 _SHARES = (0.12, 0.8)  # of the patches, for one grid after the other
 BELOW = 0.6  # of as many patches again, for a lower bound
@@ -83,10 +89,11 @@ def bound_plane_above(
     """An upper bound of log P(leaving the box) on one grid after another, what was done, and what was proved."""
     upper, done = 0.0, []
     proposed: list[Proposed] = []
-    for share in _SHARES:
-        plan = _plan(plane, level, share * patches)
+    plans = {plan.cells: plan for plan in (_plan(plane, level, share * patches) for share in _SHARES)}
+    kinds = _several()
+    for plan in plans.values():
         try:
-            surface = _promising(plane, model, plan)
+            surface = _promising(plane, model, plan, kinds=kinds)
             if surface is not None:
                 payment = prove_upper(surface, model, plane.starts)
                 if payment.log < upper:
@@ -115,7 +122,8 @@ def _plan(plane: Plane, level: float, patches: float) -> Plan:
 
 def rough_level(plane: Plane) -> float:
     """log P from a coarse proposal; 0 where that breaks down."""
-    rough = propose_plane(plane, Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon))
+    plan = Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon)
+    rough = propose_plane(plane, plan) or propose_monotone(plane, plan, None, _RAISED[0])
     return 0.0 if rough is None else min(0.0, float(extreme_over(rough, plane.starts, upper=True)))
 
 
@@ -129,29 +137,59 @@ def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float],
     return [] if surface is None else chart_above(surface, model, levels, [0])
 
 
-def _promising(plane: Plane, model: Model, plan: Plan, level: float | None = None) -> Surface | None:
-    """The proposal whose bound will be the smallest where V is the ``level``, or over the starts."""
-    surface = propose_plane(plane, plan)
+def _several() -> list[Propose]:
+    """The ways of proposing, the most accurate one first, then those that serve layers thinner and thinner."""
+    return [propose_plane, *(partial(propose_monotone, raised=factor) for factor in _RAISED)]
+
+
+def _promising(
+    plane: Plane, model: Model, plan: Plan, level: float | None = None, kinds: list[Propose] | None = None
+) -> Surface | None:
+    """The proposal whose bound will be the smallest where V is the ``level``, or over the starts.
+
+    The monotone ones are asked where splines through V break down, or the proof would lose much. ``kinds`` are tried
+    in turn, and what breaks down becomes the last of them.
+    """
+    best: Sketch | None = None
+    for propose in list(kinds := _several() if kinds is None else kinds):
+        found = _refined(plane, model, plan, level, propose, _TOPS if propose is propose_plane else _TOPS[1:])
+        if found is None:  # the last one to be asked on the next grid
+            kinds.append(kinds.pop(kinds.index(propose)))
+            continue
+        if best is not None and found.start >= best.estimate():
+            break
+        if best is None or found.estimate() < best.estimate():
+            best = found
+        if best.estimate() < best.start + _POOR:
+            break
+    if best is None or (level is None and best.estimate() >= 0):
+        return None
+    return best.surface if covers(best.surface, plane.horizon, plane.low, plane.high, within=True) else None
+
+
+def _refined(
+    plane: Plane, model: Model, plan: Plan, level: float | None, propose: Propose, tops: Sequence[float]
+) -> Sketch | None:
+    """The best of a few proposals, each with a source made of what the last one would pay."""
+    surface = propose(plane, plan, None)
     if surface is None:
         return None
     first = best = Sketch.of(surface, model, plane.starts, level)
-    if first.estimate() > first.start + _HOPELESS:
+    if first.estimate() > first.start + _HOPELESS[propose is not propose_plane]:
         return None
-    for top in _TOPS:
+    for top in tops:
         sketch, source = first, None
         for _ in range(_PASSES):
             more = Source.above(sketch.surface, _FACTOR * sketch.needed(top))
             source = more if source is None else source.plus(more)
-            surface = propose_plane(plane, plan, source)
+            surface = propose(plane, plan, source)
             if surface is None:
                 break
             sketch = Sketch.of(surface, model, plane.starts, level)
             best = min(best, sketch, key=lambda one: one.estimate())
         if best.estimate() < best.start + _CLOSE:
             break
-    if level is None and best.estimate() >= 0:
-        return None
-    return best.surface if covers(best.surface, plane.horizon, plane.low, plane.high, within=True) else None
+    return best
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
