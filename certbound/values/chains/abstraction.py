@@ -26,7 +26,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Region
 from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
-from certbound.values.chains.extremes import Extremes
+from certbound.values.chains.extremes import Extremes, places
 from certbound.values.chains.pieces import pieces_of
 from certbound.values.discrete import FailureBounds, evaluate
 from certbound.values.grids import Grid, graded_axis
@@ -245,10 +245,11 @@ class _Images:
 
     def __init__(self, chain: _Chain, grid: Grid, cells: Interval) -> None:
         self.chain, self.grid, self.cells = chain, grid, cells
+        self.shape = (*(size + 2 for size in grid.shape), 1)[:2]  # of tables with a ring around
         size = len(cells) * len(chain.pieces.most) * 4 * (len(chain.boxes) + len(chain.corners))
         self.keeps = chain.steady and size <= _CACHED
         self.lost: dict[tuple[int, bool], Mask] = {}  # where the model is undefined
-        self.kept: dict[tuple[int, bool], list[tuple[Integers, Integers]]] = {}
+        self.kept: dict[tuple[int, bool], list[Integers]] = {}
 
     def means(self, t: int, value: _Sides) -> tuple[Array, Array]:
         """Bounds of sup_d E V_{t+1}(f + G w): from above over all disturbances, from below at their corners."""
@@ -260,13 +261,13 @@ class _Images:
 
     def _sum(self, t: int, k: int, extremes: Extremes, weights: Array, above: bool) -> Array:
         total = np.zeros(len(self.cells))
-        for (first, last), weight in zip(self._met(t, k, above), weights, strict=True):
+        for boxes, weight in zip(self._met(t, k, above), weights, strict=True):
             if weight > 0:
-                total += weight * extremes.over(first, last)
+                total += weight * extremes.over(boxes)
         return np.where(self.lost[k, above], 1.0 if above else 0.0, total)
 
-    def _met(self, t: int, k: int, above: bool) -> Iterator[tuple[Integers, Integers]]:
-        """First and last cell along each axis, shapes (2, boxes), of the ringed grid."""
+    def _met(self, t: int, k: int, above: bool) -> Iterator[Integers]:
+        """Places of the boxes of cells that are met, on the ringed grid, for each piece of the noise."""
         if not self.keeps:
             yield from self._computed(t, k, above)
             return
@@ -274,7 +275,7 @@ class _Images:
             self.kept[k, above] = list(self._computed(t, k, above))
         yield from self.kept[k, above]
 
-    def _computed(self, t: int, k: int, above: bool) -> Iterator[tuple[Integers, Integers]]:
+    def _computed(self, t: int, k: int, above: bool) -> Iterator[Integers]:
         chain, problem = self.chain, self.chain.problem
         box = (chain.boxes if above else chain.corners)[k]
         clock = [Interval.point(float(t)), *(self.cells[:, i] for i in range(chain.n))]
@@ -291,7 +292,8 @@ class _Images:
             ends = image + (gain * w).sum(axis=-1)
             yield self._indices(ends, bad)
 
-    def _indices(self, ends: Interval, bad: Mask) -> tuple[Integers, Integers]:
+    def _indices(self, ends: Interval, bad: Mask) -> Integers:
+        """Places of the boxes of cells that hold the images; of all cells where these are unknown."""
         count = len(self.cells)
         first, last = np.zeros((2, count), dtype=int), np.zeros((2, count), dtype=int)
         for i, axis in enumerate(self.grid.axes):
@@ -300,7 +302,7 @@ class _Images:
             unknown = bad | ~np.isfinite(ends.lo[:, i]) | ~np.isfinite(ends.hi[:, i])
             first[i] = np.where(unknown, 0, low)
             last[i] = np.where(unknown, len(axis), high)
-        return first, last
+        return places(self.shape, first, last)
 
 
 def _ends(region: Region, n: int, i: int) -> list[float]:

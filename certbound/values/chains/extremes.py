@@ -18,7 +18,7 @@ class Extremes:
     """
 
     def __init__(self, table: Array, pick: np.ufunc) -> None:
-        self.pick, self.shape = pick, table.shape
+        self.pick = pick
         levels = [int(size).bit_length() for size in table.shape]
         blocks = np.empty((*levels, *table.shape))
         blocks[0, 0] = table
@@ -30,18 +30,21 @@ class Extremes:
             half = 1 << (a - 1)
             blocks[a] = blocks[a - 1]
             pick(blocks[a - 1][:, :-half], blocks[a - 1][:, half:], out=blocks[a][:, :-half])
-        self.blocks, self.levels = blocks.ravel(), levels
+        self.blocks = blocks.ravel()
 
-    def over(self, first: Integers, last: Integers) -> Array:
-        """Over the entries from ``first`` to ``last``, both included, shapes (2, K)."""
-        level = np.frexp(last - first + 1)[1] - 1  # the largest power of 2 that fits
-        ends = last - (1 << level) + 1
-        base = (level[0] * self.levels[1] + level[1]) * self.shape[0]
-        found: Array | None = None
-        for rows in (first[0], ends[0]):
-            line = (base + rows) * self.shape[1]
-            for columns in (first[1], ends[1]):
-                value = self.blocks.take(line + columns)
-                found = value if found is None else self.pick(found, value)
-        assert found is not None
-        return found
+    def over(self, places: Integers) -> Array:
+        """Over the boxes whose `places` are given, shape (4, K) to (K,)."""
+        first, second, third, fourth = (self.blocks.take(row) for row in places)
+        return np.asarray(self.pick(self.pick(self.pick(first, second), third), fourth))
+
+
+def places(shape: tuple[int, ...], first: Integers, last: Integers) -> Integers:
+    """Where the four blocks that cover the boxes from ``first`` to ``last``, both included, shapes (2, K), are kept.
+
+    They serve all tables of one shape; shape (4, K).
+    """
+    level = np.frexp(last - first + 1)[1] - 1  # the largest power of 2 that fits
+    ends = last - (1 << level) + 1
+    base = (level[0] * int(shape[1]).bit_length() + level[1]) * shape[0]
+    lines = [(base + rows) * shape[1] for rows in (first[0], ends[0])]
+    return np.stack([line + columns for line in lines for columns in (first[1], ends[1])])

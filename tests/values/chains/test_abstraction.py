@@ -9,7 +9,7 @@ import certbound as cb
 from certbound.errors import CertificateError, InfeasibleError
 from certbound.problem.files.loading import loads, save
 from certbound.values.chains import bound_chain
-from certbound.values.chains.extremes import Extremes
+from certbound.values.chains.extremes import Extremes, places
 from certbound.values.chains.pieces import pieces_of
 
 LAWS = {
@@ -68,7 +68,7 @@ def test_extremes_are_those_of_the_boxes():
     last = np.minimum(first + rng.integers(0, 22, (2, 300)), [[12], [21]])
     for pick, reduce in ((np.maximum, np.max), (np.minimum, np.min)):
         wanted = [reduce(table[a : c + 1, b : d + 1]) for (a, b), (c, d) in zip(first.T, last.T)]
-        np.testing.assert_array_equal(Extremes(table, pick).over(first, last), wanted)
+        np.testing.assert_array_equal(Extremes(table, pick).over(places(table.shape, first, last)), wanted)
 
 
 MULTIPLIED = """
