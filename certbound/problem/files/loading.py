@@ -73,7 +73,7 @@ def loads(text: str, *, folder: Path | None = None, **parameters: Any) -> Proble
     from certbound.problem.files.schema import Specification, explain
 
     try:
-        content = tomllib.loads(text)
+        content = tomllib.loads(text.removeprefix("\ufeff"))
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"the problem file is not TOML: {error}.") from error
     except RecursionError as error:
