@@ -16,6 +16,7 @@ from experiments.harness import Arrays, Claims, main
 HORIZONS = {"left": 2.0, "right": 5.0}
 POINTS = 50
 BOXES = 16
+DIRECTIONS = 24
 
 
 def compute(full: bool) -> tuple[Arrays, Claims]:
@@ -38,6 +39,8 @@ def compute(full: bool) -> tuple[Arrays, Claims]:
         exits = cb.simulate_exits(problem, paths=5000, rng=np.random.default_rng(85 + seed))
         band = np.linalg.norm(verdict.deviation.extent[:, :2], axis=1)
         arrays[f"{side}_band"] = np.array(float(band.max()))
+        arrays[f"{side}_needed"] = _needed(verdict)
+        claims[f"{side}_needed"] = [float(end(arrays[f"{side}_needed"])) for end in (np.min, np.max)]
         claims[f"{side}_status"] = verdict.status
         claims[f"{side}_log10_delta"] = verdict.log10_delta
         claims[f"{side}_margin"] = verdict.margin
@@ -58,6 +61,14 @@ def _boxes(pieces, horizon: float) -> np.ndarray:  # type: ignore[no-untyped-def
         held = [pieces[k] for k in np.flatnonzero((ends > first) & (starts < last))]
         found.append([np.min([p.low[:2] for p in held], axis=0), np.max([p.high[:2] for p in held], axis=0)])
     return np.array(found)
+
+
+def _needed(verdict: cb.Verdict) -> np.ndarray:
+    """Certified bounds of the deviation along each of some directions of the plane alone: (DIRECTIONS + 1,)."""
+    angles = np.linspace(0.0, np.pi, DIRECTIONS // 2 + 1)
+    answer = verdict.answers["linear"].details
+    half = [float(np.max(answer.extent_along([np.cos(a), np.sin(a), 0.0]))) for a in angles[:-1]]
+    return np.array([*half, *half, half[0]])
 
 
 def _hits(problem: Problem, paths: np.ndarray, band: float) -> int:

@@ -38,26 +38,35 @@ def draw(data: Data) -> Figure:
     )
     handles = [
         Patch(facecolor=OBSTACLE, edgecolor=RIM, hatch="////", label="obstacle"),
-        Patch(facecolor=BAND, edgecolor=EDGE, linewidth=0.5, label="eroded"),
+        Patch(facecolor=BAND, edgecolor=EDGE, linewidth=0.5, label="eroded by a ball"),
+        Line2D([], [], color=BLUE, linestyle=(0, (2, 1)), linewidth=0.7, label="eroded by direction"),
         Line2D([], [], color="black", marker="x", markersize=4, linestyle="none", label="goal"),
         Line2D([], [], color=NOMINAL, label="noise-free path"),
         Line2D([], [], color=NOISY, label="noisy path"),
         Patch(facecolor=BOX, edgecolor=BLUE, linewidth=0.7, label="reachable box"),
     ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, columnspacing=1.2, handlelength=1.5)
+    figure.legend(handles=handles, loc="outside upper center", ncols=3, columnspacing=1.0, handlelength=1.5)
     return figure
 
 
 def _scene(axes: Axes, data: Data, side: str) -> None:
     for centre, radius in zip(data["centers"], data["radii"]):
         band = radius + float(data[f"{side}_band"])
-        axes.add_patch(Circle(tuple(centre), band, facecolor=BAND, edgecolor=EDGE, linewidth=0.5, zorder=0.5))
+        axes.add_patch(Circle(tuple(centre), band, facecolor=BAND, edgecolor=EDGE, linewidth=0.5, zorder=0.7))
         axes.add_patch(
-            Circle(tuple(centre), radius, facecolor=OBSTACLE, edgecolor=RIM, hatch="////", linewidth=0.4, zorder=0.6)
+            Circle(tuple(centre), radius, facecolor=OBSTACLE, edgecolor=RIM, hatch="////", linewidth=0.4, zorder=0.8)
         )
+        ring = (radius + data[f"{side}_needed"])[:, None] * _circle(len(data[f"{side}_needed"]))
+        axes.plot(*(centre + ring).T, color=BLUE, linestyle=(0, (2, 1)), linewidth=0.7, zorder=0.9)
     axes.plot(0.5, 0.0, "x", color="black", markersize=4, zorder=6)
     axes.set(xlim=(-2.6, 7.8), ylim=(-1.0, 5.6), xticks=range(-2, 8, 2), yticks=range(0, 6, 2))
     axes.set_aspect("equal", adjustable="box")
+    axes.set_axisbelow(True)
+
+
+def _circle(count: int) -> np.ndarray:
+    angles = np.linspace(0.0, 2 * np.pi, count)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def _inset(axes: Axes, data: Data, side: str) -> None:

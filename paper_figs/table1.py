@@ -13,7 +13,7 @@ LEFT = (0.0, 0.235, 0.345, 0.56, 0.665, 0.765, 0.925)
 
 def draw(data: Data) -> Figure:
     """Text on lines; no axes."""
-    figure = Figure(figsize=(COLUMN, 1.3))
+    figure = Figure(figsize=(COLUMN, 1.42))
     claims = data.claims
     lines = [HEADINGS]
     for case, pick, example, method, radii in zip(
@@ -25,14 +25,14 @@ def draw(data: Data) -> Figure:
     for row, line in enumerate(lines):
         for left, cell in zip(LEFT, line):
             weight = "bold" if row == 0 else "normal"
-            figure.text(0.01 + 0.98 * left, 0.86 - 0.165 * row, cell, fontsize=5.8, weight=weight, va="center")
-    for height, width in ((0.955, 1.0), (0.775, 0.6), (0.115, 1.0)):
+            figure.text(0.01 + 0.98 * left, 0.87 - 0.15 * row, cell, fontsize=5.8, weight=weight, va="center")
+    for height, width in ((0.96, 1.0), (0.79, 0.6), (0.19, 1.0)):
         figure.add_artist(_rule(height, width))
     note = (
-        r"* with the factor 1/L that the print lacks. Largest radius, $n=\sigma=1$, $\delta=10^{-3}$. "
+        r"* with the factor 1/L that the print lacks. Largest radius, $n=\sigma=1$, $\delta=10^{-3}$." "\n"
         "K: Kummer, B: Bessel, T: Theorem 3 sharpened."
     )
-    figure.text(0.01, 0.05, note, fontsize=4.7, va="center")
+    figure.text(0.01, 0.085, note, fontsize=4.7, va="center")
     return figure
 
 

@@ -64,6 +64,9 @@ def explain(error: Exception, command: str) -> tuple[int, str, str]:
         return BAD_INPUT, f"the module `{error.name}` is not installed", _install_hint(error.name or "")
     if isinstance(error, (ValueError, TypeError)) and _refused(error):
         return BAD_INPUT, why, cure or help_line
+    if isinstance(error, MemoryError):
+        why = f"the memory is too small: {_one_line(str(error))}"
+        return FAILED, why, "ask for less: fewer states, paths or points"
     if isinstance(error, CertboundError):
         return FAILED, why, cure or "run again with --verbose for the details"
     return (
@@ -123,6 +126,8 @@ _FOR_FILES = (
     (r"\(`?cells`?\)", "(--cells)"),
     (r"`smallest=True`", "--smallest"),
     (r"method [\"'](\w+)[\"']", "--method \\1"),
+    (r"write np\.diag\(\[\.\.\.\]\)", "write [[a, 0], [0, b]]"),
+    (r"write ([\d.e+-]+) \* np\.eye\(2\)", "write [[\\1, 0], [0, \\1]]"),
     (r"use cb\.(Box|Ball|Ellipsoid)\(.*?\)", "write a table"),
 )
 """What a message says to who writes Python, and what to who writes problem files."""

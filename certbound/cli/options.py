@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certbound.cli.messages import InputError, split_cure
+from certbound.cli.messages import InputError, for_files, split_cure
 from certbound.cli.output import SETTINGS
 
 if TYPE_CHECKING:
@@ -170,8 +170,8 @@ def _as_input_error(cure: str, *, module: bool = False) -> Iterator[None]:
     except (InputError, SyntaxError):
         raise
     except (ValueError, TypeError, ArithmeticError) as error:
-        why, own = split_cure(str(error))
-        raise InputError(why, own or _about(why, cure)) from error
+        why, own = split_cure(for_files(str(error)) if not module else str(error))
+        raise InputError(why.replace("`source`", "`PROBLEM`"), own or _about(why, cure)) from error
     except Exception as error:  # a user's module may raise anything; what is ours is raised again
         if not module:
             raise
@@ -180,15 +180,22 @@ def _as_input_error(cure: str, *, module: bool = False) -> Iterator[None]:
 
 def _about(why: str, cure: str) -> str:
     """A cure that names the key which the reason names."""
+    if "`source` must be a text file" in why:
+        return "save the file as UTF-8 text"
+    if "`source` must" in why:
+        return "check the name; files and modules are looked for from the folder where you are"
     named = re.search(r"`([\w.\[\]]+)`", why)
     return cure.replace("mend the file", f"change `{named[1]}` in the file") if named else cure
 
 
-def check_writable(*paths: Path | None) -> None:
-    """Refuse, before any work, to write where no file can be written."""
-    for path in paths:
-        if path is None:
-            continue
+def check_writable(*paths: Path | None, problem: str = "") -> None:
+    """Refuse, before any work, to write where no file can be written, twice, or over the problem's own file."""
+    named = [path for path in paths if path is not None]
+    for place, path in enumerate(named):
+        if path in named[:place]:
+            raise InputError(f"`{path}` is to be written twice", "name two files")
+        if path.is_file() and Path(problem).is_file() and path.samefile(problem):
+            raise InputError(f"`{path}` is the problem's own file, and would be lost", "name another file")
         if path.is_dir():
             raise InputError(f"`{path}` is a directory", "name a file")
         if not path.parent.is_dir():

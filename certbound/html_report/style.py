@@ -59,13 +59,13 @@ pre {{ overflow-x: auto; background: #f4f5f7; padding: 0.5rem; }}
   #verdict tr, #problem tr, #engines tr {{ display: block; border-bottom: 1px solid #e3e5e8; }}
   #verdict tr > *, #problem tr > *, #engines tr > * {{ display: block; border: 0; padding: 0.1rem 0; }}
   #engines thead, #engines td:nth-child(2), #engines td:empty {{ display: none; }}
-  #engines td:nth-child(3)::before {{ content: "P at most: "; }} #engines td:nth-child(4)::before {{ content: "margin: "; }}
-  #engines td:nth-child(5)::before {{ content: "time: "; }}
+  #engines td:nth-child(3)::before {{ content: "P at most: "; }}
+  #engines td:nth-child(4)::before {{ content: "margin: "; }} #engines td:nth-child(5)::before {{ content: "time: "; }}
 }}
 @media print {{
   body {{ background: white; font-size: 11px; }} main {{ display: block; padding: 0; }}
   section {{ break-inside: avoid; border-radius: 0; }} section.whole {{ break-inside: auto; }}
-  .multiples > div, tr {{ break-inside: avoid; }} .modebar, .skip {{ display: none; }}
+  .multiples > div, tr {{ break-inside: avoid; }} .modebar, .skip, .slider-container {{ display: none; }}
   .multiples {{ grid-template-columns: repeat(2, 1fr); }} .wide {{ overflow: visible; }}
 }}
 """

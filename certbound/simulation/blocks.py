@@ -20,6 +20,8 @@ Counts = NDArray[np.int64]
 BLOCK = 1024
 """Paths per block."""
 
+_MOST = 1e15  # of anything that is counted: floats count no further than 9e15
+
 MEMORY_LIMIT = 512 * 2**20
 """Bytes that the arrays of one simulation may take."""
 
@@ -31,6 +33,8 @@ def check_count(name: str, value: Any) -> int:
     number = float(value)
     if not np.isfinite(number) or number != int(number) or number <= 0:
         raise ValueError(f"`{name}` must be a positive whole number, got {value!r}.")
+    if number > _MOST:
+        raise ValueError(f"`{name}` must be at most {_MOST:g}, got {number:g}.")
     return int(number)
 
 

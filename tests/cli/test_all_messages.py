@@ -58,6 +58,20 @@ SWINGS = [
     ("[parameters]", "[domain]\nbox = { angle = [2, 3] }\n[parameters]", "domain"),
     ("[parameters]", '[definitions]\nangle = "1"\n[parameters]', "angle"),
     ("[parameters]", "[cost]\nQ = [1, 2, 3]\n[parameters]", "cost"),
+    ("[[stay]]", "[stay]", "stay"), ("[[stay]]\nbox", "[[stay.box]]\nangle", "stay"), ('"swing"', "5", "`name`"),
+    ("delta = 1e-3", "delta = 2024-01-01", "delta"), ("horizon = 1.0", "horizon = true", "horizon"),
+    ("[[-0.1, 0.1], [-0.1", "[[nan, 0.1], [-0.1", "initial.box.angle.0"), ('[[0], ["sigma"]]', "[]", "noise.diffusion"),
+    ("[[-0.1, 0.1], [-0.1", "[[-inf, 0.1], [-0.1", "initial"), ('[[0], ["sigma"]]', "[[], []]", "noise.diffusion"),
+    ('[[0], ["sigma"]]', '[[0, 1], ["sigma"]]', "noise.diffusion"), ('["sigma"]]', "[nan]]", "noise.diffusion.1.0"),
+    ('[[0], ["sigma"]]', "[0, 0.02]", "diffusion"), ("sigma = 0.05", "sigma = inf", "parameters.sigma"),
+    ("sigma = 0.05", "sigma = [1, 2]", "parameters.sigma"), ("angle = [-1, 1]", 'angle = ["1 rad", 2]', "angle.0"),
+    ('"angle", "speed"]', '"\u00e1ngulo", "speed"]', "'angle'"), ("-sin(angle)", "\u2212sin(angle)", "\u2212"),
+    ("[parameters]", '[units]\nangl = "rad"\n[parameters]', "angl"), ("-sin(angle)", "(" * 5000 + ")" * 5000, "speed"),
+    ("-sin(angle)", "__import__('os').getpid()", "dynamics.speed"), ("-sin(angle)", "dv/dt = 1", "dynamics.speed"),
+    ("[parameters]", '[definitions]\na = "b"\nb = "a"\n[parameters]', "definitions.a"),
+    ("[parameters]", '[networks]\np = "none.onnx"\n[parameters]', "`networks.p`"),
+    ("[parameters]", '[networks]\np = "folder.npz"\n[parameters]', "`networks.p`"),
+    ("[parameters]", '[networks]\np = "broken.npz"\n[parameters]', "`networks.p`"),
 ]  # fmt: skip
 STEPPED = [
     ("std = 0.1", "stdev = 0.1", "stdev"), ("std = 0.1", "std = 0.1\nvariance = 0.01", "variance"),
@@ -83,7 +97,11 @@ LINES = [
     ("simulate ou --paths 10 --step 0", "step"), ("sweep ou", "--over"), ("sweep ou --over sigma", "--over"),
     ("sweep ou --over sgma=0.1:0.2:3", "sgma"), ("tune ou --horizon 0", "horizon"), ("check none.json", "none.json"),
     ("check note.txt", "JSON"), ("new a/b", "a"), ("synthesize ou", "inputs"), ("derive ou --nothing", "--nothing"),
-    ("vrfy ou", "vrfy"), ("exit-times", "PROBLEM"), ("problems all", "all"),
+    ("vrfy ou", "vrfy"), ("exit-times", "PROBLEM"), ("problems all", "all"), ("verify latin.toml", "UTF-8"),
+    ("verify folder.npz", "folder.npz"), ("verify problem.toml --report problem.toml", "own file"),
+    ("verify ou --plot a.png --report a.png", "twice"), ("simulate ou --paths 1e300", "paths"),
+    ("sweep ou --over sigma=0.1:1:1e9", "at most 1000000"), ("sweep ou --over sigma=nan,1", "sigma"),
+    ("new a --example pendulm", "pendulum"), ("check folder.npz", "folder.npz"), ("verify ou --delta 0,01", "--delta"),
 ]  # fmt: skip
 
 
@@ -130,13 +148,21 @@ CASES = {name: rest for name, *rest in cases()}
 
 
 def test_there_are_more_than_a_hundred() -> None:
-    assert len(CASES) + len(PYTHON) >= 130
+    assert len(CASES) + len(PYTHON) >= 165
+
+
+def furnish(folder: Path) -> None:
+    """Files that are no problems."""
+    (folder / "note.txt").write_text("this is neither a problem nor a certificate\n")
+    (folder / "folder.npz").mkdir()
+    (folder / "broken.npz").write_bytes(b"PK\x03\x04")
+    (folder / "latin.toml").write_bytes(GOOD.replace("swing", "schw\u00fcng").encode("latin-1"))
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "note.txt").write_text("this is neither a problem nor a certificate\n")
+    furnish(tmp_path)
     return tmp_path
 
 
@@ -171,7 +197,7 @@ def page() -> Iterator[str]:
     here = Path.cwd()
     with tempfile.TemporaryDirectory() as place:
         os.chdir(place)
-        Path("note.txt").write_text("this is neither a problem nor a certificate\n")
+        furnish(Path(place))
         for name, (words, text, _) in CASES.items():
             Path("problem.toml").write_text(text)
             with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.redirect_stdout(io.StringIO()):

@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import pytest
 import certbound as cb
 from certbound.html_report import report_page
 from certbound.plotting import Scene, noisy_reach
+from certbound.safety.answers import SPARED, EngineAnswer
 from certbound.safety.verification import Verdict
 
 BROWSER = next((path for name in ("chromium", "google-chrome", "chrome") if (path := shutil.which(name))), None)
@@ -63,6 +65,14 @@ def case() -> tuple[Scene, Verdict]:
 @pytest.fixture(scope="module")
 def page(case: tuple[Scene, Verdict]) -> str:
     return report_page(*case, command="certbound verify my.toml", probability="1e-9")
+
+
+def test_engines_that_were_not_asked_are_not_said_to_fail(case: tuple[Scene, Verdict]) -> None:
+    scene, verdict = case
+    answers = {"constants": verdict.answers["constants"], "barrier": EngineAnswer(applicable=False, reason=SPARED)}
+    page = report_page(scene, replace(verdict, answers=answers))
+    assert "<td>not asked</td>" in page
+    assert "does not apply" not in page
 
 
 def test_the_page_is_well_formed_and_asks_the_network_for_nothing(page: str) -> None:

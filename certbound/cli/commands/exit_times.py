@@ -40,7 +40,7 @@ def exit_times(
     as_json: JsonOption = False,
 ) -> None:
     """Bound the probability of leaving before every time up to the horizon, and the mean time (one state)."""
-    check_writable(plot)
+    check_writable(plot, problem=problem)
     check_picture(plot)
     subject = load_problem(problem, pairs, horizon=horizon)
     started = time.perf_counter()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
 from pathlib import Path
@@ -32,7 +33,8 @@ def new(
 ) -> None:
     """Write a commented problem file to start from, and beside it the schema that editors complete and check it by."""
     if example not in STARTERS:
-        raise InputError(f"`--example` must be one of {', '.join(STARTERS)}, got `{example}`", "try --example target")
+        near = next(iter(difflib.get_close_matches(example, STARTERS, n=1)), "target")
+        raise InputError(f"`--example` must be one of {', '.join(STARTERS)}, got `{example}`", f"try --example {near}")
     path = Path(name if name.endswith(".toml") else f"{name}.toml")
     if not re.fullmatch(r"[A-Za-z0-9][\w-]*", path.stem):
         raise InputError(

@@ -75,7 +75,7 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Count how many random paths leave the safe set or the domain, with confidence limits."""
-    check_writable(checkpoint)
+    check_writable(checkpoint, problem=problem)
     rng = generator(seed)
     if time_limit is not None and checkpoint is not None:
         raise InputError(

@@ -31,6 +31,8 @@ from certbound.cli.pictures import check_picture, write_picture
 from certbound.cli.progress import progress
 from certbound.display import log10_text, one_line
 
+_MOST = 1_000_000  # values of one range
+
 if TYPE_CHECKING:
     from certbound.safety.sweeps import Sweep
 
@@ -74,7 +76,7 @@ def sweep(
     as_json: JsonOption = False,
 ) -> None:
     """Verify a problem at every point of a grid of parameters; the time limit is that of each point."""
-    check_writable(resume, out, plot)
+    check_writable(resume, out, plot, problem=problem)
     check_picture(plot)
     files = [path.resolve() for path in (resume, out, plot) if path is not None]
     if len(set(files)) < len(files):
@@ -134,6 +136,8 @@ def _range(text: str) -> list[float]:
     first, last, parts = number(low), number(high), number(count)
     if parts != int(parts) or parts < 2:
         raise typer.BadParameter(f"a range has a whole number of values, at least 2, got `{count}`")
+    if parts > _MOST:
+        raise typer.BadParameter(f"a range has at most {_MOST} values, got `{count}`")
     if not first < last:
         raise typer.BadParameter(f"the range is empty: {low} is not below {high}")
     if scale and first <= 0:

@@ -74,7 +74,7 @@ def synthesize(
     as_json: JsonOption = False,
 ) -> None:
     """Find a plan of inputs under which the noisy system stays safe, and prove it."""
-    check_writable(plan, plot)
+    check_writable(plan, plot, problem=problem)
     check_picture(plot)
     if closed_loop is not None and closed_loop < 1:
         raise InputError(f"`--closed-loop` must be at least 1, got {closed_loop}", "give a number of runs, like 3000")

@@ -56,7 +56,7 @@ def tune(
     as_json: JsonOption = False,
 ) -> None:
     """Compute the probabilistic tube by every method that applies, and say which is smallest."""
-    check_writable(plot)
+    check_writable(plot, problem=problem)
     check_picture(plot)
     from certbound.problem.goals import check_end
 

@@ -87,7 +87,7 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Decide whether the system stays safe but for a probability of delta, and prove it."""
-    check_writable(certificate, report, plot)
+    check_writable(certificate, report, plot, problem=problem)
     check_picture(plot)
     subject = load_problem(problem, pairs, horizon=horizon, delta=delta)
     started = time.perf_counter()

@@ -74,7 +74,7 @@ def loads(text: str, *, folder: Path | None = None, **parameters: Any) -> Proble
     Errors are those of ``load``.
     """
     try:
-        content = tomllib.loads(text)
+        content = tomllib.loads(text.removeprefix("\ufeff"))
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"the problem file is not TOML: {error}.") from error
     except RecursionError as error:

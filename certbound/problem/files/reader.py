@@ -14,7 +14,7 @@ from certbound.checks import nearest
 from certbound.problem.files.constants_drawn import read_random
 from certbound.problem.files.parser import RESERVED, constant, parse
 from certbound.problem.files.schema import Specification
-from certbound.problem.model import Graph, Tape
+from certbound.problem.model import Graph, Network, Tape
 from certbound.problem.networks import network
 
 
@@ -37,7 +37,7 @@ class Reader:
         taken |= set(self.parameters)
         checked_names("networks", list(spec.networks), taken)
         paths = {name: self.file(value, f"networks.{name}") for name, value in spec.networks.items()}
-        self.networks = {name: network(path, name=name).data for name, path in paths.items()}
+        self.networks = {name: _network(path, name) for name, path in paths.items()}
         checked_names("definitions", list(spec.definitions), taken | set(self.networks))
         self.random = {name: read_random(table, self.array, f"random.{name}") for name, table in spec.random.items()}
 
@@ -75,7 +75,7 @@ class Reader:
         for name in ("t", *self.states, *self.inputs, *self.disturbances):
             slot = graph.inputs.index(name) if name in graph.inputs else None
             names[name] = _forbidden(name, inputs) if slot is None else graph.input(slot)
-        names |= {name: graph.const(value) for name, value in self.parameters.items()}
+        names |= {name: graph.const(_finite(value, f"parameters.{name}")) for name, value in self.parameters.items()}
         for name, text in self.spec.definitions.items():
             try:
                 names[name] = self._node(text, graph, names, f"definitions.{name}")
@@ -88,7 +88,9 @@ class Reader:
         self, text: float | str, graph: Graph, names: Mapping[str, int | Callable[[], int]], where: str
     ) -> int:
         try:
-            return parse(text, graph, names, where, self.networks) if isinstance(text, str) else graph.const(text)
+            if isinstance(text, str):
+                return parse(text, graph, names, where, self.networks)
+            return graph.const(_finite(text, where))
         except _ForbiddenError as error:
             raise _ForbiddenError(f"`{where}`: {error}") from None
 
@@ -112,6 +114,21 @@ class Reader:
         if self.folder is None or path.is_absolute() or ".." in path.parts or not isinstance(value, str):
             raise ValueError(f"`{where}` must be a file in the problem file's folder, got {value!r}.")
         return self.folder / path
+
+
+def _finite(value: float, where: str) -> float:
+    """A number that may stand in a model."""
+    if not np.isfinite(value):
+        raise ValueError(f"`{where}` must be finite, got {value}.")
+    return value
+
+
+def _network(path: Path, name: str) -> Network:
+    """The network of a file, whose errors name the key."""
+    try:
+        return network(path, name=name).data
+    except ValueError as error:
+        raise ValueError(str(error).replace("`source`", f"`networks.{name}`", 1)) from error
 
 
 def _forbidden(name: str, inputs: Sequence[str]) -> Callable[[], int]:

@@ -120,6 +120,8 @@ class _ProblemReader(SetReader):
         """A matrix of expressions in t and the states."""
         rows: list[list[float | str]] = [list(row) for row in value if isinstance(row, list)]
         texts = [entry for row in rows for entry in row]
+        if not texts:
+            raise ValueError(f"`{name}` must not be empty; leave [noise] out where there is none.")
         shape = (len(rows), len(rows[0]))
         if len(texts) != shape[0] * shape[1] or any(len(row) != shape[1] for row in rows):
             raise ValueError(f"`{name}` must have rows of equal length.")

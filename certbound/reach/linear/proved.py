@@ -96,10 +96,8 @@ class LinearAnswer:
             what = "the remainder of the linearisation feeds itself"
             if self.run.engine.model.jumping:
                 what = f"the dynamics may jump inside the tube, or {what},"
-            return (
-                f"{what} from t = {self.time:.4g} on; split the initial set (cells), shorten the horizon or lower "
-                "the noise"
-            )
+            split = "split the initial set (cells), " if np.any(self.run.engine.radii[0]) else ""
+            return f"{what} from t = {self.time:.4g} on; {split}shorten the horizon or lower the noise"
         if self.margin == -np.inf:
             return f"no bound of the deviation was found that the room of '{self.constraint}' could be compared with"
         asked, logs = self.run.requirements[self.outcome.cell], self.outcome.logs
@@ -110,8 +108,8 @@ class LinearAnswer:
         left = log10_text(min(self.outcome.nonlinear.log / np.log(10.0), 0.0))
         if self.run.curved and logs[worst] < self.outcome.nonlinear.log - _LITTLE:
             return (
-                f"nearly all of that probability is the share of delta set aside for the remainder of the linearisation, "
-                f"which holds; the largest part beside it is {part}. `smallest=True` goes on to less"
+                "nearly all of that probability is the share of delta set aside for the remainder of the "
+                f"linearisation, which holds; the largest part beside it is {part}. `smallest=True` goes on to less"
             )
         rest = f", and {left} is spent on bounding the remainder of the linearisation" if self.run.curved else ""
         return f"the largest part of that probability is {part}{rest}"

@@ -210,6 +210,12 @@ def test_files_are_loaded_from_paths(tmp_path):
         load(tmp_path / "bytes.toml")
 
 
+def test_files_of_windows_are_read(tmp_path):
+    path = tmp_path / "course.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + COURSE.replace("\n", "\r\n").encode())
+    assert same(load(str(path)), loads(COURSE))
+
+
 def test_an_enormous_file_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("certbound.problem.files.loading._LARGEST", 10)
     (tmp_path / "big.toml").write_text(COURSE)
