@@ -107,7 +107,7 @@ def test_constants_from_a_wrong_metric_hold(
 
 
 def test_the_fractions_notice_a_rate_that_is_too_small() -> None:
-    constants = cb.bound_constants(problem(continuous=True))
+    constants: Any = cb.bound_constants(problem(continuous=True))
     assert not any(exceeds(constants, slope) for slope in slopes())
     forged = replace(constants, rate=float(constants.rate) - 0.05)
     assert any(exceeds(forged, slope) for slope in slopes())
