@@ -90,6 +90,8 @@ class Linearisation:
         if problem.system.time == "discrete":
             return cls(problem, cells=cells, noise=noise)
         trial = cls(problem, noise=noise)
+        if problem.input_sequence is None:
+            trial._refuse_stiff()
         while trial.lost and 4 * trial.pieces <= MOST_PIECES:  # a coarse grid loses a stiff system's nominal at once
             trial = cls(problem, pieces=4 * trial.pieces, noise=noise)
         slopes = np.nan_to_num(trial.slopes[0])
@@ -174,6 +176,13 @@ class Linearisation:
             k4 = self._evaluate(k, t + h, x + h * k3)
             x = x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
         return x
+
+    def _refuse_stiff(self) -> None:
+        """EngineError, before anything is followed, where the first piece would be refused on the finest grid."""
+        slope = self.model.reference_slope(self.times[:1], self.centres[:1], self.inputs[:1], self.d_middle)
+        slope, silent = np.nan_to_num(slope)[None], np.zeros((self.n, self.n))
+        step = float(self.problem.horizon) / _MOST_PIECES
+        continuous_response(slope, np.zeros_like(slope), step, silent, silent)
 
     @cached_property
     def controls(self) -> Array:

@@ -159,9 +159,10 @@ def _inside(tube: Sets, region: Region, norm: Norm, relative: list[Series], span
         return Clearance(radius=np.full(shape[1], np.inf), factor=np.ones(shape[1]))
     rooms = []
     for face, bound in zip(faces, bounds):
-        direction = Interval.point(face)
-        gap = Interval.point(bound) - _functional(relative, direction, span)
-        rooms.append(_room(tube, norm, gap, _lift(direction, region, tube.curve.dimension)))
+        kept = np.flatnonzero(face)  # most faces of a large model read one state
+        series = _combined([relative[i] for i in kept], face[kept].tolist())
+        gap = Interval.point(bound) - polynomial_range(series, span)
+        rooms.append(_room(tube, norm, gap, _lift(Interval.point(face), region, tube.curve.dimension)))
     radius, factor = (np.stack([np.broadcast_to(room[i], shape) for room in rooms]) for i in (0, 1))
     return _least(radius, factor)
 

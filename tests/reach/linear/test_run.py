@@ -315,3 +315,12 @@ def test_a_reach_tube_that_nothing_bounds_names_the_state(monkeypatch: pytest.Mo
     problem = cb.Problem(system, initial=[1.0], safe=[], horizon=2, delta=1e-2)
     with pytest.raises(ArithmeticError, match=r"no bound of the deviation of x1 was found .*method='contraction'"):
         linear_reach(problem)
+
+
+def test_what_is_too_stiff_on_the_finest_pieces_is_refused_before_a_path_is_followed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Linearisation, "_followed", property(lambda self: pytest.fail("a path was followed")))
+    system = cb.ContinuousSystem(lambda x: -1e5 * x, states=1, diffusion=[[1.0]])
+    with pytest.raises(EngineError, match=r"\|\|J\|\| h = 50"):
+        Linearisation.of(cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1, delta=0.1))

@@ -8,6 +8,7 @@ import pytest
 from certbound.problem.sets.constraints import Inside, Outside
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 from certbound.reach.nominal.curve import Curve
+from certbound.reach.sets import clearance
 from certbound.reach.sets.clearance import constraint_clearance
 from certbound.reach.sets.reach_tube import ReachTube
 from certbound.rigor.intervals import Interval
@@ -210,3 +211,11 @@ def test_twelve_states():
     assert value == pytest.approx(0.5, rel=1e-9)
     ball = constraint_clearance(tube, Outside(Ball(np.full(12, 1.0), 0.1)), Norm(12, metric)).radius[0]
     assert 0 < ball < np.sqrt(78.0)
+
+
+def test_a_face_of_one_state_asks_for_nothing_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, combined = [], clearance._combined
+    monkeypatch.setattr(clearance, "_combined", lambda r, w: seen.append(len(r)) or combined(r, w))
+    sides = np.array([0.5, 2.0, 1.0])
+    assert room(Inside(Box(-sides, sides)), still([0.0, 0.1, 0.25]))[0] == pytest.approx(0.5, rel=1e-12)
+    assert seen == [1] * 6
