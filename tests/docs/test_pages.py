@@ -18,7 +18,7 @@ import pytest
 import certbound as cb
 from tests.docs.blocks import DOCS, ROOT, Block, blocks, commands, matches, pages
 
-LANGUAGES = {"python", "console", "bash", "toml", "text", "json", "bibtex", ""}
+LANGUAGES = {"python", "console", "bash", "toml", "yaml", "text", "json", "bibtex", ""}
 ELSEWHERE = {"pip", "python3.11", ".", "git", "make", "dask", "jupytext", "mkdocs", "pytest"}
 """Programs that the test of a fresh environment runs, or that need a second computer."""
 SLOW = {
