@@ -35,8 +35,7 @@ LITERATURE = {
     "halfdisc_sde_disc": "moment-SOS, order 6: <= .557",
     "halfdisc_steps": "moment-SOS, order 6: <= 6.5e-4",
     "halfdisc_steps_disc": "moment-SOS, order 6: <= .402",
-    "santoyo": "sums of squares, degree 14: a curve, no table; what is missing here: noise in one coordinate without a "
-    "box around both",
+    "santoyo": "sums of squares, degree 14: a curve, no table",
     "neural_barrier": "a table that was not readable",
     "population": "a table that was not readable",
     "polynomial_4d": "none found",
