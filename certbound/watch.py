@@ -252,6 +252,19 @@ def executor_lent() -> Any:
     return None if watch is None else watch.executor
 
 
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Hold the timer of a limit back in the block, for a library that an interruption would leave broken for good."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def silenced() -> None:
     """Let the watch that runs, if any, tell no more: in a copy of the process."""
     watch = _CURRENT.get()

@@ -129,13 +129,14 @@ Each problem is a file in `experiments/benchmarks/`, with its source in a commen
 `certbound verify experiments/benchmarks/room_3d.toml`. The published numbers are those of the tools' own papers, on
 their machines and with their solvers. Where the true probability of leaving is large the right answer is UNKNOWN, with
 what could be proved. Leaving the model's domain counts as leaving here, and does not there. Every search has
-{LIMIT:g} seconds. `simulated` is the share of failures in {PATHS} paths, whose starts are drawn from the set; what is
-proved holds for the worst of them. `>=` is what is proved from below, where something is.
+{LIMIT:g} seconds of processor time. `simulated` is the share of failures in {PATHS} paths, whose starts are drawn from
+the set; what is proved holds for the worst of them. `>=` is what is proved from below, where something is.
 
 {found}
 
 - `contraction_14d`: the true probability of staying is 0.840 for one step; SAFE at delta = 0.01 would be wrong.
-- `van_der_pol_dt`: from the corner (5, 5) the noise-free next state (5.5, -7.5) lies outside the domain.
+- `van_der_pol_dt`: from the corner (5, 5) the noise-free next state (5.5, -7.5) lies outside the domain, which is what
+  is proved from below; most starts of the set are safe.
 - `oscillator_cubic`: about 2e-5 of simulated runs fail; a polynomial barrier proves it safe, where the linear response
   and the constants prove nothing.
 

@@ -148,7 +148,7 @@ def _tell_taken(source: str) -> None:
     from certbound.problem.files import notes
 
     first, *lines = notes(source)
-    sys.stderr.write("".join([f"certbound: {first}\n", *(f"  {line}\n" for line in lines)]))
+    sys.stderr.write("".join([f"{first}\n", *(f"  {line}\n" for line in lines)]))
     sys.stderr.flush()
 
 

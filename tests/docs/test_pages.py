@@ -18,13 +18,13 @@ import pytest
 import certbound as cb
 from tests.docs.blocks import DOCS, ROOT, Block, blocks, commands, matches, pages
 
-LANGUAGES = {"python", "console", "bash", "toml", "text", "json", "bibtex", ""}
+LANGUAGES = {"python", "console", "bash", "toml", "yaml", "text", "json", "bibtex", ""}
 ELSEWHERE = {"pip", "python3.11", ".", "git", "make", "dask", "jupytext", "mkdocs", "pytest"}
 """Programs that the test of a fresh environment runs, or that need a second computer."""
 SLOW = {
     "README.md", "certificate.md", "how-to/certificates.md", "how-to/cluster.md", "how-to/expressions.md",
-    "how-to/mpc.md", "how-to/networks.md", "how-to/obstacles.md", "how-to/python-control.md", "how-to/sweeps.md",
-    "how-to/toml.md", "tutorial.md",
+    "how-to/mpc.md", "how-to/networks.md", "how-to/observers.md", "how-to/obstacles.md", "how-to/plug-ins.md",
+    "how-to/python-control.md", "how-to/speed.md", "how-to/sweeps.md", "how-to/toml.md", "tutorial.md",
 }  # fmt: skip
 """Pages that take more than some seconds; the tutorial's and the README's first steps are in other tests as well."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from experiments.advice import CASES
 from experiments.literature import LITERATURE
 from experiments.performance import BENCHMARKS, benchmark_row, equal_strength, machine, power, table
 from tests.docs.blocks import DOCS, ROOT
@@ -53,3 +54,9 @@ def test_the_pages_say_when_and_where_they_were_measured() -> None:
         text = (DOCS / name).read_text(encoding="utf-8")
         assert "*Written by `python -m experiments.performance` on 20" in text
         assert "cores" in text
+
+
+def test_the_guide_on_speed_has_the_rows_that_its_script_measures() -> None:
+    text = (DOCS / "how-to" / "speed.md").read_text(encoding="utf-8")
+    first = [line.split(" | ")[0].removeprefix("| ") for line in text.splitlines() if line.startswith("| `")]
+    assert first[1:] == [*CASES]

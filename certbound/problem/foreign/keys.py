@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,7 +43,9 @@ class Keys:
         """The value of a key, which is a ValueError where it is missing and has no default."""
         self.known.append(key)
         if key not in self.left and default is _MISSING:
-            raise ValueError(f"`{self.name(key)}` is missing; {self.tool} needs it.")
+            close = difflib.get_close_matches(key, map(str, self.left), 1)
+            instead = f"the file has `{close[0]}` instead" if close else f"{self.tool} needs it"
+            raise ValueError(f"`{self.name(key)}` is missing; {instead}.")
         return self.left.pop(key, default)
 
     def note(self, key: str, became: str) -> None:

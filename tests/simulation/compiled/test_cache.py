@@ -1,6 +1,7 @@
 """Kernels on disk: only in folders that nobody else can write, whole or not at all, and never trusted blindly."""
 
 import os
+import signal
 import stat
 import sys
 
@@ -151,3 +152,23 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch)
         write_atomically(target, b"new")
     assert target.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [target]
+
+
+@posix
+def test_a_timer_waits_until_a_kernel_is_loaded(private, monkeypatch):
+    rung: list[bool] = []
+    loaded = []
+
+    def load(digest, source, folder):
+        signal.raise_signal(signal.SIGALRM)
+        loaded.append(list(rung))
+        return lambda: 5
+
+    monkeypatch.setattr(cache, "_run", load)
+    before = signal.signal(signal.SIGALRM, lambda *_: rung.append(True))
+    try:
+        assert load_kernel("a kernel that nobody wrote")() == 5
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert loaded == [[]]
+    assert rung == [True]
