@@ -13,6 +13,7 @@ from certbound.arrays import Array
 from certbound.constants.enclosures import Metric, Supremum, bound_supremum, random_points
 from certbound.constants.jacobians import affine_set
 from certbound.constants.model_data import Model
+from certbound.constants.network_slopes import bound_by_slopes
 from certbound.constants.noise_bounds import NoiseBound, bound_noise
 from certbound.constants.recheck import certify_gain, certify_rate
 from certbound.constants.state_jacobian import StateJacobian
@@ -31,6 +32,9 @@ LARGE = 24
 EXACT = 1e-9
 """A relative gap that leaves nothing to gain."""
 
+BY_SLOPES = "slopes of a network's activations"
+"""How a bound is called that no certificate states: the checker proves Jacobians over boxes."""
+
 SMALLEST_GAIN = 1e-12
 """Stands for L = 0, which the tubes exclude."""
 
@@ -42,10 +46,14 @@ def certify(
     norm = Metric(metric, model.dimension)
     jacobian = StateJacobian(model.dynamics, model.state_slots, model.ranges)
     found = _supremum(model, jacobian, norm, tolerance, budget)
-    if not np.isfinite(found.upper):
+    upper = found.upper
+    if upper - found.sampled > tolerance * max(1.0, abs(found.sampled)):  # intervals lose much to a network
+        upper = min(upper, bound_by_slopes(model, norm.matrix))
+        status = BY_SLOPES if upper < found.upper else status
+    if not np.isfinite(upper):
         _refuse(model, jacobian, found)
     noise, status = bound_noise(model, norm), jacobian.remark(status)
-    return record(model, norm, noise, np.array(found.upper), found.sampled, found.boxes, status, None)
+    return record(model, norm, noise, np.array(upper), found.sampled, found.boxes, status, None)
 
 
 def _supremum(model: Model, jacobian: StateJacobian, norm: Metric, tolerance: float, budget: int) -> Supremum:

@@ -32,6 +32,7 @@ class Task:
     high: tuple[float, ...]
     law: Callable[[Array], Array]
     problem: str
+    clip: float | None = None  # of the outputs, by a last layer of the network
 
 
 LINEAR = """# linear-sys of the RASM, logRASM and NeuralStoc papers: github LAVA-LAB/logRASM models/linearsystem.py.
@@ -133,6 +134,71 @@ box = {{ x = [-0.2, 0.2], y = [-0.2, 0.2] }}
 """
 
 
+CART_POLE = """# cart-pole with the constants of Barto, Sutton and Anderson (1983), as gymnasium has them. The force is
+# computed every .05 s and held. Noise pushes cart and pole; at the limits an episode fails.
+name = "cart-pole with a learned policy"
+time = "continuous"
+horizon = 5
+delta = 1e-6
+states = ["x", "v", "th", "w"]
+networks = {{ policy = "{file}" }}
+inputs = {{ force = [-10, 10] }}
+plan = {{ force = "policy(x, v, th, w)[0]", hold = 0.05 }}
+
+[definitions]
+push = "(force + 0.05*w**2*sin(th))/1.1"
+turn = "(9.8*sin(th) - cos(th)*push)/(0.5*(4/3 - 0.1*cos(th)**2/1.1))"
+
+[dynamics]
+x = "v"
+v = "push - 0.05*turn*cos(th)/1.1"
+th = "w"
+w = "turn"
+
+[noise]
+diffusion = [[0, 0], [0.02, 0], [0, 0], [0, 0.05]]
+
+[initial]
+box = [[-0.03, 0.03], [-0.03, 0.03], [-0.03, 0.03], [-0.03, 0.03]]
+
+[[stay]]
+box = {{ x = [-2.4, 2.4], th = [-0.2095, 0.2095] }}
+"""
+
+LANE = """# a kinematic bicycle (wheelbase 2.8 m) at 10 m/s keeps its lane: offset y, heading psi, steering angle.
+# The rate of steering is computed every .05 s and held, and the network's last layer clips it.
+name = "lane keeping with a learned policy"
+time = "continuous"
+horizon = 5
+delta = 1e-6
+states = ["y", "psi", "steer"]
+networks = {{ policy = "{file}" }}
+inputs = {{ rate = [-0.5, 0.5] }}
+plan = {{ rate = "policy(y, psi, steer)[0]", hold = 0.05 }}
+
+[dynamics]
+y = "10*sin(psi)"
+psi = "10/2.8*tan(steer)"
+steer = "rate"
+
+[noise]
+diffusion = [[0.06, 0], [0, 0.01], [0, 0]]
+
+[initial]
+box = [[-0.1, 0.1], [-0.01, 0.01], [-0.005, 0.005]]
+
+[[stay]]
+box = {{ y = [-0.9, 0.9] }}
+
+[[stay]]
+box = {{ steer = [-0.3, 0.3], psi = [-0.3, 0.3] }}
+
+[[stay]]
+box = {{ y = [-0.6, 0.6] }}
+during = [3, 5]
+"""
+
+
 def _linear_law(points: Array) -> Array:
     return np.clip(-1.2 * points[:, :1] - 0.5 * points[:, 1:], -1.0, 1.0)
 
@@ -146,10 +212,20 @@ def _collision_law(points: Array) -> Array:
     return np.clip(-1.5 * points, -1.0, 1.0)
 
 
+def _cart_pole_law(points: Array) -> Array:
+    return points @ np.array([[1.0], [2.2], [35.0], [8.0]])
+
+
+def _lane_law(points: Array) -> Array:
+    return points @ np.array([[-0.2], [-2.5], [-4.0]])
+
+
 TASKS: dict[str, Task] = {
     "linear-sys": Task((-1.5, -1.5), (1.5, 1.5), _linear_law, LINEAR),
     "pendulum": Task((-0.7, -0.7), (0.7, 0.7), _pendulum_law, PENDULUM),
     "collision": Task((-1.2, -1.2), (1.2, 1.2), _collision_law, COLLISION),
+    "cart-pole": Task((-0.5, -0.7, -0.2, -0.7), (0.5, 0.7, 0.2, 0.7), _cart_pole_law, CART_POLE, 10.0),
+    "lane": Task((-0.9, -0.2, -0.15), (0.9, 0.2, 0.15), _lane_law, LANE, 0.5),
 }
 
 
@@ -194,7 +270,11 @@ def write(folder: Path, task: str, *, width: int, activation: str) -> Path:
     """Train a policy and write it, with its problem file, which is returned."""
     folder.mkdir(parents=True, exist_ok=True)
     stem = f"{task}-{activation}{width}"
-    policy = cb.network(train(TASKS[task], width=width, activation=activation), name="policy")
+    layers, clip = train(TASKS[task], width=width, activation=activation), TASKS[task].clip
+    if clip is not None:
+        identity = np.eye(len(layers[-1]["bias"]))
+        layers.append({"weights": identity, "activation": "clip", "low": -clip, "high": clip})
+    policy = cb.network(layers, name="policy")
     write_network(policy, folder / f"{stem}.npz")
     path = folder / f"{stem}.toml"
     path.write_text(TASKS[task].problem.format(file=f"{stem}.npz"), encoding="utf-8")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.constants.certification import BY_SLOPES
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
@@ -46,6 +47,8 @@ def constants_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
         raise CertificateError("no constants were found.")
     if given.times is not None:
         raise CertificateError("constants along a tube are not stated in certificates; use --method linear.")
+    if given.proof is not None and given.proof.status.startswith(BY_SLOPES):
+        raise CertificateError(f"bounds by the {BY_SLOPES} are not stated in certificates; use --method linear.")
     effort = min(attempt, len(_TINY) - 1)
     slack = _TINY[effort]
     start = random_start(problem, given)

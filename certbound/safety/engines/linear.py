@@ -59,7 +59,14 @@ def _held(problem: Problem, asked: Request) -> EngineAnswer:
     hidden = hidden_jump(loop.flow) or hidden_jump(loop.sample)
     if hidden is not None:
         return EngineAnswer(applicable=False, reason=hidden, method="linear")
-    answer = linear_answer(loop, cells=asked.cells, thorough=asked.thorough)
+
+    def found(answer: LinearAnswer) -> None:
+        asked.found(EngineAnswer(
+            log10_delta=answer.log10_delta, method="linear", details=answer, foresight=True,
+            reason="a first bound of the linear response; its largest parts were not made smaller after it.",
+        ))  # fmt: skip
+
+    answer = linear_answer(loop, cells=asked.cells, thorough=asked.thorough, before=asked.before, found=found)
     tube = answer.tube
     return EngineAnswer(
         log10_delta=answer.log10_delta, margin=answer.margin if np.isfinite(answer.margin) else None,
