@@ -128,6 +128,9 @@ _FOR_FILES = (
     (r"method [\"'](\w+)[\"']", "--method \\1"),
     (r"write np\.diag\(\[\.\.\.\]\)", "write [[a, 0], [0, b]]"),
     (r"write ([\d.e+-]+) \* np\.eye\(2\)", "write [[\\1, 0], [0, \\1]]"),
+    (r"\bcb\.Histogram\b", 'law = "histogram"'),
+    (r"\bcb\.SubGaussian\b", 'law = "subgaussian"'),
+    (r"\bcb\.Gaussian\b", 'law = "gaussian"'),
     (r"use cb\.(Box|Ball|Ellipsoid)\(.*?\)", "write a table"),
 )
 """What a message says to who writes Python, and what to who writes problem files."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from certbound.cli.messages import InputError
 from certbound.cli.output import write_file
 from certbound.errors import EngineError, contained
+from certbound.watch import OutOfTime, Watch
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from certbound.safety.verification import Verdict
 
 PATHS = 60
+_SECONDS = 20.0  # for a tube that only a picture needs
 _log = logging.getLogger(__name__)
 
 
@@ -69,6 +71,23 @@ def values_of(problem: Problem, verdict: Verdict) -> SafeStarts | None:
             return None if found is None else replace(found, problem=problem)
     except EngineError as error:
         _log.info("no value function is drawn: %s", error)
+        return None
+
+
+def drawn_reach(problem: Problem, verdict: Verdict) -> ReachTube | None:
+    """The noise-free tube of a verdict: its own, or one proved for the picture alone; None where there is none."""
+    if verdict.reach is not None:
+        return verdict.reach
+    from certbound.reach import bound_reach
+
+    if len(problem.starts) > 1 or problem.endless:
+        return None
+    try:
+        with contained("noise-free"), Watch(_SECONDS).running():
+            found: ReachTube = bound_reach(problem, noise=False)
+            return found
+    except (EngineError, OutOfTime) as error:
+        _log.info("no tube is drawn: %s", error)
         return None
 
 

@@ -195,8 +195,8 @@ class Laplace(Law):
     @property
     def proxy(self) -> NoReturn:
         raise InfeasibleError(
-            "Laplace noise has no variance proxy, as its tails are exponential, and no engine bounds it so far; cut it "
-            "off (cb.Histogram), or state what you know of it by cb.SubGaussian."
+            "Laplace noise has no variance proxy, as its tails are exponential: value functions of one or two states "
+            "alone bound it; cut it off (cb.Histogram), or state what you know of it by cb.SubGaussian."
         )
 
     @property

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import certbound as cb
-from certbound.cli.pictures import values_of, write_picture
+from certbound.cli.pictures import drawn_reach, scene_of, values_of, write_picture
 from certbound.display import at_least_text, log10_text, name_text
 from certbound.plotting import Scene, draw_scene, draw_values
 
@@ -61,9 +61,11 @@ def draw(problem: cb.Problem, verdict: cb.Verdict, path: Path, title: str) -> No
     """The picture that ``certbound verify --plot`` draws, small enough to keep."""
     if verdict.reach is None:
         starts = values_of(problem, verdict)
-        if starts is None:
+        reach = drawn_reach(problem, verdict) if starts is None else None
+        if starts is None and reach is None:
             raise ValueError(f"`{path.stem}` has nothing that could be drawn; {verdict.reason}")
-        write_picture(path, draw_values(starts, title), dpi=90)
+        figure = draw_values(starts, title) if reach is None else draw_scene(scene_of(problem, verdict, reach, title))
+        write_picture(path, figure, dpi=90)
         return
     paths = cb.sample_paths(problem, paths=PATHS, rng=np.random.default_rng(0))
     times = np.linspace(0.0, float(problem.horizon), paths.shape[1])

@@ -58,6 +58,7 @@ def test_an_error_from_inside_numpy_is_a_failure_of_certbound() -> None:
         (cb.CertificateError("the hash differs; ask for the file again"), BAD_INPUT, "ask for the file again"),
         (FileNotFoundError(2, "No such file or directory", "a.toml"), BAD_INPUT, "check the path"),
         (ModuleNotFoundError("No module named 'dask'", name="dask"), BAD_INPUT, 'pip install "certbound[cluster]"'),
+        (MemoryError("no room for an array"), FAILED, "ask for less"),
         (RuntimeError("boom"), FAILED, "report"),
         (ZeroDivisionError("boom"), FAILED, "report"),
     ],

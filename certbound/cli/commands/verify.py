@@ -33,7 +33,7 @@ from certbound.cli.options import (
     option,
 )
 from certbound.cli.output import SETTINGS, console, print_status, show, spinner, write_file
-from certbound.cli.pictures import check_picture, scene_of, values_of, write_picture
+from certbound.cli.pictures import check_picture, drawn_reach, scene_of, values_of, write_picture
 from certbound.cli.progress import progress
 from certbound.display import at_least_text, log10_text, name_text, one_line, rounded
 from certbound.errors import CertificateError, EngineError, contained
@@ -173,11 +173,9 @@ def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | Non
         problem = verdict.problem or problem
     title = f"{name_text(problem.name)}: {verdict.status}, P({problem.failing}) <= {log10_text(verdict.log10_delta)}"
     with spinner("looking for what can be drawn"):
-        shown = (
-            values_of(problem, verdict)
-            if verdict.reach is None
-            else scene_of(problem, verdict, verdict.reach, title)
-        )
+        starts = values_of(problem, verdict) if verdict.reach is None else None
+        reach = drawn_reach(problem, verdict) if starts is None else None
+        shown = starts if reach is None else scene_of(problem, verdict, reach, title)
     if shown is None:
         sys.stderr.write("certbound: nothing was drawn or reported: no set was proved that could be\n")
         return
