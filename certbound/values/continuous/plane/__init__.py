@@ -1,6 +1,6 @@
 """Two states: V on a tensor grid, proposed for both sides and proved by `hypotheses`.
 
-From the bottom: ``plane_grids``, ``solver``, ``plane_proposal``, ``plane_below``, ``two_sides``; then
+From the bottom: ``plane_grids``, ``solver``, ``plane_proposal``, ``monotone``, ``plane_below``, ``two_sides``; then
 ``target_proposal``, ``plane_targets`` for targets, ``stages``, ``later``, ``plane_windows``
 for windows, and ``frames`` for limits that move.
 """
