@@ -181,7 +181,7 @@ class Linearisation:
         """EngineError, before anything is followed, where the first piece would be refused on the finest grid."""
         slope = self.model.reference_slope(self.times[:1], self.centres[:1], self.inputs[:1], self.d_middle)
         slope, silent = np.nan_to_num(slope)[None], np.zeros((self.n, self.n))
-        step = float(self.problem.horizon) / _MOST_PIECES
+        step = float(self.problem.horizon) / MOST_PIECES
         continuous_response(slope, np.zeros_like(slope), step, silent, silent)
 
     @cached_property
