@@ -8,7 +8,6 @@ interrupted, early for first bounds, later for all others, and goes on with what
 from __future__ import annotations
 
 import contextlib
-import difflib
 import logging
 import math
 from dataclasses import replace
@@ -27,7 +26,7 @@ from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import best_time, find_miss, window_of
-from certbound.safety.portfolio import ENGINES, Engine, engine_named
+from certbound.safety.portfolio import ENGINES, Engine, engines_for
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
@@ -57,7 +56,7 @@ def decide(
     request = Request(
         method="auto" if method in ENGINES else method, cells=cells, constants=constants, thorough=method != "auto"
     )
-    names = _chosen(method)
+    names = engines_for(method)
     watch = watch or current_watch() or Watch()
     for start in problem.starts:
         _checked(problem.replace(initial=start) if len(problem.starts) > 1 else problem, request)
@@ -144,6 +143,8 @@ class _Search:
 
     def whole(self, names: tuple[str, ...]) -> None:
         """Sketches, all engines in turn, and thoroughly those that spared themselves."""
+        if self.endlessly(names):
+            return
         if self.problem.system.dimension <= _LARGE and self.request.constants is None:
             for name in (name for name in names if ENGINES[name].sketch):
                 found = self.sketches[name] = self._asked(name, replace(self.request, quick=True))
@@ -159,6 +160,13 @@ class _Search:
             first = self.answers.get(name)
             if first is not None and first.applicable and not first.conclusive:
                 self._thoroughly(name, Request(before=first.details))
+
+    def endlessly(self, names: tuple[str, ...]) -> bool:
+        """Whether a function of one state settles a target without an end, which others meet at some late time."""
+        for name in (name for name in names if self.late and self.problem.system.dimension == 1):
+            if ENGINES[name].endless:
+                self.ask(name, self.request)
+        return self.late and self.settled
 
     def _in_full(self, names: tuple[str, ...], share: float) -> bool:
         """Ask once those that spared themselves for others' sake, which have proved nothing; whether that says SAFE."""
@@ -314,12 +322,11 @@ class _Search:
 
     def _in_time(self, row: Engine, request: Request) -> EngineAnswer:
         """What an engine answers about meeting the target by a time; not to meet it by then says nothing from below."""
-        if row.endless:
-            found = row.prove(self.problem, request)
-            if found.applicable:
-                return found
-        found = row.prove(self.problem.replace(horizon=self.meeting[0]), request)
-        return replace(found, log10_lower=None, conclusive=False)
+        found = row.prove(self.problem, request) if row.endless else None
+        if found is None or not found.applicable:
+            found = row.prove(self.problem.replace(horizon=self.meeting[0]), request)
+            return replace(found, log10_lower=None, conclusive=False)
+        return found
 
     @cached_property
     def fixed(self) -> bool:
@@ -388,17 +395,3 @@ def _checked(problem: Problem, request: Request) -> None:
     from certbound.constants.stated import refuse_contradiction
 
     refuse_contradiction(problem, constants)
-
-
-def _chosen(method: str) -> tuple[str, ...]:
-    if method == "auto":
-        return tuple(ENGINES)
-    name = engine_named(method)
-    if name is not None:
-        return (name,)
-    from certbound.tubes.tuning import METHODS
-
-    known = ["auto", *ENGINES, *(name for name in METHODS if name != "auto")]
-    near = difflib.get_close_matches(str(method), known, n=1)
-    cure = f"did you mean {near[0]!r}?" if near else "leave it out for the best of all engines."
-    raise ValueError(f"`method` must be one of {', '.join(known)}, got {method!r}; {cure}")

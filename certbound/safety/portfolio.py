@@ -5,6 +5,7 @@ An engine from outside is a row too: ``ENGINES["mine"] = Engine(name="mine", ...
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -168,3 +169,18 @@ def engine_named(method: str) -> str | None:
     if method in ENGINES:
         return method
     return next((name for name, row in ENGINES.items() if row.methods), None) if method in METHODS else None
+
+
+def engines_for(method: str) -> tuple[str, ...]:
+    """The engines that a method asks for; ValueError of one that there is not."""
+    if method == "auto":
+        return tuple(ENGINES)
+    name = engine_named(method)
+    if name is not None:
+        return (name,)
+    from certbound.tubes.tuning import METHODS
+
+    known = ["auto", *ENGINES, *(name for name in METHODS if name != "auto")]
+    near = difflib.get_close_matches(str(method), known, n=1)
+    cure = f"did you mean {near[0]!r}?" if near else "leave it out for the best of all engines."
+    raise ValueError(f"`method` must be one of {', '.join(known)}, got {method!r}; {cure}")
