@@ -89,7 +89,7 @@ CHECKER_ORDER = """
 report reading words
 balls expressions
 statement
-constants linear barrier values time_pieces
+constants linear barrier values endless time_pieces
 claims
 check
 """
@@ -117,7 +117,7 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
-    "values.continuous": (10, "bounds and charts, and the surfaces that certificates state, with what they were paid"),
+    "values.continuous": (13, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (34, "the one description of functions, which every room reads, differentiates and evaluates"),
@@ -128,7 +128,7 @@ MANY_DOORS = {
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
     "problem.sets": (18, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
-    "checker.statement": (14, "what a certificate states is read once and asked by five proofs"),
+    "checker.statement": (15, "what a certificate states is read once and asked by all proofs"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
     "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),

@@ -156,6 +156,8 @@ def _log10_below(value: arb) -> float | None:
     """log10 rounded down; None of what may be 0."""
     if not value > 0:
         return None
+    if value >= 1:
+        return 0.0
     return min(math.nextafter(float((value.log() / arb(10).log()).lower()), -math.inf), 0.0)
 
 

@@ -15,7 +15,13 @@ from flint import arb
 
 from certbound.checker.barrier import check_barrier
 from certbound.checker.constants import check_constants
-from certbound.checker.lasting import check_drift, check_lasting, check_lasting_below
+from certbound.checker.endless import (
+    check_drift,
+    check_lasting,
+    check_lasting_below,
+    check_leaving,
+    check_leaving_below,
+)
 from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, number
 from certbound.checker.report import Budget, Unproved
@@ -34,7 +40,7 @@ RANDOM = "random"
 REACH = "reach"
 """The engine that a proof names where the problem has a target: it meets the target at one time."""
 
-WHOLE = ("lasting", "drift")
+WHOLE = ("lasting", "drift", "rate")
 """The engines that prove targets and infinite horizons themselves."""
 
 STATED = "the stated constants hold"
@@ -279,6 +285,7 @@ ENGINES = {
     "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
     "values": Engine(words="the value function itself (Thm K8)", prove=_values, below=_values_below),
     "lasting": Engine(words="a function of the state alone", prove=check_lasting, below=check_lasting_below),
+    "rate": Engine(words="how fast paths leave", prove=check_leaving, below=check_leaving_below),
     "drift": Engine(words="a drift away from the limit (Lundberg's inequality)", prove=check_drift),
     "quadratic": Engine(words="quadratic value bounds (Thm K9)", prove=_quadratic),
 }

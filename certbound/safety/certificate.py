@@ -29,6 +29,7 @@ from certbound.values.continuous import Lasting
 
 FORMAT = "certbound certificate"
 VERSION = 1
+_OTHERS = ("reach", "lasting", "rate", "drift")  # proofs that are not called as their engine
 _ROUNDING = 1e-6  # other versions of the ball arithmetic may round otherwise
 
 def certificate_text(problem: Problem, verdict: Answered, *, attempt: int = 0) -> str:
@@ -101,11 +102,17 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
         if verdict.status != "SAFE" or is_at_most(min(best[1][1], 0.0), problem.delta):
             break
     if best is not None:
-        _, (proof, log10, assumptions) = best
-        claim = {"log10_delta": exact(min(log10, 0.0)), "method": proof["engine"], "assumptions": assumptions}
+        name, (proof, log10, assumptions) = best
+        claim = {"log10_delta": exact(min(log10, 0.0)), "method": _method(name, proof), "assumptions": assumptions}
         return _whole(problem, claim, proof)
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
+
+
+def _method(name: str, proof: Mapping[str, Any]) -> str:
+    """What proves: the engine, but for proofs of a target and of all times, which have names of their own."""
+    own = proof.get("engine") if isinstance(proof, Mapping) else None
+    return own if isinstance(own, str) and own in _OTHERS else name
 
 
 def _met(
@@ -173,7 +180,7 @@ def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, 
             refusals.append(f"{name}: {error}")
             continue
         claim = {
-            "log10_delta": exact(0.0), "log10_lower": exact(log10), "method": proof["engine"],
+            "log10_delta": exact(0.0), "log10_lower": exact(log10), "method": _method(name, proof),
             "assumptions": assumptions,
         }  # fmt: skip
         return _whole(problem, claim, proof)

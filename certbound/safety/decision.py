@@ -143,6 +143,8 @@ class _Search:
 
     def whole(self, names: tuple[str, ...]) -> None:
         """Sketches, all engines in turn, and thoroughly those that spared themselves."""
+        if self.endlessly(names):
+            return
         if self.problem.system.dimension <= _LARGE and self.request.constants is None:
             for name in (name for name in names if ENGINES[name].sketch):
                 found = self.sketches[name] = self._asked(name, replace(self.request, quick=True))
@@ -158,6 +160,13 @@ class _Search:
             first = self.answers.get(name)
             if first is not None and first.applicable and not first.conclusive:
                 self._thoroughly(name, Request(before=first.details))
+
+    def endlessly(self, names: tuple[str, ...]) -> bool:
+        """Whether a function of one state settles a target without an end, which others meet at some late time."""
+        for name in (name for name in names if self.late and self.problem.system.dimension == 1):
+            if ENGINES[name].endless:
+                self.ask(name, self.request)
+        return self.late and self.settled
 
     def _in_full(self, names: tuple[str, ...], share: float) -> bool:
         """Ask once those that spared themselves for others' sake, which have proved nothing; whether that says SAFE."""
@@ -314,12 +323,11 @@ class _Search:
 
     def _in_time(self, row: Engine, request: Request) -> EngineAnswer:
         """What an engine answers about meeting the target by a time; not to meet it by then says nothing from below."""
-        if row.endless:
-            found = row.prove(self.problem, request)
-            if found.applicable:
-                return found
-        found = row.prove(self.problem.replace(horizon=self.meeting[0]), request)
-        return replace(found, log10_lower=None, conclusive=False)
+        found = row.prove(self.problem, request) if row.endless else None
+        if found is None or not found.applicable:
+            found = row.prove(self.problem.replace(horizon=self.meeting[0]), request)
+            return replace(found, log10_lower=None, conclusive=False)
+        return found
 
     @cached_property
     def fixed(self) -> bool:

@@ -198,8 +198,7 @@ def test_to_arrive_by_some_time_is_to_arrive_at_any():
     assert verdict.status == "SAFE"
     assert 2 <= verdict.answers["linear"].hit <= 64
     assert verdict.log10_lower is None
-    with pytest.raises(cb.CertificateError, match="certificates state finite horizons"):
-        verdict.certificate_text(problem)
+    assert verdict.certificate["proof"]["engine"] == "reach"  # met at one time
     assert cb.verify_safety(problem.replace(reach=None), method="linear").status == "UNKNOWN"
 
 
@@ -211,8 +210,7 @@ def test_a_target_of_one_state_is_met_at_any_time():
     )  # fmt: skip
     truth = (np.exp(8) - 1) / (np.exp(16) - 1)  # the scale function exp(2 x / sigma^2)
     verdict = cb.verify_safety(problem, method="values")
-    assert truth <= 10**verdict.log10_delta <= 0.003
-    assert verdict.log10_lower is None
+    assert 0.9999 * truth <= 10**verdict.log10_lower <= truth <= 10**verdict.log10_delta <= 1.0001 * truth
 
 
 def test_continuous_time_without_an_end_or_a_target_is_not_served():

@@ -156,8 +156,9 @@ class Linearisation:
         nodes, lost = self._followed, ~np.isfinite(self._followed).all(axis=(0, 2))
         if lost.any():
             last, sizes = int(np.argmax(lost)) - 1, np.abs(nodes).max(axis=(0, 2))
-            while last > 0 and sizes[last] > 100 * (1 + sizes[last - 1]):  # finite, but no longer meant
-                last -= 1
+            with np.errstate(over="ignore"):
+                while last > 0 and sizes[last] > 100 * (1 + sizes[last - 1]):  # finite, but no longer meant
+                    last -= 1
             end = last * self.step
             raise EngineError(
                 f"the noise-free trajectory is lost after t = {end:.4g}, before the horizon {self.problem.horizon:g}; "

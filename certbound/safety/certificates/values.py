@@ -24,8 +24,9 @@ from certbound.problem.sets import Faces, Inside
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.parts import packed
-from certbound.values.continuous import ExitBounds, Lasting, Payment, Surface, bound_lasting
-from certbound.values.discrete import Drifting, step_grids
+from certbound.values.chains import Drifting
+from certbound.values.continuous import ExitBounds, Lasting, Payment, Rate, Surface, bound_lasting
+from certbound.values.discrete import step_grids
 from certbound.values.grids import Grid
 from certbound.values.sets import active_at
 
@@ -43,6 +44,7 @@ _INWARD = 1e-13  # of a side of the grid: its faces must lie in the safe set, wh
 _STARTS = ("box", "ball", "ellipsoid")  # sets of which lower bounds state points
 _ALONG = {1: 9, 2: 5, 3: 3}  # of these, along each side of a box, by the number of states
 _LASTING = (2**9, 2**11, 2**13)  # cells of a function of the state alone
+_OFF = 1e-4  # of an eigenfunction's rate and ends, which the checker encloses in its own way
 _MEANS = 4000  # parts over which the mean over a random start is taken
 _FARTHEST = 60.0  # standard deviations of the noise for which a cell reaches beyond the safe set
 
@@ -56,6 +58,8 @@ def values_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
         raise CertificateError("the checker counts leaving the domain as failing, and this bound does not.")
     if isinstance(answer.details, Lasting):
         return _lasting(problem, attempt, above=True)
+    if isinstance(answer.details, Rate):
+        return _leaving(problem, answer.details, above=True)
     if isinstance(answer.details, Drifting):
         drift = answer.details
         data = {"engine": "drift", "mirrored": drift.mirrored, "limit": exact(drift.limit), "rate": exact(drift.rate)}
@@ -86,6 +90,8 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
         raise CertificateError("no lower bound was found.")
     if isinstance(answer.details, Lasting):
         return _lasting(problem, attempt, above=False)
+    if isinstance(answer.details, Rate) and answer.details.fast is not None:
+        return _leaving(problem, answer.details, above=False)
     if problem.endless:
         raise CertificateError("certificates state lower bounds over infinite horizons in continuous time only.")
     if not problem.initial.random and problem.initial.data(_STARTS)["kind"] not in _STARTS:
@@ -115,6 +121,22 @@ def _lasting(problem: Problem, attempt: int, *, above: bool) -> Proof:
     } | ({} if above else {"side": "lower"})
     level, room = (found.upper if above else found.lower) / math.log(10), 1e-9 * (1 + abs(found.upper))
     return data, (min(level + room, 0.0) if above else level - room), []
+
+
+def _leaving(problem: Problem, known: Rate, *, above: bool) -> Proof:
+    """How fast paths leave: an eigenfunction, a little less or more of it being claimed than what was proved."""
+    found = known.slow if above else known.fast
+    assert found is not None
+    sign, horizon = -1.0 if above else 1.0, float(problem.horizon)
+    start, extreme = (value * (1 + s * _OFF) for value, s in ((found.start, sign), (found.extreme, -sign)))
+    rate = found.rate * (1 - sign * _OFF)
+    data = {
+        "engine": "rate", "low": exact(found.ends[0]), "high": exact(found.ends[1]), "rate": exact(rate),
+        "coefficients": exact(found.coefficients), "start": exact(start), "extreme": exact(extreme),
+    } | ({} if above else {"side": "lower"})
+    still = math.log(start / extreme) - rate * horizon
+    level = math.log10(max(-math.expm1(still), 1e-300))
+    return data, min(level + 1e-9 if above else level - 1e-9, 0.0), []
 
 
 def _grids(problem: Problem, effort: int) -> list[Grid]:

@@ -11,9 +11,9 @@ from certbound.problem.goals import until
 from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
-from certbound.values.chains import bound_chain
+from certbound.values.chains import bound_chain, bound_drifting
 from certbound.values.continuous import ExitBounds, bound_exits, bound_lasting, bound_rate
-from certbound.values.discrete import FailureBounds, bound_drifting, bound_failure, bound_long_run
+from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
 
@@ -40,7 +40,8 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         if problem.reach is None and serves(problem):
             return _continuous(bound_exits_by_steps(problem, seconds=limit))
         if not isinstance(problem.system, DiscreteSystem):
-            return _continuous(_exits(problem, limit, spare=asked.bounded and not asked.thorough))
+            answer = _continuous(_exits(problem, limit, spare=asked.bounded and not asked.thorough))
+            return answer if answer.log10_delta < 0 else _by_rate(problem) or _without_end(problem, limit) or answer
         found = _failure(problem, limit)
     except (InfeasibleError, EnclosureError) as error:
         lasting = _by_rate(problem) or _without_end(problem, limit)
@@ -105,7 +106,7 @@ def _by_rate(problem: Problem) -> EngineAnswer | None:
     return EngineAnswer(
         log10_delta=log10_outward(most, up=True),
         log10_lower=None if least < 10.0**_FLOOR else log10_outward(least, up=False),
-        reason=f"{words}.", method="values",
+        reason=f"{words}.", method="values", details=rate,
     )
 
 

@@ -2,9 +2,11 @@
 
 Coarser than ``discrete``, and for what that does not serve: noise that multiplies the state or leaves one without any,
 laws given by tables, targets that are to be stayed in. From the bottom: ``pieces`` (the noise as boxes with
-probabilities), ``extremes`` (the largest value over many boxes of cells), ``abstraction`` (the answer).
+probabilities), ``extremes`` (the largest value over many boxes of cells), ``abstraction`` (the answer); by itself
+``drifting`` (for ever, away from the only limit).
 """
 
 from certbound.values.chains.abstraction import bound_chain
+from certbound.values.chains.drifting import Drifting, bound_by_drift, bound_drifting
 
-__all__ = ["bound_chain"]
+__all__ = ["Drifting", "bound_by_drift", "bound_chain", "bound_drifting"]

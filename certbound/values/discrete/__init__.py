@@ -3,11 +3,9 @@
 From the bottom: ``dominance`` (constants of the normal density), ``shocks`` (the noise as independent coordinates),
 ``kernels`` (integrals of the basis functions), ``functions`` (what is carried from step to step), ``fields`` (its mean
 after the noise, as a function of where the noise-free step ends), ``steps`` (the noise-free step on a grid),
-``induction`` (one step back), ``failures`` (the answer, refined until it is good), ``long_runs`` (any number of steps),
-``drifting`` (for ever, away from the only limit).
+``induction`` (one step back), ``failures`` (the answer, refined until it is good), ``long_runs`` (any number of steps).
 """
 
-from certbound.values.discrete.drifting import Drifting, bound_by_drift, bound_drifting
 from certbound.values.discrete.failures import bound_failure, chart_failures, step_grids
 from certbound.values.discrete.kernels import AxisKernel, axis_kernel
 from certbound.values.discrete.layout import FailureBounds
@@ -16,11 +14,8 @@ from certbound.values.discrete.steps import evaluate
 
 __all__ = [
     "AxisKernel",
-    "Drifting",
     "FailureBounds",
     "axis_kernel",
-    "bound_by_drift",
-    "bound_drifting",
     "bound_failure",
     "bound_long_run",
     "chart_failures",

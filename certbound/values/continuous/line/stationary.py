@@ -64,15 +64,33 @@ def bound_mean_time(problem: Problem) -> tuple[float, float | None] | None:
     return _bounds(problem, *ends, *best)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Eigen:
+    """A function over an interval by its Chebyshev coefficients, its rate, and what it was read to be.
+
+    ``start`` bounds it over the starts, ``extreme`` over the interval: v >= start and v <= extreme, or p <= start and
+    p >= extreme.
+    """
+
+    ends: tuple[float, float]
+    coefficients: Array
+    rate: float
+    start: float
+    extreme: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Rate:
     """1 - share[1] e^{-rate[0] T} <= P(leaving before T) <= 1 - share[0] e^{-rate[1] T} for every T.
 
     From every start, under every disturbance; the first share may exceed 1. ``rate[0]`` is 0 where nothing is proved.
+    ``slow`` and ``fast`` are v and p.
     """
 
     rate: tuple[float, float]
     share: tuple[float, float]
+    slow: Eigen
+    fast: Eigen | None
 
     def before(self, time: float) -> tuple[float, float]:
         """Bounds of the probability of leaving before a time, which may be infinite."""
@@ -94,16 +112,17 @@ def bound_rate(problem: Problem) -> Rate | None:
     cells = _Cells(problem, square, *ends, _CELLS[-1])
     degree = _DEGREES[1]
     slow = [_slow(problem, square, cells, degree, less) for less in _LESS]
-    above = min((found for found in slow if found is not None), default=None)
+    above = min((found for found in slow if found is not None), default=None, key=lambda one: one.rate)
     if above is None:
         return None
     fast = [_fast(problem, square, cells, degree, more) for more in _LONGER]
-    below = max((found for found in fast if found is not None), default=(0.0, 1.0))
-    return Rate(rate=(below[0], above[0]), share=(above[1], below[1]))
+    below = max((found for found in fast if found is not None), default=None, key=lambda one: one.rate)
+    shares = above.start / above.extreme / _SLACK, 1.0 if below is None else below.start / below.extreme * _SLACK
+    return Rate(rate=(0.0 if below is None else below.rate, above.rate), share=shares, slow=above, fast=below)
 
 
-def _slow(problem: Problem, square: Tape, cells: _Cells, degree: int, less: float) -> tuple[float, float] | None:
-    """A rate that is at least as large as the true one, and v(x)/sup v."""
+def _slow(problem: Problem, square: Tape, cells: _Cells, degree: int, less: float) -> Eigen | None:
+    """A rate that is at least as large as the true one, and v."""
     m = _proposal(problem, square, cells.low, cells.high, degree)
     found = _eigenfunction(problem, square, cells.low, cells.high, degree)
     if m is None or found is None:
@@ -119,12 +138,15 @@ def _slow(problem: Problem, square: Tape, cells: _Cells, degree: int, less: floa
     if not 0 < needed < 10 * rate or np.any(drift.lo[~inside] + needed * size.lo[~inside] * _SLACK < 0):
         return None
     least, _ = _over_starts(problem, cells.low, cells.high, v)
-    share = least / float(np.max(size.hi)) / _SLACK
-    return (needed, share) if share > 0 else None
+    if not least > 0:
+        return None
+    return Eigen(
+        ends=(cells.low, cells.high), coefficients=v, rate=needed, start=least, extreme=float(np.max(size.hi))
+    )
 
 
-def _fast(problem: Problem, square: Tape, cells: _Cells, degree: int, more: float) -> tuple[float, float] | None:
-    """A rate that is at most as large as the true one, and p(x)/min p."""
+def _fast(problem: Problem, square: Tape, cells: _Cells, degree: int, more: float) -> Eigen | None:
+    """A rate that is at most as large as the true one, and p."""
     wide = more * (cells.high - cells.low)
     found = _eigenfunction(problem, square, cells.low - wide, cells.high + wide, degree)
     if found is None:
@@ -137,7 +159,11 @@ def _fast(problem: Problem, square: Tape, cells: _Cells, degree: int, more: floa
         return None
     rate = float(np.min(-drift.hi / np.where(drift.hi < 0, size.hi, size.lo))) / _SLACK
     _, most = _over_starts(problem, cells.low, cells.high, p)
-    return (rate, most / float(np.min(size.lo)) * _SLACK) if rate > 0 else None
+    if not rate > 0:
+        return None
+    return Eigen(
+        ends=(cells.low, cells.high), coefficients=p, rate=rate, start=most, extreme=float(np.min(size.lo))
+    )
 
 
 def _eigenfunction(problem: Problem, square: Tape, low: float, high: float, degree: int) -> tuple[float, Array] | None:

@@ -20,9 +20,7 @@ from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import HalfSpace, Reach
 from certbound.problem.systems import DiscreteSystem
-from certbound.values.discrete.layout import FailureBounds
-from certbound.values.discrete.long_runs import bound_long_run
-from certbound.values.discrete.shocks import Inapplicable
+from certbound.values.discrete import FailureBounds, bound_long_run
 from certbound.values.exact import interval_of, polynomial_of
 
 _ENOUGH = 8.0  # theta M - theta y of the starts
@@ -100,7 +98,7 @@ def bound_drifting(problem: Problem, *, seconds: float, delta: float | None = No
     upper = math.exp(drift.log) * (1 + 1e-12)
     try:
         found = bound_long_run(problem.replace(reach=far), seconds=seconds, delta=delta)
-    except Inapplicable:
+    except InfeasibleError:
         found = None
     if found is None:
         return FailureBounds(upper=upper, lower=0.0, cells=(0,), share=0.0, seconds=0.0, tried=()), drift

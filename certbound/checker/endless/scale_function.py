@@ -31,8 +31,7 @@ from flint import arb, fmpq, fmpq_poly
 from certbound.checker.expressions import Ceiling, Graph, Side
 from certbound.checker.reading import Record
 from certbound.checker.report import Budget, Unproved
-from certbound.checker.statement import Model
-from certbound.checker.statement.regions import Constraint
+from certbound.checker.statement import Constraint, Model
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
