@@ -1,11 +1,17 @@
-"""Names of a package that are loaded when they are first used."""
+"""What is loaded, or compiled, when it is first used: names of a package, and functions in loops."""
 
 from __future__ import annotations
 
 import importlib
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Generic, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_LOCK = threading.Lock()
 
 
 def names_in(homes: Mapping[str, str]) -> list[str]:
@@ -27,3 +33,28 @@ def lazily(
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     return load, lambda: sorted(offered)
+
+
+class compiled(Generic[P, R]):
+    """A function that numba compiles, and keeps on disk, at its first call; so is what its module compiles beside it.
+
+    To import numba takes as long as a small proof. What is called in a module must be compiled in that module.
+    """
+
+    def __init__(self, function: Callable[P, R]) -> None:
+        self.function = function
+        self.kernel: Callable[P, R] | None = None
+        self.__doc__, self.__name__, self.__module__ = function.__doc__, function.__name__, function.__module__
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        return (self.kernel or self._ready())(*args, **kwargs)
+
+    def _ready(self) -> Callable[P, R]:
+        from numba import njit
+
+        with _LOCK:
+            for name, value in list(self.function.__globals__.items()):
+                if isinstance(value, compiled) and value.__module__ == self.__module__:
+                    value.kernel = self.function.__globals__[name] = njit(cache=True, nogil=True)(value.function)
+        assert self.kernel is not None
+        return self.kernel

@@ -7,15 +7,15 @@ by the compiler (no fast-math), and the bound of the rounding errors is that of 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from certbound.arrays import Array, Index
+from certbound.lazy import compiled
 
 BLOCK = 8
 """Patches that are worked on together, side by side in the last axis: the processor's vectors run along it."""
 
 
-@njit(cache=True)
+@compiled
 def _change(table: Array, first: Array, second: Array, third: Array, one: Array, two: Array, out: Array) -> None:
     """A matrix along each of the first three axes of ``table``, written to ``out``."""
     p, q, r = table.shape[0], table.shape[1], table.shape[2]
@@ -54,7 +54,7 @@ def _change(table: Array, first: Array, second: Array, third: Array, one: Array,
                     out[a, b, c, s] = sums[s]
 
 
-@njit(cache=True)
+@compiled
 def _extreme(table: Array, low: Array, high: Array) -> None:
     """Least and largest entry for each patch of the block."""
     for s in range(BLOCK):
@@ -67,7 +67,7 @@ def _extreme(table: Array, low: Array, high: Array) -> None:
                     high[s] = max(high[s], table[i, j, k, s])
 
 
-@njit(cache=True)
+@compiled
 def _extreme_parts(
     table: Array, parts: tuple[Array, ...], one: Array, two: Array, result: Array, low: Array, high: Array
 ) -> None:
@@ -83,7 +83,7 @@ def _extreme_parts(
                     low[s], high[s] = min(low[s], least[s]), max(high[s], most[s])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def extremes_in_plane(
     coefficients: Array, step: Array, width_x: Array, width_y: Array, place: Index, drift: Array, square: Array,
     bases: tuple[Array, ...], parts: tuple[Array, ...], wanted: float, out: Array,

@@ -8,15 +8,15 @@ errors is that of `residual`.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from certbound.arrays import Array, Index
+from certbound.lazy import compiled
 
 BLOCK = 8
 """Patches that are worked on together."""
 
 
-@njit(cache=True)
+@compiled
 def _contract(matrix: Array, table: Array, before: int, after: int, out: Array) -> None:
     """A matrix along the middle one of three axes, of lengths ``before``, its columns (4 or more) and ``after``.
 
@@ -50,7 +50,7 @@ def _contract(matrix: Array, table: Array, before: int, after: int, out: Array) 
             k += 1
 
 
-@njit(cache=True)
+@compiled
 def _extreme(table: Array, count: int, low: Array, high: Array) -> None:
     """Least and largest of ``count`` entries for each patch of the block."""
     for s in range(BLOCK):
@@ -61,7 +61,7 @@ def _extreme(table: Array, count: int, low: Array, high: Array) -> None:
             high[s] = max(high[s], table[i * BLOCK + s])
 
 
-@njit(cache=True)
+@compiled
 def _extreme_parts(
     table: Array, parts: tuple[Array, Array, Array, Array], work: tuple[Array, Array, Array, Array], low: Array,
     high: Array,
@@ -87,7 +87,7 @@ def _extreme_parts(
                         low[s], high[s] = min(low[s], least[s]), max(high[s], most[s])
 
 
-@njit(cache=True)
+@compiled
 def _derivatives(
     c: Array, rate: Array, axes: tuple[Array, ...], mixed: bool, work: tuple[Array, ...], out: Array
 ) -> None:
@@ -121,7 +121,7 @@ def _derivatives(
     _contract(x0, yy, 1, wide, out[6])
 
 
-@njit(cache=True)
+@compiled
 def _gathered(table: Array, output: int, cells: Index, sample: int, scale: Array, out: Array) -> None:
     """One output of a table (outputs, cells, 1 or t, samples) for the cells of a block, scaled, lanes last."""
     own = min(sample, table.shape[2] - 1)
@@ -133,7 +133,7 @@ def _gathered(table: Array, output: int, cells: Index, sample: int, scale: Array
             out[p * BLOCK + s] = row[p] * scale[s]
 
 
-@njit(cache=True)
+@compiled
 def _residual(v: Array, drift: Array, square: Array, mixed: bool, out: Array, energy: Array) -> None:
     """R for every branch (a row of ``out``; ``drift`` has three for each) and Q2 at the samples of space, flat."""
     vt, vx, vy, vz, xx, yy, zz = v[0], v[1], v[2], v[3], v[4], v[5], v[6]
@@ -152,7 +152,7 @@ def _residual(v: Array, drift: Array, square: Array, mixed: bool, out: Array, en
             own[p] = vt[p] + energy[p] + (fx[p] * vx[p] + fy[p] * vy[p] + fz[p] * vz[p])
 
 
-@njit(cache=True)
+@compiled
 def _model(
     drift: Array, square: Array, cells: Index, sample: int, sides: Array, mixed: bool, force: Array, spread: Array
 ) -> None:
@@ -167,7 +167,7 @@ def _model(
         _gathered(square, 5, cells, sample, sides[2] * sides[3], spread[5])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def extremes_in_space(
     coefficients: Array, inverse: Array, place: Index, drift: Array, square: Array, mixed: bool,
     bases: tuple[Array, ...], parts: tuple[Array, Array, Array, Array], wanted: float, out: Array,

@@ -6,9 +6,9 @@ The same numbers as by sliding extremes in NumPy; what is no number stays so.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from certbound.arrays import Array, Integers
+from certbound.lazy import compiled
 
 
 def in_space(table: Array) -> Array:
@@ -16,7 +16,7 @@ def in_space(table: Array) -> Array:
     return np.ascontiguousarray(table).reshape((1,) * (3 - table.ndim) + table.shape)
 
 
-@njit(cache=True)
+@compiled
 def window_extremes(table: Array, start: Integers, size: tuple[int, int, int], largest: bool, out: Array) -> None:
     """The largest (least) entry of a window from every flat index in ``start`` on, written to ``out``."""
     plane, row = table.shape[1] * table.shape[2], table.shape[2]
@@ -34,7 +34,7 @@ def window_extremes(table: Array, start: Integers, size: tuple[int, int, int], l
         out[c] = np.nan if unknown else best
 
 
-@njit(cache=True)
+@compiled
 def second_differences(table: Array) -> Array:
     """Sum over the axes of |g_{j-1} - 2 g_j + g_{j+1}|, without an axis' part at its ends."""
     p, q, r = table.shape
@@ -68,7 +68,7 @@ def cell_ranges(table: Array, close: Array, near: float, beyond: float) -> tuple
     return low.reshape(shape), high.reshape(shape)
 
 
-@njit(cache=True)
+@compiled
 def _cell_ranges(
     table: Array, bent: Array, close: Array, near: float, beyond: float, corners: tuple[int, int],
     low: Array, high: Array,

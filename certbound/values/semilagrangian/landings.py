@@ -11,12 +11,12 @@ the range of y. Along q the density goes into the parabola, along y it is paid a
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from certbound.arrays import Array, Index, Mask
+from certbound.lazy import compiled
 
 
-@njit(cache=True)
+@compiled
 def _cell_of(axis: Array, place: float) -> int:
     low, high = 0, len(axis) - 2
     while low < high:
@@ -28,7 +28,7 @@ def _cell_of(axis: Array, place: float) -> int:
     return low
 
 
-@njit(cache=True)
+@compiled
 def _density(window: Index, tables: Array, rates: Array, bend: Array) -> float:
     """sup of the density over a window; ``tables`` cross_low, cross_high, steep_y, steep_w; ``rates`` y_t, w_t ranges.
 
@@ -51,7 +51,7 @@ def _density(window: Index, tables: Array, rates: Array, bend: Array) -> float:
     return best
 
 
-@njit(cache=True)
+@compiled
 def _kinked(window: Index, kinks: Array, mesh: Array, longest: float) -> float:
     """Upper bound of the sum of the kinks that a path of that length in y crosses within a window."""
     total, largest, least = 0.0, 0.0, np.inf
@@ -67,7 +67,7 @@ def _kinked(window: Index, kinks: Array, mesh: Array, longest: float) -> float:
     return float(min(total, largest * (1 + np.floor(longest / least * 1.000001))))
 
 
-@njit(cache=True)
+@compiled
 def _window(mesh: Array, q: Array, y0: float, y1: float, w0: float, w1: float) -> Index:
     found = np.empty(4, dtype=np.intp)
     found[0], found[1] = _cell_of(mesh, y0), _cell_of(mesh, y1)
@@ -75,7 +75,7 @@ def _window(mesh: Array, q: Array, y0: float, y1: float, w0: float, w1: float) -
     return found
 
 
-@njit(cache=True)
+@compiled
 def at_nodes(
     image: Array, radius: Array, wanted: Mask, mesh: Array, q: Array, values: Array, bend: Array, steep: Array
 ) -> Array:
@@ -101,7 +101,7 @@ def at_nodes(
     return found
 
 
-@njit(cache=True)
+@compiled
 def along_q(
     image: Array, radius: Array, live: Mask, bends: Array, dq: Array, mesh: Array, q: Array, tables: Array,
     bend: Array, kinks: Array,
@@ -140,7 +140,7 @@ def along_q(
     return curve, extra
 
 
-@njit(cache=True)
+@compiled
 def over_cells(
     image: Array, radius: Array, live: Mask, slopes: Array, bends: Array, sides: tuple[Array, Array], mesh: Array,
     q: Array, tables: Array, bend: Array, kinks: Array, reach: Array, prices: Array, wide: Array, close: Array,
@@ -193,7 +193,7 @@ def over_cells(
     return found
 
 
-@njit(cache=True)
+@compiled
 def _largest(window: Index, table: Array) -> float:
     best = -np.inf
     for k in range(window[0], window[1] + 1):

@@ -22,9 +22,9 @@ import math
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 
 from certbound.arrays import Array
+from certbound.lazy import compiled
 from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, layer_rate, slab_times, spread_nodes
 from certbound.values.continuous.proposal import Splines
 from certbound.values.continuous.surface import Surface
@@ -277,7 +277,7 @@ def weakened(plane: Plane, plan: Plan, drift: Array, a: Array, places: tuple[Arr
     return np.stack(result)
 
 
-@njit(cache=True)
+@compiled
 def solve_lines(mass: Array, slope: Array, bend: Array, speed: Array, half: Array, step: float, right: Array) -> None:
     """Solve (mass - step (speed slope + half bend)) k = right along the first axis, line by line, in place.
 

@@ -10,9 +10,9 @@ axes, since interpolation is positive; sides at all places across the cell count
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from certbound.arrays import Array, Index, Mask
+from certbound.lazy import compiled
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -82,7 +82,7 @@ def _over_others(part: Array, axis: int) -> Array:
     return part
 
 
-@njit(cache=True)
+@compiled
 def _cell_of(axis: Array, place: float) -> int:
     low, high = 0, len(axis) - 2
     while low < high:
@@ -94,7 +94,7 @@ def _cell_of(axis: Array, place: float) -> int:
     return low
 
 
-@njit(cache=True)
+@compiled
 def at_images(
     value: Array, x: Array, y: Array, q: Array, shift: Array, radius: Array, known: Mask, steep: Array, top: float
 ) -> Array:
@@ -147,7 +147,7 @@ def near(field: Array, axes: tuple[Array, ...], reach: Array) -> Array:
     return field
 
 
-@njit(cache=True)
+@compiled
 def _running(field: Array, first: Index, last: Index) -> Array:
     """Largest along the first axis of members first[i] : last[i]."""
     found = np.empty_like(field)
@@ -160,7 +160,7 @@ def _running(field: Array, first: Index, last: Index) -> Array:
     return found
 
 
-@njit(cache=True)
+@compiled
 def _largest(field: Array, window: Index) -> float:
     best = 0.0
     for m in range(window[0], window[1] + 1):
@@ -170,7 +170,7 @@ def _largest(field: Array, window: Index) -> float:
     return best
 
 
-@njit(cache=True)
+@compiled
 def _at_plane(field: Array, window: Index, axis: int, plane: int) -> float:
     """Largest kink at a plane across a window."""
     part = window.copy()
@@ -178,7 +178,7 @@ def _at_plane(field: Array, window: Index, axis: int, plane: int) -> float:
     return _largest(field, part)
 
 
-@njit(cache=True)
+@compiled
 def _hump(low: float, high: float) -> float:
     """max of tau (1 - tau) over [low, high] and [0, 1]."""
     if low <= 0.5 <= high:
@@ -187,7 +187,7 @@ def _hump(low: float, high: float) -> float:
     return max(end * (1 - end), 0.0)
 
 
-@njit(cache=True)
+@compiled
 def _excess(
     axis: int, start: Array, end: Array, rate: Array, bow: Array, window: Index, x: Array, y: Array, q: Array,
     slopes: Array, crosses: Array, down: Array,
@@ -226,7 +226,7 @@ def _excess(
     return float(total + crosses[2] * moving[1] * moving[2] / 4)
 
 
-@njit(cache=True)
+@compiled
 def _sides(part: Array, axis: int, low: Array, high: Array) -> None:
     """Fill ``low`` and ``high`` with the corners at the two ends of an axis."""
     for one in range(2):
@@ -240,7 +240,7 @@ def _sides(part: Array, axis: int, low: Array, high: Array) -> None:
                 low[place], high[place] = part[one, two, 0], part[one, two, 1]
 
 
-@njit(cache=True)
+@compiled
 def over_images(
     x: Array, y: Array, q: Array, shift: Array, radius: Array, known: Mask, blocks: tuple[Index, Index, Index],
     growth: Array, bends: Array, usable: Mask, reach: Array, slopes: Array, crosses: Array, down: Array, around: Array,

@@ -1,0 +1,29 @@
+"""Functions in loops are compiled at their first call, with those of their module that they call."""
+
+import numpy as np
+
+from certbound.lazy import compiled
+
+
+@compiled
+def _once(x: float) -> float:
+    """A number and a half."""
+    return 1.5 * x
+
+
+@compiled
+def _summed(x: np.ndarray) -> float:
+    total = 0.0
+    for k in range(len(x)):
+        total += _once(x[k])
+    return total
+
+
+def test_a_module_is_compiled_when_one_of_its_functions_is_called():
+    given, other = _summed, _once  # as another module imports them
+    assert isinstance(given, compiled)
+    assert other.__doc__ == "A number and a half."
+    assert given(np.array([1.0, 3.0])) == 6.0
+    assert given(np.arange(3)) == 4.5
+    assert other.kernel is _once is globals()["_once"]
+    assert len(given.kernel.nopython_signatures) == 2
