@@ -195,5 +195,5 @@ def test_what_a_rough_guess_puts_out_of_reach_may_be_left_out() -> None:
     system = cb.ContinuousSystem(lambda x: -x, states=3, diffusion=np.eye(3))
     safe = [cb.Inside(cb.Box([-1] * 3, [1] * 3))]
     problem = cb.Problem(system, initial=[0, 0, 0], safe=safe, horizon=0.5)
-    with pytest.raises(InfeasibleError, match="rough guess .* more than is asked"):
+    with pytest.raises(InfeasibleError, match=r"rough guess .* more than is asked"):
         bound_exits(problem, seconds=1.0, delta=1e-3, spare=True)

@@ -22,6 +22,7 @@ from certbound.watch import poll
 _UNIT = 2.0**-53
 _TINY = 1e-300
 _TERMS = 24
+_MILD = 2.0  # norm of the slopes times a piece, up to which series run well in the states' own units
 _SWEEPS, _FARTHEST = 20, 60  # of balancing; exponent of a unit
 _LARGE, _SPARSE = 40, 0.1  # states and share of nonzero entries from which on products are sparse
 
@@ -198,9 +199,11 @@ def continuous_response(
 
     ``diffusion`` is g (n, m), or one matrix a cell and piece, (B, N, n, m).
     ``slope_error`` bounds entrywise how far the exact slope (the model's constants) is from its floats.
-    The series run in units of the states in which the slopes are balanced, so that units cost no pieces of time.
+    Where the slopes are too large for the series they run in units of the states in which the slopes are balanced, so
+    that units cost no pieces of time; elsewhere bounds that are the same for all entries are best in the states' own.
     """
-    unit = balancing_units(slope)
+    mild = float(_norm(slope).max(initial=0.0)) * step <= _MILD
+    unit = np.ones(slope.shape[-1]) if mild else balancing_units(slope)
     back, size = unit[:, None] / unit, unit[:, None] * unit  # powers of two: products with them are exact
     own_error = slope_error * float(1 / back.min())  # of the slope in balanced units, as far as it may grow
     own_slope, own_drift, own_noise = slope / back, drift / back, diffusion / unit[:, None]

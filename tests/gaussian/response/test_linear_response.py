@@ -45,6 +45,15 @@ def test_chosen_columns_and_repeated_rows_bound_what_is_driven(n: int) -> None:
     assert bounds[1][1][k, 0] == pytest.approx(best, abs=1e-10)
 
 
+def test_states_that_hardly_drive_each_other_keep_their_own_units() -> None:
+    """Units that balance couplings of 1 and 1e-12 widen bounds that are the same for all entries."""
+    slope = np.array([[-1.0, 1.0, 0.0], [1e-12, -1.0, 1.0], [0.0, 1e-12, -1.0]])
+    shape = (1, 30, 3, 3)
+    found = continuous_response(np.broadcast_to(slope, shape), np.zeros(shape), 0.1, np.eye(3), np.zeros((3, 3)))
+    assert found.transition_error.max() < 1e-10
+    assert found.covariance_error.max() < 1e-9
+
+
 @pytest.mark.parametrize("exponent", [0, 14, 50])
 def test_units_of_single_states_cost_no_accuracy(exponent: int) -> None:
     """x_2 in units of 2^-exponent: the same response, though the slope's norm times a piece is 2^exponent / 10."""
