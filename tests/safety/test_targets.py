@@ -104,7 +104,7 @@ def test_a_noise_free_path_that_misses_is_unsafe(time):
     verdict = cb.verify_safety(problem)
     assert verdict.status == "UNSAFE_NOMINAL"
     assert "does not 'reach -0.2 <= x <= 0.2' by" in verdict.reason
-    near = cb.verify_safety(problem.replace(reach=cb.Box([-0.2], [0.3]), delta=0.9))
+    near = cb.verify_safety(problem.replace(reach=cb.Box([-0.2], [0.3]), delta=0.9), time_limit=1.0)
     assert near.status != "UNSAFE_NOMINAL"
 
 
