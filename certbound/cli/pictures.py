@@ -75,12 +75,15 @@ def values_of(problem: Problem, verdict: Verdict) -> SafeStarts | None:
 
 
 def drawn_reach(problem: Problem, verdict: Verdict) -> ReachTube | None:
-    """The noise-free tube of a verdict: its own, or one proved for the picture alone; None where there is none."""
+    """The noise-free tube of a verdict: its own, or one proved for the picture alone; None where there is none.
+
+    None too where nothing was proved: then the time that was granted is over, or the model is not served.
+    """
     if verdict.reach is not None:
         return verdict.reach
     from certbound.reach import bound_reach
 
-    if len(problem.starts) > 1 or problem.endless:
+    if len(problem.starts) > 1 or problem.endless or not verdict.log10_delta < 0:
         return None
     try:
         with contained("noise-free"), Watch(_SECONDS).running():

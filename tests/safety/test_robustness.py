@@ -216,7 +216,7 @@ def test_a_system_too_stiff_for_the_linear_engine_says_so() -> None:
 
 
 def test_an_exact_engine_that_found_no_bound_keeps_no_other_from_being_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(linearisation, "_MOST_PIECES", 200)  # too few for this rate
+    monkeypatch.setattr(linearisation, "MOST_PIECES", 200)  # too few for this rate
     system = cb.ContinuousSystem(lambda x: -1000 * x, states=1, diffusion=[[1.0]])
     problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-0.5], [0.5]))], horizon=0.5)
     answer = verify_safety(problem, method="linear").answers["linear"]

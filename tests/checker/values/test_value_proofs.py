@@ -356,7 +356,7 @@ def test_starts_that_are_stated_by_a_box_around_them_have_no_certificate_from_be
     assert initial_data(around) == {"kind": "box", "low": exact([0.0]), "high": exact([1.0]), "around": True}
     answer = EngineAnswer(log10_delta=-0.5, log10_lower=-1.0)
     with pytest.raises(CertificateError, match="a box, a ball or an ellipsoid"):
-        values_proof_below(SimpleNamespace(initial=around, ending=False), answer)
+        values_proof_below(SimpleNamespace(initial=around, ending=False, endless=False), answer)
 
 
 def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:

@@ -78,7 +78,7 @@ def test_rows_in_words_and_a_point_without_verdict(
         (("--over", "sigma=0.1", "--out", "/nowhere/at/all.csv"), "does not exist"),
         (("--over", "sigma=0.1", "--resume", "/tmp"), "is a directory"),
         (("--over", "sigma=0.1", "--plot", "s.xyz"), "no format of pictures"),
-        (("--over", "sigma=0.1", "--out", "s.csv", "--resume", "s.csv"), "name the same file"),
+        (("--over", "sigma=0.1", "--out", "s.csv", "--resume", "s.csv"), "written twice"),
         (("--over", "sigma=0.1", "--boundary", "radius"), "must be a name in `over`, got 'radius'"),
     ],
 )
