@@ -82,7 +82,7 @@ def _version_of(distribution: str) -> Callable[[], str]:
     def check() -> str:
         from importlib.metadata import version as version_of
 
-        module = {"python-flint": "flint"}.get(distribution, distribution.replace("-", "_"))
+        module = {"python-flint": "flint", "pyyaml": "yaml"}.get(distribution, distribution.replace("-", "_"))
         importlib.import_module(module)
         version = version_of(distribution)
         needed = _requirements()[distribution]
