@@ -99,6 +99,17 @@ def test_what_is_not_served_is_refused(problem, match):
         bound_lasting(problem)
 
 
+def test_what_is_proved_from_below_is_of_a_point_that_surely_is_a_start():
+    """The ends of a ball's box are starts up to a rounding only."""
+    system = cb.ContinuousSystem(lambda x: 0 * x + 1.0, states=["x"], diffusion=1.0)
+    bounds = [
+        bound_lasting(cb.Problem(system, initial=start, safe=HALF, horizon=math.inf))
+        for start in (cb.Box([2.0], [3.0]), cb.Ball([2.5], 0.5))
+    ]
+    assert bounds[0].lower - 1e-6 < bounds[1].lower < bounds[0].lower - 1e-10
+    assert bounds[1].upper == pytest.approx(bounds[0].upper, abs=1e-12)
+
+
 def walk(step, **options):
     system = cb.DiscreteSystem(step, states=["x"], noise=cb.Gaussian(std=0.5))
     return cb.Problem(system, **({"initial": [1.0], "safe": HALF, "horizon": math.inf} | options))

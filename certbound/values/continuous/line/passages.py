@@ -30,6 +30,7 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import enclose, squared_diffusion
+from certbound.values.continuous.room import points_of
 from certbound.values.exact import interval_of, polynomial_of
 
 _CELLS = 2**13
@@ -105,7 +106,9 @@ def bound_lasting(problem: Problem, *, cells: int = _CELLS) -> Lasting:
     edges[-1] = b
     low, high = line.slopes(edges)
     with precision():
-        most, least = _share(edges, low, tail, start), _share(edges, high, None, start)
+        points = points_of(problem)  # of a ball the ends of its box need not be starts, by a rounding
+        sure = start if points is None else float((sign * points).min(initial=b))
+        most, least = _share(edges, low, tail, start), _share(edges, high, None, sure)
         bounds = upper(most.log()), lower(least.log()) if least > 0 else -math.inf
     return Lasting(
         upper=min(bounds[0], 0.0), lower=bounds[1], edges=edges, slopes=(low, high), side=side,
