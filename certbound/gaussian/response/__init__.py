@@ -9,7 +9,7 @@ from certbound.gaussian.response.linear_response import (
     Jumps,
     LinearResponse,
     RowResponse,
-    balancing_units,
+    balanced,
     continuous_response,
     discrete_response,
 )
@@ -20,7 +20,7 @@ from certbound.gaussian.response.overlaps import log_any_exceedance
 from certbound.gaussian.response.step_events import StepEvents
 
 __all__ = [
-    "balancing_units",
+    "balanced",
     "ClockEvents",
     "continuous_response",
     "discrete_response",

@@ -203,7 +203,7 @@ def continuous_response(
     that units cost no pieces of time; elsewhere bounds that are the same for all entries are best in the states' own.
     """
     mild = float(_norm(slope).max(initial=0.0)) * step <= _MILD
-    unit = np.ones(slope.shape[-1]) if mild else balancing_units(slope)
+    unit = np.ones(slope.shape[-1]) if mild else _balancing_units(slope)
     back, size = unit[:, None] / unit, unit[:, None] * unit  # powers of two: products with them are exact
     own_error = slope_error * float(1 / back.min())  # of the slope in balanced units, as far as it may grow
     own_slope, own_drift, own_noise = slope / back, drift / back, diffusion / unit[:, None]
@@ -227,7 +227,7 @@ def continuous_response(
     )
 
 
-def balancing_units(slopes: Array) -> Array:
+def _balancing_units(slopes: Array) -> Array:
     """Powers of two, (n,), in units of which rows and columns of slopes (..., n, n) are about equal.
 
     Any choice serves: it costs accuracy, and no more than that.
@@ -245,6 +245,12 @@ def balancing_units(slopes: Array) -> Array:
         if np.array_equal(before, exponents):
             break
     return np.asarray(np.exp2(exponents))
+
+
+def balanced(slopes: Array) -> Array:
+    """Slopes (..., n, n) in units of the states, powers of two, in which their rows and columns are about equal."""
+    units = _balancing_units(slopes)
+    return np.asarray(slopes / units[:, None] * units)
 
 
 def discrete_response(

@@ -10,7 +10,7 @@ import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
-from certbound.gaussian.response import LinearResponse, balancing_units, continuous_response, discrete_response
+from certbound.gaussian.response import LinearResponse, balanced, continuous_response, discrete_response
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
@@ -398,9 +398,3 @@ class Linearisation:
             return None
         found = {i for i, _ in self.model.entries} | set(np.flatnonzero((self.slopes[2] != 0).any(axis=(0, 1, 3))))
         return np.array(sorted(found), dtype=np.int64)
-
-
-def balanced(slopes: Array) -> Array:
-    """Slopes (..., n, n) in units of the states, powers of two, in which their rows and columns are about equal."""
-    units = balancing_units(slopes)
-    return np.asarray(slopes / units[:, None] * units)

@@ -9,7 +9,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
-from certbound.problem.model import Graph, Tape, compile_numpy
+from certbound.problem.model import Graph, Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Quadratic, Region
 from certbound.problem.systems import ContinuousSystem
@@ -115,7 +115,7 @@ def setting_of(problem: Problem) -> Setting:
     gain = np.asarray(system.diffusion, dtype=float)
     noisy = int(np.flatnonzero(np.any(gain != 0, axis=1))[0])
     order = (1 - noisy, noisy)
-    tape = _reordered(problem.closed_loop, order)
+    tape = reordered(problem.closed_loop, order)
     size = sqrt(sq(Interval.point(gain[noisy])).sum(axis=-1))
     starts = starts_of(problem)
     bounds, beyond, walls = _limits(problem, order)
@@ -210,29 +210,16 @@ def _reach(tape: Tape, noise: float, starts: tuple[Ends, Ends], horizon: float) 
     return (least - more).tolist(), (most + more).tolist()
 
 
-def _reordered(tape: Tape, order: tuple[int, int]) -> Tape:
-    """The drift over ("t", "p", "q")."""
-    if any(node.op == "input" and node.args[0] == 0 for node in tape.nodes):
-        live = tape.evaluate(_Reads(), [True, False, False])
-        if any(live):
-            raise InfeasibleError(
-                "value functions with noise in one coordinate serve no models that change with time yet; "
-                "value functions prove nothing here."
-            )
-    graph = Graph(("t", "p", "q"))
-    slots = [0, 0, 0]
+def reordered(tape: Tape, order: tuple[int, ...]) -> Tape:
+    """The drift over time and the states in an order; InfeasibleError where it depends on time."""
+    if any(0 in found for found in sources(tape)):
+        raise InfeasibleError(
+            "value functions with noise in one coordinate serve no models that change with time yet; "
+            "value functions prove nothing here."
+        )
+    graph = Graph(("t", *(f"y{place}" for place in range(len(order)))))
+    slots = [0] * (len(order) + 1)
     for place, state in enumerate(order):
         slots[1 + state] = 1 + place
     outputs = tape.evaluate(graph.arithmetic(), [graph.input(slot) for slot in slots])
-    return graph.tape([outputs[order[0]], outputs[order[1]]], (2,))
-
-
-class _Reads(dict):  # type: ignore[type-arg]
-    """An arithmetic of "does it depend on t": any operation passes it on."""
-
-    def __missing__(self, key: str) -> object:
-        if key == "const":
-            return lambda value: False
-        if key == "pow":
-            return lambda base, exponent: base
-        return lambda *args: any(args)
+    return graph.tape([outputs[state] for state in order], (len(order),))

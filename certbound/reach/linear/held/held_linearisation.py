@@ -14,10 +14,10 @@ from functools import cached_property
 import numpy as np
 
 from certbound.arrays import Array, Integers
-from certbound.gaussian.response import Jumps, LinearResponse, continuous_response
+from certbound.gaussian.response import Jumps, LinearResponse, balanced, continuous_response
 from certbound.problem.held import HeldLoop
 from certbound.problem.model import compile_numpy
-from certbound.reach.linear.linearisation import FEWEST_PIECES, MOST_PIECES, OWN_STEP, STEP, Linearisation, balanced
+from certbound.reach.linear.linearisation import FEWEST_PIECES, MOST_PIECES, OWN_STEP, STEP, Linearisation
 from certbound.reach.nominal import Cells, initial_cells
 from certbound.reach.remainder import Frame, HeldFrame, HeldRemainder, Remainder
 from certbound.rigor.intervals import Interval

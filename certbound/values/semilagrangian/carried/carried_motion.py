@@ -22,10 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
-from certbound.problem.model import Graph, Tape, jacobian
+from certbound.problem.model import Graph, Tape, jacobian, sources
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete import evaluate
-from certbound.values.semilagrangian.carried.carried_problem import STATES, Voyage, depends
+from certbound.values.semilagrangian.carried.carried_problem import STATES, Voyage
 from certbound.values.semilagrangian.flows import flow, reachable
 
 _UP = 1 + 1e-9
@@ -79,7 +79,8 @@ class Blocks:
 
 def needed(tape: Tape) -> tuple[bool, ...]:
     """Which states the drift depends on: along the others everything is the same."""
-    return tuple(depends(tape, 1 + k) for k in range(STATES))
+    reached = set[int]().union(*sources(tape))
+    return tuple(1 + k in reached for k in range(STATES))
 
 
 def blocks_of(voyage: Voyage, axes: Sequence[Array], step: float, omega: float) -> Blocks:

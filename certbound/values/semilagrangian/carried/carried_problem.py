@@ -10,13 +10,14 @@ import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.errors import InfeasibleError
-from certbound.problem.model import Graph, Tape, compile_numpy
+from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside, Quadratic, Region
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval, sq, sqrt, stack
 from certbound.values.continuous import faces_of, starts_of
 from certbound.values.semilagrangian.confines import Ends, parts_of
+from certbound.values.semilagrangian.noisy_axis import reordered
 from certbound.values.sets import box_around, contains
 
 _PATHS, _STEPS = 400, 200
@@ -97,7 +98,7 @@ def voyage_of(problem: Problem) -> Voyage:
     noisy = int(np.flatnonzero(np.any(gain != 0, axis=1))[0])
     order = (*(k for k in range(STATES) if k != noisy), noisy)
     size = sqrt(sq(Interval.point(gain[noisy])).sum(axis=-1))
-    tape = _ordered(problem.closed_loop, order)
+    tape = reordered(problem.closed_loop, order)
     starts = starts_of(problem)
     stays, obstacles, limits = _limits(problem, noisy)
     low, high = box_around([c for c in problem.constraints if not c.outside], STATES, 0)
@@ -150,37 +151,6 @@ def _check_alone(region: Region, constraint: Inside, noisy: int, outside: bool) 
             f"'{constraint.label}' joins the noisy state to the others; write limits of it as a box of its own, "
             "value functions prove nothing here."
         )
-
-
-def _ordered(tape: Tape, order: tuple[int, ...]) -> Tape:
-    """The drift over ("t", "x", "y", "q")."""
-    if depends(tape, 0):
-        raise InfeasibleError(
-            "value functions with noise in one coordinate serve no models that change with time yet; "
-            "value functions prove nothing here."
-        )
-    graph = Graph(("t", "x", "y", "q"))
-    slots = [0] * (STATES + 1)
-    for place, state in enumerate(order):
-        slots[1 + state] = 1 + place
-    outputs = tape.evaluate(graph.arithmetic(), [graph.input(slot) for slot in slots])
-    return graph.tape([outputs[state] for state in order], (STATES,))
-
-
-def depends(tape: Tape, slot: int) -> bool:
-    """Whether an input reaches an output."""
-    return any(tape.evaluate(_Reads(), [place == slot for place in range(STATES + 1)]))
-
-
-class _Reads(dict):  # type: ignore[type-arg]
-    """An arithmetic of "is it reached": any operation passes it on."""
-
-    def __missing__(self, key: str) -> object:
-        if key == "const":
-            return lambda value: False
-        if key == "pow":
-            return lambda base, exponent: base
-        return lambda *args: any(args)
 
 
 def _closed(
