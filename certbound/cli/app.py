@@ -27,6 +27,8 @@ from certbound.cli.commands import (
 )
 from certbound.cli.messages import BAD_INPUT, INTERRUPTED, explain, for_files, write_error
 from certbound.cli.output import SETTINGS, logging_to_stderr, show
+from certbound.errors import SolverError
+from certbound.watch import OutOfTime
 
 _ClickException = typer.BadParameter.__mro__[2]  # whichever click typer brings: vendored or its own
 _log = logging.getLogger(__name__)
@@ -81,6 +83,8 @@ def _run(words: list[str], command: str) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 0
+    except OutOfTime:
+        return _report(SolverError("nothing was proved in time; give a larger --time-limit"), command, words)
     except Exception as error:  # noqa: BLE001  (the outermost frame: whatever happened, three lines)
         _log.debug("the command ended with an error", exc_info=True)
         return _report(error, command, words)

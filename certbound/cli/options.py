@@ -81,7 +81,7 @@ HorizonOption = Annotated[float | None, option("--horizon", "T", "Seconds, or st
 DeltaOption = Annotated[float | None, option("--delta", "D", "Allowed exit probability.", number)]
 SeedOption = Annotated[int | None, option("--seed", "S", "The same seed gives the same runs.", integer)]
 ClusterOption = Annotated[str | None, option("--cluster", "ADDRESS", "A dask scheduler, tcp://host:port.")]
-PlotOption = Annotated[Path | None, option("--plot", "FILE", "Draw tubes, sets and sample paths.")]
+PlotOption = Annotated[Path | None, option("--plot", "FILE", "Draw what was found: tubes, sets and paths, or curves.")]
 
 
 def settings_of(pairs: Sequence[str] | None) -> dict[str, float]:

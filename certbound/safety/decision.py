@@ -200,9 +200,10 @@ class _Search:
                 raise OutOfTime
 
         def first_bounds() -> None:
-            self._first_bounds(names[1:])
-            if self.safe:
-                raise OutOfTime
+            if not self.safe:
+                self._first_bounds(names[1:])
+                if self.safe:
+                    raise OutOfTime
             self.watch.remind(max(patience - _SOON, 0.0), others)
 
         early = _SOON < patience < math.inf and not self.bounded

@@ -28,7 +28,7 @@ from certbound.rigor.intervals import Interval
 from certbound.values.charts import Chart
 from certbound.values.continuous import bound_mean_time, chart_slabs_of
 from certbound.values.discrete import chart_failures
-from certbound.watch import poll
+from certbound.watch import OutOfTime, poll, seconds_left
 
 _STEP = 0.004  # of log P, between two times at which a curve is read
 _FEWER = {1.0: 1.4, 0.05: 1.27}  # ratio of a horizon to the next shorter one, where P is at most so much
@@ -113,6 +113,8 @@ def _ends_text(low: float, high: float) -> tuple[str, str]:
 def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> ExitTimes:
     """Bound P(exit before s) for every s <= T from above and below, and the mean time of leaving.
 
+    Long horizons come first: once a limit of time is over, what was proved of them stands for all times.
+
     Parameters
     ----------
     problem : Problem
@@ -195,8 +197,12 @@ def _continuous(problem: Problem) -> tuple[Curve, Curve, float]:
         poll(f"exit times up to {horizon:g}")
         ratio = _FEWER[min(p for p in _FEWER if not upper or upper[-1][1] <= p)]
         shorter = horizon / ratio if k + 1 < _SHORTEST else 0.0
-        plain = problem.replace(horizon=horizon)
-        charts = chart_slabs_of(plain, step=_STEP, last=horizon - shorter)
+        try:
+            charts = chart_slabs_of(problem.replace(horizon=horizon), step=_STEP, last=horizon - shorter)
+        except OutOfTime:
+            if not upper:
+                raise
+            break
         upper += _read(problem, charts.upper, horizon, up=True)
         lower += _read(problem, charts.lower, horizon, up=False)
         if k == 0 and charts.lower:
@@ -270,8 +276,8 @@ def _sharper(problem: Problem, low: float, high: float | None) -> tuple[float, f
     """The better of these bounds of the mean and of those by one function of the state, where that proves anything."""
     try:
         with contained("mean time"):
-            found = bound_mean_time(problem)
-    except EngineError:
+            found = bound_mean_time(problem) if seconds_left() > 0 else None
+    except (EngineError, OutOfTime):
         found = None
     if found is None:
         return low, high

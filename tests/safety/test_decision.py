@@ -161,6 +161,16 @@ def test_a_first_bound_that_is_safe_ends_the_slow_engine(monkeypatch: pytest.Mon
     assert seconds < 3
 
 
+def test_what_is_safe_already_is_finished_before_others_are_asked(
+    monkeypatch: pytest.MonkeyPatch, clock: Time
+) -> None:
+    """The first bound of an engine has no margin and no tube: both come with its last."""
+    scripted(monkeypatch, clock, {"linear": [(0.2, -4), (2, -5)], "quadratic": [(1, -1)]})
+    monkeypatch.setitem(ENGINES, "quadratic", replace(ENGINES["quadratic"], soon=1))
+    verdict, _ = run(clock, 10)
+    assert (verdict.status, verdict.method, verdict.log10_delta) == ("SAFE", "linear", -5)
+
+
 def test_an_engine_without_a_chance_comes_last_and_is_brief(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
     asked = scripted(monkeypatch, clock, {"linear": [(100, -2)], "barrier": [(2, -1)]})
     hopeless = replace(ENGINES["linear"], chance=lambda problem: 0.5)

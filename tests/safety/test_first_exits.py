@@ -11,6 +11,7 @@ from certbound.errors import InfeasibleError
 from certbound.problem.files import save
 from certbound.safety import first_exits
 from certbound.values.continuous import bound_mean_time, bound_rate
+from certbound.watch import OutOfTime
 
 
 def brownian(horizon=2.0, drift=0.0, start=0.0):
@@ -205,3 +206,32 @@ def test_the_command_prints_the_curves(tmp_path, capsys):
     assert (tmp_path / "walk.png").stat().st_size > 5000
     assert run(["exit-times", str(tmp_path / "walk.toml")]) == 0
     assert "mean exit time" in capsys.readouterr().out
+
+
+def test_what_was_proved_in_time_stands_for_all_times(monkeypatch):
+    charts, asked = first_exits.chart_slabs_of, []
+
+    def in_time(problem, **options):
+        asked.append(problem.horizon)
+        if len(asked) > 1:
+            raise OutOfTime
+        return charts(problem, **options)
+
+    monkeypatch.setattr(first_exits, "_STEP", 0.05)
+    monkeypatch.setattr(first_exits, "chart_slabs_of", in_time)
+    curves = cb.bound_exit_times(brownian())
+    truth = float(1 - survival(2.0, 0.0, 0.0)[0])
+    assert curves.lower[-1] <= truth <= curves.upper[-1] < 1.1 * truth
+    assert curves.upper[0] > 0  # of longer times
+    assert len(asked) == 2
+
+
+def test_a_command_whose_time_is_over_before_anything_is_proved_says_so(monkeypatch, capsys):
+    def late(problem):
+        raise OutOfTime
+
+    monkeypatch.setattr(first_exits, "bound_exit_times", late)
+    assert run(["exit-times", "ou", "--json"]) == 3
+    said = capsys.readouterr()
+    assert "--time-limit" in json.loads(said.out)["error"] + json.loads(said.out)["try"]
+    assert "Traceback" not in said.err
