@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from certbound.checker.statement.tapes import canonical
 
-_FOR_HUMANS = {"name", "label", "units"}
+_FOR_HUMANS = re.compile(r"name|units|(constraints\[\d+\]|reach)\.label")
+"""Paths; what is drawn stands under names of its own, which may be any."""
 
 
 def first_difference(mine: Any, theirs: Any, path: str = "") -> str:
@@ -23,13 +25,13 @@ def first_difference(mine: Any, theirs: Any, path: str = "") -> str:
     'horizon differs'
     """
     if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
-        if "nodes" in mine and "nodes" in theirs:
+        if isinstance(mine.get("nodes"), list) and isinstance(theirs.get("nodes"), list):
             same = canonical(mine) == canonical(theirs) and mine.get("columns") == theirs.get("columns")
             return "" if same else f"{path} is another function"
         for name in [*mine, *(name for name in theirs if name not in mine)]:
-            if name in _FOR_HUMANS:
-                continue
             place = f"{path}.{name}" if path else str(name)
+            if _FOR_HUMANS.fullmatch(place):
+                continue
             if name not in mine or name not in theirs:
                 return f"{place} differs"
             found = first_difference(mine[name], theirs[name], place)
