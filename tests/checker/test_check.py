@@ -214,6 +214,13 @@ def test_what_is_drawn_is_compared_whatever_it_is_called(name: str) -> None:
     assert first_difference(*data) == f"random.{name}.value differs"
 
 
+def test_the_unit_of_time_which_a_claim_names_is_compared(stepping) -> None:
+    given = stepping.given
+    assert first_difference(given | {"units": {"time": "years"}}, given) == "units.time differs"
+    assert first_difference(given, given | {"units": {"time": "years"}}) == "units.time differs"
+    assert first_difference(given | {"units": {"x1": "m"}}, given) == ""
+
+
 def test_the_order_of_operations_does_not_count() -> None:
     first = cb.DiscreteSystem(lambda x: [0.5 * x[0] + np.sin(x[1]), x[1]], states=2, noise=cb.Gaussian(std=0.1))
 

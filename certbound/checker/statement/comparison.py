@@ -12,10 +12,16 @@ _FOR_HUMANS = re.compile(r"name|units|(constraints\[\d+\]|reach)\.label")
 """Paths; what is drawn stands under names of its own, which may be any."""
 
 
+def _clock(problem: Mapping[str, Any]) -> Any:
+    """The unit of time, which the claim names."""
+    units = problem.get("units")
+    return units.get("time") if isinstance(units, Mapping) else None
+
+
 def first_difference(mine: Any, theirs: Any, path: str = "") -> str:
     """Where two problems' data differ first, in words; empty where they state the same problem.
 
-    Names for humans and the order of a tape's operations do not count.
+    Names for humans, units but that of time, and the order of a tape's operations do not count.
 
     Examples
     --------
@@ -31,6 +37,8 @@ def first_difference(mine: Any, theirs: Any, path: str = "") -> str:
         for name in [*mine, *(name for name in theirs if name not in mine)]:
             place = f"{path}.{name}" if path else str(name)
             if _FOR_HUMANS.fullmatch(place):
+                if name == "units" and _clock(mine) != _clock(theirs):
+                    return "units.time differs"
                 continue
             if name not in mine or name not in theirs:
                 return f"{place} differs"
