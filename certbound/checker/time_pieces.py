@@ -34,8 +34,8 @@ def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
     CertificateError where the problem has no such jumps, or no room for the pieces.
     """
     fixed = not model.continuous or model.plan is not None or model.hold is not None
-    if fixed or not 1 <= count <= MOST_PIECES:
-        raise CertificateError("`proof.jumps` must be left out: time is discrete, inputs are held, or too many.")
+    if fixed or math.isinf(model.horizon) or not 1 <= count <= MOST_PIECES:
+        raise CertificateError("`proof.jumps` must be left out: time is discrete or endless, inputs are held, or many.")
     tape, horizon = model.dynamics, _decimal(model.horizon)
     timed = _timed(tape)
     ends = [horizon * k / count for k in range(count + 1)]

@@ -206,10 +206,8 @@ def test_what_is_drawn_is_compared_whatever_it_is_called(name: str) -> None:
         lambda x, d: 0.5 * x + d, states=["x"], disturbance=cb.Box([-9], [9]), disturbance_names=[name],
         noise=cb.Gaussian(std=0.1),
     )
-    data = [
-        problem_data(cb.Problem(system, initial=[0], safe=[], horizon=2, random={name: cb.Random(law=cb.Gaussian(std=s))}))
-        for s in (0.1, 2.0)
-    ]
+    laws = [{name: cb.Random(law=cb.Gaussian(std=std))} for std in (0.1, 2.0)]
+    data = [problem_data(cb.Problem(system, initial=[0], safe=[], horizon=2, random=law)) for law in laws]
     assert first_difference(data[0], data[0]) == ""
     assert first_difference(*data) == f"random.{name}.value differs"
 
