@@ -107,11 +107,8 @@ def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[s
     if model.hold is not None and model.target is not None:
         raise CertificateError("`problem.hold` must be left out beside a target.")
     if model.members:
-        _named(proof, path, (UNION,))
-        count = len(model.members)
-        rows = Record(proof, path, ("engine", "members")).items("members", count, count)
-        for index, (member, row) in enumerate(zip(model.members, rows)):
-            yield from _parts(replace(model, initial=member, members=()), row, f"{path}.members[{index}]")
+        for one, row, place in _members(model, proof, path):
+            yield from _parts(one, row, place)
     elif model.drawn:
         for one, row, place, _ in _cells(model, proof, path):
             if row is not None:
@@ -123,6 +120,15 @@ def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[s
     else:
         known = tuple(name for name, row in ENGINES.items() if model.hold is None or row.holds)
         yield _named(proof, path, known), model, proof  # type: ignore[misc]  # a mapping: it names an engine
+
+
+def _members(model: Model, proof: object, path: str) -> Iterator[tuple[Model, object, str]]:
+    """The model of every member of a union of starts, its proof, and where it stands."""
+    _named(proof, path, (UNION,))
+    count = len(model.members)
+    rows = Record(proof, path, ("engine", "members")).items("members", count, count)
+    for index, (member, row) in enumerate(zip(model.members, rows)):
+        yield replace(model, initial=member, members=()), row, f"{path}.members[{index}]"
 
 
 def _cells(
@@ -139,6 +145,9 @@ def _cells(
     for record, cell, weight in zip(records, ranges, weights_of(model.drawn, ranges)):
         values = list(model.disturbance)
         for constant, ends in zip(model.drawn, cell):
+            least, most = values[constant.place]
+            if not least <= ends[0] <= ends[1] <= most:
+                raise CertificateError(f"`{path}.cells` must lie in the disturbances' set, beyond which paths fail.")
             values[constant.place] = ends
         yield replace(model, disturbance=values, drawn=()), record["proof"], record.at("proof"), weight
 
@@ -167,9 +176,16 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
 def prove(model: Model, proof: object, budget: Budget, *, lower: bool = False) -> arb:
     """The probability that a proof bounds, from above or below; where the start is a union, the largest of all."""
     check_side(model, proof, lower)
-    if model.drawn and not model.members:
-        return _average(model, proof, budget)
     found = arb(0)
+    if model.members:
+        for one, row, _ in _members(model, proof, "proof"):
+            bound = prove(one, row, budget)
+            if not bound.is_finite():
+                return bound
+            found = found.max(bound)
+        return found
+    if model.drawn:
+        return _average(model, proof, budget)
     for engine, one, part in _parts(model, proof):
         row = ENGINES[engine]
         if math.isinf(one.horizon) and engine not in WHOLE:

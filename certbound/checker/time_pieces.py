@@ -19,6 +19,7 @@ from certbound.errors import CertificateError
 from certbound.problem.model import JUMPS, Node, Tape
 
 MOST_PIECES = 1000
+_LARGEST, _LONGEST = 2**53, 4096  # a value of floor that is a float itself, and bits of a fraction
 _CHOICE = "if_else_zero"
 _OF_TRUTHS = frozenset(["and", "or", "not", _CHOICE])
 _TRUTHS = JUMPS - {_CHOICE, "sign", "floor"}
@@ -33,8 +34,8 @@ def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
     CertificateError where the problem has no such jumps, or no room for the pieces.
     """
     fixed = not model.continuous or model.plan is not None or model.hold is not None
-    if fixed or not 1 <= count <= MOST_PIECES:
-        raise CertificateError("`proof.jumps` must be left out: time is discrete, inputs are held, or too many.")
+    if fixed or math.isinf(model.horizon) or not 1 <= count <= MOST_PIECES:
+        raise CertificateError("`proof.jumps` must be left out: time is discrete or endless, inputs are held, or many.")
     tape, horizon = model.dynamics, _decimal(model.horizon)
     timed = _timed(tape)
     ends = [horizon * k / count for k in range(count + 1)]
@@ -43,7 +44,7 @@ def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
         budget.check()
         lines: dict[int, Ends | None] = {}
         for index in timed:
-            lines[index] = _line(tape.nodes[index], lines, first, last)
+            lines[index] = _short(_line(tape.nodes[index], lines, first, last))
             if index in found:
                 value = lines[index]
                 found[index].append(float(value[0]) if value is not None and value[0] == value[1] else None)
@@ -92,6 +93,12 @@ def _line(node: Node, lines: Mapping[int, Ends | None], first: Fraction, last: F
     return None
 
 
+def _short(line: Ends | None) -> Ends | None:
+    """None of fractions that grow beyond all use."""
+    sizes = [part.bit_length() for end in line or () for part in (end.numerator, end.denominator)]
+    return None if any(size > _LONGEST for size in sizes) else line
+
+
 def _flat(line: Ends) -> bool:
     return line[0] == line[1]
 
@@ -113,7 +120,7 @@ def _step(op: str, given: Sequence[Ends]) -> Ends | None:
     low, high = min(low, high), max(low, high)
     if op == "floor":
         value = Fraction(math.floor(low))
-        return (value, value) if high <= value + 1 else None
+        return (value, value) if high <= value + 1 and abs(value) <= _LARGEST else None
     if low < 0 < high:
         return None
     sign = 0 if low == high == 0 else 1 if low >= 0 else -1

@@ -87,5 +87,6 @@ def diffusion_of(value: Any, states: Sequence[str], name: str = "diffusion") -> 
     if shape[0] != n:
         raise ValueError(f"`{name}` must return {n} rows (one per state), got shape {shape}.")
     if all(node.op != "input" for node in tape.nodes):
-        return frozen(compile_numpy(tape)(*np.zeros(n + 1)).reshape(shape))
+        with np.errstate(all="ignore"):
+            return matrix(name, compile_numpy(tape)(*np.zeros(n + 1)).reshape(shape), rows=n)
     return Tape(inputs=tape.inputs, nodes=tape.nodes, outputs=tape.outputs, shape=shape)

@@ -2,7 +2,8 @@
 
 P(failure) <= P(a constant lies in no cell) + sum over cells of P(it lies there) times the bound that holds for every
 value of the cell. The cell that weighs most is halved until delta is met. From below the same holds of values that
-have a probability of their own.
+have a probability of their own, where nobody chooses: the worst start of one value is not that of another, and a
+disturbance does not know which was drawn. Where there is a choice one cell alone counts.
 """
 
 from __future__ import annotations
@@ -191,7 +192,9 @@ def _refined(cells: Sequence[Cell], watch: Watch, decided: Callable[[Problem], V
 def _ends(problem: Problem, cells: Sequence[Cell]) -> tuple[float, float]:
     """Bounds of the probability of failing from below and above."""
     most = math.fsum([_outside(problem), *(cell.most for cell in cells)]) * _UP
-    return math.fsum(cell.least for cell in cells) * _DOWN, min(most, 1.0)
+    chosen = not (problem.fixed_start or problem.initial.random) or bounds_of(problem).dimension > len(problem.random)
+    least = (max if chosen else math.fsum)([cell.least for cell in cells])
+    return least * _DOWN, min(most, 1.0)
 
 
 def _outside(problem: Problem) -> float:

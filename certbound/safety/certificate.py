@@ -75,10 +75,7 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     if problem.random and not members:
         if verdict.status == "UNSAFE":
             raise CertificateError("certificates state no lower bounds where constants are drawn.")
-        return averaged(
-            problem, cells,
-            [certificate_data(one.plain, one.verdict, attempt=attempt) if one.asked else None for one in cells],
-        )
+        return averaged(problem, cells, [_stated(one, attempt) for one in cells])
     if verdict.status == "UNSAFE" or any(one.status == "UNSAFE" for one in members):
         return _lower_data(problem, verdict, attempt)
     if members:
@@ -107,6 +104,14 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
         return _whole(problem, claim, proof)
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
+
+
+def _stated(cell: Any, attempt: int) -> dict[str, Any] | None:
+    """The certificate of a cell of drawn constants; None where there is none."""
+    try:
+        return certificate_data(cell.plain, cell.verdict, attempt=attempt) if cell.asked else None
+    except CertificateError:
+        return None
 
 
 def _method(name: str, proof: Mapping[str, Any]) -> str:

@@ -86,11 +86,11 @@ def _exits(task: Task, bridge: Bridge | None, p: Parameters) -> Lines:
 def _until_goal(
     number: int, watch: tuple[list[str], list[str], list[str]], lines: tuple[list[str], list[str], list[str]]
 ) -> Lines:
-    """A path ends without failing when it runs into the goal; one that never does fails at the horizon."""
+    """A path ends without failing when it runs into the goal; one that never does fails as its window ends."""
     begin, within, end = lines[0], lines[1], lines[2] + watch[2]
     begin += ["if left >= 0:", "    counts[left, 0] += 1", "    continue", *watch[0], "if left >= 0:", "    continue"]
     within += ["if left >= 0:", "    counts[left, 1 + k * (counts.shape[1] - 1) // steps] += 1", "    break"]
-    within += [*watch[1], "if left >= 0:", "    break"]
+    within += [*watch[1], "if left >= 0:", "    break", f"if k + 1 >= windows[{number}, 1]:", "    break"]
     return begin, within, end, ["if left < 0:", f"    counts[{number}, counts.shape[1] - 1] += 1"]
 
 
@@ -104,6 +104,7 @@ def _kept_goal(
     begin = [*lines[0], "if left >= 0:", "    counts[left, 0] += 1", "    continue"]
     begin += [*keep[0], "left = -1", *watch[0], "arrived = False", *arrives]
     within = [*lines[1], *leaves, "if arrived:", *indent([*keep[1], *leaves]), "else:", *indent([*watch[1], *arrives])]
+    within += [f"if not arrived and k + 1 >= windows[{number}, 1]:", "    break"]
     finish = ["if left < 0 and not arrived:", f"    counts[{number}, counts.shape[1] - 1] += 1"]
     return begin, within, [*lines[2], *keep[2], *watch[2]], finish
 

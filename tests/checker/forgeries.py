@@ -306,6 +306,19 @@ def _(data: Data) -> None:
     data["problem"]["random"]["gain"]["mean"] = exact(0.62)
 
 
+@forges("what is drawn beyond the disturbances' set counts as failing", "drawn", "claims.py", "_cells", "beyond which")
+def _(data: Data) -> None:
+    data["problem"]["disturbance_set"] = [[exact(0.45), exact(0.8)]]
+
+
+@forges("of a union what is drawn is averaged member by member", "drawn", "claims.py", "prove", MORE)
+def _(data: Data) -> None:
+    start, proof = data["problem"]["initial"], data["proof"]
+    proof["cells"].pop()
+    data["problem"]["initial"] = {"kind": "union", "members": [start, start]}
+    data["claim"]["method"], data["proof"] = "union", {"engine": "union", "members": [proof, proof]}
+
+
 @forges("a constant derivative is defined", "straight", "statement/structure.py", "_values", "is not defined")
 def _(data: Data) -> None:
     tape = data["problem"]["dynamics"]

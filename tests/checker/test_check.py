@@ -200,6 +200,25 @@ def test_a_certificate_speaks_of_one_problem_only(stepping, contracting) -> None
     assert check_data(stepping.data, renamed).valid
 
 
+@pytest.mark.parametrize("name", ["name", "label", "units", "nodes"])
+def test_what_is_drawn_is_compared_whatever_it_is_called(name: str) -> None:
+    system = cb.DiscreteSystem(
+        lambda x, d: 0.5 * x + d, states=["x"], disturbance=cb.Box([-9], [9]), disturbance_names=[name],
+        noise=cb.Gaussian(std=0.1),
+    )
+    laws = [{name: cb.Random(law=cb.Gaussian(std=std))} for std in (0.1, 2.0)]
+    data = [problem_data(cb.Problem(system, initial=[0], safe=[], horizon=2, random=law)) for law in laws]
+    assert first_difference(data[0], data[0]) == ""
+    assert first_difference(*data) == f"random.{name}.value differs"
+
+
+def test_the_unit_of_time_which_a_claim_names_is_compared(stepping) -> None:
+    given = stepping.given
+    assert first_difference(given | {"units": {"time": "years"}}, given) == "units.time differs"
+    assert first_difference(given, given | {"units": {"time": "years"}}) == "units.time differs"
+    assert first_difference(given | {"units": {"x1": "m"}}, given) == ""
+
+
 def test_the_order_of_operations_does_not_count() -> None:
     first = cb.DiscreteSystem(lambda x: [0.5 * x[0] + np.sin(x[1]), x[1]], states=2, noise=cb.Gaussian(std=0.1))
 

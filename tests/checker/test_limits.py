@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from flint import arb, arb_mat
 
-from certbound.checker import check_data
+from certbound.checker import check_data, parse
 from certbound.checker.balls.matrices import is_positive_definite
 from certbound.checker.expressions.expansion import Expansion
 from certbound.checker.expressions.graph import Graph
@@ -18,6 +18,8 @@ from certbound.checker.linear.events import sub_gaussian
 from certbound.checker.report import Budget, Unproved
 from certbound.errors import CertificateError
 from certbound.safety.answers import exact
+from tests.checker import lasting_forgeries  # noqa: F401  # they enter themselves into the table
+from tests.checker.forgeries import text
 from tests.checker.test_adversary import linear
 
 Data = dict[str, Any]
@@ -165,3 +167,40 @@ def test_a_variance_that_is_negative_or_no_number_is_refused_where_it_is_read() 
         with pytest.raises(Unproved, match="a variance is negative"):
             sub_gaussian([[arb(1)]], [arb(1)], [arb_mat(1, 1, [variance])], Budget(10))
     assert sub_gaussian([[arb(1)]], [arb.nan()], [arb_mat(1, 1, [arb(0)])], Budget(10)) >= 1
+
+
+def grown(op: str, first: list[Any], count: int, *more: list[Any]) -> Data:
+    """A tape that does the same to its own last value again and again."""
+    nodes: list[list[Any]] = [first]
+    for place in range(count):
+        nodes.append([op, place, *{"mul": [place], "pow": [exact(20.0)]}.get(op, [])])
+    return {"nodes": [*nodes, *more], "outputs": [len(nodes) + len(more) - 1]}
+
+
+@pytest.mark.parametrize(
+    "tape",
+    [grown("sq", ["input", 1], 30), grown("pow", ["const", exact(1.1)], 8), grown("sq", ["const", exact(3.0)], 40)],
+)
+def test_polynomials_of_any_degree_and_length_end_soon(tape: Data) -> None:
+    data, started = parse(text("drift")), time.process_time()
+    data["problem"]["dynamics"] = tape
+    assert "too high a degree" in check_data(data).reason
+    assert time.process_time() - started < 1
+
+
+def test_fractions_of_any_length_end_soon_where_the_clock_decides() -> None:
+    data, started = parse(text("switched")), time.process_time()
+    nodes = data["problem"]["dynamics"]["nodes"]
+    for op, size, count in (("mul", 1.1, 40), ("mul", 1e308, 1)):
+        first = len(nodes)
+        nodes += [["const", exact(size)], *[[op, first + k, first + k] for k in range(count)]]
+        nodes.append(["floor", len(nodes) - 1])
+    assert check_data(data).valid
+    assert time.process_time() - started < 2
+
+
+def test_no_pieces_of_time_where_it_has_no_end() -> None:
+    data = parse(text("lasting"))
+    data["proof"]["jumps"] = 2
+    with pytest.raises(CertificateError, match="endless"):
+        check_data(data)

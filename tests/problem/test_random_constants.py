@@ -101,6 +101,24 @@ def test_the_average_holds_against_simulation_from_both_sides_where_values_are_s
     assert alone.probability > 1.5 * found.probability
 
 
+def test_lower_bounds_of_values_are_not_added_where_each_has_another_worst_start():
+    pushed = """
+        time = "discrete"\nhorizon = 1\ndelta = 0.2\nstates = ["p"]
+        [random]\npush = { law = "rademacher", scale = 0.5 }
+        [dynamics]\np = "p + push"
+        [noise]\nlaw = "gaussian"\nstd = 0.1
+        [initial]\nbox = [[-0.45, 0.45]]
+        [[stay]]\nbox = { p = [-1, 1] }
+    """
+    problem = loads(pushed)
+    verdict = cb.verify_safety(problem, method="values")
+    truth = 0.5 * scipy.stats.norm.sf(0.05 / 0.1)  # from 0.45, and by 0.5 only
+    assert verdict.status == "UNKNOWN"
+    assert 0.98 * truth < 10**verdict.log10_lower <= truth
+    alone = cb.verify_safety(problem.replace(initial=[0.45]), method="values")
+    assert 0.98 * truth < 10**alone.log10_lower <= truth <= 10**alone.log10_delta < 1.02 * truth
+
+
 def test_the_average_is_better_than_the_worst_value_and_never_below_simulation():
     problem = given(UNIFORM).replace(delta=0.022)
     verdict = cb.verify_safety(problem, method="values")

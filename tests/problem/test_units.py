@@ -72,8 +72,10 @@ def test_files_and_certificates_keep_them(problem, verdict, tmp_path):
         save(one, tmp_path / "room.toml")
         assert load(tmp_path / "room.toml").units == {"time": "days", "room": "K"}
     text = certificate_text(problem, verdict)
-    report = check_data(parse(text), json.loads(json.dumps(problem_data(problem.replace(units=None)))))
+    given = [json.loads(json.dumps(problem_data(problem.replace(units=units)))) for units in ({"time": "days"}, None)]
+    report = check_data(parse(text), given[0])
     assert report.valid, report.reason
+    assert "units.time differs" in check_data(parse(text), given[1]).reason  # the claim names it
     assert "within 2 days" in report.claim
 
 

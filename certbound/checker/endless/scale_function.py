@@ -36,6 +36,7 @@ from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
 MOST_CELLS = 20_000
+_MOST_DEGREE, _MOST_BITS = 100, 20_000
 _PROOF = ("engine", "mirrored", "edges", "slopes", "tail")
 
 
@@ -289,6 +290,10 @@ def _polynomial(tape: Tape, state: fmpq_poly) -> list[fmpq_poly]:
             values.append(_RING[node.op](*args))
         else:
             raise Unproved(f"the last piece needs a polynomial model, and {node.op} is none")
+        last = values[-1]
+        bits = max((part.bit_length() for part in (last.denom(), *map(int, last.numer().coeffs()))), default=0)
+        if last.degree() > _MOST_DEGREE or bits > _MOST_BITS:
+            raise Unproved("the model is a polynomial of too high a degree, or with too long coefficients")
     return [values[output] for output in tape.outputs]
 
 

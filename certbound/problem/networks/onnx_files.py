@@ -76,12 +76,16 @@ class _Chain:
         if node.op_type == "Constant":
             self.constants[node.output[0]] = self.constant(given)
             return
+        if node.domain not in ("", "ai.onnx"):
+            raise self.fail(f"{node.op_type} is one of {node.domain}, and not of ONNX")
         known = [self.constants.get(name) for name in node.input]
         if node.op_type == "Transpose" and known[0] is not None:
             self.constants[node.output[0]] = np.transpose(known[0], given.get("perm"))
             return
         if [name for name in node.input if name and name not in self.constants] != [self.current]:
             raise self.fail(f"{node.op_type} {node.name!r} has inputs beside the chain")
+        if node.op_type == "Cast" and given["to"] not in (self.onnx.TensorProto.FLOAT, self.onnx.TensorProto.DOUBLE):
+            raise self.fail("a Cast leads to numbers that are no float32 or float64, which rounds")
         if node.op_type in _AFFINE:
             self.affine(node, known, given)
         elif node.op_type in _PLAIN:
@@ -139,6 +143,8 @@ class _Chain:
     def row(self, numbers: Array) -> Array:
         """A constant as a vector of the chain's width."""
         flat = np.asarray(numbers, dtype=float).reshape(-1)
+        if np.ndim(numbers) == 2 and len(numbers) > 1:
+            raise self.fail(f"a constant of shape {np.shape(numbers)} makes a matrix of the network's values")
         if len(flat) not in (1, self.width):
             raise self.fail(f"a constant of {len(flat)} numbers meets {self.width}")
         return np.broadcast_to(flat, (self.width,)).copy()

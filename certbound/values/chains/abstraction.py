@@ -213,6 +213,8 @@ class _Chain:
         """V and W one step back, on boxes."""
         safe, broken = respected(active_at(self.limits, t), cells, t)
         above, below = images.means(t, value)
+        if self.stays and t >= self.window[1]:  # who has not arrived has failed, wherever the path ends
+            above = below = np.ones(len(cells))
         if self.target is None:
             found = _Sides(above=np.where(safe, above, 1.0), below=np.where(broken, 1.0, below))
             return found, found
@@ -226,8 +228,6 @@ class _Chain:
             done, undone = np.zeros_like(done), np.ones_like(undone)
         inside = np.where(done, there.above, np.where(undone, above, np.maximum(above, there.above)))
         least = np.where(done, there.below, np.where(undone, below, np.minimum(below, there.below)))
-        if self.stays and t > self.window[1]:  # who has not arrived has failed
-            inside = least = np.ones(len(cells))
         return _Sides(above=np.where(safe, inside, 1.0), below=np.where(broken, 1.0, least)), there
 
     def _ringed(self, value: _Sides, shape: tuple[int, ...]) -> _Sides:

@@ -82,11 +82,14 @@ def test_constants_in_nodes_are_folded(tmp_path: Path) -> None:
     ([node("Elu", "in", alpha=2.0)], "alpha"),
     ([node("Add", "in", "x")], "beside the chain"), ([node("Div", "B", "in")], "divided by"),
     ([node("MatMul", "in", "W")], "meet"), ([node("Clip", "in", "low")], "one end only"),
+    ([node("Cast", "in", to=onnx.TensorProto.INT64)], "which rounds"),
+    ([node("Relu", "in", domain="other.company")], "is one of other.company"),
+    ([node("Add", "in", "column")], "makes a matrix"),
     ([node("Gemm", "in", "W", alpha=2.0)], "alpha or beta"), ([node("Add", "in", "B")], "4 numbers meets 2"),
 ])  # fmt: skip
 def test_what_is_no_chain_of_layers_is_refused_in_words(tmp_path: Path, nodes: list[Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        cb.network(file(tmp_path, *nodes, W=W, B=B, low=-0.5))
+        cb.network(file(tmp_path, *nodes, W=W, B=B, low=-0.5, column=[[1.0], [2.0]]))
 
 
 def test_files_that_are_none_and_weights_elsewhere_are_refused(tmp_path: Path) -> None:

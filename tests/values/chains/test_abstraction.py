@@ -227,6 +227,19 @@ def test_targets_disturbances_and_domains_agree_with_finer_functions():
     assert 10**exact.log10_lower <= found.upper <= 1.7 * found.lower
 
 
+@pytest.mark.parametrize("then", [None, "stay"])
+def test_who_misses_a_target_has_failed_as_its_window_ends_and_not_later(then):
+    system = cb.DiscreteSystem(lambda x: x + 1.0, states=["x"], noise=cb.Uniform(halfwidth=0.1))
+    problem = cb.Problem(
+        system, initial=[0], safe=[], horizon=4, domain=cb.Box([-1], [1.5]), leaving="ends",
+        reach=cb.Reach(cb.Box([-0.5], [-0.4]), during=(0, 1), then=then),
+    )  # fmt: skip
+    found = bound_chain(problem, seconds=0.1)
+    assert found.lower == pytest.approx(1, abs=1e-9)
+    assert found.upper == 1
+    assert cb.simulate_exits(problem, paths=1000, rng=0).probability == 1
+
+
 def test_where_the_model_is_undefined_nothing_is_known():
     system = cb.DiscreteSystem(lambda x: 0.1 * np.sqrt(x), states=["x"], noise=cb.Triangular(halfwidth=0.5))
     problem = cb.Problem(
