@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flint import arb, ctx
 
 import certbound as cb
 from certbound.checker import check_data
+from certbound.checker.linear.samplers import Sampler
 from certbound.errors import CertificateError
 from certbound.safety.certificate import certificate_data, problem_data
 
@@ -44,6 +46,14 @@ def test_a_certificate_is_proved_again() -> None:
     report = check_data(stated(), problem_data(lane()))
     assert report.valid, report.reason
     assert report.log10_delta < -3
+
+
+def test_the_length_of_a_piece_is_as_exact_as_the_precision_allows() -> None:
+    nothing: Any = None
+    sampler = Sampler(count=100, parts=2, horizon=5.0, structure=nothing, outputs=[], hidden=[])
+    with ctx.workprec(600):
+        assert sampler.length.rad() < arb(2) ** -590
+        assert all(end.rad() < arb(2) ** -590 for end in sampler.span(298))
 
 
 @pytest.mark.parametrize(
