@@ -33,7 +33,7 @@ _STEPS = (0.25, 0.12, 0.06)
 _FEWEST, _MOST = 40, (160, 320, 640)
 EFFORTS = len(_STEPS)
 PADS = ((0.08, 0.03, 0.01), (0.15, 0.05, 0.02), (0.25, 0.1, 0.03))  # a smaller one where a larger does not close
-_NEARLY, _AT_SAMPLES = 1.3, 3.0
+_NEARLY = 1.3
 _LEAST = 1e-5  # of a row's largest level: along a singular start Z has but what its covariance was raised by
 _ROUNDS = 8
 SLACK = 0.01
@@ -242,8 +242,6 @@ def _padded(engine: Linearisation, bounds: tuple[Array, Array], pad: float) -> t
     low, high = bounds
     size = np.maximum(np.abs(low), np.abs(high))
     room = pad * (high - low) + 1e-9 * size + pad * 1e-11 * engine.remainder_sizes
-    if isinstance(engine, HeldLinearisation):  # a law is read in all states at once: its boxes are the dearest to check
-        room[:, engine.sampling] *= _AT_SAMPLES
     return low - room, high + room
 
 
