@@ -21,7 +21,7 @@ import certbound as cb
 from certbound.arrays import Array
 from certbound.problem.networks import write_network
 
-__all__ = ["TASKS", "Task", "train", "write"]
+__all__ = ["POLICIES", "TASKS", "Task", "train", "write"]
 
 
 @dataclass(frozen=True)
@@ -229,6 +229,12 @@ TASKS: dict[str, Task] = {
 }
 
 
+SIZES = (("tanh", 64), ("tanh", 128), ("tanh", 256), ("relu", 64))
+POLICIES = [(task, *size) for task in TASKS for size in SIZES if TASKS[task].clip is None or size == SIZES[0]]
+POLICIES.append(("cart-pole", "tanh", 32))
+"""Tasks, activations and widths: networks that are held are trained in the sizes that are proved in a minute."""
+
+
 def train(task: Task, *, width: int, activation: str, seed: int = 0, steps: int = 2000) -> list[dict[str, Any]]:
     """Layers (two hidden ones of ``width``) that imitate the task's law, by Adam on batches of 256."""
     rng = np.random.default_rng(seed)
@@ -286,9 +292,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m experiments.networks.training")
     parser.add_argument("folder", type=Path, help="where the policies and problem files are written")
     folder = parser.parse_args().folder
-    for task in TASKS:
-        for activation, width in (("tanh", 64), ("tanh", 128), ("tanh", 256), ("relu", 64)):
-            print(write(folder, task, width=width, activation=activation))
+    for task, activation, width in POLICIES:
+        print(write(folder, task, width=width, activation=activation))
 
 
 if __name__ == "__main__":

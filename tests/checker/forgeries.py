@@ -147,6 +147,27 @@ def _switched() -> cb.Problem:
     return cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=2)
 
 
+def _crossed() -> cb.Problem:
+    """A start on which x + y is nearly 0, and y has a remainder that reads x and z."""
+    system = cb.DiscreteSystem(
+        lambda x: [0.5 * x[0] + 0.1 * x[1], 0.5 * x[1] + 0.3 * x[0] * x[2] + 0.01 * x[0] ** 2,
+                   0.5 * x[2] + 0.3 * x[0] * x[1]],
+        states=["x", "y", "z"], noise=cb.Gaussian(std=1e-3),
+    )
+    start = cb.GaussianStart([0, 0, 0], 1e-2 * np.array([[1, -0.9999, 0], [-0.9999, 1, 0], [0, 0, 0.1]]))
+    return cb.Problem(system, initial=start, safe=[cb.Inside(cb.Ball([0, 0, 0], 3.0))], horizon=2, delta=1e-2)
+
+
+def _sampled() -> cb.Problem:
+    system = cb.ContinuousSystem(
+        lambda x, u: [u[0]], states=["x"], inputs=cb.Box([-1], [1]), diffusion=[[0.05]]
+    )
+    safe = [cb.Inside(cb.Box([-1], [1]))]
+    return cb.Problem(
+        system, initial=[0.2], safe=safe, horizon=0.4, delta=1e-3, plan=lambda x: -np.sin(x[0]), hold=0.2
+    )
+
+
 def _stated(build: Callable[[], cb.Problem], method: str) -> Callable[[], str]:
     def text() -> str:
         problem = build()
@@ -177,6 +198,8 @@ _BASES: dict[str, Callable[[], str]] = {
     "cornered": _stated(_cornered, "linear"),
     "unequal": _stated(_unequal, "linear"),
     "bent": _stated(_bent, "linear"),
+    "crossed": _stated(_crossed, "linear"),
+    "sampled": _stated(_sampled, "linear"),
     "bounded steps": _stated(_bounded, "linear"),
     "straight": lambda: json.dumps(linear()),
     "disturbed": lambda: json.dumps(linear(disturbance=cb.Box([0.0], [0.1]))),
@@ -477,6 +500,42 @@ def _(data: Data) -> None:
 @forges("the windows begin at 0 and rise", "flow", "linear/shared.py", "Shared", "must rise from 0")
 def _(data: Data) -> None:
     data["proof"]["windows"][0] = 1
+
+
+@forges(
+    "a row over further states leaves what these may add", "crossed", "linear/remainder.py", "_Frame._cut", "of y was",
+)
+def _(data: Data) -> None:
+    for name in ("remainder_low", "remainder_high"):  # enough where x + y = 0 would say that x = 0
+        _scale(_cell(data)[name][0], 1, 0.6)
+
+
+# ---- inputs that are held ------------------------------------------------------------------------------------
+
+
+@forges(
+    "what a law leaves over at a sample lies in its box", "sampled", "linear/proof.py", "_Cell._check_remainder",
+    "remainder of u",
+)
+def _(data: Data) -> None:
+    sample = data["proof"]["pieces"] // 2
+    for name in ("remainder_low", "remainder_high"):
+        _cell(data)[name][sample] = exact([0.0, 0.0])
+
+
+@forges(
+    "every entry of a law that varies is stated", "sampled", "linear/samplers.py", "sampler_of", "entries of the law's",
+)
+def _(data: Data) -> None:
+    del data["proof"]["sampled"][0]
+    for row in _cell(data)["sampled"]:
+        del row[0]
+
+
+@forges("no sample lies inside a window", "sampled", "linear/events.py", "Windows", "window is too long")
+def _(data: Data) -> None:
+    place = data["proof"]["windows"].index(data["proof"]["pieces"] // 2)
+    del data["proof"]["windows"][place], _cell(data)["window_levels"][place]
 
 
 # ---- noise that depends on the state -------------------------------------------------------------------------

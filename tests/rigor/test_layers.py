@@ -11,8 +11,8 @@ from certbound.rigor.activations import ACTIVATIONS
 from certbound.rigor.arithmetic import Interval
 from certbound.rigor.layers import bound_network, expand_network, relax_network
 from certbound.rigor.planes import Weights
+from experiments.networks.crown import crown
 from tests.networks import random_network
-from tests.rigor.crown import crown
 
 BOXES = 200
 

@@ -182,12 +182,12 @@ class _Cell:
         bounds = self._supports()
         rooms = self._rooms(bounds)
         found = None if self.state is None else self._stopped(self.state, rooms)
-        inner = len(self.rows[0])
-        for k in range(self.shared.count):
-            levels = self.levels[k]
-            if found is not None:
-                levels = [level + part.at(k) for level, part in zip(levels, found[1][:inner])]
-            self._check_remainder(k, bounds, levels, outputs)
+        with ctx.workprec(_BITS):  # what a piece leaves over is a matter of that piece: nothing magnifies its balls
+            for k in range(self.shared.count):
+                levels = self.levels[k]
+                if found is not None:
+                    levels = [level + part.at(k) for level, part in zip(levels, found[1])]
+                self._check_remainder(k, bounds, levels, outputs)
         return self._events(values, rooms, found)
 
     def _stopped(self, state: StateNoise, rooms: list[list[arb | None]]) -> tuple[arb, list[Along]]:
@@ -322,7 +322,7 @@ class _Cell:
                 names = ", ".join(self.model.dynamics.inputs[slot] for slot in hidden)
                 raise Unproved(f"{self.model.states[i]} may jump with {names}, in which it is linear otherwise")
             frame = self.frames[i] if number_ is None else self.shared.coordinates(output.states)
-            polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=frame)
+            polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=frame, sides=sides)
             least, most = (self.low[k][i] * scale).upper(), (self.high[k][i] * scale).lower()
             if not output.prove(polytope, least, most, self.budget):
                 name = self.model.states[i]

@@ -42,12 +42,16 @@ class PieceData:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Polytope:
-    """low <= row . s <= high for some rows over all states; ``frame`` numbers the rows used as coordinates."""
+    """low <= row . s <= high for some rows over all states; ``frame`` numbers the rows used as coordinates.
+
+    ``sides`` are the ranges of single states, where the rows bound them.
+    """
 
     rows: Sequence[Sequence[arb]]
     low: Sequence[arb]
     high: Sequence[arb]
     frame: Sequence[int]
+    sides: Mapping[int, Side]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -260,10 +264,19 @@ class _Frame:
             except ZeroDivisionError as error:
                 raise Unproved("the frame of an output is not regular") from error
         self.cuts = [
-            Cut(self._form(row), low, high)
-            for number, (row, low, high) in enumerate(zip(polytope.rows, polytope.low, polytope.high))
-            if number not in chosen and m > 1 and _lives_in(row, states)
+            cut for number in range(len(polytope.rows)) if number not in chosen and m > 1
+            for cut in self._cut(number)
         ]
+
+    def _cut(self, number: int) -> list[Cut]:
+        """A row of the polytope as a cut of the output's own states: what other states add is anywhere in its range."""
+        polytope, states = self.polytope, self.output.states
+        row, low, high = polytope.rows[number], polytope.low[number], polytope.high[number]
+        others = [j for j, value in enumerate(row) if j not in states and not value.is_zero()]
+        if all(row[j].is_zero() for j in states) or not all(j in polytope.sides for j in others):
+            return []
+        rest = sum((row[j] * polytope.sides[j][0].union(polytope.sides[j][1]) for j in others), arb(0))
+        return [Cut(self._form(row), (low - rest).lower(), (high - rest).upper())]
 
     def _form(self, row: Sequence[arb]) -> list[arb]:
         """A row over the states as a form over sigma."""

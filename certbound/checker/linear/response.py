@@ -16,14 +16,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from flint import arb, arb_mat
+from flint import arb, arb_mat, ctx
 
 from certbound.checker.balls import column, diagonal, identity, magnitude, row_sums
 from certbound.checker.report import Budget, Unproved
 
 _TERMS = 60
+"""Of a series at the precision of a check; more at higher ones."""
 _SWEEPS, _FARTHEST = 20, 300
-_SMALL = arb(2) ** -100
+_GUARD = 28
+"""Bits of the working precision that the rest of a series may take: one that is the same at every precision is what
+products of many transition matrices magnify."""
 _ROWS, _BLOCK = 512, 3e6
 """Rows that are carried back together, and products of numbers between two looks at the clock."""
 
@@ -68,7 +71,8 @@ def _series(
         alpha, kappa = alpha + row_sums(a.transpose()), kappa + row_sums(k.transpose())
     older, newer, total = start * 0, start, start
     small, big = arb(0), row_sums(start)
-    for i in range(_TERMS):
+    least = arb(2) ** (_GUARD - ctx.prec)
+    for i in range(max(_TERMS, _TERMS * ctx.prec // 128)):
         term = a * newer + k * older
         if twosided:
             term = term + term.transpose()
@@ -79,7 +83,7 @@ def _series(
         small, big = big, (size / (i + 1)).upper()
         total = total + newer
         rest = _tail(small, big, alpha, kappa, i + 1)
-        if rest is not None and rest < _SMALL * (1 + row_sums(total)):
+        if rest is not None and rest < least * (1 + row_sums(total)):
             return total + arb_mat(n, n, [arb(0, rest)] * (n * n))
     raise Unproved("the pieces are too long for the slope: its norm times a piece's length is beyond all use")
 

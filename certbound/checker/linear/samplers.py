@@ -49,15 +49,20 @@ def raised(model: Model) -> Model:
 class Sampler:
     """Sampling times among the pieces of a proof, and the step that one of them is.
 
-    ``parts`` pieces of a ``length`` follow each of the ``count`` sampling times.
+    ``parts`` equal pieces of the ``horizon`` follow each of the ``count`` sampling times.
     """
 
     count: int
     parts: int
-    length: arb
+    horizon: float
     structure: Structure
     outputs: list[OutputRemainder]
     hidden: list[list[int]]
+
+    @property
+    def length(self) -> arb:
+        """Of a piece, at the working precision: transition matrices are as exact as it is."""
+        return arb(self.horizon) / (self.count * self.parts)
 
     @property
     def varying(self) -> list[tuple[int, int]]:
@@ -110,7 +115,7 @@ def sampler_of(model: Model, record: Record, pieces: int, budget: Budget) -> Sam
     if given != structure.states.varying:
         raise Unproved("`proof.sampled` does not list the entries of the law's Jacobian that vary")
     return Sampler(
-        count=hold.count, parts=parts - 1, length=arb(model.horizon) / (hold.count * (parts - 1)), structure=structure,
+        count=hold.count, parts=parts - 1, horizon=model.horizon, structure=structure,
         outputs=remainders(step, structure, budget),
         hidden=[structure.hidden(step, output) for output in range(step.dimension)],
     )

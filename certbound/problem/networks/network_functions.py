@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from inspect import Parameter, Signature
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ _LARGEST = 64_000_000
 class NetworkFunction:
     """A network, to be called in a model: ``policy(x)`` on a vector, or ``policy(x[0], x[1])`` on its entries.
 
-    Made by :func:`network`. On arrays it computes in floats, (..., inputs) to (..., outputs).
+    Made by :func:`network`. On arrays it computes in floats, (..., inputs) to (..., outputs). As a plan or a model
+    itself it is a function of all states, ``x``.
 
     Attributes
     ----------
@@ -25,11 +27,13 @@ class NetworkFunction:
         Its layers, as plain data.
     """
 
+    __signature__ = Signature([Parameter("x", Parameter.POSITIONAL_OR_KEYWORD)])
+
     def __init__(self, data: Network) -> None:
         self.data = data
 
-    def __call__(self, *args: Any) -> Any:
-        return call_network(self.data, *args)
+    def __call__(self, *args: Any, **named: Any) -> Any:
+        return call_network(self.data, *args, *named.values())
 
     @property
     def inputs(self) -> int:

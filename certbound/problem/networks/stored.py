@@ -1,8 +1,8 @@
 """Networks as lists of layers: in Python, in JSON files, and in NumPy's ``.npz`` files.
 
-A JSON file holds ``{"layers": [{"weights": [[...]], "bias": [...], "activation": "tanh"}, ...]}``. An ``.npz`` file
-holds ``weights_0``, ``bias_0``, ``weights_1``, ... and ``activations`` (text), with ``constants_k`` where an activation
-has constants; arrays of objects are refused, so that nothing is executed.
+A JSON file holds ``{"layers": [{"weights": [[...]], "bias": [...], "activation": "tanh"}, ...]}``, or the list alone.
+An ``.npz`` file holds ``weights_0``, ``bias_0``, ``weights_1``, ... and ``activations`` (text), with ``constants_k``
+where an activation has constants; arrays of objects are refused, so that nothing is executed.
 """
 
 from __future__ import annotations
@@ -67,9 +67,11 @@ def read_json(path: Path) -> list[Layer]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"`source` must be a JSON file, {str(path)!r} is none: {error}.") from error
-    if not isinstance(content, dict) or set(content) != {"layers"}:
-        raise ValueError(f"`source` must hold `layers` alone, {str(path)!r} does not.")
-    return layers_of(content["layers"])
+    if isinstance(content, dict) and set(content) == {"layers"}:
+        content = content["layers"]
+    if not isinstance(content, list):
+        raise ValueError(f"`source` must hold a list of layers, or `layers` alone, {str(path)!r} does not.")
+    return layers_of(content)
 
 
 _MOST_BYTES = 64_000_000

@@ -34,6 +34,7 @@ _FEWEST, _MOST = 40, (160, 320, 640)
 EFFORTS = len(_STEPS)
 PADS = ((0.08, 0.03, 0.01), (0.15, 0.05, 0.02), (0.25, 0.1, 0.03))  # a smaller one where a larger does not close
 _NEARLY = 1.3
+_LEAST = 1e-5  # of a row's largest level: along a singular start Z has but what its covariance was raised by
 _ROUNDS = 8
 SLACK = 0.01
 _NEAR = 0.9  # of the logarithm that the engine proved
@@ -174,7 +175,8 @@ def _levels(run: LinearRun, nonlinear: Share) -> _Levels | None:
         for d in range(count):
             event = own.along(run.rows[cell, :, d])
             if event.profile.max() > 0:
-                levels[cell, :, d] = level_scale(event, event.profile, share) * event.profile
+                profile = np.maximum(event.profile, _LEAST * event.profile.max())
+                levels[cell, :, d] = level_scale(event, event.profile, share) * profile
             logs.append(math.log(2.0) + event.log_exceedance(levels[cell, :, d]))
         events.append(own)
         spent.append(logs)
@@ -195,9 +197,7 @@ def _stated(run: LinearRun, given: _Levels, bounds: tuple[Array, Array]) -> Stat
             shared = logsumexp(np.array(given.spent[cell]))
             total = min(total, correlated(own, run.requirements[cell], rooms, shared, asked))
         worst = max(worst, total)
-    return Stated(
-        levels=given.levels, bounds=bounds, events=given.events, log_probability=float(min(worst, 0.0))
-    )
+    return Stated(levels=given.levels, bounds=bounds, events=given.events, log_probability=float(min(worst, 0.0)))
 
 
 def widened(run: LinearRun, levels: Array, found: tuple[Array, Array], pad: float) -> tuple[Array, Array] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 import pytest
-from flint import arb, arb_mat
+from flint import arb, arb_mat, ctx
 
 import certbound as cb
 from certbound.checker import check_data, parse
@@ -25,6 +25,19 @@ def test_balanced_units_bring_a_matrix_in_mixed_units_back() -> None:
     again = diagonal([1 / unit for unit in found]) * mixed * diagonal(found)
     assert row_sums(again) < 2 * row_sums(own)
     assert balance(own * 0) == [1, 1, 1]
+
+
+def test_what_a_series_leaves_out_follows_the_precision() -> None:
+    slope = matrix([[0.2, 2.0], [-0.3, 0.1]])
+    with ctx.workprec(700):
+        found = continuous_piece(slope, slope, arb(0.1), diagonal([arb(0.1), arb(0.2)]))
+        assert all(x.rad() < arb(2) ** -600 for x in [*found.transition.entries(), *found.noise.entries()])
+        assert all(found.transition[i, j].overlaps(matrix_at_128(slope)[i, j]) for i in range(2) for j in range(2))
+
+
+def matrix_at_128(slope: arb_mat) -> arb_mat:
+    with ctx.workprec(128):
+        return continuous_piece(slope, slope, arb(0.1), slope * 0).transition
 
 
 def test_the_series_of_a_piece_run_in_its_own_units() -> None:

@@ -132,9 +132,10 @@ def test_json_and_npz_hold_the_same_network(tmp_path: Path, activation: str) -> 
     plain = [{key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in row.items()}
              for row in rows]  # fmt: skip
     (tmp_path / "a.json").write_text(json.dumps({"layers": plain}))
+    (tmp_path / "b.json").write_text(json.dumps(plain))
     write_network(cb.network(rows), tmp_path / "a.npz")
     point = [0.2, 0.7]
-    for name in ("a.json", "a.npz"):
+    for name in ("a.json", "b.json", "a.npz"):
         np.testing.assert_array_equal(cb.network(tmp_path / name)(point), cb.network(rows)(point))
 
 
@@ -175,6 +176,21 @@ def test_a_pickled_model_is_the_same_function() -> None:
     copy = pickle.loads(pickle.dumps(tape))
     assert copy.nodes[2].part.network is copy.nodes[3].part.network
     np.testing.assert_array_equal(compile_numpy(copy)(0.1, 0.2), compile_numpy(tape)(0.1, 0.2))
+
+
+def test_a_network_is_a_plan_of_all_states_as_it_is() -> None:
+    policy = cb.network(random_layers("tanh"))
+    system = cb.ContinuousSystem(
+        lambda x, u: [x[1] + u[0], u[1]], states=["a", "b"], inputs=cb.Box([-9, -9], [9, 9]), diffusion=0.1 * np.eye(2)
+    )
+    safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    for hold in (None, 0.5):
+        same = [
+            cb.Problem(system, initial=[0, 0], safe=safe, horizon=1, plan=plan, hold=hold)
+            for plan in (policy, lambda x: policy(x))
+        ]
+        tapes = [problem.plan if hold else problem.closed_loop for problem in same]
+        assert tapes[0].nodes == tapes[1].nodes
 
 
 def test_a_network_is_called_on_vectors_and_batches() -> None:
