@@ -25,7 +25,7 @@ from certbound.checker.endless import (
 from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, number
 from certbound.checker.report import Budget, Unproved
-from certbound.checker.statement import Model, met_at, weights_of
+from certbound.checker.statement import Model, met_at, turned_model, weights_of
 from certbound.checker.time_pieces import jumps_of, with_time_pieces
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
@@ -39,6 +39,9 @@ RANDOM = "random"
 
 REACH = "reach"
 """The engine that a proof names where the problem has a target: it meets the target at one time."""
+
+COORDINATES = "coordinates"
+"""The engine that a proof names whose own proof is about the problem in other coordinates."""
 
 WHOLE = ("lasting", "drift", "rate")
 """The engines that prove targets and infinite horizons themselves."""
@@ -85,7 +88,7 @@ class Engine:
 
 def engine_of(proof: object, method: str) -> str:
     """The engine that a proof names, which ``claim.method`` must name too."""
-    engine = _named(proof, "proof", (*ENGINES, UNION, RANDOM, REACH))
+    engine = _named(proof, "proof", (*ENGINES, UNION, RANDOM, REACH, COORDINATES))
     if method != engine:
         raise CertificateError(f"`claim.method` must be \"{engine}\", the proof's engine, got {quoted(method)}.")
     return engine
@@ -102,7 +105,7 @@ def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[s
     """A proof's engine, its plain model and its numbers; where the start is a union, those of every member.
 
     A target is met at one time, which the proof names. CertificateError where the start is a union, or there is a
-    target, and the proof does not say so, or the other way round.
+    target, and the proof does not say so, or the other way round. In other coordinates the model is another one.
     """
     if model.hold is not None and model.target is not None:
         raise CertificateError("`problem.hold` must be left out beside a target.")
@@ -122,6 +125,9 @@ def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[s
         yield from _parts(met_at(model, record.number("time")), record["proof"], f"{path}.proof")
     else:
         known = tuple(name for name, row in ENGINES.items() if model.hold is None or row.holds)
+        if isinstance(proof, Mapping) and proof.get("engine") == COORDINATES:
+            record = Record(proof, path, ("engine", "matrix", "inverse", "proof"))
+            model, proof, path = turned_model(model, record), record["proof"], f"{path}.proof"
         yield _named(proof, path, known), model, proof  # type: ignore[misc]  # a mapping: it names an engine
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from certbound.safety.certificates.barrier import barrier_proof
 from certbound.safety.certificates.constants import constants_proof
+from certbound.safety.certificates.coordinates import of_coordinates
 from certbound.safety.certificates.diffusion import response_proof
 from certbound.safety.certificates.quadratic import quadratic_proof
 from certbound.safety.certificates.values import values_proof, values_proof_below
@@ -11,6 +12,7 @@ from certbound.safety.certificates.values import values_proof, values_proof_belo
 __all__ = [
     "barrier_proof",
     "constants_proof",
+    "of_coordinates",
     "quadratic_proof",
     "response_proof",
     "values_proof",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.constants import constants_engine
+from certbound.safety.engines.coordinates import Turned, in_coordinates
 from certbound.safety.engines.erosion import Erosion, erode
 from certbound.safety.engines.linear import linear_engine
 from certbound.safety.engines.linear_sketch import linear_chance
@@ -18,10 +19,12 @@ __all__ = [
     "constants_engine",
     "erode",
     "Erosion",
+    "in_coordinates",
     "joined",
     "linear_chance",
     "linear_engine",
     "prove_truncated",
     "quadratic_engine",
+    "Turned",
     "values_engine",
 ]

@@ -1,0 +1,134 @@
+"""Engines asked once more in other coordinates: where a limit is oblique, and what was proved does not do.
+
+A limit n . x <= b becomes a limit of one state y = n . x, and where y has no noise of its own and its rate is a sum of
+states, that sum becomes a state too: of vehicles that must keep their order the distances and their rates. What noise
+and drift have in common cancels then, and windows and boxes, which are entrywise, lose less.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.errors import EnclosureError, InfeasibleError
+from certbound.problem.model import Tape, turned_tape
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Faces, HalfSpace
+from certbound.problem.systems import ContinuousSystem
+from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request, is_at_most
+from certbound.safety.engines.turning import exact_product, turned_problem
+
+Prove = Callable[[Problem, Request], EngineAnswer]
+
+_MOST = 20  # states
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Turned:
+    """What was proved in coordinates y = ``matrix`` x: the answer to the problem stated in y."""
+
+    matrix: Array
+    inverse: Array
+    problem: Problem
+    answer: EngineAnswer
+
+
+def in_coordinates(prove: Prove) -> Prove:
+    """The engine, asked once more in other coordinates where its answer is weaker than delta and a limit is oblique."""
+
+    def proved(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+        before = asked.before if isinstance(asked.before, Turned) else None
+        plain = prove(problem, replace(asked, before=None) if before else asked)
+        if asked.quick or asked.first or (plain.applicable and is_at_most(min(plain.log10_delta, 0.0), problem.delta)):
+            return plain
+        try:
+            turn = axes(problem)
+            if turn is None:
+                return plain
+            if plain.applicable and plain.log10_delta < 0:
+                asked.found(plain)
+            other = turned_problem(problem, *turn)
+
+            def stated(answer: EngineAnswer) -> EngineAnswer:
+                words = _words(problem.system.states, turn[0])
+                return replace(
+                    plain, applicable=True, log10_delta=answer.log10_delta, margin=None, time=None, constraint=None,
+                    reason=f"{answer.reason.rstrip('.')}; in the coordinates {words}.", method=answer.method,
+                    foresight=answer.foresight, conclusive=False,
+                    details=Turned(matrix=turn[0], inverse=turn[1], problem=other, answer=answer),
+                )  # fmt: skip
+
+            request = replace(
+                asked, before=before.answer.details if before else None,
+                found=lambda answer: asked.found(stated(answer)),
+            )  # fmt: skip
+            answer = prove(other, request)
+        except (InfeasibleError, EnclosureError):
+            return plain
+        better = answer.applicable and answer.certified and answer.log10_delta < min(plain.log10_delta, 0.0)
+        return stated(answer) if better else plain
+
+    return proved
+
+
+def axes(problem: Problem) -> tuple[Array, Array] | None:
+    """T and its inverse, such that oblique limits are limits of one state of y = T x; None where nothing is gained.
+
+    InfeasibleError where that is not exact in floats.
+    """
+    system, n = problem.system, problem.system.dimension
+    if not isinstance(system, ContinuousSystem) or not 1 < n <= _MOST or problem.hold is not None:
+        return None
+    rows = [region.lifted(region.form.normals, n) for region in (one.region for one in problem.constraints)
+            if isinstance(region.form, Faces)]  # fmt: skip
+    limits = np.vstack([np.zeros((0, n)), *rows])
+    turn, pivots = (np.eye(n), np.eye(n)), list[int]()
+    turn = _sheared(turn, [row for row in limits if np.count_nonzero(row) > 1], limits, pivots)
+    if not pivots:
+        return None
+    rates = turned_tape(problem.closed_loop, turn[1], turn[0])[1]
+    smooth = [rate for place in pivots if (rate := rates[place]) and not _noisy(problem, turn, place)]
+    lifted = exact_product([[rate.get(j, 0.0) for j in range(n)] for rate in smooth], turn[0]) if smooth else rows[0][:0]
+    return _sheared(turn, list(lifted), lifted, pivots)
+
+
+def _sheared(
+    turn: tuple[Array, Array], rows: Sequence[Array], others: Array, pivots: list[int]
+) -> tuple[Array, Array]:
+    """T and its inverse with rows . x, or a multiple of it, in place of one state each, which enter ``pivots``.
+
+    The state is one that few of ``others`` ask for, whose factor is a power of two: then shears are exact.
+    """
+    matrix, inverse = turn
+    for row in rows:
+        own = exact_product(row[None], inverse)[0]
+        places = [j for j in np.flatnonzero(own).tolist() if abs(math.frexp(own[j])[0]) == 0.5 and j not in pivots]
+        if np.count_nonzero(own) < 2 or not places:
+            continue
+        place = min(places, key=lambda j: (np.count_nonzero(others[:, j]), j))
+        shear, back = np.eye(len(own)), np.eye(len(own))
+        shear[place] = own / own[place]
+        back[place] = -shear[place]
+        back[place, place] = 1.0
+        matrix, inverse = exact_product(shear, matrix), exact_product(inverse, back)
+        pivots.append(place)
+    return matrix, inverse
+
+
+def _noisy(problem: Problem, turn: tuple[Array, Array], place: int) -> bool:
+    """Whether a state of y = T x has noise of its own."""
+    diffusion = problem.system.diffusion
+    if not isinstance(diffusion, Tape):
+        return bool(np.any(exact_product(turn[0][place : place + 1], diffusion)))
+    m = diffusion.shape[1]
+    return any(row != {} for row in turned_tape(diffusion, turn[1], turn[0])[1][place * m : (place + 1) * m])
+
+
+def _words(states: Sequence[str], matrix: Array) -> str:
+    """The states of y that are none of x."""
+    rows = [row for row in matrix if np.count_nonzero(row) > 1]
+    return ", ".join(HalfSpace(row, 0.0).describe(states, "inside").partition(" <= ")[0] for row in rows)
