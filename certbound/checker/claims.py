@@ -160,6 +160,8 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
         raise CertificateError("`claim.log10_lower` must not be there for an unknown constant, which does not react.")
     if lower and (model.members or model.drawn):
         raise CertificateError("`claim.log10_lower` must not be there for a union of starts.")
+    if lower and isinstance(proof, Mapping) and proof.get("engine") == COORDINATES:
+        raise CertificateError("`claim.log10_lower` must not be there in other coordinates, where starts are enclosed.")
     for engine, _, part in _parts(model, proof):
         if lower and model.target is not None and engine not in WHOLE:
             raise CertificateError("`claim.log10_lower` must not be there beside a target, but in proofs that know it.")

@@ -153,7 +153,7 @@ ENGINES: dict[str, Engine] = {
             "UNSAFE",
             prove=in_coordinates(values_engine),
             write=of_coordinates(values_proof),
-            write_below=values_proof_below,
+            write_below=of_coordinates(values_proof_below, below=True),
             reserve=True,
             dear=True,
             reaches=True,

@@ -17,7 +17,6 @@ from flint import arb
 
 from certbound.checker.balls import matrix
 from certbound.checker.reading import Record
-from certbound.checker.report import Unproved
 from certbound.checker.statement.problem import Initial, Model, Noise
 from certbound.checker.statement.regions import Constraint
 from certbound.errors import CertificateError
@@ -36,7 +35,7 @@ def turned_model(model: Model, record: Record) -> Model:
     """The model in the coordinates that a proof states.
 
     CertificateError where ``matrix`` and ``inverse`` are not inverse to each other, or the problem is none that is
-    stated in other coordinates; Unproved where that is not exact.
+    stated in other coordinates, or not exactly.
     """
     n = model.dimension
     random = model.initial.covariance is not None or bool(model.members or model.drawn)
@@ -51,7 +50,7 @@ def turned_model(model: Model, record: Record) -> Model:
         raise CertificateError(f"`{record.at('inverse')}` must be the inverse of `matrix`, exactly.")
     moved = {i for i in range(n) if any(back[i][j] != (i == j) for j in range(n))}
     if model.domain is not None and any(model.domain[j] != (None, None) for j in moved):
-        raise Unproved("the domain bounds a state that the stated coordinates replace")
+        raise CertificateError("`problem.domain` bounds a state that the stated coordinates replace.")
     return replace(
         model, dynamics=_composed(model.dynamics, turn, back), noise=_noise(model.noise, turn, back),
         initial=_start(model.initial, turn),
@@ -84,13 +83,13 @@ def _constraint(constraint: Constraint, back: Rows, moved: set[int]) -> Constrai
     if not moved & set(region.coordinates):
         return constraint
     if region.round or isinstance(region.center, Tape) or any(region.center):
-        raise Unproved(f"'{constraint.label}' is round or has a centre, and is not stated in other coordinates")
+        raise CertificateError("`problem.constraints` has a set that is round or has a centre, in other coordinates.")
     faces = []
     for face in region.faces:
         own = list(zip(region.coordinates, map(Fraction, face)))
         row = [sum((c * back[i][j] for i, c in own), Fraction(0)) for j in range(n)]
         if not all(map(_is_float, row)):
-            raise Unproved(f"'{constraint.label}' is not exact in the stated coordinates")
+            raise CertificateError("`problem.constraints` has a limit that is not exact in the stated coordinates.")
         faces.append([float(c) for c in row])
     kind = "halfspace" if region.kind == "halfspace" else "polytope"
     turned = replace(region, kind=kind, coordinates=tuple(range(n)), center=[0.0] * n, faces=faces)

@@ -108,7 +108,8 @@ class _Sums:
             for one, other in ((a, b), (b, a)):
                 if not one.terms:
                     return self.combined([(one.constant, other)])
-            return times(a, b)
+            found: Sum = times(a, b)
+            return found
 
         def ratio(a: Sum, b: Sum) -> Sum:
             exact = not b.terms and b.constant != 0 and _is_float(1 / b.constant)

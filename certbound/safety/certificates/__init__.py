@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from certbound.safety.certificates.barrier import barrier_proof
 from certbound.safety.certificates.constants import constants_proof
-from certbound.safety.certificates.coordinates import of_coordinates
 from certbound.safety.certificates.diffusion import response_proof
 from certbound.safety.certificates.quadratic import quadratic_proof
+from certbound.safety.certificates.turned_proofs import of_coordinates
 from certbound.safety.certificates.values import values_proof, values_proof_below
 
 __all__ = [

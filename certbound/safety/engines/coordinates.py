@@ -23,18 +23,21 @@ from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request, is_at_most
 from certbound.safety.engines.turning import exact_product, turned_problem
 
 Prove = Callable[[Problem, Request], EngineAnswer]
+Turn = tuple[Array, Array]
+"""T and its inverse."""
 
 _MOST = 20  # states
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Turned:
-    """What was proved in coordinates y = ``matrix`` x: the answer to the problem stated in y."""
+    """What was proved in coordinates y = ``matrix`` x: the answer to the problem stated in y, and the plain one."""
 
     matrix: Array
     inverse: Array
     problem: Problem
     answer: EngineAnswer
+    plain: EngineAnswer
 
 
 def in_coordinates(prove: Prove) -> Prove:
@@ -42,7 +45,7 @@ def in_coordinates(prove: Prove) -> Prove:
 
     def proved(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         before = asked.before if isinstance(asked.before, Turned) else None
-        plain = prove(problem, replace(asked, before=None) if before else asked)
+        plain = prove(problem, replace(asked, before=before.plain.details) if before else asked)
         if asked.quick or asked.first or (plain.applicable and is_at_most(min(plain.log10_delta, 0.0), problem.delta)):
             return plain
         try:
@@ -59,7 +62,7 @@ def in_coordinates(prove: Prove) -> Prove:
                     plain, applicable=True, log10_delta=answer.log10_delta, margin=None, time=None, constraint=None,
                     reason=f"{answer.reason.rstrip('.')}; in the coordinates {words}.", method=answer.method,
                     foresight=answer.foresight, conclusive=False,
-                    details=Turned(matrix=turn[0], inverse=turn[1], problem=other, answer=answer),
+                    details=Turned(matrix=turn[0], inverse=turn[1], problem=other, answer=answer, plain=plain),
                 )  # fmt: skip
 
             request = replace(
@@ -75,7 +78,7 @@ def in_coordinates(prove: Prove) -> Prove:
     return proved
 
 
-def axes(problem: Problem) -> tuple[Array, Array] | None:
+def axes(problem: Problem) -> Turn | None:
     """T and its inverse, such that oblique limits are limits of one state of y = T x; None where nothing is gained.
 
     InfeasibleError where that is not exact in floats.
@@ -92,13 +95,13 @@ def axes(problem: Problem) -> tuple[Array, Array] | None:
         return None
     rates = turned_tape(problem.closed_loop, turn[1], turn[0])[1]
     smooth = [rate for place in pivots if (rate := rates[place]) and not _noisy(problem, turn, place)]
-    lifted = exact_product([[rate.get(j, 0.0) for j in range(n)] for rate in smooth], turn[0]) if smooth else rows[0][:0]
-    return _sheared(turn, list(lifted), lifted, pivots)
+    if not smooth:
+        return turn
+    sums = exact_product(np.array([[rate.get(j, 0.0) for j in range(n)] for rate in smooth]), turn[0])
+    return _sheared(turn, list(sums), sums, pivots)
 
 
-def _sheared(
-    turn: tuple[Array, Array], rows: Sequence[Array], others: Array, pivots: list[int]
-) -> tuple[Array, Array]:
+def _sheared(turn: Turn, rows: Sequence[Array], others: Array, pivots: list[int]) -> Turn:
     """T and its inverse with rows . x, or a multiple of it, in place of one state each, which enter ``pivots``.
 
     The state is one that few of ``others`` ask for, whose factor is a power of two: then shears are exact.
@@ -119,8 +122,9 @@ def _sheared(
     return matrix, inverse
 
 
-def _noisy(problem: Problem, turn: tuple[Array, Array], place: int) -> bool:
+def _noisy(problem: Problem, turn: Turn, place: int) -> bool:
     """Whether a state of y = T x has noise of its own."""
+    assert isinstance(problem.system, ContinuousSystem)
     diffusion = problem.system.diffusion
     if not isinstance(diffusion, Tape):
         return bool(np.any(exact_product(turn[0][place : place + 1], diffusion)))
@@ -128,7 +132,7 @@ def _noisy(problem: Problem, turn: tuple[Array, Array], place: int) -> bool:
     return any(row != {} for row in turned_tape(diffusion, turn[1], turn[0])[1][place * m : (place + 1) * m])
 
 
-def _words(states: Sequence[str], matrix: Array) -> str:
+def _words(states: tuple[str, ...], matrix: Array) -> str:
     """The states of y that are none of x."""
     rows = [row for row in matrix if np.count_nonzero(row) > 1]
     return ", ".join(HalfSpace(row, 0.0).describe(states, "inside").partition(" <= ")[0] for row in rows)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -51,7 +52,9 @@ def turned_problem(problem: Problem, matrix: Array, inverse: Array) -> Problem:
                                           for j in moved):  # fmt: skip
         raise InfeasibleError("the domain bounds a state that other coordinates replace.")
     law = isinstance(problem.plan, Tape)
-    signals = {} if law or system.inputs is None else {"inputs": system.inputs, "input_names": system.input_names}
+    signals: dict[str, Any] = {}
+    if system.inputs is not None and not law:
+        signals |= {"inputs": system.inputs, "input_names": system.input_names}
     if system.disturbance is not None:
         signals |= {"disturbance": system.disturbance, "disturbance_names": system.disturbance_names}
     turned = ContinuousSystem(

@@ -10,14 +10,16 @@ from certbound.safety.certificates.parts import Writer
 from certbound.safety.engines import Turned
 
 
-def of_coordinates(write: Writer) -> Writer:
-    """A writer for answers that were proved in other coordinates too."""
+def of_coordinates(write: Writer, *, below: bool = False) -> Writer:
+    """A writer for answers that were proved in other coordinates too; their lower bounds are of the plain problem."""
 
     @wraps(write)
     def written(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
         found = answer.details
         if not isinstance(found, Turned):
             return write(problem, answer, attempt)
+        if below:
+            return write(problem, found.plain, attempt)
         proof, log10, assumptions = write(found.problem, found.answer, attempt)
         turn = {"matrix": exact(found.matrix), "inverse": exact(found.inverse)}
         return {"engine": "coordinates", **turn, "proof": proof}, log10, assumptions
