@@ -10,7 +10,7 @@ import certbound as cb
 from certbound.safety.answers import exact
 from certbound.safety.certificate import certificate_text
 from certbound.safety.engines import Turned, linear_engine
-from certbound.safety.engines.coordinates import axes
+from certbound.safety.engines.oblique_limits import axes
 from certbound.safety.engines.turning import turned_problem
 from certbound.safety.verdict import verdict_of
 from tests.checker.forgeries import _BASES, BEYOND, MORE, Data, forges

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.constants import constants_engine
-from certbound.safety.engines.coordinates import Turned, in_coordinates
 from certbound.safety.engines.erosion import Erosion, erode
 from certbound.safety.engines.linear import linear_engine
 from certbound.safety.engines.linear_sketch import linear_chance
+from certbound.safety.engines.oblique_limits import Turned, in_coordinates
 from certbound.safety.engines.quadratic import quadratic_engine
 from certbound.safety.engines.random_starts import prove_truncated
 from certbound.safety.engines.rooms import joined

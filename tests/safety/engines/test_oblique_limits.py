@@ -19,7 +19,7 @@ from certbound.problem.model import Tape, compile_numpy, turned_tape
 from certbound.safety.answers import Request, exact
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.engines import Turned, in_coordinates, linear_engine
-from certbound.safety.engines.coordinates import axes
+from certbound.safety.engines.oblique_limits import axes
 from certbound.safety.engines.turning import exact_product, turned_problem
 from certbound.safety.verdict import verdict_of
 from experiments.middle import platoon
