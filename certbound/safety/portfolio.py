@@ -151,8 +151,8 @@ ENGINES: dict[str, Engine] = {
             words="the probability itself as a function on a grid, from both sides (Thm K8, up to three states)",
             when="while nothing else has proved SAFE; the only one with a lower bound, so the only one that answers "
             "UNSAFE",
-            prove=in_coordinates(values_engine),
-            write=of_coordinates(values_proof),
+            prove=in_coordinates(values_engine, beside=barrier_engine),
+            write=of_coordinates(values_proof, beside=barrier_proof),
             write_below=of_coordinates(values_proof_below, below=True),
             reserve=True,
             dear=True,

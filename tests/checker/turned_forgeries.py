@@ -7,22 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 import certbound as cb
+from certbound.checker import check_data, parse
 from certbound.safety.answers import exact
-from certbound.safety.certificate import certificate_text
-from certbound.safety.engines import Turned, linear_engine
+from certbound.safety.certificate import certificate_text, restated
+from certbound.safety.engines import Apart, Turned, linear_engine
 from certbound.safety.engines.oblique_limits import axes
 from certbound.safety.engines.turning import turned_problem
 from certbound.safety.verdict import verdict_of
 from tests.checker.forgeries import _BASES, BEYOND, MORE, Data, forges
+from tests.safety.engines.test_oblique_limits import oblique
 
 _TURNED = "statement/turned.py"
-
-
-def oblique() -> cb.Problem:
-    """Two states whose difference has a limit."""
-    system = cb.ContinuousSystem(lambda x: [-x[0], 0.5 * x[0] - x[1]], states=["a", "b"], diffusion=0.125 * np.eye(2))
-    safe = [cb.Inside(cb.HalfSpace([1.0, -1.0], 1.0))]
-    return cb.Problem(system, initial=[0.25, 0.0], safe=safe, horizon=1.0, delta=1e-2)
 
 
 def turned_text() -> str:
@@ -36,7 +31,22 @@ def turned_text() -> str:
     return certificate_text(problem, verdict_of(problem, {"linear": replace(answer, details=found)}))
 
 
-_BASES["turned"] = turned_text
+def apart_text() -> str:
+    """A certificate whose two parts are about one of two equal limits each."""
+    system = cb.ContinuousSystem(lambda x: [-x[0]], states=["a"], diffusion=0.5)
+    limits = [cb.Inside(cb.HalfSpace([side], 1.0)) for side in (1.0, -1.0)]
+    problem = cb.Problem(system, initial=[0.0], safe=limits, horizon=1.0, delta=0.5)
+    alone = [problem.replace(safe=[one]) for one in limits]
+    answers = [linear_engine(one) for one in alone]
+    found = Apart(parts=(((0,), alone[0], answers[0]), ((1,), alone[1], answers[1])), plain=answers[0])
+    both = replace(answers[0], log10_delta=answers[0].log10_delta + np.log10(2.0) + 1e-9, details=found)
+    text = certificate_text(problem, verdict_of(problem, {"linear": both}))
+    proved = check_data(parse(text)).log10_proved
+    assert proved is not None
+    return restated(text, proved)
+
+
+_BASES |= {"turned": turned_text, "apart": apart_text}
 
 
 @forges("other coordinates have the stated inverse", "turned", _TURNED, "turned_model", "must be the inverse")
@@ -72,5 +82,20 @@ def _(data: Data) -> None:
 
 
 @forges("other coordinates prove no lower bound", "turned", "claims.py", "check_side", "in other coordinates")
+def _(data: Data) -> None:
+    data["claim"] |= {"log10_delta": exact(0.0), "log10_lower": data["claim"]["log10_delta"]}
+
+
+@forges("limits that are taken apart are all of them", "apart", "claims.py", "_apart", "name every constraint")
+def _(data: Data) -> None:
+    data["proof"]["parts"] = data["proof"]["parts"][:1]
+
+
+@forges("probabilities of limits that are taken apart add up", "apart", "claims.py", "prove", MORE)
+def _(data: Data) -> None:
+    data["claim"]["log10_delta"] = exact(float.fromhex(data["claim"]["log10_delta"]) - 0.25)
+
+
+@forges("limits that are taken apart prove no lower bound", "apart", "claims.py", "check_side", "taken apart")
 def _(data: Data) -> None:
     data["claim"] |= {"log10_delta": exact(0.0), "log10_lower": data["claim"]["log10_delta"]}

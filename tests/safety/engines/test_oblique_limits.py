@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from fractions import Fraction
 
 import numpy as np
@@ -16,14 +17,13 @@ from certbound.checker.report import Budget
 from certbound.checker.statement import read_model, turned_model
 from certbound.errors import CertificateError, InfeasibleError
 from certbound.problem.model import Tape, compile_numpy, turned_tape
-from certbound.safety.answers import Request, exact
+from certbound.safety.answers import EngineAnswer, Request, exact
 from certbound.safety.certificate import certificate_text, problem_data
-from certbound.safety.engines import Turned, in_coordinates, linear_engine
+from certbound.safety.engines import Apart, Turned, in_coordinates, linear_engine
 from certbound.safety.engines.oblique_limits import axes
 from certbound.safety.engines.turning import exact_product, turned_problem
 from certbound.safety.verdict import verdict_of
 from experiments.middle import platoon
-from tests.checker.turned_forgeries import oblique
 
 
 def pair() -> cb.Problem:
@@ -33,6 +33,13 @@ def pair() -> cb.Problem:
     )
     safe = [cb.Inside(cb.HalfSpace([1.0, -1.0], 0.5))]
     return cb.Problem(system, initial=[0.2, 0.0], safe=safe, horizon=0.5, delta=1e-2)
+
+
+def oblique() -> cb.Problem:
+    """Two states whose difference has a limit."""
+    system = cb.ContinuousSystem(lambda x: [-x[0], 0.5 * x[0] - x[1]], states=["a", "b"], diffusion=0.125 * np.eye(2))
+    safe = [cb.Inside(cb.HalfSpace([1.0, -1.0], 1.0))]
+    return cb.Problem(system, initial=[0.25, 0.0], safe=safe, horizon=1.0, delta=1e-2)
 
 
 def turned(problem: cb.Problem) -> tuple[Array, Array]:
@@ -97,6 +104,29 @@ def test_a_linear_response_in_other_coordinates_proves_and_certifies_more() -> N
     data = parse(certificate_text(problem, verdict))
     assert data["claim"]["method"] == "coordinates"
     assert check_data(data, problem_data(problem)).valid
+
+
+def test_limits_that_become_oblique_are_proved_by_themselves_and_the_probabilities_add_up() -> None:
+    limits = [*oblique().safe, cb.Inside(cb.Box([-3, -3], [3, 3])), cb.Inside(cb.Ball([0, 0], 9.0))]
+    problem = oblique().replace(safe=limits)
+    limits = list(problem.safe)
+    asked: list[tuple[str, list[str]]] = []
+
+    def proves(name: str, log10_delta: float) -> Callable[[cb.Problem, Request], EngineAnswer]:
+        def prove(problem: cb.Problem, request: Request) -> EngineAnswer:
+            asked.append((name, [one.label for one in problem.safe]))
+            alone = len(problem.safe) < len(limits)
+            return EngineAnswer(log10_delta=log10_delta if alone else 0.0, method=name)
+
+        return prove
+
+    answer = in_coordinates(proves("grid", -3.0), beside=proves("barrier", -4.0))(problem, Request())
+    assert answer.log10_delta == pytest.approx(np.log10(0.0011), abs=1e-9)
+    assert isinstance(answer.details, Apart)
+    labels = [one.label for one in limits]
+    assert asked == [("grid", labels), ("barrier", labels[1:]), ("grid", labels[:1])]
+    nothing = in_coordinates(proves("grid", -3.0), beside=proves("barrier", 0.0))(problem, Request())
+    assert nothing.log10_delta == 0.0
 
 
 @pytest.mark.parametrize("row", [[0.0, 0.0], [0.0, 1.0], [2.0, -1.0]], ids=["no", "singular", "another"])
