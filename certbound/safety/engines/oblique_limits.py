@@ -63,7 +63,8 @@ def in_coordinates(prove: Prove, *, beside: Prove | None = None) -> Prove:
     def proved(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         before = asked.before if isinstance(asked.before, Turned | Apart) else None
         plain = prove(problem, replace(asked, before=before.plain.details) if before else asked)
-        if asked.quick or asked.first or (plain.applicable and is_at_most(min(plain.log10_delta, 0.0), problem.delta)):
+        enough = plain.applicable and is_at_most(min(plain.log10_delta, 0.0), problem.delta)
+        if asked.quick or asked.first or enough or plain.conclusive:
             return plain
         try:
             turn = axes(problem)
