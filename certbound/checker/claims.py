@@ -23,9 +23,9 @@ from certbound.checker.endless import (
     check_leaving_below,
 )
 from certbound.checker.linear import check_linear
-from certbound.checker.reading import Record, number
+from certbound.checker.reading import Record, number, wholes
 from certbound.checker.report import Budget, Unproved
-from certbound.checker.statement import Model, met_at, weights_of
+from certbound.checker.statement import Model, met_at, turned_model, weights_of
 from certbound.checker.time_pieces import jumps_of, with_time_pieces
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
@@ -39,6 +39,12 @@ RANDOM = "random"
 
 REACH = "reach"
 """The engine that a proof names where the problem has a target: it meets the target at one time."""
+
+COORDINATES = "coordinates"
+"""The engine that a proof names whose own proof is about the problem in other coordinates."""
+
+LIMITS = "limits"
+"""The engine that a proof names whose parts are about some of the constraints each, and add up."""
 
 WHOLE = ("lasting", "drift", "rate")
 """The engines that prove targets and infinite horizons themselves."""
@@ -85,7 +91,7 @@ class Engine:
 
 def engine_of(proof: object, method: str) -> str:
     """The engine that a proof names, which ``claim.method`` must name too."""
-    engine = _named(proof, "proof", (*ENGINES, UNION, RANDOM, REACH))
+    engine = _named(proof, "proof", (*ENGINES, UNION, RANDOM, REACH, COORDINATES, LIMITS))
     if method != engine:
         raise CertificateError(f"`claim.method` must be \"{engine}\", the proof's engine, got {quoted(method)}.")
     return engine
@@ -98,27 +104,61 @@ def _named(proof: object, path: str, known: Sequence[str]) -> str:
     return engine
 
 
-def _parts(model: Model, proof: object, path: str = "proof") -> Iterator[tuple[str, Model, Mapping[str, object]]]:
+def _is(proof: object, engine: str) -> bool:
+    return isinstance(proof, Mapping) and proof.get("engine") == engine
+
+
+def _parts(model: Model, proof: object) -> Iterator[tuple[str, Model, Mapping[str, object]]]:
+    """A proof's engine, its plain model and its numbers; where limits are taken apart, those of every part."""
+    if _is(proof, LIMITS):
+        for one, row, place in _apart(model, proof):
+            yield from _plain_parts(one, row, place)
+    else:
+        yield from _plain_parts(model, proof, "proof")
+
+
+def _apart(model: Model, proof: object) -> Iterator[tuple[Model, object, str]]:
+    """The model with some of its constraints, what proves that they are kept, and where it stands: all of them."""
+    if model.members or model.drawn or model.target is not None or model.ends:
+        raise CertificateError("`proof.engine` must not be \"limits\" beside unions, drawn constants and targets.")
+    rows = Record(proof, "proof", ("engine", "parts")).items("parts", 1, MOST_CELLS)
+    records = [Record(row, f"proof.parts[{index}]", ("limits", "proof")) for index, row in enumerate(rows)]
+    last = len(model.constraints) - 1
+    asked = [wholes(record["limits"], record.at("limits"), 0, last) for record in records]
+    if {number for own in asked for number in own} != set(range(last + 1)):
+        raise CertificateError("`proof.parts` must name every constraint in some `limits`, the domain as the last one.")
+    for record, own in zip(records, asked):
+        kept = tuple(model.constraints[number] for number in sorted(set(own)))
+        domain = model.domain if last in own else None
+        yield replace(model, constraints=kept, domain=domain), record["proof"], record.at("proof")
+
+
+def _plain_parts(
+    model: Model, proof: object, path: str
+) -> Iterator[tuple[str, Model, Mapping[str, object]]]:
     """A proof's engine, its plain model and its numbers; where the start is a union, those of every member.
 
     A target is met at one time, which the proof names. CertificateError where the start is a union, or there is a
-    target, and the proof does not say so, or the other way round.
+    target, and the proof does not say so, or the other way round. In other coordinates the model is another one.
     """
     if model.hold is not None and model.target is not None:
         raise CertificateError("`problem.hold` must be left out beside a target.")
     if model.members:
         for one, row, place in _members(model, proof, path):
-            yield from _parts(one, row, place)
+            yield from _plain_parts(one, row, place)
     elif model.drawn:
         for one, row, place, _ in _cells(model, proof, path):
             if row is not None:
-                yield from _parts(one, row, place)
+                yield from _plain_parts(one, row, place)
     elif model.target is not None and not (isinstance(proof, Mapping) and proof.get("engine") in WHOLE):
         _named(proof, path, (REACH,))
         record = Record(proof, path, ("engine", "time", "proof"))
-        yield from _parts(met_at(model, record.number("time")), record["proof"], f"{path}.proof")
+        yield from _plain_parts(met_at(model, record.number("time")), record["proof"], f"{path}.proof")
     else:
         known = tuple(name for name, row in ENGINES.items() if model.hold is None or row.holds)
+        if _is(proof, COORDINATES):
+            record = Record(proof, path, ("engine", "matrix", "inverse", "proof"))
+            model, proof, path = turned_model(model, record), record["proof"], f"{path}.proof"
         yield _named(proof, path, known), model, proof  # type: ignore[misc]  # a mapping: it names an engine
 
 
@@ -163,6 +203,10 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
         raise CertificateError("`claim.log10_lower` must not be there for an unknown constant, which does not react.")
     if lower and (model.members or model.drawn):
         raise CertificateError("`claim.log10_lower` must not be there for a union of starts.")
+    if lower and _is(proof, COORDINATES):
+        raise CertificateError("`claim.log10_lower` must not be there in other coordinates, where starts are enclosed.")
+    if lower and _is(proof, LIMITS):
+        raise CertificateError("`claim.log10_lower` must not be there where limits are taken apart.")
     for engine, _, part in _parts(model, proof):
         if lower and model.target is not None and engine not in WHOLE:
             raise CertificateError("`claim.log10_lower` must not be there beside a target, but in proofs that know it.")
@@ -174,8 +218,10 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
 
 
 def prove(model: Model, proof: object, budget: Budget, *, lower: bool = False) -> arb:
-    """The probability that a proof bounds, from above or below; where the start is a union, the largest of all."""
+    """The probability that a proof bounds, from above or below: of a union of starts the largest, of limits the sum."""
     check_side(model, proof, lower)
+    if _is(proof, LIMITS):
+        return sum((prove(one, row, budget) for one, row, _ in _apart(model, proof)), arb(0))
     found = arb(0)
     if model.members:
         for one, row, _ in _members(model, proof, "proof"):

@@ -15,6 +15,7 @@ from certbound.safety.answers import EngineAnswer, Proof
 from certbound.safety.certificates import (
     barrier_proof,
     constants_proof,
+    of_coordinates,
     quadratic_proof,
     response_proof,
     values_proof,
@@ -23,6 +24,7 @@ from certbound.safety.certificates import (
 from certbound.safety.engines import (
     barrier_engine,
     constants_engine,
+    in_coordinates,
     linear_chance,
     linear_engine,
     quadratic_engine,
@@ -106,8 +108,8 @@ ENGINES: dict[str, Engine] = {
             words="the exact Gaussian response of the linearised model with a rigorous remainder (Thm K7)",
             when="always; says most where the noise is small against the curvature of the model, and where there are "
             "many states",
-            prove=linear_engine,
-            write=response_proof,
+            prove=in_coordinates(linear_engine),
+            write=of_coordinates(response_proof),
             again=True,
             chance=linear_chance,
         ),
@@ -137,8 +139,8 @@ ENGINES: dict[str, Engine] = {
             "time, up to twelve states)",
             when="while nothing else has proved SAFE; says most in three to ten states where the noise is too "
             "large for a linearisation",
-            prove=quadratic_engine,
-            write=quadratic_proof,
+            prove=in_coordinates(quadratic_engine),
+            write=of_coordinates(quadratic_proof),
             reserve=True,
             dear=True,
             soon=4,
@@ -149,9 +151,9 @@ ENGINES: dict[str, Engine] = {
             words="the probability itself as a function on a grid, from both sides (Thm K8, up to three states)",
             when="while nothing else has proved SAFE; the only one with a lower bound, so the only one that answers "
             "UNSAFE",
-            prove=values_engine,
-            write=values_proof,
-            write_below=values_proof_below,
+            prove=in_coordinates(values_engine, beside=barrier_engine),
+            write=of_coordinates(values_proof, beside=barrier_proof),
+            write_below=of_coordinates(values_proof_below, below=True),
             reserve=True,
             dear=True,
             reaches=True,

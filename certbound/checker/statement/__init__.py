@@ -10,6 +10,7 @@ from certbound.checker.statement.regions import Constraint
 from certbound.checker.statement.rooms import Grid, demands, round_demands
 from certbound.checker.statement.safe_set import SafeSet, StepSet
 from certbound.checker.statement.structure import Structure, structure_of
+from certbound.checker.statement.turned import turned_model
 
 __all__ = [
     "cells_of",
@@ -26,5 +27,6 @@ __all__ = [
     "StepSet",
     "Structure",
     "structure_of",
+    "turned_model",
     "weights_of",
 ]

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         kinks_where,
         undefined_where,
     )
+    from certbound.problem.model.recombined import turned_tape
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
     from certbound.problem.model.time_jumps import cut_at_jumps
     from certbound.problem.model.tracing import trace
@@ -47,6 +48,7 @@ _HOME = {
     "calling": "call_network",
     "network_rows": "relaxed weights_of",
     "network_data": "PARTS Layer Network Part",
+    "recombined": "turned_tape",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
     "time_jumps": "cut_at_jumps",
@@ -84,6 +86,7 @@ __all__ = [
     "substitute",
     "Tape",
     "trace",
+    "turned_tape",
     "undefined_where",
     "varying_outputs",
     "watched",

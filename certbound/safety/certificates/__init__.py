@@ -6,11 +6,13 @@ from certbound.safety.certificates.barrier import barrier_proof
 from certbound.safety.certificates.constants import constants_proof
 from certbound.safety.certificates.diffusion import response_proof
 from certbound.safety.certificates.quadratic import quadratic_proof
+from certbound.safety.certificates.turned_proofs import of_coordinates
 from certbound.safety.certificates.values import values_proof, values_proof_below
 
 __all__ = [
     "barrier_proof",
     "constants_proof",
+    "of_coordinates",
     "quadratic_proof",
     "response_proof",
     "values_proof",

@@ -7,21 +7,26 @@ from certbound.safety.engines.constants import constants_engine
 from certbound.safety.engines.erosion import Erosion, erode
 from certbound.safety.engines.linear import linear_engine
 from certbound.safety.engines.linear_sketch import linear_chance
+from certbound.safety.engines.oblique_limits import Apart, Turned, in_coordinates
 from certbound.safety.engines.quadratic import quadratic_engine
 from certbound.safety.engines.random_starts import prove_truncated
-from certbound.safety.engines.rooms import joined
+from certbound.safety.engines.rooms import joined, log10_sum
 from certbound.safety.engines.values import values_engine
 
 __all__ = [
+    "Apart",
     "Barrier",
     "barrier_engine",
     "constants_engine",
     "erode",
     "Erosion",
+    "in_coordinates",
     "joined",
     "linear_chance",
     "linear_engine",
+    "log10_sum",
     "prove_truncated",
     "quadratic_engine",
+    "Turned",
     "values_engine",
 ]

@@ -1,0 +1,202 @@
+"""Engines asked once more in other coordinates: where a limit is oblique, and what was proved does not do.
+
+A limit n . x <= b becomes a limit of one state y = n . x, and where y has no noise of its own and its rate is a sum of
+states, that sum becomes a state too: of vehicles that must keep their order the distances and their rates. What noise
+and drift have in common cancels then, and windows and boxes, which are entrywise, lose less.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.display import rounded
+from certbound.errors import EnclosureError, InfeasibleError
+from certbound.problem.model import Tape, turned_tape
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Faces, HalfSpace
+from certbound.problem.systems import ContinuousSystem
+from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request, is_at_most
+from certbound.safety.engines.rooms import log10_sum
+from certbound.safety.engines.turning import exact_product, turned_problem
+
+Prove = Callable[[Problem, Request], EngineAnswer]
+Turn = tuple[Array, Array]
+"""T and its inverse."""
+
+_MOST = 20  # states
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Turned:
+    """What was proved in coordinates y = ``matrix`` x: the answer to the problem stated in y, and the plain one."""
+
+    matrix: Array
+    inverse: Array
+    problem: Problem
+    answer: EngineAnswer
+    plain: EngineAnswer
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Apart:
+    """Numbers of limits, what was asked of these alone, and the answer: the probabilities add up. And the plain answer.
+
+    The first part may be answered in other coordinates.
+    """
+
+    parts: tuple[tuple[tuple[int, ...], Problem, EngineAnswer], ...]
+    plain: EngineAnswer
+
+
+def in_coordinates(prove: Prove, *, beside: Prove | None = None) -> Prove:
+    """The engine, asked once more in other coordinates where its answer is weaker than delta and a limit is oblique.
+
+    ``beside`` is asked of limits that are oblique in these other coordinates, by themselves and in the states.
+    """
+
+    def proved(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+        before = asked.before if isinstance(asked.before, Turned | Apart) else None
+        plain = prove(problem, replace(asked, before=before.plain.details) if before else asked)
+        enough = plain.applicable and is_at_most(min(plain.log10_delta, 0.0), problem.delta)
+        if asked.quick or asked.first or enough or plain.conclusive:
+            return plain
+        try:
+            turn = axes(problem)
+            if turn is None:
+                return plain
+            if plain.applicable and plain.log10_delta < 0:
+                asked.found(plain)
+            rest = () if beside is None else _still_oblique(problem, turn)
+            if rest and beside is not None:
+                answer = _by_parts((prove, beside), problem, turn, rest, asked, plain)
+            else:
+                inner = before.answer.details if isinstance(before, Turned) else None
+                answer = _asked_in(prove, problem, turn, replace(asked, before=inner), plain)
+        except (InfeasibleError, EnclosureError):
+            return plain
+        return answer if answer.applicable and answer.log10_delta < min(plain.log10_delta, 0.0) else plain
+
+    return proved
+
+
+def _asked_in(prove: Prove, problem: Problem, turn: Turn, asked: Request, plain: EngineAnswer) -> EngineAnswer:
+    """What an engine answers in other coordinates; it does not apply where it proves nothing."""
+    other = turned_problem(problem, *turn)
+
+    def stated(answer: EngineAnswer) -> EngineAnswer:
+        reason = f"{answer.reason.rstrip('.')}; in the coordinates {_words(problem.system.states, turn[0])}."
+        details = Turned(matrix=turn[0], inverse=turn[1], problem=other, answer=answer, plain=plain)
+        return _instead(plain, answer, reason=reason, details=details)
+
+    return stated(prove(other, replace(asked, found=lambda answer: asked.found(stated(answer)))))
+
+
+def _instead(plain: EngineAnswer, answer: EngineAnswer, **changes: Any) -> EngineAnswer:
+    """The plain answer with another bound; what it says of rooms at delta is no longer told."""
+    return replace(
+        plain, applicable=answer.applicable and answer.certified, log10_delta=answer.log10_delta, margin=None,
+        time=None, constraint=None, method=answer.method, foresight=answer.foresight, conclusive=False, **changes,
+    )  # fmt: skip
+
+
+def _still_oblique(problem: Problem, turn: Turn) -> tuple[int, ...]:
+    """The numbers of limits that are no limits of single states of y."""
+    n, found = problem.system.dimension, []
+    for number, region in enumerate(one.region for one in problem.safe):
+        form = region.form
+        flat = isinstance(form, Faces) and exact_product(region.lifted(form.normals, n), turn[1])
+        if flat is False or np.any(np.count_nonzero(flat, axis=1) > 1):
+            found.append(number)
+    return tuple(found)
+
+
+def _by_parts(
+    engines: tuple[Prove, Prove], problem: Problem, turn: Turn, rest: tuple[int, ...], asked: Request,
+    plain: EngineAnswer,
+) -> EngineAnswer:
+    """P(failing) <= P(some limit of one state of y is broken) + P(some other one is): the sum of two answers."""
+    asked = replace(asked, before=None, found=lambda answer: None)
+    along = tuple(k for k in range(len(problem.safe)) if k not in rest)
+    if not along or problem.domain is not None:
+        raise InfeasibleError("no limits are left to take apart.")
+    first, second = (problem.replace(safe=[problem.safe[k] for k in numbers]) for numbers in (along, rest))
+    other = engines[1](second, asked)
+    if not (other.applicable and other.certified and other.log10_delta < 0):
+        raise InfeasibleError("nothing is proved of some limits by themselves.")
+    answers = _asked_in(engines[0], first, turn, asked, plain), other
+    if not answers[0].applicable:
+        raise InfeasibleError("nothing is proved in other coordinates.")
+    total = log10_sum([one.log10_delta for one in answers])
+    shares = [rounded(10.0 ** min(one.log10_delta, 0.0), up=True) for one in answers]
+    names = ", ".join(f"'{problem.safe[k].label}'" for k in rest)
+    reason = f"{answers[0].reason.rstrip('.')}: {shares[0]} at most; {shares[1]} at most for {names} by itself."
+    return _instead(
+        plain, replace(answers[0], log10_delta=total), reason=reason,
+        details=Apart(parts=((along, first, answers[0]), (rest, second, answers[1])), plain=plain),
+    )  # fmt: skip
+
+
+def axes(problem: Problem) -> Turn | None:
+    """T and its inverse, such that oblique limits are limits of one state of y = T x; None where nothing is gained.
+
+    InfeasibleError where that is not exact in floats.
+    """
+    system, n = problem.system, problem.system.dimension
+    if not isinstance(system, ContinuousSystem) or not 1 < n <= _MOST or problem.hold is not None:
+        return None
+    rows = [region.lifted(region.form.normals, n) for region in (one.region for one in problem.constraints)
+            if isinstance(region.form, Faces)]  # fmt: skip
+    limits = np.vstack([np.zeros((0, n)), *rows])
+    turn, pivots = (np.eye(n), np.eye(n)), list[int]()
+    turn = _sheared(turn, [row for row in limits if np.count_nonzero(row) > 1], limits, pivots)
+    if not pivots:
+        return None
+    rates = turned_tape(problem.closed_loop, turn[1], turn[0])[1]
+    smooth = [rate for place in pivots if (rate := rates[place]) and not _noisy(problem, turn, place)]
+    if not smooth:
+        return turn
+    sums = exact_product(np.array([[rate.get(j, 0.0) for j in range(n)] for rate in smooth]), turn[0])
+    return _sheared(turn, list(sums), sums, pivots)
+
+
+def _sheared(turn: Turn, rows: Sequence[Array], others: Array, pivots: list[int]) -> Turn:
+    """T and its inverse with rows . x, or a multiple of it, in place of one state each, which enter ``pivots``.
+
+    The state is one that few of ``others`` ask for, whose factor is a power of two: then shears are exact.
+    """
+    matrix, inverse = turn
+    for row in rows:
+        own = exact_product(row[None], inverse)[0]
+        places = [j for j in np.flatnonzero(own).tolist() if abs(math.frexp(own[j])[0]) == 0.5 and j not in pivots]
+        if np.count_nonzero(own) < 2 or not places:
+            continue
+        place = min(places, key=lambda j: (np.count_nonzero(others[:, j]), j))
+        shear, back = np.eye(len(own)), np.eye(len(own))
+        shear[place] = own / own[place]
+        back[place] = -shear[place]
+        back[place, place] = 1.0
+        matrix, inverse = exact_product(shear, matrix), exact_product(inverse, back)
+        pivots.append(place)
+    return matrix, inverse
+
+
+def _noisy(problem: Problem, turn: Turn, place: int) -> bool:
+    """Whether a state of y = T x has noise of its own."""
+    assert isinstance(problem.system, ContinuousSystem)
+    diffusion = problem.system.diffusion
+    if not isinstance(diffusion, Tape):
+        return bool(np.any(exact_product(turn[0][place : place + 1], diffusion)))
+    m = diffusion.shape[1]
+    return any(row != {} for row in turned_tape(diffusion, turn[1], turn[0])[1][place * m : (place + 1) * m])
+
+
+def _words(states: tuple[str, ...], matrix: Array) -> str:
+    """The states of y that are none of x."""
+    rows = [row for row in matrix if np.count_nonzero(row) > 1]
+    return ", ".join(HalfSpace(row, 0.0).describe(states, "inside").partition(" <= ")[0] for row in rows)

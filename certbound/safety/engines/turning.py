@@ -1,0 +1,108 @@
+"""A problem in other coordinates y = T x, with T and its inverse exact in floats: nothing is rounded but the start.
+
+X solves dX = f dt + g dW and breaks a constraint just where Y = T X solves dY = T f(T^-1 Y) dt + T g(T^-1 Y) dW and
+breaks the same one, stated in y. The start is enclosed by a box, so that upper bounds are kept, and no lower ones.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.errors import InfeasibleError
+from certbound.problem.model import Tape, turned_tape
+from certbound.problem.problem import Problem
+from certbound.problem.sets import Box, Faces, HalfSpace, Inside, Polytope, Region
+from certbound.problem.systems import ContinuousSystem
+
+
+def exact_product(a: Array, b: Array) -> Array:
+    """a b for matrices; InfeasibleError where an entry is no float."""
+    columns = [[Fraction(x) for x in column] for column in np.asarray(b).T.tolist()]
+    rows = [[sum((Fraction(x) * y for x, y in zip(row, column) if x), Fraction(0)) for column in columns]
+            for row in np.asarray(a).tolist()]  # fmt: skip
+    found = np.array([[float(x) for x in row] for row in rows]).reshape(len(rows), len(columns))
+    if any(Fraction(y) != x for row, own in zip(rows, found.tolist()) for x, y in zip(row, own)):
+        raise InfeasibleError("the problem is not exact in other coordinates: a product of its numbers is no float.")
+    return found
+
+
+def turned_problem(problem: Problem, matrix: Array, inverse: Array) -> Problem:
+    """The problem of y = T x.
+
+    Proves: P(failing) is at most the largest probability of failing in y.
+
+    Raises
+    ------
+    InfeasibleError
+        If T and its inverse are not, or the problem cannot be stated exactly in y.
+    """
+    system, n = problem.system, problem.system.dimension
+    if not np.array_equal(exact_product(matrix, inverse), np.eye(n)):
+        raise InfeasibleError("the matrices of other coordinates must be inverse to each other.")
+    plain = not (problem.ending or problem.initial.random or problem.random) and len(problem.starts) == 1
+    if not isinstance(system, ContinuousSystem) or problem.hold is not None or problem.reach is not None or not plain:
+        raise InfeasibleError("other coordinates serve plain problems in continuous time.")
+    moved = {j for j in range(n) if np.any(inverse[j] != np.eye(n)[j])}
+    if problem.domain is not None and any(np.isfinite([problem.domain.low[j], problem.domain.high[j]]).any()
+                                          for j in moved):  # fmt: skip
+        raise InfeasibleError("the domain bounds a state that other coordinates replace.")
+    law = isinstance(problem.plan, Tape)
+    signals: dict[str, Any] = {}
+    if system.inputs is not None and not law:
+        signals |= {"inputs": system.inputs, "input_names": system.input_names}
+    if system.disturbance is not None:
+        signals |= {"disturbance": system.disturbance, "disturbance_names": system.disturbance_names}
+    turned = ContinuousSystem(
+        turned_tape(problem.closed_loop, inverse, matrix)[0], states=system.states,
+        diffusion=_diffusion(system.diffusion, matrix, inverse), **signals,
+    )  # fmt: skip
+    safe = [_constraint(one, inverse, moved) for one in problem.safe]
+    start, plan = _start(problem, matrix), None if law else problem.plan
+    try:
+        return problem.replace(system=turned, initial=start, safe=safe, plan=plan, cost=None, units=None)
+    except ValueError as error:
+        raise InfeasibleError(f"a box around the starts in other coordinates is too large: {error}") from error
+
+
+def _diffusion(diffusion: Array | Tape, matrix: Array, inverse: Array) -> Array | Tape:
+    if not isinstance(diffusion, Tape):
+        return exact_product(matrix, diffusion)
+    tape = turned_tape(diffusion, inverse, matrix)[0]
+    if all(node.op != "input" for node in tape.nodes):
+        raise InfeasibleError("the noise does not depend on the state in other coordinates, which is not stated so.")
+    return tape
+
+
+def _start(problem: Problem, matrix: Array) -> Box:
+    """A box around the starts, rounded outward."""
+    hull = problem.initial.hull()
+    ends = [[Fraction(x) for x in side.tolist()] for side in (hull.lo, hull.hi)]
+    low, high = [], []
+    for row in matrix.tolist():
+        parts = [(Fraction(c), a, b) if c > 0 else (Fraction(c), b, a) for c, a, b in zip(row, *ends) if c]
+        low.append(_outward(sum((c * a for c, a, _ in parts), Fraction(0)), -math.inf))
+        high.append(_outward(sum((c * b for c, _, b in parts), Fraction(0)), math.inf))
+    return Box(low, high)
+
+
+def _outward(value: Fraction, side: float) -> float:
+    found = float(value)
+    beyond = Fraction(found) >= value if side > 0 else Fraction(found) <= value
+    return found if beyond else math.nextafter(found, side)
+
+
+def _constraint(constraint: Inside, inverse: Array, moved: set[int]) -> Inside:
+    region: Region = constraint.region
+    n = len(inverse)
+    if not moved & set(region.places(n)) or (isinstance(region.form, Faces) and not len(region.form.bounds)):
+        return constraint
+    if not isinstance(region.form, Faces) or region.moving or np.any(region.center_at()):
+        raise InfeasibleError(f"'{constraint.label}' is not stated in other coordinates: it is round, or moves.")
+    rows, bounds = exact_product(region.lifted(region.form.normals, n), inverse), region.form.bounds
+    turned = HalfSpace(rows[0], bounds[0]) if region.kind == "halfspace" else Polytope(rows, bounds)
+    return type(constraint)(turned, during=constraint.during, label=constraint.label)
