@@ -43,6 +43,7 @@ from certbound.values.continuous.surface import Surface
 
 Found = TypeVar("Found")
 Near = tuple[float, float, float] | None
+Sides = tuple[bool, bool]
 
 LIFTS = (0.0, 0.003, 0.01, 0.02, 0.035, 0.06, 0.1, 0.16, 0.25)
 _NEAR = 40.0  # in units of what is granted without being looked at
@@ -237,8 +238,10 @@ def cheapest(
     return best
 
 
-def check_noise(model: Model, span: tuple[float, float], ends: Sequence[tuple[float, float]]) -> None:
-    """Refuse noise that may vanish somewhere in a box over a span of time.
+def check_noise(
+    model: Model, span: tuple[float, float], ends: Sequence[tuple[float, float]], held: Sequence[Sides] = ()
+) -> None:
+    """Refuse noise that may vanish somewhere in a box over a span of time, but for the cells at its ``held`` faces.
 
     Where it has full rank a path that touches a face crosses it: what lower bounds rest on.
 
@@ -247,6 +250,7 @@ def check_noise(model: Model, span: tuple[float, float], ends: Sequence[tuple[fl
     InfeasibleError
     """
     fine = [np.linspace(low, high, 17) for low, high in ends]
+    fine = [axis[int(sides[0]) : 17 - int(sides[1])] for axis, sides in zip(fine, held or [(False, False)] * len(fine))]
     low = np.meshgrid(*(axis[:-1] for axis in fine), indexing="ij")
     high = np.meshgrid(*(axis[1:] for axis in fine), indexing="ij")
     clock = [Interval(*span).broadcast_to((low[0].size,))]
@@ -262,10 +266,10 @@ def check_noise(model: Model, span: tuple[float, float], ends: Sequence[tuple[fl
         )
 
 
-def raised_above(surface: Surface) -> Surface:
-    """The surface, raised by what it misses of V >= 0 on its faces."""
-    sides = [(axis, side) for axis in range(len(surface.axes)) for side in (0, 1)]
-    lift = max(0.0, -min(surface.face_range(*side)[0] for side in sides))
+def raised_above(surface: Surface, held: Sequence[Sides] = ()) -> Surface:
+    """The surface, raised by what it misses of V >= 0 on its faces, but for those that no path crosses (``held``)."""
+    sides = [(axis, side) for axis in range(len(surface.axes)) for side in (0, 1) if not (held and held[axis][side])]
+    lift = max(0.0, -min((surface.face_range(*side)[0] for side in sides), default=0.0))
     surface = surface.raised(up(lift)) if lift else surface
     if any(surface.face_range(*side)[0] < 0 for side in sides):
         surface = surface.raised(1e-12 * (1 + lift))

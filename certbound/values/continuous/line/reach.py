@@ -24,8 +24,10 @@ _FARTHEST = 1e9  # times the largest of the starts and limits, and times 1
 _LARGEST = 1e60  # units in which V's second derivatives would fall below the smallest float are refused
 
 
-def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]:
-    """A place below and one above everything; `inf` is never returned.
+def cuts_of(
+    problem: Problem, model: Model, start: Start, held: tuple[float | None, float | None] = (None, None)
+) -> tuple[float, float]:
+    """A place below and one above everything; `inf` is never returned. No path crosses the ``held`` ones.
 
     Raises
     ------
@@ -43,9 +45,12 @@ def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]
     scale = max(1.0, *(abs(place) for place in (start.low, start.high, *places)))
     if not scale < _LARGEST:
         raise InfeasibleError(f"value functions need states below {_LARGEST:g}: write the state in another unit.")
+    ends = [end for end in ((0, held[0]), (1, held[1])) if end[1] is not None]
+    always |= {side for side, _ in ends}
+    places += [place for _, place in ends]
     if len(always) == 2:
         return min(places), max(places)  # nothing is cut
-    low, high = _spread(problem, model, start, _FARTHEST * scale)
+    low, high = _spread(problem, model, start, _FARTHEST * scale, held)
     low, high = min([low, *places]), max([high, *places])
     square = compile_numpy(model.square.tape)
     room = 0.02 * (high - low)
@@ -53,7 +58,9 @@ def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]
     return float(at[0]), float(at[1])
 
 
-def _spread(problem: Problem, model: Model, start: Start, farthest: float) -> tuple[float, float]:
+def _spread(
+    problem: Problem, model: Model, start: Start, farthest: float, held: tuple[float | None, float | None]
+) -> tuple[float, float]:
     """Extremes of a few paths with the worst disturbances each way, extended by so many deviations."""
     drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
     corners = [[float(value.mid) for value in branch] for branch in model.branches]
@@ -71,6 +78,7 @@ def _spread(problem: Problem, model: Model, start: Start, farthest: float) -> tu
                 f = np.array([np.broadcast_to(drift(clock[k], x, *c)[..., 0], x.shape) for c in corners])
                 g = np.sqrt(np.broadcast_to(square(clock[k], x)[..., 0, 0], x.shape))
                 x = x + step * sign * (sign * f).max(axis=0) + np.sqrt(step) * g * rng.standard_normal(_PATHS)
+            x = np.clip(x, *(side * math.inf if end is None else end for side, end in zip((-1, 1), held)))
             if not np.all(np.abs(x) < farthest):
                 raise InfeasibleError(_BEYOND)
             middle[k], deviation[k] = np.median(x), np.std(x)
