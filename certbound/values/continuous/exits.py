@@ -143,9 +143,6 @@ def bound_exits(
 
         _refuse_random(problem)
         room = safe_room(problem)
-        check_noise(model, (0.0, float(problem.horizon)), list(zip(room.inner_low, room.inner_high)))
-        if lower:
-            check_noise(model, (0.0, float(problem.horizon)), list(zip(room.outer_low, room.outer_high)))
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
         upper, least, words, (proposed, below) = two_states(problem, model, room, begin + seconds, wanted)
     return ExitBounds(

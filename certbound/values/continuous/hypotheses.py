@@ -209,9 +209,11 @@ def covers(surface: Surface, horizon: float, low: Sequence[float], high: Sequenc
     return all(left <= a and b <= right for (left, right), a, b in zip(own, low, high))
 
 
-def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment:
+def prove_upper(
+    surface: Surface, model: Model, starts: Sequence[tuple[float, float]], held: Sequence[Sides] = ()
+) -> Payment:
     """An upper bound of log P(leaving the box of the surface by its last time), whatever the surface is."""
-    surface = raised_above(surface)
+    surface = raised_above(surface, held)
     start = up(extreme_over(surface, starts, upper=True))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
     proof = examine(surface, model, need, upper=True)
