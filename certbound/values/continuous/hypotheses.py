@@ -284,13 +284,14 @@ def top_of(surface: Surface) -> float:
 
 
 def chart_above(
-    surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int], near: Near = None
+    surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int], near: Near = None,
+    held: Sequence[Sides] = (),
 ) -> list[Chart]:
     """Upper bounds of P(leaving the box from a cell on), at the start of each of the ``slabs``, or ``near`` the starts.
 
     One payment is made for each of the ``levels`` (of log P), at which it is then sharp; every cell takes the best.
     """
-    surface = raised_above(surface)
+    surface = raised_above(surface, held)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=0.0)
     proof = examine(surface, model, need, upper=True)
     paid = [cheapest(proof, need, surface, level) for level in levels]

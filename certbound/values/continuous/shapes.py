@@ -17,6 +17,7 @@ from certbound.values.continuous.proposal import Line, Sketch, through
 
 _SPARE = 8.0
 _MOST_CELLS = 20_000.0
+_SLIVER = 3e-3  # of the way to the starts
 _ROOM = 6.0  # how far below the answer V is to be known, as a logarithm
 _BACKGROUND = 0.3  # share of the cells that is spread evenly
 
@@ -35,6 +36,15 @@ def sealed(line: Line, level: float, *, gated: bool = False) -> tuple[Line, tupl
             ends[side], cut[side] = place, True
     held = (line.held[0] and not cut[0], line.held[1] and not cut[1])
     return replace(line, low=ends[0], high=ends[1], held=held), (cut[0], cut[1])
+
+
+def before_held(line: Line) -> Line:
+    """The line cut a little before its held ends."""
+    middle = 0.5 * sum(line.starts)
+    low, high = (
+        end + _SLIVER * (middle - end) if held else end for end, held in zip((line.low, line.high), line.held)
+    )
+    return replace(line, low=low, high=high, held=(False, False))
 
 
 def _cut(line: Line, side: int, barrier: float) -> float | None:

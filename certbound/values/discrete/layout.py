@@ -61,7 +61,7 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
         if not np.isfinite(ends).all():
             return _cut_line(problem, shocks, np.min([end[0] for end in ends]), np.max([end[1] for end in ends]))
     low, high = np.empty((horizon + 1, n)), np.empty((horizon + 1, n))
-    far = REACH if not shocks.laplace else shocks.reach
+    far = max(REACH, shocks.reach)
     spread = far * (np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (1 + 1e-12))
     reach = start_box(problem)
     leak = 0.0

@@ -38,7 +38,7 @@ from certbound.values.continuous.line.profiles import (
 from certbound.values.continuous.line.reach import cuts_of
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.proposal import Line, Sketch, sketch
-from certbound.values.continuous.shapes import sealed
+from certbound.values.continuous.shapes import before_held, sealed
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
@@ -263,17 +263,32 @@ def _raise_upper(
     found.work += _patches_in(links)
     payment = prove_above(links, start)
     gain = found.upper - payment.log
-    if gain > 0 and is_plain(room):
+    if gain > 0 and is_plain(room) and not any(links[0].held):
         found.proposed.append((raised_above(links[0].surface), payment))
+    if any(links[0].held) and is_plain(room):
+        _raise_shorter(found, room, start, rough, effort)
     found.upper = min(found.upper, payment.log)
     return gain
+
+
+def _raise_shorter(
+    found: _Found, room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
+) -> None:
+    """A bound on a line that ends before the faces that no path crosses: certificates state nothing of such faces."""
+    links = surfaces_above(room, start, rough, effort, cut=True)
+    if links is None or not spans(links, upper=True) or any(links[0].held):
+        return
+    found.work += _patches_in(links)
+    payment = prove_above(links, start)
+    if payment.log < min([0.0, *(one.log for _, one in found.proposed)]):
+        found.proposed.append((raised_above(links[0].surface), payment))
+        found.upper = min(found.upper, payment.log)
 
 
 def is_plain(room: Room) -> bool:
     """Whether one surface in the state itself says all: limits that stand still over the whole horizon."""
     phase = room.phases[0]
-    plain = phase.origin is None and phase.width is None and phase.held == (False, False)
-    return len(room.phases) == 1 and plain and not is_gated(room, 0)
+    return len(room.phases) == 1 and phase.origin is None and phase.width is None and not is_gated(room, 0)
 
 
 def _raise_lower(
@@ -288,22 +303,23 @@ def _raise_lower(
     if payment is None:
         return 0.0
     gain = math.inf if found.lower is None else payment.log - found.lower
-    if gain > 0 and is_plain(room):
+    if gain > 0 and is_plain(room) and not any(links[0].held):
         found.below.append((links[0].surface, payment))
     found.lower = payment.log if found.lower is None else max(found.lower, payment.log)
     return gain
 
 
 def surfaces_above(
-    room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
+    room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float], *, cut: bool = False
 ) -> list[Link] | None:
-    """Surfaces for the upper bound, the last phase first."""
+    """Surfaces for the upper bound, the last phase first; ``cut`` ends the line before held faces."""
     share, fineness, tolerance, sharpness = effort
     links: list[Link] = []
     for k in reversed(range(len(room.phases))):
         line = room.lines[k]
         if k == 0 and not start.random:
-            line = sealed(line, rough[0].level, gated=len(room.phases) > 1)[0]
+            line = sealed(line, rough[0].level, gated=cut or len(room.phases) > 1)[0]
+            line = before_held(line) if cut else line
         surface = propose_above(
             line, _end(room, k, links[0].surface if links else None), rough[k], share * line.horizon, sharpness,
             fineness=fineness, tolerance=tolerance,
