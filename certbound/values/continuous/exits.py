@@ -21,7 +21,8 @@ from certbound.rigor.intervals import Interval
 from certbound.values.charts import Charts
 from certbound.values.continuous.coefficients import Reader, squared_diffusion
 from certbound.values.continuous.curved import bound_region, walled
-from certbound.values.continuous.hypotheses import Model, check_noise
+from certbound.values.continuous.held_faces import check_noise
+from certbound.values.continuous.hypotheses import Model
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import bound_moving, bound_windows, moving, windowed
 from certbound.values.continuous.room import safe_room

@@ -1,7 +1,8 @@
 """Faces that no path crosses, as the noise across them vanishes there: a price, a rate, a population stays above 0.
 
-**Lemma.** Let a_ii(t, x) <= K (c - x_i) and f_i(t, x, d) >= -K (c - x_i) wherever x is in a box B but for c - eta <= x_i
-<= c, a = g g'. Then a path that starts in B with X_i >= c keeps X_i >= c until it leaves B by another face.
+**Lemma.** Let a_ii(t, x) <= K (c - x_i) and f_i(t, x, d) >= -K (c - x_i), a = g g', at all points with c - eta <= x_i
+<= c whose other states are in a box B. Then a path that starts in B with X_i >= c keeps X_i >= c until another state
+leaves B.
 
 *Proof.* Stop X there, and where X_i = c - eta. For Y = X_i - c the integral of 1{-eta < Y < 0} d<Y>/|Y| is at most K t,
 so that by the occupation formula the left local time of Y at 0 vanishes (Yamada and Watanabe; Le Gall). By Tanaka's
@@ -23,11 +24,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from certbound.errors import EnclosureError
+from certbound.arrays import Array, Mask
+from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model import JUMPS, Graph, Tape, compile_numpy, enclosed, jacobian
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Reader, enclose
-from certbound.values.continuous.hypotheses import Model
+from certbound.values.continuous.hypotheses import Model, Sides
 
 Ends = tuple[float, float]
 
@@ -35,6 +37,34 @@ _PARTS = 16  # of the face in time and in every other state
 _BESIDE = 1e-3  # eta, in units of the box
 _SCANNED = 2001
 _NIL = 1e-13  # of the largest a: what counts as vanishing, for candidates
+
+
+def check_noise(
+    model: Model, span: tuple[float, float], ends: Sequence[tuple[float, float]], held: Sequence[Sides] = ()
+) -> None:
+    """Refuse noise that may vanish somewhere in a box over a span of time, but for the cells at its ``held`` faces.
+
+    Where it has full rank a path that touches a face crosses it: what lower bounds rest on.
+
+    Raises
+    ------
+    InfeasibleError
+    """
+    fine = [np.linspace(low, high, 17) for low, high in ends]
+    fine = [axis[int(sides[0]) : 17 - int(sides[1])] for axis, sides in zip(fine, held or [(False, False)] * len(fine))]
+    low = np.meshgrid(*(axis[:-1] for axis in fine), indexing="ij")
+    high = np.meshgrid(*(axis[1:] for axis in fine), indexing="ij")
+    clock = [Interval(*span).broadcast_to((low[0].size,))]
+    values, _ = enclose(model.square.tape, clock + [Interval(a.ravel(), b.ravel()) for a, b in zip(low, high)])
+    smallest = values[0].lo
+    if len(fine) == 2:
+        cross = np.maximum(np.abs(values[1].lo), np.abs(values[1].hi))
+        smallest = np.minimum(np.minimum(values[0].lo, values[3].lo), values[0].lo * values[3].lo - cross**2)
+    if not np.all(smallest > 0):
+        raise InfeasibleError(
+            "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
+            "direction has none somewhere (noise in the velocities only, say), and value functions prove nothing."
+        )
 
 
 def held_face(model: Model, box: Sequence[Ends], inner: Ends, span: Ends, axis: int, side: int) -> float | None:
@@ -59,9 +89,8 @@ def held_face(model: Model, box: Sequence[Ends], inner: Ends, span: Ends, axis: 
     begin, end = inner[side], box[axis][side]
     if not (end < begin if side == 0 else begin < end):
         return None
-    found = [place for place in _candidates(model, box, begin, end, span, axis) if _is_held(
-        model, box, span, axis, side, place
-    )]  # fmt: skip
+    places = _candidates(model, box, begin, end, span, axis)
+    found = [place for place in places if _is_held(model, box, span, axis, side, place)]
     return (max(found) if side == 0 else min(found)) if found else None
 
 
@@ -72,7 +101,7 @@ def _candidates(model: Model, box: Sequence[Ends], begin: float, end: float, spa
     rng = np.random.default_rng(0)
     others = [rng.uniform(*ends, size=(8, 1)) for ends in (span, *box)]
 
-    def vanishes(places: np.ndarray) -> np.ndarray:
+    def vanishes(places: Array) -> Mask:
         points = [np.broadcast_to(row, (8, len(places))) for row in others]
         points[1 + axis] = np.broadcast_to(places, (8, len(places)))
         with np.errstate(all="ignore"):

@@ -25,10 +25,9 @@ from typing import TypeVar
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
-from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Chart, from_natural
-from certbound.values.continuous.coefficients import Cells, Interpolant, Reader, enclose
+from certbound.values.continuous.coefficients import Cells, Interpolant, Reader
 from certbound.values.continuous.payment import Patched, Payment, bound_above, bound_below, pay_lower, pay_upper
 from certbound.values.continuous.polynomials import nodes_of
 from certbound.values.continuous.residual import (
@@ -238,34 +237,6 @@ def cheapest(
         best = (payment, lift) if best is None or payment.log < best[0].log else best
     assert best is not None
     return best
-
-
-def check_noise(
-    model: Model, span: tuple[float, float], ends: Sequence[tuple[float, float]], held: Sequence[Sides] = ()
-) -> None:
-    """Refuse noise that may vanish somewhere in a box over a span of time, but for the cells at its ``held`` faces.
-
-    Where it has full rank a path that touches a face crosses it: what lower bounds rest on.
-
-    Raises
-    ------
-    InfeasibleError
-    """
-    fine = [np.linspace(low, high, 17) for low, high in ends]
-    fine = [axis[int(sides[0]) : 17 - int(sides[1])] for axis, sides in zip(fine, held or [(False, False)] * len(fine))]
-    low = np.meshgrid(*(axis[:-1] for axis in fine), indexing="ij")
-    high = np.meshgrid(*(axis[1:] for axis in fine), indexing="ij")
-    clock = [Interval(*span).broadcast_to((low[0].size,))]
-    values, _ = enclose(model.square.tape, clock + [Interval(a.ravel(), b.ravel()) for a, b in zip(low, high)])
-    smallest = values[0].lo
-    if len(fine) == 2:
-        cross = np.maximum(np.abs(values[1].lo), np.abs(values[1].hi))
-        smallest = np.minimum(np.minimum(values[0].lo, values[3].lo), values[0].lo * values[3].lo - cross**2)
-    if not np.all(smallest > 0):
-        raise InfeasibleError(
-            "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
-            "direction has none somewhere (noise in the velocities only, say), and value functions prove nothing."
-        )
 
 
 def raised_above(surface: Surface, held: Sequence[Sides] = ()) -> Surface:

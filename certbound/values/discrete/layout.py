@@ -12,6 +12,7 @@ from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside, Outside, Quadratic, Region
+from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import tail
 from certbound.values.discrete.kernels import REACH
@@ -80,8 +81,9 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
 
 
 def _cut_line(problem: Problem, shocks: Shocks, low: float, high: float) -> Boxes:
-    """One interval for all steps of one state, beyond simulated paths where nothing bounds it, and beyond all limits."""
+    """One interval for all steps: beyond simulated paths where nothing bounds the state, and beyond all limits."""
     system, hull = problem.system, start_box(problem)
+    assert isinstance(system, DiscreteSystem)
     rng, horizon = np.random.default_rng(0), int(problem.horizon)
     disturbance = problem.system.disturbance
     middle = [] if disturbance is None else list((disturbance.low + disturbance.high) / 2)
@@ -96,7 +98,9 @@ def _cut_line(problem: Problem, shocks: Shocks, low: float, high: float) -> Boxe
     scale = float(shocks.sigma.hi[0])
     room = _BEYOND * (most - least) + min(shocks.reach, _FARTHER) * scale
     beyond = shocks.reach * scale * (1 + 1e-9)
-    ends = np.array([[least - room if np.isinf(low) else low - beyond], [most + room if np.isinf(high) else high + beyond]])
+    first = least - room if np.isinf(low) else low - beyond
+    last = most + room if np.isinf(high) else high + beyond
+    ends = np.array([[first], [last]])
     _check_box(problem, ends[0], ends[1], 0, np.array([scale * shocks.reach]))
     steps = (horizon + 1, 1)
     return Boxes(np.tile(ends[0], steps), np.tile(ends[1], steps), 0.0, cut=True)

@@ -297,7 +297,8 @@ def _bounded(problem: Problem, parts: int) -> Problem:
     if around.shocks.laplace:
         raise Inapplicable("value functions of infinite horizons need limits on both sides beside exponential tails.")
     below, above = around.dynamics.step(0, Grid(axes=(np.linspace(first, last, 257),))).hull()
-    reach = max(REACH, around.shocks.reach) * np.sqrt(around.shocks.sigma.hi**2 + around.shocks.factor.mag**2) * (1 + 1e-12)
+    spread = np.sqrt(around.shocks.sigma.hi**2 + around.shocks.factor.mag**2) * (1 + 1e-12)
+    reach = max(REACH, around.shocks.reach) * spread
     ends = Interval(below, above) + Interval(-reach, reach)
     start = start_box(problem)  # of a random one what lies beyond it is paid for as the tail of one more step
     edge = min(float(ends.lo[0]), first, float(start[0][0])), max(float(ends.hi[0]), last, float(start[1][0]))

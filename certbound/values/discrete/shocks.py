@@ -100,15 +100,16 @@ def _uniform_shocks(halfwidth: Array, gain: Array) -> Shocks:
 
 def _line_shocks(law: Law, gain: float) -> Shocks:
     """One entry of a law in one state."""
-    scale = Interval.point(gain) * Interval.point(float(np.asarray(getattr(law, law.level))[0]))
+    scale = Interval.point(gain) * Interval.point(float(getattr(law, law.level)[0]))
     size = Interval.point(np.array([1.0])) * Interval(float(scale.mig), float(scale.mag))
     _check_sizes(size)
     nothing = Interval.point(np.zeros(1))
     if isinstance(law, Laplace):
         return Shocks(sigma=size, factor=nothing, uniform=True, laplace=True)
-    ends = np.asarray(law.edges) * float(scale.mid)
+    assert isinstance(law, Histogram)
+    ends: Array = np.asarray(law.edges, dtype=float) * float(scale.mid)
     low, high = np.minimum(ends[:-1], ends[1:]), np.maximum(ends[:-1], ends[1:])
-    share = np.asarray(law.probabilities, dtype=float)
+    share: Array = np.asarray(law.probabilities, dtype=float)
     width = float((share * np.hypot(high + low, (high - low) / math.sqrt(3))).sum()) / 2
     return Shocks(sigma=Interval.point(np.array([width])), factor=nothing, uniform=True, steps=(low, high, share))
 

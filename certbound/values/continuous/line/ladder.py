@@ -13,8 +13,8 @@ from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.held_faces import held_face, resolved
-from certbound.values.continuous.hypotheses import Model, check_noise, raised_above
+from certbound.values.continuous.held_faces import check_noise, held_face, resolved
+from certbound.values.continuous.hypotheses import Model, raised_above
 from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import Link, prove_above, prove_below, spans
 from certbound.values.continuous.line.moved_model import model_on

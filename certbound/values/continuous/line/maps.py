@@ -12,7 +12,8 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.values.charts import Chart, Charts
-from certbound.values.continuous.hypotheses import Model, chart_above, chart_below, check_noise
+from certbound.values.continuous.held_faces import check_noise
+from certbound.values.continuous.hypotheses import Model, chart_above, chart_below
 from certbound.values.continuous.line import ladder
 from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import spans

@@ -45,9 +45,8 @@ def cuts_of(
     scale = max(1.0, *(abs(place) for place in (start.low, start.high, *places)))
     if not scale < _LARGEST:
         raise InfeasibleError(f"value functions need states below {_LARGEST:g}: write the state in another unit.")
-    ends = [end for end in ((0, held[0]), (1, held[1])) if end[1] is not None]
-    always |= {side for side, _ in ends}
-    places += [place for _, place in ends]
+    always |= {side for side, place in enumerate(held) if place is not None}
+    places += [place for place in held if place is not None]
     if len(always) == 2:
         return min(places), max(places)  # nothing is cut
     low, high = _spread(problem, model, start, _FARTHEST * scale, held)
@@ -78,7 +77,7 @@ def _spread(
                 f = np.array([np.broadcast_to(drift(clock[k], x, *c)[..., 0], x.shape) for c in corners])
                 g = np.sqrt(np.broadcast_to(square(clock[k], x)[..., 0, 0], x.shape))
                 x = x + step * sign * (sign * f).max(axis=0) + np.sqrt(step) * g * rng.standard_normal(_PATHS)
-            x = np.clip(x, *(side * math.inf if end is None else end for side, end in zip((-1, 1), held)))
+            x = np.clip(x, -math.inf if held[0] is None else held[0], math.inf if held[1] is None else held[1])
             if not np.all(np.abs(x) < farthest):
                 raise InfeasibleError(_BEYOND)
             middle[k], deviation[k] = np.median(x), np.std(x)

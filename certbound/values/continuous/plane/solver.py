@@ -294,7 +294,8 @@ def solve_lines(
     """Solve (mass - step (speed slope + half bend)) k = right along the first axis, line by line, in place.
 
     The three matrices are given by the rows of their bands (entry (i, k) belongs to column i + k - band); the first and
-    the last row are those of ``mass``, unless they are said to be like the others. ``speed``, ``half`` and ``right`` have shape (rows, lines). No pivots.
+    the last row are those of ``mass``, unless they are said to be like the others. ``speed``, ``half`` and ``right``
+    have shape (rows, lines). No pivots.
     """
     size, wide = mass.shape
     band = (wide - 1) // 2

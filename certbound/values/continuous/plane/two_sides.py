@@ -22,12 +22,11 @@ from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.charts import Chart
-from certbound.values.continuous.held_faces import held_face, resolved
+from certbound.values.continuous.held_faces import check_noise, held_face, resolved
 from certbound.values.continuous.hypotheses import (
     LIFTS,
     Model,
     chart_above,
-    check_noise,
     covers,
     extreme_over,
     prove_upper,
@@ -106,7 +105,7 @@ def bound_plane_above(
     upper, done = 0.0, []
     proposed: list[Proposed] = []
     plans = {plan.cells: plan for plan in (_plan(plane, level, share * patches) for share in _SHARES)}
-    kinds = [propose_plane] if held_anywhere(plane) else _several()
+    kinds: list[Propose] = [propose_plane] if held_anywhere(plane) else _several()
     for plan in plans.values():
         try:
             surface = _promising(plane, model, plan, kinds=kinds)
