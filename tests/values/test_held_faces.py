@@ -10,9 +10,8 @@ import pytest
 import certbound as cb
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous import bound_exits
+from certbound.values.continuous import bound_exits, exits
 from certbound.values.continuous.coefficients import enclose
-from certbound.values.continuous.exits import _model
 from certbound.values.continuous.held_faces import held_face, resolved
 
 
@@ -74,7 +73,7 @@ def test_nobody_leaves_where_no_face_can_be_crossed() -> None:
     ],
 )
 def test_a_face_is_held_where_noise_vanishes_linearly_and_the_drift_leads_inside(f, g, held) -> None:
-    model = _model(line(f, g, ([-1.0], [1.0])))
+    model = exits._model(line(f, g, ([-1.0], [1.0])))
     assert held_face(model, [(-1.0, 1.0)], (0.5, 0.5), (0.0, 2.0), 0, 0) == held
 
 
@@ -91,7 +90,7 @@ def test_in_the_plane_the_noise_along_the_face_does_not_matter() -> None:
 
     system = cb.ContinuousSystem(lambda x, v: [-v / 2, 2 * (0.04 - v)], states=["x", "v"], diffusion=g)
     asked = cb.Problem(system, initial=[0, 0.04], safe=[cb.Inside(cb.Box([-0.25, -1], [0.4, 0.3]))], horizon=0.25)
-    model = _model(asked)
+    model = exits._model(asked)
     box = [(-0.25, 0.4), (-1.0, 0.3)]
     assert held_face(model, box, (0.04, 0.04), (0.0, 0.25), 1, 0) == 0.0
     assert held_face(model, box, (0.0, 0.0), (0.0, 0.25), 0, 0) is None
@@ -111,7 +110,7 @@ def test_stochastic_volatility_is_bounded_from_above() -> None:
 
 def test_the_square_of_a_root_is_what_is_under_it_and_stays_undefined_elsewhere() -> None:
     asked = line(lambda x: [1 - x[0]], lambda t, x: [[-0.5 * np.sqrt(x[0]) / 2]], ([-1.0], [3.0]))
-    model = _model(asked)
+    model = exits._model(asked)
     assert model.square.degrees == [0, 1]
     beyond = [Interval.point(np.zeros(1)), Interval(np.array([-0.1]), np.array([0.1]))]
     with pytest.raises(EnclosureError, match="undefined"):
