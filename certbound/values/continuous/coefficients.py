@@ -143,8 +143,11 @@ class Cells:
         """The boxes themselves."""
         return [Interval(low, high) for low, high in zip(self.low, self.high)]
 
-    def points(self, counts: Sequence[int]) -> list[Interval]:
-        """The nodes of each axis as narrow intervals, shaped for an outer product behind the batch."""
+    def points(self, counts: Sequence[int], *, within: bool = False) -> list[Interval]:
+        """The nodes of each axis as narrow intervals, shaped for an outer product behind the batch.
+
+        ``within`` cuts off what rounding adds beyond the cells, where a root may have no value.
+        """
         result = []
         for axis, count in enumerate(counts):
             shape = [1] * len(counts)
@@ -153,7 +156,8 @@ class Cells:
             share = np.array(nodes_of(count)).reshape(shape)
             extended = (len(self.low[axis]), *([1] * len(counts)))
             low, high = low.reshape(extended), high.reshape(extended)
-            result.append(low + (high - low) * Interval.point(share))
+            place = low + (high - low) * Interval.point(share)
+            result.append(Interval(np.maximum(place.lo, low.lo), np.minimum(place.hi, high.hi)) if within else place)
         return result
 
 
@@ -208,7 +212,8 @@ class Reader:
         Proves: |F(t, x, d) - p(t, x)| <= remainder on each cell, d in the branch; see the module.
         """
         counts = [degree + 1 for degree in self.degrees]
-        values, _ = enclose(self.tape, [*cells.points(counts), *branch])
+        rooted = any(node.op == "sqrt" for node in self.tape.nodes)
+        values, _ = enclose(self.tape, [*cells.points(counts, within=rooted), *branch])
         shape = (len(cells.low[0]), *counts)
         full = [value.broadcast_to(shape) for value in values]
         mid = np.array([value.mid for value in full])
