@@ -55,6 +55,18 @@ def test_a_population_that_dies_out_is_bounded_from_both_sides() -> None:
     assert 0.03 < 10**found.lower <= 10**found.upper < min(0.25, 1.15 * 10**found.lower)
 
 
+def test_a_share_of_genes_is_bounded_the_same_seen_from_either_end() -> None:
+    """The upper face is one at which rounding would leave the root without a value."""
+    def g(t, x):
+        return [[0.4 * np.sqrt(x[0] * (1 - x[0]))]]
+
+    sides = (([0.2], [1.0], 0.6), ([0.0], [0.8], 0.4))
+    found = [bound_exits(line(lambda x: [0.3 * (0.5 - x[0])], g, (low, high), start=start, horizon=1.0), seconds=0.01)
+             for low, high, start in sides]  # fmt: skip
+    assert math.isclose(found[0].upper, found[1].upper, abs_tol=1e-3)
+    assert found[0].lower > found[0].upper - 0.05
+
+
 def test_nobody_leaves_where_no_face_can_be_crossed() -> None:
     logistic = line(lambda x: [x[0] * (1 - x[0])], lambda t, x: [[x[0] * (1 - x[0])]], ([0.0], [1.0]))
     assert bound_exits(logistic, seconds=0.2).upper < -100
