@@ -192,7 +192,7 @@ def test_v_is_bounded_from_below_on_the_walls_and_raised_by_what_it_misses(name:
 def disc_proposals():
     problem = in_disc()
     model = exits._model(problem)
-    plane, region, level = bounding._setting(problem, model)
+    plane, region, level, _ = bounding._setting(problem, model)
     surface = propose_within(plane, Plan(cells=18, growth=0.4, lead=0.1, floor=level - 4), region.walls)
     assert surface is not None
     return problem, model, region.walls, surface
@@ -234,7 +234,7 @@ def half_plane() -> cb.Problem:
 def test_a_state_without_limits_gets_a_box_that_few_paths_leave() -> None:
     problem = half_plane()
     assert walled(problem)
-    plane, region, level = bounding._setting(problem, exits._model(problem))
+    plane, region, level, _ = bounding._setting(problem, exits._model(problem))
     assert 1 - 1e-12 < plane.high[0] == region.high[0] <= 1.0
     assert not region.walls.groups
     assert plane.low[0] < -1.0

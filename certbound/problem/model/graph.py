@@ -46,9 +46,9 @@ class Graph:
             graph._index.setdefault(node, index)
         return graph
 
-    def tape(self, outputs: Sequence[int], shape: tuple[int, ...], keep: int = 0) -> Tape:
-        """The finished tape, less the nodes that no output needs (the first ``keep`` nodes always stay)."""
-        live = needed(self.nodes, outputs, keep)
+    def tape(self, outputs: Sequence[int], shape: tuple[int, ...], keep: int = 0, also: Sequence[int] = ()) -> Tape:
+        """The finished tape, less the nodes that no output needs (the first ``keep`` nodes and ``also`` stay)."""
+        live = needed(self.nodes, [*outputs, *also], keep)
         place: dict[int, int] = {}
         nodes: list[Node] = []
         for index, node in enumerate(self.nodes):

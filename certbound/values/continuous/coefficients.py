@@ -13,6 +13,7 @@ constant and the remainder the radius of the enclosed range.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
@@ -70,7 +71,10 @@ def enclose(tape: Tape, inputs: Sequence[Interval]) -> tuple[list[Interval], Mas
 
 
 def squared_diffusion(diffusion: Array | Tape, states: Sequence[str]) -> Tape:
-    """The tape of a = g g', shape (n, n), over ``("t", *states)``."""
+    """The tape of a = g g', shape (n, n), over ``("t", *states)``; sqrt(u)^2 is u where the root is defined.
+
+    The roots stay among the nodes, so that the tape is undefined wherever g is.
+    """
     graph = Graph(("t", *states))
     rows, columns = diffusion.shape
     if isinstance(diffusion, Tape):
@@ -79,12 +83,48 @@ def squared_diffusion(diffusion: Array | Tape, states: Sequence[str]) -> Tape:
         flat = [graph.const(float(entry)) for entry in np.asarray(diffusion).reshape(-1)]
     outputs = []
     for i, j in itertools.product(range(rows), repeat=2):
-        terms = [graph.apply("mul", flat[i * columns + k], flat[j * columns + k]) for k in range(columns)]
+        terms = [_product(graph, flat[i * columns + k], flat[j * columns + k]) for k in range(columns)]
         total = terms[0]
         for term in terms[1:]:
             total = graph.apply("add", total, term)
         outputs.append(total)
-    return graph.tape(outputs, (rows, rows))
+    return graph.tape(outputs, (rows, rows), also=[k for k, node in enumerate(graph.nodes) if node.op == "sqrt"])
+
+
+def _product(graph: Graph, first: int, second: int) -> int:
+    """The node of a product, in which roots that occur twice have gone."""
+    above: Counter[int] = Counter()
+    below: Counter[int] = Counter()
+    sign = _factors(graph, first, above, below) * _factors(graph, second, above, below)
+    if not any(graph.nodes[leaf].op == "sqrt" and count > 1 for leaf, count in [*above.items(), *below.items()]):
+        return graph.apply("mul", first, second)
+    top, bottom = (_powers(graph, counted) for counted in (above, below))
+    whole = graph.apply("div", top, bottom) if below else top
+    return whole if sign > 0 else graph.apply("neg", whole)
+
+
+def _factors(graph: Graph, index: int, above: Counter[int], below: Counter[int]) -> int:
+    """Count the factors of a node over and under its line; its sign."""
+    node = graph.nodes[index]
+    if node.op == "neg":
+        return -_factors(graph, node.args[0], above, below)
+    if node.op == "sq":
+        return _factors(graph, node.args[0], above, below) * _factors(graph, node.args[0], above, below)
+    if node.op in ("mul", "div"):
+        sides = (above, below) if node.op == "mul" else (below, above)
+        return _factors(graph, node.args[0], above, below) * _factors(graph, node.args[1], *sides)
+    above[index] += 1
+    return 1
+
+
+def _powers(graph: Graph, counted: Counter[int]) -> int:
+    total = graph.const(1.0)
+    for leaf, count in counted.items():
+        if graph.nodes[leaf].op == "sqrt":
+            total = graph.apply("mul", total, graph.pow(graph.nodes[leaf].args[0], count // 2))
+            count %= 2
+        total = graph.apply("mul", total, graph.pow(leaf, count))
+    return total
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -103,8 +143,11 @@ class Cells:
         """The boxes themselves."""
         return [Interval(low, high) for low, high in zip(self.low, self.high)]
 
-    def points(self, counts: Sequence[int]) -> list[Interval]:
-        """The nodes of each axis as narrow intervals, shaped for an outer product behind the batch."""
+    def points(self, counts: Sequence[int], *, within: bool = False) -> list[Interval]:
+        """The nodes of each axis as narrow intervals, shaped for an outer product behind the batch.
+
+        ``within`` cuts off what rounding adds beyond the cells, where a root may have no value.
+        """
         result = []
         for axis, count in enumerate(counts):
             shape = [1] * len(counts)
@@ -113,7 +156,8 @@ class Cells:
             share = np.array(nodes_of(count)).reshape(shape)
             extended = (len(self.low[axis]), *([1] * len(counts)))
             low, high = low.reshape(extended), high.reshape(extended)
-            result.append(low + (high - low) * Interval.point(share))
+            place = low + (high - low) * Interval.point(share)
+            result.append(Interval(np.maximum(place.lo, low.lo), np.minimum(place.hi, high.hi)) if within else place)
         return result
 
 
@@ -168,7 +212,8 @@ class Reader:
         Proves: |F(t, x, d) - p(t, x)| <= remainder on each cell, d in the branch; see the module.
         """
         counts = [degree + 1 for degree in self.degrees]
-        values, _ = enclose(self.tape, [*cells.points(counts), *branch])
+        rooted = any(node.op == "sqrt" for node in self.tape.nodes)
+        values, _ = enclose(self.tape, [*cells.points(counts, within=rooted), *branch])
         shape = (len(cells.low[0]), *counts)
         full = [value.broadcast_to(shape) for value in values]
         mid = np.array([value.mid for value in full])

@@ -21,7 +21,8 @@ from certbound.rigor.intervals import Interval
 from certbound.values.charts import Charts
 from certbound.values.continuous.coefficients import Reader, squared_diffusion
 from certbound.values.continuous.curved import bound_region, walled
-from certbound.values.continuous.hypotheses import Model, check_noise
+from certbound.values.continuous.held_faces import check_noise
+from certbound.values.continuous.hypotheses import Model
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import bound_moving, bound_windows, moving, windowed
 from certbound.values.continuous.room import safe_room
@@ -143,9 +144,6 @@ def bound_exits(
 
         _refuse_random(problem)
         room = safe_room(problem)
-        check_noise(model, (0.0, float(problem.horizon)), list(zip(room.inner_low, room.inner_high)))
-        if lower:
-            check_noise(model, (0.0, float(problem.horizon)), list(zip(room.outer_low, room.outer_high)))
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
         upper, least, words, (proposed, below) = two_states(problem, model, room, begin + seconds, wanted)
     return ExitBounds(

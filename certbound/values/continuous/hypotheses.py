@@ -25,10 +25,9 @@ from typing import TypeVar
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
-from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Chart, from_natural
-from certbound.values.continuous.coefficients import Cells, Interpolant, Reader, enclose
+from certbound.values.continuous.coefficients import Cells, Interpolant, Reader
 from certbound.values.continuous.payment import Patched, Payment, bound_above, bound_below, pay_lower, pay_upper
 from certbound.values.continuous.polynomials import nodes_of
 from certbound.values.continuous.residual import (
@@ -43,6 +42,7 @@ from certbound.values.continuous.surface import Surface
 
 Found = TypeVar("Found")
 Near = tuple[float, float, float] | None
+Sides = tuple[bool, bool]
 
 LIFTS = (0.0, 0.003, 0.01, 0.02, 0.035, 0.06, 0.1, 0.16, 0.25)
 _NEAR = 40.0  # in units of what is granted without being looked at
@@ -208,9 +208,11 @@ def covers(surface: Surface, horizon: float, low: Sequence[float], high: Sequenc
     return all(left <= a and b <= right for (left, right), a, b in zip(own, low, high))
 
 
-def prove_upper(surface: Surface, model: Model, starts: Sequence[tuple[float, float]]) -> Payment:
+def prove_upper(
+    surface: Surface, model: Model, starts: Sequence[tuple[float, float]], held: Sequence[Sides] = ()
+) -> Payment:
     """An upper bound of log P(leaving the box of the surface by its last time), whatever the surface is."""
-    surface = raised_above(surface)
+    surface = raised_above(surface, held)
     start = up(extreme_over(surface, starts, upper=True))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
     proof = examine(surface, model, need, upper=True)
@@ -237,35 +239,10 @@ def cheapest(
     return best
 
 
-def check_noise(model: Model, span: tuple[float, float], ends: Sequence[tuple[float, float]]) -> None:
-    """Refuse noise that may vanish somewhere in a box over a span of time.
-
-    Where it has full rank a path that touches a face crosses it: what lower bounds rest on.
-
-    Raises
-    ------
-    InfeasibleError
-    """
-    fine = [np.linspace(low, high, 17) for low, high in ends]
-    low = np.meshgrid(*(axis[:-1] for axis in fine), indexing="ij")
-    high = np.meshgrid(*(axis[1:] for axis in fine), indexing="ij")
-    clock = [Interval(*span).broadcast_to((low[0].size,))]
-    values, _ = enclose(model.square.tape, clock + [Interval(a.ravel(), b.ravel()) for a, b in zip(low, high)])
-    smallest = values[0].lo
-    if len(fine) == 2:
-        cross = np.maximum(np.abs(values[1].lo), np.abs(values[1].hi))
-        smallest = np.minimum(np.minimum(values[0].lo, values[3].lo), values[0].lo * values[3].lo - cross**2)
-    if not np.all(smallest > 0):
-        raise InfeasibleError(
-            "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
-            "direction has none somewhere (noise in the velocities only, say), and value functions prove nothing."
-        )
-
-
-def raised_above(surface: Surface) -> Surface:
-    """The surface, raised by what it misses of V >= 0 on its faces."""
-    sides = [(axis, side) for axis in range(len(surface.axes)) for side in (0, 1)]
-    lift = max(0.0, -min(surface.face_range(*side)[0] for side in sides))
+def raised_above(surface: Surface, held: Sequence[Sides] = ()) -> Surface:
+    """The surface, raised by what it misses of V >= 0 on its faces, but for those that no path crosses (``held``)."""
+    sides = [(axis, side) for axis in range(len(surface.axes)) for side in (0, 1) if not (held and held[axis][side])]
+    lift = max(0.0, -min((surface.face_range(*side)[0] for side in sides), default=0.0))
     surface = surface.raised(up(lift)) if lift else surface
     if any(surface.face_range(*side)[0] < 0 for side in sides):
         surface = surface.raised(1e-12 * (1 + lift))
@@ -278,13 +255,14 @@ def top_of(surface: Surface) -> float:
 
 
 def chart_above(
-    surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int], near: Near = None
+    surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int], near: Near = None,
+    held: Sequence[Sides] = (),
 ) -> list[Chart]:
     """Upper bounds of P(leaving the box from a cell on), at the start of each of the ``slabs``, or ``near`` the starts.
 
     One payment is made for each of the ``levels`` (of log P), at which it is then sharp; every cell takes the best.
     """
-    surface = raised_above(surface)
+    surface = raised_above(surface, held)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=0.0)
     proof = examine(surface, model, need, upper=True)
     paid = [cheapest(proof, need, surface, level) for level in levels]

@@ -22,6 +22,7 @@ from certbound.watch import poll
 
 _DEGREE = 5
 _BAND = 5
+_THICKEST = 1e-4  # share of the largest a below which cells beside held ends grow no finer
 _THINNEST = 1e-6  # share of a cell that a bent one keeps
 _GAMMA = 1 - 0.5**0.5  # the L-stable two-stage method of order 2
 _NEAR = 6.0  # below the answer, as a logarithm: what a path hardly meets on its way
@@ -42,6 +43,20 @@ class Line:
     square: Callable[[float, Array], Array]
     starts: tuple[float, float]
     autonomous: bool
+    held: tuple[bool, bool] = (False, False)  # ends that no path crosses: the equation itself holds there
+
+    @property
+    def absorbing(self) -> bool:
+        """Whether paths end at a held end, from where nothing is met any more: log u has no limit there."""
+        places = [x for x, held in zip((self.low, self.high), self.held) if held]
+        return any(not self.drift(t, np.array([x])).any() for x in places for t in (0.0, self.horizon))
+
+    def spread_of(self, x: Array) -> Array:
+        """Lengths in which the noise is 1, as far as grids are made by them: beside held ends they end somewhere."""
+        a = self.square(0.5 * self.horizon, x)
+        middle = self.square(0.5 * self.horizon, np.array([0.5 * sum(self.starts)]))[0]
+        least = min(_THICKEST * float(np.max(a)), 0.01 * float(middle)) if any(self.held) else 0.0
+        return 1 / np.sqrt(np.maximum(a, max(least, 1e-300)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -66,7 +81,8 @@ def sketch(
     x = graded(line, cells, [0.002 * (line.high - line.low)] * 2)
     left, right = np.diff(x)[:-1], np.diff(x)[1:]
     u = np.zeros(len(x)) if begin is None else begin(x)
-    u[0] = u[-1] = 1.0
+    for side in (0, -1):
+        u[side] = u[side] if line.held[side] else 1.0
     tau = line.horizon * np.concatenate([[0.0], np.geomspace(1e-5, 1.0, steps)])
     rates = _rates(line, 0.0, x, u, left, right)
     before = 0.0
@@ -80,6 +96,11 @@ def sketch(
         bands[1] = 1.0
         bands[1, 1:-1] += _GAMMA * step * (down + up)
         bands[0, 2:], bands[2, :-2] = -_GAMMA * step * up, -_GAMMA * step * down
+        for side, row in ((0, 0), (-1, 2)):
+            if line.held[side]:  # no noise: the drift alone leads inside
+                along = float(np.abs(line.drift(line.horizon - end, x[[side]])).max()) / abs(x[side] - x[1 + 3 * side])
+                bands[1, side] += _GAMMA * step * along
+                bands[row, 1 + 3 * side] = -_GAMMA * step * along
         before = float(np.max(u[inside]))
         stage = solve_banded((1, 1), bands, u)
         u = np.maximum(solve_banded((1, 1), bands, u + (1 / _GAMMA - 1) * (stage - u)), 0.0)
@@ -108,7 +129,7 @@ def _rates(line: Line, t: float, x: Array, u: Array, left: Array, right: Array) 
 def graded(line: Line, cells: int, layers: list[float]) -> Array:
     """Nodes that crowd at both faces: cells in proportion to the distance (by the noise), down to ``layers``."""
     fine = np.linspace(line.low, line.high, 8001)
-    scale = 1 / np.sqrt(np.maximum(line.square(0.5 * line.horizon, fine), 1e-300))
+    scale = line.spread_of(fine)
     way = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(fine))])
     density = np.full(len(fine), 0.8 / way[-1])
     for distance, layer in ((way, layers[0] * scale[0]), (way[-1] - way, layers[1] * scale[-1])):
@@ -264,6 +285,9 @@ class _Collocation:
     def start(self) -> Array:
         values = self.boundary.profile(self.splines.points)
         values[[0, -1]] = np.where(self.boundary.free, 0.0, self.boundary.faces(0.0)[0])
+        for side in (0, -1):
+            if self.line.held[side]:
+                values[side] = self.boundary.profile(self.splines.points[[side]])[0]
         return self.mass.solve(values)
 
     def value(self, coefficients: Array) -> Array:
@@ -279,7 +303,8 @@ class _Collocation:
         best = f[0] if len(f) == 1 else f[np.argmax(f * slope, axis=0), np.arange(len(slope))]
         value = best * slope + 0.5 * a * (bend + slope * slope)
         speed = best + a * slope
-        value[[0, -1]] = np.where(self.boundary.free, 0.0, self.boundary.faces(tau)[1])
+        ends = np.where(self.boundary.free, 0.0, self.boundary.faces(tau)[1])
+        value[[0, -1]] = np.where(self.line.held, value[[0, -1]], ends)
         return value, speed, a
 
     def step(self, tau: float, c: Array, h: float) -> tuple[Array, Array]:
@@ -287,7 +312,7 @@ class _Collocation:
         s = self.splines
         value, speed, a = self._right(tau, c)
         jacobian = speed[:, None] * s.at[1] + 0.5 * a[:, None] * s.at[2]
-        jacobian[[0, -1]] = 0.0
+        jacobian[[0, -1]] *= np.array(self.line.held)[:, None]
         matrix = _Banded(2 / h * self.weights - jacobian)
         small = 1e-3 * h
         change = (self._right(tau + small, c)[0] - value) / small

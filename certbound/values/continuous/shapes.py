@@ -17,22 +17,34 @@ from certbound.values.continuous.proposal import Line, Sketch, through
 
 _SPARE = 8.0
 _MOST_CELLS = 20_000.0
+_SLIVER = 3e-3  # of the way to the starts
 _ROOM = 6.0  # how far below the answer V is to be known, as a logarithm
 _BACKGROUND = 0.3  # share of the cells that is spread evenly
 
 
-def sealed(line: Line, level: float) -> tuple[Line, tuple[bool, bool]]:
+def sealed(line: Line, level: float, *, gated: bool = False) -> tuple[Line, tuple[bool, bool]]:
     """The line cut where the drift back inside keeps almost every path away: cut ends, and which they are.
 
     An end is cut (for upper bounds; for lower bounds it is known to be out of reach) where exp(-int 2 |f| / a) along
     the way out is far below P. The proof does not rest on that: leaving the longer line means leaving the shorter one.
+    Held ends stay as they are, but before a gate (``gated``), whose front no cells hold where the noise ends.
     """
     ends, cut = [line.low, line.high], [False, False]
     for side in (0, 1):
-        place = _cut(line, side, _SPARE - level)
+        place = None if line.held[side] and not gated else _cut(line, side, _SPARE - level)
         if place is not None:
             ends[side], cut[side] = place, True
-    return replace(line, low=ends[0], high=ends[1]), (cut[0], cut[1])
+    held = (line.held[0] and not cut[0], line.held[1] and not cut[1])
+    return replace(line, low=ends[0], high=ends[1], held=held), (cut[0], cut[1])
+
+
+def before_held(line: Line) -> Line:
+    """The line cut a little before its held ends."""
+    middle = 0.5 * sum(line.starts)
+    low, high = (
+        end + _SLIVER * (middle - end) if held else end for end, held in zip((line.low, line.high), line.held)
+    )
+    return replace(line, low=low, high=high, held=(False, False))
 
 
 def _cut(line: Line, side: int, barrier: float) -> float | None:
@@ -97,7 +109,7 @@ def spread(line: Line, marks: Sequence[tuple[float, float]], rough: Sketch, fine
     close = [place + np.concatenate([-away, away]) / rate for place, rate in marks]
     fine = np.unique(np.concatenate([even, *close]))
     fine = fine[(fine >= line.low) & (fine <= line.high)]
-    scale = 1 / np.sqrt(np.maximum(line.square(0.5 * line.horizon, fine), 1e-300))
+    scale = line.spread_of(fine)
     way = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(fine))])
     depth = max(-rough.level, 1.0) + _ROOM
     density = _bends(rough, fine) / scale

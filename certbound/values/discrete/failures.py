@@ -41,7 +41,7 @@ from certbound.values.discrete.layout import (
 from certbound.values.discrete.shocks import Inapplicable, Shocks, gaussian_shocks, shocks_of
 from certbound.values.discrete.steps import Dynamics, Step
 from certbound.values.discrete.transitions import Transition
-from certbound.values.discrete.uniform_noise import UniformTables, UniformTransition
+from certbound.values.discrete.uniform_noise import LineTables, UniformTables, UniformTransition
 from certbound.values.grids import Grid, corners
 from certbound.values.sets import active_at, box_around, contains, respected
 from certbound.watch import OutOfTime, poll
@@ -282,7 +282,7 @@ class Work:
         last = self.horizon
         zones = [self.zones(grid, t) for t, grid in enumerate(grids)]
         above = final(grids[last], zones[last], above=True, beyond=self.beyond)
-        below = final(grids[last], zones[last], above=False, beyond=self.beyond)
+        below = final(grids[last], zones[last], above=False, beyond=0.0 if self.boxes.cut else self.beyond)
         yield last, above, below
         kept: tuple[object, AnyTransition] | None = None
         for t in range(last - 1, end - 1, -1):
@@ -322,9 +322,8 @@ class Work:
     def transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
         step = self.dynamics.step(t, grid)
         if self.shocks.uniform:
-            return UniformTransition(
-                step, UniformTables(after, self.shocks, *step.hull(), fineness=max(2 / share, 4.0))
-            )
+            kind = LineTables if self.shocks.laplace or self.shocks.steps is not None else UniformTables
+            return UniformTransition(step, kind(after, self.shocks, *step.hull(), fineness=max(2 / share, 4.0)))
         return Transition(step, Tables(after, self.shocks, *step.hull()))
 
     def at_random(self, above: ValueFunction, below: ValueFunction) -> tuple[float, float]:

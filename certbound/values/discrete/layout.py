@@ -12,6 +12,7 @@ from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside, Outside, Quadratic, Region
+from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import tail
 from certbound.values.discrete.kernels import REACH
@@ -23,6 +24,10 @@ from certbound.values.sets import active_at, box_around
 _COARSE = {1: 256, 2: 32, 3: 12}  # cells along each side when the reach of a step is bounded
 
 
+_PATHS = 400
+_BEYOND, _FARTHER = 0.6, 15.0  # how far beyond simulated paths a line is cut: of their extent, and sizes of the noise
+
+
 class Boxes:
     """Per step a box outside which a path counts as failed, and what that adds to the probability of failing.
 
@@ -32,10 +37,13 @@ class Boxes:
         Ends.
     leak : float
         Upper bound of the probability that a path leaves a box through a side that no constraint has put there.
+    cut : bool
+        Whether the boxes, which reach beyond all limits, end where hardly a path gets to: from below such paths count
+        as safe.
     """
 
-    def __init__(self, low: Array, high: Array, leak: float) -> None:
-        self.low, self.high, self.leak = low, high, leak
+    def __init__(self, low: Array, high: Array, leak: float, *, cut: bool = False) -> None:
+        self.low, self.high, self.leak, self.cut = low, high, leak, cut
 
 
 def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
@@ -49,8 +57,13 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
     n, horizon = problem.system.dimension, int(problem.horizon)
     if problem.ending:
         return _of_domain(problem, np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (REACH * (1 + 1e-12)))
+    if shocks.laplace or shocks.steps is not None:
+        ends = [box_around(active_at(problem.constraints, t), n, t) for t in range(horizon + 1)]
+        if not np.isfinite(ends).all():
+            return _cut_line(problem, shocks, np.min([end[0] for end in ends]), np.max([end[1] for end in ends]))
     low, high = np.empty((horizon + 1, n)), np.empty((horizon + 1, n))
-    spread = REACH * (np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (1 + 1e-12))
+    far = max(REACH, shocks.reach)
+    spread = far * (np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (1 + 1e-12))
     reach = start_box(problem)
     leak = 0.0
     for t in range(horizon + 1):
@@ -65,6 +78,32 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
         if t < horizon and _needed(problem, t):
             reach = _next_reach(dynamics, t, low[t], high[t], reach, spread)
     return Boxes(low, high, leak)
+
+
+def _cut_line(problem: Problem, shocks: Shocks, low: float, high: float) -> Boxes:
+    """One interval for all steps: beyond simulated paths where nothing bounds the state, and beyond all limits."""
+    system, hull = problem.system, start_box(problem)
+    assert isinstance(system, DiscreteSystem)
+    rng, horizon = np.random.default_rng(0), int(problem.horizon)
+    disturbance = problem.system.disturbance
+    middle = [] if disturbance is None else list((disturbance.low + disturbance.high) / 2)
+    step, x = compile_numpy(problem.closed_loop), rng.uniform(*hull, (_PATHS, 1))[:, 0]
+    least, most = float(x.min()), float(x.max())
+    for t in range(horizon):
+        inputs = [] if problem.input_sequence is None else list(problem.input_sequence[t])
+        noise = system.noise.sample(rng, _PATHS)[:, 0] * float(system.noise_matrix[0, 0])
+        x = np.broadcast_to(step(float(t), x, *inputs, *middle)[..., 0], x.shape) + noise
+        x = np.where((x >= low) & (x <= high), x, hull[0])
+        least, most = min(least, float(np.nanmin(x))), max(most, float(np.nanmax(x)))
+    scale = float(shocks.sigma.hi[0])
+    room = _BEYOND * (most - least) + min(shocks.reach, _FARTHER) * scale
+    beyond = shocks.reach * scale * (1 + 1e-9)
+    first = least - room if np.isinf(low) else low - beyond
+    last = most + room if np.isinf(high) else high + beyond
+    ends = np.array([[first], [last]])
+    _check_box(problem, ends[0], ends[1], 0, np.array([scale * shocks.reach]))
+    steps = (horizon + 1, 1)
+    return Boxes(np.tile(ends[0], steps), np.tile(ends[1], steps), 0.0, cut=True)
 
 
 def _of_domain(problem: Problem, spread: Array) -> Boxes:

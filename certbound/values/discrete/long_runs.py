@@ -81,6 +81,8 @@ def bound_long_run(
         return None
     begun = time.perf_counter()
     run = _Run(problem, parts)
+    if run.work.boxes.cut and not problem.endless:
+        return None
     left, best = seconds, None
     tried: list[tuple[float, float, float]] = []
     for share in shares_of(run.work.n, uniform=run.work.shocks.uniform):
@@ -140,7 +142,7 @@ class _Run:
         plain = _bounded(problem, parts)
         self.work = Work(plain, self.target, parts)
         self.leak = 0.0 if self.target is None else 2 * self.work.n * tail(REACH)
-        if self.work.boxes.leak > 0:
+        if self.work.boxes.leak > 0 or (self.work.boxes.cut and math.isinf(self.horizon)):
             raise Inapplicable(
                 "value functions of long horizons need limits on both sides of every state: add a constraint or a "
                 "`domain`."
@@ -292,8 +294,11 @@ def _bounded(problem: Problem, parts: int) -> Problem:
         raise Inapplicable("value functions need a limit wherever the target leaves a state without one.")
     inner = plain.replace(safe=[*plain.safe, Inside(Box([first], [last]))], initial=[(first + last) / 2])
     around = Work(inner, None, parts)
+    if around.shocks.laplace:
+        raise Inapplicable("value functions of infinite horizons need limits on both sides beside exponential tails.")
     below, above = around.dynamics.step(0, Grid(axes=(np.linspace(first, last, 257),))).hull()
-    reach = REACH * np.sqrt(around.shocks.sigma.hi**2 + around.shocks.factor.mag**2) * (1 + 1e-12)
+    spread = np.sqrt(around.shocks.sigma.hi**2 + around.shocks.factor.mag**2) * (1 + 1e-12)
+    reach = max(REACH, around.shocks.reach) * spread
     ends = Interval(below, above) + Interval(-reach, reach)
     start = start_box(problem)  # of a random one what lies beyond it is paid for as the tail of one more step
     edge = min(float(ends.lo[0]), first, float(start[0][0])), max(float(ends.hi[0]), last, float(start[1][0]))

@@ -10,6 +10,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.noise import Law
+from certbound.problem.table_laws import Histogram, Laplace
 from certbound.rigor.intervals import Interval, sq, sqrt
 
 _SIZES = (1e-60, 1e60)
@@ -32,12 +33,26 @@ class Shocks:
     factor : Interval, shape (n,)
         Loads of the common factor; all 0 where the entries are independent.
     uniform : bool
-        True: w is uniform on the box [-sigma, sigma] instead, without a common factor.
+        True: w has another law, without a common factor: uniform on the box [-sigma, sigma] if nothing else is said.
+    laplace : bool
+        One state: the density exp(-|w|/sigma)/(2 sigma).
+    steps : (Array, Array, Array), optional
+        One state: lower ends, upper ends and probabilities of intervals on each of which w is uniform; all of them are
+        known up to 1e-11 of the largest end.
     """
 
     sigma: Interval
     factor: Interval
     uniform: bool = False
+    laplace: bool = False
+    steps: tuple[Array, Array, Array] | None = None
+
+    @property
+    def reach(self) -> float:
+        """How far one step of such a law leads, in units of ``sigma``, but for 1e-20."""
+        if self.steps is None:
+            return 47.0 if self.laplace else 1.0
+        return float(np.abs(self.steps[:2]).max()) / float(self.sigma.lo[0]) * (1 + 1e-9)
 
     @property
     def dimension(self) -> int:
@@ -51,7 +66,7 @@ class Shocks:
 
 
 def shocks_of(law: Law, gain: Array) -> Shocks:
-    """The law of G w, for Gaussian w and for uniform w that moves every state on its own.
+    """The law of G w, for Gaussian w and for uniform w that moves every state on its own; in one state also others.
 
     Raises
     ------
@@ -60,6 +75,8 @@ def shocks_of(law: Law, gain: Array) -> Shocks:
     """
     if law.uniform:
         return _uniform_shocks(np.asarray(law.bound), gain)
+    if gain.shape == (1, 1) and type(law) in (Laplace, Histogram) and gain.item():
+        return _line_shocks(law, float(gain.item()))
     if not law.gaussian:
         raise Inapplicable(
             "value functions take noise that is exactly Gaussian or uniform so far, no other law and no class of "
@@ -79,6 +96,22 @@ def _uniform_shocks(halfwidth: Array, gain: Array) -> Shocks:
     sides = Interval.point(np.abs(gain[np.arange(n), place])) * Interval.point(halfwidth[place])
     _check_sizes(sides)
     return Shocks(sigma=sides, factor=Interval.point(np.zeros(n)), uniform=True)
+
+
+def _line_shocks(law: Law, gain: float) -> Shocks:
+    """One entry of a law in one state."""
+    scale = Interval.point(gain) * Interval.point(float(getattr(law, law.level)[0]))
+    size = Interval.point(np.array([1.0])) * Interval(float(scale.mig), float(scale.mag))
+    _check_sizes(size)
+    nothing = Interval.point(np.zeros(1))
+    if isinstance(law, Laplace):
+        return Shocks(sigma=size, factor=nothing, uniform=True, laplace=True)
+    assert isinstance(law, Histogram)
+    ends: Array = np.asarray(law.edges, dtype=float) * float(scale.mid)
+    low, high = np.minimum(ends[:-1], ends[1:]), np.maximum(ends[:-1], ends[1:])
+    share: Array = np.asarray(law.probabilities, dtype=float)
+    width = float((share * np.hypot(high + low, (high - low) / math.sqrt(3))).sum()) / 2
+    return Shocks(sigma=Interval.point(np.array([width])), factor=nothing, uniform=True, steps=(low, high, share))
 
 
 def gaussian_shocks(covariance: Interval) -> Shocks:

@@ -6,6 +6,17 @@ V_i is bounded over cells of the mesh by means of U's largest and smallest value
 union and the intersection of the windows [m - r, m + r] that occur. A function whose slope along axis i ranges over
 an interval of width R lies within R D_i/4 of its interpolation along a cell's side; more precisely phi - I_i phi <=
 (2 R/D_i) (x_i - a_i)(a_i + D_i - x_i)/2, which is a bend of -2 R/D_i in ``functions``.
+
+In one state the same of two other laws. Where w is uniform on intervals [a_j, b_j] with probabilities p_j (a table),
+
+    h(m) = sum_j p_j (A(m + b_j) - A(m + a_j))/(b_j - a_j),   A' = U,   and h' is the same of U in place of A.
+
+For Laplace's law h = L + R, L what lies below m, and with the scale s
+
+    s L' = U/2 - L,   s R' = R - U/2,   h' = (R - L)/s,   h'' = (h - U)/s^2,
+
+so that L and R are carried from point to point with factors below 1, and h' is Lipschitz with |h - U|/s^2. Where U
+is at least -c, h + c changes by a factor of at most exp(|v|/s) over a way v.
 """
 
 from __future__ import annotations
@@ -16,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.lazy import compiled
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import product_error
 from certbound.values.discrete.fields import Mesh, Tables
@@ -43,6 +55,8 @@ class UniformField:
 
 class UniformTables(Tables):
     """What turns value functions on one grid into fields on one mesh; see ``Tables``."""
+
+    blur = 0.0  # up to which ends of windows are known, beside rounding
 
     def __init__(self, grid: Grid, shocks: Shocks, low: Array, high: Array, *, fineness: float) -> None:
         n = grid.dimension
@@ -148,7 +162,7 @@ class UniformTables(Tables):
     def _met(self, table: Array, axis: int, points: Array, pick: np.ufunc) -> Array:
         """Extreme over the cells of a padded grid that the interval between neighbouring points meets."""
         nodes = self.grid.axes[axis]
-        slack = 1e-12 * (1 + np.abs(points).max())
+        slack = 1e-12 * (1 + np.abs(points).max()) + self.blur
         first = np.searchsorted(nodes, points[:-1] - slack, side="left")
         last = np.searchsorted(nodes, points[1:] + slack, side="right")
         moved = np.moveaxis(table, axis, 0)
@@ -199,3 +213,122 @@ class UniformTransition:
                 row.append(np.where(steady, -jump if above else jump, -np.inf if above else np.inf))
             found.append(row)
         return found
+
+
+class LineTables(UniformTables):
+    """In one state: tables of intervals on each of which the noise is uniform."""
+
+    def __init__(self, grid: Grid, shocks: Shocks, low: Array, high: Array, *, fineness: float) -> None:
+        self.grid, self.shocks, self.n = grid, shocks, 1
+        self.sigma = shocks.sigma.mid
+        self.reach = self.sigma * shocks.reach
+        step = self.sigma / fineness
+        floor, ceiling = grid.axes[0][0] - 1.01 * self.reach[0], grid.axes[0][-1] + 1.01 * self.reach[0]
+        first, last = (min(max(float(end[0]), floor), ceiling) for end in (low, high))
+        count = max(2, math.ceil((last - first) / step[0]) + 1) + 2
+        self.mesh = Mesh(start=np.array([first]) - step, step=step, count=(count,))
+        size = (max(float(np.abs(grid.axes[0]).max()), abs(first), abs(last)) + 3 * self.reach[0]) / self.sigma[0]
+        self.blur = 0.0 if shocks.laplace else 1e-11 * (1 + shocks.reach) * float(self.sigma[0])
+        self.off = 64 * (size + 1) * (_UNIT + float((shocks.sigma.rad / self.sigma).max()))
+
+    def field(self, value: ValueFunction, *, order: int = 0) -> UniformField:  # type: ignore[override]
+        """h and the ranges of its slope; ``order`` is ignored."""
+        largest = max(1.0, float(value.size().max()))
+        return (self._exponential if self.shocks.laplace else self._stepped)(value, largest)
+
+    def _stepped(self, value: ValueFunction, largest: float) -> UniformField:
+        """A table: differences of an antiderivative of U, and of U itself."""
+        assert self.shocks.steps is not None
+        nodes, points = self.grid.axes[0], self.mesh.points(0)
+        start, slope, bend = _pieces(value)
+        widths = np.diff(nodes)
+        heads = np.concatenate([[0.0], np.cumsum(widths * (start + widths * (slope / 2 + widths * bend / 3)))])
+
+        def integral(y: Array) -> Array:
+            cell = np.clip(np.searchsorted(nodes, y, side="right") - 1, 0, len(widths) - 1)
+            s = np.clip(y - nodes[cell], 0.0, widths[cell])
+            inside = heads[cell] + s * (start[cell] + s * (slope[cell] / 2 + s * bend[cell] / 3))
+            return np.asarray(inside + value.beyond * (np.minimum(y - nodes[0], 0) + np.maximum(y - nodes[-1], 0)))
+
+        low, high = value.range()
+        least, most = np.pad(low, 1, constant_values=value.beyond), np.pad(high, 1, constant_values=value.beyond)
+        table = np.zeros(len(points))
+        ends = np.zeros((2, len(points) - 1))
+        thinnest = np.inf
+        for a, b, share in zip(*self.shocks.steps):
+            if share > 0:
+                rate, thinnest = share / (b - a), min(thinnest, b - a)
+                table += rate * (integral(points + b) - integral(points + a))
+                for end, sign in ((b, 1), (a, -1)):
+                    found = [self._met(one, 0, points + end, pick) for one, pick in
+                             ((least, np.minimum), (most, np.maximum))]  # fmt: skip
+                    ends += sign * rate * np.array(found if sign > 0 else found[::-1])
+        total = float((widths * value.size()).sum())
+        # sums over cells, and positions
+        off = 4 * (self.off * float(self.sigma[0]) + self.blur) / min(thinnest, float(self.sigma[0]))
+        wrong = (len(nodes) + 64) * 16 * _UNIT * total / thinnest + largest * off
+        slack = 4 * off * largest / thinnest
+        return UniformField(mesh=self.mesh, table=table, error=wrong, slopes=[(ends[0] - slack, ends[1] + slack)])
+
+    def _exponential(self, value: ValueFunction, largest: float) -> UniformField:
+        """Laplace's law."""
+        nodes, points, s = self.grid.axes[0], self.mesh.points(0), float(self.sigma[0])
+        start, slope, bend = _pieces(value)
+        places = np.union1d(points, nodes)
+        if np.diff(places).max() > s / 4:
+            places = np.union1d(places, np.arange(nodes[0], nodes[-1], s / 4))
+        cell = np.searchsorted(nodes, places[:-1], side="right") - 1
+        inside = (cell >= 0) & (cell < len(nodes) - 1)
+        own = np.clip(cell, 0, len(nodes) - 2)
+        lengths = np.diff(places)
+        at, weight = np.polynomial.legendre.leggauss(_RULE)
+        share = (1 + at) / 2
+        y = (places[:-1] - nodes[own])[:, None] + lengths[:, None] * share
+        u = np.where(inside[:, None], start[own, None] + y * (slope[own, None] + y * bend[own, None]), value.beyond)
+        near = np.exp(-lengths[:, None] * share / s) * weight * lengths[:, None] / (4 * s)
+        far = np.exp(-lengths[:, None] * (1 - share) / s) * weight * lengths[:, None] / (4 * s)
+        fade = np.exp(-lengths / s)
+        left, right, count = np.zeros((3, len(places)))
+        left[0] = right[-1] = value.beyond / 2
+        carry(fade, (u * far).sum(axis=1), (u * near).sum(axis=1), left, right, count)
+        index = np.searchsorted(places, points)
+        table, tilt = (left + right)[index], (right - left)[index] / s
+        placed = float(np.abs(nodes).max() / np.diff(nodes).min())  # of how far into a cell a place is
+        wrong = largest * (2 * self.off + (200 + 8 * float(count.max()) + 8 * placed) * _UNIT)
+        low, high = value.range()
+        least, most = np.pad(low, 1, constant_values=value.beyond), np.pad(high, 1, constant_values=value.beyond)
+        under, over = (self._met(one, 0, points, pick) for one, pick in ((least, np.minimum), (most, np.maximum)))
+        step = float(self.mesh.step[0])
+        grown, lift = math.exp(step / s) * (1 + 1e-12), max(0.0, -float(least.min())) + 2 * wrong
+        top = grown * (np.minimum(table[:-1], table[1:]) + lift) - lift + wrong
+        bottom = (np.maximum(table[:-1], table[1:]) + lift) / grown - lift - wrong
+        curved = np.maximum(top - under, over - bottom) / s**2 * (1 + 1e-9)
+        middle, width = (tilt[:-1] + tilt[1:]) / 2, curved * step / 2 + 4 * wrong / s
+        return UniformField(mesh=self.mesh, table=table, error=wrong, slopes=[(middle - width, middle + width)])
+
+
+_RULE = 6
+"""Gauss's points on a piece of at most a quarter of the scale: exact to 1e-18 of the largest |U|."""
+
+
+def _pieces(value: ValueFunction) -> tuple[Array, Array, Array]:
+    """U on every cell of one axis as a polynomial of the distance from its lower end."""
+    widths, bend = value.grid.widths(0), value.bend[0]
+    start, slope = value.nodal[:-1], np.diff(value.nodal) / widths - bend * widths / 2
+    if value.fixed is None:
+        return start, slope, bend / 2
+    keep = ~value.fixed
+    return np.where(keep, start, value.level), slope * keep, bend / 2 * keep
+
+
+@compiled
+def carry(fade: Array, rise: Array, fall: Array, left: Array, right: Array, count: Array) -> None:
+    """What lies below and above every place, from its neighbours, and how many roundings that adds up, in place."""
+    for k in range(len(fade)):
+        left[k + 1] = fade[k] * left[k] + rise[k]
+        count[k + 1] = fade[k] * count[k] + 1.0
+    most = 0.0
+    for k in range(len(fade) - 1, -1, -1):
+        right[k] = fade[k] * right[k + 1] + fall[k]
+        most = fade[k] * most + 1.0
+        count[k] = max(count[k], most)

@@ -24,7 +24,15 @@ from certbound.values.continuous.curved.proof import Lot, highest_over, look_ove
 from certbound.values.continuous.curved.region import Region, region_of
 from certbound.values.continuous.hypotheses import LIFTS, Model, covers, extreme_over
 from certbound.values.continuous.payment import Payment
-from certbound.values.continuous.plane import Plan, Plane, Source, bound_plane_above, rough_level, slab_times
+from certbound.values.continuous.plane import (
+    Plan,
+    Plane,
+    Source,
+    bound_plane_above,
+    held_plane,
+    rough_level,
+    slab_times,
+)
 from certbound.values.continuous.residual import sample_in_plane, value_range
 from certbound.values.continuous.room import starts_of
 from certbound.values.continuous.surface import Surface
@@ -51,7 +59,7 @@ def bound_region(
     problem: Problem, model: Model, deadline: float
 ) -> tuple[float, None, str, list[tuple[Surface, Payment]]]:
     """The upper bound on one grid after another; nothing is proposed for certificates, which know boxes only."""
-    plane, region, level = _setting(problem, model)
+    plane, region, level, model = _setting(problem, model)
     patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     if not region.walls.groups:
         upper, done, _ = bound_plane_above(plane, model, level, patches)
@@ -71,8 +79,11 @@ def bound_region(
     return upper, None, f"value function in two states within curved limits, cells: {', '.join(done)}", []
 
 
-def _setting(problem: Problem, model: Model) -> tuple[Plane, Region, float]:
-    """The problem in floats, the region, and about log P; the box is a small one if that makes no difference."""
+def _setting(problem: Problem, model: Model) -> tuple[Plane, Region, float, Model]:
+    """The problem in floats, the region, and about log P; the box is a small one if that makes no difference.
+
+    Without walls the box ends at faces that no path crosses, and the model is written for their inner side.
+    """
     drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
     corners = [[float(value.mid) for value in branch] for branch in model.branches]
 
@@ -90,7 +101,8 @@ def _setting(problem: Problem, model: Model) -> tuple[Plane, Region, float]:
             low=region.low, high=region.high, horizon=float(problem.horizon), drift=drifts, square=squares,
             starts=starts_of(problem), autonomous=model.autonomous,
         )  # fmt: skip
-        found.append((plane, region, _rough_level(plane, region.walls)))
+        plane, own = (plane, model) if region.walls.groups else held_plane(plane, model)
+        found.append((plane, region, _rough_level(plane, region.walls), own))
     return found[1] if found[1][2] < found[0][2] + _ALIKE else found[0]
 
 

@@ -18,7 +18,8 @@ import math
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Outside, Region
-from certbound.values.continuous.hypotheses import NEGLIGIBLE, Model, Need, check_noise, examine, patched_of, up
+from certbound.values.continuous.held_faces import check_noise
+from certbound.values.continuous.hypotheses import NEGLIGIBLE, Model, Need, examine, patched_of, up
 from certbound.values.continuous.line import ladder
 from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import Link, prove_below, spans

@@ -13,11 +13,20 @@ from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.hypotheses import Model, check_noise, raised_above
+from certbound.values.continuous.held_faces import check_noise, held_face, resolved
+from certbound.values.continuous.hypotheses import Model, raised_above
 from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import Link, prove_above, prove_below, spans
 from certbound.values.continuous.line.moved_model import model_on
-from certbound.values.continuous.line.phases import Gate, Phase, check_room, pieces
+from certbound.values.continuous.line.phases import (
+    Gate,
+    Phase,
+    check_room,
+    held_at,
+    last_instant,
+    limits_of,
+    pieces,
+)
 from certbound.values.continuous.line.profiles import (
     End,
     propose_above,
@@ -29,7 +38,7 @@ from certbound.values.continuous.line.profiles import (
 from certbound.values.continuous.line.reach import cuts_of
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.proposal import Line, Sketch, sketch
-from certbound.values.continuous.shapes import sealed
+from certbound.values.continuous.shapes import before_held, sealed
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
@@ -37,6 +46,7 @@ LADDER = ((4.0, 1e-4, 0.008), (4.5, 3e-5, 0.005), (6.0, 1e-5, 0.003), (8.0, 3e-6
 """Cells a bend, error a step, and lead (a share of the horizon, by d log P / d log T): one attempt after another."""
 _DEARER = 2.0  # what the next attempt costs, in units of the last one
 _SMALL_GAIN = 0.005
+_ASIDE = 4.0  # how far from starts and limits faces that no path crosses are looked for, in units of these
 _RATE = 80_000.0
 """Patches of 63 samples that are taken for a second: measured once, so that a grant of seconds is one of work."""
 _USUAL_SAMPLES = 63.0
@@ -64,6 +74,7 @@ class _Found:
     below: list[tuple[Surface, Payment]] = field(default_factory=list)
 
 
+Held = tuple[float | None, float | None]
 Proposals = tuple[list[tuple[Surface, Payment]], list[tuple[Surface, Payment]]]
 
 
@@ -80,10 +91,12 @@ def bound_line(
     start = start_of(problem)
     if not problem.constraints or any(c.during == (0.0, 0.0) for c in problem.constraints):
         raise InfeasibleError("value functions do not serve constraints at time 0 alone.")
-    cuts = cuts_of(problem, model, start)
-    inner, outer = (room_of(problem, model, cuts, start, inner=side) for side in (True, False))
+    held = held_in(problem, model, start)
+    cuts = cuts_of(problem, model, start, held)
+    inner, outer = (room_of(problem, model, cuts, start, held, inner=side) for side in (True, False))
     for phase, one in zip(outer.phases, outer.models):
-        check_noise(one, (phase.start, phase.end), [(phase.low, phase.high)])
+        check_noise(one, (phase.start, phase.end), [(phase.low, phase.high)], [phase.held])
+    lower = lower and (held == (None, None) or len(model.branches) == 1)
     rough = sketches(inner)
     leak = _leak(outer, model, cuts, start) if lower and len(outer.phases) > 1 else -math.inf
     if leak > -math.inf:
@@ -109,12 +122,28 @@ def bound_line(
     return found.upper, found.lower, words, (found.proposed, found.below)
 
 
+def held_in(problem: Problem, model: Model, start: Start) -> Held:
+    """Below and above the starts the nearest places that no path crosses; None where there are none."""
+    if start.random:  # it may be beyond any face
+        return None, None
+    ends, last = (start.low, start.high), last_instant(problem)
+    offsets = [[limit.offset for limit, _ in limits_of(problem, inner=True) if limit.side == side] for side in (0, 1)]
+    room = _ASIDE * max(1.0, *(abs(place) for place in (*ends, *offsets[0], *offsets[1])))
+    box = (min([ends[0] - room, *offsets[0]]), max([ends[1] + room, *offsets[1]]))
+    low, high = (held_face(model, [box], ends, (0.0, last), 0, side) for side in (0, 1))
+    return low, high
+
+
 def room_of(
-    problem: Problem, model: Model, cuts: tuple[float, float], start: Start, *, inner: bool
+    problem: Problem, model: Model, cuts: tuple[float, float], start: Start, held: Held = (None, None), *, inner: bool
 ) -> Room:
     phases, gates = pieces(problem, cuts, inner=inner)
+    phases = [held_at(phase, held) for phase in phases]
     check_room(phases)
     models = [model_on(phase, model) for phase in phases]
+    if held != (None, None):
+        models = [resolved(one, (phase.start, phase.end), [(phase.low, phase.high)])
+                  for phase, one in zip(phases, models)]  # fmt: skip
     lines = [line_of(phase, one, start) for phase, one in zip(phases, models)]
     return Room(phases=phases, gates=gates, models=models, lines=lines)
 
@@ -161,7 +190,7 @@ def line_of(phase: Phase, model: Model, start: Start) -> Line:
     line = Line(
         low=phase.low, high=phase.high, horizon=phase.end - phase.start, drift=drifts,
         square=lambda t, y: np.broadcast_to(square(t, y)[..., 0, 0], np.shape(y)),
-        starts=starts, autonomous=model.autonomous,
+        starts=starts, autonomous=model.autonomous, held=phase.held,
     )  # fmt: skip
     return shifted(line, phase.start)
 
@@ -234,10 +263,26 @@ def _raise_upper(
     found.work += _patches_in(links)
     payment = prove_above(links, start)
     gain = found.upper - payment.log
-    if gain > 0 and is_plain(room):
+    if gain > 0 and is_plain(room) and not any(links[0].held):
         found.proposed.append((raised_above(links[0].surface), payment))
+    if any(links[0].held) and is_plain(room):
+        _raise_shorter(found, room, start, rough, effort)
     found.upper = min(found.upper, payment.log)
     return gain
+
+
+def _raise_shorter(
+    found: _Found, room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
+) -> None:
+    """A bound on a line that ends before the faces that no path crosses: certificates state nothing of such faces."""
+    links = surfaces_above(room, start, rough, effort, cut=True)
+    if links is None or not spans(links, upper=True) or any(links[0].held):
+        return
+    found.work += _patches_in(links)
+    payment = prove_above(links, start)
+    if payment.log < min([0.0, *(one.log for _, one in found.proposed)]):
+        found.proposed.append((raised_above(links[0].surface), payment))
+        found.upper = min(found.upper, payment.log)
 
 
 def is_plain(room: Room) -> bool:
@@ -258,22 +303,23 @@ def _raise_lower(
     if payment is None:
         return 0.0
     gain = math.inf if found.lower is None else payment.log - found.lower
-    if gain > 0 and is_plain(room):
+    if gain > 0 and is_plain(room) and not any(links[0].held):
         found.below.append((links[0].surface, payment))
     found.lower = payment.log if found.lower is None else max(found.lower, payment.log)
     return gain
 
 
 def surfaces_above(
-    room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float]
+    room: Room, start: Start, rough: list[Sketch], effort: tuple[float, float, float, float], *, cut: bool = False
 ) -> list[Link] | None:
-    """Surfaces for the upper bound, the last phase first."""
+    """Surfaces for the upper bound, the last phase first; ``cut`` ends the line before held faces."""
     share, fineness, tolerance, sharpness = effort
     links: list[Link] = []
     for k in reversed(range(len(room.phases))):
         line = room.lines[k]
         if k == 0 and not start.random:
-            line = sealed(line, rough[0].level)[0]
+            line = sealed(line, rough[0].level, gated=cut or len(room.phases) > 1)[0]
+            line = before_held(line) if cut else line
         surface = propose_above(
             line, _end(room, k, links[0].surface if links else None), rough[k], share * line.horizon, sharpness,
             fineness=fineness, tolerance=tolerance,

@@ -44,6 +44,12 @@ class Link:
     model: Model
     surface: Surface
 
+    @property
+    def held(self) -> tuple[bool, bool]:
+        """The ends of the surface that no path crosses."""
+        nodes, phase = self.surface.axes[0], self.phase
+        return phase.held[0] and nodes[0] == phase.low, phase.held[1] and nodes[-1] == phase.high
+
 
 def spans(links: Sequence[Link], *, upper: bool) -> bool:
     """Whether every surface spans its phase, within the phase's box (upper) or around it (lower)."""
@@ -63,7 +69,7 @@ def prove_above(links: Sequence[Link], start: Start) -> Payment:
     ready: list[Link] = []
     for link in reversed(links):
         after = ready[0] if ready else None
-        surface = raised_above(link.surface)
+        surface = raised_above(link.surface, [link.held])
         missing = missing_upper(surface, link.phase, link.gate, (after.surface, after.phase) if after else None)
         if not math.isfinite(missing):
             return Payment(log=0.0)
@@ -109,6 +115,7 @@ def prove_below(links: Sequence[Link], start: Start) -> Payment | None:
     parts = [patched_of(proof, -proof.ranges.residual_low, need, steps) for proof in proofs]
     ceiling = highest_inside(ready[-1].surface, ready[-1].phase, ready[-1].gate)
     for link in ready:
-        ends = [link.surface.face_range(0, side)[1] for side in (0, 1) if not link.phase.closed[side]]
+        cut = [side for side in (0, 1) if not (link.phase.closed[side] or link.phase.held[side])]
+        ends = [link.surface.face_range(0, side)[1] for side in cut]
         ceiling = max([ceiling, *ends])
     return pay_lower(chained(parts, [link.surface for link in ready], need), level, ceiling, whole=start.random)

@@ -12,7 +12,8 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.values.charts import Chart, Charts
-from certbound.values.continuous.hypotheses import Model, chart_above, chart_below, check_noise
+from certbound.values.continuous.held_faces import check_noise
+from certbound.values.continuous.hypotheses import Model, chart_above, chart_below
 from certbound.values.continuous.line import ladder
 from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import spans
@@ -43,15 +44,17 @@ def chart_line(problem: Problem, model: Model, levels: list[float], times: int, 
         )
         if links is not None and spans(links, upper=True):
             surface = links[0].surface
-            found = _at_times(model, surface.times, times, -1, partial(chart_above, surface, model, levels))
+            chart = partial(chart_above, surface, inner.models[0], levels, held=[links[0].held])
+            found = _at_times(model, surface.times, times, -1, chart)
             same = len(above) == len(found) and all(a.time == b.time for a, b in zip(above, found))
             above = [a.joined(b) for a, b in zip(above, found)] if same else found
     below: list[Chart] = []
     rough = [dataclasses.replace(rough[0], level=levels[0])]
+    lower = lower and (len(model.branches) == 1 or not any(outer.phases[0].held))
     links = ladder.surfaces_below(outer, start, rough, (share, fineness, 0.5 * tolerance, lead)) if lower else None
     if links is not None and spans(links, upper=False):
         surface = links[0].surface
-        below = _at_times(model, surface.times, times, 1, partial(chart_below, surface, model, levels))
+        below = _at_times(model, surface.times, times, 1, partial(chart_below, surface, outer.models[0], levels))
     return Charts(upper=tuple(above), lower=tuple(below))
 
 
@@ -77,36 +80,42 @@ def chart_slabs(problem: Problem, model: Model, step: float, last: float) -> Cha
     share = lead / growth
     near = (horizon * step / (growth * ratio), start.low, start.high)
     above = ladder.surfaces_above(inner, start, rough, (share, fineness, tolerance, lead))
-    below = ladder.surfaces_below(outer, start, rough, (share, fineness, 0.5 * tolerance, lead))
+    below = None
+    if len(model.branches) == 1 or not any(outer.phases[0].held):
+        below = ladder.surfaces_below(outer, start, rough, (share, fineness, 0.5 * tolerance, lead))
     upper: list[Chart] = []
     lower: list[Chart] = []
     if above is not None and spans(above, upper=True):
         surface = above[0].surface
-        upper = chart_above(surface, model, levels, np.flatnonzero(surface.times[:-1] <= last).tolist(), near)
+        slabs = np.flatnonzero(surface.times[:-1] <= last).tolist()
+        upper = chart_above(surface, inner.models[0], levels, slabs, near, [above[0].held])
     if below is not None and spans(below, upper=False):
         surface = below[0].surface
-        lower = chart_below(surface, model, levels, np.flatnonzero(surface.times[:-1] <= last).tolist(), near)
+        slabs = np.flatnonzero(surface.times[:-1] <= last).tolist()
+        lower = chart_below(surface, outer.models[0], levels, slabs, near)
     return Charts(upper=tuple(upper), lower=tuple(lower))
 
 
 def _rooms(problem: Problem, model: Model) -> tuple[ladder.Room, ladder.Room, Start]:
     """The room for upper bounds, that for lower ones, and the start; refused where limits change."""
     start = start_of(problem)
-    cuts = cuts_of(problem, model, start)
-    inner, outer = (ladder.room_of(problem, model, cuts, start, inner=side) for side in (True, False))
+    held = ladder.held_in(problem, model, start)
+    cuts = cuts_of(problem, model, start, held)
+    inner, outer = (ladder.room_of(problem, model, cuts, start, held, inner=side) for side in (True, False))
     if any(_changing(room) for room in (inner, outer)) or start.random:
         raise InfeasibleError(
             "maps of value functions serve limits on both sides that stand still over the whole horizon, and a set of "
             "starts."
         )
     phase = outer.phases[0]
-    check_noise(outer.models[0], (phase.start, phase.end), [(phase.low, phase.high)])
+    check_noise(outer.models[0], (phase.start, phase.end), [(phase.low, phase.high)], [phase.held])
     return inner, outer, start
 
 
 def _changing(room: ladder.Room) -> bool:
     """Whether the limits move, come or go in time, or one is missing."""
-    return not ladder.is_plain(room) or not all(room.phases[0].closed)
+    phase = room.phases[0]
+    return not ladder.is_plain(room) or not all(end or held for end, held in zip(phase.closed, phase.held))
 
 
 def _at_times(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,7 +35,8 @@ class Limit:
 class Phase:
     """A piece of time, and a box of the coordinate y with x = origin(t) + width(t) y (x = y where these are None).
 
-    ``closed`` tells at which of the two faces a path that leaves has failed; at the others the line is only cut.
+    ``closed`` tells at which of the two faces a path that leaves has failed; at the others the line is only cut, or
+    ``held``: no path crosses them (`certbound.values.continuous.held_faces`).
     """
 
     start: float
@@ -43,6 +44,7 @@ class Phase:
     low: float
     high: float
     closed: tuple[bool, bool]
+    held: tuple[bool, bool] = (False, False)
     origin: Tape | None = None
     width: Tape | None = None
 
@@ -173,6 +175,19 @@ def phase_of(limits: list[Limit], start: float, end: float, cuts: tuple[float, f
     origin = graph.tape([nodes[0]], (1,))
     width = graph.tape([graph.apply("sub", nodes[1], nodes[0])], (1,))
     return Phase(start=start, end=end, low=0.0, high=1.0, closed=closed, origin=origin, width=width)
+
+
+def held_at(phase: Phase, faces: tuple[float | None, float | None]) -> Phase:
+    """The phase, ended at faces that no path crosses, where these lie within its limits."""
+    if phase.origin is not None or phase.width is not None:
+        return phase
+    low, high = faces
+    held = (low is not None and low >= phase.low, high is not None and high <= phase.high)
+    return replace(
+        phase, low=low if held[0] and low is not None else phase.low,
+        high=high if held[1] and high is not None else phase.high,
+        closed=(phase.closed[0] and not held[0], phase.closed[1] and not held[1]), held=held,
+    )  # fmt: skip
 
 
 def _strongest(limits: list[Limit], side: int) -> Side:

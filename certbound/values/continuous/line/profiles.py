@@ -18,6 +18,7 @@ from certbound.values.continuous.surface import Surface
 
 Values = Callable[[Array], Array]
 _SHARE = 0.005  # what a lower bound starts from at the horizon, as a share of P; it is subtracted at last
+_DEEP = 3.0  # how far below log P an upper V has its floor where paths come to rest
 _APART = 4.0  # how far beyond a gate a lower V begins to rise, in units of its slope
 _BENT = 3.0  # over which length V is bent at a gate, in units of its slope
 _SHARPER = 0.25  # at jumps, what lower bounds need in addition: their V has to rise from far below
@@ -51,7 +52,7 @@ def propose_above(
     line: Line, end: End, rough: Sketch, lead: float, sharpness: float, *, fineness: float, tolerance: float
 ) -> Surface | None:
     """V = 0 on both faces and beyond the gate."""
-    layers = [layer(line, side, lead) for side in (0, 1)]
+    layers = [(0.0, 0.0) if line.held[side] else layer(line, side, lead) for side in (0, 1)]
     steep = _gate_slopes(line, end, rough, sharpness, 1.0)
 
     def profile(y: Array) -> Array:
@@ -71,11 +72,14 @@ def propose_above(
         for _, past, depth in rows:
             if past is not None:
                 total = np.minimum(total, 0.0) * _smooth(past / depth)
+        if line.absorbing:
+            total = np.logaddexp(total, rough.level - _DEEP)
         return np.asarray(np.maximum(total, -1e4))
 
     zero = np.zeros(2)
     boundary = Boundary(profile=profile, faces=lambda tau: (zero, zero), step=_first_step(line, end, steep, lead))
-    nodes = spread(line, _marks(line, end, [rate for rate, _ in layers], steep), rough, fineness)
+    slopes = [None if line.held[side] else rate for side, (rate, _) in enumerate(layers)]
+    nodes = spread(line, _marks(line, end, slopes, steep), rough, fineness)
     return propose(line, nodes, boundary, tolerance=tolerance, level=rough.level)
 
 
@@ -88,12 +92,15 @@ def propose_below(
     With a ``floor`` it is just that there.
     """
     top = rough.level + float(np.log(_SHARE)) if floor is None else floor
+    floor = top if line.absorbing and end.after is None else floor
     steep = _gate_slopes(line, end, rough, sharpness, _SHARPER)
-    rates = [rise(line, side, -2 * top / lead) for side in (0, 1)]
+    rates = [0.0 if line.held[side] else rise(line, side, -2 * top / lead) for side in (0, 1)]
+
     def flat(y: Array) -> Array:
         return np.full(len(y), top)
 
-    profile = flat if floor is not None else _profile_below(line, end, far, top, rates, steep)
+    absent = (far[0] or line.held[0], far[1] or line.held[1])
+    profile = flat if floor is not None else _profile_below(line, end, absent, top, rates, steep)
     at_faces = profile(np.array([line.low, line.high]))
     target = np.where(closed, 0.0, top)
     rising = np.array(closed) & (at_faces < -1e-9)
@@ -106,7 +113,7 @@ def propose_below(
         return value, gap * 30 * (s * (1 - s)) ** 2 / lead
 
     boundary = Boundary(profile=profile, faces=faces, step=_first_step(line, end, steep, lead), free=far)
-    slopes = [None if far[k] else rates[k] for k in (0, 1)]
+    slopes = [None if absent[k] else rates[k] for k in (0, 1)]
     nodes = spread(line, _marks(line, end, slopes, steep), rough, fineness)
     return propose(line, nodes, boundary, tolerance=tolerance, level=rough.level)
 
@@ -183,6 +190,8 @@ def _jump(line: Line, end: End, side: int) -> bool:
 
 
 def _new(line: Line, end: End, side: int) -> bool:
+    if line.held[side]:
+        return False
     if end.after is None:
         return True
     face = np.array([line.low if side == 0 else line.high])
@@ -194,7 +203,7 @@ def _gate_slopes(line: Line, end: End, rough: Sketch, sharpness: float, jump: fl
     found = []
     for side in (0, 1):
         place = np.array([line.low if side == 0 else line.high])
-        spread_out = float(np.sqrt(line.square(line.horizon, place)[0] * line.horizon))
+        spread_out = max(float(np.sqrt(line.square(line.horizon, place)[0] * line.horizon)), 1e-150)
         sharp = sharpness * (jump if _inside(line, end, side) and _jump(line, end, side) else _SOFTER)
         found.append(float(np.sqrt(2 * (1 - rough.level))) / (spread_out * sharp))
     return found
@@ -219,7 +228,7 @@ def _first_step(line: Line, end: End, steep: list[float], lead: float) -> float:
     step = 0.02 * lead
     for side in (0, 1):
         if _inside(line, end, side):
-            a = float(line.square(line.horizon, _mark(end, side))[0])
+            a = max(float(line.square(line.horizon, _mark(end, side))[0]), 1e-300)
             step = min(step, 0.02 / (a * steep[side] ** 2))
     return step
 

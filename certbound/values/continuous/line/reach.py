@@ -24,8 +24,10 @@ _FARTHEST = 1e9  # times the largest of the starts and limits, and times 1
 _LARGEST = 1e60  # units in which V's second derivatives would fall below the smallest float are refused
 
 
-def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]:
-    """A place below and one above everything; `inf` is never returned.
+def cuts_of(
+    problem: Problem, model: Model, start: Start, held: tuple[float | None, float | None] = (None, None)
+) -> tuple[float, float]:
+    """A place below and one above everything; `inf` is never returned. No path crosses the ``held`` ones.
 
     Raises
     ------
@@ -43,9 +45,11 @@ def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]
     scale = max(1.0, *(abs(place) for place in (start.low, start.high, *places)))
     if not scale < _LARGEST:
         raise InfeasibleError(f"value functions need states below {_LARGEST:g}: write the state in another unit.")
+    always |= {side for side, place in enumerate(held) if place is not None}
+    places += [place for place in held if place is not None]
     if len(always) == 2:
         return min(places), max(places)  # nothing is cut
-    low, high = _spread(problem, model, start, _FARTHEST * scale)
+    low, high = _spread(problem, model, start, _FARTHEST * scale, held)
     low, high = min([low, *places]), max([high, *places])
     square = compile_numpy(model.square.tape)
     room = 0.02 * (high - low)
@@ -53,7 +57,9 @@ def cuts_of(problem: Problem, model: Model, start: Start) -> tuple[float, float]
     return float(at[0]), float(at[1])
 
 
-def _spread(problem: Problem, model: Model, start: Start, farthest: float) -> tuple[float, float]:
+def _spread(
+    problem: Problem, model: Model, start: Start, farthest: float, held: tuple[float | None, float | None]
+) -> tuple[float, float]:
     """Extremes of a few paths with the worst disturbances each way, extended by so many deviations."""
     drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
     corners = [[float(value.mid) for value in branch] for branch in model.branches]
@@ -71,6 +77,7 @@ def _spread(problem: Problem, model: Model, start: Start, farthest: float) -> tu
                 f = np.array([np.broadcast_to(drift(clock[k], x, *c)[..., 0], x.shape) for c in corners])
                 g = np.sqrt(np.broadcast_to(square(clock[k], x)[..., 0, 0], x.shape))
                 x = x + step * sign * (sign * f).max(axis=0) + np.sqrt(step) * g * rng.standard_normal(_PATHS)
+            x = np.clip(x, -math.inf if held[0] is None else held[0], math.inf if held[1] is None else held[1])
             if not np.all(np.abs(x) < farthest):
                 raise InfeasibleError(_BEYOND)
             middle[k], deviation[k] = np.median(x), np.std(x)

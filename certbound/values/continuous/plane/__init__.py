@@ -12,10 +12,16 @@ from certbound.values.continuous.plane.plane_targets import bound_failing
 from certbound.values.continuous.plane.plane_windows import bound_windows
 from certbound.values.continuous.plane.solver import Solver, integrated, solve_lines
 from certbound.values.continuous.plane.stages import windowed
-from certbound.values.continuous.plane.two_sides import bound_plane_above, chart_plane, rough_level, two_states
+from certbound.values.continuous.plane.two_sides import (
+    bound_plane_above,
+    chart_plane,
+    held_plane,
+    rough_level,
+    two_states,
+)
 
 __all__ = [
     "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",
-    "bound_windows", "chart_plane", "integrated", "moving", "reach_of", "rough_level", "slab_times", "solve_lines",
-    "spread_nodes", "two_states", "windowed",
+    "bound_windows", "chart_plane", "held_plane", "integrated", "moving", "reach_of", "rough_level", "slab_times",
+    "solve_lines", "spread_nodes", "two_states", "windowed",
 ]

@@ -20,7 +20,8 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Reader
-from certbound.values.continuous.hypotheses import Model, check_noise
+from certbound.values.continuous.held_faces import check_noise
+from certbound.values.continuous.hypotheses import Model
 from certbound.values.continuous.line import Limit, Phase, check_room, phase_of, value_at
 from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
 from certbound.values.continuous.plane.plane_grids import Pair, Plane

@@ -137,10 +137,13 @@ class Monotone(Solver):
         return new
 
     def _solved(self, diagonal: Array, weights: Weights, right: Array) -> Array:
-        """The M-matrix with these weights of neighbours, divided into the right-hand side."""
+        """The M-matrix with these weights of neighbours, divided into the right-hand side; nan where they overflow."""
         from scipy.sparse.linalg import splu
 
-        matrix = self._matrix(diagonal + sum(weights), weights)
+        entries = diagonal + sum(weights)
+        if not np.isfinite(entries).all() or not np.isfinite(right).all():
+            return np.full(right.shape, np.nan)
+        matrix = self._matrix(entries, weights)
         return np.asarray(splu(matrix, permc_spec="MMD_AT_PLUS_A").solve(right.ravel()).reshape(right.shape))
 
     def _matrix(self, diagonal: Array, weights: Weights) -> csc_array:

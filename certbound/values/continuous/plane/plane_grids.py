@@ -15,6 +15,9 @@ from certbound.values.continuous.residual import along
 from certbound.values.continuous.surface import Surface
 
 Pair = tuple[float, float]
+Sides = tuple[bool, bool]
+
+_THINNEST = 0.2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -29,6 +32,13 @@ class Plane:
     starts: list[Pair]
     autonomous: bool
     nodes: tuple[Array, Array] | None = None
+    held: tuple[Sides, Sides] = ((False, False), (False, False))  # faces that no path crosses
+
+    def across(self, axis: int, place: list[Array], t: float) -> Array:
+        """a's entry across a face, not below a small share of its largest value where it may vanish."""
+        a = self.square(t, *place)[axis, axis] * np.ones(np.broadcast_shapes(*(np.shape(one) for one in place)))
+        least = _THINNEST * float(np.max(a)) if any(itertools.chain(*self.held)) else 0.0
+        return np.asarray(np.maximum(a, max(least, 1e-300)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -104,6 +114,8 @@ def spread_nodes(plane: Plane, plan: Plan, axis: int, more: Callable[[Array], Ar
     density = 1 / mean_deviation(plane, axis, fine)
     density = density / np.trapezoid(density, fine)
     for side, distance in ((0, fine - low), (1, high - fine)) if more is None else ():
+        if plane.held[axis][side]:
+            continue
         weight = 1 / (distance + 1 / layer_rate(plane, plan, axis, side))
         density += 0.5 * weight / np.trapezoid(weight, fine)
     density = density if more is None else density * more(fine)
@@ -127,7 +139,7 @@ def layer_rate(plane: Plane, plan: Plan, axis: int, side: int) -> float:
     ends = [np.linspace(plane.low[k], plane.high[k], 33) for k in (0, 1)]
     ends[axis] = np.array([plane.low[axis] if side == 0 else plane.high[axis]])
     x, y = np.meshgrid(*ends, indexing="ij")
-    a = np.maximum(plane.square(plane.horizon, x, y)[axis, axis] * np.ones(x.shape), 1e-300)
+    a = plane.across(axis, [x, y], plane.horizon)
     if plan.below:
         return float(np.max(rise(plane, plan, axis, side, x, y)))
     inward = np.max(plane.drift(plane.horizon, x, y)[:, axis] * (1 if side == 0 else -1), axis=0)

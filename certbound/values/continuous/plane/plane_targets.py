@@ -21,13 +21,13 @@ from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Faces, Region
 from certbound.rigor.intervals import Interval
+from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import (
     LIFTS,
     NEGLIGIBLE,
     Model,
     Need,
     cheapest,
-    check_noise,
     covers,
     examine,
     extreme_over,

@@ -17,12 +17,12 @@ import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.problem.problem import Problem
+from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import (
     NEGLIGIBLE,
     Model,
     Need,
     chained,
-    check_noise,
     examine,
     extreme_over,
     patched_of,

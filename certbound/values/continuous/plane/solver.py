@@ -100,8 +100,10 @@ class Solver:
         self.gaps = np.meshgrid(*(np.gradient(one) for one in points), indexing="ij")
         widths = [np.interp(one, nodes, np.gradient(nodes)) for one, nodes in zip(points, self.nodes)]
         self.widths = np.meshgrid(*widths, indexing="ij")
-        self.edge = np.ones(self.x.shape, dtype=bool)
-        self.edge[1:-1, 1:-1] = False
+        self.edge = np.zeros(self.x.shape, dtype=bool)
+        for axis, side in itertools.product((0, 1), (0, 1)):
+            if not plane.held[axis][side]:
+                np.moveaxis(self.edge, axis, 0)[-side] = True
         self.fixed = self._model(0.0) if plane.autonomous else None
         self.source = None
         if source is not None:
@@ -123,6 +125,8 @@ class Solver:
         sides = []
         for axis, place in enumerate((self.x, self.y)):
             for side in (0, 1):
+                if self.plane.held[axis][side]:
+                    continue
                 rate, bend, curve = self._layer(axis, side)
                 depth = rate * (place - self.plane.low[axis] if side == 0 else self.plane.high[axis] - place)
                 sides.append(np.log1p(bend * depth) + 0.5 * curve * depth**2 * np.exp(-depth) - depth)
@@ -138,7 +142,7 @@ class Solver:
         rate = layer_rate(self.plane, self.plan, axis, side)
         place = [self.x, self.y]
         place[axis] = np.full(self.x.shape, self.plane.low[axis] if side == 0 else self.plane.high[axis])
-        a = self.plane.square(self.plane.horizon, *place)[axis, axis]
+        a = self.plane.across(axis, place, self.plane.horizon)
         inward = self.plane.drift(self.plane.horizon, *place)[0, axis] * (1 if side == 0 else -1)
         share = inward / (rate * a)
         bend = np.clip((0.5 - share) / np.maximum(1 - share, 0.1), 0.0, 0.9)
@@ -221,7 +225,7 @@ class Solver:
             line = np.ascontiguousarray(right if axis == 0 else right.T)
             speed = np.ascontiguousarray(speeds[axis] if axis == 0 else speeds[axis].T)
             half = np.ascontiguousarray(0.5 * (a[0, 0] if axis == 0 else a[1, 1].T) * np.ones(line.shape))
-            solve_lines(own.at[0], own.at[1], own.at[2], speed, half, self.gamma * step, line)
+            solve_lines(own.at[0], own.at[1], own.at[2], speed, half, self.gamma * step, line, *self.plane.held[axis])
             line = own.dense[0] @ line
             right = line if axis == 0 else line.T
         return right
@@ -244,8 +248,11 @@ class Solver:
             part = np.einsum("iap,kpq->kiaq", maps[0], np.array(tables), optimize=True)
             found = np.einsum("jbq,kiaq->kiajb", maps[1], part, optimize=True)[::-1]
             if not self.plan.below:
-                found[:, [0, -1], 0] = 0.0  # V = 0 on the faces, exactly
-                found[:, :, :, [0, -1], 0] = 0.0
+                for side in (0, 1):  # V = 0 on the faces, exactly
+                    if not self.plane.held[0][side]:
+                        found[:, -side, 0] = 0.0
+                    if not self.plane.held[1][side]:
+                        found[:, :, :, -side, 0] = 0.0
             return np.asarray(found)
 
         forward = self.plane.horizon - times[::-1]
@@ -267,6 +274,8 @@ def weakened(plane: Plane, plan: Plan, drift: Array, a: Array, places: tuple[Arr
         zone = _ZONE * width / plan.cells
         weak = drift[axis] * np.ones(place.shape)
         for distance, sign in ((place - plane.low[axis], 1.0), (plane.high[axis] - place, -1.0)):
+            if plane.held[axis][int(sign < 0)]:
+                continue
             share = np.clip(2 - distance / zone, 0.0, 1.0)
             line = distance[:, 0] if axis == 0 else distance[0]
             beyond = np.take(value, [np.argmin(np.abs(line - 1.5 * zone))], axis=axis)
@@ -278,18 +287,22 @@ def weakened(plane: Plane, plan: Plan, drift: Array, a: Array, places: tuple[Arr
 
 
 @compiled
-def solve_lines(mass: Array, slope: Array, bend: Array, speed: Array, half: Array, step: float, right: Array) -> None:
+def solve_lines(
+    mass: Array, slope: Array, bend: Array, speed: Array, half: Array, step: float, right: Array, first: bool,
+    last: bool,
+) -> None:
     """Solve (mass - step (speed slope + half bend)) k = right along the first axis, line by line, in place.
 
     The three matrices are given by the rows of their bands (entry (i, k) belongs to column i + k - band); the first and
-    the last row are those of ``mass``. ``speed``, ``half`` and ``right`` have shape (rows, lines). No pivots.
+    the last row are those of ``mass``, unless they are said to be like the others. ``speed``, ``half`` and ``right``
+    have shape (rows, lines). No pivots.
     """
     size, wide = mass.shape
     band = (wide - 1) // 2
     work = np.empty((size, wide))
     for line in range(right.shape[1]):
         for i in range(size):
-            inside = step if 0 < i < size - 1 else 0.0
+            inside = step if (i > 0 or first) and (i < size - 1 or last) else 0.0
             for k in range(wide):
                 work[i, k] = mass[i, k] - inside * (speed[i, line] * slope[i, k] + half[i, line] * bend[i, k])
         for i in range(size):

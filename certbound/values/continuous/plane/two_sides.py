@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -21,6 +22,7 @@ from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.charts import Chart
+from certbound.values.continuous.held_faces import check_noise, held_face, resolved
 from certbound.values.continuous.hypotheses import (
     LIFTS,
     Model,
@@ -36,6 +38,7 @@ from certbound.values.continuous.plane.monotone import propose_monotone
 from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.plane_proposal import propose_plane
+from certbound.values.continuous.plane.plane_reach import reach_of
 from certbound.values.continuous.room import Room, points_of, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
@@ -55,6 +58,11 @@ _RAISED = (0.6, 1.5, 2.5)  # times a: what they keep of it at kinks, one after t
 _HOPELESS = (60.0, 1000.0)  # what a first proposal may lose (log P); sources make less of it, more so of monotone ones
 _VARIED = 1.0  # about how much V varies on a patch
 _SHARES = (0.12, 0.8)  # of the patches, for one grid after the other
+_LONGER = 4.0  # leads beside faces that no path crosses, where the noise across others may vanish in places
+_DEEP = 3.0  # how far below log P the floor is there
+_FLOORS = (-7.0, -20.0, -50.0)
+_BEYOND = 0.35  # how far beyond simulated paths a box ends, in units of their extent
+_ALIKE = 0.03  # of log P, which a smaller box may add to a rough guess
 BELOW = 0.6  # of as many patches again, for a lower bound
 
 
@@ -67,12 +75,19 @@ def two_states(
     What certificates state of both sides comes last.
     """
     starts = starts_of(problem)
-    inner = plane_of(problem, model, room.inner_low, room.inner_high, starts)
+    inner, model = held_plane(plane_of(problem, model, room.inner_low, room.inner_high, starts), model)
+    if held_anywhere(inner):
+        near = _near(problem, inner)
+        inner = near if rough_level(near) < rough_level(inner) + _ALIKE else inner
+    else:
+        check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
+        if wanted < math.inf:
+            check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
     patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     level = rough_level(inner)
     upper, done, proposed = bound_plane_above(inner, model, level, patches)
     below: list[Proposed] = []
-    if upper > wanted:
+    if upper > wanted and not held_anywhere(inner):
         outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
         plan = plan_below(outer, min(level, upper), BELOW * patches)
         with contextlib.suppress(OutOfTime):
@@ -90,15 +105,15 @@ def bound_plane_above(
     upper, done = 0.0, []
     proposed: list[Proposed] = []
     plans = {plan.cells: plan for plan in (_plan(plane, level, share * patches) for share in _SHARES)}
-    kinds = _several()
+    kinds: list[Propose] = [propose_plane] if held_anywhere(plane) else _several()
     for plan in plans.values():
         try:
             surface = _promising(plane, model, plan, kinds=kinds)
             if surface is not None:
-                payment = prove_upper(surface, model, plane.starts)
+                payment = prove_upper(surface, model, plane.starts, plane.held)
                 if payment.log < upper:
                     upper = payment.log
-                    proposed.append((raised_above(surface), payment))
+                    proposed.append((raised_above(surface, plane.held), payment))
         except OutOfTime:
             if upper < 0:
                 break
@@ -112,9 +127,11 @@ def _plan(plane: Plane, level: float, patches: float) -> Plan:
 
     Where failing is rare (log P the ``level``) a longer lead costs little, and makes for fronts that are less steep.
     """
-    share = 0.32 * min(max(-level / 3, 1.0), 3.0)
+    held = held_anywhere(plane)
+    share = _LONGER if held else 0.32 * min(max(-level / 3, 1.0), 3.0)
+    floor = level - _DEEP if held and level < 0 else -math.inf
     for cells in itertools.count(16):
-        plan = Plan(cells=cells, growth=min(6 / cells, 0.3), lead=share / cells * plane.horizon)
+        plan = Plan(cells=cells, growth=min(6 / cells, 0.3), lead=share / cells * plane.horizon, floor=floor)
         if cells**2 * len(slab_times(plane.horizon, plan)) > patches:
             break
     return plan
@@ -122,9 +139,23 @@ def _plan(plane: Plane, level: float, patches: float) -> Plan:
 
 def rough_level(plane: Plane) -> float:
     """log P from a coarse proposal; 0 where that breaks down."""
-    plan = Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon)
-    rough = propose_plane(plane, plan) or propose_monotone(plane, plan, None, _RAISED[0])
-    return 0.0 if rough is None else min(0.0, float(extreme_over(rough, plane.starts, upper=True)))
+    plans = [Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon)]
+    if held_anywhere(plane):
+        plans = [Plan(cells=28, growth=0.25, lead=_LONGER / 28 * plane.horizon, floor=floor) for floor in _FLOORS]
+    level = 0.0
+    for plan in plans:
+        rough = propose_plane(plane, plan)
+        if rough is None and not held_anywhere(plane):
+            rough = propose_monotone(plane, plan, None, _RAISED[0])
+        level = level if rough is None else min(level, float(extreme_over(rough, plane.starts, upper=True)))
+        if level > plan.floor + 1:
+            break
+    return level
+
+
+def held_anywhere(plane: Plane) -> bool:
+    """Whether no path crosses some face of the box."""
+    return any(itertools.chain(*plane.held))
 
 
 def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float], seconds: float) -> list[Chart]:
@@ -216,6 +247,32 @@ class Sketch:
         """About what the proof will find."""
         worst = [np.where(self.low < -lift, self.excess, 0.0).max(axis=(1, 2)) for lift in LIFTS]
         return self.start + min(lift + float(rate @ self.surface.steps) for lift, rate in zip(LIFTS, worst))
+
+
+def held_plane(plane: Plane, model: Model) -> tuple[Plane, Model]:
+    """The plane, ended at faces that no path crosses, and the model as it is written on their inner side."""
+    span, box = (0.0, plane.horizon), list(zip(plane.low, plane.high))
+    held = [[False, False], [False, False]]
+    for axis, side in itertools.product((0, 1), (0, 1)):
+        place = held_face(model, box, plane.starts[axis], span, axis, side)
+        if place is not None:
+            held[axis][side] = True
+            box[axis] = (place, box[axis][1]) if side == 0 else (box[axis][0], place)
+    if not any(itertools.chain(*held)):
+        return plane, model
+    (low, high), sides = zip(*box), [(row[0], row[1]) for row in held]
+    plane = replace(plane, low=low, high=high, held=(sides[0], sides[1]))
+    return plane, resolved(model, span, box)
+
+
+def _near(problem: Problem, plane: Plane) -> Plane:
+    """The plane, ended not far beyond simulated paths on the sides that some path may cross."""
+    reach = reach_of(problem, lambda t, x, y: plane.drift(t, x, y), plane.square, _BEYOND)
+    ends = [
+        [float(end if plane.held[axis][side] else pick(end, reach[side][axis])) for axis, end in enumerate(box)]
+        for side, (box, pick) in enumerate(((plane.low, max), (plane.high, min)))
+    ]
+    return replace(plane, low=(ends[0][0], ends[0][1]), high=(ends[1][0], ends[1][1]))
 
 
 def plane_of(

@@ -178,7 +178,7 @@ class SpaceSolver:
                 for table in (right, speeds[axis], 0.5 * spreads[axis])
             )
             line = line.copy()
-            solve_lines(own.at[0], own.at[1], own.at[2], speed, half, _GAMMA * step, line)
+            solve_lines(own.at[0], own.at[1], own.at[2], speed, half, _GAMMA * step, line, False, False)
             shape = [right.shape[axis], *(size for k, size in enumerate(right.shape) if k != axis)]
             right = np.moveaxis((own.dense[0] @ line).reshape(shape), 0, axis)
         return right

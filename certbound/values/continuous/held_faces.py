@@ -1,0 +1,217 @@
+"""Faces that no path crosses, as the noise across them vanishes there: a price, a rate, a population stays above 0.
+
+**Lemma.** Let a_ii(t, x) <= K (c - x_i) and f_i(t, x, d) >= -K (c - x_i), a = g g', at all points with c - eta <= x_i
+<= c whose other states are in a box B. Then a path that starts in B with X_i >= c keeps X_i >= c until another state
+leaves B.
+
+*Proof.* Stop X there, and where X_i = c - eta. For Y = X_i - c the integral of 1{-eta < Y < 0} d<Y>/|Y| is at most K t,
+so that by the occupation formula the left local time of Y at 0 vanishes (Yamada and Watanabe; Le Gall). By Tanaka's
+formula the negative part of Y is -int 1{Y < 0} dY, and its mean at most K times the integral of its mean: 0 by
+Gronwall's inequality. QED.
+
+So nothing is asked of a value function at such a face, and the inequality of Theorem K8-CT is proved up to it. The
+hypotheses hold where a_ii = 0 <= f_i on the face itself and the derivatives of both by x_i are bounded beside it. Where
+the model is not defined beyond the face (a square root of the state) no path is there.
+
+`resolved` writes the model for one side of the face: max(x, 0) is x where x >= 0, and sqrt(u)^2 is u where the root is
+defined, which the tape goes on to ask (`squared_diffusion`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from certbound.arrays import Array, Mask
+from certbound.errors import EnclosureError, InfeasibleError
+from certbound.problem.model import JUMPS, Graph, Tape, compile_numpy, enclosed, jacobian
+from certbound.rigor.intervals import Interval
+from certbound.values.continuous.coefficients import Reader, enclose
+from certbound.values.continuous.hypotheses import Model, Sides
+
+Ends = tuple[float, float]
+
+_PARTS = 16  # of the face in time and in every other state
+_BESIDE = 1e-3  # eta, in units of the box
+_SCANNED = 2001
+_NIL = 1e-13  # of the largest a: what counts as vanishing, for candidates
+
+
+def check_noise(
+    model: Model, span: tuple[float, float], ends: Sequence[tuple[float, float]], held: Sequence[Sides] = ()
+) -> None:
+    """Refuse noise that may vanish somewhere in a box over a span of time, but for the cells at its ``held`` faces.
+
+    Where it has full rank a path that touches a face crosses it: what lower bounds rest on.
+
+    Raises
+    ------
+    InfeasibleError
+    """
+    fine = [np.linspace(low, high, 17) for low, high in ends]
+    fine = [axis[int(sides[0]) : 17 - int(sides[1])] for axis, sides in zip(fine, held or [(False, False)] * len(fine))]
+    low = np.meshgrid(*(axis[:-1] for axis in fine), indexing="ij")
+    high = np.meshgrid(*(axis[1:] for axis in fine), indexing="ij")
+    clock = [Interval(*span).broadcast_to((low[0].size,))]
+    values, _ = enclose(model.square.tape, clock + [Interval(a.ravel(), b.ravel()) for a, b in zip(low, high)])
+    smallest = values[0].lo
+    if len(fine) == 2:
+        cross = np.maximum(np.abs(values[1].lo), np.abs(values[1].hi))
+        smallest = np.minimum(np.minimum(values[0].lo, values[3].lo), values[0].lo * values[3].lo - cross**2)
+    if not np.all(smallest > 0):
+        raise InfeasibleError(
+            "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
+            "direction has none somewhere (noise in the velocities only, say), and value functions prove nothing."
+        )
+
+
+def held_face(model: Model, box: Sequence[Ends], inner: Ends, span: Ends, axis: int, side: int) -> float | None:
+    """A place of x_i between the starts and a side of the box that no path crosses outward; None if none was found.
+
+    Parameters
+    ----------
+    model : Model
+    box : sequence of (float, float)
+        Finite.
+    inner : (float, float)
+        Ends of the starts along the axis: the face is outside of them.
+    span : (float, float)
+        Of time.
+    axis, side : int
+
+    Returns
+    -------
+    float or None
+        Proved by the lemma of this module, for paths that are otherwise in the box.
+    """
+    begin, end = inner[side], box[axis][side]
+    if not (end < begin if side == 0 else begin < end):
+        return None
+    places = _candidates(model, box, begin, end, span, axis)
+    found = [place for place in places if _is_held(model, box, span, axis, side, place)]
+    return (max(found) if side == 0 else min(found)) if found else None
+
+
+def _candidates(model: Model, box: Sequence[Ends], begin: float, end: float, span: Ends, axis: int) -> list[float]:
+    """Where a_ii may vanish on all of the box: its side, 0, and the edge of where it does, in plain floats."""
+    low, high = min(begin, end), max(begin, end)
+    square = compile_numpy(model.square.tape)
+    rng = np.random.default_rng(0)
+    others = [rng.uniform(*ends, size=(8, 1)) for ends in (span, *box)]
+
+    def vanishes(places: Array) -> Mask:
+        points = [np.broadcast_to(row, (8, len(places))) for row in others]
+        points[1 + axis] = np.broadcast_to(places, (8, len(places)))
+        with np.errstate(all="ignore"):
+            a = np.broadcast_to(square(*points)[..., axis, axis], (8, len(places)))
+        top = np.nanmax(np.abs(a), initial=1e-300)
+        return np.asarray(~(a > _NIL * top).any(axis=0))
+
+    line = np.linspace(begin, end, _SCANNED)
+    gone = vanishes(line)
+    places = [place for place in (end, 0.0) if low <= place <= high and place != begin]
+    if gone.any() and not gone[0]:
+        inside, outside = line[np.argmax(gone) - 1], line[np.argmax(gone)]
+        for _ in range(60):
+            middle = (inside + outside) / 2
+            inside, outside = (inside, middle) if vanishes(np.array([middle]))[0] else (middle, outside)
+        edge = round(float(outside), 10)
+        places += [edge] if low <= edge <= high and edge != begin else []
+    return places
+
+
+def _is_held(model: Model, box: Sequence[Ends], span: Ends, axis: int, side: int, place: float) -> bool:
+    """The hypotheses of the lemma on a face, in outward-rounded arithmetic."""
+    width = _BESIDE * (abs(box[axis][1] - box[axis][0]) + abs(place))
+    beside = Interval(place - width, place) if side == 0 else Interval(place, place + width)
+    fine = [np.linspace(*ends, _PARTS + 1) for k, ends in enumerate((span, *box)) if k != 1 + axis]
+    low = [cut.ravel() for cut in np.meshgrid(*(row[:-1] for row in fine), indexing="ij")]
+    high = [cut.ravel() for cut in np.meshgrid(*(row[1:] for row in fine), indexing="ij")]
+    cells = [Interval(a, b) for a, b in zip(low, high)]
+    on, near = cells.copy(), cells.copy()
+    on.insert(1 + axis, Interval(np.full(len(low[0]), place), np.full(len(low[0]), place)))
+    near.insert(1 + axis, beside.broadcast_to(low[0].shape))
+    n, sign = len(box), 1 - 2 * side
+    square = _output(model.square.tape, axis * n + axis)
+    drift = _output(model.drift.tape, axis)
+    try:
+        if not np.all(enclose(square, on)[0][0].mag == 0) or not _lipschitz(square, near, axis):
+            return False
+        for branch in model.branches:
+            given = [one.broadcast_to(low[0].shape) for one in branch]
+            inward = enclose(drift, [*on, *given])[0][0] * float(sign)
+            if not np.all(inward.lo >= 0) or not _lipschitz(drift, [*near, *given], axis):
+                return False
+    except EnclosureError:
+        return False
+    return True
+
+
+def _output(tape: Tape, output: int) -> Tape:
+    """One output of a tape alone; what it does not need is not asked."""
+    graph = Graph.starting_with(tape)
+    return graph.tape([tape.outputs[output]], (1,))
+
+
+def _lipschitz(tape: Tape, near: Sequence[Interval], axis: int) -> bool:
+    """Whether a function is Lipschitz along an axis on boxes: no jumps, and bounded generalised derivatives."""
+    if any(node.op in JUMPS or node.op == "atan2" for node in tape.nodes):
+        return False
+    value = enclose(jacobian(tape, [1 + axis]), near)[0][0]
+    return bool(np.isfinite(value.mag).all())
+
+
+def resolved(model: Model, span: Ends, box: Sequence[Ends]) -> Model:
+    """The model with the branch of every min, max and abs that it is on all over a box."""
+    whole = [Interval.point(0.0) + Interval(*ends) for ends in (span, *box)]
+    axes = 1 + len(box)
+    given = [Interval(min(float(one.lo) for one in row), max(float(one.hi) for one in row))
+             for row in zip(*model.branches)]  # fmt: skip
+    drift = _resolved(model.drift.tape, [*whole, *given])
+    square = _resolved(model.square.tape, whole)
+    if drift is model.drift.tape and square is model.square.tape:
+        return model
+    return replace(model, drift=Reader(drift, axes), square=Reader(square, axes))
+
+
+def _resolved(tape: Tape, inputs: Sequence[Interval]) -> Tape:
+    if not any(node.op in ("min", "max", "abs") for node in tape.nodes):
+        return tape
+    graph = Graph(tape.inputs)
+    arithmetic = graph.arithmetic()
+    values: list[Interval] = []
+    place: list[int] = []
+    kept: list[int] = []
+    for node in tape.nodes:
+        args = [] if node.op == "input" else [values[arg] for arg in node.args]
+        with np.errstate(all="ignore"):
+            values.append(inputs[node.args[0]] if node.op == "input" else enclosed(node, args))
+        chosen = _branch(node.op, args)
+        if node.op == "input":
+            place.append(graph.input(node.args[0]))
+        elif node.op == "const":
+            place.append(graph.const(node.value))
+        elif chosen is not None:
+            place.append(place[node.args[abs(chosen) - 1]])
+            if chosen < 0:
+                place[-1] = graph.apply("neg", place[-1])
+        else:
+            own = [place[arg] for arg in node.args]
+            more = [node.value] if node.op == "pow" else [node.part] if node.part is not None else []
+            place.append(arithmetic[node.op](*own, *more))
+        if node.op == "sqrt":
+            kept.append(place[-1])
+    outputs = [place[output] for output in tape.outputs]
+    return graph.tape(outputs, tape.shape, also=kept)
+
+
+def _branch(op: str, args: Sequence[Interval]) -> int | None:
+    """Which argument (from 1 on) a min, max or abs is everywhere, less than 0 for its negative."""
+    if op == "abs":
+        return 1 if np.all(args[0].lo >= 0) else -1 if np.all(args[0].hi <= 0) else None
+    if op not in ("min", "max"):
+        return None
+    above = 1 if np.all(args[0].lo >= args[1].hi) else 2 if np.all(args[1].lo >= args[0].hi) else None
+    return above if op == "max" or above is None else 3 - above

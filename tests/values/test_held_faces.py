@@ -1,0 +1,129 @@
+"""Faces that no path crosses: prices, rates and populations, whose noise vanishes at 0."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.errors import EnclosureError, InfeasibleError
+from certbound.rigor.intervals import Interval
+from certbound.values.continuous import bound_exits, exits
+from certbound.values.continuous.coefficients import enclose
+from certbound.values.continuous.held_faces import held_face, resolved
+
+
+def line(f, g, safe, *, start=0.5, horizon=2.0, states=("x",)):
+    system = cb.ContinuousSystem(f, states=list(states), diffusion=g)
+    return cb.Problem(system, initial=[start], safe=[cb.Inside(cb.Box(*safe))], horizon=horizon)
+
+
+def root(x):
+    return np.sqrt(np.maximum(x[0], 0.0))
+
+
+def test_a_price_reaches_its_limit_as_often_as_the_reflection_principle_says() -> None:
+    """dx = x^2's half dt + s x dW: log x is Brownian motion."""
+    s = 0.5
+    asked = line(lambda x: [0.5 * s**2 * x[0]], lambda t, x: [[s * x[0]]], ([0.0], [1.5]))
+    found = bound_exits(asked, seconds=0.01)
+    exact = math.erfc(math.log(3) / (s * math.sqrt(2.0)) / math.sqrt(2))
+    assert 10**found.lower <= exact <= 10**found.upper < 1.05 * 10**found.lower
+
+
+def test_a_rate_whose_noise_is_the_root_of_it_is_bounded_from_both_sides() -> None:
+    """The square of Brownian motion in the plane: that its radius reaches sqrt 3 is known as a series."""
+    asked = line(lambda x: [2.0], lambda t, x: [[2 * root(x)]], ([-1.0], [3.0]), start=0.25, horizon=0.5)
+    found = bound_exits(asked, seconds=0.01)
+    zeros = np.array([2.404825557695773, 5.520078110286311, 8.653727912911013, 11.791534439014281])
+    first = np.array([0.5191474972894669, -0.3402648065583682, 0.2714522999283819, -0.2324598313647014])  # J_1 there
+    r, radius = 0.5, math.sqrt(3)
+
+    def j0(z: float) -> float:
+        return sum((-1) ** k * (z / 2) ** (2 * k) / math.factorial(k) ** 2 for k in range(25))
+
+    fades = np.exp(-((zeros / radius) ** 2) * 0.5 / 2)
+    stays = sum(2 * j0(z * r / radius) / (z * j) * fade for z, j, fade in zip(zeros, first, fades))
+    assert 10**found.lower <= 1 - stays <= 10**found.upper < 1.06 * 10**found.lower
+
+
+def test_a_population_that_dies_out_is_bounded_from_both_sides() -> None:
+    """dx = sqrt(x) dW, absorbed at 0: less than the martingale's .5/2."""
+    found = bound_exits(line(lambda x: [0.0], lambda t, x: [[root(x)]], ([-1.0], [2.0])), seconds=0.01)
+    assert 0.03 < 10**found.lower <= 10**found.upper < min(0.25, 1.15 * 10**found.lower)
+
+
+def test_a_share_of_genes_is_bounded_the_same_seen_from_either_end() -> None:
+    """The upper face is one at which rounding would leave the root without a value."""
+    def g(t, x):
+        return [[0.4 * np.sqrt(x[0] * (1 - x[0]))]]
+
+    sides = (([0.2], [1.0], 0.6), ([0.0], [0.8], 0.4))
+    found = [bound_exits(line(lambda x: [0.3 * (0.5 - x[0])], g, (low, high), start=start, horizon=1.0), seconds=0.01)
+             for low, high, start in sides]  # fmt: skip
+    assert math.isclose(found[0].upper, found[1].upper, abs_tol=1e-3)
+    assert found[0].lower > found[0].upper - 0.05
+
+
+def test_nobody_leaves_where_no_face_can_be_crossed() -> None:
+    logistic = line(lambda x: [x[0] * (1 - x[0])], lambda t, x: [[x[0] * (1 - x[0])]], ([0.0], [1.0]))
+    assert bound_exits(logistic, seconds=0.2).upper < -100
+
+
+@pytest.mark.parametrize(
+    ("f", "g", "held"),
+    [
+        (lambda x: [1 - x[0]], lambda t, x: [[x[0]]], 0.0),
+        (lambda x: [1 - x[0]], lambda t, x: [[root(x)]], 0.0),
+        (lambda x: [1 - x[0]], lambda t, x: [[np.maximum(x[0] - 0.25, 0.0)]], 0.25),
+        (lambda x: [-0.1 - x[0]], lambda t, x: [[x[0]]], None),  # the drift leads out
+        (lambda x: [1 - x[0]], lambda t, x: [[x[0] + 1e-6]], None),  # some noise is left
+        (lambda x: [1 - x[0]], lambda t, x: [[np.sqrt(np.sqrt(np.maximum(x[0], 0)))]], None),  # a too steep
+        (lambda x: [np.sign(x[0])], lambda t, x: [[x[0]]], None),  # the drift jumps
+    ],
+)
+def test_a_face_is_held_where_noise_vanishes_linearly_and_the_drift_leads_inside(f, g, held) -> None:
+    model = exits._model(line(f, g, ([-1.0], [1.0])))
+    assert held_face(model, [(-1.0, 1.0)], (0.5, 0.5), (0.0, 2.0), 0, 0) == held
+
+
+def test_a_start_beyond_the_face_is_not_held_by_it() -> None:
+    asked = line(lambda x: [1 - x[0]], lambda t, x: [[root(x)]], ([-1.0], [3.0]), start=-0.5)
+    with pytest.raises(InfeasibleError, match="full rank"):
+        bound_exits(asked, seconds=0.2)
+
+
+def test_in_the_plane_the_noise_along_the_face_does_not_matter() -> None:
+    """Stochastic volatility: upper bound of a fall of the log-price."""
+    def g(t, x):
+        return [[np.sqrt(np.maximum(x[1], 0)), 0.0], [0.0, 0.3 * np.sqrt(np.maximum(x[1], 0))]]
+
+    system = cb.ContinuousSystem(lambda x, v: [-v / 2, 2 * (0.04 - v)], states=["x", "v"], diffusion=g)
+    asked = cb.Problem(system, initial=[0, 0.04], safe=[cb.Inside(cb.Box([-0.25, -1], [0.4, 0.3]))], horizon=0.25)
+    model = exits._model(asked)
+    box = [(-0.25, 0.4), (-1.0, 0.3)]
+    assert held_face(model, box, (0.04, 0.04), (0.0, 0.25), 1, 0) == 0.0
+    assert held_face(model, box, (0.0, 0.0), (0.0, 0.25), 0, 0) is None
+    written = resolved(model, (0.0, 0.25), [(-0.25, 0.4), (0.0, 0.3)])
+    assert written.square.degrees == [0, 0, 1]
+
+
+@pytest.mark.slow
+def test_stochastic_volatility_is_bounded_from_above() -> None:
+    def g(t, x):
+        return [[np.sqrt(np.maximum(x[1], 0)), 0.0], [0.0, 0.3 * np.sqrt(np.maximum(x[1], 0))]]
+
+    system = cb.ContinuousSystem(lambda x, v: [-v / 2, 2 * (0.04 - v)], states=["x", "v"], diffusion=g)
+    asked = cb.Problem(system, initial=[0, 0.04], safe=[cb.Inside(cb.Box([-0.25, -1], [0.4, 0.3]))], horizon=0.25)
+    assert 0.005 < 10 ** bound_exits(asked, seconds=10).upper < 0.1
+
+
+def test_the_square_of_a_root_is_what_is_under_it_and_stays_undefined_elsewhere() -> None:
+    asked = line(lambda x: [1 - x[0]], lambda t, x: [[-0.5 * np.sqrt(x[0]) / 2]], ([-1.0], [3.0]))
+    model = exits._model(asked)
+    assert model.square.degrees == [0, 1]
+    beyond = [Interval.point(np.zeros(1)), Interval(np.array([-0.1]), np.array([0.1]))]
+    with pytest.raises(EnclosureError, match="undefined"):
+        enclose(model.square.tape, beyond)
