@@ -131,4 +131,4 @@ def _diffusion(model: StepModel, x: Array) -> Array:
     if isinstance(model.noise, Tape):
         noise: Array = compile_numpy(model.noise)(0.0, *x)
         return noise if np.all(np.isfinite(noise)) else np.zeros(noise.shape)
-    return np.asarray(model.noise) / np.sqrt(model.step)
+    return np.asarray(model.noise / np.sqrt(model.step), dtype=float)
