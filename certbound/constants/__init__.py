@@ -20,8 +20,7 @@ from certbound.lazy import lazily, names_in
 _HOME = {
     "bounds": "bound_constants constants_along",
     "metrics": "bound_metrics propose_metrics split_delta jacobian_set",
-    "fitted": "fitted_constants_along",
-    "moving": "moving_constants_along",
+    "fitted": "fitted_constants_along moving_constants_along",
     "jacobians": "matrix_measure induced_norm diagonal_weights "
     "AffineSet SectorSet VertexPolytope IntervalMatrixSet UnionSet",
     "recheck": "certify_rate certify_gain",

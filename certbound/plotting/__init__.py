@@ -8,11 +8,13 @@ colour-blind readers lose nothing. Everything drawn here is a rendering of sets 
 from __future__ import annotations
 
 from certbound.plotting.animation import animate
-from certbound.plotting.derived import draw_constants
 from certbound.plotting.picture import draw_scene
 from certbound.plotting.scene import Scene, measured_rooms, noisy_reach
 from certbound.plotting.sweep_maps import draw_sweep
-from certbound.plotting.tubes import draw_tubes
+from certbound.plotting.tubes import draw_constants, draw_tubes
 from certbound.plotting.value_maps import draw_values
 
-__all__ = ["Scene", "animate", "draw_constants", "draw_scene", "draw_sweep", "draw_tubes", "draw_values", "measured_rooms", "noisy_reach"]
+__all__ = [
+    "Scene", "animate", "draw_constants", "draw_scene", "draw_sweep", "draw_tubes", "draw_values", "measured_rooms",
+    "noisy_reach",
+]  # fmt: skip

@@ -36,7 +36,7 @@ from certbound.watch import OutOfTime, poll
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from certbound.constants.moving import MovingConstants
+    from certbound.constants.fitted import MovingConstants
     from certbound.problem.problem import Problem
     from certbound.rigor.intervals import Interval
     from certbound.tubes.constants import Constants
@@ -207,7 +207,7 @@ def _search(subject: Problem, asked: _Asked, found: list[Found]) -> None:
 
 def _moving(subject: Problem, constants: Constants, boxes: Interval) -> _Moving:
     """The same in coordinates that move, which make the deviation small where constraints ask about it."""
-    from certbound.constants.moving import moving_constants_along
+    from certbound.constants.fitted import moving_constants_along
     from certbound.tubes.tuning import tune_tube
 
     asked = _states_asked(subject)

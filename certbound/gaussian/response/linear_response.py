@@ -97,18 +97,18 @@ def _transition(slope: Array, drift: Array, step: float, slope_error: float) -> 
     n = slope.shape[-1]
     a, k = slope * step, drift * step**2
     alpha, kappa = _norm(a) * (1 + 1e-14), _norm(k) * (1 + 1e-14)
-    size = np.broadcast_to(np.eye(n), a.shape)
-    terms, total = [np.zeros_like(a), size.copy()], size.copy()
-    majorant = [np.zeros_like(alpha), np.ones_like(alpha)]
-    for i in range(_TERMS):
-        terms.append((a @ terms[-1] + k @ terms[-2]) / (i + 1))
-        majorant.append((alpha * majorant[-1] + kappa * majorant[-2]) / (i + 1))
-        total = total + terms[-1]
+    older, newer = np.zeros_like(a), np.broadcast_to(np.eye(n), a.shape)
+    small, big = np.zeros_like(alpha), np.ones_like(alpha)
+    total = newer.copy()
+    for i in range(_TERMS):  # the last two terms: with all of them, states by the hundred would fill the memory
+        older, newer = newer, (a @ newer + k @ older) / (i + 1)
+        small, big = big, (alpha * big + kappa * small) / (i + 1)
+        total += newer
     # beyond the last term the majorant falls by this ratio at least every second term
     ratio = (alpha + kappa) / _TERMS
     if np.any(ratio > 0.5):
         raise _too_stiff(float((alpha + kappa).max()))
-    tail = 4.1 * (majorant[-1] + majorant[-2]) * np.maximum(ratio, _TINY)
+    tail = 4.1 * (big + small) * np.maximum(ratio, _TINY)
     growth = np.exp(alpha + kappa) * (1 + 1e-13)
     error = tail + _TERMS * (3 * n + 12) * 2 * _UNIT * growth + 2 * n * step * slope_error * growth
     size_ = (np.abs(a) + np.abs(k)) * (1 + 1e-14)
