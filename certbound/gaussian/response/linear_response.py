@@ -22,6 +22,7 @@ from certbound.watch import poll
 _UNIT = 2.0**-53
 _TINY = 1e-300
 _TERMS = 24
+_MEMORY = 6 * 2**30  # bytes that the rows of one cell may take
 _MILD = 2.0  # norm of the slopes times a piece, up to which series run well in the states' own units
 _SWEEPS, _FARTHEST = 20, 60  # of balancing; exponent of a unit
 _LARGE, _SPARSE = 40, 0.1  # states and share of nonzero entries from which on products are sparse
@@ -292,6 +293,12 @@ class RowResponse:
         self.transition, self.error = response.transition[cell], response.transition_error[cell]
         self.columns = np.arange(n) if columns is None else np.asarray(columns)
         self.others = np.setdiff1d(np.arange(n), self.columns)
+        needed = 4.0 * self.nodes**2 * self.count * len(self.columns)  # bytes
+        if needed > _MEMORY:
+            raise EngineError(
+                f"the linear engine would take {needed / 2**30:.3g} GiB of memory, for {self.count} rows at "
+                f"{self.nodes} times, and stops at {_MEMORY / 2**30:g}; use another method, or a shorter horizon."
+            )
         current = np.array(rows[:, first])
         self.coefficients: list[Array] = [np.empty(0)] * (self.nodes - 1)
         self.rest: list[Array] = [np.empty(0)] * (self.nodes - 1)  # row sums over the other columns
