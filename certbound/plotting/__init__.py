@@ -11,7 +11,10 @@ from certbound.plotting.animation import animate
 from certbound.plotting.picture import draw_scene
 from certbound.plotting.scene import Scene, measured_rooms, noisy_reach
 from certbound.plotting.sweep_maps import draw_sweep
-from certbound.plotting.tubes import draw_tubes
+from certbound.plotting.tubes import draw_constants, draw_tubes
 from certbound.plotting.value_maps import draw_values
 
-__all__ = ["Scene", "animate", "draw_scene", "draw_sweep", "draw_tubes", "draw_values", "measured_rooms", "noisy_reach"]
+__all__ = [
+    "Scene", "animate", "draw_constants", "draw_scene", "draw_sweep", "draw_tubes", "draw_values", "measured_rooms",
+    "noisy_reach",
+]  # fmt: skip

@@ -18,9 +18,13 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.problem.sets import Faces, Inside, Outside, Quadratic
 from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
+from certbound.simulation.wide_text import product
 
 EXPONENT = 40.0
 """A bridge is looked at only where it exits with probability above exp(-40)."""
+
+_UNROLLED = 8
+"""Faces of a set that have lines of their own; more are looked at in a loop, which compiles sooner."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -194,9 +198,13 @@ def _faces(
     number: int, barrier: Barrier, bridge: Bridge | None, p: Parameters, column: int
 ) -> tuple[list[str], list[str], list[str]]:
     rows, dimension = barrier.matrix.shape
-    old, new = vector(f"g_{number}", rows), vector(f"n_{number}", rows)
+    looped = barrier.stay and rows > _UNROLLED
+    names = [f"g_{number}", f"n_{number}"]
+    old, new = ([f"{name}[{f}]" for f in range(rows)] if looped else vector(name, rows) for name in names)
 
     def gaps(targets: list[str], state: str, step: str) -> list[str]:
+        if looped and p.wide:
+            return _gaps_in_loops(barrier, targets[0].split("[")[0], state, f"moving[{step}, {column} + i]", p)
         lines = []
         for f, target in enumerate(targets):
             bound = f"moving[{step}, {column + f}]" if barrier.moving else p.add(float(barrier.offset[f]))
@@ -209,6 +217,10 @@ def _faces(
             return " or ".join(f"{name} < 0.0" for name in names)
         return " and ".join(f"{name} <= 0.0" for name in names)  # sets are closed: an edge belongs to the obstacle
 
+    if looped:
+        made = [f"{names[0]}, {names[1]} = np.empty({rows}), np.empty({rows})", *gaps(old, "x", "0")]
+        made += [if_all(starts_at_once(number, barrier), f"{names[0]}.min() < 0.0"), f"    left = {number}"]
+        return made, *_many_faces(number, barrier, bridge, gaps(new, "y", "k + 1"), p)
     start = [*gaps(old, "x", "0"), if_all(starts_at_once(number, barrier), f"({out(old)})"), f"    left = {number}"]
     step = [
         *gaps(new, "y", "k + 1"),
@@ -222,6 +234,36 @@ def _faces(
         active = window_test(number, barrier, "k")
         step += (_bridge_stay if barrier.stay else _bridge_avoid)(number, active, old, new, spreads, p)
     return start, step, end
+
+
+def _gaps_in_loops(barrier: Barrier, gap: str, state: str, moving: str, p: Parameters) -> list[str]:
+    """Lines that set the array of gaps of a set to be stayed in, where the state is an array too."""
+    bound = moving if barrier.moving else f"p[{p.extend(barrier.offset.tolist())} + i]"
+    fill = [f"for i in range({len(barrier.matrix)}):", f"    {gap}[i] = {bound}"]
+    return [*fill, *product(-barrier.matrix, state, gap, p)]
+
+
+def _many_faces(
+    number: int, barrier: Barrier, bridge: Bridge | None, gaps: list[str], p: Parameters
+) -> tuple[list[str], list[str]]:
+    """Lines within a step and at its end for a set of many faces, whose gaps stand in arrays."""
+    g, n, spread, faces = f"g_{number}", f"n_{number}", f"v_{number}", len(barrier.matrix)
+    step = [*gaps, if_all(f"{n}.min() < 0.0", *window_test(number, barrier, "k + 1")), f"    left = {number}"]
+    if bridge is None:
+        return step, []
+    rows = [row.tolist() for row in barrier.matrix]
+    if bridge.spread is not None:
+        first = p.extend(np.sum((barrier.matrix @ bridge.spread) ** 2, axis=1).tolist())
+        step += [f"{spread} = p[{first}:{first + faces}]"]
+    else:
+        step += [f"{spread} = np.empty({faces})"]
+        step += [f"{spread}[{f}] = {bridge.variance(row, p)}" for f, row in enumerate(rows)]
+    near = f"0.0 <= {g}[face] and {g}[face] * {n}[face] < {0.5 * EXPONENT} * {spread}[face]"
+    touch = _touch(f"2.0 * {g}[face] * {n}[face] / {spread}[face]", number)
+    looks = [f"for face in range({faces}):", *indent([if_all("left < 0", near), *indent(touch)])]
+    active = window_test(number, barrier, "k")
+    step += [if_all(*active), *indent(looks)] if active else looks
+    return step, [f"{g}[:] = {n}"]
 
 
 def _bridge_stay(

@@ -18,8 +18,9 @@ from certbound.arrays import Array
 from certbound.problem.model import Tape, is_zero
 from certbound.simulation.gap_tests import Bridge
 from certbound.simulation.stepping import StepModel
-from certbound.simulation.tape_text import Parameters, function_source, indent, linear_form, vector
+from certbound.simulation.tape_text import Parameters, each, function_source, indent, linear_form, vector
 from certbound.simulation.tasks import Task, task_source
+from certbound.simulation.wide_text import array_function, fits, in_arrays, product, values_count
 
 _WORDS = "word_0, word_1, word_2, word_3"  # the state of the noise's stream
 _STORED = "stream[4], stream[5], stream[6], stream[7]"
@@ -59,21 +60,27 @@ def kernel_source(model: StepModel, task: Task) -> tuple[str, Array]:
     The module defines ``run``, whose arrays are prepared by `certbound.simulation.blocks`. It returns the
     number of steps done, or -1 after writing (path, step, state) of the last finite state to ``notes``.
     """
-    p = Parameters()
-    head = module_head(model, task.kind, p)
+    p = start_text(model)
+    functions = function_lines(model, p)
     step, bridge = step_lines(model, p)
     begin, within, end, finish = task_source(task, model.dimension, bridge, nominal_lines(model, p), p)
-    start = [*load_lines(model, "starts[path, {0}]"), *begin]
-    loop = [*step, *within, *[f"x_{i} = y_{i}" for i in range(model.dimension)], *end]
+    start = [*load_lines(model, "starts[path, {0}]", p), *begin]
+    loop = [*step, *within, *each("x_{0} = y_{0}", model.dimension, p), *end]
     path = [*start, "for k in range(steps):", *indent(loop), *finish]
-    body = [*open_noise(model), "done = 0", "for path in range(starts.shape[0]):", *indent(path), "return done"]
-    text = head + SIGNATURE + "\n".join(indent(body)) + "\n"
+    body = [*open_noise(model, p), "done = 0", "for path in range(starts.shape[0]):", *indent(path), "return done"]
+    text = module_text(model, task.kind, functions, p) + SIGNATURE + kernel_body(body, p)
     return text, np.array([*p.values, 0.0])
 
 
-def module_head(model: StepModel, kind: str, p: Parameters) -> str:
-    """Imports and the model's functions."""
-    functions: list[str] = []
+def start_text(model: StepModel) -> Parameters:
+    """The numbers of a kernel, none yet, and how it keeps its states."""
+    plain = not isinstance(model.noise, Tape) and model.law is None and model.signal is None
+    return Parameters(wide=plain and fits(model.drift, model.dimension))
+
+
+def function_lines(model: StepModel, p: Parameters) -> list[str]:
+    """The model's functions."""
+    lines: list[str] = []
     for name, tape in (
         ("drift", model.drift),
         ("diffusion", model.noise if isinstance(model.noise, Tape) else None),
@@ -84,13 +91,32 @@ def module_head(model: StepModel, kind: str, p: Parameters) -> str:
     ):
         if tape is not None:
             names = {"drift": _arguments(model, "x"), "unit": ["v"]}.get(name, ["t", *vector("x", model.dimension)])
-            functions += ["", NJIT, *function_source(name, tape, names, p), ""]
-    return _HEAD.format(kind=kind, variate=model.variate) + "\n".join(functions)
+            if name == "drift" and p.wide:
+                source = array_function(name, tape, model.dimension, names[1 + model.dimension :], p)
+            else:
+                source = function_source(name, tape, names, p)
+            lines += ["", NJIT, *source, ""]
+    return lines
 
 
-def open_noise(model: StepModel) -> list[str]:
-    """Lines that take up the stream of the noise."""
-    return [f"noise = np.empty({model.noise_count})", f"{_WORDS} = {_STORED}"]
+def module_text(model: StepModel, kind: str, functions: list[str], p: Parameters) -> str:
+    """Imports and functions of a kernel, whose other lines are written by now."""
+    index = [f"INDEX = np.array({p.places}, dtype=np.int64)"] if p.places else []
+    return _HEAD.format(kind=kind, variate=model.variate) + "\n".join([*index, *functions])
+
+
+def kernel_body(lines: Sequence[str], p: Parameters) -> str:
+    """The lines of a function after its head."""
+    return "\n".join(indent(in_arrays(lines) if p.wide else lines)) + "\n"
+
+
+def open_noise(model: StepModel, p: Parameters) -> list[str]:
+    """Lines that take up the stream of the noise, and make the arrays that a path needs."""
+    lines = [f"noise = np.empty({model.noise_count})", f"{_WORDS} = {_STORED}"]
+    if p.wide:
+        lines += [f"{state} = np.empty({model.dimension})" for state in "xyfabh"]
+        lines += [f"values = np.empty({values_count(model.drift)})"]
+    return lines
 
 
 def close_noise() -> str:
@@ -98,31 +124,42 @@ def close_noise() -> str:
     return f"{_STORED} = {_WORDS}"
 
 
-def load_lines(model: StepModel, start: str) -> list[str]:
+def load_lines(model: StepModel, start: str, p: Parameters) -> list[str]:
     """Lines that set the first state and the disturbance of a path."""
-    lines = [f"x_{i} = {start.format(i)}" for i in range(model.dimension)]
+    lines = each(f"x_{{0}} = {start}", model.dimension, p)
     lines += [f"d_{i} = signals[path, {i}]" for i in range(model.disturbance_count)]
     return [*lines, "wait = 0"] if model.switching > 0.0 else lines
 
 
 def step_lines(model: StepModel, p: Parameters) -> tuple[list[str], Bridge | None]:
     """Lines that go from the state x_i at step k to the state y_i, and the bridge between them."""
-    noise_lines, new_state, bridge = _noise(model, p)
-    states = range(model.dimension)
+    if p.wide:
+        noise_lines, new_state, bridge = _wide_noise(model, p)
+        finite = ["odd = 0.0", *each("odd += y_{0} - y_{0}", model.dimension, p)]
+    else:
+        noise_lines, new_state, bridge = _noise(model, p)
+        finite = _sum("odd", [f"(y_{i} - y_{i})" for i in range(model.dimension)])
     lines = [
         f"t = k * {p.add(model.interval)}",
         *_inputs(model),
         *_disturbance(model, p),
-        f"{_targets(vector('f', model.dimension))} = drift(p, {', '.join(_arguments(model, 'x'))})",
+        _drift_call(model, "x", "f", p),
         *noise_lines,
         *new_state,
-        f"if {' + '.join(f'(y_{i} - y_{i})' for i in states)} != 0.0:",
+        *finite,
+        "if odd != 0.0:",
         "    notes[0], notes[1] = path, k",
-        *[f"    notes[{2 + i}] = x_{i}" for i in states],
+        *indent(each("notes[2 + {0}] = x_{0}", model.dimension, p)),
         "    return -1",
         "done += 1",
     ]
     return lines, bridge
+
+
+def _sum(name: str, terms: Sequence[str]) -> list[str]:
+    """Lines that add up terms, ten at a time: text that is nested deeply is compiled slowly, or not at all."""
+    lines = [" + ".join(terms[first : first + 10]) for first in range(0, len(terms), 10)]
+    return [f"{name} = {lines[0]}", *[f"{name} += {line}" for line in lines[1:]]]
 
 
 def _inputs(model: StepModel) -> list[str]:
@@ -137,8 +174,40 @@ def _inputs(model: StepModel) -> list[str]:
 
 def nominal_lines(model: StepModel, p: Parameters) -> list[str]:
     """Lines that advance the noise-free path from a_i to b_i."""
-    call = f"{_targets(vector('h', model.dimension))} = drift(p, {', '.join(_arguments(model, 'a'))})"
+    call = _drift_call(model, "a", "h", p)
+    if p.wide:
+        return [call, *_wide_move(model, "a", "h", "b", p)]
     return [call, *[f"b_{i} = {value}" for i, value in enumerate(_moved(model, "a", "h", p))]]
+
+
+def _drift_call(model: StepModel, state: str, target: str, p: Parameters) -> str:
+    """The line that sets the drift at a state."""
+    names = _arguments(model, state)
+    if p.wide:
+        names = ["t", state, *names[1 + model.dimension :], "values", target]
+        return f"drift(p, {', '.join(names)})"
+    return f"{_targets(vector(target, model.dimension))} = drift(p, {', '.join(names)})"
+
+
+def _wide_move(model: StepModel, state: str, drift: str, target: str, p: Parameters) -> list[str]:
+    """Lines that set an array to the next state without noise."""
+    if model.flow is not None:
+        return [f"{target}[:] = {state}", *product(model.flow, drift, target, p)]
+    moved = f"{state}_{{0}} + {p.add(model.step)} * {drift}_{{0}}" if model.step > 0.0 else f"{drift}_{{0}}"
+    return each(f"{target}_{{0}} = {moved}", model.dimension, p)
+
+
+def _wide_noise(model: StepModel, p: Parameters) -> tuple[list[str], list[str], Bridge | None]:
+    """What `_noise` returns, for states in arrays: the noise has a matrix."""
+    noise = np.asarray(model.noise)
+    drawn = [f"for j in range({model.noise_count}):", f"    noise[j], {_WORDS} = draw_{model.variate}({_WORDS})"]
+    drawn += ["    noise[j], = unit(p, noise[j])"] if model.unit is not None else []
+    new = [*_wide_move(model, "x", "f", "y", p), *product(noise, "noise", "y", p)]
+    return drawn if model.noise_count else [], new, _bridge(model)
+
+
+def _bridge(model: StepModel) -> Bridge | None:
+    return Bridge(spread=model.spread) if model.bridge and model.spread is not None else None
 
 
 def _arguments(model: StepModel, state: str) -> list[str]:
@@ -180,11 +249,14 @@ def _noise(model: StepModel, p: Parameters) -> tuple[list[str], list[str], Bridg
         bridge = Bridge(spread=None, entries=scaled) if model.bridge else None
     else:
         shocks = [linear_form(row.tolist(), variates, p) for row in model.noise]
-        bridge = Bridge(spread=model.spread) if model.bridge and model.spread is not None else None
+        bridge = _bridge(model)
     new = []
+    moves = _moved(model, "x", "f", p) if model.flow is not None else []
     step = p.add(model.step)
     for i, shock in enumerate(shocks):  # noise first: the drift is known last, and its chain of operations is short
-        if model.step > 0.0:
+        if model.flow is not None:
+            new.append(f"y_{i} = {moves[i]}" + ("" if shock == "0.0" else f" + ({shock})"))
+        elif model.step > 0.0:
             noisy = f"x_{i}" if shock == "0.0" else f"(x_{i} + ({shock}))"
             new.append(f"y_{i} = {noisy} + {step} * f_{i}")
         else:
@@ -219,6 +291,9 @@ def _disturbance(model: StepModel, p: Parameters) -> list[str]:
 
 def _moved(model: StepModel, state: str, drift: str, p: Parameters) -> list[str]:
     """Expressions of the next state without noise."""
+    if model.flow is not None:
+        names = vector(drift, model.dimension)
+        return [f"{state}_{i} + {linear_form(row.tolist(), names, p)}" for i, row in enumerate(model.flow)]
     if model.step <= 0.0:
         return vector(drift, model.dimension)
     step = p.add(model.step)

@@ -14,7 +14,7 @@ from certbound.problem.model import Node, Tape, compile_numpy, edged, is_zero, j
 from certbound.problem.noise import Law, check_law
 from certbound.problem.random_constants import Random
 from certbound.simulation.tape_text import live_nodes
-from certbound.simulation.transition import exact_transition
+from certbound.simulation.transition import bridge_shares, exact_transition
 
 _LARGEST_EXACT = 16
 
@@ -30,7 +30,8 @@ class Scenario:
     """
 
     # Continuous time only. ``auto`` takes the exact transition of a linear system of up to 16 states, Milstein's scheme
-    # where the diffusion is diagonal and entry i depends on state i alone, and Euler-Maruyama otherwise.
+    # where the diffusion is diagonal and entry i depends on state i alone, and Euler-Maruyama otherwise; where that
+    # would need shorter steps, and the diffusion is constant, the exponential scheme of ``stiffness``.
     scheme: Literal["auto", "exact", "milstein", "euler"] = "auto"
     bridge: bool = True  # continuous time only: look for exits between two steps with a Brownian bridge
     # (n,): one start for all paths; otherwise X_0 is uniform in the problem's initial set (or drawn from its law)
@@ -68,6 +69,8 @@ class StepModel:
     unit: Tape | None = None  # z as a function of v, entry by entry; without it z = v
     # (n, m): what multiplies z. A tape (inputs t, states; shape (n, m)) is multiplied by sqrt(step) too.
     noise: Array | Tape
+    # (n, n), of the exponential scheme: without noise the state moves by ``flow`` times the drift
+    flow: Array | None = None
     correction: Tape | None = None  # diagonal of d g_ii/d x_i, for Milstein's scheme
     # (n, m): g sqrt(h) of the bridge between two steps; None in discrete time, and where ``noise`` is a tape
     spread: Array | None = None
@@ -83,7 +86,7 @@ class StepModel:
     # inputs that are held, the first ones: a function of (t, states), computed every so many steps
     law: Tape | None = None
     every: int = 0
-    scheme: str = "discrete"  # what was chosen: ``exact``, ``milstein``, ``euler`` or ``discrete``
+    scheme: str = "discrete"  # what was chosen: ``exact``, ``milstein``, ``euler``, ``exponential`` or ``discrete``
 
     @property
     def noise_count(self) -> int:
@@ -222,6 +225,7 @@ def _continuous(
     if linear is not None and (n <= _LARGEST_EXACT or wanted == "exact"):
         transition, offset, factor = exact_transition(*linear, np.asarray(diffusion), step)
         drift = _affine_tape(tape.inputs, np.hstack([np.zeros((n, 1)), transition]), offset)
+        spread *= bridge_shares(linear[0][:, :n], np.asarray(diffusion), step)[:, None]
         return StepModel(drift=drift, noise=factor, spread=spread, scheme="exact", **fields)
     if wanted in ("exact", "milstein"):
         need = "a linear system with constant coefficients" if wanted == "exact" else "a state-dependent diffusion"

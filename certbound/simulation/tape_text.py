@@ -18,11 +18,25 @@ class Parameters:
     """The array ``p`` of numbers that a kernel reads, filled while its source is written."""
 
     values: list[float] = field(default_factory=list)
+    places: list[int] = field(default_factory=list)  # the kernel's array INDEX
+    wide: bool = False  # whether the states are arrays: see ``wide_text``
 
     def add(self, value: float) -> str:
         """Append a number; returns the expression that reads it."""
         self.values.append(float(value))
         return f"p[{len(self.values) - 1}]"
+
+    def extend(self, values: Sequence[float]) -> int:
+        """Append numbers; returns the place of the first."""
+        self.values.extend(values)
+        return len(self.values) - len(values)
+
+    def place(self, places: Sequence[int], counter: str) -> str:
+        """The expression that is the entry ``counter`` of some places."""
+        if all(place == places[0] + i for i, place in enumerate(places)):
+            return f"{places[0]} + {counter}"
+        self.places.extend(places)
+        return f"INDEX[{len(self.places) - len(places)} + {counter}]"
 
     def value_of(self, expression: str) -> float | None:
         """The number behind an expression, None unless it is one of these parameters or "0.0"."""
@@ -43,6 +57,13 @@ def vector(letter: str, count: int) -> list[str]:
 def indent(lines: Sequence[str]) -> list[str]:
     """Lines moved to the right."""
     return ["    " + line for line in lines]
+
+
+def each(line: str, count: int, p: Parameters) -> list[str]:
+    """A line for every state, ``{0}`` standing for its number: a loop where the states are arrays."""
+    if p.wide:
+        return [f"for i in range({count}):", "    " + line.format("i")]
+    return [line.format(i) for i in range(count)]
 
 
 def live_nodes(tape: Tape) -> list[int]:
@@ -114,11 +135,11 @@ def _pairs(tape: Tape, live: Sequence[int]) -> dict[int, tuple[int, int]]:
 
 def _operation(node: Node, operands: list[str], parameters: Parameters) -> str:
     if node.op == "pow":
-        return _power(operands[0], node.value, parameters)
+        return power(operands[0], node.value, parameters)
     return OPERATIONS[node.op].kernel.format(*operands)
 
 
-def _power(base: str, exponent: float, parameters: Parameters) -> str:
+def power(base: str, exponent: float, parameters: Parameters) -> str:
     """Small whole exponents become products, which are ten times faster than a call of pow."""
     if exponent == 0.5:
         return f"math.sqrt({base})"

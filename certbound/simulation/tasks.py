@@ -14,7 +14,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, barrier_source
-from certbound.simulation.tape_text import Parameters, indent, linear_form
+from certbound.simulation.tape_text import Parameters, each, indent, linear_form
 
 Lines = tuple[list[str], list[str], list[str], list[str]]
 
@@ -47,18 +47,17 @@ def task_source(task: Task, dimension: int, bridge: Bridge | None, nominal_step:
     """Lines of a task; ``nominal_step`` advances the noise-free path from a_i to b_i."""
     if task.kind == "exits":
         return _exits(task, bridge, p)
-    states = range(dimension)
     begin: list[str] = []
     within: list[str] = []
     end: list[str] = []
     if task.own_nominal:
         begin, within, end = (
-            [f"a_{i} = x_{i}" for i in states],
+            each("a_{0} = x_{0}", dimension, p),
             nominal_step,
-            [f"a_{i} = b_{i}" for i in states],
+            each("a_{0} = b_{0}", dimension, p),
         )
     elif task.kind == "deviation":
-        within = [f"b_{i} = nominal[k + 1, {i}]" for i in states]
+        within = each("b_{0} = nominal[k + 1, {0}]", dimension, p)
     watch = _record if task.kind == "record" else _deviation
     lines = watch(task, dimension, bridge, p)
     return begin + lines[0], within + lines[1], end + lines[2], lines[3]
@@ -111,7 +110,7 @@ def _kept_goal(
 
 def _record(task: Task, dimension: int, bridge: Bridge | None, p: Parameters) -> Lines:
     def store(place: str, value: str) -> list[str]:
-        return [f"    out[path, {place}, {i}] = {value.format(i)}" for i in range(dimension)]
+        return indent(each(f"out[path, {place}, {{0}}] = {value}", dimension, p))
 
     begin = [
         "mark = 0",

@@ -45,6 +45,28 @@ def exact_transition(matrix: Array, offset: Array, diffusion: Array, step: float
     return move[:, :width], move[:, width], _factor((covariance + covariance.T) / 2)
 
 
+def bridge_shares(matrix: Array, diffusion: Array, step: float) -> Array:
+    """What is left of a Brownian bridge's standard deviation in the middle of a step, by state, shape (n,).
+
+    For dx = A x dt + G dW, given both ends; a mode that dies out within a step keeps to them more closely than a
+    Brownian motion, by sqrt(tanh(a h/2)/(a h/2)) at rate -a. States without noise of their own have 1.
+
+    Examples
+    --------
+    >>> share = bridge_shares(np.array([[-8.0]]), np.array([[1.0]]), 0.5)
+    >>> bool(np.isclose(share[0] ** 2, np.tanh(2.0) / 2.0))
+    True
+    """
+    n = len(matrix)
+    move, _, factor = exact_transition(matrix, np.zeros(n), diffusion, step / 2.0)
+    half = factor @ factor.T
+    reach = move @ half
+    gain = np.linalg.lstsq(reach @ move.T + half, reach, rcond=None)[0]
+    left = np.diag(half) - np.sum(reach * gain, axis=0)
+    own = np.sum(diffusion**2, axis=1) * step / 4.0
+    return np.asarray(np.sqrt(np.maximum(np.divide(left, own, out=np.ones(n), where=own > 0.0), 0.0)))
+
+
 def _factor(covariance: Array) -> Array:
     """L with L L' = covariance: Cholesky's, or one without the directions that get no noise."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from certbound.plotting import draw_tubes
+import certbound as cb
+from certbound.constants.fitted import MovingConstants
+from certbound.plotting import draw_constants, draw_tubes
 from certbound.tubes.constants import Constants
 from certbound.tubes.tuning import tune_tube
 
@@ -38,3 +40,23 @@ def test_the_command_writes_the_picture(tmp_path, monkeypatch):
     target = tmp_path / "tubes.png"
     assert run(["tune", "ou", "--plot", str(target), "--json"]) == 0
     assert target.read_bytes().startswith(b"\x89PNG")
+
+
+def test_rates_metrics_and_entries_of_the_jacobian_are_drawn():
+    problem = cb.load("pendulum")
+    times = np.array([0.0, 2.0, 5.0])
+    still = Constants(rate=[1.0, -1.0], sigma=1.0, dimension=2, times=times)
+    frames = np.array([np.eye(2), np.diag([2.0, 1.0]), np.eye(2)])
+    ones = np.ones(2)
+    moving = MovingConstants(
+        times=times, frames=frames, rate=-ones, sigma=ones, effective_dimension=2.0, sampled=-ones,
+        _inverse=frames[1:], _error=ones,
+    )  # fmt: skip
+    rates, spectra, entries = draw_constants(problem, {"all in one": still}, moving).axes
+    assert [text.get_text() for text in rates.get_legend().get_texts()] == ["one metric", "moving coordinates"]
+    np.testing.assert_allclose(spectra.get_lines()[1].get_ydata(), [1.0, 4.0, 1.0])
+    np.testing.assert_array_equal(entries.get_images()[0].get_array(), [[0, 1], [2, 1]])
+    single = Constants(rate=-1.0, sigma=1.0, dimension=2, metric=np.diag([4.0, 1.0]))
+    rates, spectra, entries = draw_constants(problem, {"all in one": single, "th <= 1.2": single}).axes
+    assert [label.get_text() for label in rates.get_yticklabels()] == ["all in one", "th <= 1.2"]
+    np.testing.assert_allclose(spectra.collections[1].get_offsets(), [[1.0, 1.0], [4.0, 1.0]])

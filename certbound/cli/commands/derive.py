@@ -12,19 +12,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from certbound.cli.clock import Clock, TimeLimitOption
-from certbound.cli.describe import describe_constants
+from certbound.cli.describe import attributes, describe_constants
 from certbound.cli.messages import InputError, computing
 from certbound.cli.options import (
     HorizonOption,
     JsonOption,
+    PlotOption,
     ProblemArgument,
     SetOption,
+    check_writable,
     examples,
     integer,
     load_problem,
     option,
 )
 from certbound.cli.output import SETTINGS, console, show
+from certbound.cli.pictures import check_picture, write_picture
 from certbound.cli.progress import progress
 from certbound.display import log10_text, name_text
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
@@ -33,12 +36,14 @@ from certbound.watch import OutOfTime, poll
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from certbound.constants.fitted import MovingConstants
     from certbound.problem.problem import Problem
+    from certbound.rigor.intervals import Interval
     from certbound.tubes.constants import Constants
 
 EXAMPLES = examples(
     "certbound derive chain --json",
-    "certbound derive unicycle --time-limit 20",
+    "certbound derive unicycle --time-limit 20 --plot rates.png",
     'certbound derive chain --constraint "v3 <= 2"',
     "certbound derive chain_rest --set masses=20 --constraint all --jobs 2",
 )
@@ -58,12 +63,15 @@ def derive(
     horizon: HorizonOption = None,
     constraint: ConstraintOption = None,
     jobs: JobsOption = 1,
+    plot: PlotOption = None,
     time_limit: TimeLimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Bound the contraction rate (or gain) and the noise, with a metric for each constraint."""
     from certbound.problem.goals import check_end
 
+    check_writable(plot, problem=problem)
+    check_picture(plot)
     subject = load_problem(problem, pairs, horizon=horizon)
     check_end(subject, "a rate along the trajectory")
     asked = _Asked(_places(subject, constraint), _checked_jobs(jobs), live=not as_json)
@@ -72,7 +80,7 @@ def derive(
         progress(f"bounding the constants of {name_text(subject.name)}", time_limit) as tell,
         computing("constants", subject),
     ):
-        constants, metrics, where = _bound(subject, asked, Clock(time_limit, tell))
+        constants, metrics, where, moving = _bound(subject, asked, Clock(time_limit, tell))
     seconds = time.perf_counter() - started
     result = {
         **describe_constants(constants),
@@ -82,9 +90,17 @@ def derive(
             {"constraint": subject.constraints[place].label, **describe_constants(one)}
             for place, one in sorted(metrics.items())
         ],
+        "moving": None if moving is None else moving.describe(),
         "seconds": seconds,
     }
-    show(result, as_json, lambda: _print(constants, result))
+    if plot is not None:
+        from certbound.plotting import draw_constants
+
+        labels = {subject.constraints[place].label: one for place, one in sorted(metrics.items())}
+        write_picture(
+            plot, draw_constants(subject, {"all in one": constants, **labels}, None if moving is None else moving.found)
+        )
+    show(result, as_json, lambda: _print(constants, moving, result))
 
 
 @dataclass(frozen=True)
@@ -118,7 +134,22 @@ def _checked_jobs(jobs: int) -> int:
     return jobs
 
 
-Found = tuple["Constants", dict[int, "Constants"], str]
+@dataclass(frozen=True, eq=False)
+class _Moving:
+    """Rates in moving coordinates, and how far |W (X - x)| comes, in the ``states`` that are asked about."""
+
+    found: MovingConstants
+    delta: float
+    states: list[str]
+    radius: float
+    standing_radius: float  # by the constants of the metric that stands still
+
+    def describe(self) -> dict[str, Any]:
+        names = ("times", "rate", "sigma", "effective_dimension", "integral", "frames")
+        return {**attributes(self.found, *names), **attributes(self, "delta", "states", "radius", "standing_radius")}
+
+
+Found = tuple["Constants", dict[int, "Constants"], str, _Moving | None]
 
 
 def _bound(subject: Problem, asked: _Asked, clock: Clock) -> Found:
@@ -136,7 +167,7 @@ def _bound(subject: Problem, asked: _Asked, clock: Clock) -> Found:
     with contextlib.suppress(OutOfTime):
         with clock.running(), contextlib.suppress(EnclosureError, InfeasibleError):
             quick = bound_constants(subject, metric="euclidean")
-            found.append((quick, {}, "stated" if quick.proof is None else quick.proof.domain))
+            found.append((quick, {}, "stated" if quick.proof is None else quick.proof.domain, None))
         with clock.running():
             _search(subject, asked, found)
     if not found:
@@ -153,7 +184,7 @@ def _search(subject: Problem, asked: _Asked, found: list[Found]) -> None:
         poll("one metric for all constraints")
         constants = bound_constants(subject)
         metrics: dict[int, Constants] = {}
-        found.append((constants, metrics, constants.proof.domain if constants.proof is not None else "stated"))
+        found.append((constants, metrics, constants.proof.domain if constants.proof is not None else "stated", None))
         if not asked.places:
             return
         poll("a metric for each constraint")
@@ -166,11 +197,41 @@ def _search(subject: Problem, asked: _Asked, found: list[Found]) -> None:
         if subject.domain is not None:
             raise
         _log.info("no constants hold everywhere: %s", error)
-    constants, where = _local(subject)
-    found.append((constants, {}, f"{where} (no constants hold on all of R^n)"))
+    constants, where, boxes = _local(subject)
+    where = f"{where} (no constants hold on all of R^n)"
+    found.append((constants, {}, where, None))
+    if constants.continuous and constants.dimension > 1:
+        with contextlib.suppress(ArithmeticError, InfeasibleError, ValueError):
+            found.append((constants, {}, where, _moving(subject, constants, boxes)))
 
 
-def _local(subject: Problem) -> tuple[Constants, str]:
+def _moving(subject: Problem, constants: Constants, boxes: Interval) -> _Moving:
+    """The same in coordinates that move, which make the deviation small where constraints ask about it."""
+    from certbound.constants.fitted import moving_constants_along
+    from certbound.tubes.tuning import tune_tube
+
+    asked = _states_asked(subject)
+    rows = np.eye(constants.dimension)[asked]
+    assert constants.times is not None
+    end, delta = float(constants.times[-1]), subject.delta
+    found = moving_constants_along(subject, constants.times, boxes, directions=rows)
+    radius = found.extent(tune_tube(found.constants(), horizon=end, delta=delta), rows)
+    standing = tune_tube(constants, horizon=end, delta=delta).bound(0.0, end) * constants.norm.section(rows)
+    names = [subject.system.states[k] for k in asked]
+    return _Moving(found, delta, names, float(np.max(radius)), float(standing))
+
+
+def _states_asked(subject: Problem) -> list[int]:
+    """Places of the states that a constraint bounds; all where none does."""
+    asked: set[int] = set()
+    for part in subject.constraints:
+        places = part.region.places(subject.system.dimension)
+        normals = getattr(part.region.form, "normals", np.eye(len(places)))
+        asked |= {places[k] for k in np.flatnonzero(np.any(normals != 0, axis=0))}
+    return sorted(asked) or list(range(subject.system.dimension))
+
+
+def _local(subject: Problem) -> tuple[Constants, str, Interval]:
     """Constants along the reach tube with noise (Thm K4), or without where none was proved; and where they hold."""
     from certbound.constants.fitted import fitted_constants_along
     from certbound.reach import bound_reach
@@ -200,10 +261,10 @@ def _local(subject: Problem) -> tuple[Constants, str]:
         times = np.append(times, reach.curve.ends[-1])
     else:
         boxes = Interval(boxes.lo[:-1], boxes.hi[:-1])
-    return fitted_constants_along(subject, times, boxes), where
+    return fitted_constants_along(subject, times, boxes), where, boxes
 
 
-def _print(constants: Constants, result: dict[str, Any]) -> None:
+def _print(constants: Constants, moving: _Moving | None, result: dict[str, Any]) -> None:
     screen = console()
     name = "rate" if constants.continuous else "gain"
     unit = "1/s" if constants.continuous else "per step"
@@ -216,6 +277,14 @@ def _print(constants: Constants, result: dict[str, Any]) -> None:
         screen.print(f"at most {constants.gap:.3g} above what sampling found")
     screen.print(f"holds on {result['domain']}", markup=False)
     screen.print(f"proposed by: {result['status']}", markup=False)
+    if moving is not None:
+        whole = float(np.diff(moving.found.times) @ np.broadcast_to(constants.slope, moving.found.rate.shape))
+        screen.print(
+            f"in coordinates that move with the trajectory the rate integrates to {moving.found.integral:.4g}, not "
+            f"{whole:.4g}: at delta = {moving.delta:g} a tube stays within {moving.radius:.4g} in "
+            f"{', '.join(moving.states)}, not {moving.standing_radius:.4g} (no certificate states such coordinates)",
+            markup=False,
+        )
     if not result["metrics"]:
         screen.print("metrics of single constraints: --constraint NAME, or all")
     else:

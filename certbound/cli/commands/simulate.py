@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -52,7 +54,7 @@ SPENT = ("steps", "scheme", "path_steps_per_second", "seconds")
 PathsOption = Annotated[
     int, typer.Option("--paths", parser=integer, metavar="N", help="Paths to simulate, such as 3e6.")
 ]
-StepOption = Annotated[float | None, option("--step", "H", "Time step in seconds; T/1000 if left out.", number)]
+StepOption = Annotated[float | None, option("--step", "H", "Time step in seconds [T/1000, or what it takes].", number)]
 ConfidenceOption = Annotated[float, typer.Option("--confidence", parser=number, metavar="C", help="Of the limits.")]
 RareOption = Annotated[bool, typer.Option("--rare", help="Importance splitting, for rare exits.")]
 CheckpointOption = Annotated[Path | None, option("--checkpoint", "FILE", "Keep finished work here, and go on from it.")]
@@ -88,7 +90,10 @@ def simulate(
         options["rng"] = rng
     with cluster_at(cluster) as executor, _progress_bar(paths) as progress:
         options |= {"executor": executor, "progress": progress, "checkpoint": checkpoint}
-        result = _within(Clock(time_limit), _rare if rare else _plain, subject, options)
+        with warnings.catch_warnings(record=True) as doubts:
+            result = _within(Clock(time_limit), _rare if rare else _plain, subject, options)
+    for doubt in {str(doubt.message) for doubt in doubts}:
+        sys.stderr.write(f"certbound: {doubt}\n")
     if claim is not None:
         contradicted = result["lower"] > 10.0**claim
         result["against"] = {"certificate": str(against), "log10_delta": claim, "contradicted": contradicted}

@@ -22,6 +22,7 @@ from certbound.watch import poll
 _UNIT = 2.0**-53
 _TINY = 1e-300
 _TERMS = 24
+_MEMORY = 6 * 2**30  # bytes that the rows of one cell may take
 _MILD = 2.0  # norm of the slopes times a piece, up to which series run well in the states' own units
 _SWEEPS, _FARTHEST = 20, 60  # of balancing; exponent of a unit
 _LARGE, _SPARSE = 40, 0.1  # states and share of nonzero entries from which on products are sparse
@@ -97,18 +98,18 @@ def _transition(slope: Array, drift: Array, step: float, slope_error: float) -> 
     n = slope.shape[-1]
     a, k = slope * step, drift * step**2
     alpha, kappa = _norm(a) * (1 + 1e-14), _norm(k) * (1 + 1e-14)
-    size = np.broadcast_to(np.eye(n), a.shape)
-    terms, total = [np.zeros_like(a), size.copy()], size.copy()
-    majorant = [np.zeros_like(alpha), np.ones_like(alpha)]
-    for i in range(_TERMS):
-        terms.append((a @ terms[-1] + k @ terms[-2]) / (i + 1))
-        majorant.append((alpha * majorant[-1] + kappa * majorant[-2]) / (i + 1))
-        total = total + terms[-1]
+    older, newer = np.zeros_like(a), np.broadcast_to(np.eye(n), a.shape)
+    small, big = np.zeros_like(alpha), np.ones_like(alpha)
+    total = newer.copy()
+    for i in range(_TERMS):  # the last two terms: with all of them, states by the hundred would fill the memory
+        older, newer = newer, (a @ newer + k @ older) / (i + 1)
+        small, big = big, (alpha * big + kappa * small) / (i + 1)
+        total += newer
     # beyond the last term the majorant falls by this ratio at least every second term
     ratio = (alpha + kappa) / _TERMS
     if np.any(ratio > 0.5):
         raise _too_stiff(float((alpha + kappa).max()))
-    tail = 4.1 * (majorant[-1] + majorant[-2]) * np.maximum(ratio, _TINY)
+    tail = 4.1 * (big + small) * np.maximum(ratio, _TINY)
     growth = np.exp(alpha + kappa) * (1 + 1e-13)
     error = tail + _TERMS * (3 * n + 12) * 2 * _UNIT * growth + 2 * n * step * slope_error * growth
     size_ = (np.abs(a) + np.abs(k)) * (1 + 1e-14)
@@ -292,6 +293,12 @@ class RowResponse:
         self.transition, self.error = response.transition[cell], response.transition_error[cell]
         self.columns = np.arange(n) if columns is None else np.asarray(columns)
         self.others = np.setdiff1d(np.arange(n), self.columns)
+        needed = 4.0 * self.nodes**2 * self.count * len(self.columns)  # bytes
+        if needed > _MEMORY:
+            raise EngineError(
+                f"the linear engine would take {needed / 2**30:.3g} GiB of memory, for {self.count} rows at "
+                f"{self.nodes} times, and stops at {_MEMORY / 2**30:g}; use another method, or a shorter horizon."
+            )
         current = np.array(rows[:, first])
         self.coefficients: list[Array] = [np.empty(0)] * (self.nodes - 1)
         self.rest: list[Array] = [np.empty(0)] * (self.nodes - 1)  # row sums over the other columns

@@ -47,7 +47,7 @@ class ExitCounts:
     steps : int
         Time steps per path.
     scheme : str
-        ``exact``, ``milstein``, ``euler`` or ``discrete``.
+        ``exact``, ``milstein``, ``euler``, ``exponential`` or ``discrete``.
     seconds, path_steps_per_second : float
         Compilation left out.
     """
@@ -96,7 +96,8 @@ def simulate_exits(
     rng : numpy.random.Generator, optional
         The same state gives the same counts, on any executor.
     steps : int, optional
-        Time steps over the horizon; 1000 in continuous time, the horizon itself in discrete time.
+        Time steps over the horizon; the horizon itself in discrete time, and in continuous time 1000, or as many as
+        the model's fastest modes need (a warning says so where given ones are too few).
     confidence : float
         Of the limits.
     executor : concurrent.futures.Executor or dask Client, optional

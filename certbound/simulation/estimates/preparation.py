@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -14,8 +15,13 @@ from certbound.problem.goals import check_end
 from certbound.problem.model import compile_scalar
 from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
 from certbound.simulation.stepping import Scenario, StepModel, step_model
+from certbound.simulation.stiffness import exponential, jacobians, step_error, steps_needed
+
+Starts = Callable[[np.random.Generator, int], Array]
+"""``start(rng, count)`` draws starts."""
 
 _DEFAULT_STEPS = 1000
+_MOST_STEPS = 64_000  # that are taken unasked
 _LONGEST_NOMINAL = 20_000  # steps; longer paths are advanced by the kernel
 
 
@@ -36,7 +42,7 @@ class Setting:
     model: StepModel
     steps: int
     times: Array  # (steps + 1,)
-    start: Callable[[np.random.Generator, int], Array]  # ``start(rng, count)`` draws starts
+    start: Starts
     fixed: Array | None  # (n,): the start, if all paths share one
 
     @property
@@ -55,7 +61,11 @@ class Setting:
         with np.errstate(all="ignore"):
             for k in range(self.steps):
                 value = drift(k * model.interval, *path[k], *inputs[k])
-                path.append([x + model.step * v for x, v in zip(path[k], value)] if model.step > 0.0 else value)
+                if model.flow is not None:
+                    value = (np.array(path[k]) + model.flow @ np.array(value)).tolist()
+                elif model.step > 0.0:
+                    value = [x + model.step * v for x, v in zip(path[k], value)]
+                path.append(value)
         return np.array(path, dtype=float)
 
     def work(self, kernel: tuple[str, Array], kind: type[Work] = Work, **fields: Any) -> Work:
@@ -104,9 +114,36 @@ def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = 
             f"`steps` must be at most {fit} for this problem, got {count}: its tables over time would take "
             f"more than {MEMORY_LIMIT // 2**20} MiB; take a longer step."
         )
-    times = np.linspace(0.0, float(problem.horizon), count + 1)
     start, fixed = _start(problem, scenario)
-    return Setting(model=step_model(problem, count, scenario), steps=count, times=times, start=start, fixed=fixed)
+    model = step_model(problem, count, scenario)
+    if model.step > 0.0:
+        model, count = _fine_enough(problem, model, count, scenario, start, fit if steps is None else 0)
+    times = np.linspace(0.0, float(problem.horizon), count + 1)
+    return Setting(model=model, steps=count, times=times, start=start, fixed=fixed)
+
+
+def _fine_enough(
+    problem: Any, model: StepModel, steps: int, scenario: Scenario, start: Starts, most: int
+) -> tuple[StepModel, int]:
+    """The scheme and the steps, at most ``most``, that a model's fastest modes need; a warning where these are more."""
+    horizon = float(problem.horizon)
+    looks = jacobians(model, steps, start)
+    if not len(looks) or step_error(looks, horizon / steps, horizon) <= 1.0:
+        return model, steps
+    needed, base = steps_needed(looks, steps, horizon), None
+    if scenario.scheme == "auto" and model.spread is not None:
+        fewer = steps_needed(looks, steps, horizon, looks[0])
+        needed, base = (fewer, looks[0]) if fewer < needed else (needed, None)
+    if steps < needed <= min(most, _MOST_STEPS):
+        steps = needed
+        model = step_model(problem, steps, scenario)
+    elif steps < needed:
+        warnings.warn(
+            f"{steps} steps are too coarse for the fastest modes of this model, and what is counted may be far from "
+            f"the truth; steps={needed} would do.",
+            stacklevel=4,
+        )
+    return (model if base is None else exponential(model, base, np.asarray(problem.system.diffusion))), steps
 
 
 def refuse_held(problem: Any, what: str) -> None:
@@ -128,7 +165,7 @@ def _steps(problem: Any, steps: int | None) -> int:
     return -(-_DEFAULT_STEPS // pieces) * pieces
 
 
-def _start(problem: Any, scenario: Scenario) -> tuple[Callable[[np.random.Generator, int], Array], Array | None]:
+def _start(problem: Any, scenario: Scenario) -> tuple[Starts, Array | None]:
     initial, n = problem.initial, problem.system.dimension
     if scenario.initial is not None:
         point = np.asarray(scenario.initial, dtype=float)

@@ -29,14 +29,17 @@ from certbound.simulation.kernel_source import (
     NJIT,
     SIGNATURE,
     close_noise,
+    function_lines,
+    kernel_body,
     load_lines,
-    module_head,
+    module_text,
     nominal_lines,
     open_noise,
+    start_text,
     step_lines,
 )
 from certbound.simulation.stepping import Scenario, StepModel
-from certbound.simulation.tape_text import Parameters, indent
+from certbound.simulation.tape_text import each, indent
 
 _PARTICLES = 500
 _DISCARDED = 0.1
@@ -246,23 +249,24 @@ _REPLICA = """\
 
 def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tuple[str, Array]:
     """Source of the splitting kernel; ``run`` writes the estimate to ``out[0, 0, 0]``."""
-    p = Parameters()
-    head = module_head(model, "splitting", p)
+    p = start_text(model)
+    functions = function_lines(model, p)
     step, bridge = step_lines(model, p)
     begin, within, end = score_source(barriers, bridge, p)
-    n = range(model.dimension)
-    load = [*load_lines(model, "states[path, first, {0}]"), "top = tops[path, first]"]
-    free = [f"b_{i} = nominal[k + 1, {i}]" for i in n]
-    store = [f"states[path, k + 1, {i}] = y_{i}" for i in n] + ["tops[path, k + 1] = top"]
+    n = model.dimension
+    load = [*load_lines(model, "states[path, first, {0}]", p), "top = tops[path, first]"]
+    free = each("b_{0} = nominal[k + 1, {0}]", n, p)
+    store = [*each("states[path, k + 1, {0}] = y_{0}", n, p), "tops[path, k + 1] = top"]
     if own:
-        load += [f"a_{i} = frees[path, first, {i}]" for i in n]
+        load += each("a_{0} = frees[path, first, {0}]", n, p)
         free = nominal_lines(model, p)
-        store += [f"frees[path, k + 1, {i}] = b_{i}" for i in n]
-        end = [*end, *[f"a_{i} = b_{i}" for i in n]]
+        store += each("frees[path, k + 1, {0}] = b_{0}", n, p)
+        end = [*end, *each("a_{0} = b_{0}", n, p)]
     full = ["hold(tops, path, k + 1, top)", "break"]
-    loop = [*step, *free, *within, *store, "if top >= 1.0:", *indent(full), *[f"x_{i} = y_{i}" for i in n], *end]
+    loop = [*step, *free, *within, *store, "if top >= 1.0:", *indent(full), *each("x_{0} = y_{0}", n, p), *end]
     out = ["if top >= 1.0:", "    hold(tops, path, first, top)", "    return done"]
-    body = [*load, *begin, *out, *open_noise(model), "for k in range(first, steps):", *indent(loop)]
+    body = [*open_noise(model, p), *load, *begin, *out, "for k in range(first, steps):", *indent(loop)]
     body += [close_noise(), "return done"]
     run = SIGNATURE + _REPLICA.format(frees="count" if own else "0", discarded=_DISCARDED)
-    return head + _IMPORTS + _FOLLOW + "\n".join(indent(body)) + "\n" + run, np.array([*p.values, 0.0])
+    text = module_text(model, "splitting", functions, p) + _IMPORTS + _FOLLOW + kernel_body(body, p) + run
+    return text, np.array([*p.values, 0.0])

@@ -98,3 +98,33 @@ def test_what_was_found_when_the_time_is_over_is_kept(
 def test_derive_refuses_what_it_cannot_do(words: list[str], why: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["derive", "chain_rest", *words]) == 2
     assert why in capsys.readouterr().err
+
+
+PLANE = """
+name = "plane"
+time = "continuous"
+horizon = 0.5
+delta = 1e-3
+states = ["x", "y"]
+[dynamics]
+x = "2*y + 0.1*x**2"
+y = "-y"
+[noise]
+diffusion = [[0], [0.02]]
+[initial]
+point = [0.2, 0.1]
+[[stay]]
+box = { x = [-5, 5] }
+"""
+
+
+@pytest.mark.slow
+def test_moving_coordinates_are_shown_and_drawn_where_constants_are_local(tmp_path, capsys):
+    path, picture = tmp_path / "plane.toml", tmp_path / "rates.png"
+    path.write_text(PLANE)
+    assert run(["derive", str(path), "--json", "--plot", str(picture)]) == 0
+    moving = json.loads(capsys.readouterr().out)["moving"]
+    assert moving["states"] == ["x"]
+    assert 0.0 < moving["radius"] < 0.7 * moving["standing_radius"]
+    assert len(moving["rate"]) == len(moving["frames"]) - 1
+    assert picture.read_bytes().startswith(b"\x89PNG")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from certbound.errors import EngineError
 from certbound.gaussian.response.linear_response import RowResponse, continuous_response, discrete_response
 from certbound.gaussian.response.step_events import StepEvents
 
@@ -106,3 +107,12 @@ def test_variances_of_any_size_are_enclosed(size: float) -> None:
     assert StepEvents(response, 0, True).along(np.full((4, 1), 1e10)).correlation[1:] == pytest.approx(
         0.5 * np.sqrt([1 / 1.25, 1.25 / 1.3125]), rel=1e-9
     )
+
+
+def test_rows_that_would_fill_the_memory_are_refused_before_they_are_made(monkeypatch):
+    response = discrete_response(np.full((1, 10, 1, 1), 0.5), np.eye(1), 0.0, np.zeros((1, 1)))
+    rows = np.ones((11, 1, 1))
+    assert RowResponse(response, 0, rows).count == 1
+    monkeypatch.setattr("certbound.gaussian.response.linear_response._MEMORY", 400)
+    with pytest.raises(EngineError, match="GiB of memory, for 1 rows at 11 times"):
+        RowResponse(response, 0, rows)

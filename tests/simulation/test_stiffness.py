@@ -1,0 +1,71 @@
+"""Steps that are too long for a model are noticed: another scheme, more steps, or a warning that names enough."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm, solve_continuous_lyapunov
+
+import certbound as cb
+from certbound.simulation.estimates.preparation import prepare
+from certbound.simulation.stepping import Scenario
+from certbound.simulation.stiffness import step_error, steps_needed
+from certbound.simulation.transition import bridge_shares
+
+SWING = np.array([[0.0, 1.0], [-38_900.0, -20.0]])
+
+
+def swing(diffusion, pull=38_900.0):
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -pull * np.sin(x[0]) - 20.0 * x[1]], states=2, diffusion=diffusion
+    )
+    box = cb.Box([-0.2, -np.inf], [0.2, np.inf])
+    return cb.Problem(system, initial=np.zeros(2), safe=[cb.Inside(box)], horizon=1.0, delta=1e-3)
+
+
+def test_eulers_error_is_that_of_the_damping():
+    real, imaginary = -10.0, np.sqrt(38_900.0 - 100.0)
+    for step in (1e-3, 1e-4):
+        right = abs(np.log(abs(1 + step * (real + 1j * imaginary))) / step - real) / (0.2 * 10.0)
+        assert step_error(SWING[None], step, 1.0) == pytest.approx(right, rel=1e-9)
+    assert step_error(SWING[None], 1e-3, 1.0) > 1.0 >= step_error(SWING[None], 1e-4, 1.0)
+    assert steps_needed(SWING[None], 1000, 1.0) == 16_000
+
+
+def test_a_stiff_model_with_constant_noise_takes_the_exponential_scheme_and_keeps_its_covariance():
+    noise = np.array([[0.0], [1.0]])
+    setting = prepare(swing(noise))
+    model = setting.model
+    assert (model.scheme, setting.steps) == ("exponential", 1000)
+    move = np.eye(2) + model.flow @ SWING
+    np.testing.assert_allclose(move, expm(SWING * 1e-3), rtol=1e-9, atol=1e-12)
+    stationary = solve_continuous_lyapunov(SWING, -noise @ noise.T)
+    after = move @ stationary @ move.T + model.noise @ model.noise.T
+    np.testing.assert_allclose(after, stationary, rtol=1e-9, atol=1e-16)
+    assert model.spread[0, 0] == 0.0
+    assert setting.nominal().shape == (1001, 2)
+
+
+def test_where_noise_depends_on_the_state_more_steps_are_taken():
+    setting = prepare(swing(lambda x: [[0.0], [1.0 + x[0] ** 2]]))
+    assert (setting.model.scheme, setting.steps) == ("euler", 16_000)
+
+
+def test_steps_that_are_given_are_kept_and_a_warning_names_enough():
+    noise = np.array([[0.0], [1.0]])
+    with pytest.warns(UserWarning, match=r"500 steps are too coarse .* steps=16000 would do"):
+        assert prepare(swing(noise), 500, Scenario(scheme="euler")).steps == 500
+    assert prepare(swing(noise), 16_000, Scenario(scheme="euler")).model.scheme == "euler"
+    assert prepare(swing(noise), 500).model.scheme == "exponential"
+
+
+def test_models_without_fast_modes_keep_eulers_scheme():
+    assert prepare(swing(np.array([[0.0], [1.0]]), pull=9.81)).model.scheme == "euler"
+    for name in ("pendulum", "unicycle"):
+        setting = prepare(cb.load(name))
+        assert (setting.model.scheme, setting.steps) == ("euler", 1000)
+
+
+def test_bridges_of_modes_that_die_out_stay_near_their_ends():
+    share = bridge_shares(np.array([[-8.0, 0.0], [0.0, -1e-9]]), np.eye(2), 0.5)
+    np.testing.assert_allclose(share, [np.sqrt(np.tanh(2.0) / 2.0), 1.0], rtol=1e-6)
