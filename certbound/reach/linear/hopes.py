@@ -12,7 +12,7 @@ from certbound.reach.linear import shares
 from certbound.reach.linear.diffusion import DiffusionRun, depends_on_state
 from certbound.reach.linear.fit import fitted
 from certbound.reach.linear.held import HeldLinearisation
-from certbound.reach.linear.linearisation import Linearisation
+from certbound.reach.linear.linearisation import FEWEST_PIECES, Linearisation
 from certbound.reach.linear.proved import LinearAnswer
 from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share
@@ -31,7 +31,8 @@ def coarser(problem: Problem | HeldLoop, cells: int | None) -> list[int]:
     plain = Linearisation.of(problem, cells=cells)
     if plain.pieces < _FINE or not len(plain.model.active) or depends_on_state(problem):
         return []
-    return [int(np.ceil(plain.pieces / factor)) for factor in _COARSER]
+    found = (int(np.ceil(plain.pieces / factor)) for factor in _COARSER)
+    return [pieces for pieces in found if pieces >= FEWEST_PIECES]
 
 
 def nobody(answer: LinearAnswer) -> None:

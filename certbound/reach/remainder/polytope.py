@@ -60,7 +60,7 @@ class Polytope:
 def own_faces(rows: Array, block: list[int]) -> Mask:
     """Which rows (M, D, active) see no other coordinates than those of a block, (D,)."""
     others = np.setdiff1d(np.arange(rows.shape[2]), block)
-    return ~np.any(rows[..., others] != 0, axis=(0, 2))
+    return np.asarray(~np.any(rows[..., others] != 0, axis=(0, 2)))
 
 
 def linear_range(matrix: Array, radius: Array, normals: Array, room: Array) -> Array:
