@@ -21,7 +21,7 @@ itself, opposite sides by themselves."""
 _FIRST_PIECES = 4
 _GROWTH = 1.5  # of the pieces before a window, backward: what is long ago is smooth
 _SMALLEST = -300.0
-_LARGEST = 1e7  # inequalities, times the square of the entries of each
+_LARGEST = 5e6  # inequalities, times the square of the entries of each
 
 
 @dataclass(eq=False, kw_only=True, slots=True)

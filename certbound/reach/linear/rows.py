@@ -31,7 +31,7 @@ def _curved(engine: Linearisation) -> Array:
     active, cells, blocks = engine.model.active, engine.cells, engine.model.blocks
     count = len(active)
     nothing = np.zeros((cells, engine.pieces, 0, count))
-    if not 2 <= count <= 12 or len(blocks) != 1 or len(blocks[0]) != 1:
+    if not 2 <= count <= 6 or len(blocks) != 1 or len(blocks[0]) != 1:
         return nothing
     hessians = engine.model.reference_hessians(engine.frame).reshape(cells, engine.pieces, -1, count, count)
     kinks = not hessians.any() and engine.model.kinked and not engine.model.planar
@@ -52,7 +52,7 @@ def _curved(engine: Linearisation) -> Array:
     # what the remainder does not depend on must not help to cull its boxes
     rows[..., np.setdiff1d(np.arange(count), blocks[0][0])] = 0.0
     rows = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-300)  # the spread may be next to nothing
-    if engine.continuous and len(blocks[0][0]) == engine.n and not engine.model.parts:
+    if engine.continuous and len(blocks[0][0]) == engine.n:
         rows = _carried(rows, engine)
     # the sign of an eigenvector is free: keep it from flipping between neighbours
     flips = np.einsum("bkda,bkac,bkdc->bkd", rows[:, 1:], spread[:, 1:], rows[:, :-1])

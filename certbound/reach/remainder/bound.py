@@ -23,7 +23,7 @@ from certbound.problem.model import adds_plainly, selected
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.expansion import Expansion, Parts
 from certbound.reach.remainder.frame import Frame
-from certbound.reach.remainder.polytope import Boxes, Polytope, grid, own_faces
+from certbound.reach.remainder.polytope import Boxes, Polytope, grid
 from certbound.reach.remainder.samples import fitted_slopes, sampled_range
 from certbound.rigor.intervals import Interval
 from certbound.watch import poll
@@ -46,20 +46,12 @@ class _Asked:
     tolerance: float
     target: Target | None
     only: Index | None
-    outputs: Index | None = None  # asked for; all where omitted
-
-    def within(self, block: list[int], outputs: Index | None) -> _Asked:
-        """The same for some outputs of a part that moves in one block: of the faces, those of its coordinates."""
-        p, own = self.polytope, own_faces(self.polytope.rows, block)
-        return replace(self, polytope=Polytope(p.low[:, own], p.high[:, own], p.rows[:, own]), outputs=outputs)
 
     def excess(self, lo: Array, hi: Array, inner_lo: Array, inner_hi: Array, items: Index) -> Array:
         """By how much bounds over boxes exceed what is hoped for, or their own range: in its units, (Q, n)."""
         low, high = (inner_lo, inner_hi) if self.target is None else self.target
         found = np.maximum(hi - high[items], low[items] - lo) / np.maximum(high - low, 1e-300)[items]
         found = found - self.tolerance if self.target is None else found
-        if self.outputs is not None:
-            found[:, np.setdiff1d(np.arange(found.shape[1]), self.outputs)] = -np.inf
         return np.where(np.isfinite(found) | (found < 0), found, np.inf)
 
 
@@ -94,36 +86,23 @@ class Remainder(Derivatives):
             Infinite where the dynamics is not defined on the whole polytope.
         """
         count = len(self.active)
+        expansion = self._expansion(frame)
         extra = self._disturbance(frame, low[:, :count], high[:, :count]) if self.gain is not None else None
         if target is not None and extra is not None:
             target = target[0] - extra.lo, target[1] - extra.hi
         inner = low[:, :count], high[:, :count]
         asked = _Asked(inner, Polytope(low[:, count:], high[:, count:], rows), *_EFFORT[effort], target, only)
-        lower, upper = self._ranges(frame, asked)
+        if len(self.blocks) == 1:
+            lower, upper = self._group(expansion, self.blocks[0], asked)
+        else:
+            total = base = self._at_nominal(frame)
+            for group in self.blocks:
+                total = total + (Interval(*self._group(expansion, group, replace(asked, target=None))) - base)
+            lower, upper = total.lo, total.hi
         if extra is not None:
             total = Interval(lower, upper) + extra
             lower, upper = total.lo, total.hi
         return lower, upper
-
-    def _ranges(self, frame: Frame, asked: _Asked) -> tuple[Array, Array]:
-        """beta without the disturbance: block by block, or, where too many are coupled, output by output."""
-        if self.parts:
-            base = self._at_nominal(frame)
-            lower, upper = base.lo.copy(), base.hi.copy()
-            for model, outputs in self.parts:
-                low, high = model._ranges(frame, replace(asked, outputs=outputs))
-                lower[:, outputs], upper[:, outputs] = low[:, outputs], high[:, outputs]
-            return lower, upper
-        expansion = self._expansion(frame)
-        if len(self.blocks) == 1:
-            block = self.blocks[0][0]
-            alone = asked.within(block, asked.outputs) if len(self.blocks[0]) == 1 else asked
-            return self._group(expansion, self.blocks[0], alone)
-        total = base = self._at_nominal(frame)
-        for group in self.blocks:
-            alone = replace(asked.within(group[0], asked.outputs), target=None)
-            total = total + (Interval(*self._group(expansion, group, alone)) - base)
-        return total.lo, total.hi
 
     def sampled(self, frame: Frame, low: Array, high: Array, rows: Array) -> tuple[Array, Array]:
         """Range of beta over sample points, which proves nothing; see `sampled_range`."""

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, Self
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,8 +24,6 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.remainder.frame import Frame
 from certbound.rigor.intervals import Interval
-
-_MANY, _MOST = 7, 24  # coupled coordinates from which, and up to which, outputs are bounded one by one
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +52,6 @@ class Derivatives:
     time: Tape = field(init=False)
     time2: Tape = field(init=False)
     gain: Tape | None = field(init=False)
-    recent: list[Any] = field(init=False, default_factory=list)  # kept for the last frame
 
     def __post_init__(self) -> None:
         tape = self.problem.closed_loop
@@ -115,56 +108,6 @@ class Derivatives:
         i, j = self.entries[entry]
         return state >= 0 and state != j and (i, state) in self.entries and (
             self.entries.index((i, state)), j) not in self.second_index
-
-    @cached_property
-    def parts(self) -> list[tuple[Self, Index]]:
-        """Of a smooth model with many coupled coordinates, what each set of outputs with the same ones needs alone.
-
-        None where some output depends on all of them.
-        """
-        size = max((len(block) for group in self.blocks for block in group), default=0)
-        if not _MANY <= size <= _MOST or self.kinked or self.planar or self.jumping:
-            return []
-        used: dict[int, set[int]] = {}
-        for (i, j), own in zip(self.entries, self.sources, strict=True):
-            used.setdefault(i, set()).update((j, *own))
-        outputs: dict[frozenset[int], list[int]] = {}
-        for i, states in sorted(used.items()):
-            outputs.setdefault(frozenset(states), []).append(i)
-        if max(map(len, outputs)) >= size:
-            return []
-        return [(self.of_outputs(own), np.array(own, dtype=np.intp)) for own in outputs.values()]
-
-    def of_outputs(self, outputs: Sequence[int]) -> Self:
-        """The same, of what these outputs need: what it says of the others means nothing. For smooth models."""
-        other, own = copy.copy(self), [self.value.outputs[i] for i in outputs]
-
-        def part(tape: Tape, places: list[int]) -> Tape:
-            """Some outputs, with the nodes of the function itself, which tell where it is undefined."""
-            whole = replace(tape, outputs=(*(tape.outputs[p] for p in places), *own), shape=(len(places) + len(own),))
-            found = selected(whole, list(range(len(whole.outputs))), None)
-            return replace(found, outputs=found.outputs[: len(places)], shape=(len(places),))
-
-        entries = [e for e, (i, _) in enumerate(self.entries) if i in outputs]
-        columns = [c for c, (entry, _) in enumerate(self.second_index) if entry in entries]
-        timed = [c for c, i in enumerate(self.timed) if i in outputs]
-        n = len(self.value.outputs)
-        found = {
-            "value": selected(self.value, [i if i in outputs else outputs[0] for i in range(n)], None),
-            "entries": [self.entries[e] for e in entries],
-            "sources": [self.sources[e] for e in entries],
-            "varying": part(self.varying, entries),
-            "second_index": [(entries.index(self.second_index[c][0]), self.second_index[c][1]) for c in columns],
-            "second": part(self.second, columns),
-            "timed": [self.timed[c] for c in timed],
-            "time": part(self.time, timed),
-            "time2": selected(self.time2, timed, None),
-            "recent": [],
-        }
-        for name, value in found.items():
-            object.__setattr__(other, name, value)
-        object.__setattr__(other, "blocks", other._colours())
-        return other
 
     def _stirring(self) -> set[int]:
         """States that the diffusion depends on: they ask for bounds, though not of beta."""

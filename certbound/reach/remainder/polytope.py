@@ -57,12 +57,6 @@ class Polytope:
         return keep, ((value <= hi) & (value >= lo)).all(axis=1)
 
 
-def own_faces(rows: Array, block: list[int]) -> Mask:
-    """Which rows (M, D, active) see no other coordinates than those of a block, (D,)."""
-    others = np.setdiff1d(np.arange(rows.shape[2]), block)
-    return np.asarray(~np.any(rows[..., others] != 0, axis=(0, 2)))
-
-
 def linear_range(matrix: Array, radius: Array, normals: Array, room: Array) -> Array:
     """Upper bounds of g . d over |d| <= e and one of normals_k . d <= room_k at a time, the least over k.
 

@@ -14,7 +14,6 @@ from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.frame import Frame
-from certbound.reach.remainder.polytope import own_faces
 
 _POINTS = {1: 17, 2: 9, 3: 7, 4: 3, 5: 3, 6: 3}
 _DIRECTIONS = 64
@@ -29,10 +28,7 @@ def sampled_range(model: Derivatives, frame: Frame, low: Array, high: Array, row
     """
     base = _remainder(model, frame, np.zeros((len(frame), 1, len(model.active))))[:, 0]
     lower, upper = base.copy(), base.copy()
-    for part, outputs in model.parts:
-        found = sampled_range(part, frame, low, high, rows)
-        lower[:, outputs], upper[:, outputs] = found[0][:, outputs], found[1][:, outputs]
-    for group in () if model.parts else model.blocks:
+    for group in model.blocks:
         values = _remainder(model, frame, _points(model, group, low, high, rows)[0]) - base[:, None]
         lower += np.fmin(np.fmin.reduce(values, axis=1), 0.0)
         upper += np.fmax(np.fmax.reduce(values, axis=1), 0.0)
@@ -48,8 +44,6 @@ def fitted_slopes(model: Derivatives, frame: Frame, low: Array, high: Array, row
     """
     m, n = frame.spread.shape
     result = np.zeros((m, n, n))
-    if model.parts:
-        return result + sum(fitted_slopes(part, frame, low, high, rows) for part, _ in model.parts)
     position = {int(state): a for a, state in enumerate(model.active)}
     for group in model.blocks:
         shift, half = _points(model, group, low, high, rows)
@@ -87,11 +81,8 @@ def _points(
         step[..., block] = half[:, None, block] * unit
         shift[..., block] = middle[:, None, block]
     if len(group) == 1 and rows.shape[1]:
-        own = own_faces(rows, group[0])
-        rows, above, below = rows[:, own], high[:, count:][:, own], low[:, count:][:, own]
-    if len(group) == 1 and rows.shape[1]:
         along, offset = np.einsum("mda,mka->mkd", rows, step), np.einsum("mda,ma->md", rows, shift[:, 0])[:, None]
-        room = np.where(along > 0, above[:, None] - offset, offset - below[:, None])
+        room = np.where(along > 0, high[:, None, count:] - offset, offset - low[:, None, count:])
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.where(np.abs(along) > 0, room / np.abs(along), np.inf)
         step *= np.clip(ratio.min(axis=2), 0.0, 1.0)[..., None]

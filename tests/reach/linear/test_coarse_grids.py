@@ -27,10 +27,13 @@ def fast_actuator(sigma: float = 0.02, delta: float = 1e-3) -> cb.Problem:
 def test_a_bound_that_meets_delta_is_found_on_a_grid_that_is_not_dear() -> None:
     problem, told = fast_actuator(), []
     counts = coarser(problem, 1)
-    assert counts == sorted(counts) and counts[-1] < Linearisation.of(problem).pieces
+    assert counts == sorted(counts)
+    assert counts[-1] < Linearisation.of(problem).pieces
     answer = linear_answer(problem, found=told.append)
-    assert isinstance(answer, LinearAnswer) and answer.run.engine.pieces in counts
-    assert answer.log10_delta <= -3 and told[-1].log10_delta == answer.log10_delta
+    assert isinstance(answer, LinearAnswer)
+    assert answer.run.engine.pieces in counts
+    assert answer.log10_delta <= -3
+    assert told[-1].log10_delta == answer.log10_delta
 
 
 def test_grids_are_as_they_were_where_they_are_cheap() -> None:
@@ -50,4 +53,5 @@ def test_a_first_bound_is_kept_where_a_finer_grid_proves_less(monkeypatch: pytes
     monkeypatch.setattr("certbound.reach.linear.answer.best_of", lost)
     with pytest.raises(LookupError):  # at the fine grid, after the coarse ones
         linear_answer(problem, found=first.append)
-    assert first and math.log10(problem.delta) < first[-1].log10_delta < 0
+    assert first
+    assert math.log10(problem.delta) < first[-1].log10_delta < 0
