@@ -159,6 +159,7 @@ class _Quest:
         """One pass over the walls of a working box; None where there can be none."""
         try:
             search = make_search(self.problem, low, high, together=together)
+            refuse_large(search.attempts[:1], search.setting.dimension)
         except InfeasibleError as error:
             self.failure = error
             return None
@@ -238,7 +239,6 @@ class Search:
     def first(self, target: float, share: float) -> Iterator[QuadraticBound]:
         """Bound every wall once, then the sides by themselves; a wall that proves nothing, even refined, ends it."""
         until = time.perf_counter() + share
-        refuse_large(self.attempts[:1], self.setting.dimension)
         for place, attempt in enumerate(self.attempts):
             poll(f"walls {place + 1} of {len(self.attempts)}")
             if time.perf_counter() > until:
