@@ -30,6 +30,7 @@ from certbound.quadratic.wall_attempts import (
     groups,
     log10_up,
     log_sum,
+    refuse_large,
     total,
 )  # fmt: skip
 from certbound.quadratic.wall_program import Proposal, StatedCells, propose
@@ -158,6 +159,7 @@ class _Quest:
         """One pass over the walls of a working box; None where there can be none."""
         try:
             search = make_search(self.problem, low, high, together=together)
+            refuse_large(search.attempts[:1], search.setting.dimension)
         except InfeasibleError as error:
             self.failure = error
             return None
@@ -222,9 +224,8 @@ class Search:
         """Slabs that make a large remainder small, as far as a few do: without them many a bound is 1."""
         held, n = self.dynamics.held, self.setting.dimension
         slabs = [1] * len(held)
-        least, most = self.dynamics.remainder(*grid(n, held, slabs)), _FIRST_SLABS
-        if n > _SMALL_DIMENSION:
-            most = _FEWER_SLABS
+        least = self.dynamics.remainder(*grid(n, held, slabs))
+        most = _FEWER_SLABS if n > _SMALL_DIMENSION else _FIRST_SLABS
         if least <= _LARGE:  # the walls by themselves gain more
             return tuple(slabs)
         while least > _LOOSE and math.prod(slabs) < most:
@@ -367,8 +368,7 @@ class Search:
         self.solved[attempt.key] = attempt
 
     def _prove(self, attempt: Attempt, proposal: Proposal, cells: Sequence[StatedCells]) -> None:
-        known = [one.cells for one in cells]
-        attempt.proved = prove(self.setting, attempt.wall, proposal, known, others=attempt.others)
+        attempt.proved = prove(self.setting, attempt.wall, proposal, [c.cells for c in cells], others=attempt.others)
         attempt.corners = corner_levels(self.setting, attempt.proved)
 
     def _mirrored(self, attempt: Attempt, cells: Sequence[StatedCells]) -> bool:

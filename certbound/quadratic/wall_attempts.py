@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.errors import InfeasibleError
 from certbound.quadratic.inequality import Proved
 from certbound.quadratic.setting import Wall
 from certbound.rigor.balls import precision, upper
@@ -20,6 +21,7 @@ itself, opposite sides by themselves."""
 _FIRST_PIECES = 4
 _GROWTH = 1.5  # of the pieces before a window, backward: what is long ago is smooth
 _SMALLEST = -300.0
+_LARGEST = 5e6  # inequalities, times the square of the entries of each
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -120,6 +122,16 @@ class Attempt:
     def blocks(self) -> int:
         """Matrix inequalities of its program."""
         return int(3 * (len(self.times[0]) - 1) * math.prod(self.slabs) * 2 ** len(self.slabs))
+
+
+def refuse_large(attempts: Sequence[Attempt], states: int) -> None:
+    """InfeasibleError where the program of an attempt would take minutes, in a single step of the solver."""
+    for attempt in attempts:
+        if attempt.blocks * ((states + 1) * (states + 2) / 2) ** 2 > _LARGEST:
+            raise InfeasibleError(
+                f"a bound takes a program of {attempt.blocks} matrix inequalities in {states} states, since the slopes "
+                f"of the dynamics depend on {len(attempt.slabs)} of them; that is more than what is solved in a minute."
+            )
 
 
 class Option(NamedTuple):

@@ -5,11 +5,14 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import certbound as cb
+from certbound.errors import InfeasibleError
 from certbound.quadratic import QuadraticBound, bound_quadratic, refinement
 from certbound.quadratic.inequality import prove
 from certbound.quadratic.refinement import make_search
@@ -174,3 +177,30 @@ def test_a_timer_does_not_break_the_solver_while_it_loads() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.split() == ["late", "solved"]
+
+
+def test_a_copy_of_the_process_solves_what_is_long_and_ends_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = make_search(problem_of(), *working_box(problem_of(), 4.0), together=True)
+    one = replace(search.attempts[0], pieces=2)
+    times, first = one.times
+    cells = search.cells(times, one.slabs)
+
+    def matrices(seconds: float) -> object:
+        found = propose(search.setting, one.wall, times, cells, seconds=seconds, first=first, others=one.others)
+        return found and found.matrices
+
+    here = matrices(20.0)
+    assert here is not None
+    monkeypatch.setattr("certbound.quadratic.conic._LONG", 0.0)
+    there = matrices(20.0)
+    assert np.array_equal(here, there)
+    monkeypatch.setattr("certbound.quadratic.conic.Program._solved", lambda *_: time.sleep(60))  # one step that lasts
+    begin = time.perf_counter()
+    assert matrices(0.1) is None
+    assert time.perf_counter() - begin < 20
+
+
+def test_programs_that_take_minutes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("certbound.quadratic.wall_attempts._LARGEST", 1e3)
+    with pytest.raises(InfeasibleError, match=r"a program of \d+ matrix inequalities in 3 states"):
+        bound_quadratic(problem_of(), target=1e-3, seconds=5)

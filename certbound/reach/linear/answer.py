@@ -11,7 +11,7 @@ from certbound.problem.problem import Problem
 from certbound.reach.linear import shares
 from certbound.reach.linear.bisection import bisected
 from certbound.reach.linear.diffusion import DiffusionRun, depends_on_state
-from certbound.reach.linear.hopes import best_of, least, nobody, refined, run_of, tried
+from certbound.reach.linear.hopes import best_of, coarser, hopes_of, least, nobody, refined, run_of, tried
 from certbound.reach.linear.proved import LinearAnswer
 from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share
@@ -47,6 +47,9 @@ def linear_answer(
         Takes each better answer on the way to the best one.
     """
     target = Share.of(problem.delta)
+    first = None if before is not None else _on_coarse_grids(problem, cells, target, found)
+    if first is not None and first.outcome.log_probability <= target.log:
+        return first
     run = run_of(problem, cells=1 if cells is None else cells) if before is None else before.run
     best, effort = best_of(run, target, found) if before is None else (before.outcome, shares.HOPED[-1][1])
     unproved = best.log_probability > target.log
@@ -66,7 +69,33 @@ def linear_answer(
                 break
     shown = best
     best = refined(run, best, effort, target, lambda o: found(LinearAnswer(run=run, outcome=o, shown=shown)))
+    if first is not None and first.outcome.log_probability < best.log_probability:
+        return first
     return LinearAnswer(run=run, outcome=best, shown=shown)
+
+
+def _on_coarse_grids(
+    problem: Problem | HeldLoop, cells: int | None, target: Share, found: Callable[[LinearAnswer], object]
+) -> LinearAnswer | None:
+    """The best of grids with fewer and fewer too few pieces, up to one that meets the target; each is a proof."""
+    best: LinearAnswer | None = None
+    for pieces in coarser(problem, 1 if cells is None else cells):
+        run = run_of(problem, cells=1 if cells is None else cells, pieces=pieces)
+        tries = ((target.part(part), effort) for part, effort in hopes_of(run, target))
+        rough = (share for share in map(Share.of, shares.LIKELIER) if target.log < share.log)
+        for share, effort in (*tries, *((share, 2) for share in rough)):
+            if best is not None and share.log > target.log:
+                break
+            if share.log > target.log and run.promise(share, effort, limit=_NOTHING) > _NOTHING:
+                continue
+            outcome = run.probability(share, effort)
+            if outcome.bounds is None or (best and outcome.log_probability >= best.outcome.log_probability):
+                continue
+            best = LinearAnswer(run=run, outcome=refined(run, outcome, effort, target), shown=outcome)
+            found(best)
+            if outcome.log_probability <= target.log:
+                return best
+    return best
 
 
 def _on_grids(

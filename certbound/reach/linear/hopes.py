@@ -12,14 +12,27 @@ from certbound.reach.linear import shares
 from certbound.reach.linear.diffusion import DiffusionRun, depends_on_state
 from certbound.reach.linear.fit import fitted
 from certbound.reach.linear.held import HeldLinearisation
-from certbound.reach.linear.linearisation import Linearisation
+from certbound.reach.linear.linearisation import FEWEST_PIECES, Linearisation
 from certbound.reach.linear.proved import LinearAnswer
 from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share
 from certbound.reach.nominal import Cells
 
+_SEVERAL, _FINE = 4, 300  # states, and pieces of time
+_COARSER = (16.0, 6.0, 2.4)  # times fewer pieces
 _REFINEMENTS = 3
 _MANY = 20  # nonlinear coordinates beyond which a probability below the target is not refined
+
+
+def coarser(problem: Problem | HeldLoop, cells: int | None) -> list[int]:
+    """Pieces of grids that are tried before a fine one in four states or more: it is dear, and seldom needed."""
+    if isinstance(problem, HeldLoop) or problem.system.time == "discrete" or problem.system.dimension < _SEVERAL:
+        return []
+    plain = Linearisation.of(problem, cells=cells)
+    if plain.pieces < _FINE or not len(plain.model.active) or depends_on_state(problem):
+        return []
+    found = (int(np.ceil(plain.pieces / factor)) for factor in _COARSER)
+    return [pieces for pieces in found if pieces >= FEWEST_PIECES]
 
 
 def nobody(answer: LinearAnswer) -> None:
@@ -52,7 +65,7 @@ def best_of(
     guessed = run.curved and not isinstance(run, DiffusionRun)
     parts = shares.GUESSED if guessed else shares.HOPED if run.curved else shares.HOPED_LINEAR
     best: Outcome | None = None
-    for hope in _hopes(run, target) if guessed else parts:
+    for hope in hopes_of(run, target) if guessed else parts:
         outcome = tried(run, target, hope)
         best = outcome if best is None else least(best, outcome)
         found(LinearAnswer(run=run, outcome=best, shown=best))
@@ -63,7 +76,7 @@ def best_of(
 
 def meeting(run: LinearRun, target: Share) -> tuple[Outcome, int] | None:
     """The first outcome that meets the target, with its effort, among those that a guess promises; None without."""
-    for hope in _hopes(run, target):
+    for hope in hopes_of(run, target):
         outcome = tried(run, target, hope)
         if outcome.log_probability <= target.log:
             return outcome, hope[1]
@@ -75,7 +88,7 @@ def tried(run: LinearRun, target: Share, hope: tuple[float, int]) -> Outcome:
     return run.probability(target.part(hope[0]), hope[1])
 
 
-def _hopes(run: LinearRun, target: Share) -> Iterator[tuple[float, int]]:
+def hopes_of(run: LinearRun, target: Share) -> Iterator[tuple[float, int]]:
     """The shares of the target with which a guess of the remainder says that it is within reach.
 
     Of all of them the last one has the least levels, and so the least remainder. Where the first has no chance, it is
@@ -97,12 +110,11 @@ def _within_reach(run: LinearRun, target: Share) -> bool:
 
 def promising(run: LinearRun, target: Share) -> bool:
     """Whether a guess of the remainder says that the target is within reach."""
-    return _within_reach(run, target) and any(True for _ in _hopes(run, target))
+    return _within_reach(run, target) and any(True for _ in hopes_of(run, target))
 
 
 def least(first: Outcome, second: Outcome) -> Outcome:
     return second if second.log_probability < first.log_probability else first
-
 
 
 
