@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.problem.goals import check_end
+from certbound.problem.goals import check_end, until
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside, Region
 from certbound.problem.systems import DiscreteSystem
@@ -160,9 +160,16 @@ def chart_failures(problem: Problem, *, share: float, times: int = 1, parts: int
 def step_grids(problem: Problem, share: float) -> list[Grid]:
     """The grids of all steps at one size of the cells, one object where steps share one; as certificates state them.
 
-    Inapplicable where value functions do not fit the problem, or the grids would be too large.
+    Of a target that need not be stayed in up to the end of its window. Inapplicable where value functions do not fit
+    the problem, or the grids would be too large.
     """
-    work = Work(problem, None, 1)
+    target = problem.reach
+    if target is None:
+        work = Work(problem, None, 1)
+    else:
+        first, last = target.during or (0, problem.horizon)
+        plain = until(problem, problem.horizon if target.stays else int(last))
+        work = Work(plain, target.region, 1, int(first))
     found = work.layout(share)
     if found is None:
         raise Inapplicable(work.too_large)

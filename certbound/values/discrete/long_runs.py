@@ -106,6 +106,15 @@ def bound_long_run(
     return replace(best, seconds=time.perf_counter() - begun, tried=tuple(tried))
 
 
+def long_grid(problem: Problem, share: float) -> Grid:
+    """The grid of every step at one size of the cells; Inapplicable where value functions do not fit the problem."""
+    run = _Run(problem, 1)
+    layout = run.work.layout(share)
+    if layout is None:
+        raise Inapplicable(run.work.too_large)
+    return layout[-1]
+
+
 def _better(one: FailureBounds, other: FailureBounds) -> FailureBounds:
     """The better bounds of both; rates only with the number of steps that they belong to."""
     best = min(other, one, key=_rate_gap)
