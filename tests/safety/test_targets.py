@@ -9,7 +9,6 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.cli.commands.check import proved_certificate
 from certbound.errors import CertificateError, InfeasibleError
-from certbound.problem.files import load, save
 from certbound.problem.goals import met_at, until
 from certbound.safety.certificate import problem_data
 
@@ -149,13 +148,6 @@ def test_value_functions_of_targets_in_continuous_time_are_not_stated_in_certifi
     problem = walk(reach=TARGET, horizon=2.0).replace(system=system, delta=0.9)
     with pytest.raises(CertificateError, match="certificates state that a target is met at one time"):
         cb.verify_safety(problem, method="values").certificate_text(problem)
-
-
-def test_it_is_saved_and_loaded(tmp_path):
-    problem = walk(cb.Reach(cb.Ball([0.0], 0.2), (2, 5), "home"))
-    save(problem, tmp_path / "walk.toml")
-    assert problem_data(load(tmp_path / "walk.toml")) == problem_data(problem)
-    assert "[[reach]]" in (tmp_path / "walk.toml").read_text()
 
 
 def test_targets_that_cannot_be_met_are_refused():

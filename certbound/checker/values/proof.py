@@ -13,7 +13,7 @@ from certbound.checker.reading import Record, entries, numbers, wholes
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, StepSet, cells_of, starts_of
 from certbound.checker.values import batches as tm
-from certbound.checker.values.batches import Array, above, below, terms
+from certbound.checker.values.batches import Array, above, terms
 from certbound.checker.values.crossing import Crossing
 from certbound.checker.values.normal_means import axis_table, mean_table
 from certbound.checker.values.passage import Passage
@@ -212,8 +212,8 @@ class _Discrete:
         return bounded(self._kept[1].apply(after), upper=self.above)
 
     def _over_starts(self, value: Values, arrived: Values | None) -> float:
-        low = np.array([[below(box[i][0]) for box in self.starts] for i in range(self.model.dimension)])
-        high = np.array([[above(box[i][1]) for box in self.starts] for i in range(self.model.dimension)])
+        low = np.array([[-_end(-box[i][0]) for box in self.starts] for i in range(self.model.dimension)])
+        high = np.array([[_end(box[i][1]) for box in self.starts] for i in range(self.model.dimension)])
         step = self._transition(0, low, high, value.grid)
         found = step.apply(value)
         if self.model.target is not None and counts(self.model, 0):
@@ -281,6 +281,11 @@ class _Discrete:
         if key not in self._zones:
             self._zones[key] = zones(self._grid(step), self.model, step, self.budget)
         return self._zones[key]
+
+
+def _end(ball: arb) -> float:
+    """A float that is at least every number in a ball; the very number where it is a float."""
+    return float(ball) if arb(float(ball)) >= ball else above(ball)
 
 
 def _tops(coefficients: Array) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import CertificateError, InfeasibleError
-from certbound.problem.model import compile_numpy
+from certbound.problem.model import JUMPS, compile_numpy
 from certbound.problem.noise import Law
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside
@@ -41,6 +41,9 @@ _STARTS = ("box", "ball", "ellipsoid")  # sets of which lower bounds state point
 _ALONG = {1: 9, 2: 5, 3: 3}  # of these, along each side of a box, by the number of states
 _FARTHEST = 60.0  # standard deviations of the noise for which a cell reaches beyond the safe set
 _BEYOND = 1000.0  # lengths of a side for which it does where these are not known
+_LOOKED = 2000  # parts of an axis in which a jump is looked for
+_NARROW = 1e-6  # half of a cell at a jump, of the length of an axis: with less the checker loses digits
+_SLIVER = 1e-6  # of the length of an axis
 _MOST_STEPS = 2000  # that the checker looks at
 _MORE = 1.25  # times the steps after which the engine's bounds were close
 
@@ -56,7 +59,15 @@ def induction_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0, *,
     steps = _steps(problem, answer.details)
     grids, pieces = _grids(problem, effort, steps)
     plain = problem.reach is None and not problem.ending and steps == problem.horizon and not pieces
-    moved = partial(_outward, problem, bool(pieces)) if lower else partial(_inward, problem)
+    ends = partial(_outward, problem, bool(pieces)) if lower else partial(_inward, problem)
+    jumps = _jumps(problem, grids[-1])
+    if lower and problem.reach is not None and problem.reach.stays:  # what is not surely there is not valued by W
+        for axis, place, _ in _faces(Inside(problem.reach.region), 0):
+            jumps[axis].append(place)
+
+    def moved(grid: Grid, step: int) -> list[Array]:
+        return [_around(edges, places) for edges, places in zip(ends(grid, step), jumps)]
+
     first = 0 if problem.initial.random else 1
     distinct = {id(grid): (grid, step) for step, grid in enumerate(grids) if step >= first}
     place = {key: k for k, key in enumerate(distinct)}
@@ -126,7 +137,57 @@ def _parts(problem: Problem, most: int) -> int:
 
 def _inward(problem: Problem, grid: Grid, step: int) -> list[Array]:
     """The edges, the outermost ones moved inward by next to nothing; but for a domain that they must hold."""
-    return list(grid.axes) if problem.ending else [stretched(edges, -INWARD) for edges in grid.axes]
+    return list(grid.axes) if problem.ending else [stretched(_without_slivers(edges), -INWARD) for edges in grid.axes]
+
+
+def _jumps(problem: Problem, grid: Grid) -> list[list[float]]:
+    """Where the model jumps along every state while the others are in the middle; of no consequence but for the bound.
+
+    A difference between neighbours that does not get smaller as they get closer.
+    """
+    tapes = [problem.closed_loop, *([] if problem.system.gain is None else [problem.system.gain])]
+    if problem.input_sequence is not None or not any(node.op in JUMPS for tape in tapes for node in tape.nodes):
+        return [[] for _ in grid.axes]
+    box = problem.system.disturbance
+    pushes = [] if box is None else list((box.low + box.high) / 2)
+    found = []
+    for i, edges in enumerate(grid.axes):
+        middle = [float(axis.mean()) for axis in grid.axes]
+
+        def at(x: Array, i: int = i, middle: list[float] = middle) -> Array:
+            states = [x if k == i else np.full(len(x), value) for k, value in enumerate(middle)]
+            parts = [
+                np.broadcast_to(compile_numpy(tape)(0.0, *states, *more), (len(x), *tape.shape)).reshape(len(x), -1)
+                for tape, more in zip(tapes, (pushes, []))
+            ]
+            return np.concatenate(parts, axis=1)
+
+        low = np.linspace(edges[0], edges[-1], _LOOKED + 1)[:-1]
+        high = low + (edges[-1] - edges[0]) / _LOOKED
+        for _ in range(60):
+            middles = (low + high) / 2
+            left = np.abs(at(middles) - at(low)).sum(axis=1) >= np.abs(at(high) - at(middles)).sum(axis=1)
+            low, high = np.where(left, low, middles), np.where(left, middles, high)
+        far = np.abs(at(high) - at(low)).sum(axis=1) > 1e-9 * (edges[-1] - edges[0])
+        found.append(sorted({float(place) for place in low[far]}))
+    return found
+
+
+def _around(edges: Array, places: Sequence[float]) -> Array:
+    """The edges with one on both sides of some places: what lies between them is next to nothing."""
+    off = _NARROW * (edges[-1] - edges[0])
+    for place in places:
+        if edges[0] + off < place < edges[-1] - off:
+            edges = edges[np.abs(edges - place) > 2 * off]
+            edges = np.sort(np.concatenate([edges, [place - off, place + off]]))
+    return edges
+
+
+def _without_slivers(edges: Array) -> Array:
+    """The edges without cells at the ends that are next to nothing."""
+    widths = np.diff(edges) > _SLIVER * (edges[-1] - edges[0])
+    first, last = np.argmax(widths), len(widths) - np.argmax(widths[::-1])
+    return edges[first : last + 1]
 
 
 def _outward(problem: Problem, pieces: bool, grid: Grid, step: int) -> list[Array]:
@@ -136,7 +197,8 @@ def _outward(problem: Problem, pieces: bool, grid: Grid, step: int) -> list[Arra
     faces = [face for constraint in asked for face in _faces(constraint, step)]
     found = []
     for i, edges in enumerate(grid.axes):
-        length, edges = edges[-1] - edges[0], edges.copy()
+        edges = edges.copy() if problem.ending else _without_slivers(edges).copy()
+        length = edges[-1] - edges[0]
         for axis, place, sign in faces:
             if axis == i:
                 edges[np.abs(edges - place) <= INWARD * length] += 2 * sign * INWARD * length
