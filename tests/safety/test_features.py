@@ -53,7 +53,7 @@ def _with(text: str, *pairs: tuple[str, str]) -> str:
     return text
 
 
-QUICK = ("union", "target", "polygon", "packets", "forever", "growth", "staying")
+QUICK = ("union", "target", "polygon", "packets", "forever", "growth", "staying", "ruin", "sampled")
 LAW = 'law = "gaussian"\nstd = 0.3'
 ROWS: dict[str, str] = {name: STARTERS[name] for name in QUICK} | {
     "several at once": PLAIN.replace("[initial]", "[[initial]]") + "[[initial]]\nbox = [[-0.1, 0.3]]\n",
@@ -72,12 +72,9 @@ ROWS: dict[str, str] = {name: STARTERS[name] for name in QUICK} | {
     "sign and floor": _with(PLAIN, ("0.8*x", "0.8*x - 0.1*sign(x) + 0.05*floor(2*x)"), ("0.3\n[in", "0.2\n[in")),
     "a long horizon": _with(PLAIN, ("horizon = 6", "horizon = 2500"), ("std = 0.3", "std = 0.14")),
     "a target for ever": _with(FLOW, ("horizon = 1", "horizon = inf")) + "[[reach]]\nbox = { x = [-0.3, 0] }\n",
-    "a sampled input": _with(
-        FLOW, ('"-x"', '"-x + u"'), ("[dyn", "[inputs]\nu = [-5, 5]\n[plan]\nu = '-x'\nhold = 0.25\n[dyn"),
-    ),
 }  # fmt: skip
 
-METHODS = {"a target for ever": "values", "union": "linear"}
+METHODS = {"a target for ever": "values", "ruin": "values", "union": "linear"}
 OWN = {"discrete": "values", "continuous": "linear"}
 
 

@@ -57,7 +57,7 @@ class SetReader(Reader):
                 assert table.gaussian is not None
                 mean = self.array(table.gaussian.mean, f"{where}.mean")
                 if table.gaussian.covariance is None:
-                    std = np.broadcast_to(self.array(table.gaussian.std, f"{where}.std"), mean.shape)
+                    std = np.broadcast_to(self.array(table.gaussian.std, f"{where}.std"), len(mean))
                     if np.any(std < 0):
                         raise ValueError(f"`{where}.std` must not be negative, got {std.tolist()}.")
                     return sets.GaussianStart(mean, np.diag(std**2))
