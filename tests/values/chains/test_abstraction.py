@@ -10,9 +10,11 @@ import certbound as cb
 from certbound.cli.commands.check import proved_certificate
 from certbound.errors import InfeasibleError
 from certbound.problem.files.loading import loads, save
+from certbound.problem.goals import until
 from certbound.values.chains import bound_chain
 from certbound.values.chains.extremes import Extremes, places
 from certbound.values.chains.pieces import pieces_of
+from certbound.values.discrete import bound_failure
 
 LAWS = {
     "gaussian": cb.Gaussian(std=0.2),
@@ -184,6 +186,19 @@ def test_a_target_that_is_to_be_stayed_in(tmp_path):
     save(problem.replace(name="again"), tmp_path / "again.toml")
     again = cb.load(tmp_path / "again.toml")
     assert (again.reach.then, again.reach.label) == ("stay", "reach and stay -0.25 <= x <= 0.25")
+
+
+def test_smooth_functions_say_more_of_a_target_that_is_to_be_stayed_in():
+    problem = loads(STAYING)
+    plain, target = until(problem, problem.horizon), problem.reach.region
+    for first, last in ((0, 10), (2, 4)):
+        fine = bound_failure(plain, target=target, since=first, until=last, seconds=1)
+        coarse = bound_chain(problem.replace(reach=cb.Reach(target, during=(first, last), then="stay")), seconds=0.5)
+        assert coarse.lower < fine.lower <= fine.upper < coarse.upper
+        if last == 10:
+            assert fine.lower <= staying_truth() <= fine.upper <= 1.02 * fine.lower
+    with pytest.raises(InfeasibleError, match="no start in a target"):
+        bound_failure(plain.replace(initial=[0.1]), target=target, until=10)
 
 
 def test_arriving_late_or_before_the_window_does_not_count():
