@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from flint import arb
 
 from certbound.checker.reading import Record
-from certbound.checker.statement.shares import Cut, atoms, bins, cut_by
+from certbound.checker.statement.law_pieces import Cut, atoms, bins, cut_by
 from certbound.errors import CertificateError
 
 Squares = list[arb]

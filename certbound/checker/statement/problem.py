@@ -13,9 +13,9 @@ from certbound.checker.reading import Record, number, numbers, text
 from certbound.checker.reading import entries as listed
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement.drawn import Drawn, read_drawn
+from certbound.checker.statement.law_pieces import Piece
 from certbound.checker.statement.laws import LAWS, Law
 from certbound.checker.statement.regions import Constraint, read_constraint
-from certbound.checker.statement.shares import Piece
 from certbound.checker.statement.tapes import read_tape
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape

@@ -1,6 +1,6 @@
 """Proofs by value functions as data.
 
-Those of discrete time: ``induction``.
+Those of discrete time: ``step_values``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from certbound.arrays import Array
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.safety.answers import EngineAnswer, Proof, exact
-from certbound.safety.certificates.induction import (
+from certbound.safety.certificates.parts import packed
+from certbound.safety.certificates.step_values import (
     INWARD,
     ROOMS,
     check_starts,
@@ -25,7 +26,6 @@ from certbound.safety.certificates.induction import (
     some_starts,
     stretched,
 )
-from certbound.safety.certificates.parts import packed
 from certbound.values.chains import Drifting
 from certbound.values.continuous import ExitBounds, Lasting, Payment, Rate, Surface, bound_lasting
 from certbound.values.discrete import FailureBounds

@@ -9,7 +9,7 @@ after the noise, as a function of where the noise-free step ends), ``steps`` (th
 from certbound.values.discrete.failures import bound_failure
 from certbound.values.discrete.kernels import AxisKernel, axis_kernel
 from certbound.values.discrete.layout import FailureBounds
-from certbound.values.discrete.long_runs import bound_long_run, chart_failures, long_grid, step_grids
+from certbound.values.discrete.long_runs import bound_long_run, chart_failures, step_grids
 from certbound.values.discrete.steps import evaluate
 
 __all__ = [
@@ -20,6 +20,5 @@ __all__ = [
     "bound_long_run",
     "chart_failures",
     "evaluate",
-    "long_grid",
     "step_grids",
 ]

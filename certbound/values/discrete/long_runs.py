@@ -131,12 +131,17 @@ def chart_failures(problem: Problem, *, share: float, times: int = 1, parts: int
     return work.charts(share, sorted({work.horizon * k // times for k in range(times)}))
 
 
-def step_grids(problem: Problem, share: float) -> list[Grid]:
+def step_grids(problem: Problem, share: float, most: float = math.inf) -> list[Grid]:
     """The grids of all steps at one size of the cells, one object where steps share one; as certificates state them.
 
-    Of a target that need not be stayed in up to the end of its window. Inapplicable where value functions do not fit
-    the problem, or the grids would be too large.
+    Of a target that need not be stayed in up to the end of its window; one grid where there are more than ``most``
+    steps, which must be alike. Inapplicable where value functions do not fit the problem, or the grids would be too large.
     """
+    if problem.horizon > most:
+        found = _Run(problem, 1).work.layout(share)
+        if found is None:
+            raise Inapplicable(Work.too_large)
+        return found[-1:]
     target = problem.reach
     if target is None:
         work = Work(problem, None, 1)
@@ -148,15 +153,6 @@ def step_grids(problem: Problem, share: float) -> list[Grid]:
     if found is None:
         raise Inapplicable(work.too_large)
     return found
-
-
-def long_grid(problem: Problem, share: float) -> Grid:
-    """The grid of every step at one size of the cells; Inapplicable where value functions do not fit the problem."""
-    run = _Run(problem, 1)
-    layout = run.work.layout(share)
-    if layout is None:
-        raise Inapplicable(run.work.too_large)
-    return layout[-1]
 
 
 def _better(one: FailureBounds, other: FailureBounds) -> FailureBounds:

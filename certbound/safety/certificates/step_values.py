@@ -24,7 +24,7 @@ from certbound.problem.sets import Faces, Inside
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.values.chains import chain_grid
-from certbound.values.discrete import FailureBounds, long_grid, step_grids
+from certbound.values.discrete import FailureBounds, step_grids
 from certbound.values.grids import Grid
 from certbound.values.sets import active_at
 
@@ -62,8 +62,8 @@ def induction_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0, *,
     ends = partial(_outward, problem, bool(pieces)) if lower else partial(_inward, problem)
     jumps = _jumps(problem, grids[-1])
     if lower and problem.reach is not None and problem.reach.stays:  # what is not surely there is not valued by W
-        for axis, place, _ in _faces(Inside(problem.reach.region), 0):
-            jumps[axis].append(place)
+        for axis, face, _ in _faces(Inside(problem.reach.region), 0):
+            jumps[axis].append(face)
 
     def moved(grid: Grid, step: int) -> list[Array]:
         return [_around(edges, places) for edges, places in zip(ends(grid, step), jumps)]
@@ -114,9 +114,8 @@ def _grids(problem: Problem, effort: int, steps: int) -> tuple[list[Grid], int]:
     try:
         law, shares = _law_of(problem), _SHARES[problem.system.dimension]
         share = (shares if law.gaussian else _UNIFORM_SHARES)[effort]
-        if problem.horizon > _MOST_STEPS:
-            return [long_grid(problem, share)] * (steps + 1), 0
-        return step_grids(problem, share)[: steps + 1], 0
+        grids = step_grids(problem, share, _MOST_STEPS)
+        return (grids if len(grids) > 1 else grids * (steps + 1))[: steps + 1], 0
     except (CertificateError, InfeasibleError) as error:
         n, entries = problem.system.dimension, problem.system.noise_dimension
         if n not in _SIDES or entries not in _PIECES:
@@ -145,10 +144,12 @@ def _jumps(problem: Problem, grid: Grid) -> list[list[float]]:
 
     A difference between neighbours that does not get smaller as they get closer.
     """
-    tapes = [problem.closed_loop, *([] if problem.system.gain is None else [problem.system.gain])]
+    system = problem.system
+    gain = system.gain if isinstance(system, DiscreteSystem) else None
+    tapes = [problem.closed_loop, *([] if gain is None else [gain])]
     if problem.input_sequence is not None or not any(node.op in JUMPS for tape in tapes for node in tape.nodes):
         return [[] for _ in grid.axes]
-    box = problem.system.disturbance
+    box = system.disturbance
     pushes = [] if box is None else list((box.low + box.high) / 2)
     found = []
     for i, edges in enumerate(grid.axes):
