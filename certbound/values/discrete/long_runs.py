@@ -135,7 +135,7 @@ def step_grids(problem: Problem, share: float, most: float = math.inf) -> list[G
     """The grids of all steps at one size of the cells, one object where steps share one; as certificates state them.
 
     Of a target that need not be stayed in up to the end of its window; one grid where there are more than ``most``
-    steps, which must be alike. Inapplicable where value functions do not fit the problem, or the grids would be too large.
+    steps, which must be alike. Inapplicable where value functions do not fit the problem, or grids would be too large.
     """
     if problem.horizon > most:
         found = _Run(problem, 1).work.layout(share)
