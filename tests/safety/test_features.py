@@ -74,6 +74,7 @@ ROWS: dict[str, str] = {name: STARTERS[name] for name in QUICK} | {
     "a target for ever": _with(FLOW, ("horizon = 1", "horizon = inf")) + "[[reach]]\nbox = { x = [-0.3, 0] }\n",
 }  # fmt: skip
 
+SLOW = ("a long horizon", "a model that jumps in time", "sampled")
 METHODS = {"a target for ever": "values", "ruin": "values", "union": "linear"}
 OWN = {"discrete": "values", "continuous": "linear"}
 
@@ -159,7 +160,7 @@ def failing(problem: cb.Problem, start: np.ndarray, rng: np.random.Generator) ->
 # ---- the table -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in ROWS])
 def test_a_feature_is_saved_bounded_simulated_and_certified(name: str, tmp_path: Any) -> None:
     path = tmp_path / "problem.toml"
     path.write_text(ROWS[name])
