@@ -47,7 +47,7 @@ LIMITS = "limits"
 """The engine that a proof names whose parts are about some of the constraints each, and add up."""
 
 WHOLE = ("lasting", "drift", "rate")
-"""The engines that prove targets and infinite horizons themselves."""
+"""The engines that prove targets and infinite horizons themselves, beside value functions in discrete time."""
 
 STATED = "the stated constants hold"
 """How a certificate's own list names what `assumptions` derives from the proof."""
@@ -141,6 +141,8 @@ def _plain_parts(
     A target is met at one time, which the proof names. CertificateError where the start is a union, or there is a
     target, and the proof does not say so, or the other way round. In other coordinates the model is another one.
     """
+    if model.stays and not _is_whole(model, proof) and not (model.members or model.drawn):
+        raise CertificateError(f"`{path}.engine` must be \"values\" where a target is to be stayed in.")
     if model.hold is not None and model.target is not None:
         raise CertificateError("`problem.hold` must be left out beside a target.")
     if model.members:
@@ -150,7 +152,7 @@ def _plain_parts(
         for one, row, place, _ in _cells(model, proof, path):
             if row is not None:
                 yield from _plain_parts(one, row, place)
-    elif model.target is not None and not (isinstance(proof, Mapping) and proof.get("engine") in WHOLE):
+    elif model.target is not None and not _is_whole(model, proof):
         _named(proof, path, (REACH,))
         record = Record(proof, path, ("engine", "time", "proof"))
         yield from _plain_parts(met_at(model, record.number("time")), record["proof"], f"{path}.proof")
@@ -169,6 +171,14 @@ def _members(model: Model, proof: object, path: str) -> Iterator[tuple[Model, ob
     rows = Record(proof, path, ("engine", "members")).items("members", count, count)
     for index, (member, row) in enumerate(zip(model.members, rows)):
         yield replace(model, initial=member, members=()), row, f"{path}.members[{index}]"
+
+
+def _is_whole(model: Model, proof: object) -> bool:
+    """Whether a proof is of a target, of an infinite horizon and of paths that end, where there are any."""
+    engine = proof.get("engine") if isinstance(proof, Mapping) else None
+    if model.stays or engine == "values":
+        return engine == "values" and not model.continuous
+    return engine in WHOLE
 
 
 def _cells(
@@ -197,7 +207,7 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
 
     CertificateError where a proof says one thing and the claim another.
     """
-    if lower and model.ends:
+    if lower and model.ends and (model.continuous or not _is_whole(model, proof)):
         raise CertificateError("`claim.log10_lower` must not be there where a path ends as it leaves the domain.")
     if lower and model.unknown:
         raise CertificateError("`claim.log10_lower` must not be there for an unknown constant, which does not react.")
@@ -208,7 +218,7 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
     if lower and _is(proof, LIMITS):
         raise CertificateError("`claim.log10_lower` must not be there where limits are taken apart.")
     for engine, _, part in _parts(model, proof):
-        if lower and model.target is not None and engine not in WHOLE:
+        if lower and model.target is not None and not _is_whole(model, part):
             raise CertificateError("`claim.log10_lower` must not be there beside a target, but in proofs that know it.")
         side = part.get("side")
         if side is not None and (side != "lower" or ENGINES[engine].below is None):
@@ -234,8 +244,10 @@ def prove(model: Model, proof: object, budget: Budget, *, lower: bool = False) -
         return _average(model, proof, budget)
     for engine, one, part in _parts(model, proof):
         row = ENGINES[engine]
-        if math.isinf(one.horizon) and engine not in WHOLE:
+        if math.isinf(one.horizon) and not _is_whole(one, part):
             raise Unproved("this proof needs a finite horizon")
+        if engine != "values" and not one.continuous and isinstance(one.noise.diffusion, Tape):
+            raise Unproved("only value functions prove anything of noise that the state multiplies in discrete time")
         count, numbers = jumps_of(part)
         one = one if count is None else with_time_pieces(one, count, budget)
         bound = (row.below if lower and row.below is not None else row.prove)(one, numbers, budget)
@@ -306,11 +318,13 @@ def claim_below(model: Model, level: float, assumed: Sequence[str]) -> str:
 
 
 def _sentence(model: Model, start: str, bound: str, assumed: Sequence[str]) -> str:
-    kept = f"breaks one of its {len(model.constraints)} constraints"
+    count = len(model.constraints) - model.ends  # the domain is none of them where leaving it ends a path
+    kept = f"breaks one of its {count} constraints" + (" before it leaves its domain" if model.ends else "")
     if model.drawn:
         kept += f" ({len(model.drawn)} of its constants being drawn)"
     if model.target is not None:
-        kept += f" before it is in its target ({quoted(model.target.label)}), or is not in it"
+        then = " and stays there" if model.stays else ""
+        kept += f" before it is in its target ({quoted(model.target.label)}){then}, or is not in it"
     words = (
         f"from {start} the problem {quoted(model.name)} {kept} "
         f"{_when(model)} with probability {bound} delta = {plainly(model.delta)})"

@@ -7,9 +7,12 @@ non-finite numbers are refused, whole numbers serve as counts and indices.
 
 from __future__ import annotations
 
+import base64
+import binascii
 import json
 import os
 import re
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -20,6 +23,7 @@ LARGEST_FILE = 16 * 2**20
 """Bytes."""
 MOST_ENTRIES = 2_000_000
 _LONGEST_WHOLE = 9
+_LONGEST = 24  # characters of a packed number, with the space after it
 _NUMBER = re.compile(r"-?0x[01]\.[0-9a-f]{1,13}p[+-][0-9]{1,4}\Z")
 
 
@@ -216,3 +220,28 @@ def text(value: object, path: str, longest: int) -> str:
     if not isinstance(value, str) or len(value) > longest or not value.isprintable():
         raise CertificateError(f"`{path}` must be printable text of at most {longest} characters.")
     return value
+
+
+def unpacked(value: object, path: str, count: int) -> list[float]:
+    """Numbers with single spaces between them, compressed and written in base 64.
+
+    Nothing beyond what so many numbers need is ever unpacked, however small the text.
+    """
+    if not isinstance(value, str) or not value.isascii():
+        raise CertificateError(f"`{path}` must be text in base 64.")
+    try:
+        machine = zlib.decompressobj()
+        found = machine.decompress(base64.b64decode(value, validate=True), count * _LONGEST + 1)
+    except (binascii.Error, ValueError, zlib.error) as error:
+        raise CertificateError(f"`{path}` must be compressed text in base 64.") from error
+    if not machine.eof or machine.unused_data or len(found) > count * _LONGEST:
+        raise CertificateError(f"`{path}` must hold {count} numbers, and nothing else.")
+    words = found.decode("ascii", "replace").split(" ") if found else []
+    if len(words) != count:
+        raise CertificateError(f"`{path}` must hold {count} numbers, got {len(words)}.")
+    if not all(_NUMBER.match(word) for word in words):
+        raise CertificateError(f"`{path}` must hold numbers in hexadecimal notation, such as \"0x1.8p+1\".")
+    try:
+        return [float.fromhex(word) for word in words]
+    except OverflowError as error:
+        raise CertificateError(f"`{path}` must hold finite numbers.") from error

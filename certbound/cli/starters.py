@@ -266,5 +266,52 @@ box = { x = [-1, 1] }
 box = { x = [-0.3, 0.3] }
 then = "stay"
 """,
+    "ruin": """\
+# For ever, where failing is not certain: a reserve that grows on average, and must not be used up.
+name = "NAME"
+time = "continuous"
+horizon = inf
+delta = 0.05
+states = ["reserve"]
+
+[dynamics]
+reserve = "1"
+
+[noise]
+diffusion = [[1]]
+
+[initial]
+point = [2]
+
+[[stay]]
+halfspace = { normal = { reserve = -1 }, bound = 0 }   # -reserve <= 0
+""",
+    "sampled": """\
+# A controller that looks at sampling times only: its input is kept in between, while the plant moves on.
+name = "NAME"
+time = "continuous"
+horizon = 2
+delta = 1e-3
+states = ["x"]
+
+[inputs]                   # name = [low, high]
+u = [-2, 2]
+
+[dynamics]
+x = "0.5*x + u"
+
+[plan]
+u = "-2*x"
+hold = 0.25                # seconds; the horizon is a whole number of them
+
+[noise]
+diffusion = [[0.1]]
+
+[initial]
+gaussian = { mean = [0.1], std = 0.05 }
+
+[[stay]]
+box = { x = [-1, 1] }
+""",
 }
 """By the name that ``certbound new --example`` takes."""

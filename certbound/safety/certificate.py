@@ -25,7 +25,6 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.balls import precision, upper
 from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most
 from certbound.safety.portfolio import ENGINES
-from certbound.values.continuous import Lasting
 
 FORMAT = "certbound certificate"
 VERSION = 1
@@ -89,7 +88,7 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
                 raise CertificateError("certificates do not state what this engine proves.")
             if answer.truncated:
                 raise CertificateError("certificates do not state what an ellipsoid of starts says of a random one.")
-            whole = problem.reach is None or isinstance(answer.details, Lasting)
+            whole = problem.reach is None or (answer.hit is None and ENGINES[name].reaches)
             found = write(problem, answer, attempt) if whole else _met(problem, answer, attempt, write)
         except CertificateError as error:
             refusals.append(f"{name}: {error}")
@@ -167,11 +166,9 @@ def averaged(problem: Problem, cells: Sequence[Any], found: Sequence[Mapping[str
 
 def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, Any]:
     """The certificate of UNSAFE: P(some constraint is broken) >= 10**claim from some start, for some disturbance."""
-    alone = any(isinstance(answer.details, Lasting) for answer in verdict.answers.values())
-    if len(problem.starts) > 1 or (problem.reach is not None and not alone):
+    if len(problem.starts) > 1:
         raise CertificateError(
-            "certificates state no lower bounds where there is a target, or the start is a union: verify by itself the "
-            "member that is UNSAFE."
+            "certificates state no lower bounds where the start is a union: verify by itself the member that is UNSAFE."
         )
     refusals: list[str] = []
     found = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_lower is not None]
@@ -180,6 +177,8 @@ def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, 
             write = ENGINES[name].write_below
             if write is None:
                 raise CertificateError("certificates do not state the lower bounds of this engine.")
+            if answer.hit is not None:
+                raise CertificateError("certificates state no lower bounds of targets that count at one time.")
             proof, log10, assumptions = write(problem, answer, attempt)
         except CertificateError as error:
             refusals.append(f"{name}: {error}")
@@ -238,8 +237,6 @@ def problem_data(problem: Problem) -> dict[str, Any]:
     CertificateError
         If certificates do not state such problems.
     """
-    if problem.reach is not None and problem.reach.stays:
-        raise CertificateError("certificates do not state targets that are to be stayed in.")
     system, held = problem.system, problem.hold is not None
     tape = system.dynamics if held else problem.closed_loop
     continuous = system.time == "continuous"
@@ -281,7 +278,7 @@ def _drawn(constant: Random) -> dict[str, Any]:
 
 def _constraint(constraint: Inside) -> dict[str, Any]:
     return {
-        "kind": constraint.word,
+        "kind": constraint.word if not getattr(constraint, "stays", False) else "reach and stay",
         "region": _region(constraint.region.data(_KINDS)),
         "during": None if constraint.during is None else exact([float(end) for end in constraint.during]),
         "label": str(constraint.label),
@@ -331,22 +328,24 @@ def _end(value: float) -> str | None:
 
 def _noise(system: Any) -> dict[str, Any]:
     if isinstance(system, ContinuousSystem):
-        g = system.diffusion
-        if isinstance(g, Tape):
-            return {"law": "wiener", "diffusion": {"columns": int(g.shape[1]), **tape_data(g)}}
-        return {"law": "wiener", "diffusion": exact(np.asarray(g, dtype=float))}
-    if system.gain is not None:
-        raise CertificateError("certificates do not state noise that is multiplied by the state in discrete time.")
+        return {"law": "wiener", "diffusion": _drives(system.diffusion)}
     law: Law = system.noise
     check_law(law, "be certified", CertificateError)
     return {
         "law": law.name,
         "level": law.level.removeprefix("proxy_"),
         "values": exact(np.asarray(getattr(law, law.level), dtype=float)),
-        "matrix": exact(np.asarray(system.noise_matrix, dtype=float)),
+        "matrix": _drives(system.noise_matrix if system.gain is None else system.gain),
         **{flag: bool(getattr(law, flag)) for flag in law.flags},
         **({"tables": {name: exact(getattr(law, name)) for name in law.tables}} if law.tables else {}),
     }
+
+
+def _drives(matrix: Any) -> Any:
+    """What multiplies the noise: numbers, or a tape over t and the states."""
+    if isinstance(matrix, Tape):
+        return {"columns": int(matrix.shape[1]), **tape_data(matrix)}
+    return exact(np.asarray(matrix, dtype=float))
 
 
 _KINDS = ("box", "ball", "ellipsoid", "halfspace", "polytope")  # those that the checker has a row for

@@ -10,7 +10,7 @@ from flint import fmpq, fmpq_poly
 
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model import Tape
-from certbound.problem.sets import Region
+from certbound.problem.sets import Quadratic, Region
 
 
 def polynomial_of(tape: Tape, sign: float) -> fmpq_poly | None:
@@ -47,11 +47,14 @@ def interval_of(region: Region) -> tuple[float, float]:
     refused = InfeasibleError("value functions of infinite horizons need boxes and half-spaces that stand still.")
     if region.moving:
         raise refused
+    centre = float(np.ravel(region.center_at())[0]) if region.center is not None else 0.0
+    match region.form:
+        case Quadratic() as form if form.even and form.dimension == 1 and centre == 0.0:
+            return -form.radius, form.radius
     try:
         normals, bounds = region.halfspaces()
     except (TypeError, ValueError, EnclosureError) as error:
         raise refused from error
-    centre = float(np.ravel(region.center_at())[0]) if region.center is not None else 0.0
     if centre != 0.0 or not np.all(np.abs(normals) == 1.0):
         raise refused
     low, high = -math.inf, math.inf

@@ -90,6 +90,30 @@ FILES = {
     ),
     "a window after the end": (GOOD + "during = [0, 9]\n", "during", ""),
     "a set that is empty": (change("angle = [-1, 1]", "angle = [1, -1]"), "", ""),
+    "a target outside the limits": (STEPS + "[[reach]]\nbox = { x = [2, 3] }\n", "must meet the safe set", "move the"),
+    "an intersection that is empty": (
+        STEPS + "[[avoid]]\nall = [ { box = { x = [0.3, 0.4] } }, { box = { x = [0.5, 1] } } ]\n", "in common", "",
+    ),
+    "a start in two dimensions among others": (
+        change("[initial]", "[[initial]]", STEPS) + "[[initial]]\npoint = [0, 0]\n", "initial.1.point", "1 entries"
+    ),
+    "a histogram that sums to less than 1": (
+        change('"gaussian"\nstd = 0.1', '"histogram"\nedges = [-1, 0, 1]\nprobabilities = [0.5, 0.499999]', STEPS),
+        "must sum to 1 within 1e-12", "scale them",
+    ),
+    "a window of time that has no end": (
+        change("horizon = 5", "horizon = inf", STEPS) + "during = [0, 5]\n", "no `during`", "give a finite horizon"
+    ),
+    "a target's window without an end": (
+        change("horizon = 5", "horizon = inf", STEPS) + "[[reach]]\nbox = { x = [1, 2] }\nduring = [0, 5]\n",
+        "`reach` must have no `during`", "give a finite horizon",
+    ),
+    "an unknown constant upside down": (
+        change("[dynamics]", "[uncertain]\nk = [0.5, 0.2]\n[dynamics]", STEPS), "uncertain.k", "swap"
+    ),
+    "a random start by two levels": (
+        change("point = [0]", "gaussian = { mean = [0], std = 1, covariance = [[1]] }", STEPS), "exactly one of std", ""
+    ),
     "a plan that is not there": (
         GOOD + '[inputs]\nu = [-1, 1]\n[plan]\nfile = "none.json"\n', "none.json", ""
     ),

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from flint import arb
 
 from certbound.checker.reading import Record
+from certbound.checker.statement.law_pieces import Cut, atoms, bins, cut_by
 from certbound.errors import CertificateError
 
 Squares = list[arb]
@@ -24,15 +25,17 @@ class Law:
 
     It is given by one of ``levels``. ``proxies`` finds the p_i from the squared levels of the entries (a variance is
     one already, and a covariance stands as it is) and from the law's data, if it has ``flags``, true or false, or
-    ``tables``.
+    ``tables``; None where no such p_i exist. ``cut`` makes pieces of one entry at level 1, where entries are
+    independent and of this very law.
     """
 
     levels: tuple[str, ...]
-    proxies: Callable[[Squares, Record], Squares]
+    proxies: Callable[[Squares, Record], Squares] | None
     flags: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()  # lists of numbers, under ``tables``
     gaussian: bool = False  # exactly normal
     uniform: bool = False  # independent entries, each uniform between its level and minus that
+    cut: Cut | None = None
 
 
 def _as_they_are(squares: Squares, data: Record) -> Squares:
@@ -72,16 +75,22 @@ def _thirds(squares: Squares, data: Record) -> Squares:
 
 LAWS = {
     # E exp(l.w) = exp(l' S l / 2): S is the covariance
-    "gaussian": Law(levels=("std", "variance", "covariance"), proxies=_as_they_are, gaussian=True),
+    "gaussian": Law(levels=("std", "variance", "covariance"), proxies=_as_they_are, gaussian=True,
+                    cut=cut_by("normal", -8.3, 8.3)),
     # what it says of itself
     "subgaussian": Law(levels=("std", "variance", "covariance"), proxies=_as_they_are),
     # sinh(x)/x <= exp(x^2/6)
-    "uniform": Law(levels=("halfwidth",), proxies=_thirds, uniform=True),
+    "uniform": Law(levels=("halfwidth",), proxies=_thirds, uniform=True, cut=cut_by("uniform", -1, 1)),
     # cosh(x) <= exp(x^2/2)
-    "rademacher": Law(levels=("scale",), proxies=_as_they_are),
+    "rademacher": Law(levels=("scale",), proxies=_as_they_are, cut=lambda count, tables: atoms([-1, 1], [0.5, 0.5])),
     # the sum of two uniform ones
-    "triangular": Law(levels=("halfwidth",), proxies=lambda squares, data: [square / 6 for square in squares]),
-    "discrete": Law(levels=("scale",), proxies=_tabled("values", 0), tables=("values", "probabilities")),
-    "histogram": Law(levels=("scale",), proxies=_tabled("edges", 1), tables=("edges", "probabilities")),
+    "triangular": Law(levels=("halfwidth",), proxies=lambda squares, data: [square / 6 for square in squares],
+                      cut=cut_by("triangular", -1, 1)),
+    "discrete": Law(levels=("scale",), proxies=_tabled("values", 0), tables=("values", "probabilities"),
+                    cut=lambda count, tables: atoms(*tables)),
+    "histogram": Law(levels=("scale",), proxies=_tabled("edges", 1), tables=("edges", "probabilities"),
+                     cut=lambda count, tables: bins(count, *tables)),
+    # its tails are those of an exponential
+    "laplace": Law(levels=("scale",), proxies=None, cut=cut_by("laplace", -37, 37)),
     "bounded": Law(levels=("halfwidth",), proxies=_bounded, flags=("independent",)),
 }

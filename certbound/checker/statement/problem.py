@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from flint import arb, arb_mat
 
 from certbound.checker.balls import diagonal, is_positive_definite, matrix
-from certbound.checker.reading import Record, number, text
+from certbound.checker.reading import Record, number, numbers, text
 from certbound.checker.reading import entries as listed
-from certbound.checker.report import Budget
+from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement.drawn import Drawn, read_drawn
+from certbound.checker.statement.law_pieces import Piece
 from certbound.checker.statement.laws import LAWS, Law
 from certbound.checker.statement.regions import Constraint, read_constraint
 from certbound.checker.statement.tapes import read_tape
@@ -21,6 +23,7 @@ from certbound.problem.model import Tape
 MOST_STATES = 400
 MOST_STEPS = 100_000
 MOST_SAMPLES = 1000
+_STAYING = "reach and stay"
 _SLACK = arb(2) ** -39
 """How far a covariance may miss semidefiniteness where every variance is 1."""
 _FIELDS = (
@@ -33,14 +36,17 @@ _FIELDS = (
 class Noise:
     """The noise: ``diffusion`` is the matrix g (CT) or G (DT), or a tape over (t, states).
 
-    ``proxy`` is the covariance (or variance proxy) of w in discrete time, the identity in continuous time.
-    ``gaussian`` says whether it is exactly normal; ``uniform`` holds the halfwidths of independent uniform entries.
+    ``proxy`` is the covariance (or variance proxy) of w in discrete time, the identity in continuous time, None where a
+    law has none. ``gaussian`` says whether it is exactly normal; ``uniform`` holds the halfwidths of independent
+    uniform entries; ``entries`` the sizes of independent entries of one law, whose pieces at size 1 ``cut`` makes.
     """
 
     diffusion: arb_mat | Tape
-    proxy: arb_mat
+    proxy: arb_mat | None
     gaussian: bool
     uniform: tuple[arb, ...] | None = None
+    entries: tuple[arb, ...] = ()
+    cut: Callable[[int], list[Piece]] | None = None
 
     def constant(self) -> arb_mat:
         """A constant matrix; CertificateError of a tape."""
@@ -51,6 +57,8 @@ class Noise:
     def covariance(self) -> arb_mat:
         """g g^T, or G S G^T; a constant matrix only."""
         matrix = self.constant()
+        if self.proxy is None:
+            raise Unproved("the law of the noise has no variance proxy")
         return matrix * self.proxy * matrix.transpose()
 
 
@@ -98,6 +106,7 @@ class Model:
     domain: list[tuple[float | None, float | None]] | None
     states: tuple[str, ...] = field(default=())
     target: Constraint | None = None  # then a path fails that breaks a constraint before it is there, or never is
+    stays: bool = False  # who is there must stay: a path fails too that breaks a constraint or leaves the target later
     unknown: tuple[str, ...] = ()  # disturbances that do not change: one that reacts to the state says nothing of them
     unit: str = ""  # of time, for humans
     ends: bool = False  # where the domain is left: that is no failure, and counting it as one bounds from above only
@@ -170,6 +179,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         noise=_noise(record["noise"], path + ".noise", states, time, budget),
         initial=initial, members=members, target=_target(record, n, horizon, budget),
         constraints=tuple(constraints), domain=domain,
+        stays="reach" in record.value and record["reach"].get("kind") == _STAYING,
     )
 
 
@@ -226,32 +236,40 @@ def _disturbance(record: Record, count: int) -> list[tuple[float, float]]:
 
 
 def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget: Budget) -> Noise:
-    n = len(states)
     if time == "continuous":
         record = Record(value, path, ("law", "diffusion"))
         if record["law"] != "wiener":
             raise CertificateError(f"`{path}.law` must be \"wiener\" in continuous time.")
-        if isinstance(record["diffusion"], dict):
-            inner = Record(record["diffusion"], path + ".diffusion", ("columns", "nodes", "outputs"), ("networks",))
-            m = inner.whole("columns", 1, MOST_STATES)
-            tape = {name: entry for name, entry in inner.value.items() if name != "columns"}
-            return Noise(
-                diffusion=read_tape(tape, inner.path, ("t", *states), (n, m)), proxy=diagonal([arb(1)] * m),
-                gaussian=True,
-            )
-        rows = record.array("diffusion", n, None)
-        m = len(rows[0])
-        return Noise(diffusion=matrix(_same_length(rows, path)), proxy=diagonal([arb(1)] * m), gaussian=True)
+        drives, m = _drives(record, "diffusion", states)
+        return Noise(diffusion=drives, proxy=diagonal([arb(1)] * m), gaussian=True)
     name = text(value.get("law") if isinstance(value, dict) else None, f"{path}.law", 200)
     if name not in LAWS:
         raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {name[:40]!r}.")
     law = LAWS[name]
     tables = ("tables",) if law.tables else ()
     record = Record(value, path, ("law", "level", "values", "matrix", *law.flags, *tables))
-    rows = _same_length(record.array("matrix", n, None), path)
-    proxy = _proxy(record, law, len(rows[0]), budget)
-    widths = tuple(arb(number(x, path)) for x in record.items("values")) if law.uniform else None
-    return Noise(diffusion=matrix(rows), proxy=proxy, gaussian=law.gaussian, uniform=widths)
+    drives, m = _drives(record, "matrix", states)
+    proxy, sizes = _proxy(record, law, m, budget)
+    cut = law.cut
+    if cut is None:
+        return Noise(diffusion=drives, proxy=proxy, gaussian=law.gaussian)
+    found = [numbers(record["tables"][table], record.at(table), None) for table in law.tables]
+    return Noise(
+        diffusion=drives, proxy=proxy, gaussian=law.gaussian, uniform=sizes if law.uniform else None, entries=sizes,
+        cut=lambda count: cut(count, found),
+    )  # fmt: skip
+
+
+def _drives(record: Record, name: str, states: tuple[str, ...]) -> tuple[arb_mat | Tape, int]:
+    """What multiplies the noise, a matrix or a tape over t and the states, and its number of columns."""
+    n = len(states)
+    if not isinstance(record[name], dict):
+        rows = _same_length(record.array(name, n, None), record.path)
+        return matrix(rows), len(rows[0])
+    inner = Record(record[name], record.at(name), ("columns", "nodes", "outputs"), ("networks",))
+    m = inner.whole("columns", 1, MOST_STATES)
+    tape = {key: entry for key, entry in inner.value.items() if key != "columns"}
+    return read_tape(tape, inner.path, ("t", *states), (n, m)), m
 
 
 def _same_length(rows: list[list[float]], path: str) -> list[list[float]]:
@@ -260,17 +278,21 @@ def _same_length(rows: list[list[float]], path: str) -> list[list[float]]:
     return rows
 
 
-def _proxy(record: Record, law: Law, m: int, budget: Budget) -> arb_mat:
-    """The variance proxy that is proved of a law."""
+def _proxy(record: Record, law: Law, m: int, budget: Budget) -> tuple[arb_mat | None, tuple[arb, ...]]:
+    """The variance proxy that is proved of a law (None: it has none), and the sizes of entries that are independent."""
     level = record.text("level")
     if level not in law.levels:
         raise CertificateError(f"`{record.at('level')}` must be one of {', '.join(law.levels)}, got {level[:40]!r}.")
     if level == "covariance":
-        return _semidefinite(matrix(record.symmetric("values", m)), record.at("values"), budget)
+        found = _semidefinite(matrix(record.symmetric("values", m)), record.at("values"), budget)
+        alone = all(found[i, j].is_zero() for i in range(m) for j in range(i))
+        return found, tuple(found[i, i].sqrt() for i in range(m)) if alone else ()
     values = [arb(number(item, record.at("values"), least=0.0)) for item in record.items("values", m, m)]
     if level == "variance":
-        return diagonal(values)
-    return diagonal(law.proxies([value * value for value in values], record))
+        return diagonal(values), tuple(value.sqrt() for value in values)
+    if law.proxies is None:
+        return None, tuple(values)
+    return diagonal(law.proxies([value * value for value in values], record)), tuple(values)
 
 
 def _semidefinite(a: arb_mat, path: str, budget: Budget) -> arb_mat:
@@ -297,7 +319,7 @@ def _semidefinite(a: arb_mat, path: str, budget: Budget) -> arb_mat:
 def _target(record: Record, n: int, horizon: float, budget: Budget) -> Constraint | None:
     if "reach" not in record.value:
         return None
-    return read_constraint(record["reach"], record.at("reach"), n, horizon, budget, ("reach",))
+    return read_constraint(record["reach"], record.at("reach"), n, horizon, budget, ("reach", _STAYING))
 
 
 def met_at(model: Model, time: float) -> Model:

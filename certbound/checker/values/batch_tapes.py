@@ -118,17 +118,17 @@ def _gated(condition: Batch, x: Batch) -> Batch:
 
 
 def _step(op: str) -> Callable[[Batch], Batch]:
-    """A piecewise constant function, where it is the same number on all of a box."""
+    """A piecewise constant function that rises, where it is the same number at both ends of a box."""
 
     def apply(x: Batch) -> Batch:
         value, sure = np.zeros(x.error.shape), np.zeros(x.error.shape, dtype=bool)
         low, high = x.ends()
         for k in np.flatnonzero(np.isfinite(low) & np.isfinite(high)):
             try:
-                value[k] = float(OPERATIONS[op].ball(arb(low[k]).union(arb(high[k]))).mid())
-                sure[k] = True
+                first, last = (OPERATIONS[op].ball(arb(float(end))) for end in (low[k], high[k]))
             except Undecided:
                 continue
+            value[k], sure[k] = float(first.mid()), bool(first == last)
         return tm.known(tm.fixed(x.terms, value, np.where(sure, 0.0, np.inf)))
 
     return apply

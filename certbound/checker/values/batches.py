@@ -150,7 +150,8 @@ def variable(which: Terms, number: int, low: Array, high: Array) -> Batch:
     """x = (low + high)/2 + xi (high - low)/2 for one of the variables xi: all of [low, high]."""
     found = fixed(which, low / 2 + high / 2)
     found.coefficients[1 + number] = high / 2 - low / 2
-    return Batch(which, found.coefficients, (np.abs(low) + np.abs(high)) * 2 * _UNIT + _TINY)
+    exact = (low == high) & (found.value == low)
+    return Batch(which, found.coefficients, np.where(exact, 0.0, (np.abs(low) + np.abs(high)) * 2 * _UNIT + _TINY))
 
 
 def unknown(like: Batch) -> Batch:

@@ -22,6 +22,7 @@ a closer look is worth its time.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -30,14 +31,13 @@ import numpy as np
 from flint import arb
 
 from certbound.checker.balls import tail
-from certbound.checker.reading import Record, numbers
+from certbound.checker.reading import Record, numbers, unpacked
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, SafeSet
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.batches import Array, Batch, Index, Terms, above, below, terms
 from certbound.checker.values.hermite import Patches, Surface
-from certbound.checker.values.packed import unpacked
 from certbound.checker.values.step_back import independent
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
@@ -140,7 +140,8 @@ class Passage:
         if (len(times) - 1) * np.prod([len(axis) - 1 for axis in axes]) > MOST_PATCHES:
             raise CertificateError(f"`proof.axes` and `proof.times` must make at most {MOST_PATCHES} patches.")
         shape = (len(times), *(size for axis in axes for size in (len(axis), 3)))
-        values, rates = (unpacked(record[name], record.at(name), shape) for name in ("values", "rates"))
+        found = (unpacked(record[name], record.at(name), math.prod(shape)) for name in ("values", "rates"))
+        values, rates = (np.array(part).reshape(shape) for part in found)
         return Surface(times, tuple(axes), values, rates)
 
     def upper(self) -> arb:

@@ -22,13 +22,13 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
+import numpy as np
 from flint import arb, arb_mat
 
 from certbound.checker.balls import identity, is_positive_definite, largest_eigenvalue, matrix, upper
-from certbound.checker.reading import Record, entries, numbers, whole, wholes
+from certbound.checker.reading import Record, entries, numbers, unpacked, whole, wholes
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model
-from certbound.checker.values.packed import unpacked
 from certbound.checker.values.second_order import Flow, Local
 from certbound.checker.values.walls import Key, Surroundings, Wall
 from certbound.errors import CertificateError
@@ -191,7 +191,8 @@ class _Value:
                   "weights": (pieces, ends, 1 << self.corners, cells, forms)}  # fmt: skip
         if any(math.prod(shape) > MOST_NUMBERS for shape in shapes.values()):
             raise CertificateError(f"`{record.path}` must hold at most {MOST_NUMBERS} multipliers.")
-        self.moves, self.weights = (unpacked(record[name], record.at(name), shapes[name]) for name in shapes)
+        found = (unpacked(record[name], record.at(name), math.prod(shape)) for name, shape in shapes.items())
+        self.moves, self.weights = (np.array(part).reshape(shape) for part, shape in zip(found, shapes.values()))
         self.wall_weights, self.wall_rows = (self._on_walls(name, forms) for name in ("wall_weights", "wall_rows"))
         if not ((self.weights >= 0).all() and all(mu >= 0 for rows in self.wall_weights for row in rows for mu in row)):
             raise CertificateError(f"`{record.path}` must not have a negative weight.")

@@ -15,15 +15,16 @@ is known as 0; any one disturbance will do.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from flint import arb, arb_mat
 
 from certbound.checker.report import Budget, Unproved
-from certbound.checker.statement import Model, StepSet
+from certbound.checker.statement import Constraint, Model, StepSet
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.batches import Array, Batch, Mask, Terms, above, terms
@@ -35,6 +36,9 @@ from certbound.checker.values.normal_means import (
     axis_table,
     mean_table,
 )
+from certbound.problem.model import Tape
+
+Side = tuple[arb, arb]
 
 DEGREE = 4
 _CHUNK = 4096
@@ -85,10 +89,10 @@ class Steps:
 
     def __init__(self, model: Model, parts: int, budget: Budget, *, upper: bool) -> None:
         self.model, self.budget, self.upper = model, budget, upper
-        self.deviations = [] if model.noise.uniform is not None else _deviations(model)
         self.terms = terms(model.dimension + len(model.disturbance), DEGREE)
         self.disturbances = _parts(model.disturbance, parts, upper)
-        clock = any(node.op == "input" and node.args[0] == 0 for node in model.dynamics.nodes)
+        tapes = [model.dynamics, *([g] if isinstance(g := model.noise.diffusion, Tape) else [])]
+        clock = any(node.op == "input" and node.args[0] == 0 for tape in tapes for node in tape.nodes)
         rows = model.plan
         self.steady = not clock and (rows is None or all(row == rows[0] for row in rows))
 
@@ -103,10 +107,22 @@ class Steps:
             found.append([tm.joined([chunk[i] for chunk in chunks]) for i in range(len(low))])
         return found
 
+    def gains(self, step: int, low: Array, high: Array) -> list[Batch]:
+        """What multiplies the noise over some boxes, row by row."""
+        given = self.model.noise.diffusion
+        if isinstance(given, Tape):
+            return run(given, self._states(step, low, high))
+        count = low.shape[1]
+        return [tm.fixed(self.terms, np.full(count, float(x))) for x in given.entries()]
+
+    def _states(self, step: int, low: Array, high: Array) -> list[Batch]:
+        which, count = self.terms, low.shape[1]
+        inputs = [tm.fixed(which, np.full(count, float(step)))]
+        return inputs + [tm.variable(which, i, low[i], high[i]) for i in range(len(low))]
+
     def _image(self, step: int, low: Array, high: Array, part: Sequence[tuple[float, float]]) -> list[Batch]:
         which, count, n = self.terms, low.shape[1], len(low)
-        inputs = [tm.fixed(which, np.full(count, float(step)))]
-        inputs += [tm.variable(which, i, low[i], high[i]) for i in range(n)]
+        inputs = self._states(step, low, high)
         if self.model.plan is not None:
             inputs += [tm.fixed(which, np.full(count, value)) for value in self.model.plan[step]]
         for j, (a, b) in enumerate(part):
@@ -118,11 +134,8 @@ def _deviations(model: Model) -> list[arb]:
     """Standard deviations of the noise, which must move every state on its own."""
     if not model.noise.gaussian:
         raise Unproved("value functions are proved for normal and uniform noise only")
-    found, proxy = independent(model.noise.covariance(), "noise"), model.noise.proxy
-    m = proxy.nrows()
-    if any(not proxy[i, j].is_zero() for i in range(m) for j in range(m) if i != j):
-        return [x.union(x * (1 - arb(2) ** -38)) for x in found]  # it may have been raised, by 2^-39 of a variance
-    return found
+    found = independent(model.noise.covariance(), "noise")
+    return found if model.noise.entries else [x.union(x * (1 - arb(2) ** -38)) for x in found]  # it may be raised
 
 
 def independent(covariance: arb_mat, what: str) -> list[arb]:
@@ -150,8 +163,9 @@ class Transition:
     def __init__(self, steps: Steps, step: int, low: Array, high: Array, after: Grid) -> None:
         self.steps, self.n = steps, len(low)
         self.images = steps.images(step, low, high)
-        self._scales = [(float((1 / s).mid()), above(abs(1 / s - float((1 / s).mid())))) for s in steps.deviations]
-        self._spacing = [float(s.mid()) / PER_DEVIATION for s in steps.deviations]
+        spreads = _deviations(steps.model)
+        self._scales = [(float((1 / s).mid()), above(abs(1 / s - float((1 / s).mid())))) for s in spreads]
+        self._spacing = [float(s.mid()) / PER_DEVIATION for s in spreads]
         points = [self._points(i, after.edges[i]) for i in range(self.n)]
         if np.prod([len(one) for one in points]) > _MOST_POINTS:
             raise Unproved(f"the mesh around the images would have more than {_MOST_POINTS} points")
@@ -159,7 +173,7 @@ class Transition:
             raise Unproved(f"the mesh and the grid of one state make more than {_MOST_ENTRIES} pairs")
         self.axes: list[AxisTable] = [
             axis_table(one, edges, s, DEGREE, steps.budget)
-            for one, edges, s in zip(points, after.edges, steps.deviations)
+            for one, edges, s in zip(points, after.edges, spreads)
         ]
 
     def _points(self, i: int, edges: Array) -> Array:
@@ -270,52 +284,78 @@ def _larger(x: Batch, y: Batch, *, upper: bool) -> Batch:
 
 @dataclass(frozen=True, eq=False)
 class Zones:
-    """Which cells of a grid surely break no constraint at a step, and which surely break one throughout."""
+    """Which cells of a grid surely break no constraint at a step (``safe``), and which surely do throughout.
+
+    Likewise which surely lie in the target, and which surely do not meet it; None where it does not count at the step.
+    From above a path that ends where it leaves the domain does not count any more beyond it: nothing is asked of a cell
+    there. From below only cells that surely lie ``within`` count.
+    """
 
     safe: Mask
     unsafe: Mask
+    done: Mask | None
+    undone: Mask | None
+    within: Mask
 
 
-def zones(grid: Grid, allowed: StepSet, budget: Budget) -> Zones:
+def zones(grid: Grid, model: Model, step: int, budget: Budget) -> Zones:
     """What is known of every cell."""
     low, high = grid.boxes()
-    safe, unsafe = np.zeros(low.shape[1], dtype=bool), np.zeros(low.shape[1], dtype=bool)
-    for k in range(low.shape[1]):
+    boxes = [[(arb(a), arb(b)) for a, b in zip(low[:, k], high[:, k])] for k in range(low.shape[1])]
+    limits, domain = (model.constraints[:-1], model.constraints[-1:]) if model.ends else (model.constraints, ())
+    allowed, inside = (StepSet(replace(model, constraints=part), step, budget) for part in (limits, domain))
+    done: Mask | None = None
+    undone: Mask | None = None
+    if counts(model, step):
+        target = StepSet(replace(model, constraints=(target_of(model),)), step, budget)
+        done, undone = _decided(target.holds, boxes, budget), _decided(target.excludes, boxes, budget)
+    safe, unsafe = _decided(allowed.holds, boxes, budget), _decided(allowed.excludes, boxes, budget)
+    return Zones(safe, unsafe, done, undone, _decided(inside.holds, boxes, budget))
+
+
+def counts(model: Model, step: int) -> bool:
+    """Whether being in the target counts at a step: within its window, and later where it must be stayed in."""
+    if model.target is None:
+        return False
+    first, last = model.target.during or (0.0, math.inf)
+    return first <= step and (step <= last or model.stays)
+
+
+def target_of(model: Model) -> Constraint:
+    """The target without its window."""
+    assert model.target is not None
+    return replace(model.target, during=None)
+
+
+def _decided(test: Callable[[Sequence[Side]], bool], boxes: Sequence[Sequence[Side]], budget: Budget) -> Mask:
+    found = np.zeros(len(boxes), dtype=bool)
+    for k, box in enumerate(boxes):
         budget.box()
-        box = [(arb(a), arb(b)) for a, b in zip(low[:, k], high[:, k])]
-        safe[k], unsafe[k] = allowed.holds(box), allowed.excludes(box)
-    return Zones(safe, unsafe)
+        found[k] = test(box)
+    return found
 
 
-def final(grid: Grid, zone: Zones, *, upper: bool) -> Values:
-    """The function at the horizon."""
-    coefficients = np.zeros((len(terms(len(grid.edges), DEGREE).exponents), len(zone.safe)))
-    coefficients[0] = ~zone.safe if upper else zone.unsafe
-    return Values(grid, coefficients, 1.0 if upper else 0.0)
-
-
-def bounded(found: Batch, grid: Grid, zone: Zones, *, upper: bool) -> Values:
-    """The function of a step from what its cells lead to: 1 where they are (not shown to be) unsafe."""
+def bounded(found: Batch, *, upper: bool) -> Array:
+    """Coefficients of a step's function from what its cells lead to: 1 (upper) or 0 where nothing is known."""
     coefficients = found.coefficients.copy()
     rest = np.abs(coefficients[1:]).sum(axis=0)
     lost = ~np.isfinite(found.error) | (rest > 8)
     if upper:
-        flat = lost | ~zone.safe | (coefficients[0] - rest * (1 + 1e-9) >= 1)
-        coefficients[:, flat] = 0.0
-        coefficients[0, flat] = 1.0
-    else:
-        coefficients[:, lost] = 0.0
-        coefficients[:, zone.unsafe] = 0.0
-        coefficients[0, zone.unsafe] = 1.0
-    return Values(grid, coefficients, 1.0 if upper else 0.0)
+        lost |= coefficients[0] - rest * (1 + 1e-9) >= 1
+    return levelled(coefficients, lost, 1.0 if upper else 0.0)
+
+
+def levelled(coefficients: Array, cells: Mask, level: float) -> Array:
+    """The same with a constant on some cells, in place."""
+    coefficients[:, cells] = 0.0
+    coefficients[0, cells] = level
+    return coefficients
 
 
 def highest(found: Batch) -> float:
     """At least the largest value over all boxes."""
     tops = (found.coefficients[0] + np.abs(found.coefficients[1:]).sum(axis=0)) * (1 + 1e-12) + 1e-300
     return float(np.where(np.isfinite(found.error), tops, 1.0).max())
-
-
 
 
 def lowest(found: Batch) -> float:

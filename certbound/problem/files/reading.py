@@ -96,7 +96,8 @@ class _ProblemReader(SetReader):
         ends = np.array([self.array(pair, f"{where}.{name}") for name, pair in table.items()])
         for name, (low, high) in zip(table, ends):
             if low > high:
-                raise ValueError(f"`{where}.{name}` must be [low, high], got {low:g} > {high:g}; swap the two.")
+                table_of = "uncertain" if name in self.spec.uncertain else where
+                raise ValueError(f"`{table_of}.{name}` must be [low, high], got {low:g} > {high:g}; swap the two.")
         return sets.Box(ends[:, 0], ends[:, 1])
 
     def diffusion(self) -> dict[str, Any]:

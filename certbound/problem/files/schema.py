@@ -87,14 +87,6 @@ class PolygonTable(_Table):
     vertices: dict[str, Vector] | Matrix
 
 
-class GaussianTable(_Table):
-    """A random start."""
-
-    title: ClassVar[str] = "gaussian"
-    mean: Vector
-    covariance: Matrix
-
-
 class DomainTable(_Table):
     """Where the model is meant."""
 
@@ -120,6 +112,16 @@ class _Choice(_Table):
     def chosen(self) -> str:
         """The key that is given."""
         return next(name for name in self.choices if getattr(self, name) is not None)
+
+
+class GaussianTable(_Choice):
+    """A random start: by its covariance, or by the standard deviations of states that are independent."""
+
+    title: ClassVar[str] = "gaussian"
+    choices: ClassVar[tuple[str, ...]] = ("std", "covariance")
+    mean: Vector
+    covariance: Matrix | None = None
+    std: Number | Vector | None = None
 
 
 class Start(_Choice):

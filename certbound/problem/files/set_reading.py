@@ -56,6 +56,11 @@ class SetReader(Reader):
             case "gaussian":
                 assert table.gaussian is not None
                 mean = self.array(table.gaussian.mean, f"{where}.mean")
+                if table.gaussian.covariance is None:
+                    std = np.broadcast_to(self.array(table.gaussian.std, f"{where}.std"), len(mean))
+                    if np.any(std < 0):
+                        raise ValueError(f"`{where}.std` must not be negative, got {std.tolist()}.")
+                    return sets.GaussianStart(mean, np.diag(std**2))
                 covariance = self.matrix(table.gaussian.covariance, f"{where}.covariance")
                 return sets.GaussianStart(mean, covariance)
         region = self.shape(getattr(table, table.chosen), table.chosen, where)

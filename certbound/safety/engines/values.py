@@ -122,7 +122,11 @@ def _failure(problem: Problem, limit: float) -> FailureBounds:
             first, last = target.during or (0, problem.horizon)
             plain = until(problem, int(last))
             return bound_failure(plain, target=target.region, since=int(first), seconds=limit, delta=problem.delta)
-        refused = "a target that is to be stayed in is served in one or two states"
+        first, last = target.during or (0, problem.horizon)
+        return bound_failure(
+            until(problem, problem.horizon), target=target.region, since=int(first), until=int(last), seconds=limit,
+            delta=problem.delta,
+        )
     except InfeasibleError as error:
         refused = str(error)
     try:

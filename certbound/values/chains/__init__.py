@@ -6,7 +6,7 @@ probabilities), ``extremes`` (the largest value over many boxes of cells), ``abs
 ``drifting`` (for ever, away from the only limit).
 """
 
-from certbound.values.chains.abstraction import bound_chain
+from certbound.values.chains.abstraction import bound_chain, chain_grid
 from certbound.values.chains.drifting import Drifting, bound_by_drift, bound_drifting
 
-__all__ = ["Drifting", "bound_by_drift", "bound_chain", "bound_drifting"]
+__all__ = ["Drifting", "bound_by_drift", "bound_chain", "bound_drifting", "chain_grid"]

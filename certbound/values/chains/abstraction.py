@@ -96,6 +96,11 @@ def bound_chain(
     )
 
 
+def chain_grid(problem: Problem, side: int) -> Grid:
+    """The grid of `bound_chain` with about so many cells along each side, which raises as that does."""
+    return _Chain(problem).grid(side)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _Sides:
     """Bounds on some boxes, shape (boxes,), or on the cells of a grid with a ring around, from above and below."""

@@ -6,10 +6,10 @@ after the noise, as a function of where the noise-free step ends), ``steps`` (th
 ``induction`` (one step back), ``failures`` (the answer, refined until it is good), ``long_runs`` (any number of steps).
 """
 
-from certbound.values.discrete.failures import bound_failure, chart_failures, step_grids
+from certbound.values.discrete.failures import bound_failure
 from certbound.values.discrete.kernels import AxisKernel, axis_kernel
 from certbound.values.discrete.layout import FailureBounds
-from certbound.values.discrete.long_runs import bound_long_run
+from certbound.values.discrete.long_runs import bound_long_run, chart_failures, step_grids
 from certbound.values.discrete.steps import evaluate
 
 __all__ = [

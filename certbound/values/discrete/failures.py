@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -21,10 +21,14 @@ from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import (
     AnyTransition,
+    Parts,
     Zones,
+    assembled,
     back_above,
     back_below,
     final,
+    jointly,
+    nodes_below,
     values_above,
     zones_of,
 )
@@ -62,6 +66,7 @@ def bound_failure(
     *,
     target: Region | None = None,
     since: int = 0,
+    until: int | None = None,
     ratio: float = 1.05,
     delta: float | None = None,
     seconds: float = 20.0,
@@ -80,6 +85,8 @@ def bound_failure(
         Set that ends the danger.
     since : int
         First step at which it does.
+    until : int, optional
+        Where the target must be stayed in until the horizon: the last step at which it may be entered.
     ratio : float
         Stop once upper <= ratio * lower.
     delta : float, optional
@@ -94,7 +101,7 @@ def bound_failure(
     Inapplicable
         If value functions do not fit the problem; the message says why.
     """
-    work = Work(problem, target, parts, since)
+    work = Work(problem, target, parts, since, until)
     begun = time.perf_counter()
     upper, lower, spent = 1.0, 0.0, 0.0
     tried: list[tuple[float, float, float]] = []
@@ -134,41 +141,6 @@ def bound_failure(
     )
 
 
-def chart_failures(problem: Problem, *, share: float, times: int = 1, parts: int = 4) -> Charts:
-    """Bound the probability of failing from every safe state, not from the initial set alone.
-
-    Parameters
-    ----------
-    problem : Problem
-        As `bound_failure` takes it; where constraints do not bound a state, as far as paths from its initial set get.
-    share : float
-        Of the cells, as `FailureBounds` has it.
-    times : int
-        How many steps are charted, step 0 the first of them.
-    parts : int
-        Parts along each side of the set of disturbances.
-
-    Raises
-    ------
-    Inapplicable
-        If value functions do not fit the problem; the message says why.
-    """
-    work = Work(problem, None, parts)
-    return work.charts(share, sorted({work.horizon * k // times for k in range(times)}))
-
-
-def step_grids(problem: Problem, share: float) -> list[Grid]:
-    """The grids of all steps at one size of the cells, one object where steps share one; as certificates state them.
-
-    Inapplicable where value functions do not fit the problem, or the grids would be too large.
-    """
-    work = Work(problem, None, 1)
-    found = work.layout(share)
-    if found is None:
-        raise Inapplicable(work.too_large)
-    return found
-
-
 def _settled(upper: float, lower: float, delta: float | None) -> bool:
     """Whether the question is answered with room to spare."""
     return delta is not None and (upper <= delta / 100 or lower >= min(100 * delta, 0.5))
@@ -182,7 +154,9 @@ class Work:
         "deviations of the noise wide. Use another engine, which is at its best there."
     )
 
-    def __init__(self, problem: Problem, target: Region | None, parts: int, since: int = 0) -> None:
+    def __init__(
+        self, problem: Problem, target: Region | None, parts: int, since: int = 0, until: int | None = None
+    ) -> None:
         system = problem.system
         if not isinstance(system, DiscreteSystem):
             raise Inapplicable("this engine's backward induction needs discrete time.")
@@ -192,7 +166,8 @@ class Work:
         if problem.horizon > _MOST_STEPS:
             raise Inapplicable(f"a step by step induction takes at most {_MOST_STEPS} steps, not {problem.horizon}.")
         self.problem, self.target, self.n, self.since = problem, target, system.dimension, since
-        self.horizon, self.ending = int(problem.horizon), target if since == 0 else None
+        self.horizon, self.ending = int(problem.horizon), target if since == 0 and until is None else None
+        self.until = until
         asked = problem.constraints  # which refuses a problem with a target of its own
         self.limits = problem.safe if problem.ending else asked
         self.beyond = 0.0 if problem.ending else 1.0
@@ -201,6 +176,7 @@ class Work:
         self.boxes: Boxes = boxes_of(problem, self.shocks, self.dynamics)
         self.random = problem.initial.random
         self.start_shocks = self._start_shocks()
+        self._last: tuple[object, AnyTransition] | None = None
         self._lengths: dict[int, list[tuple[Array, Array]]] = {}
 
     def check_first(self, nodes: int, seconds: float) -> None:
@@ -217,6 +193,7 @@ class Work:
     def cost(self, layout: list[Grid]) -> float:
         """Seconds that a layout stands for, at fixed rates: bounds must not depend on the machine's load."""
         boxes = float(self.dynamics.parts) ** len(self.problem.system.disturbance_names)
+        boxes *= 1 if self.until is None else 3  # functions
         return boxes * seconds_of(layout, common=self.shocks.common, uniform=self.shocks.uniform)
 
     def fits(self, share: float, seconds: float) -> bool:
@@ -270,7 +247,12 @@ class Work:
     def bounds(self, grids: list[Grid], share: float) -> tuple[float, float]:
         """(upper, lower) from the grids."""
         end = 0 if self.random else 1
-        *_, (_, above, below) = self._backward(grids, share, end)
+        above: Parts | ValueFunction
+        below: Parts | ValueFunction
+        if self.until is None:
+            *_, (_, above, below) = self._backward(grids, share, end)
+        else:
+            above, below = self._staying(grids, share, end, self.until)
         upper, lower = self.at_random(above, below) if self.random else self.over_start(above, below, share)
         leak = self.boxes.leak * (1 + 1e-9)
         return min(max(upper, 0.0), 1.0), max(lower - leak, 0.0)
@@ -284,15 +266,41 @@ class Work:
         above = final(grids[last], zones[last], above=True, beyond=self.beyond)
         below = final(grids[last], zones[last], above=False, beyond=0.0 if self.boxes.cut else self.beyond)
         yield last, above, below
-        kept: tuple[object, AnyTransition] | None = None
         for t in range(last - 1, end - 1, -1):
             poll(f"values at step {t}, {math.prod(grids[t].shape)} cells")
-            key = (id(grids[t]), id(grids[t + 1])) if self.dynamics.steady else t
-            if kept is None or kept[0] != key:
-                kept = (key, self.transition(t, grids[t], grids[t + 1], share))
-            above = back_above(kept[1], above, zones[t])
-            below = back_below(kept[1], below, zones[t])
+            step = self._kept_transition(t, grids[t], grids[t + 1], share)
+            above, below = back_above(step, above, zones[t]), back_below(step, below, zones[t])
             yield t, above, below
+
+    def _staying(self, grids: list[Grid], share: float, end: int, until: int) -> tuple[Parts, Parts]:
+        """Functions above and below at step ``end`` where the target, if met until a step, must be stayed in."""
+        above: Parts = ()
+        below: Parts = ()
+        for t in range(self.horizon, end - 1, -1):
+            poll(f"values at step {t}, {math.prod(grids[t].shape)} cells")
+            zones, grid = self.zones(grids[t], t), grids[t]
+            plain, done, undone = replace(zones, has_target=False), zones.done, zones.undone
+            kept = replace(plain, safe=zones.safe & done, unsafe=zones.unsafe | undone)
+            if t == self.horizon:
+                high, low = (final(grid, kept, above=side, beyond=self.beyond) for side in (True, False))
+            else:
+                step = self._kept_transition(t, grid, grids[t + 1], share)
+                high, low = back_above(step, high, kept), back_below(step, low, kept)
+            if t == until:
+                nodal, bend, every = 0.0 * high.nodal, 0.0 * high.bend, np.ones(grid.shape)
+                failed = assembled(grid, nodal, bend, every > 0, every, self.beyond)
+                above, below = jointly(failed, high, done), jointly(failed, low, ~undone)
+            elif t < until:  # W is at least V
+                above = jointly(back_above(step, above[0], plain, *above[1:]), high, ~undone)
+                below = jointly(back_below(step, below[0], plain, *below[1:]), low, done)
+        return above, below
+
+    def _kept_transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
+        """The transition of a step, the same one as long as nothing changes."""
+        key = (id(grid), id(after), 0 if self.dynamics.steady else t)
+        if self._last is None or self._last[0] != key:
+            self._last = key, self.transition(t, grid, after, share)
+        return self._last[1]
 
     def charts(self, share: float, steps: Sequence[int]) -> Charts:
         """Both bounds on all cells at some steps; lower ones only where constraints bound every state."""
@@ -326,23 +334,30 @@ class Work:
             return UniformTransition(step, kind(after, self.shocks, *step.hull(), fineness=max(2 / share, 4.0)))
         return Transition(step, Tables(after, self.shocks, *step.hull()))
 
-    def at_random(self, above: ValueFunction, below: ValueFunction) -> tuple[float, float]:
+    def at_random(self, above: ValueFunction | Parts, below: ValueFunction | Parts) -> tuple[float, float]:
         """Mean over a Gaussian start: one more convolution, read at the mean."""
         assert self.start_shocks is not None
         mean = self.problem.initial.mean
-        tables = Tables(above.grid, self.start_shocks, mean, mean)
+        tops, bottoms = (one if isinstance(one, tuple) else (one,) for one in (above, below))
+        tables = Tables(tops[0].grid, self.start_shocks, mean, mean)
         point = Grid(axes=tuple(np.array([value]) for value in mean))
         image = (Interval.point(mean[None]), np.ones(1, dtype=bool))
         transition = Transition(Step(grid=point, vertices=[image], cells=[], pieces=np.empty((0, 0))), tables)
-        ((high, error),) = transition.at_nodes(tables.field(above, order=0))
-        ((low, other),) = transition.at_nodes(tables.field(below, order=0))
-        return float(high.item() + error.item()), float(low.item() - other.item())
+        highs = [at + error for one in tops for at, error in transition.at_nodes(tables.field(one, order=0))]
+        slack = 0.0 if len(tops) == 1 else 1e-15
+        return float(np.sum(highs)) + slack, float(nodes_below(transition, *bottoms, order=0)[0].item()) - slack
 
-    def over_start(self, above: ValueFunction, below: ValueFunction, share: float) -> tuple[float, float]:
+    def over_start(
+        self, above: ValueFunction | Parts, below: ValueFunction | Parts, share: float
+    ) -> tuple[float, float]:
         """Largest value over the initial set, on a grid of its own."""
         region = self._start_region()
+        tops, bottoms = (one if isinstance(one, tuple) else (one,) for one in (above, below))
         grid = self._start_grid(region, share)
         cells = grid.cells()
+        stays = self.target if self.until is not None and self.since == 0 else None
+        if stays is not None and not contains(stays, cells, 0)[1].all():
+            raise Inapplicable("value functions take no start in a target that is to be stayed in from then on.")
         meets = ~contains(region, cells, 0)[1]
         safe, _ = respected(active_at(self.limits, 0), cells, 0)
         if self.ending is not None:
@@ -352,19 +367,17 @@ class Work:
         if not np.all(safe[meets]):
             upper = 1.0
         else:
-            transition = self.transition(0, grid, above.grid, share)
-            upper = self._highest(transition, above, meets)
-        transition = self.transition(0, grid, below.grid, share)
-        field: Any = transition.tables.field(below, order=0)
-        values = np.maximum.reduce([at - error for at, error in transition.at_nodes(field)])
+            upper = self._highest(self.transition(0, grid, tops[0].grid, share), tops, meets)
+        transition = self.transition(0, grid, bottoms[0].grid, share)
+        values = np.maximum.reduce(nodes_below(transition, *bottoms, order=0))
         inside = contains(region, Interval.point(grid.nodes()), 0)[0]
         if self.ending is not None:
             inside &= contains(self.ending, Interval.point(grid.nodes()), 0)[1]
         values = values.ravel()[inside]
         return upper, float(values.max()) if len(values) else 0.0
 
-    def _highest(self, transition: AnyTransition, above: ValueFunction, meets: Mask) -> float:
-        nodal, bend, known = values_above(transition, above)
+    def _highest(self, transition: AnyTransition, above: Parts, meets: Mask) -> float:
+        nodal, bend, known = values_above(transition, *above)
         top = np.maximum.reduce(corners(nodal))
         for i in range(self.n):
             top = top + np.maximum(-bend[i], 0.0) * transition.step.grid.widths(i) ** 2 / 8 * (1 + 1e-12)

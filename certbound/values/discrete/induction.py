@@ -5,6 +5,10 @@ With V_t(x) the largest probability, over the disturbances, of failing from x at
 Above: U_t is 1 outside the grid and on every cell that is not surely safe, and at least sup_d phi elsewhere; below: the
 grid contains S_t, U_t is 1 on cells that are surely unsafe, and at most phi for one disturbance a cell elsewhere (V_t
 is at least that everywhere). A target G_t that ends the danger puts 0 on its cells, and 1 on the others at step T.
+
+A target that must be stayed in: W_t, the probability of failing of who has arrived, comes by the same induction with
+every step off G_t unsafe, and V_t = W_t on G_t, W_t >= V_t elsewhere. V_{t+1} jumps there, so that it is given as a sum
+of two functions, each 0 on the other's cells; means are sums, and so are their bounds.
 """
 
 from __future__ import annotations
@@ -24,9 +28,12 @@ from certbound.values.grids import Grid, around_nodes, corners
 from certbound.values.sets import contains, respected
 
 AnyTransition = Transition | UniformTransition
+Parts = tuple[ValueFunction, ...]
+"""Functions whose sum is meant."""
 
 _STEEPEST = 0.5
 """Largest bend times width^2/8 that a cell keeps; beyond it the cell is constant."""
+_SUM = 1e-15  # what the sum of a few numbers may be off, of the larger ones of which none is far below 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -70,10 +77,10 @@ def final(grid: Grid, zones: Zones, *, above: bool, beyond: float = 1.0) -> Valu
     return assembled(grid, np.zeros(grid.node_shape), np.zeros((grid.dimension, *grid.shape)), fixed, level, beyond)
 
 
-def back_above(transition: AnyTransition, value: ValueFunction, zones: Zones) -> ValueFunction:
-    """A function at least V_t, given one that is at least V_{t+1}."""
+def back_above(transition: AnyTransition, value: ValueFunction, zones: Zones, *more: ValueFunction) -> ValueFunction:
+    """A function at least V_t, given one that is at least V_{t+1}, or several whose sum is."""
     grid = transition.step.grid
-    nodal, bend, known = values_above(transition, value)
+    nodal, bend, known = values_above(transition, value, *more)
     fixed = ~zones.safe | ~known
     level = np.ones(grid.shape)
     if zones.has_target:
@@ -82,22 +89,41 @@ def back_above(transition: AnyTransition, value: ValueFunction, zones: Zones) ->
     return assembled(grid, nodal, bend, fixed, level, value.beyond)
 
 
-def values_above(transition: AnyTransition, value: ValueFunction) -> tuple[Array, Array, Mask]:
-    """Node values, bends and the cells on which they lie above sup_d phi."""
-    field: Any = transition.tables.field(value)
-    nodal = np.maximum.reduce([at + error for at, error in transition.at_nodes(field)])
-    bend, bump, known = _bends(transition, field, above=True)
-    nodal, holes = _without_holes(nodal + bump, 1.0)
+def values_above(transition: AnyTransition, *values: ValueFunction) -> tuple[Array, Array, Mask]:
+    """Node values, bends and the cells on which they lie above sup_d phi, phi the mean of the sum of some functions."""
+    most: list[Array] = []
+    bend, bump, known = np.zeros(1), np.zeros(1), np.ones(1, dtype=bool)
+    for value in values:
+        field: Any = transition.tables.field(value)
+        each = [at + error for at, error in transition.at_nodes(field)]
+        most = [a + b for a, b in zip(most, each, strict=True)] if most else each
+        more, raised, sure = _bends(transition, field, above=True)
+        bend, bump, known = bend + more, bump + raised, known & sure
+    nodal = np.maximum.reduce(most) + bump
+    if len(values) > 1:
+        nodal, bend = nodal + _SUM * np.abs(nodal), bend - _SUM * np.abs(bend)
+    nodal, holes = _without_holes(nodal, 1.0)
     return nodal, bend, known & ~holes
 
 
-def back_below(transition: AnyTransition, value: ValueFunction, zones: Zones) -> ValueFunction:
-    """A function at most V_t, given one that is at most V_{t+1}."""
+def nodes_below(transition: AnyTransition, *values: ValueFunction, **options: Any) -> list[Array]:
+    """Node values at most phi, one array for each disturbance that is tried."""
+    found: list[Array] = []
+    for value in values:
+        field: Any = transition.tables.field(value, **options)
+        least = [at - error for at, error in transition.at_nodes(field)]
+        found = [a + b - _SUM * np.abs(a + b) for a, b in zip(found, least, strict=True)] if found else least
+    return found
+
+
+def back_below(transition: AnyTransition, value: ValueFunction, zones: Zones, *more: ValueFunction) -> ValueFunction:
+    """A function at most V_t, given one that is at most V_{t+1}, or several whose sum is."""
     grid = transition.step.grid
-    field: Any = transition.tables.field(value)
-    options = [at - error for at, error in transition.at_nodes(field)]
+    options = nodes_below(transition, value, *more)
     nodal = options[0] if len(options) == 1 else _policy(options)
-    bend, _, known = _bends(transition, field, above=False)
+    bends = [_bends(transition, transition.tables.field(one), above=False) for one in (value, *more)]
+    bend, known = np.sum([found[0] for found in bends], axis=0), np.all([found[2] for found in bends], axis=0)
+    bend = bend + _SUM * np.abs(bend) if more else bend
     nodal, holes = _without_holes(nodal, 0.0)
     fixed = zones.unsafe | ~known | holes
     level = np.where(zones.unsafe, 1.0, 0.0)
@@ -105,6 +131,18 @@ def back_below(transition: AnyTransition, value: ValueFunction, zones: Zones) ->
         maybe = ~zones.undone & ~zones.unsafe
         fixed, level = fixed | maybe, np.where(maybe, 0.0, level)
     return assembled(grid, nodal, bend, fixed, level, value.beyond)
+
+
+def jointly(value: ValueFunction, arrived: ValueFunction, cells: Mask) -> Parts:
+    """The function that is ``arrived`` on some cells and ``value`` on all others and beyond the grid, in two parts."""
+    return _cleared(value, cells, value.beyond), _cleared(arrived, ~cells, 0.0)
+
+
+def _cleared(value: ValueFunction, cells: Mask, beyond: float) -> ValueFunction:
+    """The function, with 0 on some cells."""
+    before = np.zeros(value.grid.shape, dtype=bool) if value.fixed is None else value.fixed
+    level = np.where(cells, 0.0, value.level)
+    return assembled(value.grid, value.nodal, value.bend, before | cells, level, beyond)
 
 
 def _policy(options: list[Array]) -> Array:

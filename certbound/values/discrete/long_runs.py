@@ -22,9 +22,11 @@ from dataclasses import replace
 import numpy as np
 
 from certbound.arrays import Array, Mask
+from certbound.problem.goals import until
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Inside, Region
 from certbound.rigor.intervals import Interval
+from certbound.values.charts import Charts
 from certbound.values.discrete.dominance import tail
 from certbound.values.discrete.failures import Work
 from certbound.values.discrete.functions import ValueFunction
@@ -106,6 +108,53 @@ def bound_long_run(
     if best is None:
         raise Inapplicable(run.work.too_large)
     return replace(best, seconds=time.perf_counter() - begun, tried=tuple(tried))
+
+
+def chart_failures(problem: Problem, *, share: float, times: int = 1, parts: int = 4) -> Charts:
+    """Bound the probability of failing from every safe state, not from the initial set alone.
+
+    Parameters
+    ----------
+    problem : Problem
+        As `bound_failure` takes it; where constraints do not bound a state, as far as paths from its initial set get.
+    share : float
+        Of the cells, as `FailureBounds` has it.
+    times : int
+        How many steps are charted, step 0 the first of them.
+    parts : int
+        Parts along each side of the set of disturbances.
+
+    Raises
+    ------
+    Inapplicable
+        If value functions do not fit the problem; the message says why.
+    """
+    work = Work(problem, None, parts)
+    return work.charts(share, sorted({work.horizon * k // times for k in range(times)}))
+
+
+def step_grids(problem: Problem, share: float, most: float = math.inf) -> list[Grid]:
+    """The grids of all steps at one size of the cells, one object where steps share one; as certificates state them.
+
+    Of a target that need not be stayed in up to the end of its window; one grid where there are more than ``most``
+    steps, which must be alike. Inapplicable where value functions do not fit the problem, or grids would be too large.
+    """
+    if problem.horizon > most:
+        found = _Run(problem, 1).work.layout(share)
+        if found is None:
+            raise Inapplicable(Work.too_large)
+        return found[-1:]
+    target = problem.reach
+    if target is None:
+        work = Work(problem, None, 1)
+    else:
+        first, last = target.during or (0, problem.horizon)
+        plain = until(problem, problem.horizon if target.stays else int(last))
+        work = Work(plain, target.region, 1, int(first))
+    found = work.layout(share)
+    if found is None:
+        raise Inapplicable(work.too_large)
+    return found
 
 
 def _better(one: FailureBounds, other: FailureBounds) -> FailureBounds:

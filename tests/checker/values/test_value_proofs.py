@@ -19,7 +19,7 @@ from scipy.stats import norm
 
 import certbound as cb
 from certbound.checker import check_data, parse
-from certbound.checker.reading import Record
+from certbound.checker.reading import Record, unpacked
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import read_model, starts_of
 from certbound.checker.values import batches as tm
@@ -28,7 +28,6 @@ from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.crossing import has_full_rank
 from certbound.checker.values.hermite import Surface
 from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
-from certbound.checker.values.packed import unpacked
 from certbound.checker.values.passage import Levels, Passage
 from certbound.checker.values.quadratic import missing_form, splitting
 from certbound.checker.values.second_order import Flow
@@ -487,14 +486,14 @@ def packed_text(content: bytes) -> str:
 )  # fmt: skip
 def test_packed_numbers_that_are_none_are_refused(value: Any, why: str) -> None:
     with pytest.raises(CertificateError, match=why):
-        unpacked(value, "proof.values", (2,))
+        unpacked(value, "proof.values", 2)
 
 
 def test_a_text_that_unpacks_to_very_much_is_not_unpacked() -> None:
     bomb = base64.b64encode(zlib.compress(b"0" * 10**8, 9)).decode()
     assert len(bomb) < 200_000
     with pytest.raises(CertificateError, match="nothing else"):
-        unpacked(bomb, "proof.values", (4,))
+        unpacked(bomb, "proof.values", 4)
 
 
 @pytest.fixture(scope="module")

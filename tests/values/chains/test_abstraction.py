@@ -1,16 +1,20 @@
 """Chains: bounds around closed forms and simulations, for what other value functions do not serve."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.errors import CertificateError, InfeasibleError
+from certbound.cli.commands.check import proved_certificate
+from certbound.errors import InfeasibleError
 from certbound.problem.files.loading import loads, save
+from certbound.problem.goals import until
 from certbound.values.chains import bound_chain
 from certbound.values.chains.extremes import Extremes, places
 from certbound.values.chains.pieces import pieces_of
+from certbound.values.discrete import bound_failure
 
 LAWS = {
     "gaussian": cb.Gaussian(std=0.2),
@@ -114,13 +118,13 @@ def test_noise_that_multiplies_the_state(tmp_path):
     assert cb.load(tmp_path / "again.toml").system.gain.nodes == problem.system.gain.nodes
 
 
-def test_other_engines_and_certificates_refuse_such_noise():
+def test_other_engines_refuse_such_noise_and_certificates_state_it():
     problem = loads(MULTIPLIED)
     verdict = cb.verify_safety(problem, time_limit=20)
     assert "the noise matrix depends on t or the states" in verdict.answers["linear"].reason
     assert verdict.answers["values"].applicable
-    with pytest.raises(CertificateError, match="the noise matrix depends on t or the states"):
-        verdict.certificate_text(problem)
+    stated = json.loads(proved_certificate(problem, verdict))["problem"]["noise"]["matrix"]
+    assert stated["columns"] == problem.system.gain.shape[1]
     with pytest.raises(InfeasibleError, match="depends on t or the states"):
         problem.system.noise_matrix  # noqa: B018  (it refuses)
     with pytest.raises(ValueError, match="`noise_matrix` must return a matrix with 2 rows"):
@@ -184,6 +188,19 @@ def test_a_target_that_is_to_be_stayed_in(tmp_path):
     assert (again.reach.then, again.reach.label) == ("stay", "reach and stay -0.25 <= x <= 0.25")
 
 
+def test_smooth_functions_say_more_of_a_target_that_is_to_be_stayed_in():
+    problem = loads(STAYING)
+    plain, target = until(problem, problem.horizon), problem.reach.region
+    for first, last in ((0, 10), (2, 4)):
+        fine = bound_failure(plain, target=target, since=first, until=last, seconds=1)
+        coarse = bound_chain(problem.replace(reach=cb.Reach(target, during=(first, last), then="stay")), seconds=0.5)
+        assert coarse.lower < fine.lower <= fine.upper < coarse.upper
+        if last == 10:
+            assert fine.lower <= staying_truth() <= fine.upper <= 1.02 * fine.lower
+    with pytest.raises(InfeasibleError, match="no start in a target"):
+        bound_failure(plain.replace(initial=[0.1]), target=target, until=10)
+
+
 def test_arriving_late_or_before_the_window_does_not_count():
     problem = loads(STAYING)
     late = problem.replace(reach=cb.Reach(cb.Box([-0.25], [0.25]), during=(6, 10), then="stay"))
@@ -200,8 +217,8 @@ def test_staying_is_refused_where_it_cannot_be():
     verdict = cb.verify_safety(problem.replace(delta=0.1), time_limit=20)
     assert verdict.status == "UNSAFE"
     assert "to be stayed in" in verdict.answers["linear"].reason
-    with pytest.raises(CertificateError):
-        verdict.certificate_text(problem)
+    proved = float.fromhex(json.loads(proved_certificate(problem, verdict))["claim"]["log10_lower"])
+    assert math.log10(0.999 * staying_truth()) < proved <= math.log10(staying_truth())
     with pytest.raises(ValueError, match='`then` must be "stay" or omitted'):
         cb.Reach(cb.Box([0], [1]), then="leave")
     with pytest.raises(ValueError, match=r"`stay\.0\.then` must be omitted"):

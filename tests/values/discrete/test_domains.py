@@ -9,7 +9,7 @@ import pytest
 import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.errors import CertificateError, InfeasibleError
-from certbound.problem.files.loading import loads, save
+from certbound.problem.files.loading import loads
 from certbound.safety.certificate import problem_data
 from certbound.values.discrete import bound_failure, bound_long_run
 
@@ -80,14 +80,6 @@ def test_who_leaves_the_domain_has_ended(text):
     assert counted.lower > found.upper
 
 
-def test_it_is_read_and_written(tmp_path):
-    problem = loads(GAUSSIAN)
-    assert problem.ending
-    save(problem.replace(name="again"), tmp_path / "again.toml")
-    again = cb.load(tmp_path / "again.toml")
-    assert (again.leaving, again.domain.low.tolist(), again.domain.high.tolist()) == ("ends", [-0.5], [1.0])
-
-
 def test_it_needs_a_domain_and_one_of_two_words():
     problem = loads(GAUSSIAN)
     with pytest.raises(ValueError, match='`leaving` must be "unsafe" or "ends", got \'stops\''):
@@ -106,11 +98,8 @@ def test_it_needs_a_domain_and_one_of_two_words():
         cb.bound_exit_times(problem)
 
 
-def test_certificates_count_leaving_as_failing():
+def test_other_certificates_count_leaving_as_failing():
     problem = loads(GAUSSIAN).replace(domain=cb.Box([-9], [9]), safe=[cb.Inside(cb.HalfSpace([1], 8))], delta=0.01)
-    verdict = cb.verify_safety(problem, method="values")
-    with pytest.raises(CertificateError, match="the checker counts leaving the domain as failing"):
-        verdict.certificate_text(problem)
     text = cb.verify_safety(problem, method="linear").certificate_text(problem)
     assert check_data(parse(text)).valid
     forged = json.loads(text)

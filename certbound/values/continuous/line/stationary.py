@@ -24,12 +24,14 @@ from flint import arb, arb_poly, fmpq, fmpq_poly
 from numpy.polynomial import chebyshev
 
 from certbound.arrays import Array
+from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import enclose, squared_diffusion
+from certbound.values.exact import interval_of
 
 _DEGREES = (16, 28, 44)
 _CELLS = (2**11, 2**14)
@@ -201,14 +203,13 @@ def _interval(problem: Problem) -> tuple[float, float] | None:
     """The ends of the safe interval, where it is one that is exactly known."""
     low, high = -np.inf, np.inf
     for constraint in problem.constraints:
-        if constraint.outside or constraint.region.moving:
+        if constraint.outside:
             return None
-        normals, bounds = constraint.region.halfspaces()
-        centre = float(np.ravel(constraint.region.center_at())[0]) if constraint.region.center is not None else 0.0
-        if centre != 0.0 or not np.all(np.abs(normals) == 1.0):
+        try:
+            first, last = interval_of(constraint.region)
+        except InfeasibleError:
             return None
-        for normal, bound in zip(normals.ravel().tolist(), bounds.tolist()):
-            low, high = (low, min(high, bound)) if normal > 0 else (max(low, -bound), high)
+        low, high = max(low, first), min(high, last)
     return (low, high) if np.isfinite([low, high]).all() and low < high else None
 
 
