@@ -14,6 +14,8 @@ from certbound.checker import check_data
 from certbound.errors import CertificateError
 from certbound.safety.certificate import certificate_data, problem_data
 
+HOLDS = 3
+
 
 def lane(hold: float | None = 0.2, gain: float = 0.8) -> cb.Problem:
     system = cb.ContinuousSystem(
@@ -21,7 +23,7 @@ def lane(hold: float | None = 0.2, gain: float = 0.8) -> cb.Problem:
         diffusion=0.03 * np.eye(2),
     )
     return cb.Problem(
-        system, initial=[0.2, 0], safe=[cb.Inside(cb.Box([-0.6], [0.6], coordinates=[0]))], horizon=1, delta=1e-3,
+        system, initial=[0.2, 0], safe=[cb.Inside(cb.Box([-0.6], [0.6], coordinates=[0]))], horizon=0.6, delta=1e-3,
         plan=lambda x: 0.5 * np.tanh(-gain * x[0] - 1.5 * x[1]), hold=hold,
     )
 
@@ -59,7 +61,7 @@ def test_it_speaks_of_no_other_hold_and_law(other: cb.Problem, words: str) -> No
 def test_what_a_sampling_time_does_must_be_in_its_box() -> None:
     data = copy.deepcopy(stated())
     cell = data["proof"]["cells"][0]
-    jump = 3 * (data["proof"]["pieces"] // 5)
+    jump = 2 * (data["proof"]["pieces"] // HOLDS)
     cell["remainder_low"][jump] = cell["remainder_high"][jump] = [0.0.hex()] * 3
     report = check_data(data)
     assert not report.valid
@@ -71,7 +73,7 @@ def test_slopes_and_nominal_of_a_sampling_time_are_looked_at() -> None:
     slopes = [[(2.0).hex() for _ in row] for row in cell["sampled"]]
     assert not check_data(forged("proof", "cells", 0, "sampled", value=slopes)).valid
     nominal = copy.deepcopy(cell["nominal"])
-    for k in range(stated()["proof"]["pieces"] // 5):  # of the first hold: another input than the law's
+    for k in range(stated()["proof"]["pieces"] // HOLDS):  # of the first hold: another input than the law's
         for point in nominal[k]:
             point[2] = (0.4).hex()
     assert not check_data(forged("proof", "cells", 0, "nominal", value=nominal)).valid
@@ -79,7 +81,7 @@ def test_slopes_and_nominal_of_a_sampling_time_are_looked_at() -> None:
 
 def test_a_sampling_time_begins_a_window() -> None:
     starts = stated()["proof"]["windows"]
-    data = forged("proof", "windows", value=[start for start in starts if start % (stated()["proof"]["pieces"] // 5)])
+    data = forged("proof", "windows", value=[start for start in starts if start % (stated()["proof"]["pieces"] // HOLDS)])
     data["proof"]["windows"] = [0, *data["proof"]["windows"]]
     cell, count = data["proof"]["cells"][0], len(data["proof"]["windows"])
     cell["window_levels"] = cell["window_levels"][:count]
