@@ -17,10 +17,11 @@ BLOCK = 8
 
 
 @compiled
-def _contract(matrix: Array, table: Array, before: int, after: int, out: Array) -> None:
+def _contract(matrix: Array, table: Array, before: int | np.intp, after: int | np.intp, out: Array) -> None:
     """A matrix along the middle one of three axes, of lengths ``before``, its columns (4 or more) and ``after``.
 
-    The arrays are flat; slices let the compiler see that rows do not overlap.
+    The arrays are flat; slices let the compiler see that rows do not overlap. Numbers that are written out are given
+    as ``np.intp``: numba compiles a function anew for every literal.
     """
     rows, columns = matrix.shape
     for b in range(before):
@@ -160,7 +161,10 @@ def _residual(v: Array, drift: Array, square: Array, mixed: bool, out: Array, en
 def _model(
     drift: Array, square: Array, cells: Index, sample: int, sides: Array, mixed: bool, force: Array, spread: Array
 ) -> None:
-    """f_i / h_i, a_ii / (2 h_i^2) and a_ij / (h_i h_j) at the samples, so that V's derivatives are those on [0, 1]."""
+    """f_i / h_i, a_ii / (2 h_i^2) and a_ij / (h_i h_j) at the samples, so that V's derivatives are those on [0, 1].
+
+    ``sides`` holds the four inverse sides of each patch, and ones.
+    """
     for output in range(len(drift)):
         _gathered(drift, output, cells, sample, 1.0, sides[1 + output % 3], sides[4], force[output])
     for k in range(6 if mixed else 3):

@@ -80,8 +80,8 @@ def test_slopes_and_nominal_of_a_sampling_time_are_looked_at() -> None:
 
 
 def test_a_sampling_time_begins_a_window() -> None:
-    starts = stated()["proof"]["windows"]
-    data = forged("proof", "windows", value=[start for start in starts if start % (stated()["proof"]["pieces"] // HOLDS)])
+    starts, hold = stated()["proof"]["windows"], stated()["proof"]["pieces"] // HOLDS
+    data = forged("proof", "windows", value=[start for start in starts if start % hold])
     data["proof"]["windows"] = [0, *data["proof"]["windows"]]
     cell, count = data["proof"]["cells"][0], len(data["proof"]["windows"])
     cell["window_levels"] = cell["window_levels"][:count]
