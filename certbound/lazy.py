@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import importlib
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Generic, ParamSpec, TypeVar
 
 P = ParamSpec("P")
@@ -35,6 +37,18 @@ def lazily(
     return load, lambda: sorted(offered)
 
 
+@contextlib.contextmanager
+def uncollected() -> Iterator[None]:
+    """Without the garbage collector, which would walk what a compiler makes again and again: a seventh of its time."""
+    before = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if before:
+            gc.enable()
+
+
 class compiled(Generic[P, R]):
     """A function that numba compiles, and keeps on disk, at its first call; so is what its module compiles beside it.
 
@@ -47,7 +61,10 @@ class compiled(Generic[P, R]):
         self.__doc__, self.__name__, self.__module__ = function.__doc__, function.__name__, function.__module__
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        return (self.kernel or self._ready())(*args, **kwargs)
+        if self.kernel is not None:
+            return self.kernel(*args, **kwargs)
+        with uncollected():
+            return self._ready()(*args, **kwargs)
 
     def _ready(self) -> Callable[P, R]:
         from numba import njit

@@ -5,8 +5,9 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
@@ -31,16 +32,22 @@ from certbound.values.continuous.line import ladder
 class Case:
     """A problem, its certificate as data, and its problem part."""
 
-    def __init__(self, problem: cb.Problem, method: str) -> None:
-        self.problem = problem
-        self.verdict = verify_safety(problem, method=method)
-        self.text = certificate_text(problem, self.verdict)
-        self.given = json.loads(json.dumps(problem_data(problem)))
+    def __init__(self, build: Callable[[], cb.Problem], method: str) -> None:
+        self.problem, self.verdict = proved(build, method)
+        self.text = certificate_text(self.problem, self.verdict)
+        self.given = json.loads(json.dumps(problem_data(self.problem)))
 
     @property
     def data(self) -> dict[str, Any]:
         """A fresh copy of the certificate."""
         return parse(self.text)
+
+
+@cache
+def proved(build: Callable[[], cb.Problem], method: str) -> tuple[cb.Problem, Any]:
+    """A problem and its verdict, once for all tests."""
+    problem = build()
+    return problem, verify_safety(problem, method=method)
 
 
 def steps() -> cb.Problem:
@@ -147,10 +154,16 @@ def leaving() -> cb.Problem:
     return cb.Problem(system, initial=cb.Box([-0.1], [0.2]), safe=safe, horizon=0.4, delta=0.5)
 
 
-def exit_certificate(problem: cb.Problem, seconds: float = 0.1, *, lower: bool = False) -> str:
-    """A certificate by a value function in continuous time from one attempt, coarser than usual, for short checks."""
+@cache
+def _exits(build: Callable[[], cb.Problem]) -> tuple[cb.Problem, Any]:
+    problem = build()
     with patch.object(ladder, "LADDER", ((2.5, 1e-3, 0.03),)):
-        found = bound_exits(problem, seconds=seconds, lower=lower)
+        return problem, bound_exits(problem, seconds=0.1)
+
+
+def exit_certificate(build: Callable[[], cb.Problem], *, lower: bool = False) -> str:
+    """A certificate by a value function in continuous time from one attempt, coarser than usual, for short checks."""
+    problem, found = _exits(build)
     answer = EngineAnswer(log10_delta=found.upper, log10_lower=found.lower, method="values", details=found)
     return side_of(problem, {"values": answer}, lower=lower)
 
@@ -173,6 +186,12 @@ def squared() -> cb.Problem:
         cb.Inside(cb.HalfSpace([1.0, 1.0], 1.2)),
     ]  # fmt: skip
     return cb.Problem(system, initial=cb.Ball([0, 0], 0.05), safe=safe, horizon=0.5, delta=0.1)
+
+
+@cache
+def squared_certificate(*, windows: bool = False) -> str:
+    """Of ``squared``, by quadratic value bounds."""
+    return quadratic_certificate(squared(), windows=windows)
 
 
 def quadratic_certificate(problem: cb.Problem, *, windows: bool = False) -> str:
@@ -241,39 +260,39 @@ def kept_tables() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def stepping() -> Case:
-    return Case(steps(), "linear")
+    return Case(steps, "linear")
 
 
 @pytest.fixture(scope="session")
 def flowing() -> Case:
-    return Case(flow(), "linear")
+    return Case(flow, "linear")
 
 
 @pytest.fixture(scope="session")
 def contracting() -> Case:
-    return Case(contraction(), "constants")
+    return Case(contraction, "constants")
 
 
 @pytest.fixture(scope="session")
 def springing() -> Case:
-    return Case(spring(), "barrier")
+    return Case(spring, "barrier")
 
 
 @pytest.fixture(scope="session")
 def stirring() -> Case:
-    return Case(stirred(), "linear")
+    return Case(stirred, "linear")
 
 
 @pytest.fixture(scope="session")
 def valuing() -> Case:
-    return Case(valued(), "values")
+    return Case(valued, "values")
 
 
 @pytest.fixture(scope="session")
 def squaring() -> SimpleNamespace:
     """Quadratic value bounds."""
     problem = squared()
-    text, given = quadratic_certificate(problem, windows=True), json.loads(json.dumps(problem_data(problem)))
+    text, given = squared_certificate(windows=True), json.loads(json.dumps(problem_data(problem)))
     return SimpleNamespace(problem=problem, text=text, data=parse(text), given=given)
 
 

@@ -20,7 +20,6 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.safety.answers import exact
 from certbound.safety.certificate import certificate_text, problem_data, restated
-from certbound.safety.verification import verify_safety
 from tests.checker import conftest
 from tests.checker.linear.test_diffusion import growth
 from tests.checker.test_adversary import jumping, linear
@@ -170,8 +169,7 @@ def _sampled() -> cb.Problem:
 
 def _stated(build: Callable[[], cb.Problem], method: str) -> Callable[[], str]:
     def text() -> str:
-        problem = build()
-        return certificate_text(problem, verify_safety(problem, method=method))
+        return certificate_text(*conftest.proved(build, method))
 
     return text
 
@@ -213,7 +211,7 @@ _BASES: dict[str, Callable[[], str]] = {
     "rising": lambda: json.dumps(_rising()),
     "valued": _sharp(_stated(conftest.valued, "values")),
     "valued plane": _sharp(_stated(conftest.valued_plane, "values")),
-    "leaving": _sharp(lambda: conftest.exit_certificate(conftest.leaving())),
+    "leaving": _sharp(lambda: conftest.exit_certificate(conftest.leaving)),
     "barrier": lambda: json.dumps(by_hand(kinked(), 8.0, 0.7201, 0.0801, 7.999)),
 }
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from functools import cache
+from typing import Any
+from unittest.mock import patch
 
 import certbound as cb
 from certbound.safety.answers import EngineAnswer, exact
@@ -52,9 +55,19 @@ def rested() -> cb.Problem:
     return restless(delta=0.99).replace(horizon=0.5)
 
 
+@cache
+def _rate() -> Any:
+    return bound_rate(rested())
+
+
+def _rate_below() -> str:
+    """Of an infinite horizon, by the same functions."""
+    with patch("certbound.safety.engines.values.bound_rate", lambda _: _rate()):
+        return _below(restless)()
+
+
 def _by_rate() -> str:
-    problem = rested()
-    rate = bound_rate(problem)
+    problem, rate = rested(), _rate()
     answer = EngineAnswer(log10_delta=math.log10(rate.before(0.5)[1]), reason="", method="values", details=rate)
     proof, log10, _ = values_proof(problem, answer)
     claim = {"log10_delta": exact(log10), "method": "rate", "assumptions": []}
@@ -68,7 +81,7 @@ _BASES |= {
     "lasting target": _sharp(_stated(met, "values")),
     "lasting below": _sharp(_below(lambda: met(delta=0.01))),
     "rate": _sharp(_by_rate),
-    "rate below": _sharp(_below(restless)),
+    "rate below": _sharp(_rate_below),
     "drift": _sharp(_stated(lasting_steps, "values")),
 }
 

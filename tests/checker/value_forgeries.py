@@ -10,7 +10,6 @@ import numpy as np
 
 import certbound as cb
 from certbound.safety.answers import exact
-from certbound.safety.verification import verify_safety
 from tests.checker import conftest
 from tests.checker.forgeries import _BASES, Data, _claim, _lower, _scale, _sharp, _stated, forges, repacked
 from tests.checker.test_adversary import jumping
@@ -23,8 +22,8 @@ _ABOVE, _BELOW = "values/passage.py", "values/crossing.py"
 
 def _below(build: Callable[[], cb.Problem]) -> Callable[[], str]:
     def text() -> str:
-        problem = build()
-        return conftest.side_of(problem, dict(verify_safety(problem, method="values").answers), lower=True)
+        problem, verdict = conftest.proved(build, "values")
+        return conftest.side_of(problem, dict(verdict.answers), lower=True)
 
     return text
 
@@ -35,10 +34,10 @@ _BASES |= {
     "started below": _sharp(_below(conftest.started)),
     "shaken": _sharp(_stated(conftest.shaken, "values")),
     "shaken below": _sharp(_below(conftest.shaken)),
-    "squared": _sharp(lambda: conftest.quadratic_certificate(conftest.squared(), windows=True)),
-    "leaving below": _sharp(lambda: conftest.exit_certificate(conftest.leaving(), lower=True)),
-    "drifting": _sharp(lambda: conftest.exit_certificate(conftest.drifting())),
-    "drifting below": _sharp(lambda: conftest.exit_certificate(conftest.drifting(), lower=True)),
+    "squared": _sharp(lambda: conftest.squared_certificate(windows=True)),
+    "leaving below": _sharp(lambda: conftest.exit_certificate(conftest.leaving, lower=True)),
+    "drifting": _sharp(lambda: conftest.exit_certificate(conftest.drifting)),
+    "drifting below": _sharp(lambda: conftest.exit_certificate(conftest.drifting, lower=True)),
 }
 
 

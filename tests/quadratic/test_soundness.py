@@ -52,7 +52,7 @@ def test_the_bound_is_above_the_frequency_of_failures(seed: int) -> None:
 def test_cells_that_are_curved_at_some_times_only_have_the_same_corners() -> None:
     """Drift and noise of this one change with time: on some pieces a remainder is 0."""
     problem = quadratic(np.random.default_rng([7, 13]))
-    found = bound_quadratic(problem, target=1e-6, seconds=1.0)  # a pass over the walls, and some of the search
+    found = bound_quadratic(problem, target=1e-6, seconds=0.5)  # a pass over the walls, and some of the search
     seen = cb.simulate_exits(problem, paths=1000, rng=np.random.default_rng(1))
     assert seen.lower <= 10**found.upper <= 1
 

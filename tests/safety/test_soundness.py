@@ -34,8 +34,8 @@ def random_dynamics(rng: np.random.Generator, n: int, discrete: bool) -> Callabl
     return f
 
 
-def random_problem(index: int) -> cb.Problem:
-    """Problem number ``index``; its box is placed so that roughly 3 paths in 10^4 leave it."""
+def boundless_problem(index: int) -> cb.Problem:
+    """Problem number ``index`` in a box that no path leaves."""
     rng = np.random.default_rng([7, index])
     n, discrete = 1 + index % 4, index % 2 == 1
     f = random_dynamics(rng, n, discrete)
@@ -49,9 +49,14 @@ def random_problem(index: int) -> cb.Problem:
         system = cb.ContinuousSystem(f, states=n, diffusion=sigma * (np.eye(n) + 0.3 * rng.normal(size=(n, n))))
         horizon = 2.0
     initial = cb.Box(start - 0.02, start + 0.02)
-    wide = cb.Problem(
+    return cb.Problem(
         system, initial=initial, safe=[cb.Inside(cb.Box([-50.0] * n, [50.0] * n))], horizon=horizon, delta=1e-2
     )
+
+
+def random_problem(index: int) -> cb.Problem:
+    """The same in a box that roughly 3 paths in 10^4 leave."""
+    wide = boundless_problem(index)
     paths = cb.sample_paths(wide, paths=4000, rng=np.random.default_rng(index))
     low, high = paths.min(axis=1), paths.max(axis=1)
     middle = (low.mean(axis=0) + high.mean(axis=0)) / 2
@@ -62,7 +67,7 @@ def random_problem(index: int) -> cb.Problem:
 
 def test_random_dynamics_trace_to_what_they_compute() -> None:
     for index in range(4):
-        problem = random_problem(index)
+        problem = boundless_problem(index)
         x = np.random.default_rng(0).uniform(-1, 1, problem.system.dimension)
         f = random_dynamics(np.random.default_rng([7, index]), problem.system.dimension, index % 2 == 1)
         value = np.asarray(compile_numpy(problem.closed_loop)(0.0, *x))

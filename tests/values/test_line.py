@@ -79,7 +79,7 @@ def test_between_two_limits_it_does_not_matter_that_paths_beyond_them_leave_ever
     """x' = -x + 6 x^3 leaves [-1.2, 1.2] within 1 with a probability in [.0322, .0332] (10^6 simulated paths)."""
     system = cb.ContinuousSystem(lambda x: -x + 6 * x**3, states=1, diffusion=0.3)
     problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.2], [1.2]))], horizon=1.0)
-    found = bound_exits(problem, seconds=0.5)
+    found = bound_exits(problem, seconds=0.2)
     assert found.lower is not None
     assert math.log10(0.031) < found.lower < math.log10(0.0332)
     assert math.log10(0.0322) < found.upper < math.log10(0.0345)

@@ -23,7 +23,7 @@ def drawn(rng, states):
 
 
 def bounds(problem):
-    return bound_failure(until(problem, problem.horizon), target=problem.reach.region, seconds=1.5)
+    return bound_failure(until(problem, problem.horizon), target=problem.reach.region, seconds=0.5)
 
 
 def check(problem, seed):

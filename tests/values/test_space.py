@@ -149,7 +149,7 @@ def test_wrong_proposals_only_cost_tightness(size: float, factor: float) -> None
 def test_a_product_of_lines_is_bounded_within_its_factor() -> None:
     sigmas = (0.7, 0.5, 0.3)
     truth = 1 - math.prod(stays(sigma, 0.5) for sigma in sigmas)
-    found = bound_exits(brownian(sigmas), seconds=1.0)
+    found = bound_exits(brownian(sigmas), seconds=0.3)
     assert truth <= 10**found.upper <= 2.8 * truth
     assert found.lower is None
     assert "three states" in found.words

@@ -90,7 +90,7 @@ def test_a_ball_in_one_state_counts_without_what_rounding_adds_to_it() -> None:
     system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=0.4)
     ball, box = (
         bound_exits(
-            cb.Problem(system, initial=start, safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1), seconds=1.0, lower=True
+            cb.Problem(system, initial=start, safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1), seconds=0.3, lower=True
         )
         for start in (cb.Ball([0.1], 0.2), cb.Box([-0.1], [0.3]))
     )

@@ -24,6 +24,7 @@ from types import ModuleType
 from typing import Any
 
 from certbound._version import __version__
+from certbound.lazy import uncollected
 from certbound.watch import undisturbed
 
 logger = logging.getLogger(__name__)
@@ -109,7 +110,7 @@ def load_kernel(source: str) -> Callable[..., Any]:
     ``@CACHE@`` stands for the cache switch in what `certbound.simulation.kernel_source` writes.
     """
     digest = hashlib.sha256(f"{_fingerprint()}\n{source}".encode()).hexdigest()[:32]
-    with _LOCK, undisturbed():  # numba's registries do not survive an exception while they are filled
+    with _LOCK, undisturbed(), uncollected():  # numba's registries do not survive an exception while they are filled
         if digest not in _LOADED:
             folder = cache_directory()
             try:

@@ -73,7 +73,8 @@ def _extreme_parts(
 ) -> None:
     """Least and largest coefficient of a table over all parts, which ``parts`` lead to from the samples."""
     least, most = np.empty(BLOCK), np.empty(BLOCK)
-    low[:], high[:] = np.inf, -np.inf
+    for s in range(BLOCK):
+        low[s], high[s] = np.inf, -np.inf
     for i in range(parts[0].shape[0]):
         for j in range(parts[1].shape[0]):
             for k in range(parts[2].shape[0]):
@@ -108,8 +109,11 @@ def extremes_in_plane(
     count = coefficients.shape[0]
     for begin in range(0, count, BLOCK):
         for s in range(BLOCK):  # the last patch is repeated where the block is not full
-            c[:, :, :, s] = coefficients[min(begin + s, count - 1)]
-            look[s] = 0.0
+            patch, look[s] = min(begin + s, count - 1), 0.0
+            for i in range(4):
+                for j in range(6):
+                    for k in range(6):
+                        c[i, j, k, s] = coefficients[patch, i, j, k]
         _change(c, t1, x0, y0, one, two, vt)
         _change(c, t0, x1, y0, one, two, vx)
         _change(c, t0, x0, y1, one, two, vy)
@@ -145,10 +149,12 @@ def extremes_in_plane(
                 out[begin + s, branch, 0], out[begin + s, branch, 1] = low[s], high[s]
                 out[begin + s, branch, 3], out[begin + s, branch, 4] = least[s], most[s]
                 look[s] = max(look[s], max(-low[s], high[s]))
-        if look.max() > wanted:
+        top = 0.0
+        for s in range(BLOCK):
+            low[s], top = 0.0, max(top, look[s])
+        if top > wanted:
             _extreme_parts(energy, parts, one, two, result, low, high)
-        else:
-            low[:] = 0.0
         _extreme(energy, least, most)
         for s in range(min(BLOCK, count - begin)):
-            out[begin + s, :, 2], out[begin + s, :, 5] = low[s], max(-least[s], most[s])
+            for branch in range(drift.shape[0]):
+                out[begin + s, branch, 2], out[begin + s, branch, 5] = low[s], max(-least[s], most[s])

@@ -17,10 +17,11 @@ BLOCK = 8
 
 
 @compiled
-def _contract(matrix: Array, table: Array, before: int, after: int, out: Array) -> None:
+def _contract(matrix: Array, table: Array, before: int | np.intp, after: int | np.intp, out: Array) -> None:
     """A matrix along the middle one of three axes, of lengths ``before``, its columns (4 or more) and ``after``.
 
-    The arrays are flat; slices let the compiler see that rows do not overlap.
+    The arrays are flat; slices let the compiler see that rows do not overlap. Numbers that are written out are given
+    as ``np.intp``: numba compiles a function anew for every literal.
     """
     rows, columns = matrix.shape
     for b in range(before):
@@ -71,17 +72,18 @@ def _extreme_parts(
     one, two, slices, last = work
     nt, size = time.shape[1], x.shape[1] * y.shape[1] * z.shape[1]
     least, most = np.empty(BLOCK), np.empty(BLOCK)
-    low[:], high[:] = np.inf, -np.inf
+    for s in range(BLOCK):
+        low[s], high[s] = np.inf, -np.inf
     for i in range(x.shape[0]):
         for j in range(y.shape[0]):
             for k in range(z.shape[0]):
                 for sample in range(nt):
                     own = slice(sample * size * BLOCK, (sample + 1) * size * BLOCK)
-                    _contract(z[k], table[own], x.shape[1] * y.shape[1], BLOCK, one)
+                    _contract(z[k], table[own], x.shape[1] * y.shape[1], np.intp(BLOCK), one)
                     _contract(y[j], one, x.shape[1], z.shape[1] * BLOCK, two)
-                    _contract(x[i], two, 1, y.shape[1] * z.shape[1] * BLOCK, slices[own])
+                    _contract(x[i], two, np.intp(1), y.shape[1] * z.shape[1] * BLOCK, slices[own])
                 for part in range(time.shape[0]):
-                    _contract(time[part], slices, 1, size * BLOCK, last)
+                    _contract(time[part], slices, np.intp(1), size * BLOCK, last)
                     _extreme(last, nt * size, least, most)
                     for s in range(BLOCK):
                         low[s], high[s] = min(low[s], least[s]), max(high[s], most[s])
@@ -93,44 +95,47 @@ def _derivatives(
 ) -> None:
     """V_t, V_x, V_y, V_z, V_xx, V_yy, V_zz (and V_xy, V_xz, V_yz) at the samples of space, in the cell's units."""
     x0, x1, x2, y0, y1, y2, z0, z1, z2 = axes
+    four, one, eight = np.intp(4), np.intp(1), np.intp(BLOCK)
     za, zb, zc, yy = work
     ny, nz = y0.shape[0], z0.shape[0]
     deep, wide = nz * BLOCK, ny * nz * BLOCK
-    _contract(z0, rate, 16, BLOCK, za)
-    _contract(y0, za, 4, deep, yy)
-    _contract(x0, yy, 1, wide, out[0])
-    _contract(z0, c, 16, BLOCK, za)
-    _contract(z1, c, 16, BLOCK, zb)
-    _contract(z2, c, 16, BLOCK, zc)
-    _contract(y0, za, 4, deep, yy)
-    _contract(x1, yy, 1, wide, out[1])
-    _contract(x2, yy, 1, wide, out[4])
-    _contract(y1, za, 4, deep, yy)
-    _contract(x0, yy, 1, wide, out[2])
+    _contract(z0, rate, four * four, eight, za)
+    _contract(y0, za, four, deep, yy)
+    _contract(x0, yy, one, wide, out[0])
+    _contract(z0, c, four * four, eight, za)
+    _contract(z1, c, four * four, eight, zb)
+    _contract(z2, c, four * four, eight, zc)
+    _contract(y0, za, four, deep, yy)
+    _contract(x1, yy, one, wide, out[1])
+    _contract(x2, yy, one, wide, out[4])
+    _contract(y1, za, four, deep, yy)
+    _contract(x0, yy, one, wide, out[2])
     if mixed:
-        _contract(x1, yy, 1, wide, out[7])
-    _contract(y2, za, 4, deep, yy)
-    _contract(x0, yy, 1, wide, out[5])
-    _contract(y0, zb, 4, deep, yy)
-    _contract(x0, yy, 1, wide, out[3])
+        _contract(x1, yy, one, wide, out[7])
+    _contract(y2, za, four, deep, yy)
+    _contract(x0, yy, one, wide, out[5])
+    _contract(y0, zb, four, deep, yy)
+    _contract(x0, yy, one, wide, out[3])
     if mixed:
-        _contract(x1, yy, 1, wide, out[8])
-        _contract(y1, zb, 4, deep, yy)
-        _contract(x0, yy, 1, wide, out[9])
-    _contract(y0, zc, 4, deep, yy)
-    _contract(x0, yy, 1, wide, out[6])
+        _contract(x1, yy, one, wide, out[8])
+        _contract(y1, zb, four, deep, yy)
+        _contract(x0, yy, one, wide, out[9])
+    _contract(y0, zc, four, deep, yy)
+    _contract(x0, yy, one, wide, out[6])
 
 
 @compiled
-def _gathered(table: Array, output: int, cells: Index, sample: int, scale: Array, out: Array) -> None:
-    """One output of a table (outputs, cells, 1 or t, samples) for the cells of a block, scaled, lanes last."""
+def _gathered(
+    table: Array, output: int, cells: Index, sample: int, factor: float, one: Array, two: Array, out: Array
+) -> None:
+    """An output of a table (outputs, cells, 1 or t, samples) for a block's cells times factor one two, lanes last."""
     own = min(sample, table.shape[2] - 1)
     if sample > own:
         return
     for s in range(BLOCK):
-        row = table[output, cells[s], own]
+        scale = factor * one[s] * two[s]
         for p in range(table.shape[3]):
-            out[p * BLOCK + s] = row[p] * scale[s]
+            out[p * BLOCK + s] = table[output, cells[s], own, p] * scale
 
 
 @compiled
@@ -156,15 +161,15 @@ def _residual(v: Array, drift: Array, square: Array, mixed: bool, out: Array, en
 def _model(
     drift: Array, square: Array, cells: Index, sample: int, sides: Array, mixed: bool, force: Array, spread: Array
 ) -> None:
-    """f_i / h_i, a_ii / (2 h_i^2) and a_ij / (h_i h_j) at the samples, so that V's derivatives are those on [0, 1]."""
+    """f_i / h_i, a_ii / (2 h_i^2) and a_ij / (h_i h_j) at the samples, so that V's derivatives are those on [0, 1].
+
+    ``sides`` holds the four inverse sides of each patch, and ones.
+    """
     for output in range(len(drift)):
-        _gathered(drift, output, cells, sample, sides[1 + output % 3], force[output])
-    for axis in range(3):
-        _gathered(square, 4 * axis, cells, sample, 0.5 * sides[1 + axis] * sides[1 + axis], spread[axis])
-    if mixed:
-        _gathered(square, 1, cells, sample, sides[1] * sides[2], spread[3])
-        _gathered(square, 2, cells, sample, sides[1] * sides[3], spread[4])
-        _gathered(square, 5, cells, sample, sides[2] * sides[3], spread[5])
+        _gathered(drift, output, cells, sample, 1.0, sides[1 + output % 3], sides[4], force[output])
+    for k in range(6 if mixed else 3):
+        i, j = (k, k) if k < 3 else (0, k - 2) if k < 5 else (1, 2)
+        _gathered(square, 3 * i + j, cells, sample, 0.5 if k < 3 else 1.0, sides[1 + i], sides[1 + j], spread[k])
 
 
 @compiled
@@ -183,7 +188,7 @@ def extremes_in_space(
     axes = bases[2:]
     nt, nx, ny, nz = t0.shape[0], bases[2].shape[0], bases[5].shape[0], bases[8].shape[0]
     size = nx * ny * nz
-    c, now, rate = np.empty((4, 64, BLOCK)), np.empty(64 * BLOCK), np.empty(64 * BLOCK)
+    c, now, rate = np.empty(256 * BLOCK), np.empty(64 * BLOCK), np.empty(64 * BLOCK)
     stages = (np.empty(16 * nz * BLOCK), np.empty(16 * nz * BLOCK), np.empty(16 * nz * BLOCK),
               np.empty(4 * ny * nz * BLOCK))  # fmt: skip
     v = np.zeros((10, size * BLOCK))
@@ -191,17 +196,22 @@ def extremes_in_space(
     tables, energy = np.empty((drift.shape[0] // 3, nt * size * BLOCK)), np.empty(nt * size * BLOCK)
     work = (np.empty(size * BLOCK), np.empty(size * BLOCK), np.empty(nt * size * BLOCK), np.empty(nt * size * BLOCK))
     low, high, look = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-    least, most, cells, sides = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, dtype=np.intp), np.empty((4, BLOCK))
+    least, most, cells, sides = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, dtype=np.intp), np.ones((5, BLOCK))
     count = coefficients.shape[0]
     for begin in range(0, count, BLOCK):
         for s in range(BLOCK):  # the last patch is repeated where the block is not full
             patch = min(begin + s, count - 1)
-            c[:, :, s], cells[s], sides[:, s], look[s] = coefficients[patch], place[patch], inverse[:, patch], 0.0
+            cells[s], look[s] = place[patch], 0.0
+            for i in range(4):
+                sides[i, s] = inverse[i, patch]
+                for k in range(64):
+                    c[(i * 64 + k) * BLOCK + s] = coefficients[patch, i, k]
         for sample in range(nt):
-            _contract(t0[sample : sample + 1], c.reshape(-1), 1, 64 * BLOCK, now)
-            _contract(t1[sample : sample + 1], c.reshape(-1), 1, 64 * BLOCK, rate)
-            for s in range(BLOCK):
-                rate[s::BLOCK] *= sides[0, s]
+            _contract(t0[sample : sample + 1], c, np.intp(1), 64 * BLOCK, now)
+            _contract(t1[sample : sample + 1], c, np.intp(1), 64 * BLOCK, rate)
+            for k in range(64):
+                for s in range(BLOCK):
+                    rate[k * BLOCK + s] *= sides[0, s]
             _derivatives(now, rate, axes, mixed, stages, v)
             _model(drift, square, cells, sample, sides, mixed, force, spread)
             own = slice(sample * size * BLOCK, (sample + 1) * size * BLOCK)
@@ -213,10 +223,12 @@ def extremes_in_space(
                 out[begin + s, branch, 0], out[begin + s, branch, 1] = low[s], high[s]
                 out[begin + s, branch, 3], out[begin + s, branch, 4] = least[s], most[s]
                 look[s] = max(look[s], max(-low[s], high[s]))
-        if look.max() > wanted:
+        top = 0.0
+        for s in range(BLOCK):
+            low[s], top = 0.0, max(top, look[s])
+        if top > wanted:
             _extreme_parts(energy, parts, work, low, high)
-        else:
-            low[:] = 0.0
         _extreme(energy, nt * size, least, most)
         for s in range(min(BLOCK, count - begin)):
-            out[begin + s, :, 2], out[begin + s, :, 5] = low[s], max(-least[s], most[s])
+            for branch in range(len(tables)):
+                out[begin + s, branch, 2], out[begin + s, branch, 5] = low[s], max(-least[s], most[s])

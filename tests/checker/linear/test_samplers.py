@@ -16,6 +16,8 @@ from certbound.checker.linear.samplers import Sampler
 from certbound.errors import CertificateError
 from certbound.safety.certificate import certificate_data, problem_data
 
+HOLDS = 3
+
 
 def lane(hold: float | None = 0.2, gain: float = 0.8) -> cb.Problem:
     system = cb.ContinuousSystem(
@@ -23,7 +25,7 @@ def lane(hold: float | None = 0.2, gain: float = 0.8) -> cb.Problem:
         diffusion=0.03 * np.eye(2),
     )
     return cb.Problem(
-        system, initial=[0.2, 0], safe=[cb.Inside(cb.Box([-0.6], [0.6], coordinates=[0]))], horizon=1, delta=1e-3,
+        system, initial=[0.2, 0], safe=[cb.Inside(cb.Box([-0.6], [0.6], coordinates=[0]))], horizon=0.6, delta=1e-3,
         plan=lambda x: 0.5 * np.tanh(-gain * x[0] - 1.5 * x[1]), hold=hold,
     )
 
@@ -71,7 +73,7 @@ def test_slopes_and_nominal_of_a_sampling_time_are_looked_at() -> None:
     slopes = [[(2.0).hex() for _ in row] for row in cell["sampled"]]
     assert not check_data(forged("proof", "cells", 0, "sampled", value=slopes)).valid
     nominal = copy.deepcopy(cell["nominal"])
-    for k in range(stated()["proof"]["pieces"] // 5):  # of the first hold: another input than the law's
+    for k in range(stated()["proof"]["pieces"] // HOLDS):  # of the first hold: another input than the law's
         for point in nominal[k]:
             point[2] = (0.4).hex()
     assert not check_data(forged("proof", "cells", 0, "nominal", value=nominal)).valid

@@ -50,6 +50,7 @@ from tests.checker.conftest import (
     shaken,
     side_of,
     squared,
+    squared_certificate,
     started,
     valued,
     valued_plane,
@@ -360,7 +361,7 @@ def test_starts_that_are_stated_by_a_box_around_them_have_no_certificate_from_be
 
 def test_quadratic_bounds_prove_about_what_the_engine_found() -> None:
     problem = squared()
-    data = parse(quadratic_certificate(problem))
+    data = parse(squared_certificate())
     report = check_data(data, json.loads(json.dumps(problem_data(problem))))
     assert report.valid, report.reason
     assert data["claim"]["method"] == "quadratic"
@@ -377,7 +378,7 @@ def test_forms_are_bounded_over_boxes_about_zero() -> None:
 
 
 def test_many_quadratic_bounds_are_not_all_unpacked() -> None:
-    data = parse(quadratic_certificate(squared()))
+    data = parse(squared_certificate())
     counted = patch.object(quadratic, "_Value", wraps=quadratic._Value)
     with patch.object(quadratic, "MOST_NUMBERS", 3000), counted as made:
         assert check_data(data).valid
@@ -409,8 +410,7 @@ def test_what_is_missing_of_a_curved_drift_is_proved_again_without_more_room() -
 
 def test_a_ball_of_starts_has_a_bound_of_its_own() -> None:
     """Against V at points of the ball; its corners, which lie outside, are left aside."""
-    problem = squared()
-    data = parse(quadratic_certificate(problem))
+    data = parse(squared_certificate())
     with patch.object(quadratic, "_at_corners", lambda *_: arb(1)):
         found = check_data(data).log10_proved
     assert found is not None
@@ -545,7 +545,7 @@ def test_lam_of_the_file_proves_nothing(exiting: str) -> None:
 
 def test_a_door_writes_what_the_checker_proves() -> None:
     problem = leaving()
-    data = parse(exit_certificate(problem))
+    data = parse(exit_certificate(leaving))
     assert data["claim"]["method"] == "values"
     report = check_data(data, json.loads(json.dumps(problem_data(problem))))
     assert report.valid, report.reason

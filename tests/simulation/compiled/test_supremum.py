@@ -19,7 +19,8 @@ def records(stream, values, top, spread, paths):
     found = np.empty(paths)
     track = np.empty(len(values))
     for path in range(paths):
-        track[:] = values
+        for k in range(len(values)):
+            track[k] = values[k]
         found[path] = raise_top(stream, track, len(values) - 1, top, spread, 40.0)
     return found
 

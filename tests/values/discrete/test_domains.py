@@ -69,7 +69,7 @@ def truth(problem, horizon=8):
 @pytest.mark.parametrize("text", [GAUSSIAN, UNIFORM], ids=["gaussian", "uniform"])
 def test_who_leaves_the_domain_has_ended(text):
     problem = loads(text)
-    found, exact = bound_failure(problem, seconds=1), truth(problem)
+    found, exact = bound_failure(problem, seconds=0.3), truth(problem)
     slack = 0.0 if problem.system.noise.gaussian else 0.004  # Gauss's rule across jumps
     assert found.lower - slack <= exact <= found.upper + slack
     assert found.upper <= 1.1 * found.lower

@@ -152,11 +152,10 @@ def _running(field: Array, first: Index, last: Index) -> Array:
     """Largest along the first axis of members first[i] : last[i]."""
     found = np.empty_like(field)
     for i in range(len(field)):
-        found[i] = field[first[i]]
-        for m in range(first[i] + 1, last[i]):
+        for m in range(first[i], max(last[i], first[i] + 1)):
             for j in range(field.shape[1]):
                 for k in range(field.shape[2]):
-                    found[i, j, k] = max(found[i, j, k], field[m, j, k])
+                    found[i, j, k] = field[m, j, k] if m == first[i] else max(found[i, j, k], field[m, j, k])
     return found
 
 
@@ -173,8 +172,9 @@ def _largest(field: Array, window: Index) -> float:
 @compiled
 def _at_plane(field: Array, window: Index, axis: int, plane: int) -> float:
     """Largest kink at a plane across a window."""
-    part = window.copy()
-    part[2 * axis], part[2 * axis + 1] = plane, plane
+    part = np.empty(6, dtype=np.intp)
+    for k in range(6):
+        part[k] = plane if k // 2 == axis else window[k]
     return _largest(field, part)
 
 
@@ -227,6 +227,18 @@ def _excess(
 
 
 @compiled
+def _ends(values: Array, found: Array) -> None:
+    """Write the least and the largest of ``values`` to the first two of ``found``; what is no number stays so."""
+    least, most = values[0], values[0]
+    for value in values:
+        if value < least or value != value:
+            least = value
+        if value > most or value != value:
+            most = value
+    found[0], found[1] = least, most
+
+
+@compiled
 def _sides(part: Array, axis: int, low: Array, high: Array) -> None:
     """Fill ``low`` and ``high`` with the corners at the two ends of an axis."""
     for one in range(2):
@@ -262,7 +274,8 @@ def over_images(
     corner = np.empty((3, 2, 2, 2))
     close = np.empty(6, dtype=np.intp)
     first, last, rate, bow, local = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 2)), np.empty(3), np.empty(6)
-    width, low, high = np.empty(3), np.empty(4), np.empty(4)
+    width, low, high, move, ends = np.empty(3), np.empty(4), np.empty(4), np.empty(4), np.empty(2)
+    corners = corner.reshape(3, 8)
     for i in range(shape[0]):
         for j in range(shape[1]):
             for k in range(shape[2]):
@@ -288,7 +301,8 @@ def over_images(
                     for a in range(3):
                         sag += bends[b, a, a, bi, bj, bk] * width[a] ** 2 / 8
                     mesh = x if b == 0 else (y if b == 1 else q)
-                    least, most = corner[b].min() - sag, corner[b].max() + sag
+                    _ends(corners[b], ends)
+                    least, most = ends[0] - sag, ends[1] + sag
                     if least - reach[b] < mesh[0] or most + reach[b] > mesh[-1]:
                         fine = False
                         break
@@ -313,13 +327,17 @@ def over_images(
                             if e != a:
                                 sag += bends[b, e, e, bi, bj, bk] * width[e] ** 2 / 8
                         _sides(corner[b], a, low, high)
-                        first[b, 0], first[b, 1] = low.min() - sag, low.max() + sag
-                        last[b, 0], last[b, 1] = high.min() - sag, high.max() + sag
-                        move = high - low
+                        for c in range(4):
+                            move[c] = high[c] - low[c]
+                        _ends(low, ends)
+                        first[b, 0], first[b, 1] = ends[0] - sag, ends[1] + sag
+                        _ends(high, ends)
+                        last[b, 0], last[b, 1] = ends[0] - sag, ends[1] + sag
+                        _ends(move, ends)
                         most = growth[b, a, bi, bj, bk] * width[a]
                         own = width[a] if a == b else 0.0
-                        rate[b, 0] = max(move.min() - vary, own - most)
-                        rate[b, 1] = min(move.max() + vary, own + most)
+                        rate[b, 0] = max(ends[0] - vary, own - most)
+                        rate[b, 1] = min(ends[1] + vary, own + most)
                         if a != b and most == 0.0:
                             rate[b, 0], rate[b, 1] = 0.0, 0.0
                     excess[i, j, k] += _excess(
