@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from certbound.errors import InfeasibleError
 from certbound.quadratic import bound_quadratic
 from certbound.quadratic.setting import make_setting, safe_sides
 from certbound.quadratic.surroundings import working_box
+from certbound.safety.answers import Request
 from certbound.safety.engines import quadratic_engine
+from certbound.watch import Watch
 
 PUSHED = cb.ContinuousSystem(lambda x: [x[1], -x[0] - x[1]], states=["p", "v"], diffusion=[[0.0], [0.3]])
 
@@ -99,6 +102,24 @@ def test_what_is_not_served_is_an_answer(problem: cb.Problem, reason: str) -> No
     answer = quadratic_engine(problem)
     assert not answer.applicable
     assert reason in answer.reason
+
+
+@pytest.mark.parametrize(("limit", "thorough", "most"), [(40, True, 40), (40, False, 5), (None, True, 20)])
+def test_who_asks_for_it_alone_gives_it_all_of_his_time(
+    monkeypatch: pytest.MonkeyPatch, limit: float | None, thorough: bool, most: float
+) -> None:
+    granted: list[float] = []
+
+    def bounded(problem: cb.Problem, *, seconds: float, **options: Any) -> Any:
+        granted.append(seconds)
+        raise InfeasibleError("nothing")
+
+    monkeypatch.setattr(sys.modules[quadratic_engine.__module__], "bound_quadratic", bounded)
+    cooling = cb.ContinuousSystem(lambda x: [-x[0], -x[1], -x[2]], states=3, diffusion=0.1 * np.eye(3))
+    with Watch(limit).running():
+        quadratic_engine(of([cb.Inside(cb.Box([-1] * 3, [1] * 3))], system=cooling, initial=[0] * 3),
+                         Request(thorough=thorough))  # fmt: skip
+    assert granted[0] == pytest.approx(most, abs=0.5)
 
 
 def test_discrete_time_is_not_served() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.quadratic import QuadraticBound, bound_quadratic
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.watch import seconds_left
 
-_SECONDS = 20.0  # about what may be spent
+_SECONDS = 20.0  # about what may be spent, but by who asks for this engine alone, with a limit of his own
 _SPARED = {3: 5.0, 12: 18.0}  # the same, by the number of states, where other engines are asked too
 _LEAST = 0.1
 _ANY = 0.999  # a target that any bound meets
@@ -27,7 +29,9 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
         return EngineAnswer(applicable=False, method="quadratic", reason=reason)
     try:
         most = next((most for n, most in _SPARED.items() if problem.system.dimension <= n), _SECONDS)
-        limit = max(min(_SECONDS if asked.thorough else most, seconds_left()), _LEAST)
+        left = seconds_left()
+        named = asked.thorough and problem.system.dimension >= _FEW and left < math.inf
+        limit = max(left if named else min(_SECONDS if asked.thorough else most, left), _LEAST)
         best = bound_quadratic(
             problem, target=_ANY if asked.first else problem.delta, seconds=limit, before=asked.before,
             found=lambda bound: asked.found(_answer(bound)),
