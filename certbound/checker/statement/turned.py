@@ -179,7 +179,7 @@ class _Writer:
         if op == "neg":
             return self.total([(-one, given[0])])
         for factor, other in (given, given[::-1]) if op == "mul" else ():
-            if not factor[0]:
+            if not factor[0] and factor[1]:
                 return self.total([(factor[1], other)])
         if op == "div" and not given[1][0] and given[1][1] and _is_float(1 / given[1][1]):
             return self.total([(1 / given[1][1], given[0])])

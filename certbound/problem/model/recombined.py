@@ -106,7 +106,7 @@ class _Sums:
 
         def product(a: Sum, b: Sum) -> Sum:
             for one, other in ((a, b), (b, a)):
-                if not one.terms:
+                if not one.terms and one.constant:
                     return self.combined([(one.constant, other)])
             found: Sum = times(a, b)
             return found

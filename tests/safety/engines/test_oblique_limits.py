@@ -178,3 +178,11 @@ def test_sums_whose_coefficients_are_no_floats_are_left_as_they_stand() -> None:
     found, rows = turned_tape(tape, np.eye(2), np.array([[1.0, 1.0], [0.0, 1.0]]))
     assert rows == [None, None]
     np.testing.assert_allclose(compile_numpy(found)(0.0, 1.0, 2.0), [0.1 + 0.7 * 2.1, 0.7 * 2.1], rtol=1e-15)
+
+
+def test_what_is_not_defined_stays_so_where_its_factor_is_zero() -> None:
+    tape = cb.ContinuousSystem(lambda x: [0.0 * np.log(x[0]) + x[1], -x[0]], states=2).dynamics
+    found = compile_numpy(turned_tape(tape, np.eye(2), np.array([[1.0, 1.0], [0.0, 1.0]]))[0])
+    with np.errstate(invalid="ignore"):
+        assert np.isnan(found(0.0, -1.0, 2.0)[0]) == np.isnan(compile_numpy(tape)(0.0, -1.0, 2.0)[0])
+    np.testing.assert_allclose(found(0.0, 1.0, 2.0), [1.0, -1.0])
