@@ -48,7 +48,8 @@ def explain(error: Exception, command: str) -> tuple[int, str, str]:
     if isinstance(error, InputError):
         return BAD_INPUT, error.why, error.cure
     if isinstance(error, (SolverError, InfeasibleError)):
-        return FAILED, why, cure or "try another --method or a smaller problem; --verbose shows the details"
+        other = "another --method or " if command in ("verify", "synthesize") else ""
+        return FAILED, why, cure or f"try {other}a smaller problem; --verbose shows the details"
     if isinstance(error, (EnclosureError, CertificateError)):
         return BAD_INPUT, why, cure or help_line
     if isinstance(error, SyntaxError):

@@ -177,7 +177,10 @@ def _check(problem: Problem) -> None:
     if problem.ending:
         raise InfeasibleError("exit times count leaving the domain as an exit; leave `leaving` out.")
     if problem.system.dimension != 1:
-        raise InfeasibleError(f"exit times are bounded in one state, the problem has {problem.system.dimension}.")
+        raise InfeasibleError(
+            f"exit times are bounded in one state, the problem has {problem.system.dimension}; sweep over the horizon "
+            "(`certbound sweep --over horizon=A:B:N`) for bounds at single times."
+        )
     if len(problem.starts) > 1 or problem.initial.random:
         raise InfeasibleError("exit times need one set of starts; take the members of a union one by one.")
     if problem.unknown:

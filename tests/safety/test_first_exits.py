@@ -235,3 +235,10 @@ def test_a_command_whose_time_is_over_before_anything_is_proved_says_so(monkeypa
     said = capsys.readouterr()
     assert "--time-limit" in json.loads(said.out)["error"] + json.loads(said.out)["try"]
     assert "Traceback" not in said.err
+
+
+def test_a_command_without_methods_does_not_speak_of_them(capsys):
+    assert run(["exit-times", "unicycle"]) == 3
+    said = capsys.readouterr().err
+    assert "certbound sweep --over horizon" in said
+    assert "--method" not in said
