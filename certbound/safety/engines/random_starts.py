@@ -6,6 +6,7 @@ chi-squared variable of n degrees of freedom, P(X_0 outside E) = Q(n / 2, r^2 / 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from flint import arb
 
+from certbound.errors import EngineError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Ellipsoid
 from certbound.rigor.balls import precision, upper
@@ -20,12 +22,17 @@ from certbound.safety.answers import EngineAnswer, Request
 
 Prove = Callable[[Problem, Request], EngineAnswer]
 
-_SHARE = 0.1  # of delta, at most, for starts outside the ellipsoid
+_SHARES = (0.1, 0.3, 0.7)  # of delta, at most, for starts outside the ellipsoid: the first that is a safe start
 _WIDER = (1e-9, 1e-12)  # of the covariance, of its trace: more than rounding can take away
 
 
 def truncated(problem: Problem) -> tuple[Problem, float]:
     """The problem from an ellipsoid of starts, with what is left of delta, and the mass outside, rounded up.
+
+    Raises
+    ------
+    EngineError
+        If no ellipsoid that holds enough of the starts keeps the constraints that are due at time 0.
 
     Examples
     --------
@@ -37,17 +44,28 @@ def truncated(problem: Problem) -> tuple[Problem, float]:
     >>> round(float(np.sqrt(inner.initial.shape[0, 0])), 4), 0.998e-4 < outside < 1e-4
     (0.4292, True)
     """
+    if np.trace(problem.initial.covariance) == 0:
+        return problem.replace(initial=Box(problem.initial.mean, problem.initial.mean)), 0.0
+    for share in _SHARES:
+        with contextlib.suppress(ValueError):
+            return _within(problem, share)
+    raise EngineError(
+        f"the ellipsoid that holds all but {_SHARES[-1] * float(problem.delta):.2g} of the random start breaks a "
+        "constraint at time 0; give a larger delta, or a start that spreads less."
+    )
+
+
+def _within(problem: Problem, share: float) -> tuple[Problem, float]:
+    """The same, with a part of delta for starts outside; ValueError where the ellipsoid breaks a constraint."""
     from scipy.stats import chi2
 
     start, delta = problem.initial, float(problem.delta)
     covariance, trace = start.covariance, float(np.trace(start.covariance))
-    if trace == 0:
-        return problem.replace(initial=Box(start.mean, start.mean)), 0.0
-    square = float(chi2.isf(0.999 * _SHARE * delta, start.dimension))
+    square = float(chi2.isf(0.999 * share * delta, start.dimension))
     shape = square * ((1 + _WIDER[0]) * covariance + _WIDER[1] * trace * np.eye(start.dimension))
     with precision():
         outside = upper((arb(square) / 2).gamma_upper(arb(start.dimension) / 2, 1))
-    return problem.replace(initial=Ellipsoid(start.mean, shape), delta=float(f"{(1 - _SHARE) * delta:.12g}")), outside
+    return problem.replace(initial=Ellipsoid(start.mean, shape), delta=float(f"{(1 - share) * delta:.12g}")), outside
 
 
 def prove_truncated(prove: Prove, problem: Problem, request: Request) -> EngineAnswer:

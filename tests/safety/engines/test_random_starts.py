@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.errors import CertificateError
+from certbound.errors import CertificateError, EngineError
 from certbound.safety.certificate import certificate_data
 from certbound.safety.engines.random_starts import truncated
 
@@ -28,6 +28,17 @@ def test_what_lies_outside_is_as_rare_as_stated(covariance, rank: int) -> None:
     assert missed <= outside + 4 * np.sqrt(outside / len(points))
     assert missed >= 0.9 * outside or rank < 2
     assert outside + inner.delta <= problem.delta
+
+
+def test_near_a_limit_less_of_the_start_is_held_and_more_of_delta_is_spent_on_the_rest() -> None:
+    inner, outside = truncated(spinning(0.65**2 * np.eye(2), 0.2))
+    assert inner.delta == pytest.approx(0.06)
+    assert outside == pytest.approx(0.14, rel=2e-3)
+    assert outside < 0.14
+    with pytest.raises(EngineError, match="holds all but 0.14 of the random start breaks a constraint at time 0; give"):
+        truncated(spinning(0.8**2 * np.eye(2), 0.2))
+    verdict = cb.verify_safety(spinning(0.8**2 * np.eye(2), 0.2), method="quadratic")
+    assert "failed" not in verdict.reason
 
 
 def test_a_start_that_is_not_random_after_all_is_a_point() -> None:
