@@ -140,13 +140,15 @@ class _Moving:
 
     found: MovingConstants
     delta: float
+    left: float  # log10 of the probability that paths leave the boxes where the rates hold
     states: list[str]
     radius: float
     standing_radius: float  # by the constants of the metric that stands still
 
     def describe(self) -> dict[str, Any]:
         names = ("times", "rate", "sigma", "effective_dimension", "integral", "frames")
-        return {**attributes(self.found, *names), **attributes(self, "delta", "states", "radius", "standing_radius")}
+        own = attributes(self, "delta", "states", "radius", "standing_radius")
+        return {**attributes(self.found, *names), **own, "log10_left": self.left}
 
 
 Found = tuple["Constants", dict[int, "Constants"], str, _Moving | None]
@@ -197,16 +199,19 @@ def _search(subject: Problem, asked: _Asked, found: list[Found]) -> None:
         if subject.domain is not None:
             raise
         _log.info("no constants hold everywhere: %s", error)
-    constants, where, boxes = _local(subject)
+    constants, where, boxes, left = _local(subject)
     where = f"{where} (no constants hold on all of R^n)"
     found.append((constants, {}, where, None))
-    if constants.continuous and constants.dimension > 1:
+    if left is not None and constants.continuous and constants.dimension > 1:
         with contextlib.suppress(ArithmeticError, InfeasibleError, ValueError):
-            found.append((constants, {}, where, _moving(subject, constants, boxes)))
+            found.append((constants, {}, where, _moving(subject, constants, boxes, left)))
 
 
-def _moving(subject: Problem, constants: Constants, boxes: Interval) -> _Moving:
-    """The same in coordinates that move, which make the deviation small where constraints ask about it."""
+def _moving(subject: Problem, constants: Constants, boxes: Interval, left: float) -> _Moving:
+    """The same in coordinates that move, which make the deviation small where constraints ask about it.
+
+    A tube by them holds but for delta and the probability that paths leave the boxes.
+    """
     from certbound.constants.fitted import moving_constants_along
     from certbound.tubes.tuning import tune_tube
 
@@ -218,7 +223,7 @@ def _moving(subject: Problem, constants: Constants, boxes: Interval) -> _Moving:
     radius = found.extent(tune_tube(found.constants(), horizon=end, delta=delta), rows)
     standing = tune_tube(constants, horizon=end, delta=delta).bound(0.0, end) * constants.norm.section(rows)
     names = [subject.system.states[k] for k in asked]
-    return _Moving(found, delta, names, float(np.max(radius)), float(standing))
+    return _Moving(found, delta, left, names, float(np.max(radius)), float(standing))
 
 
 def _states_asked(subject: Problem) -> list[int]:
@@ -231,8 +236,11 @@ def _states_asked(subject: Problem) -> list[int]:
     return sorted(asked) or list(range(subject.system.dimension))
 
 
-def _local(subject: Problem) -> tuple[Constants, str, Interval]:
-    """Constants along the reach tube with noise (Thm K4), or without where none was proved; and where they hold."""
+def _local(subject: Problem) -> tuple[Constants, str, Interval, float | None]:
+    """Constants along the reach tube with noise (Thm K4), or without where none was proved; and where they hold.
+
+    Last the log10 of the probability that a path leaves the boxes; None where they have no room for the noise.
+    """
     from certbound.constants.fitted import fitted_constants_along
     from certbound.reach import bound_reach
     from certbound.rigor.intervals import Interval
@@ -261,7 +269,8 @@ def _local(subject: Problem) -> tuple[Constants, str, Interval]:
         times = np.append(times, reach.curve.ends[-1])
     else:
         boxes = Interval(boxes.lo[:-1], boxes.hi[:-1])
-    return fitted_constants_along(subject, times, boxes), where, boxes
+    left = reach.log10_delta if reach.noise else None
+    return fitted_constants_along(subject, times, boxes), where, boxes, left
 
 
 def _print(constants: Constants, moving: _Moving | None, result: dict[str, Any]) -> None:
@@ -281,8 +290,9 @@ def _print(constants: Constants, moving: _Moving | None, result: dict[str, Any])
         whole = float(np.diff(moving.found.times) @ np.broadcast_to(constants.slope, moving.found.rate.shape))
         screen.print(
             f"in coordinates that move with the trajectory the rate integrates to {moving.found.integral:.4g}, not "
-            f"{whole:.4g}: at delta = {moving.delta:g} a tube stays within {moving.radius:.4g} in "
-            f"{', '.join(moving.states)}, not {moving.standing_radius:.4g} (no certificate states such coordinates)",
+            f"{whole:.4g}: but for {moving.delta:g} and {log10_text(moving.left, ulps=2)} for leaving that set, paths "
+            f"stay within {moving.radius:.4g} of the noise-free one in {', '.join(moving.states)}, not "
+            f"{moving.standing_radius:.4g} (no certificate states such coordinates)",
             markup=False,
         )
     if not result["metrics"]:

@@ -125,6 +125,17 @@ def test_moving_coordinates_are_shown_and_drawn_where_constants_are_local(tmp_pa
     assert run(["derive", str(path), "--json", "--plot", str(picture)]) == 0
     moving = json.loads(capsys.readouterr().out)["moving"]
     assert moving["states"] == ["x"]
+    assert moving["log10_left"] == pytest.approx(-3, abs=0.1)  # paths may leave the boxes, too
     assert 0.0 < moving["radius"] < 0.7 * moving["standing_radius"]
     assert len(moving["rate"]) == len(moving["frames"]) - 1
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_no_radius_is_shown_where_the_boxes_have_no_room_for_the_noise(tmp_path, capsys):
+    """Rates that hold on the noise-free reach set alone say nothing of noisy paths."""
+    path = tmp_path / "plane.toml"
+    path.write_text(PLANE.replace("0.02", "60").replace("0.1*x**2", "0.1*x**3"))
+    assert run(["derive", str(path), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert "no room for the noise" in result["domain"]
+    assert result["moving"] is None
