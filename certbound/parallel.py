@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol, TypeVar
 
 from certbound.errors import EngineError, SolverError
-from certbound.watch import OutOfTime, Watch, poll, seconds_left, silenced
+from certbound.watch import OutOfTime, Watch, poll, seconds_left, silenced, undisturbed
 
 T = TypeVar("T")
 Answer = tuple[Any, BaseException | None]
@@ -120,11 +120,12 @@ class _Copies:
     def begin(self, key: Hashable, task: Callable[[], Any]) -> None:
         ours, theirs = multiprocessing.Pipe(duplex=False)
         process = multiprocessing.get_context("fork").Process(target=_work, args=(task, theirs), daemon=True)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of copies beside a thread that only writes lines
-            process.start()
+        with undisturbed():  # what is interrupted at the fork loses the process, or its locks
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # of copies beside a thread that only writes lines
+                process.start()
+            self._running[ours] = key, process
         theirs.close()
-        self._running[ours] = key, process
 
     def finished(self) -> list[tuple[Any, Answer]]:
         found = []

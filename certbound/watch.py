@@ -266,7 +266,9 @@ def undisturbed() -> Iterator[None]:
 
 
 def silenced() -> None:
-    """Let the watch that runs, if any, tell no more: in a copy of the process."""
+    """Let the watch that runs, if any, tell no more: in a copy of the process, whose own timers are heard."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGALRM})
     watch = _CURRENT.get()
     if watch is not None:
         watch.silence()

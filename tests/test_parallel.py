@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing.context
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -51,6 +53,24 @@ def test_the_end_of_the_time_ends_them_all() -> None:
     with pytest.raises(OutOfTime), watch.running():
         side_by_side([lambda: time.sleep(60), lambda: time.sleep(60)], 2)
     assert time.monotonic() - began < 30
+
+
+def test_a_timer_is_heard_after_the_fork_in_both_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    started = multiprocessing.context.ForkProcess.start
+    seen = []
+
+    def interrupted(process: multiprocessing.context.ForkProcess) -> None:
+        signal.raise_signal(signal.SIGALRM)  # the timer goes off just before the fork
+        seen.append(process)
+        started(process)
+
+    monkeypatch.setattr(multiprocessing.context.ForkProcess, "start", interrupted)
+    with pytest.raises(OutOfTime), Watch(30.0).running():
+        side_by_side([lambda: time.sleep(60)] * 2, 2)
+    assert len(seen) == 1
+    assert not seen[0].is_alive()
+    monkeypatch.undo()
+    assert side_by_side([lambda: signal.pthread_sigmask(signal.SIG_BLOCK, [])] * 2, 2) == [set(), set()]
 
 
 @pytest.fixture(scope="module")

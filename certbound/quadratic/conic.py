@@ -6,7 +6,6 @@ Everything is handed to Clarabel as it stands. What comes back is a proposal; a 
 from __future__ import annotations
 
 import importlib
-import signal
 import time
 from collections.abc import Sequence
 from functools import cache
@@ -16,7 +15,7 @@ import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.parallel import crew, result_of
-from certbound.watch import poll
+from certbound.watch import poll, undisturbed
 
 _ROOT = float(np.sqrt(2.0))
 _LONG, _GRACE = 1e6, 0.3  # squared sizes of all inequalities beyond which a copy of this process solves; seconds
@@ -53,9 +52,7 @@ def block(constant: Array, maps: Sequence[Array]) -> Block:
 @cache
 def _solver_module() -> Any:
     """Clarabel with everything loaded: a timer that interrupts its first solution would leave it broken for good."""
-    alarms = {signal.SIGALRM} if hasattr(signal, "SIGALRM") else set()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, alarms) if alarms else set()
-    try:
+    with undisturbed():
         from scipy import sparse
 
         clarabel = importlib.import_module("clarabel")
@@ -64,9 +61,6 @@ def _solver_module() -> Any:
         eye, one = sparse.csc_matrix(np.eye(3)), np.array([1.0, 0.0, 1.0])
         cone = clarabel.PSDTriangleConeT(2)
         clarabel.DefaultSolver(sparse.csc_matrix((3, 3)), one, -eye, one, [cone], settings).solve()
-    finally:
-        if alarms:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return clarabel
 
 
