@@ -8,6 +8,7 @@ common.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import multiprocessing
 import os
 import threading
@@ -89,8 +90,14 @@ def result_of(answer: Answer) -> Any:
 
 @contextlib.contextmanager
 def alone() -> Iterator[None]:
-    """One thread of linear algebra in the block."""
+    """One thread of linear algebra in the block, or in a function that this decorates.
+
+    Our matrices are small: threads that wait for each other take twice the processor time, and a busy machine's time.
+    """
     from threadpoolctl import threadpool_limits
+
+    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
+        importlib.import_module("scipy.linalg")  # has a library of its own, and only what is loaded is held back
 
     with threadpool_limits(limits=1, user_api="blas"):
         yield

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import certbound as cb
 from certbound.errors import EngineError, SolverError
@@ -71,6 +72,22 @@ def test_a_timer_is_heard_after_the_fork_in_both_processes(monkeypatch: pytest.M
     assert not seen[0].is_alive()
     monkeypatch.undo()
     assert side_by_side([lambda: signal.pthread_sigmask(signal.SIG_BLOCK, [])] * 2, 2) == [set(), set()]
+
+
+def test_a_verdict_has_one_thread_of_linear_algebra_and_gives_the_others_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    def threads() -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    seen: list[set[int]] = []
+    system = cb.linear_system([[-1.0]], diffusion=[[0.1]])
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1)
+    with threadpool_limits(2, "blas"):
+        cb.verify_safety(problem, method="linear", progress=lambda _: seen.append(threads()))
+        after = threads()
+    assert seen
+    assert set.union(*seen) == {1}
+    assert after == {2}
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ input), 3 (a solver or certbound itself failed) and 130 (interrupted).
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -16,6 +17,8 @@ EARLY = "certbound: interrupted\n  why: it had not begun yet; nothing was writte
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and leave with its exit code."""
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # before NumPy is loaded; see `certbound.parallel.alone`
+        os.environ.setdefault(name, "1")
     try:
         from certbound.cli.app import run
 

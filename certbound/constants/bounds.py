@@ -20,10 +20,12 @@ from certbound.constants.model_data import Model, model_of
 from certbound.constants.noise_bounds import bound_noise
 from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import EnclosureError
+from certbound.parallel import alone
 from certbound.rigor.intervals import Interval
 from certbound.tubes.constants import Constants
 
 
+@alone()
 def bound_constants(
     source: Any,
     domain: Any = None,

@@ -27,6 +27,7 @@ from certbound.constants.model_data import model_of
 from certbound.constants.programs import rate_proposals, sampled_polytope
 from certbound.constants.state_jacobian import StateJacobian
 from certbound.errors import EnclosureError, InfeasibleError, SolverError
+from certbound.parallel import alone
 from certbound.problem.model import Tape
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.definite import eigenvalue_upper
@@ -147,6 +148,7 @@ class MovingConstants:
         return np.asarray(upper(upper(upper(np.sqrt(square)) * radius) / lower(1.0 - self._error)))
 
 
+@alone()
 def moving_constants_along(
     source: Any,
     times: ArrayLike,

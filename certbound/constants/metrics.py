@@ -38,7 +38,7 @@ from certbound.constants.programs import (
     rooms_of,
     stated_rooms,
 )
-from certbound.parallel import crew, result_of
+from certbound.parallel import alone, crew, result_of
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box
 from certbound.problem.systems import System
@@ -146,6 +146,7 @@ def improve(
     return best if best.worst_slope < wanted else euclidean
 
 
+@alone()
 def bound_metrics(
     problem: Problem, *, horizon: float | None = None, delta: float | None = None, domain: Any = None, jobs: int = 1
 ) -> tuple[Constants, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from certbound.constants.bounds import bound_constants
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, contained
+from certbound.parallel import alone
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
 from certbound.reach.contraction import (
@@ -29,6 +30,7 @@ _STATISTICAL = ("sampled", "learned")
 """Names of the methods that rest on samples; "auto" never takes them."""
 
 
+@alone()
 def bound_reach(
     problem: Problem, *, noise: bool = True, cells: int | None = None, method: str = "auto", **sampling: Any
 ) -> ReachTube:

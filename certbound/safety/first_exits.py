@@ -20,6 +20,7 @@ from certbound.arrays import Array
 from certbound.checks import vector
 from certbound.display import Shown, rounded
 from certbound.errors import EngineError, InfeasibleError, contained
+from certbound.parallel import alone
 from certbound.problem.goals import check_end
 from certbound.problem.model import sources
 from certbound.problem.problem import Problem
@@ -110,6 +111,7 @@ def _ends_text(low: float, high: float) -> tuple[str, str]:
     return rounded(float(low), up=False, digits=4), rounded(float(high), up=True, digits=4)
 
 
+@alone()
 def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> ExitTimes:
     """Bound P(exit before s) for every s <= T from above and below, and the mean time of leaving.
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from certbound.parallel import alone
 from certbound.problem.problem import Problem
 from certbound.safety.decision import decide
 from certbound.safety.limits import limits_so_far, smaller_verdicts
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from certbound.tubes.constants import Constants
 
 
+@alone()
 def verify_safety(
     problem: Problem, method: str = "auto", cells: int | None = None, *, constants: Constants | None = None,
     time_limit: float | None = None, progress: Callable[[Progress], object] | None = None, smallest: bool = False,

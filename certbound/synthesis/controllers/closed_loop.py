@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array, Mask
+from certbound.parallel import alone
 from certbound.problem.problem import Problem
 from certbound.simulation.blocks import MEMORY_LIMIT
 from certbound.simulation.estimates import bound_binomial, sample_paths, simulate_exits
@@ -37,6 +38,7 @@ class ClosedLoop:
     seconds: float
 
 
+@alone()
 def simulate_closed_loop(
     result: Synthesis,
     *,

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from certbound.constants.matching import check_constants
 from certbound.constants.stated import refuse_contradiction
 from certbound.errors import EnclosureError, InfeasibleError
+from certbound.parallel import alone
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Region
 from certbound.reach.linear import refusal
@@ -31,6 +32,7 @@ from certbound.tubes.tuning import METHODS
 _LOG = logging.getLogger(__name__)
 
 
+@alone()
 def synthesize_plan(
     problem: Problem,
     *,
