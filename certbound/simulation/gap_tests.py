@@ -194,6 +194,12 @@ def _touch(exponent: str, number: int) -> list[str]:
     return [f"if touches(stream, {exponent}):", f"    left = {number}"]
 
 
+def _cross(old: str, new: str, spread: str, number: int, active: Sequence[str]) -> list[str]:
+    """Leave where the bridge between two gaps touches 0."""
+    crossed = f"crossed(stream, {old}, {new}, {spread}, {EXPONENT})"
+    return [if_all("left < 0", *active, crossed), f"    left = {number}"]
+
+
 def _faces(
     number: int, barrier: Barrier, bridge: Bridge | None, p: Parameters, column: int
 ) -> tuple[list[str], list[str], list[str]]:
@@ -258,9 +264,7 @@ def _many_faces(
     else:
         step += [f"{spread} = np.empty({faces})"]
         step += [f"{spread}[{f}] = {bridge.variance(row, p)}" for f, row in enumerate(rows)]
-    near = f"0.0 <= {g}[face] and {g}[face] * {n}[face] < {0.5 * EXPONENT} * {spread}[face]"
-    touch = _touch(f"2.0 * {g}[face] * {n}[face] / {spread}[face]", number)
-    looks = [f"for face in range({faces}):", *indent([if_all("left < 0", near), *indent(touch)])]
+    looks = [f"for face in range({faces}):", *indent(_cross(f"{g}[face]", f"{n}[face]", f"{spread}[face]", number, []))]
     active = window_test(number, barrier, "k")
     step += [if_all(*active), *indent(looks)] if active else looks
     return step, [f"{g}[:] = {n}"]
@@ -273,9 +277,7 @@ def _bridge_stay(
     lines = []
     for g, n, spread in zip(old, new, spreads):
         if not p.is_zero(spread):
-            near = f"0.0 <= {g} and {g} * {n} < {0.5 * EXPONENT} * ({spread})"
-            lines += [if_all(near, "left < 0", *active)]
-            lines += indent(_touch(f"2.0 * {g} * {n} / ({spread})", number))
+            lines += _cross(g, n, spread, number, active)
     return lines
 
 

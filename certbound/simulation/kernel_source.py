@@ -36,7 +36,7 @@ from numba import njit
 
 from certbound.simulation.compiled.elementary import atan2, sincos, tanh
 from certbound.simulation.compiled.streams import draw_{variate}, uniform
-from certbound.simulation.compiled.supremum import STRETCH, bin_of, raise_top, rise_between, touches
+from certbound.simulation.compiled.supremum import STRETCH, bin_of, crossed, raise_top, rise_between, touches
 
 '''
 

@@ -79,6 +79,13 @@ def _touches(stream, exponent):  # type: ignore[no-untyped-def]
     return chance * (1.0 + exponent * (1.0 + 0.5 * exponent)) < 1.0 and chance < math.exp(-exponent)
 
 
+def _crossed(stream, before, after, spread, exponent_limit):  # type: ignore[no-untyped-def]
+    """Whether a bridge between two gaps that are not negative touches 0; one that hardly can draws no variate."""
+    if before >= 0.0 and before * after < 0.5 * exponent_limit * spread:
+        return touches(stream, 2.0 * before * after / spread)
+    return False
+
+
 def _rise_between(stream, before, after, exponent, spread, top):  # type: ignore[no-untyped-def]
     """The record ``top`` with a bridge that exceeds it with probability exp(-e); few need the logarithm."""
     chance = uniform(stream)
@@ -109,5 +116,6 @@ _raise_over = njit(inline="always", error_model="numpy", fastmath={"nnan", "nsz"
 raise_top = njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan", "nsz"})(_raise_top)
 bin_of = inner(_bin_of)
 touches = inner(_touches)
+crossed = inner(_crossed)
 rise_between = inner(_rise_between)
 fall_between = inner(_fall_between)
