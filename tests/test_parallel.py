@@ -83,11 +83,13 @@ def test_a_verdict_has_one_thread_of_linear_algebra_and_gives_the_others_back(mo
     system = cb.linear_system([[-1.0]], diffusion=[[0.1]])
     problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1)
     with threadpool_limits(2, "blas"):
+        given = threads()
         cb.verify_safety(problem, method="linear", progress=lambda _: seen.append(threads()))
         after = threads()
     assert seen
     assert set.union(*seen) == {1}
-    assert after == {2}
+    assert 2 in given
+    assert after == given
 
 
 @pytest.fixture(scope="module")
