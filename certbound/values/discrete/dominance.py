@@ -101,7 +101,8 @@ def quadrature_error(points: int, half: float, order: int, reach: float, ratio: 
     (interval of length 2), and ||g - p|| <= 2 M rho^-N/(rho - 1), M = sup |g| on the Bernstein ellipse of rho: there
     |phi(z)| <= exp(-(|z0| - half A)_+^2/2 + half^2 B^2/2)/sqrt(2 pi) with the half-axes A, B, |b| <= (2 A)^2 (a
     polynomial of degree 2 bounded by 1 on [-1, 1] is at most |T_2| <= 2 A^2 + 2 B^2 + 1 there) and |He_k(z)| <= (1 +
-    |z|)^k for k <= 3, three times that for k = 4. The mass is at least the width times the least density. The supremum over z0 is taken in pieces.
+    |z|)^k for k <= 3, three times that for k = 4. The mass is at least the width times the least density. The supremum
+    over z0 is taken in pieces.
     """
     left = np.arange(0.0, reach, 1 / 16)
     right = left + 1 / 16

@@ -177,7 +177,7 @@ def widths_of(
     inputs = [] if problem.input_sequence is None else list(problem.input_sequence[when])
     slopes = compile_numpy(dynamics.slopes)(float(when), *points.T, *inputs, *middle)[:, :, :n]
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
-    sizes = shocks.sigma.mid if shocks.sizes is None else shocks.sizes(points)
+    sizes = shocks.sigma.mid if shocks.sizes is None else np.maximum(shocks.sizes(points), 1e-3 * shocks.sigma.mid)
     square = np.sum((slopes / sizes[..., :, None]) ** 2, axis=1).reshape([count] * n + [n])
     found = []
     for i, axis in enumerate(axes):

@@ -33,8 +33,8 @@ from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import AnyTransition, Zones, assembled, back_above, back_below, final
 from certbound.values.discrete.kernels import REACH
 from certbound.values.discrete.layout import FailureBounds, shares_of, start_box
-from certbound.values.discrete.shocks import Inapplicable
 from certbound.values.discrete.scaled import dynamics_of
+from certbound.values.discrete.shocks import Inapplicable
 from certbound.values.grids import Grid, over_corners
 from certbound.values.sets import box_around
 from certbound.watch import OutOfTime, poll

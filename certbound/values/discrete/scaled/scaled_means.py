@@ -1,7 +1,7 @@
 """phi(x) = E U(m(x) + sqrt(S(x)) xi) for independent normal xi: values at nodes, second derivatives over cells.
 
-As a function h of m and S it solves heat equations, dh/dS_a = (1/2) d^2h/dm_a^2 (where S_a > 0, for every bounded U), so
-that every derivative of phi by x is a sum of derivatives of h by m. With the symbol
+As a function h of m and S it solves heat equations, dh/dS_a = (1/2) d^2h/dm_a^2 (where S_a > 0, for every bounded U),
+so that every derivative of phi by x is a sum of derivatives of h by m. With the symbol
     q_B = sum_a d_B m_a X_a + (1/2) d_B S_a X_a^2,  X_a standing for d/dm_a,
 that sum is the Bell polynomial P_alpha(X) = sum over partitions of alpha into blocks of prod q_B. At the nodes h is
 integrated up to fourth derivatives, which gives g = d_ii phi there; over a cell with sides delta g lies between its
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from certbound.arrays import Array, Mask
+from certbound.arrays import Array, Integers, Mask
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import product_error
 from certbound.values.discrete.dominance import dominance
@@ -151,7 +151,7 @@ class ScaledTables(Tables):
 
 
 class ScaledTransition:
-    """One step from a grid into the next function, but for cells that are ``left_out``; offers what ``Transition`` does."""
+    """One step from a grid into the next function, but for cells ``left_out``; offers what ``Transition`` does."""
 
     def __init__(self, dynamics: ScaledDynamics, t: int, grid: Grid, after: Grid, left_out: Mask) -> None:
         self.n, self._grid = grid.dimension, grid
@@ -199,7 +199,7 @@ class ScaledTransition:
         images = CellImages(image=image, slopes=empty, bends=empty, defined=sure, steady=sure, smooth=sure)
         return Step(grid=grid, vertices=[], cells=[images], pieces=np.empty((1, 0)))
 
-    def _dominated(self, symbol: Symbol, least: list[Array], kinds: list[Array]) -> tuple[Array, Array]:
+    def _dominated(self, symbol: Symbol, least: list[Array], kinds: list[Integers]) -> tuple[Array, Array]:
         """sum_beta |P_beta| times bounds of d^beta h: in units of H, and of what lies beyond the kernels' reach."""
         near, beyond = np.zeros(len(least[0])), np.zeros(len(least[0]))
         top = 1 + max(max(beta) for beta in symbol)
@@ -277,7 +277,8 @@ def _symbol(rows: Any, n: int) -> Symbol:
     for a in range(n):
         found[_unit(a, n)] = rows[:, a]
         found[tuple(2 * b for b in _unit(a, n))] = rows[:, n + a] * 0.5
-    return {beta: factor for beta, factor in found.items() if np.any(_magnitude(factor))} or {(0,) * n: rows[:, 0] * 0.0}
+    found = {beta: factor for beta, factor in found.items() if np.any(_magnitude(factor))}
+    return found or {(0,) * n: rows[:, 0] * 0.0}
 
 
 def _magnitude(factor: Any) -> Array:

@@ -21,6 +21,7 @@ Alpha = tuple[int, ...]
 
 _MOST_NODES = 20_000  # of the tapes of fourth derivatives
 _SAMPLES = 33
+_LEAST = 0.02  # of the typical noise
 _UNIT = 2.0**-53
 _ORDERS = [a for a in itertools.product(range(5), repeat=2) if sum(a) <= 4 and sorted(a) != [1, 3]]
 """Derivatives that fourth derivatives d_jj d_ii of a function of m and S are made of."""
@@ -50,7 +51,8 @@ class ScaledDynamics(Dynamics):
 
     def __init__(self, problem: Problem, parts: int = 4) -> None:
         system = problem.system
-        assert isinstance(system, DiscreteSystem) and system.gain is not None
+        assert isinstance(system, DiscreteSystem)
+        assert system.gain is not None
         if system.dimension != 2 or system.disturbance_names or not system.noise.gaussian:
             raise Inapplicable(
                 "smooth value functions take a noise matrix that depends on t or the states in two states, with "
@@ -93,10 +95,9 @@ class ScaledDynamics(Dynamics):
         return float(np.max(radius / np.where(middle > 0, middle, 1.0))) + 4 * _UNIT
 
     def sizes(self, points: Array) -> Array:
-        """Standard deviations at points (P, n) at step 0, not far below the typical one; in plain floats."""
+        """Standard deviations at points (P, n) at step 0, in plain floats."""
         found = compile_numpy(self.tapes[0, 0][1])(0.0, *points.T)
-        root = np.sqrt(np.maximum(np.nan_to_num(np.broadcast_to(found, points.shape)), 0.0))
-        return np.asarray(np.maximum(root, 1e-2 * np.median(root, axis=0)))
+        return np.asarray(np.sqrt(np.maximum(np.nan_to_num(np.broadcast_to(found, points.shape)), 0.0)))
 
     def jets(self, t: int, boxes: Interval, order: int) -> Jets:
         """All derivatives that are needed, up to an order, over some boxes."""
@@ -147,8 +148,12 @@ def noise_of(problem: Problem, dynamics: Dynamics) -> Shocks:
     low, high = (problem.domain.low, problem.domain.high) if problem.ending else ends
     if not np.isfinite([low, high]).all():
         raise Inapplicable("value functions need limits on both sides of every state where the state multiplies noise.")
-    places = np.meshgrid(*(np.linspace(a, b, _SAMPLES) for a, b in zip(low, high)), indexing="ij")
-    middle = np.median(dynamics.sizes(np.stack([place.ravel() for place in places], axis=1)), axis=0)
-    if not np.all(middle > 0):
-        raise Inapplicable("value functions need noise of its own on every state.")
+    coarse = Grid(axes=tuple(np.linspace(a, b, _SAMPLES) for a, b in zip(low, high)))
+    least = dynamics.jets(0, coarse.cells(), 0).parts[0, 0].lo[:, dynamics.n :]
+    middle = np.median(dynamics.sizes(coarse.nodes()), axis=0)
+    if not np.all(least > (_LEAST * middle) ** 2):
+        raise Inapplicable(
+            "smooth value functions need noise of its own on every state, and nowhere in the safe set much less of it "
+            "than elsewhere."
+        )
     return Shocks(sigma=Interval.point(middle), factor=Interval.point(np.zeros(dynamics.n)), sizes=dynamics.sizes)
