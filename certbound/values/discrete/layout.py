@@ -166,7 +166,7 @@ def widths_of(
 ) -> list[tuple[Array, Array]]:
     """Per axis places in the box of step t and the lengths over which phi changes: 1/sqrt(sum_k (J_ki/s_k)^2).
 
-    In plain floats; J is that of step ``when``.
+    In plain floats; J is that of step ``when``. Where the noise depends on the state, log s changes little as well.
     """
     n = problem.system.dimension
     count = {1: 257, 2: 33, 3: 13}[n]
@@ -179,6 +179,10 @@ def widths_of(
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     sizes = shocks.sigma.mid if shocks.sizes is None else np.maximum(shocks.sizes(points), 1e-3 * shocks.sigma.mid)
     square = np.sum((slopes / sizes[..., :, None]) ** 2, axis=1).reshape([count] * n + [n])
+    if shocks.sizes is not None:
+        logs = np.log(sizes).reshape(square.shape)
+        for i, axis in enumerate(axes):
+            square[..., i] += _STEADY**2 * np.sum(np.gradient(logs, axis, axis=i) ** 2, axis=-1)
     found = []
     for i, axis in enumerate(axes):
         others = tuple(k for k in range(n) if k != i)
@@ -250,6 +254,7 @@ _ORDER, _UNIFORM_ORDER = 2.5, 2.0
 _COMMON_FACTOR = 20.0  # how much more that is with a common factor in the noise
 _UNIFORM_FACTOR = 0.4
 _SCALED_FACTOR = 8.0
+_STEADY = 6.0  # by how much less noise may change over a cell than what it smoothes
 _OVERHEAD = 250  # cells that every step is worth in addition
 _NEARLY = 1.15  # times the share that would do
 _WIDEST = 10.0  # upper over lower beyond which nothing is known of how it will fall
