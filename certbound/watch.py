@@ -68,17 +68,19 @@ class Watch:
         Processes that may work side by side.
     executor : concurrent.futures.Executor or dask Client, optional
         Who works instead.
+    patient : bool
+        Whether somebody waits until the limit for an answer that is worth it, rather than for an answer.
     """
 
     def __init__(
         self, limit: float | None = None, *, progress: Callable[[Progress], object] | None = None,
-        clock: Callable[[], float] = time.perf_counter, jobs: int = 1, executor: Any = None,
+        clock: Callable[[], float] = time.perf_counter, jobs: int = 1, executor: Any = None, patient: bool = False,
     ) -> None:
         if limit is not None and not limit > 0:
             raise ValueError(f"`time_limit` must be a positive number of seconds, got {limit!r}.")
         if isinstance(jobs, bool) or int(jobs) != jobs or jobs < 1:
             raise ValueError(f"`jobs` must be a positive number of processes, got {jobs!r}.")
-        self.jobs, self.executor = int(jobs), executor
+        self.jobs, self.executor, self.patient = int(jobs), executor, patient
         self.limit, self._progress, self._clock = limit, progress, clock
         self.started = clock()
         self._end = math.inf if limit is None else self.started + limit

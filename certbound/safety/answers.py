@@ -138,8 +138,9 @@ class Request:
     what is slow and then seldom decides may be left out. Not ``thorough``: an engine may spare itself, as it is asked
     again where that matters, with the ``details`` of its first answer as ``before``. ``bounded``: some probability
     below 1 is proved, and what has no hope of delta may be left out. ``first``: it may end with the first bound that it
-    finds, and goes on from there when it is asked again. ``found`` takes an answer that holds
-    already while the engine looks for a better one: it stands where time ends the search (`certbound.watch`).
+    finds, and goes on from there when it is asked again. ``at_length``: all the time that is left is its own.
+    ``found`` takes an answer that holds already while the engine looks for a better one: it stands where time ends the
+    search (`certbound.watch`).
     """
 
     method: str = "auto"
@@ -149,6 +150,7 @@ class Request:
     thorough: bool = True
     first: bool = False
     bounded: bool = False
+    at_length: bool = False
     before: Any = None
     found: Callable[[EngineAnswer], object] = lambda answer: None
 

@@ -19,14 +19,13 @@ from typing import Any
 from certbound.errors import EngineError, contained
 from certbound.problem.goals import met_at
 from certbound.problem.problem import Problem
-from certbound.reach.nominal import initial_cells
 from certbound.safety.answers import EngineAnswer, Request, is_more_than
 from certbound.safety.averages import average_verdict
 from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import best_time, find_miss, window_of
-from certbound.safety.portfolio import ENGINES, Engine, engines_of
+from certbound.safety.portfolio import ENGINES, Engine, check_request, engines_of
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
@@ -59,7 +58,7 @@ def decide(
     names = engines_of(method)
     watch = watch or current_watch() or Watch()
     for start in problem.starts:
-        _checked(problem.replace(initial=start) if len(problem.starts) > 1 else problem, request)
+        check_request(problem.replace(initial=start) if len(problem.starts) > 1 else problem, request)
     options: dict[str, Any] = {"method": method, "cells": cells, "constants": constants, "watch": watch}
     if len(problem.starts) > 1:
         return worst_verdict(problem, watch, lambda member: decide(member, **options))
@@ -154,12 +153,33 @@ class _Search:
         self._in_turn(names)
         if self.safe or self.refuted or self.request.cells is not None:
             return
-        if self._in_full(names, 1 - _LAST):
+        if self._in_full(names, 1 - _LAST) or (self._refining(names) and self._at_length(names)):
             return
         for name in (name for name in names if ENGINES[name].again and (self._likely(name) or not self.bounded)):
             first = self.answers.get(name)
             if first is not None and first.applicable and not first.conclusive:
                 self._thoroughly(name, Request(before=first.details))
+        if not self.safe:
+            self._at_length(names)
+
+    def _refining(self, names: tuple[str, ...]) -> bool:
+        """Whether the smallest bound is that of an engine whose bound falls with the time that it is granted."""
+        found = [name for name in names if name in self.answers]
+        best = min(found, key=lambda name: self.answers[name].log10_delta, default=None)
+        return best is not None and ENGINES[best].refines and self.bounded
+
+    def _at_length(self, names: tuple[str, ...]) -> bool:
+        """Where somebody waits for a limit of his own: engines that refine go on, the nearest first; whether SAFE."""
+        if not self.watch.patient or self.watch.limit is None:
+            return False
+        for name in sorted(names, key=lambda name: 0.0 if name not in self.answers else self.answers[name].log10_delta):
+            first = self.answers.get(name)
+            if first is None or not (ENGINES[name].refines and first.applicable) or first.conclusive or self.safe:
+                continue
+            if first.log10_lower is None or not is_more_than(first.log10_lower, self.problem.delta):
+                with self.watch.share(1 - _LAST):
+                    self.ask(name, Request(before=first.details, at_length=True))
+        return self.safe
 
     def endlessly(self, names: tuple[str, ...]) -> bool:
         """Whether a function of one state settles a target without an end, which others meet at some late time."""
@@ -373,27 +393,3 @@ class _Search:
         rest += [name for name in names if name not in self.answers]
         more = f" More time would go on with {', then '.join(rest)}." if rest else ""
         return f"The search was stopped after {self.watch.limit:g} s.{more}"
-
-
-def _checked(problem: Problem, request: Request) -> None:
-    """Refuse what is wrong with a request before any engine runs: from then on whatever fails is an engine.
-
-    ValueError where the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit
-    it.
-    """
-    from certbound.tubes.paper import check_method
-
-    initial_cells(problem, request.cells)
-    _ = problem.hold is None and problem.closed_loop
-    continuous, n = problem.system.time == "continuous", problem.system.dimension
-    check_method(request.method, continuous=continuous, dimension=n)
-    constants = request.constants
-    if constants is None:
-        return
-    if constants.continuous != continuous:
-        raise ValueError(f"`constants` must state a {'rate' if continuous else 'gain'}, as the problem's time asks.")
-    if constants.times is not None and constants.times[-1] < problem.horizon:
-        raise ValueError(f"`constants` must reach the horizon {problem.horizon:g}, got {constants.times[-1]:g}.")
-    from certbound.constants.stated import refuse_contradiction
-
-    refuse_contradiction(problem, constants)

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from certbound.problem.problem import Problem
-from certbound.safety.answers import EngineAnswer, Proof
+from certbound.reach.nominal import initial_cells
+from certbound.safety.answers import EngineAnswer, Proof, Request
 from certbound.safety.certificates import (
     barrier_proof,
     constants_proof,
@@ -58,6 +59,9 @@ class Engine:
         Asked while nothing else has proved SAFE, and for the smallest probability, as its bound knows no delta.
     again : bool
         Asked a second time, thoroughly, where nothing was proved SAFE.
+    refines : bool
+        Its bound falls with the time that it is granted: it goes on where nothing is SAFE and somebody waits for a
+        limit of his own.
     sketch : bool
         Asked before all others, quickly: that takes next to nothing.
     dear : bool
@@ -86,6 +90,7 @@ class Engine:
     methods: bool = False
     reserve: bool = False
     again: bool = False
+    refines: bool = False
     sketch: bool = False
     dear: bool = False
     soon: int = 0
@@ -142,6 +147,7 @@ ENGINES: dict[str, Engine] = {
             prove=in_coordinates(quadratic_engine),
             write=of_coordinates(quadratic_proof),
             reserve=True,
+            refines=True,
             dear=True,
             soon=4,
             spares=3,
@@ -155,6 +161,7 @@ ENGINES: dict[str, Engine] = {
             write=of_coordinates(values_proof, beside=barrier_proof),
             write_below=of_coordinates(values_proof_below, below=True),
             reserve=True,
+            refines=True,
             dear=True,
             reaches=True,
             endless=True,
@@ -186,3 +193,27 @@ def engines_of(method: str) -> tuple[str, ...]:
     near = difflib.get_close_matches(str(method), known, n=1)
     cure = f"did you mean {near[0]!r}?" if near else "leave it out for the best of all engines."
     raise ValueError(f"`method` must be one of {', '.join(known)}, got {method!r}; {cure}")
+
+
+def check_request(problem: Problem, request: Request) -> None:
+    """Refuse what is wrong with a request before any engine runs: from then on whatever fails is an engine.
+
+    ValueError where the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit
+    it.
+    """
+    from certbound.tubes.paper import check_method
+
+    initial_cells(problem, request.cells)
+    _ = problem.hold is None and problem.closed_loop
+    continuous, n = problem.system.time == "continuous", problem.system.dimension
+    check_method(request.method, continuous=continuous, dimension=n)
+    constants = request.constants
+    if constants is None:
+        return
+    if constants.continuous != continuous:
+        raise ValueError(f"`constants` must state a {'rate' if continuous else 'gain'}, as the problem's time asks.")
+    if constants.times is not None and constants.times[-1] < problem.horizon:
+        raise ValueError(f"`constants` must reach the horizon {problem.horizon:g}, got {constants.times[-1]:g}.")
+    from certbound.constants.stated import refuse_contradiction
+
+    refuse_contradiction(problem, constants)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def verify_safety(
     problem: Problem, method: str = "auto", cells: int | None = None, *, constants: Constants | None = None,
     time_limit: float | None = None, progress: Callable[[Progress], object] | None = None, smallest: bool = False,
-    explain: bool = False, jobs: int = 1, executor: Any = None,
+    explain: bool = False, jobs: int = 1, executor: Any = None, patient: bool = True,
 ) -> Verdict:
     """Prove that a problem's constraints are broken with probability at most delta, or say why not.
 
@@ -55,6 +55,9 @@ def verify_safety(
         Processes that prove cells of the initial set side by side; the answer is the same.
     executor : concurrent.futures.Executor or dask Client, optional
         Who proves cells instead, with the same answer.
+    patient : bool
+        Whether what is left of ``time_limit`` is spent where nothing is SAFE, on engines whose bounds go on falling; if
+        not, the search ends where more time would hardly change the verdict.
 
     Returns
     -------
@@ -77,7 +80,8 @@ def verify_safety(
     'SAFE'
     """
     own = time_limit is not None or progress is not None or jobs != 1 or executor is not None
-    watch = Watch(time_limit, progress=progress, jobs=jobs, executor=executor) if own else current_watch() or Watch()
+    made = Watch(time_limit, progress=progress, jobs=jobs, executor=executor, patient=patient)
+    watch = made if own else current_watch() or made
     verdict = decide(problem, method=method, cells=cells, constants=constants, watch=watch)
     with contextlib.suppress(OutOfTime), watch.running():
         if smallest and verdict.status == "SAFE":

@@ -361,3 +361,23 @@ def test_who_spared_itself_is_asked_in_full_before_others_are_asked_again(monkey
     assert cb.verify_safety(problem).status == "UNKNOWN"
     again = [name for name, thorough in asked if thorough]
     assert again.index("quadratic") < again.index("linear")
+
+
+@pytest.mark.parametrize("patient", [True, False])
+def test_what_is_left_of_a_limit_of_ones_own_goes_to_who_refines(
+    monkeypatch: pytest.MonkeyPatch, clock: Time, patient: bool
+) -> None:
+    scripted(monkeypatch, clock, {"linear": [(1, -1)], "quadratic": [(1, -1.5)]})
+    asked: list[float] = []
+
+    def refine(problem: cb.Problem, request: Request) -> EngineAnswer:
+        if request.at_length:
+            asked.append(seconds_left())
+        clock.work(5 if request.at_length else 1, "refining")
+        return EngineAnswer(method="values", log10_delta=-4 if request.at_length else -2)
+
+    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=refine))
+    verdict = decide(problem(), watch=Watch(30, clock=clock, patient=patient))
+    assert verdict.status == ("SAFE" if patient else "UNKNOWN")
+    assert len(asked) == patient  # quadratic, which was farther off, has no need to go on
+    assert all(20 < left < 27 for left in asked)

@@ -97,7 +97,7 @@ def verify(
 
         verdict = verify_safety(
             subject, method=method, cells=cells, time_limit=clock.limit, progress=tell, smallest=smallest, jobs=jobs,
-            executor=executor,
+            executor=executor, patient=time_limit is not None,
         )  # fmt: skip
     seconds = time.perf_counter() - started
     result = _result(subject, verdict, seconds)

@@ -23,7 +23,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import EngineAnswer, Proof, exact
-from certbound.values.chains import chain_grid
+from certbound.values.chains import bound_chain, chain_grid
 from certbound.values.discrete import FailureBounds, step_grids
 from certbound.values.grids import Grid
 from certbound.values.sets import active_at
@@ -58,6 +58,8 @@ def induction_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0, *,
         check_starts(problem)
     steps = _steps(problem, answer.details)
     grids, pieces = _grids(problem, effort, steps)
+    if pieces and effort == 0 and problem.horizon == steps:
+        _check_pieces(problem, answer, lower)
     plain = problem.reach is None and not problem.ending and steps == problem.horizon and not pieces
     ends = partial(_outward, problem, bool(pieces)) if lower else partial(_inward, problem)
     jumps = _jumps(problem, grids[-1])
@@ -83,6 +85,25 @@ def induction_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0, *,
     if not problem.initial.random:
         data |= {"starts": exact(some_starts(problem))} if lower else {"splits": exact(_splits(problem, grids[0].axes))}
     return data, _level(problem, answer, ROOMS[effort] if plain else None, lower=lower), []
+
+
+def _check_pieces(problem: Problem, answer: EngineAnswer, lower: bool) -> None:
+    """Refuse what constants on cells, all that the checker knows of noise that the state multiplies, hardly show.
+
+    Their error falls with the cells' size, which is a quarter of the coarsest one at last.
+    """
+    system = problem.system
+    if not isinstance(system, DiscreteSystem) or system.gain is None or system.dimension != 2:
+        return
+    coarse = bound_chain(problem, seconds=1e-3)
+    level, found = 10 ** _level(problem, answer, None, lower=lower), answer.log10_lower if lower else answer.log10_delta
+    at_last = (3 * 10 ** (found or 0.0) + (coarse.lower if lower else coarse.upper)) / 4
+    if at_last < level if lower else at_last > level:
+        raise CertificateError(
+            "the checker knows noise that the state multiplies in two states by functions that are constant on cells, "
+            f"which on its finest grid would say about {at_last:.2g}, not {level:.2g}; the bound stands without a "
+            "certificate."
+        )
 
 
 def _level(problem: Problem, answer: EngineAnswer, room: float | None, *, lower: bool) -> float:

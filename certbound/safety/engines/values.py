@@ -19,6 +19,7 @@ from certbound.watch import seconds_left
 
 _SECONDS = 20.0  # about what may be spent
 _SPACE = 120.0  # the same for three states in continuous time
+_GRANT = 0.7  # of the time that is left, where all of it may be spent: what does not come to its end is lost
 _LEAST = 1e-3
 _FLOOR = -300.0
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
@@ -33,7 +34,8 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         return EngineAnswer(applicable=False, method="values", reason=SPARED)
     wide = problem.system.dimension == 3 and not isinstance(problem.system, DiscreteSystem)
     most = _SPACE if wide else _SECONDS
-    limit = max(min(most if asked.thorough else _SECONDS / 4, seconds_left()), _LEAST)
+    most = _GRANT * seconds_left() if asked.at_length else most if asked.thorough else _SECONDS / 4
+    limit = max(min(most, seconds_left()), _LEAST)
     try:
         if problem.system.time == "continuous" and problem.endless:
             return _lasting(problem)

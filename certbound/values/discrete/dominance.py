@@ -5,6 +5,10 @@ With phi_s the density of N(0, s^2), He_k the Hermite polynomials, kappa > 1 and
     A_k = kappa sup_{z >= 0} |He_k(z)| exp(-z^2/2 + (z + rho)^2/(2 kappa^2)),
 because the k-th derivative is He_k(z) phi_s(s z) with z = (y - m - mu)/s, and |y - m| <= s (|z| + rho). Products over
 the axes give the same for densities in the plane and in space. Source: K8 of docs/theory.md.
+
+With s' instead of s on the left, s/tau <= s' <= tau s, |y - m| <= s (tau |z| + rho), and for tau < kappa
+    s^k |d^k/dm^k phi_s'(y - m - mu)| <= tau^(k + 1) kappa sup |He_k(z)| exp(-z^2/2 + (tau z + rho)^2/(2 kappa^2))
+times phi_{kappa s}(y - m).
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ _REACH = 30  # where the supremum is surely past its peak
 
 
 @lru_cache(maxsize=1024)
-def dominance(order: int, rho: float = 0.0, power: int = 0) -> float:
+def dominance(order: int, rho: float = 0.0, power: int = 0, stretch: float = 1.0) -> float:
     """A_k of the module for kappa = `KAPPA`, rounded up; with ``power`` p, of (1 + z)^p times the density.
 
     Parameters
@@ -34,7 +38,11 @@ def dominance(order: int, rho: float = 0.0, power: int = 0) -> float:
         Between 0 and 3.
     power : int
         Exponent p of the extra factor (1 + z)^p.
+    stretch : float
+        tau of the module, between 1 and 1.1.
     """
+    if not 1 <= stretch <= 1.1:
+        raise ValueError(f"`stretch` must lie in [1, 1.1], got {stretch}.")
     if not (0 <= rho <= 3 and 0 <= order + power <= 12):
         raise ValueError(f"`rho` must lie in [0, 3] and the order be at most 12, got {rho} and {order + power}.")
     ends = np.arange(_REACH * _STEPS + 1) / _STEPS
@@ -42,14 +50,14 @@ def dominance(order: int, rho: float = 0.0, power: int = 0) -> float:
     weight = abs_(_hermite(z, order))
     for _ in range(power):
         weight = weight * (z + 1.0)
-    exponent = sq(z + rho) / Interval.point(2 * KAPPA**2) - sq(z) * 0.5
+    exponent = sq(z * stretch + rho) / Interval.point(2 * KAPPA**2) - sq(z) * 0.5
     value = weight * exp(exponent) * KAPPA
     # beyond the reach: (1 + z)^(k + p) exp(...) bounds it, whose logarithm falls there (k + p <= 12, kappa = 1.3)
     last = Interval.point(float(_REACH))
-    beyond = exp(sq(last + rho) / Interval.point(2 * KAPPA**2) - sq(last) * 0.5) * KAPPA
+    beyond = exp(sq(last * stretch + rho) / Interval.point(2 * KAPPA**2) - sq(last) * 0.5) * KAPPA
     for _ in range(order + power):
         beyond = beyond * (last + 4.0)
-    return float(max(value.hi.max(), float(beyond.hi))) * (1 + 1e-12)
+    return float(max(value.hi.max(), float(beyond.hi))) * stretch ** (order + 1) * (1 + 1e-12)
 
 
 def _hermite(z: Interval, order: int) -> Interval:
@@ -93,16 +101,18 @@ def quadrature_error(points: int, half: float, order: int, reach: float, ratio: 
     (interval of length 2), and ||g - p|| <= 2 M rho^-N/(rho - 1), M = sup |g| on the Bernstein ellipse of rho: there
     |phi(z)| <= exp(-(|z0| - half A)_+^2/2 + half^2 B^2/2)/sqrt(2 pi) with the half-axes A, B, |b| <= (2 A)^2 (a
     polynomial of degree 2 bounded by 1 on [-1, 1] is at most |T_2| <= 2 A^2 + 2 B^2 + 1 there) and |He_k(z)| <= (1 +
-    |z|)^k for k <= 2. The mass is at least the width times the least density. The supremum over z0 is taken in pieces.
+    |z|)^k for k <= 3, three times that for k = 4. The mass is at least the width times the least density. The supremum
+    over z0 is taken in pieces.
     """
     left = np.arange(0.0, reach, 1 / 16)
     right = left + 1 / 16
     best = np.full(left.shape, np.inf)
+    more = math.log(3) if order == 4 else 0.0
     for rho in (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0, 128.0, 192.0, 256.0):
         a, b = (rho + 1 / rho) / 2, (rho - 1 / rho) / 2
         nearest = np.maximum(left - half * a, 0.0)
         size = right + half * (a + b)
         exponent = -(nearest**2) / 2 + (half * b) ** 2 / 2 + (right + half) ** 2 / (2 * ratio**2)
         exponent += np.log(1 + size) * order + math.log(2 * a * a + 2 * b * b + 1) - (2 * points - 1) * math.log(rho)
-        best = np.minimum(best, exponent + math.log(4 / (rho - 1) * ratio))
+        best = np.minimum(best, exponent + math.log(4 / (rho - 1) * ratio) + more)
     return float(np.exp(best.max())) * (1 + 1e-9)

@@ -42,8 +42,9 @@ from certbound.values.discrete.layout import (
     widths_of,
     without_hopeless,
 )
-from certbound.values.discrete.shocks import Inapplicable, Shocks, gaussian_shocks, shocks_of
-from certbound.values.discrete.steps import Dynamics, Step
+from certbound.values.discrete.scaled import ScaledDynamics, ScaledTransition, dynamics_of, noise_of
+from certbound.values.discrete.shocks import Inapplicable, Shocks, gaussian_shocks
+from certbound.values.discrete.steps import Step
 from certbound.values.discrete.transitions import Transition
 from certbound.values.discrete.uniform_noise import LineTables, UniformTables, UniformTransition
 from certbound.values.grids import Grid, corners
@@ -106,7 +107,7 @@ def bound_failure(
     upper, lower, spent = 1.0, 0.0, 0.0
     tried: list[tuple[float, float, float]] = []
     cells: tuple[int, ...] = ()
-    shares = shares_of(work.n, uniform=work.shocks.uniform)
+    shares = shares_of(work.n, work.shocks)
     while shares:
         if tried:
             affordable = partial(work.fits, seconds=seconds - spent)
@@ -171,8 +172,8 @@ class Work:
         asked = problem.constraints  # which refuses a problem with a target of its own
         self.limits = problem.safe if problem.ending else asked
         self.beyond = 0.0 if problem.ending else 1.0
-        self.shocks = shocks_of(system.noise, system.noise_matrix)
-        self.dynamics = Dynamics(problem, parts)
+        self.dynamics = dynamics_of(problem, parts)
+        self.shocks = noise_of(problem, self.dynamics)
         self.boxes: Boxes = boxes_of(problem, self.shocks, self.dynamics)
         self.random = problem.initial.random
         self.start_shocks = self._start_shocks()
@@ -193,8 +194,7 @@ class Work:
     def cost(self, layout: list[Grid]) -> float:
         """Seconds that a layout stands for, at fixed rates: bounds must not depend on the machine's load."""
         boxes = float(self.dynamics.parts) ** len(self.problem.system.disturbance_names)
-        boxes *= 1 if self.until is None else 3  # functions
-        return boxes * seconds_of(layout, common=self.shocks.common, uniform=self.shocks.uniform)
+        return boxes * (1 if self.until is None else 3) * seconds_of(layout, self.shocks)  # functions
 
     def fits(self, share: float, seconds: float) -> bool:
         """Whether grids with cells of this size exist and cost no more."""
@@ -203,9 +203,7 @@ class Work:
 
     def _start_shocks(self) -> Shocks | None:
         initial = self.problem.initial
-        if not initial.random:
-            return None
-        if not np.any(initial.covariance):
+        if not initial.random or not np.any(initial.covariance):
             self.random = False
             return None
         try:
@@ -328,6 +326,8 @@ class Work:
         return zones_of(grid, active_at(self.limits, t), self.target, t, ends=t >= self.since)
 
     def transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
+        if isinstance(self.dynamics, ScaledDynamics):
+            return ScaledTransition(self.dynamics, t, grid, after, self.zones(grid, t).unsafe)
         step = self.dynamics.step(t, grid)
         if self.shocks.uniform:
             kind = LineTables if self.shocks.laplace or self.shocks.steps is not None else UniformTables

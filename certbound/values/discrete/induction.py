@@ -22,12 +22,13 @@ import numpy as np
 from certbound.arrays import Array, Mask
 from certbound.problem.sets import Inside, Region
 from certbound.values.discrete.functions import ValueFunction
+from certbound.values.discrete.scaled import ScaledTransition
 from certbound.values.discrete.transitions import Transition
 from certbound.values.discrete.uniform_noise import UniformTransition
 from certbound.values.grids import Grid, around_nodes, corners
 from certbound.values.sets import contains, respected
 
-AnyTransition = Transition | UniformTransition
+AnyTransition = Transition | UniformTransition | ScaledTransition
 Parts = tuple[ValueFunction, ...]
 """Functions whose sum is meant."""
 

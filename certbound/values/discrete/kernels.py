@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from flint import arb
@@ -53,8 +54,8 @@ class AxisKernel:
         Rows.
     nodes : ndarray, shape (N + 1,)
         The grid's nodes.
-    sigma : float
-        Standard deviation, known up to the relative error ``spread``.
+    sigma : float or ndarray, shape (M,)
+        Standard deviation, of every row if they differ; known up to the relative error ``spread``.
     error : float
         |K^(a) - computed| <= error s^-a mass, entry by entry, for basis functions bounded by 1.
     outside : ndarray, shape (ORDERS, M)
@@ -65,7 +66,7 @@ class AxisKernel:
 
     points: Array
     nodes: Array
-    sigma: float
+    sigma: float | Array
     error: float
     blocks: list[Block] = field(repr=False)
     outside: Array = field(repr=False)
@@ -91,51 +92,72 @@ class AxisKernel:
         return found.reshape(len(self.points), *tensor.shape[1:])
 
 
-def axis_kernel(points: Array, nodes: Array, sigma: float, spread: float) -> AxisKernel:
+def axis_kernel(
+    points: Array, nodes: Array, sigma: float | Array, spread: float, *, orders: int = ORDERS, sides: bool = True
+) -> AxisKernel:
     """The matrices of one axis.
 
     Parameters
     ----------
     points, nodes : ndarray
-        Rising.
+        Rising; points of rows with standard deviations of their own in any order.
     sigma, spread : float
-        Standard deviation and its relative uncertainty (at most 1e-9).
+        Standard deviation (one, or one for every row) and its relative uncertainty (at most 1e-9).
+    orders : int
+        Orders of derivatives, at most 5.
+    sides : bool
+        Whether the halves ``left`` and ``right`` of hats are kept, which take as much memory as all else.
     """
-    widths = np.diff(nodes)
-    panels = max(1, math.ceil(float(widths.max()) / sigma / 0.9))
-    half = float(widths.max()) / sigma / panels / 2 * (1 + 1e-9)
-    count = _points(half)
-    place, weight = _rule(count, panels)
+    sizes = np.broadcast_to(np.asarray(sigma, dtype=float), points.shape)
+    half, rule = _rule_for(np.diff(nodes), float(np.min(sizes)), orders)
+    own, widest = np.ndim(sigma) > 0, 0.0
     blocks = []
     for first in range(0, len(points), _ROWS):
-        rows = points[first : first + _ROWS]
-        index = np.flatnonzero((nodes[1:] >= rows[0] - _MARGIN * sigma) & (nodes[:-1] <= rows[-1] + _MARGIN * sigma))
+        rows, size = points[first : first + _ROWS], sizes[first : first + _ROWS]
+        near = _MARGIN * float(size.max())
+        index = np.flatnonzero((nodes[1:] >= rows.min() - near) & (nodes[:-1] <= rows.max() + near))
         left, right = (int(index[0]), int(index[-1]) + 1) if len(index) else (0, 0)
-        parts, mass = _integrals(rows, nodes[left : right + 1], sigma, place, weight)
-        blocks.append(Block(
-            first=first, last=first + len(rows), left=left, right=right, parts=parts, mass=mass,
-        ))  # fmt: skip
-    scale = float(max(np.abs(nodes).max(), np.abs(points).max())) / sigma
+        if own:
+            half, rule = _rule_for(np.diff(nodes[left : right + 1]), float(size.min()), orders)
+        widest = max(widest, half)
+        parts, mass = _integrals(rows, nodes[left : right + 1], size, *rule, orders)
+        kept = parts if sides else {name: part for name, part in parts.items() if name not in ("left", "right")}
+        blocks.append(Block(first=first, last=first + len(rows), left=left, right=right, parts=kept, mass=mass))
+    scale = float(max(np.abs(nodes).max(), np.abs(points).max())) / float(np.min(sizes))
     # density at a point: z is off by 3 u scale (the node) and |z| (3 u + spread), the exponential by 8 units; weights
-    # and sums cost 40 u more. All of it is taken times (1 + |z|)^(2 + 2) phi <= dominance(...) phi_{kappa s}.
+    # and sums cost 40 u more. All of it is taken times (1 + |z|)^(2 + 2) phi <= dominance(...) phi_{kappa s}; beyond
+    # order 2 times 8 (1 + |z|)^(k + 2), as |He_4| <= 3 (1 + |z|)^4 and |He_k'| <= 4 (1 + |z|)^3.
     slack = 3 * _UNIT * scale + 3 * _UNIT + spread + 60 * _UNIT
-    error = _WANTED + 1.1 * slack * dominance(0, min(2 * half, 3.0), 4)
-    outside, outside_mass = _outside(points, float(nodes[0]), float(nodes[-1]), sigma)
+    more = 1.1 if orders <= ORDERS else 8.0
+    error = _WANTED + more * slack * dominance(0, min(2 * widest, 3.0), orders + 1)
+    outside, outside_mass = _outside(points, float(nodes[0]), float(nodes[-1]), sigma, orders)
     return AxisKernel(
         points=points, nodes=nodes, sigma=sigma, error=error, blocks=blocks, outside=outside, outside_mass=outside_mass
     )
 
 
-def _points(half: float) -> int:
+def _rule_for(widths: Array, sigma: float, orders: int) -> tuple[float, tuple[Array, Array]]:
+    """Half the width of a panel in units of sigma, and a rule that suffices for it."""
+    longest = float(widths.max(initial=0.0)) / sigma
+    panels = max(1, math.ceil(longest / 0.9))
+    half = longest / panels / 2 * (1 + 1e-9)
+    if orders > ORDERS:  # rules are shared by rows whose standard deviations are nearly alike
+        half = math.ceil(half * 64 + 1e-9) / 64
+    return half, _rule(_points(half, orders), panels)
+
+
+@lru_cache(maxsize=256)
+def _points(half: float, orders: int) -> int:
     """Points of the rule that suffice for the derivatives and, to 1e-4 of themselves, for the masses."""
 
     def fits(count: int) -> bool:
-        wrong = max(quadrature_error(count, half, order, _FARTHEST) for order in range(ORDERS))
+        wrong = max(quadrature_error(count, half, order, _FARTHEST) for order in range(orders))
         return wrong <= _WANTED and quadrature_error(count, half / KAPPA, 0, (REACH + 1) / KAPPA, 1.0) <= 1e-4
 
     return next(count for count in range(4, 64) if fits(count))
 
 
+@lru_cache(maxsize=64)
 def _rule(count: int, panels: int) -> tuple[Array, Array]:
     """Gauss's rule on [0, 1], repeated on equal panels; nodes and weights are balls rounded to floats."""
     with precision():
@@ -145,19 +167,23 @@ def _rule(count: int, panels: int) -> tuple[Array, Array]:
     return ((shifts + (root + 1) / 2) / panels).ravel(), np.tile(weight / 2 / panels, panels)
 
 
-def _integrals(rows: Array, nodes: Array, sigma: float, place: Array, weight: Array) -> tuple[dict[str, Array], Array]:
-    widths = np.diff(nodes)
+def _integrals(
+    rows: Array, nodes: Array, sizes: Array, place: Array, weight: Array, orders: int
+) -> tuple[dict[str, Array], Array]:
+    widths, sigma = np.diff(nodes), sizes[:, None, None]
     y = nodes[:-1, None] + widths[:, None] * place
     z = (y[None] - rows[:, None, None]) / sigma
     density = np.exp(-0.5 * z * z) / (sigma * math.sqrt(2 * math.pi))
     gap = np.maximum(nodes[:-1] - rows[:, None], rows[:, None] - nodes[1:])
-    near = (gap <= _MARGIN * sigma)[:, :, None]
+    near = (gap <= _MARGIN * sigma[:, :, 0])[:, :, None]
     density *= near
     shapes = np.stack([1 - place, place, place * (1 - place) / 2, np.ones_like(place)], axis=1) * weight[:, None]
-    moments = np.stack([density, density * z / sigma, density * (z * z - 1) / sigma**2])
-    values = np.moveaxis(moments @ shapes, -1, 0) * widths  # (4, ORDERS, rows, intervals)
+    moments = [density, density * z / sigma, density * (z * z - 1) / sigma**2]
+    if orders > ORDERS:
+        moments += [density * (z * (z * z - 3)) / sigma**3, density * (z * z * (z * z - 6) + 3) / sigma**4]
+    values = np.moveaxis(np.stack(moments[:orders]) @ shapes, -1, 0) * widths  # (4, orders, rows, intervals)
     left, right, bubble, whole = values
-    hat = np.zeros((ORDERS, len(rows), len(nodes)))
+    hat = np.zeros((orders, len(rows), len(nodes)))
     hat[..., :-1] += left
     hat[..., 1:] += right
     parts = {"hat": hat, "left": left, "right": right, "bubble": bubble * widths**2, "whole": whole}
@@ -165,14 +191,19 @@ def _integrals(rows: Array, nodes: Array, sigma: float, place: Array, weight: Ar
     return parts, (wide @ weight) * widths
 
 
-def _outside(points: Array, low: float, high: float, sigma: float) -> tuple[Array, Array]:
+def _outside(points: Array, low: float, high: float, sigma: float | Array, orders: int) -> tuple[Array, Array]:
     """Probability of leaving [low, high], its derivatives by m, and the dominating one."""
     above, below = (high - points) / sigma, (points - low) / sigma
     density = [np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi) for z in (above, below)]
     value = _upper_tail(above) + _upper_tail(below)
-    first = (density[0] - density[1]) / sigma
-    second = (above * density[0] + below * density[1]) / sigma**2
-    return np.stack([value, first, second]), _upper_tail(above / KAPPA) + _upper_tail(below / KAPPA)
+    found = [
+        value,
+        (density[0] - density[1]) / sigma,
+        (above * density[0] + below * density[1]) / sigma**2,
+        ((above**2 - 1) * density[0] - (below**2 - 1) * density[1]) / sigma**3,
+        (above * (above**2 - 3) * density[0] + below * (below**2 - 3) * density[1]) / sigma**4,
+    ]
+    return np.stack(found[:orders]), _upper_tail(above / KAPPA) + _upper_tail(below / KAPPA)
 
 
 def _upper_tail(z: Array) -> Array:

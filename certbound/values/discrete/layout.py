@@ -70,6 +70,8 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
         low[t], high[t] = box_around(active_at(problem.constraints, t), n, t)
         free = ~np.isfinite(low[t]) | ~np.isfinite(high[t])
         if np.any(free):
+            if shocks.sizes is not None:
+                raise Inapplicable("value functions need limits on both sides of every state that multiplies noise.")
             leak += 2 * n * tail(REACH)
             below, above = np.isfinite(low[t]), np.isfinite(high[t])
             low[t] = np.where(below, low[t], reach[0] - 1e-9 * (1 + np.abs(reach[0])))
@@ -164,7 +166,7 @@ def widths_of(
 ) -> list[tuple[Array, Array]]:
     """Per axis places in the box of step t and the lengths over which phi changes: 1/sqrt(sum_k (J_ki/s_k)^2).
 
-    In plain floats; J is that of step ``when``.
+    In plain floats; J is that of step ``when``. Where the noise depends on the state, log s changes little as well.
     """
     n = problem.system.dimension
     count = {1: 257, 2: 33, 3: 13}[n]
@@ -175,7 +177,12 @@ def widths_of(
     inputs = [] if problem.input_sequence is None else list(problem.input_sequence[when])
     slopes = compile_numpy(dynamics.slopes)(float(when), *points.T, *inputs, *middle)[:, :, :n]
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
-    square = np.sum((slopes / shocks.sigma.mid[:, None]) ** 2, axis=1).reshape([count] * n + [n])
+    sizes = shocks.sigma.mid if shocks.sizes is None else np.maximum(shocks.sizes(points), 1e-3 * shocks.sigma.mid)
+    square = np.sum((slopes / sizes[..., :, None]) ** 2, axis=1).reshape([count] * n + [n])
+    if shocks.sizes is not None:
+        logs = np.log(sizes).reshape(square.shape)
+        for i, axis in enumerate(axes):
+            square[..., i] += _STEADY**2 * np.sum(np.gradient(logs, axis, axis=i) ** 2, axis=-1)
     found = []
     for i, axis in enumerate(axes):
         others = tuple(k for k in range(n) if k != i)
@@ -240,11 +247,14 @@ _UNIFORM_SHARES = {
     2: (0.3, 0.15, 0.07, 0.035, 0.02, 0.012),
     3: (0.5, 0.3, 0.2, 0.12),
 }
+_SCALED_SHARES = (0.33, 0.24, 0.18, 0.13, 0.1)
 _CELL_SECONDS = 4e-6  # what a cell takes for one step, both bounds; measured once
 _ORDER, _UNIFORM_ORDER = 2.5, 2.0
 """About the power of the cells' size with which the logarithm of upper over lower falls; measured."""
 _COMMON_FACTOR = 20.0  # how much more that is with a common factor in the noise
 _UNIFORM_FACTOR = 0.4
+_SCALED_FACTOR = 8.0
+_STEADY = 6.0  # by how much less noise may change over a cell than what it smoothes
 _OVERHEAD = 250  # cells that every step is worth in addition
 _NEARLY = 1.15  # times the share that would do
 _WIDEST = 10.0  # upper over lower beyond which nothing is known of how it will fall
@@ -283,14 +293,17 @@ class FailureBounds:
     before: tuple[int, float, float] | None = None
 
 
-def shares_of(states: int, *, uniform: bool) -> list[float]:
+def shares_of(states: int, shocks: Shocks) -> list[float]:
     """Sizes of the cells that are tried, relative to the lengths over which the solution changes."""
-    return list((_UNIFORM_SHARES if uniform else _SHARES)[states])
+    if shocks.sizes is not None:
+        return list(_SCALED_SHARES)
+    return list((_UNIFORM_SHARES if shocks.uniform else _SHARES)[states])
 
 
-def seconds_of(layout: list[Grid], *, common: bool, uniform: bool) -> float:
+def seconds_of(layout: list[Grid], shocks: Shocks) -> float:
     """Seconds that the grids of all steps stand for, without disturbances."""
-    rate = _CELL_SECONDS * (_COMMON_FACTOR if common else 1.0) * (_UNIFORM_FACTOR if uniform else 1.0)
+    rate = _CELL_SECONDS * (_COMMON_FACTOR if shocks.common else 1.0) * (_UNIFORM_FACTOR if shocks.uniform else 1.0)
+    rate *= 1.0 if shocks.sizes is None else _SCALED_FACTOR
     return rate * sum(_OVERHEAD + math.prod(grid.shape) for grid in layout)
 
 

@@ -33,8 +33,8 @@ from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import AnyTransition, Zones, assembled, back_above, back_below, final
 from certbound.values.discrete.kernels import REACH
 from certbound.values.discrete.layout import FailureBounds, shares_of, start_box
+from certbound.values.discrete.scaled import dynamics_of
 from certbound.values.discrete.shocks import Inapplicable
-from certbound.values.discrete.steps import Dynamics
 from certbound.values.grids import Grid, over_corners
 from certbound.values.sets import box_around
 from certbound.watch import OutOfTime, poll
@@ -52,7 +52,7 @@ def _all_alike(problem: Problem) -> bool:
     """Whether all steps are alike."""
     whole = (0.0, float(problem.horizon))
     still = all(not c.region.moving and c.during in (None, whole) for c in problem.kept)
-    return still and problem.input_sequence is None and Dynamics(problem, 1).steady
+    return still and problem.input_sequence is None and dynamics_of(problem, 1).steady
 
 
 def bound_long_run(
@@ -87,7 +87,7 @@ def bound_long_run(
         return None
     left, best = seconds, None
     tried: list[tuple[float, float, float]] = []
-    for share in shares_of(run.work.n, uniform=run.work.shocks.uniform):
+    for share in shares_of(run.work.n, run.work.shocks):
         layout = run.work.layout(share)
         if layout is None:
             break

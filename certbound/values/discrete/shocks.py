@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +40,9 @@ class Shocks:
     steps : (Array, Array, Array), optional
         One state: lower ends, upper ends and probabilities of intervals on each of which w is uniform; all of them are
         known up to 1e-11 of the largest end.
+    sizes : callable, optional
+        Where the noise depends on the state: standard deviations at points, (P, n) to (P, n), in plain floats;
+        ``sigma`` holds typical ones. Only grids take these.
     """
 
     sigma: Interval
@@ -46,6 +50,7 @@ class Shocks:
     uniform: bool = False
     laplace: bool = False
     steps: tuple[Array, Array, Array] | None = None
+    sizes: Callable[[Array], Array] | None = None
 
     @property
     def reach(self) -> float:

@@ -124,19 +124,19 @@ class Dynamics:
         box = self.problem.system.disturbance
         return (np.empty(0), np.empty(0)) if box is None else (np.asarray(box.low), np.asarray(box.high))
 
-    def _arguments(self, t: int, states: Interval, disturbance: Interval) -> list[Interval]:
+    def arguments(self, t: int, states: Interval, disturbance: Interval) -> list[Interval]:
         found = [Interval.point(float(t)), *(states[:, k] for k in range(self.n))]
         if self._inputs is not None:
             found += [Interval.point(float(value)) for value in self._inputs[t]]
         return found + [disturbance[k] for k in range(len(disturbance))]
 
     def _nodes(self, t: int, grid: Grid, vertex: Interval) -> tuple[Interval, Mask]:
-        image, undefined, _ = evaluate(self.tape, self._arguments(t, Interval.point(grid.nodes()), vertex))
+        image, undefined, _ = evaluate(self.tape, self.arguments(t, Interval.point(grid.nodes()), vertex))
         return image, ~undefined & np.isfinite(image.lo).all(axis=1) & np.isfinite(image.hi).all(axis=1)
 
     def _cells(self, t: int, grid: Grid, box: Interval) -> CellImages:
         boxes = grid.cells()
-        whole = self._arguments(t, boxes, box)
+        whole = self.arguments(t, boxes, box)
         image, undefined, jumps = evaluate(self.tape, whole)
         slopes, bad_slopes, kinks = evaluate(self.slopes, whole)
         count, variables = len(boxes), len(self.columns)
@@ -160,7 +160,7 @@ class Dynamics:
         if not steady.any():
             return image
         middle, centre = Interval.point(boxes.mid), Interval.point(box.mid)
-        at, undefined, _ = evaluate(self.tape, self._arguments(t, middle, centre))
+        at, undefined, _ = evaluate(self.tape, self.arguments(t, middle, centre))
         usable = steady & ~undefined & np.isfinite(at.mag).all(axis=1)
         away = boxes - middle
         if len(box):
