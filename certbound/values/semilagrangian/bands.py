@@ -1,8 +1,8 @@
 """A band of cells between two lines of the grid, and the normal laws of one step on it.
 
-All cells share the variance of y. That of q differs: with T_v the function smoothed by the variance v, d/dv T = d_ww T/2
-and d/dv of that is d_wwww T/4, so that T_v exceeds its interpolation between T_a and T_b, a <= v <= b, by at most
-(b - a)^2/32 sup |d_wwww T|. Each cell interpolates in its own place; what the covariance has beyond is priced.
+All cells share the variance of y. That of q differs: with T_v the function smoothed by the variance v, the derivative
+d/dv T is d_ww T/2, and that of it d_wwww T/4, so that T_v exceeds its interpolation between T_a and T_b, a <= v <= b,
+by at most (b - a)^2/32 sup |d_wwww T|. Each cell interpolates in its place; what the covariance has beyond is priced.
 """
 
 from __future__ import annotations
@@ -227,11 +227,12 @@ def _landed(band: Band, frame: Frame, mesh: Array, found: Rows) -> tuple[Array, 
     image, radius = frame.image[:, nodes], frame.radius[:, nodes]
     tables = np.stack([found.cross_low, found.cross_high, found.steep_y, found.steep_w])
     wanted = _touched(band.live)
-    nodal = at_nodes(image, radius, wanted, mesh, frame.q, found.values, found.bend, tables[2:])
+    nodal = at_nodes(image, radius, wanted, mesh, frame.q, found.values, found.arch, tables[2:])
     dq = np.diff(frame.q)
     bend, extra = along_q(
-        image, radius, band.live, frame.bends[2:, cells], dq, mesh, frame.q, tables, found.bend, found.kinks
-    )
+        image, radius, band.live, frame.bends[2:, cells], dq, mesh, frame.q, tables, found.bend, found.kinks,
+        (found.sagging, found.sway),
+    )  # fmt: skip
     wide = np.stack([found.bent, found.mixed, found.bowed])
     close = np.stack([found.lean_y, found.lean_q, found.lift, found.near + band.beyond])
     payment = over_cells(

@@ -113,7 +113,8 @@ def across(nodes: Array, sigma: float, spread: float, stretch: float) -> Across:
     wide = _mass(nodes, nodes, sigma, WIDER)
     return Across(
         values=values, parabolas=parabolas, sup=sup, density=density, fourth=fourth,
-        mass=np.minimum(density * np.diff(nodes), 1.0), wide=wide, error=kernel.error, spans=spans_of([*values, *parabolas, *sup, density, fourth, wide]),
+        mass=np.minimum(density * np.diff(nodes), 1.0), wide=wide, error=kernel.error,
+        spans=spans_of([*values, *parabolas, *sup, density, fourth, wide]),
     )  # fmt: skip
 
 

@@ -46,8 +46,11 @@ class Rows:
     ----------
     values : ndarray, shape (rows, nq)
         W_k at the nodes.
-    bend : ndarray, shape (rows, nq - 1)
-        Upper bounds of -W_k'' on cells.
+    sagging, sway : ndarray, shapes (rows, nq), (rows, nq - 1)
+        -W_k'' at the nodes, and by how much it may exceed its linear interpolation on cells.
+    bend, arch : ndarray, shape (rows, nq - 1)
+        Upper bounds of -W_k'' on cells, and b such that W_k lies below its chords plus b (w - w_l)(w_{l+1} - w)/2: of
+        what is linear in -W_k'' the mean and a sixth of the change.
     kinks : ndarray, shape (rows, nq - 1)
         Upper bounds of -KW_k on cells.
     lift : ndarray, shape (rows - 1, nq - 1)
@@ -67,7 +70,10 @@ class Rows:
     """
 
     values: Array
+    sagging: Array
+    sway: Array
     bend: Array
+    arch: Array
     kinks: Array
     lift: Array
     cross_low: Array
@@ -109,6 +115,7 @@ def smoothed(
     )
     fourth = across_by(_kinks(u, b, dq), two.sup[2], spans) * eighth
     down = _ends(np.maximum, -v2) + fourth
+    mean = -(v2[:, 1:] + v2[:, :-1]) / 2 + np.abs(np.diff(v2, axis=1)) / 6 * _UP + fourth
     slope_u, slope_b = np.diff(u, axis=0) / dy, np.diff(b, axis=0) / dy
     turn = across_by(_kinks(slope_u, slope_b, dq), two.sup[1], spans) * eighth
     jump = np.diff(np.diff(v, axis=0) / dy, axis=0)
@@ -135,7 +142,8 @@ def smoothed(
     inner = np.maximum(np.maximum(bend[:-1], bend[1:]), bent)
     rate = np.abs(np.diff(rows, axis=1)) / dq
     return Rows(
-        values=rows, bend=bend, kinks=one.spread @ drop, lift=dm / 4 * (one.cells @ np.maximum(drop, 0.0)) * _UP,
+        values=rows, sagging=-(one.rows @ v2), sway=one.rows @ fourth, bend=bend, arch=one.rows @ mean,
+        kinks=one.spread @ drop, lift=dm / 4 * (one.cells @ np.maximum(drop, 0.0)) * _UP,
         cross_low=low, cross_high=high, bent=bent, mixed=mixed, bowed=bowed,
         steep_y=_ends(np.maximum, np.abs(np.diff(rows, axis=0)) / dm) + dq / 2 * np.maximum(np.abs(low), np.abs(high)),
         steep_w=np.maximum(rate[:-1], rate[1:]) + dq / 2 * np.maximum(inner, 0.0),
