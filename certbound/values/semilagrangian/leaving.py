@@ -91,7 +91,7 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
                 raise
             break
         done.append(f"{plan.count} steps")
-        spare = max(min(_SHARE * best / (_RARE * plan.count), _SPARE), 1e-200)
+        spare = max(_SHARE * best / (_RARE * plan.count), 1e-200)
     if failed is not None and not done:
         raise failed
     words = f"value function along the flow, {', '.join(done)}"
