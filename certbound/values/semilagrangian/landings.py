@@ -82,7 +82,7 @@ def _mean_bent(
     smallest = 0.0 if rates[2] <= 0.0 <= rates[3] else min(abs(rates[2]), abs(rates[3])) ** 2
     one, two = level[0] + above, level[count - 1] + above
     first, last = max(one * largest, one * smallest), max(two * largest, two * smallest)
-    return (first + last) / 2 + abs(last - first) / 6
+    return float((first + last) / 2 + abs(last - first) / 6)
 
 
 @compiled
