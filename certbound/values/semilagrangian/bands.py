@@ -1,17 +1,23 @@
-"""A band of cells between two lines of the grid, with the normal law that all of them share in one step."""
+"""A band of cells between two lines of the grid, and the normal laws of one step on it.
+
+All cells share the variance of y. That of q differs: with T_v the function smoothed by the variance v, the derivative
+d/dv T is d_ww T/2, and that of it d_wwww T/4, so that T_v exceeds its interpolation between T_a and T_b, a <= v <= b,
+by at most (b - a)^2/32 sup |d_wwww T|. Each cell interpolates in its place; what the covariance has beyond is priced.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from certbound.arrays import Array, Mask
+from certbound.rigor.intervals import Interval
 from certbound.values.semilagrangian.landings import along_q, at_nodes, over_cells
 from certbound.values.semilagrangian.local_steps import Base
 from certbound.values.semilagrangian.smoothers import REACH, WIDER, Across, Along, across, along
-from certbound.values.semilagrangian.smoothing import Lines, smoothed
+from certbound.values.semilagrangian.smoothing import Lines, Rows, smoothed
 
 _UP = 1 + 1e-9
 NOWHERE = -1e300
@@ -48,21 +54,29 @@ class Frame:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Band:
-    """Cells ``first:last`` along y; see the module."""
+    """Cells ``first:last`` along y; see the module.
+
+    ``two`` holds the kernels along q of the least and the largest variance, ``share`` (cells, nq - 1) where between
+    them a cell's variance is.
+    """
 
     first: int
     last: int
     rows: slice
     lines: slice
     one: Along
-    two: Across
+    two: tuple[Across, Across]
+    share: Array
     reach: Array
     prices: Array
     live: Mask
     beyond: float
+    apart: float
 
 
-def band_of(frame: Frame, first: int, last: int, base: Base, excess: Array, live: Mask, follow: float) -> Band:
+def band_of(
+    frame: Frame, first: int, last: int, base: Base, excess: Array, height: Interval, live: Mask, follow: float
+) -> Band:
     """Prepare a band.
 
     Parameters
@@ -70,12 +84,21 @@ def band_of(frame: Frame, first: int, last: int, base: Base, excess: Array, live
     first, last : int
         Its cells along y.
     base, excess : Base, ndarray of shape (3, last - first, nq - 1)
-        The shared law, and D on the band's cells.
+        The shared law of y, and what ``base.excess`` holds on the band's cells.
+    height : Interval
+        S_qq on the band's cells.
     live : ndarray of bool, shape (last - first, nq - 1)
     follow : float
         Standard deviations up to which D's effect is followed.
     """
-    sigma = base.sigma
+    # the variance of a cell: below S_qq by the tilt, and by what makes up for rounding in what follows
+    held = (height.lo - excess[2]) * (1 - 1e-12)
+    live = live & (held > 0.5 * height.hi)
+    ends = (float(held[live].min()), float(held[live].max())) if live.any() else (1.0, 1.0)
+    share = np.clip((held - ends[0]) / max(ends[1] - ends[0], 1e-300), 0.0, 1.0)
+    sigmas = [math.sqrt(end) for end in ends]
+    sigma = base.sigma, sigmas[0]
+    more = np.where(live, (height.hi - held) * _UP + 1e-14 * height.hi, 0.0)
     reach = follow * np.sqrt(excess[0]) * _UP
     rows = _rows(frame, first, last, live, reach)
     mesh = frame.y[rows]
@@ -83,23 +106,27 @@ def band_of(frame: Frame, first: int, last: int, base: Base, excess: Array, live
     start = int(np.searchsorted(frame.y, mesh[0] - margin, side="right")) - 1
     stop = int(np.searchsorted(frame.y, mesh[-1] + margin)) + 1
     lines = slice(max(start, 0), min(stop, len(frame.y)))
-    live = live & _far_from_ends(frame, first, last, sigma, (float(mesh[0]) - margin, float(mesh[-1]) + margin))
+    live = live & _far_from_ends(
+        frame, first, last, (sigma[0], sigmas[1]), (float(mesh[0]) - margin, float(mesh[-1]) + margin)
+    )
     one = along(frame.y, sigma[0], 1e-15, rows, lines)
-    wider = float(np.where(live, excess[2], 0.0).max(initial=0.0)) / sigma[1] ** 2
-    two = across(frame.q, sigma[1], 1e-15, math.sqrt(1 + wider) * _UP)
-    share = float(np.where(live, excess[0] / sigma[0] ** 2 + excess[2] / sigma[1] ** 2, 0.0).max(initial=0.0))
-    c = 0.5 * (1 - (1 + share) / WIDER**2)
+    wider = (float(more.max(initial=0.0)) + ends[1]) / ends[0]
+    two = across(frame.q, sigmas[0], 1e-15, math.sqrt(wider) * _UP), across(frame.q, sigmas[1], 1e-15, _UP)
+    away = np.where(live, height.hi - ends[0], 0.0)
+    spread = float(np.where(live, excess[0] / sigma[0] ** 2 + away / ends[0], 0.0).max(initial=0.0)) * _UP
+    c = 0.5 * (1 - (1 + spread) / WIDER**2)
     factor = WIDER**2 * math.exp(c - 1) / c * _UP if c > 0.02 else math.inf
     if not math.isfinite(factor):
         live = np.zeros_like(live)
         factor = 0.0
     drift = frame.drift[:, first:last] * factor
-    error = one.error + two.error + 1e-13 + 8e-16 * (len(frame.y[lines]) + 2 * len(frame.q))
-    rounding = error * _amplified(frame, slice(first, last), frame.y[lines], mesh, sigma)
-    prices = np.stack([excess[2] / 2, excess[1], excess[0] / 2, drift[0], drift[1], rounding]) * _UP
+    error = one.error + max(part.error for part in two) + 1e-13 + 8e-16 * (len(frame.y[lines]) + 2 * len(frame.q))
+    amplified = [_amplified(frame, slice(first, last), frame.y[lines], mesh, (sigma[0], s)) for s in sigmas]
+    rounding = error * np.maximum(*amplified)
+    prices = np.stack([more / 2, excess[1], excess[0] / 2, drift[0], drift[1], rounding]) * _UP
     return Band(
-        first=first, last=last, rows=rows, lines=lines, one=one, two=two, reach=reach, prices=prices, live=live,
-        beyond=_NEGLECTED / error,
+        first=first, last=last, rows=rows, lines=lines, one=one, two=two, share=share, reach=reach, prices=prices,
+        live=live, beyond=_NEGLECTED / error, apart=(ends[1] - ends[0]) ** 2 / 32 * _UP,
     )  # fmt: skip
 
 
@@ -166,30 +193,53 @@ def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array])
         `NOWHERE` at nodes of no live cell.
     payment : ndarray, shape (cells, nq - 1)
     """
-    lines, rows = band.lines, frame.y[band.rows]
+    lines, mesh = band.lines, frame.y[band.rows]
     inner = slice(lines.start, lines.stop - 1)
     part = Lines(nodal=value.nodal[lines], bend=value.bend[lines])
-    found = smoothed(
-        part, (slopes[0][inner], slopes[1][inner]), frame.y[lines], rows, frame.q, band.one, band.two
-    )
+    near = slopes[0][inner], slopes[1][inner]
+    least = smoothed(part, near, frame.y[lines], mesh, frame.q, band.one, band.two[0])
+    least = replace(least, lift=least.lift + band.apart * least.fourth)
+    found = [_landed(band, frame, mesh, least)]
+    if band.apart > 0:
+        most = smoothed(part, near, frame.y[lines], mesh, frame.q, band.one, band.two[1], least)
+        found.append(_landed(band, frame, mesh, most))
+    else:
+        found.append(found[0])
+    share, live = band.share, band.live
+    nodal = np.full((live.shape[0] + 1, live.shape[1] + 1), NOWHERE)
+    bend = np.full((live.shape[0] + 1, live.shape[1]), -np.inf)
+
+    def raised(table: Array, place: tuple[slice, slice], low: Array, high: Array, nothing: float) -> None:
+        mixed = (1 - share) * low[place] + share * high[place]
+        table[place] = np.maximum(table[place], np.where(live, mixed, nothing))
+
+    for a in (slice(None, -1), slice(1, None)):
+        raised(bend, (a, slice(None)), found[0][1], found[1][1], -np.inf)
+        for b in (slice(None, -1), slice(1, None)):
+            raised(nodal, (a, b), found[0][0], found[1][0], NOWHERE)
+    bend = np.where(np.isfinite(bend), bend, 0.0)
+    return nodal, bend, ((1 - share) * found[0][2] + share * found[1][2]) * _UP
+
+
+def _landed(band: Band, frame: Frame, mesh: Array, found: Rows) -> tuple[Array, Array, Array]:
+    """The smoothed function of one kernel at the images of the band's nodes and cells, as ``through`` returns it."""
     nodes, cells = slice(band.first, band.last + 1), slice(band.first, band.last)
     image, radius = frame.image[:, nodes], frame.radius[:, nodes]
     tables = np.stack([found.cross_low, found.cross_high, found.steep_y, found.steep_w])
     wanted = _touched(band.live)
-    nodal = at_nodes(image, radius, wanted, rows, frame.q, found.values, found.bend, tables[2:])
-    nodal = np.where(wanted, nodal, NOWHERE)
+    nodal = at_nodes(image, radius, wanted, mesh, frame.q, found.values, found.arch, tables[2:])
     dq = np.diff(frame.q)
     bend, extra = along_q(
-        image, radius, band.live, frame.bends[2:, cells], dq, rows, frame.q, tables, found.bend, found.kinks
-    )
+        image, radius, band.live, frame.bends[2:, cells], dq, mesh, frame.q, tables, found.bend, found.kinks,
+        (found.sagging, found.sway),
+    )  # fmt: skip
     wide = np.stack([found.bent, found.mixed, found.bowed])
     close = np.stack([found.lean_y, found.lean_q, found.lift, found.near + band.beyond])
     payment = over_cells(
-        image, radius, band.live, frame.slopes[:, cells], frame.bends[:, cells], (np.diff(frame.y)[cells], dq), rows,
+        image, radius, band.live, frame.slopes[:, cells], frame.bends[:, cells], (np.diff(frame.y)[cells], dq), mesh,
         frame.q, tables, found.bend, found.kinks, band.reach, band.prices, wide, close,
     )  # fmt: skip
-    payment += np.maximum(extra[:-1], extra[1:])
-    return nodal, bend, payment * _UP
+    return nodal, bend, payment + np.maximum(extra[:-1], extra[1:])
 
 
 def _touched(live: Mask) -> Mask:

@@ -17,7 +17,7 @@ from certbound.values.semilagrangian.backward import Bounds, bounds_below, level
 from certbound.values.semilagrangian.bands import Band, Frame, band_of
 from certbound.values.semilagrangian.confines import Wall
 from certbound.values.semilagrangian.flows import flow, sheared
-from certbound.values.semilagrangian.local_steps import Blocks, Clock, base_of, blocks_of
+from certbound.values.semilagrangian.local_steps import Blocks, Clock, base_of, blocks_of, height_on
 from certbound.values.semilagrangian.mirrors import mirrors_of
 from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.remainders import chord_level, level_of
@@ -27,6 +27,7 @@ _BLOCKS = (90, 40)
 _ORDERS = (4, 8, 7)
 """Of Taylor's polynomials in time: for a first look, on blocks, at nodes."""
 _MOST_BANDS = 12
+_APART = 0.02  # how far apart the variances of a band's cells may be
 _MOST_REACH = 6
 _MIRRORED = 6.0  # standard deviations beyond q's faces over which nodes are mirror images
 
@@ -84,7 +85,7 @@ def layout_of(setting: Setting, plan: Plan) -> Layout:
     marked = _marked(setting, clock, axes, blocks, usable)
     live = ~marked.broken & marked.boxed & usable[np.ix_(*index)]
     frame = _frame(setting, clock, axes, blocks, usable, (index[0], index[1]), live)
-    bands, live = _bands(frame, blocks, usable, (index[0], index[1]), clock)
+    bands, live = _bands(frame, blocks, usable, (index[0], index[1]), (edges[0], edges[1]), clock)
     frame = replace(frame, live=live)
     reach = _reach(blocks, clock, usable, axes)
     above, below, beyond = mirrors_of(setting, clock, axes, blocks, usable)
@@ -338,9 +339,10 @@ def _images(setting: Setting, clock: Clock, y: Array, q: Array, live: Mask) -> t
 
 
 def _bands(
-    frame: Frame, blocks: Blocks, usable: Mask, index: tuple[Index, Index], clock: Clock
+    frame: Frame, blocks: Blocks, usable: Mask, index: tuple[Index, Index], edges: tuple[Array, Array], clock: Clock
 ) -> tuple[list[Band], Mask]:
-    """Bands between which the covariance changes little, and the cells for which a band was found."""
+    """Bands within which the covariance changes little, and the cells for which a band was found."""
+    height = height_on(blocks, edges, index, (frame.y, frame.q))
     live = np.zeros_like(frame.live)
     bands = []
     for first, last in _groups(blocks, usable):
@@ -356,7 +358,7 @@ def _bands(
         if not alive.any():
             continue
         excess = np.where(alive, base.excess[:, spread[0], spread[1]], 0.0)
-        band = band_of(frame, a, b, base, excess, alive, clock.omega)
+        band = band_of(frame, a, b, base, excess, height[a:b], alive, clock.omega)
         live[a:b] = band.live
         bands.append(band)
     return bands, live
@@ -369,7 +371,7 @@ def _groups(blocks: Blocks, usable: Mask) -> list[tuple[int, int]]:
     if not len(rows):
         raise InfeasibleError("no part of the safe set could be followed over a step; value functions prove nothing.")
     middle = np.array([float(np.median(line[keep])) if keep.any() else 0.0 for line, keep in zip(qq, usable)])
-    tolerance = 5e-4
+    tolerance = _APART
     while True:
         groups: list[tuple[int, int]] = []
         start, least, most = int(rows[0]), np.inf, -np.inf

@@ -5,7 +5,9 @@ has the image (y(tau), w(tau)) and, in the sense of distributions,
     -phi0'' <= (-W'') w_t^2 - 2 X y_t w_t + |W_y| |y_tt| + |W_w| |w_tt| + sum_k (-KW_k)^+ |y_t| delta(tau - tau_k),
 tau_k where the path crosses the row Y_k. phi0 exceeds its chord by int G(tau, .) of that: at most tau (1 - tau)/2 times
 a bound of the density, and 1/4 a unit of mass; where y_t may vanish a kink exceeds the chord by at most its slope times
-the range of y. Along q the density goes into the parabola, along y it is paid as a constant.
+the range of y. Of a bound that is linear in tau the mean and a sixth of the change are enough, as the integral of
+G(tau, s) (s - 1/2) is tau (1 - tau)/2 times (2 tau - 1)/6.
+Along q the density goes into the parabola, along y it is paid as a constant.
 """
 
 from __future__ import annotations
@@ -29,10 +31,10 @@ def _cell_of(axis: Array, place: float) -> int:
 
 
 @compiled
-def _density(window: Index, tables: Array, rates: Array, bend: Array) -> float:
+def _density(window: Index, tables: Array, rates: Array, bend: Array, share: float) -> float:
     """sup of the density over a window; ``tables`` cross_low, cross_high, steep_y, steep_w; ``rates`` y_t, w_t ranges.
 
-    The last two of ``rates`` are bounds of |y_tt| and |w_tt|.
+    The last two of ``rates`` are bounds of |y_tt| and |w_tt|; ``share`` is 1, or 0 to leave -W'' w_t^2 out.
     """
     y0, y1, w0, w1 = rates[0], rates[1], rates[2], rates[3]
     largest = max(abs(w0), abs(w1)) ** 2
@@ -42,13 +44,45 @@ def _density(window: Index, tables: Array, rates: Array, bend: Array) -> float:
     best = -np.inf
     for k in range(window[0], window[1] + 1):
         for c in range(window[2], window[3] + 1):
-            b = max(bend[k, c], bend[k + 1, c])
+            b = share * max(bend[k, c], bend[k + 1, c])
             a, d = tables[0, k, c], tables[1, k, c]
             mixed = min(min(a * p, a * r), min(d * p, d * r))
             total = (b * largest if b > 0 else b * smallest) - 2 * mixed
             total += tables[2, k, c] * rates[4] + tables[3, k, c] * rates[5]
             best = max(best, total)
     return best
+
+
+@compiled
+def _mean_bent(
+    window: Index, q: Array, ends: tuple[float, float], loose: float, rates: Array, sagging: Array, sway: Array
+) -> float:
+    """Mean and a sixth of the change of a linear bound of -W'' w_t^2 along a side whose image has these ends in w."""
+    count = window[3] - window[2] + 3
+    place, level = np.empty(count), np.full(count, -np.inf)
+    place[0], place[count - 1] = ends[0], ends[1]
+    for n in range(1, count - 1):
+        place[n] = q[min(max(window[2] + n, 0), len(q) - 1)]
+    steep, more = 0.0, 0.0
+    for k in range(window[0], window[1] + 2):
+        for c in range(window[2], window[3] + 1):
+            more = max(more, sway[k, c])
+            steep = max(steep, abs(sagging[k, c + 1] - sagging[k, c]) / (q[c + 1] - q[c]))
+        for n in range(count):
+            c = min(max(_cell_of(q, place[n]), 0), len(q) - 2)
+            t = min(max((place[n] - q[c]) / (q[c + 1] - q[c]), 0.0), 1.0)
+            level[n] = max(level[n], (1 - t) * sagging[k, c] + t * sagging[k, c + 1])
+    above, span = 0.0, ends[1] - ends[0]
+    for n in range(1, count - 1):
+        t = (place[n] - ends[0]) / span if span != 0.0 else 0.0
+        if 0.0 < t < 1.0:
+            above = max(above, level[n] - (1 - t) * level[0] - t * level[count - 1])
+    above += more + steep * loose
+    largest = max(abs(rates[2]), abs(rates[3])) ** 2
+    smallest = 0.0 if rates[2] <= 0.0 <= rates[3] else min(abs(rates[2]), abs(rates[3])) ** 2
+    one, two = level[0] + above, level[count - 1] + above
+    first, last = max(one * largest, one * smallest), max(two * largest, two * smallest)
+    return float((first + last) / 2 + abs(last - first) / 6)
 
 
 @compiled
@@ -104,11 +138,12 @@ def at_nodes(
 @compiled
 def along_q(
     image: Array, radius: Array, live: Mask, bends: Array, dq: Array, mesh: Array, q: Array, tables: Array,
-    bend: Array, kinks: Array,
+    bend: Array, kinks: Array, sags: tuple[Array, Array],
 ) -> tuple[Array, Array]:  # fmt: skip
     """Per line and cell of the q-axis: the parabola's coefficient and the constant for kinks.
 
-    ``live`` (cells, nq - 1); ``bends`` (2, cells, nq - 1): |d_qq m|; lines are the cells' ends.
+    ``live`` (cells, nq - 1); ``bends`` (2, cells, nq - 1): |d_qq m|; lines are the cells' ends; ``sags`` as `Rows` has
+    ``sagging`` and ``sway``.
     """
     lines, columns = image.shape[1], image.shape[2] - 1
     curve, extra = np.zeros((lines, columns)), np.zeros((lines, columns))
@@ -133,7 +168,10 @@ def along_q(
             y0, y1 = min(image[0, i, j], image[0, i, j + 1]) - sag_y, max(image[0, i, j], image[0, i, j + 1]) + sag_y
             w0, w1 = min(image[1, i, j], image[1, i, j + 1]) - sag_w, max(image[1, i, j], image[1, i, j + 1]) + sag_w
             window = _window(mesh, q, y0, y1, w0, w1)
-            curve[i, j] = _density(window, tables, rates, bend) / square
+            ends = (image[1, i, j], image[1, i, j + 1])
+            mean = _mean_bent(window, q, ends, sag_w, rates, sags[0], sags[1])
+            mean += _density(window, tables, rates, bend, 0.0)
+            curve[i, j] = min(mean, _density(window, tables, rates, bend, 1.0)) / square
             longest = max(abs(rates[0]), abs(rates[1]))
             share = 1.0 if rates[0] <= 0.0 <= rates[1] else 0.25
             extra[i, j] = share * longest * _kinked(window, kinks, mesh, longest)
@@ -182,7 +220,7 @@ def over_cells(
             window = _window(mesh, q, ends[0], ends[1], ends[2], ends[3])
             longest = max(abs(rates[0]), abs(rates[1]))
             share = 1.0 if rates[0] <= 0.0 <= rates[1] else 0.25
-            total = max(_density(window, tables, rates, bend), 0.0) / 8
+            total = max(_density(window, tables, rates, bend, 1.0), 0.0) / 8
             total += share * longest * _kinked(window, kinks, mesh, longest)
             total += _largest(window, close[2]) + prices[5, i, j] * _largest(window, close[3])
             total += prices[3, i, j] * _largest(window, close[0]) + prices[4, i, j] * _largest(window, close[1])

@@ -34,7 +34,7 @@ Shorter steps ask for smaller cells, since every step pays for its interpolation
 """
 _FIRST = 0.25  # share of the work that a first look may take, which tells how rare failing is
 _SPARE = 1e-15
-_RATE = 900_000
+_RATE = 1_200_000
 """Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes."""
 _PREPARED = 20
 _LEAST, _MOST = 8, 2000
@@ -91,7 +91,7 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
                 raise
             break
         done.append(f"{plan.count} steps")
-        spare = max(min(_SHARE * best / (_RARE * plan.count), _SPARE), 1e-200)
+        spare = max(_SHARE * best / (_RARE * plan.count), 1e-200)
     if failed is not None and not done:
         raise failed
     words = f"value function along the flow, {', '.join(done)}"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from certbound.arrays import Array, Mask
+from certbound.arrays import Array, Index, Mask
 from certbound.rigor.intervals import Interval, concatenate, sq
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
 from certbound.values.semilagrangian.noisy_axis import Setting
@@ -40,6 +40,8 @@ class Blocks:
         |d_yy y|, |d_yy q|, |d_qq y|, |d_qq q|.
     covariance : (Interval, Interval, Interval)
         S_yy, S_yq, S_qq.
+    tilted : (Interval, Interval, Interval)
+        S_qq in the box's middle, and its derivatives by y and q over the box.
     strays : Remainders
         In (p, q).
     known : ndarray of bool
@@ -49,6 +51,7 @@ class Blocks:
     slopes: Array
     bends: Array
     covariance: tuple[Interval, Interval, Interval]
+    tilted: tuple[Interval, Interval, Interval]
     strays: Remainders
     known: Mask
 
@@ -93,6 +96,7 @@ def blocks_of(
         slopes=filled(np.stack([getattr(end[k], side) for k in (2, 3) for side in ("lo", "hi")])),
         bends=filled(np.stack([end[k].mag for k in range(6, 10)])),
         covariance=tuple(shaped(value * loose) for value in covariance),  # type: ignore[arg-type]
+        tilted=tuple(shaped(value * loose) for value in (centre[12], end[15], end[18])),  # type: ignore[arg-type]
         strays=_filled(strays, filled), known=filled(known.astype(float)) > 0,
     )  # fmt: skip
 
@@ -111,14 +115,29 @@ def _both(one: Interval, other: Interval) -> Interval:
     return Interval(np.minimum(low, high), high)
 
 
+def height_on(
+    blocks: Blocks, edges: tuple[Array, Array], index: tuple[Index, Index], axes: tuple[Array, Array]
+) -> Interval:
+    """S_qq on cells of finer axes, shape (len(y) - 1, len(q) - 1): its mean-value form about the blocks' middles."""
+    spread = np.ix_(*index)
+    found, by_y, by_q = (part[spread] for part in blocks.tilted)
+    places = [
+        Interval(axis[:-1], axis[1:]) - Interval.point(Interval(edge[:-1], edge[1:]).mid[block])
+        for axis, edge, block in zip(axes, edges, index)
+    ]
+    found = found + by_y * places[0][:, None] + by_q * places[1][None]
+    return _both(found, blocks.covariance[2][spread])
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Base:
-    """The normal law that a band's kernels are made for: D = S - diag(sigma_y^2, sigma_q^2) >= 0 on ``known`` blocks.
+    """The noise of y that a band's kernels are made for: D = S - diag(sigma_y^2, v) >= 0 on ``known`` blocks, if v is
+    at most S_qq less ``tilt``.
 
-    ``excess`` holds upper bounds of D_yy, |D_yq|, D_qq, shape (3, blocks of y, blocks of q).
+    ``excess`` holds upper bounds of D_yy, |D_yq|, and the tilt D_yq^2/D_yy, shape (3, blocks of y, blocks of q).
     """
 
-    sigma: tuple[float, float]
+    sigma: float
     excess: Array
     known: Mask
 
@@ -131,17 +150,10 @@ def base_of(blocks: Blocks, known: Mask) -> Base:
     limit = max(0.02, 4 * float(np.median(tilt[known])))
     known = known & (tilt <= min(limit, 0.3))
     if not known.any():
-        return Base(sigma=(1.0, 1.0), excess=np.zeros((3, *known.shape)), known=known)
-    most = float(tilt[known].max())
-    shares = (4.2 * min(most, 0.2) + 1e-6, 0.25 * most + 1e-7)
-    sigma = [
-        math.sqrt(float(value.lo[known].min()) * (1 - share)) for value, share in zip((yy, qq), shares)
-    ]
-    first = yy - sq(Interval.point(sigma[0]))
-    second = qq - sq(Interval.point(sigma[1]))
-    fine = (first.lo >= 0) & (second.lo >= 0)
-    product = Interval.point(np.maximum(first.lo, 0.0)) * Interval.point(np.maximum(second.lo, 0.0))
-    fine &= product.lo >= sq(yq).hi
-    return Base(
-        sigma=(sigma[0], sigma[1]), excess=np.stack([first.hi, yq.mag, second.hi]), known=known & fine
-    )
+        return Base(sigma=1.0, excess=np.zeros((3, *known.shape)), known=known)
+    share = 4.2 * min(float(tilt[known].max()), 0.2) + 1e-6
+    sigma = math.sqrt(float(yy.lo[known].min()) * (1 - share))
+    first = yy - sq(Interval.point(sigma))
+    fine = first.lo > 0
+    least = sq(yq) / Interval.point(np.where(fine, first.lo, 1.0))
+    return Base(sigma=sigma, excess=np.stack([first.hi, yq.mag, least.hi]), known=known & fine)

@@ -11,7 +11,8 @@ with absolute values; sup over a cell is over all y of the cell [Y_k, Y_{k+1}].
     mass     min(1, D_i sup of phi over cell k - cell i), for s and for the wider s kappa
 
 For the q-axis: matrices of values, first and second derivatives from nodal values and from parabolas, the suprema of
-|phi|, |phi'|, |phi''| over cell - cell, and the suprema of phi and of the mass over all s between s_q and s_q stretch.
+|phi|, |phi'|, |phi''| over cell - cell, and the suprema of phi, |phi''| and the mass over all s between s_q and s_q
+stretch.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ class Across:
     parabolas: tuple[Array, ...]
     sup: tuple[Array, ...]
     density: Array
+    fourth: Array
     mass: Array
     wide: Array
     error: float
@@ -107,11 +109,12 @@ def across(nodes: Array, sigma: float, spread: float, stretch: float) -> Across:
     values = tuple(_dense(kernel, "hat", len(nodes), order) for order in range(3))
     parabolas = tuple(_dense(kernel, "bubble", len(nodes) - 1, order) for order in range(3))
     sup = peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma)
-    density = peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma, stretch)[0]
+    density, _, fourth = peak(nodes[:-1], nodes[1:], nodes[:-1], nodes[1:], sigma, stretch)
     wide = _mass(nodes, nodes, sigma, WIDER)
     return Across(
-        values=values, parabolas=parabolas, sup=sup, density=density, mass=np.minimum(density * np.diff(nodes), 1.0),
-        wide=wide, error=kernel.error, spans=spans_of([*values, *parabolas, *sup, density, wide]),
+        values=values, parabolas=parabolas, sup=sup, density=density, fourth=fourth,
+        mass=np.minimum(density * np.diff(nodes), 1.0), wide=wide, error=kernel.error,
+        spans=spans_of([*values, *parabolas, *sup, density, fourth, wide]),
     )  # fmt: skip
 
 

@@ -46,8 +46,11 @@ class Rows:
     ----------
     values : ndarray, shape (rows, nq)
         W_k at the nodes.
-    bend : ndarray, shape (rows, nq - 1)
-        Upper bounds of -W_k'' on cells.
+    sagging, sway : ndarray, shapes (rows, nq), (rows, nq - 1)
+        -W_k'' at the nodes, and by how much it may exceed its linear interpolation on cells.
+    bend, arch : ndarray, shape (rows, nq - 1)
+        Upper bounds of -W_k'' on cells, and b such that W_k lies below its chords plus b (w - w_l)(w_{l+1} - w)/2: of
+        what is linear in -W_k'' the mean and a sixth of the change.
     kinks : ndarray, shape (rows, nq - 1)
         Upper bounds of -KW_k on cells.
     lift : ndarray, shape (rows - 1, nq - 1)
@@ -62,10 +65,15 @@ class Rows:
         The dominating mean of |U|, in which errors are measured.
     lean_y, lean_q : ndarray, shape (rows - 1, nq - 1)
         Dominating means of |U|'s slopes near a point.
+    fourth : ndarray, shape (rows - 1, nq - 1)
+        Upper bound of |d_wwww T|, for all s in [s_q, s_q stretch].
     """
 
     values: Array
+    sagging: Array
+    sway: Array
     bend: Array
+    arch: Array
     kinks: Array
     lift: Array
     cross_low: Array
@@ -78,11 +86,13 @@ class Rows:
     near: Array
     lean_y: Array
     lean_q: Array
+    fourth: Array
 
 
 def smoothed(
-    lines: Lines, slopes: tuple[Array, Array], y: Array, mesh: Array, q: Array, one: Along, two: Across
-) -> Rows:
+    lines: Lines, slopes: tuple[Array, Array], y: Array, mesh: Array, q: Array, one: Along, two: Across,
+    least: Rows | None = None,
+) -> Rows:  # fmt: skip
     """The majorant on the rows at ``mesh``, from the lines at ``y``.
 
     Parameters
@@ -91,6 +101,9 @@ def smoothed(
         Those within reach of the rows only.
     slopes : (ndarray, ndarray), shape (lines - 1, nq - 1)
         Bounds of |d_y U|, |d_q U| near every cell.
+    least : Rows, optional
+        The same with a smaller s_q whose stretch reaches this one's: what depends on second derivatives and dominating
+        means alone is then as there.
     """
     dy, dq, dm = np.diff(y)[:, None], np.diff(q), np.diff(mesh)[:, None]
     eighth = dq**2 / 8 * _UP
@@ -102,29 +115,40 @@ def smoothed(
     )
     fourth = across_by(_kinks(u, b, dq), two.sup[2], spans) * eighth
     down = _ends(np.maximum, -v2) + fourth
+    mean = -(v2[:, 1:] + v2[:, :-1]) / 2 + np.abs(np.diff(v2, axis=1)) / 6 * _UP + fourth
     slope_u, slope_b = np.diff(u, axis=0) / dy, np.diff(b, axis=0) / dy
     turn = across_by(_kinks(slope_u, slope_b, dq), two.sup[1], spans) * eighth
-    tilt = across_by(np.abs(np.diff(slope_u, axis=1)) / dq + np.abs(slope_b) * dq / 2, two.mass, spans)
     jump = np.diff(np.diff(v, axis=0) / dy, axis=0)
     wave = across_by(_kinks(np.diff(slope_u, axis=0), np.diff(slope_b, axis=0), dq), two.sup[0], spans) * eighth
     edge = ((1, 1), (0, 0))
     drop = np.pad(_ends(np.maximum, -jump) + wave, edge)
-    bow = _ends(np.maximum, np.abs(np.diff(slope_u, axis=0))) + np.abs(np.diff(slope_b, axis=0)) * eighth
-    size = np.pad(across_by(bow, two.mass, spans), edge)
     rows, rows1, bend = one.rows @ v, one.rows @ v1, one.rows @ down
     cross = np.diff(rows1, axis=0) / dm
     spare = one.mass @ turn
     low, high = _ends(np.minimum, cross) - spare, _ends(np.maximum, cross) + spare
-    bent = one.ceiling @ across_by(_rising(u, b, dq), two.density, spans) * _UP
+    if least is None:
+        tilt = across_by(np.abs(np.diff(slope_u, axis=1)) / dq + np.abs(slope_b) * dq / 2, two.mass, spans)
+        bow = _ends(np.maximum, np.abs(np.diff(slope_u, axis=0))) + np.abs(np.diff(slope_b, axis=0)) * eighth
+        size = np.pad(across_by(bow, two.mass, spans), edge)
+        bent, mixed, bowed, lean_y, lean_q, quartic = (
+            one.ceiling @ across_by(_rising(u, b, dq), two.density, spans) * _UP, (one.mass @ tilt) * _UP,
+            (one.density @ size) * _UP, _wide(slopes[0], one, two), _wide(slopes[1], one, two),
+            one.ceiling @ across_by(_kinks(u, b, dq), two.fourth, spans) * _UP,
+        )  # fmt: skip
+    else:
+        bent, mixed, bowed, lean_y, lean_q, quartic = (
+            least.bent, least.mixed, least.bowed, least.lean_y, least.lean_q, least.fourth,
+        )  # fmt: skip
     inner = np.maximum(np.maximum(bend[:-1], bend[1:]), bent)
     rate = np.abs(np.diff(rows, axis=1)) / dq
     return Rows(
-        values=rows, bend=bend, kinks=one.spread @ drop, lift=dm / 4 * (one.cells @ np.maximum(drop, 0.0)) * _UP,
-        cross_low=low, cross_high=high, bent=bent, mixed=(one.mass @ tilt) * _UP, bowed=(one.density @ size) * _UP,
+        values=rows, sagging=-(one.rows @ v2), sway=one.rows @ fourth, bend=bend, arch=one.rows @ mean,
+        kinks=one.spread @ drop, lift=dm / 4 * (one.cells @ np.maximum(drop, 0.0)) * _UP,
+        cross_low=low, cross_high=high, bent=bent, mixed=mixed, bowed=bowed,
         steep_y=_ends(np.maximum, np.abs(np.diff(rows, axis=0)) / dm) + dq / 2 * np.maximum(np.abs(low), np.abs(high)),
         steep_w=np.maximum(rate[:-1], rate[1:]) + dq / 2 * np.maximum(inner, 0.0),
         near=_wide(_corners(u) + _sides(np.abs(b)) * eighth, one, two),
-        lean_y=_wide(slopes[0], one, two), lean_q=_wide(slopes[1], one, two),
+        lean_y=lean_y, lean_q=lean_q, fourth=quartic,
     )  # fmt: skip
 
 
