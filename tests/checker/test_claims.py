@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -251,3 +252,20 @@ def test_what_no_drawn_value_makes_likely_is_certified_as_far_as_balls_tell() ->
     report = check_data(parse(proved_certificate(problem, verify_safety(problem, method="values"))))
     assert report.valid
     assert report.log10_delta < -20
+
+
+def test_a_certificate_that_is_too_large_for_the_checker_leaves_those_of_other_engines(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = cb.Problem(STEP, initial=[0.2], safe=SIDE, horizon=2, delta=0.2)
+    one, other = (verify_safety(problem, method=name) for name in ("linear", "constants"))
+    verdict = replace(one, answers=one.answers | other.answers)
+    best = parse(proved_certificate(problem, verdict))["claim"]["method"]
+
+    def small(data: Data, *given: Any, **options: Any) -> Report:
+        if data["claim"]["method"] == best:
+            raise CertificateError("`proof.grids[0]` must make at most 100000 cells.")
+        return check_data(data, *given, **options)
+
+    monkeypatch.setattr("certbound.checker.check_data", small)
+    assert parse(proved_certificate(problem, verdict))["claim"]["method"] != best
