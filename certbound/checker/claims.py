@@ -264,7 +264,7 @@ def _average(model: Model, proof: object, budget: Budget) -> arb:
         if row is not None:
             bound = prove(one, row, budget)
             kept += weight * (1 - bound) if bound.is_finite() and bound < 1 else arb(0)
-    return 1 - kept
+    return arb.max((1 - kept).upper(), arb(0))
 
 
 def words_of(model: Model, proof: object) -> str:

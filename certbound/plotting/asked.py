@@ -43,7 +43,10 @@ class Panel:
 
 
 def panels_of(problem: Problem) -> list[Panel]:
-    """Half-spaces that share a direction share a panel; every other constraint has one of its own."""
+    """Half-spaces that share a direction share a panel; every other constraint has one of its own.
+
+    Where there is no constraint (a target or a domain alone) the first state has a panel without limits.
+    """
     found: list[Panel] = []
     names = tuple(problem.axis(name) for name in problem.system.states)
     for number, constraint in enumerate(problem.safe):
@@ -56,7 +59,7 @@ def panels_of(problem: Problem) -> list[Panel]:
         rows, bounds = region.lifted(form.normals, problem.system.dimension), form.bounds
         for row, b in zip(rows, bounds if region.center is None else bounds + form.normals @ region.center_at()):
             _add_face(found, row, float(b), names, constraint.during, number)
-    return found
+    return found or [Panel(label=names[0], direction=np.eye(problem.system.dimension)[0])]
 
 
 def _distance_label(constraint: Inside) -> str:

@@ -142,7 +142,7 @@ def _built(
     own: Array | Tape = system.fixed_gain if system.gain is None else system.gain
     if law is None:
         law = system.noise
-    elif not np.any(system.noise.proxy):  # the plant has no noise
+    elif not np.any(getattr(system.noise, system.noise.level)):  # the plant has no noise
         own = np.zeros((len(system.states), 0))
     else:
         law = _joined(system.noise, law)

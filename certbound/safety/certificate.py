@@ -156,8 +156,8 @@ def averaged(problem: Problem, cells: Sequence[Any], found: Sequence[Mapping[str
             rows.append({"low": exact(cell.low), "high": exact(cell.high), "proof": proof})
             if one is not None:
                 kept += cell.weight * (1 - arb(10) ** arb(float.fromhex(one["claim"]["log10_delta"])))
-        most = 1 - kept
-        level = min(upper(most.log() / arb(10).log()) + _ROUNDING, 0.0) if most.upper() > 0 else 0.0
+        most = (1 - kept).upper()
+        level = min(upper(most.log() / arb(10).log()) + _ROUNDING, 0.0) if most > 0 else 0.0
     if not level < 0:
         raise CertificateError("what is certified of the cells of the drawn constants gives no bound below 1.")
     claim = {"log10_delta": exact(level), "method": "random", "assumptions": list(assumed)}

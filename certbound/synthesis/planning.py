@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from certbound.arrays import Array
 from certbound.constants.bounds import bound_constants
 from certbound.errors import InfeasibleError
+from certbound.problem.goals import check_end
 from certbound.problem.model import jacobian
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Region
@@ -326,6 +327,7 @@ class Planner:
 def _grid(problem: Problem, steps: int | None) -> Grid:
     if steps is not None and (isinstance(steps, bool) or int(steps) != steps or steps < 1):
         raise ValueError(f"`steps` must be a positive integer, got {steps!r}.")
+    check_end(problem, "a plan")
     if problem.system.time == "discrete":
         if steps is not None and steps != problem.horizon:
             raise ValueError(f"`steps` must be the horizon, {problem.horizon}, in discrete time; leave it out.")

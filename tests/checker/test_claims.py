@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import certbound as cb
 from certbound.checker import Report, check_data, parse
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.cli.app import run
+from certbound.cli.commands.check import proved_certificate
 from certbound.errors import CertificateError
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.verification import verify_safety
@@ -223,3 +225,47 @@ def test_the_method_is_the_proofs_engine(stepping: Case) -> None:
     with pytest.raises(CertificateError, match=r'`claim\.method` must be "linear"'):
         check_data(data)
     assert math.isfinite(check_data(stepping.data).log10_delta)
+
+
+# ---- what is certain ---------------------------------------------------------------------------------------------
+
+STEP = cb.DiscreteSystem(lambda x: 0.5 * x, states=["x"], noise=cb.Gaussian(std=0.3))
+
+
+@pytest.mark.parametrize(("high", "arrived"), [(0.3, True), (0.45, False)])
+def test_a_start_in_the_target_has_not_failed(high: float, arrived: bool) -> None:
+    asked = {"safe": SIDE, "reach": cb.Box([0.1], [0.4]), "horizon": 2, "delta": 0.9}
+    problem = cb.Problem(STEP, initial=cb.Box([0.2], [high]), **asked)
+    report = check_data(parse(proved_certificate(problem, verify_safety(problem, method="values"))))
+    assert report.log10_proved is not None
+    assert (report.log10_proved < -100) == arrived
+    assert report.log10_proved < 0
+
+
+def test_what_no_drawn_value_makes_likely_is_certified_as_far_as_balls_tell() -> None:
+    system = cb.DiscreteSystem(
+        lambda x, d: d * x, states=["x"], disturbance=cb.Box([0], [1]), disturbance_names=["k"],
+        noise=cb.Rademacher(scale=0.1),
+    )  # fmt: skip
+    law = {"k": cb.Random(law=cb.Rademacher(scale=0.25), mean=0.5)}
+    problem = cb.Problem(system, initial=[0.1], safe=SIDE, horizon=2, random=law)
+    report = check_data(parse(proved_certificate(problem, verify_safety(problem, method="values"))))
+    assert report.valid
+    assert report.log10_delta < -20
+
+
+def test_a_certificate_that_is_too_large_for_the_checker_leaves_those_of_other_engines(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = cb.Problem(STEP, initial=[0.2], safe=SIDE, horizon=2, delta=0.2)
+    one, other = (verify_safety(problem, method=name) for name in ("linear", "constants"))
+    verdict = replace(one, answers=one.answers | other.answers)
+    best = parse(proved_certificate(problem, verdict))["claim"]["method"]
+
+    def small(data: Data, *given: Any, **options: Any) -> Report:
+        if data["claim"]["method"] == best:
+            raise CertificateError("`proof.grids[0]` must make at most 100000 cells.")
+        return check_data(data, *given, **options)
+
+    monkeypatch.setattr("certbound.checker.check_data", small)
+    assert parse(proved_certificate(problem, verdict))["claim"]["method"] != best

@@ -97,3 +97,12 @@ def test_an_animation_without_a_plane_runs_over_time(tmp_path: Path) -> None:
     verdict = cb.verify_safety(cb.load("ou"), method="constants")
     cb.animate(verdict, tmp_path / "ou.gif", frames=2, paths=2)
     assert (tmp_path / "ou.gif").stat().st_size > 1000
+
+
+def test_a_picture_needs_no_limits(axes: Axes) -> None:
+    system = cb.DiscreteSystem(lambda x: 0.9 * x, states=["level"], noise=cb.Gaussian(std=0.1))
+    problem = cb.Problem(system, initial=[0.5], safe=[], horizon=4)
+    for shown in (problem, cb.verify_safety(problem, method="constants")):
+        axes.clear()
+        shown.plot(axes)
+        assert len(axes.lines) > 0

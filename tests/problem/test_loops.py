@@ -121,6 +121,12 @@ def test_a_plant_without_noise_takes_the_law_of_its_sensor():
     np.testing.assert_array_equal(loop.noise_matrix, [[0], [0], [0.4], [0.6]])
 
 
+def test_noise_without_a_proxy_stands_beside_its_own_kind():
+    own, other = cb.Laplace(scale=3.0), cb.Laplace(scale=4.0)
+    loop = cb.estimate_loop(sampled(own), L, output=C, feedback=lambda x: K @ x, sensor_noise=other)
+    np.testing.assert_array_equal(loop.noise.scale, [3.0, 4.0])
+
+
 def test_what_is_proved_of_a_loop_holds_in_simulations_of_the_recursion():
     loop = cb.estimate_loop(sampled(), L, output=C, feedback=lambda x: K @ x, sensor_noise=cb.Gaussian(std=0.02))
     safe = [cb.Inside(cb.Box([-0.03], [0.03], coordinates=(0,)))]

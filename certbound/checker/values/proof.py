@@ -219,10 +219,13 @@ class _Discrete:
         if self.model.target is not None and counts(self.model, 0):
             target = StepSet(replace(self.model, constraints=(target_of(self.model),)), 0, self.budget)
             off = np.array([target.excludes(box) for box in self.starts])
-            there = found if arrived is None else step.apply(arrived)
+            over = tm.fixed(found.terms, np.zeros(len(off)))
             if not self.above:
-                there = tm.fixed(found.terms, np.zeros(len(off)))
-            found = tm.chosen(off, found, there) if self.above or arrived is None else found
+                found = tm.chosen(off, found, over) if arrived is None else found
+            elif arrived is None:
+                found = tm.chosen(np.array([target.holds(box) for box in self.starts]), over, found)
+            else:
+                found = tm.chosen(off, found, step.apply(arrived))
         if self.model.ends and not self.above:
             domain = StepSet(replace(self.model, constraints=self.model.constraints[-1:]), 0, self.budget)
             within = np.array([domain.holds(box) for box in self.starts])

@@ -233,7 +233,7 @@ class LinearRun(Inclusion):
         rooms = self.rooms(outcome.cell, outcome.bounds)
         kept = self.kept.get(outcome.nonlinear, (None, []))[1]
         events = kept[outcome.cell] if kept else self.events(outcome.cell, outcome.nonlinear.common(self.inner))
-        target = Share.of(self.engine.problem.delta / len(asked)).log
+        target = Share.of(self.engine.problem.delta / max(len(asked), 1)).log
         left = np.empty_like(rooms)
         for index, requirement in enumerate(asked):
             event = events.along(requirement.rows)

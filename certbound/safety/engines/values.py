@@ -77,7 +77,8 @@ def _by_function(problem: Problem) -> EngineAnswer:
 
 def _without_end(problem: Problem, limit: float) -> EngineAnswer | None:
     """What all times say of a horizon without a target, which may end; None where nothing is proved."""
-    if problem.system.dimension > 1 or problem.reach is not None:
+    timed = problem.input_sequence is not None or any(one.during is not None for one in problem.safe)
+    if problem.system.dimension > 1 or problem.reach is not None or timed:
         return None
     try:
         if problem.system.time == "continuous":

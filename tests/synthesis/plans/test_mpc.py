@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
+from certbound.errors import InfeasibleError
 from certbound.synthesis.plans.infeasibility import smallest_delta
 from tests.synthesis.conftest import A, B, cart
 
@@ -258,3 +259,13 @@ def test_ours_plans_the_chain_at_more_than_twice_the_noise_of_the_papers() -> No
     loud = cb.load("chain", sigma=0.43 * 3.2)
     assert cb.synthesize_plan(loud, method="linear").status == "SAFE"
     assert not cb.synthesize_plan(cb.load("chain", sigma=0.43 * 1.6), method="thm5", epsilon=15 / 16, step=1).feasible
+
+
+def test_a_plan_needs_an_end() -> None:
+    for system in (
+        cb.DiscreteSystem(lambda x, u: [x[0] + u[0]], states=1, inputs=cb.Box([-1], [1]), noise=cb.Gaussian(std=0.1)),
+        cb.ContinuousSystem(lambda x, u: [u[0]], states=1, inputs=cb.Box([-1], [1]), diffusion=0.1),
+    ):
+        problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=np.inf)
+        with pytest.raises(InfeasibleError, match="give a finite `horizon`"):
+            cb.synthesize_plan(problem)
