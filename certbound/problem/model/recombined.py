@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+
 from certbound.arrays import Array
 from certbound.problem.model.graph import Graph
 from certbound.problem.model.tape import Tape
@@ -60,11 +62,25 @@ def turned_tape(tape: Tape, inverse: Array, matrix: Array | None = None) -> tupl
     return sums.graph.tape([sums.node(one) for one in found], tape.shape), rows
 
 
+def curved_sums(tape: Tape, n: int) -> Array:
+    """The sums of states that operations other than sums see, by the states' factors, each once: shape (count, n).
+
+    f depends on its n states through these alone, but for what is linear.
+    """
+    sums = _Sums(tape.inputs)
+    given = [Sum({sums.graph.input(slot): _ONE}) for slot in range(len(tape.inputs))]
+    tape.evaluate(sums.arithmetic(), given)
+    state = {node: place - 1 for place in range(1, n + 1) for node in given[place].terms}
+    found = {tuple(float(one.terms.get(node, 0)) for node in state) for one in sums.seen}
+    return np.array(sorted(row for row in found if any(row)), dtype=float).reshape(-1, n)
+
+
 class _Sums:
-    """The arithmetic of sums over a graph."""
+    """The arithmetic of sums over a graph; ``seen`` are those that went into other operations."""
 
     def __init__(self, inputs: Sequence[str]) -> None:
         self.graph = Graph(inputs)
+        self.seen: list[Sum] = []
 
     def combined(self, parts: Iterable[tuple[Any, Sum]]) -> Sum:
         """A sum of sums by factors that are floats."""
@@ -78,6 +94,7 @@ class _Sums:
         terms = {node: c for node, c in terms.items() if c}
         if len(terms) <= _MOST and all(_is_float(c) for c in (constant, *terms.values())):
             return Sum(terms, constant)
+        self.seen += [one for _, one in kept]
         total = self.graph.const(0.0)
         for factor, one in kept:
             total = self._plus(total, factor, self.node(one))
@@ -102,7 +119,11 @@ class _Sums:
         plain = self.graph.arithmetic()
 
         def nonlinear(apply: Callable[..., int]) -> Callable[..., Sum]:
-            return lambda *given: self._of(apply(*(self.node(x) if isinstance(x, Sum) else x for x in given)))
+            def applied(*given: Any) -> Sum:
+                self.seen += [x for x in given if isinstance(x, Sum)]
+                return self._of(apply(*(self.node(x) if isinstance(x, Sum) else x for x in given)))
+
+            return applied
 
         def product(a: Sum, b: Sum) -> Sum:
             for one, other in ((a, b), (b, a)):
