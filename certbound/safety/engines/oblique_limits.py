@@ -2,9 +2,9 @@
 
 A limit n . x <= b becomes a limit of one state y = n . x, and where y has no noise of its own and its rate is a sum of
 states, that sum becomes a state too: of vehicles that must keep their order the distances and their rates. What noise
-and drift have in common cancels then, and windows and boxes, which are entrywise, lose less. Where the dynamics bends along
-fewer sums of states than states (of generators the differences of angles), these sums become states, too, and the other
-coordinates come first: what all have in common wanders, and boxes of it cost most of what is bounded.
+and drift have in common cancels then, and windows and boxes, which are entrywise, lose less. Where the dynamics bends
+along fewer sums of states than states (of generators the differences of angles), these sums become states, too, and the
+other coordinates come first: what all have in common wanders, and boxes of it cost most of what is bounded.
 """
 
 from __future__ import annotations

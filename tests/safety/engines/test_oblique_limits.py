@@ -59,9 +59,11 @@ def test_distances_and_their_rates_become_states() -> None:
 def rotors() -> cb.Problem:
     """Two coupled rotors: what bends is their difference alone, and together they wander."""
     system = cb.ContinuousSystem(
-        lambda x: [0.25 - np.sin(x[0] - x[1]), 0.25 + np.sin(x[0] - x[1])], states=["a", "b"], diffusion=0.0625 * np.eye(2)
+        lambda x: [0.25 - np.sin(x[0] - x[1]), 0.25 + np.sin(x[0] - x[1])], states=["a", "b"],
+        diffusion=0.0625 * np.eye(2),
     )
-    return cb.Problem(system, initial=[0.25, 0.0], safe=[cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))], horizon=0.5, delta=1e-2)
+    safe = [cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))]
+    return cb.Problem(system, initial=[0.25, 0.0], safe=safe, horizon=0.5, delta=1e-2)
 
 
 def test_the_sums_along_which_a_model_bends_become_states() -> None:
@@ -88,14 +90,17 @@ def test_where_a_model_bends_along_fewer_sums_than_states_these_coordinates_come
         return in_coordinates(prove)(problem, Request())
 
     enough = proves(-9.0, -2.5)
-    assert isinstance(enough.details, Turned) and len(asked) == 1 and asked[0] is not problem
+    assert isinstance(enough.details, Turned)
+    assert len(asked) == 1
+    assert asked[0] is not problem
     better = proves(-0.5, -1.0)  # neither is enough: each is asked once
-    assert isinstance(better.details, Turned) and better.details.plain.log10_delta == -0.5
-    assert better.log10_delta == -1.0 and len(asked) == 2
+    assert isinstance(better.details, Turned)
+    assert (better.details.plain.log10_delta, better.log10_delta, len(asked)) == (-0.5, -1.0, 2)
     worse = proves(-1.5, -1.0)
-    assert worse.details is None and worse.log10_delta == -1.5 and len(asked) == 2
+    assert (worse.details, worse.log10_delta, len(asked)) == (None, -1.5, 2)
     verdict = verdict_of(problem, {"linear": in_coordinates(linear_engine)(problem, Request())})
-    assert verdict.status == "SAFE" and isinstance(verdict.answers["linear"].details, Turned)
+    assert verdict.status == "SAFE"
+    assert isinstance(verdict.answers["linear"].details, Turned)
     assert check_data(parse(certificate_text(problem, verdict)), problem_data(problem)).valid
 
 
