@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         kinks_where,
         undefined_where,
     )
-    from certbound.problem.model.recombined import curved_sums, turned_tape
+    from certbound.problem.model.recombined import turned_tape
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
     from certbound.problem.model.time_jumps import cut_at_jumps
     from certbound.problem.model.tracing import trace
@@ -48,7 +48,7 @@ _HOME = {
     "calling": "call_network",
     "network_rows": "relaxed weights_of",
     "network_data": "PARTS Layer Network Part",
-    "recombined": "curved_sums turned_tape",
+    "recombined": "turned_tape",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
     "time_jumps": "cut_at_jumps",
@@ -62,7 +62,6 @@ __all__ = [
     "call_network",
     "compile_numpy",
     "compile_scalar",
-    "curved_sums",
     "cut_at_jumps",
     "deciding",
     "edged",

@@ -29,8 +29,10 @@ class Sum:
     constant: Fraction = Fraction(0)
 
 
-def turned_tape(tape: Tape, inverse: Array, matrix: Array | None = None) -> tuple[Tape, list[dict[int, float] | None]]:
-    """matrix . f(t, inverse y, ...) of a tape f over (t, states, ...), and which of its outputs are linear in y.
+def turned_tape(
+    tape: Tape, inverse: Array, matrix: Array | None = None
+) -> tuple[Tape, list[dict[int, float] | None], Array]:
+    """matrix . f(t, inverse y, ...) of a tape f over (t, states, ...), which outputs are linear in y, and what bends.
 
     Parameters
     ----------
@@ -45,12 +47,16 @@ def turned_tape(tape: Tape, inverse: Array, matrix: Array | None = None) -> tupl
         Over the same inputs.
     rows : list
         Per output the coefficients by state, None of an output that is not linear in the states alone.
+    bent : ndarray, shape (count, n)
+        The sums of states y that go into operations other than sums: but for what is linear, f sees no others.
     """
     sums, n = _Sums(tape.inputs), len(inverse)
     given = [Sum({sums.graph.input(slot): _ONE}) for slot in range(len(tape.inputs))]
     state = {node: place - 1 for place in range(1, n + 1) for node in given[place].terms}
     given[1 : n + 1] = [sums.combined(zip(row, given[1 : n + 1])) for row in inverse.tolist()]
     found: list[Sum] = tape.evaluate(sums.arithmetic(), given)
+    seen = {tuple(float(one.terms.get(node, 0)) for node in state) for one in sums.seen}
+    bent = np.array(sorted(row for row in seen if any(row)), dtype=float).reshape(-1, n)
     if matrix is not None:
         m = len(found) // n
         found = [sums.combined(zip(row, found[k::m])) for row in matrix.tolist() for k in range(m)]
@@ -59,20 +65,7 @@ def turned_tape(tape: Tape, inverse: Array, matrix: Array | None = None) -> tupl
         if one.constant == 0 and one.terms.keys() <= state.keys() else None
         for one in found
     ]  # fmt: skip
-    return sums.graph.tape([sums.node(one) for one in found], tape.shape), rows
-
-
-def curved_sums(tape: Tape, n: int) -> Array:
-    """The sums of states that operations other than sums see, by the states' factors, each once: shape (count, n).
-
-    f depends on its n states through these alone, but for what is linear.
-    """
-    sums = _Sums(tape.inputs)
-    given = [Sum({sums.graph.input(slot): _ONE}) for slot in range(len(tape.inputs))]
-    tape.evaluate(sums.arithmetic(), given)
-    state = {node: place - 1 for place in range(1, n + 1) for node in given[place].terms}
-    found = {tuple(float(one.terms.get(node, 0)) for node in state) for one in sums.seen}
-    return np.array(sorted(row for row in found if any(row)), dtype=float).reshape(-1, n)
+    return sums.graph.tape([sums.node(one) for one in found], tape.shape), rows, bent
 
 
 class _Sums:

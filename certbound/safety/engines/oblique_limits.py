@@ -20,7 +20,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.display import rounded
 from certbound.errors import EnclosureError, InfeasibleError
-from certbound.problem.model import Tape, curved_sums, turned_tape
+from certbound.problem.model import Tape, turned_tape
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, HalfSpace
 from certbound.problem.systems import ContinuousSystem
@@ -200,12 +200,12 @@ def eased(problem: Problem) -> Turn | None:
 def _bent(problem: Problem) -> Array:
     """The sums of states along which the dynamics bends; none of a model that is too long to be looked through."""
     tape, n = problem.closed_loop, problem.system.dimension
-    return curved_sums(tape, n) if len(tape.nodes) <= _LONGEST else np.zeros((0, n))
+    return turned_tape(tape, np.eye(n))[2] if len(tape.nodes) <= _LONGEST else np.zeros((0, n))
 
 
 def _fewer(bent: Array, turn: Turn) -> bool:
     """Whether fewer states of y than of x have a part in these sums."""
-    return np.count_nonzero(exact_product(bent, turn[1]).any(axis=0)) < np.count_nonzero(bent.any(axis=0))
+    return bool(np.count_nonzero(exact_product(bent, turn[1]).any(axis=0)) < np.count_nonzero(bent.any(axis=0)))
 
 
 def _sheared(turn: Turn, rows: Sequence[Array], others: Array, pivots: list[int]) -> Turn:

@@ -16,7 +16,7 @@ from certbound.checker.reading import Record
 from certbound.checker.report import Budget
 from certbound.checker.statement import read_model, turned_model
 from certbound.errors import CertificateError, InfeasibleError
-from certbound.problem.model import Tape, compile_numpy, curved_sums, turned_tape
+from certbound.problem.model import Tape, compile_numpy, turned_tape
 from certbound.safety.answers import EngineAnswer, Request, exact
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.engines import Apart, Turned, in_coordinates, linear_engine
@@ -68,10 +68,10 @@ def rotors() -> cb.Problem:
 
 def test_the_sums_along_which_a_model_bends_become_states() -> None:
     problem = rotors()
-    assert curved_sums(problem.closed_loop, 2).tolist() == [[1.0, -1.0]]
+    assert turned_tape(problem.closed_loop, np.eye(2))[2].tolist() == [[1.0, -1.0]]
     turn = eased(problem)
     assert turn is not None
-    bent = curved_sums(turned_problem(problem, *turn).closed_loop, 2)
+    bent = turned_tape(turned_problem(problem, *turn).closed_loop, np.eye(2))[2]
     assert np.count_nonzero(bent.any(axis=0)) == 1
     assert eased(oblique()) is None  # a limit alone makes nothing bend less
     assert eased(pair()) is None
@@ -223,8 +223,9 @@ def test_limits_along_states_need_no_other_coordinates() -> None:
 
 def test_sums_whose_coefficients_are_no_floats_are_left_as_they_stand() -> None:
     tape = cb.ContinuousSystem(lambda x: [0.1 * x[0], 0.7 * (0.1 * x[0] + x[1])], states=2).dynamics
-    found, rows = turned_tape(tape, np.eye(2), np.array([[1.0, 1.0], [0.0, 1.0]]))
+    found, rows, bent = turned_tape(tape, np.eye(2), np.array([[1.0, 1.0], [0.0, 1.0]]))
     assert rows == [None, None]
+    assert bent.any(axis=0).all()
     np.testing.assert_allclose(compile_numpy(found)(0.0, 1.0, 2.0), [0.1 + 0.7 * 2.1, 0.7 * 2.1], rtol=1e-15)
 
 
