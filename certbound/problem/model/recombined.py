@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+
 from certbound.arrays import Array
 from certbound.problem.model.graph import Graph
 from certbound.problem.model.tape import Tape
@@ -27,8 +29,10 @@ class Sum:
     constant: Fraction = Fraction(0)
 
 
-def turned_tape(tape: Tape, inverse: Array, matrix: Array | None = None) -> tuple[Tape, list[dict[int, float] | None]]:
-    """matrix . f(t, inverse y, ...) of a tape f over (t, states, ...), and which of its outputs are linear in y.
+def turned_tape(
+    tape: Tape, inverse: Array, matrix: Array | None = None
+) -> tuple[Tape, list[dict[int, float] | None], Array]:
+    """matrix . f(t, inverse y, ...) of a tape f over (t, states, ...), which outputs are linear in y, and what bends.
 
     Parameters
     ----------
@@ -43,12 +47,16 @@ def turned_tape(tape: Tape, inverse: Array, matrix: Array | None = None) -> tupl
         Over the same inputs.
     rows : list
         Per output the coefficients by state, None of an output that is not linear in the states alone.
+    bent : ndarray, shape (count, n)
+        The sums of states y that go into operations other than sums: but for what is linear, f sees no others.
     """
     sums, n = _Sums(tape.inputs), len(inverse)
     given = [Sum({sums.graph.input(slot): _ONE}) for slot in range(len(tape.inputs))]
     state = {node: place - 1 for place in range(1, n + 1) for node in given[place].terms}
     given[1 : n + 1] = [sums.combined(zip(row, given[1 : n + 1])) for row in inverse.tolist()]
     found: list[Sum] = tape.evaluate(sums.arithmetic(), given)
+    seen = {tuple(float(one.terms.get(node, 0)) for node in state) for one in sums.seen}
+    bent = np.array(sorted(row for row in seen if any(row)), dtype=float).reshape(-1, n)
     if matrix is not None:
         m = len(found) // n
         found = [sums.combined(zip(row, found[k::m])) for row in matrix.tolist() for k in range(m)]
@@ -57,14 +65,15 @@ def turned_tape(tape: Tape, inverse: Array, matrix: Array | None = None) -> tupl
         if one.constant == 0 and one.terms.keys() <= state.keys() else None
         for one in found
     ]  # fmt: skip
-    return sums.graph.tape([sums.node(one) for one in found], tape.shape), rows
+    return sums.graph.tape([sums.node(one) for one in found], tape.shape), rows, bent
 
 
 class _Sums:
-    """The arithmetic of sums over a graph."""
+    """The arithmetic of sums over a graph; ``seen`` are those that went into other operations."""
 
     def __init__(self, inputs: Sequence[str]) -> None:
         self.graph = Graph(inputs)
+        self.seen: list[Sum] = []
 
     def combined(self, parts: Iterable[tuple[Any, Sum]]) -> Sum:
         """A sum of sums by factors that are floats."""
@@ -78,6 +87,7 @@ class _Sums:
         terms = {node: c for node, c in terms.items() if c}
         if len(terms) <= _MOST and all(_is_float(c) for c in (constant, *terms.values())):
             return Sum(terms, constant)
+        self.seen += [one for _, one in kept]
         total = self.graph.const(0.0)
         for factor, one in kept:
             total = self._plus(total, factor, self.node(one))
@@ -102,7 +112,11 @@ class _Sums:
         plain = self.graph.arithmetic()
 
         def nonlinear(apply: Callable[..., int]) -> Callable[..., Sum]:
-            return lambda *given: self._of(apply(*(self.node(x) if isinstance(x, Sum) else x for x in given)))
+            def applied(*given: Any) -> Sum:
+                self.seen += [x for x in given if isinstance(x, Sum)]
+                return self._of(apply(*(self.node(x) if isinstance(x, Sum) else x for x in given)))
+
+            return applied
 
         def product(a: Sum, b: Sum) -> Sum:
             for one, other in ((a, b), (b, a)):

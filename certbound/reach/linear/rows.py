@@ -11,6 +11,7 @@ from certbound.arrays import Array
 from certbound.reach.linear.linearisation import Linearisation
 
 _POINTS = 64
+_MOST = 8  # active coordinates
 _FARTHEST = 2.0  # times the spread, for points at which kinks are looked for
 
 
@@ -31,7 +32,7 @@ def _curved(engine: Linearisation) -> Array:
     active, cells, blocks = engine.model.active, engine.cells, engine.model.blocks
     count = len(active)
     nothing = np.zeros((cells, engine.pieces, 0, count))
-    if not 2 <= count <= 6 or len(blocks) != 1 or len(blocks[0]) != 1:
+    if not 2 <= count <= _MOST or len(blocks) != 1 or len(blocks[0]) != 1:
         return nothing
     hessians = engine.model.reference_hessians(engine.frame).reshape(cells, engine.pieces, -1, count, count)
     kinks = not hessians.any() and engine.model.kinked and not engine.model.planar

@@ -6,7 +6,8 @@ On a piece with nominal curve p and slope Jhat(t) = J_m + (t - t_m) K,
 
 over s in a polytope. The polytope is cut into boxes of the coordinates that enter the dynamics nonlinearly; on each
 box beta is expanded to second order (`certbound.reach.remainder.expansion`), and boxes that reach beyond what is asked
-for are cut further. Coordinates that no second derivative couples are handled side by side.
+for are cut further. Coordinates that no second derivative couples are handled side by side; where many are coupled,
+every output has boxes of its own, cut in the coordinates that it depends on.
 
 Symbols: H second derivatives of f, J first ones; Thm K7 and "Bounding beta" of docs/theory.md.
 """
@@ -14,6 +15,7 @@ Symbols: H second derivatives of f, J first ones; Thm K7 and "Bounding beta" of 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -31,6 +33,7 @@ from certbound.watch import poll
 Target = tuple[Array, Array]
 
 _GRID = {1: 16, 2: 6, 3: 4}
+_MANY = 4  # coupled coordinates from which on outputs that depend on fewer are bounded by themselves
 _MOST = 300  # boxes per piece that one round may cut
 _STALLED = 0.995  # cutting a box must make it exceed less
 _EFFORT = ((0, np.inf), (8, 0.5), (12, 0.2), (20, 0.08))  # rounds of bisection, tolerated excess over the range
@@ -38,7 +41,7 @@ _EFFORT = ((0, np.inf), (8, 0.5), (12, 0.2), (20, 0.08))  # rounds of bisection,
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """Over what a bound is asked for, in how many rounds and how closely, what is hoped for, and on which pieces."""
+    """Over what a bound is asked for, in how many rounds, how closely, what is hoped for, on which pieces, of what."""
 
     inner: Target
     polytope: Polytope
@@ -46,12 +49,15 @@ class _Asked:
     tolerance: float
     target: Target | None
     only: Index | None
+    outputs: list[int] | None = None  # all when omitted
 
     def excess(self, lo: Array, hi: Array, inner_lo: Array, inner_hi: Array, items: Index) -> Array:
         """By how much bounds over boxes exceed what is hoped for, or their own range: in its units, (Q, n)."""
         low, high = (inner_lo, inner_hi) if self.target is None else self.target
         found = np.maximum(hi - high[items], low[items] - lo) / np.maximum(high - low, 1e-300)[items]
         found = found - self.tolerance if self.target is None else found
+        if self.outputs is not None:
+            found[:, np.setdiff1d(np.arange(found.shape[1]), self.outputs)] = -np.inf
         return np.where(np.isfinite(found) | (found < 0), found, np.inf)
 
 
@@ -92,7 +98,9 @@ class Remainder(Derivatives):
             target = target[0] - extra.lo, target[1] - extra.hi
         inner = low[:, :count], high[:, :count]
         asked = _Asked(inner, Polytope(low[:, count:], high[:, count:], rows), *_EFFORT[effort], target, only)
-        if len(self.blocks) == 1:
+        if self.apart:
+            lower, upper = self._one_by_one(expansion, asked)
+        elif len(self.blocks) == 1:
             lower, upper = self._group(expansion, self.blocks[0], asked)
         else:
             total = base = self._at_nominal(frame)
@@ -148,6 +156,39 @@ class Remainder(Derivatives):
         reach = Interval(frame.disturbance_low, frame.disturbance_high) - frame.disturbance_middle
         return ((gain - frame.input_gain) * reach[None, None, :]).sum(axis=-1)
 
+    @cached_property
+    def apart(self) -> dict[tuple[int, ...], list[int]]:
+        """Outputs by the places in ``active`` of what they depend on nonlinearly, where that is less than all of many.
+
+        Empty where one search over all coordinates does as well.
+        """
+        block = self.blocks[0][0] if len(self.blocks) == 1 and len(self.blocks[0]) == 1 else []
+        if len(block) < _MANY or self.planar or self.jumping:
+            return {}
+        place = {int(state): a for a, state in enumerate(self.active)}
+        own: dict[int, set[int]] = {}
+        for (i, j), states in zip(self.entries, self.sources, strict=True):
+            own.setdefault(i, set()).update(place[state] for state in (j, *states))
+        found: dict[tuple[int, ...], list[int]] = {}
+        for i, places in own.items():
+            found.setdefault(tuple(sorted(places)), []).append(i)
+        return found if any(len(places) < len(block) for places in found) else {}
+
+    def _one_by_one(self, expansion: Expansion, asked: _Asked) -> tuple[Array, Array]:
+        """Bounds of every output over boxes that are cut in its own coordinates alone, and whole in all others."""
+        whole = Boxes(*_whole(asked))
+        lower, upper = np.zeros((2, *expansion.frame.spread.shape))
+        lower[whole.items], upper[whole.items] = expansion.plain_range(expansion.parts(whole), whole)
+        for own, outputs in self.apart.items():
+            found = self._group(expansion, [list(own)], replace(asked, outputs=outputs))
+            for kept, part in zip((lower, upper), found):
+                kept[:, outputs] = part[:, outputs]
+        if np.isfinite(lower).all() and np.isfinite(upper).all():
+            return lower, upper
+        # boxes that are whole in other coordinates may reach where something else is undefined
+        joint = self._group(expansion, self.blocks[0], asked)
+        return np.fmax(lower, joint[0]), np.fmin(upper, joint[1])
+
     @np.errstate(over="ignore", invalid="ignore")  # boxes next to all floats: what overflows bounds nothing
     def _group(self, expansion: Expansion, group: list[list[int]], asked: _Asked) -> tuple[Array, Array]:
         """Bounds over the boxes of one group of blocks, displaced together."""
@@ -200,10 +241,21 @@ class Remainder(Derivatives):
         divisions = _GRID.get(size, 2 if size <= 8 else 1)
         items = np.repeat(np.arange(m), divisions**size)
         centre, radius = (np.zeros((m, divisions**size, count)) for _ in range(2))
+        if asked.outputs is not None:  # of some outputs alone: the coordinates that they do not see are whole
+            _, middle, half = _whole(replace(asked, only=None))
+            centre[:], radius[:] = middle[:, None], half[:, None]
         for block in group:
             centre[..., block], radius[..., block] = grid(*asked.inner, block, divisions)
         boxes = Boxes(items, centre.reshape(-1, count), radius.reshape(-1, count))
         return boxes if asked.only is None else boxes[np.isin(items, asked.only)]
+
+
+def _whole(asked: _Asked) -> tuple[Index, Array, Array]:
+    """One box a piece that is asked for: pieces, centres and radii."""
+    (m, count), block = asked.inner[0].shape, list(range(asked.inner[0].shape[1]))
+    centre, radius = (a.reshape(m, count) for a in grid(*asked.inner, block, 1))
+    items = np.arange(m) if asked.only is None else np.unique(asked.only)
+    return items, centre[items], radius[items]
 
 
 def _costliest(expansion: Expansion, parts: Parts, radius: Array, share: Array, excess: Array) -> Index:

@@ -1,12 +1,15 @@
-"""Engines asked once more in other coordinates: where a limit is oblique, and what was proved does not do.
+"""Engines asked in other coordinates too: where a limit is oblique, and what was proved does not do.
 
 A limit n . x <= b becomes a limit of one state y = n . x, and where y has no noise of its own and its rate is a sum of
 states, that sum becomes a state too: of vehicles that must keep their order the distances and their rates. What noise
-and drift have in common cancels then, and windows and boxes, which are entrywise, lose less.
+and drift have in common cancels then, and windows and boxes, which are entrywise, lose less. Where the dynamics bends
+along fewer sums of states than states (of generators the differences of angles), these sums become states, too, and the
+other coordinates come first: what all have in common wanders, and boxes of it cost most of what is bounded.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +32,10 @@ Prove = Callable[[Problem, Request], EngineAnswer]
 Turn = tuple[Array, Array]
 """T and its inverse."""
 
+_UNASKED = EngineAnswer(applicable=False, reason="not asked in the states, as other coordinates did.")
+
 _MOST = 20  # states
+_LONGEST = 4000  # operations of a model that is looked through for sums
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,12 +68,21 @@ def in_coordinates(prove: Prove, *, beside: Prove | None = None) -> Prove:
 
     def proved(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         before = asked.before if isinstance(asked.before, Turned | Apart) else None
+        inner = replace(asked, before=before.answer.details if isinstance(before, Turned) else None)
+        hasty = asked.quick or asked.first
+        turn = None if hasty or beside is not None else eased(problem)
+        first: EngineAnswer | None = None
+        if turn is not None:
+            with contextlib.suppress(InfeasibleError, EnclosureError):
+                first = _asked_in(prove, problem, turn, inner, _UNASKED)
+            if first is not None and first.applicable and is_at_most(first.log10_delta, problem.delta):
+                return first
         plain = prove(problem, replace(asked, before=before.plain.details) if before else asked)
         enough = plain.applicable and is_at_most(min(plain.log10_delta, 0.0), problem.delta)
-        if asked.quick or asked.first or enough or plain.conclusive:
+        if hasty or enough or plain.conclusive:
             return plain
         try:
-            turn = axes(problem)
+            turn = turn or axes(problem)
             if turn is None:
                 return plain
             if plain.applicable and plain.log10_delta < 0:
@@ -75,9 +90,10 @@ def in_coordinates(prove: Prove, *, beside: Prove | None = None) -> Prove:
             rest = () if beside is None else _still_oblique(problem, turn)
             if rest and beside is not None:
                 answer = _by_parts((prove, beside), problem, turn, rest, asked, plain)
+            elif first is not None:
+                answer = _instead(plain, first, reason=first.reason, details=replace(first.details, plain=plain))
             else:
-                inner = before.answer.details if isinstance(before, Turned) else None
-                answer = _asked_in(prove, problem, turn, replace(asked, before=inner), plain)
+                answer = _asked_in(prove, problem, turn, inner, plain)
         except (InfeasibleError, EnclosureError):
             return plain
         return answer if answer.applicable and answer.log10_delta < min(plain.log10_delta, 0.0) else plain
@@ -145,6 +161,8 @@ def _by_parts(
 def axes(problem: Problem) -> Turn | None:
     """T and its inverse, such that oblique limits are limits of one state of y = T x; None where nothing is gained.
 
+    Sums along which the dynamics bends come first, where they are fewer than the states that they are made of.
+
     InfeasibleError where that is not exact in floats.
     """
     system, n = problem.system, problem.system.dimension
@@ -153,7 +171,12 @@ def axes(problem: Problem) -> Turn | None:
     rows = [region.lifted(region.form.normals, n) for region in (one.region for one in problem.constraints)
             if isinstance(region.form, Faces)]  # fmt: skip
     limits = np.vstack([np.zeros((0, n)), *rows])
-    turn, pivots = (np.eye(n), np.eye(n)), list[int]()
+    bent = _bent(problem)
+    pivots = list[int]()
+    turn = _sheared((np.eye(n), np.eye(n)), [row for row in bent if np.count_nonzero(row) > 1], limits, pivots)
+    if not _fewer(bent, turn):
+        pivots.clear()
+        turn = np.eye(n), np.eye(n)
     turn = _sheared(turn, [row for row in limits if np.count_nonzero(row) > 1], limits, pivots)
     if not pivots:
         return None
@@ -163,6 +186,26 @@ def axes(problem: Problem) -> Turn | None:
         return turn
     sums = exact_product(np.array([[rate.get(j, 0.0) for j in range(n)] for rate in smooth]), turn[0])
     return _sheared(turn, list(sums), sums, pivots)
+
+
+def eased(problem: Problem) -> Turn | None:
+    """Those coordinates, where the dynamics bends along fewer states of y than of x; None where it does not."""
+    try:
+        turn = axes(problem)
+        return turn if turn is not None and _fewer(_bent(problem), turn) else None
+    except InfeasibleError:
+        return None
+
+
+def _bent(problem: Problem) -> Array:
+    """The sums of states along which the dynamics bends; none of a model that is too long to be looked through."""
+    tape, n = problem.closed_loop, problem.system.dimension
+    return turned_tape(tape, np.eye(n))[2] if len(tape.nodes) <= _LONGEST else np.zeros((0, n))
+
+
+def _fewer(bent: Array, turn: Turn) -> bool:
+    """Whether fewer states of y than of x have a part in these sums."""
+    return bool(np.count_nonzero(exact_product(bent, turn[1]).any(axis=0)) < np.count_nonzero(bent.any(axis=0)))
 
 
 def _sheared(turn: Turn, rows: Sequence[Array], others: Array, pivots: list[int]) -> Turn:

@@ -237,3 +237,48 @@ def test_boxes_are_not_cut_where_cutting_does_not_help(monkeypatch: pytest.Monke
     monkeypatch.setattr(Expansion, "parts", counted)
     assert run.include(run.levels(Share.of(1e-4))[0], 3) is not None
     assert seen[0] < 100 * engine.pieces
+
+
+def ring(first: str = "product") -> cb.Problem:
+    """Five coupled states, of which every output sees two or three."""
+
+    def flow(t: object, x: Array) -> list[object]:
+        bends = [np.sin(3 * x[(i + 1) % 5]) * x[(i + 2) % 5] for i in range(5)]
+        bends[0] = bends[0] * np.cos(t) + np.sin(x[0]) if first == "product" else np.log(1.0 + x[0] + x[1] + x[2])
+        return [bend - x[i] for i, bend in enumerate(bends)]
+
+    system = cb.ContinuousSystem(flow, states=5, diffusion=0.05 * np.eye(5))
+    return cb.Problem(system, initial=[0.3, 0.2, 0.1, 0.0, -0.1], safe=[], horizon=0.5, delta=1e-2)
+
+
+def test_where_many_coordinates_are_coupled_every_output_has_boxes_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine, rng = Linearisation(ring(), pieces=3), np.random.default_rng(3)
+    model = engine.model
+    assert model.apart == {(0, 1, 2): [0], (2, 3): [1], (3, 4): [2], (0, 4): [3], (0, 1): [4]}
+    rows = rng.normal(size=(3, 1, 5))
+    low, high = np.full((3, 6), -0.4), np.full((3, 6), 0.3)
+    lower, upper = model.bound(engine.frame, low, high, rows, 0)
+    some = model.bound(engine.frame, low, high, rows, 0, only=np.array([1]))
+    assert np.array_equal(some[0][1], lower[1])
+    assert np.array_equal(some[1][1], upper[1])
+    monkeypatch.setitem(vars(model), "apart", {})
+    joint = model.bound(engine.frame, low, high, rows, 0)
+    assert (upper - lower).sum() < 0.95 * (joint[1] - joint[0]).sum()
+    s = rng.uniform(-0.4, 0.3, (4000, 5)) * rng.choice([0.5, 1.0], (4000, 1))
+    for k in range(3):
+        along = s @ rows[k, 0]
+        inside = s[(along >= -0.4) & (along <= 0.3)]
+        beta = remainder(engine, k, rng.uniform(0, 1, len(inside)), inside)
+        assert len(inside) > 100
+        assert np.all(beta >= lower[k] - 1e-13)
+        assert np.all(beta <= upper[k] + 1e-13)
+
+
+def test_boxes_of_one_output_that_reach_where_another_is_undefined_are_left_for_joint_ones() -> None:
+    engine = Linearisation(ring("logarithm"), pieces=6)
+    rows = np.broadcast_to(np.array([1.0, 1.0, 1.0, 0.0, 0.0]) / 3, (6, 1, 5))
+    low, high = np.full((6, 6), -0.75), np.full((6, 6), 0.3)
+    low[:, -1] = -0.3
+    lower, upper = engine.model.bound(engine.frame, low, high, rows, 3)
+    assert np.all(np.isfinite(lower))
+    assert np.all(np.isfinite(upper))

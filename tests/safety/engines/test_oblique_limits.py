@@ -20,7 +20,7 @@ from certbound.problem.model import Tape, compile_numpy, turned_tape
 from certbound.safety.answers import EngineAnswer, Request, exact
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.engines import Apart, Turned, in_coordinates, linear_engine
-from certbound.safety.engines.oblique_limits import axes
+from certbound.safety.engines.oblique_limits import axes, eased
 from certbound.safety.engines.turning import exact_product, turned_problem
 from certbound.safety.verdict import verdict_of
 from experiments.middle import platoon
@@ -54,6 +54,54 @@ def test_distances_and_their_rates_become_states() -> None:
     assert matrix[[0, 1, 4, 5]].tolist() == [
         [1, 0, -1, 0, 0, 0], [0, 1, 0, -1, 0, 0], [0, 0, -1, 0, 1, 0], [0, 0, 0, -1, 0, 1]
     ]  # fmt: skip
+
+
+def rotors() -> cb.Problem:
+    """Two coupled rotors: what bends is their difference alone, and together they wander."""
+    system = cb.ContinuousSystem(
+        lambda x: [0.25 - np.sin(x[0] - x[1]), 0.25 + np.sin(x[0] - x[1])], states=["a", "b"],
+        diffusion=0.0625 * np.eye(2),
+    )
+    safe = [cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))]
+    return cb.Problem(system, initial=[0.25, 0.0], safe=safe, horizon=0.5, delta=1e-2)
+
+
+def test_the_sums_along_which_a_model_bends_become_states() -> None:
+    problem = rotors()
+    assert turned_tape(problem.closed_loop, np.eye(2))[2].tolist() == [[1.0, -1.0]]
+    turn = eased(problem)
+    assert turn is not None
+    bent = turned_tape(turned_problem(problem, *turn).closed_loop, np.eye(2))[2]
+    assert np.count_nonzero(bent.any(axis=0)) == 1
+    assert eased(oblique()) is None  # a limit alone makes nothing bend less
+    assert eased(pair()) is None
+
+
+def test_where_a_model_bends_along_fewer_sums_than_states_these_coordinates_come_first() -> None:
+    problem = rotors()
+    asked: list[cb.Problem] = []
+
+    def proves(plain: float, turned: float) -> EngineAnswer:
+        def prove(own: cb.Problem, request: Request) -> EngineAnswer:
+            asked.append(own)
+            return EngineAnswer(log10_delta=plain if own is problem else turned, applicable=True)
+
+        asked.clear()
+        return in_coordinates(prove)(problem, Request())
+
+    enough = proves(-9.0, -2.5)
+    assert isinstance(enough.details, Turned)
+    assert len(asked) == 1
+    assert asked[0] is not problem
+    better = proves(-0.5, -1.0)  # neither is enough: each is asked once
+    assert isinstance(better.details, Turned)
+    assert (better.details.plain.log10_delta, better.log10_delta, len(asked)) == (-0.5, -1.0, 2)
+    worse = proves(-1.5, -1.0)
+    assert (worse.details, worse.log10_delta, len(asked)) == (None, -1.5, 2)
+    verdict = verdict_of(problem, {"linear": in_coordinates(linear_engine)(problem, Request())})
+    assert verdict.status == "SAFE"
+    assert isinstance(verdict.answers["linear"].details, Turned)
+    assert check_data(parse(certificate_text(problem, verdict)), problem_data(problem)).valid
 
 
 def test_what_cancels_is_gone() -> None:
@@ -175,8 +223,9 @@ def test_limits_along_states_need_no_other_coordinates() -> None:
 
 def test_sums_whose_coefficients_are_no_floats_are_left_as_they_stand() -> None:
     tape = cb.ContinuousSystem(lambda x: [0.1 * x[0], 0.7 * (0.1 * x[0] + x[1])], states=2).dynamics
-    found, rows = turned_tape(tape, np.eye(2), np.array([[1.0, 1.0], [0.0, 1.0]]))
+    found, rows, bent = turned_tape(tape, np.eye(2), np.array([[1.0, 1.0], [0.0, 1.0]]))
     assert rows == [None, None]
+    assert bent.any(axis=0).all()
     np.testing.assert_allclose(compile_numpy(found)(0.0, 1.0, 2.0), [0.1 + 0.7 * 2.1, 0.7 * 2.1], rtol=1e-15)
 
 
