@@ -101,10 +101,12 @@ class Shown:
         Raises
         ------
         ValueError
-            If a state is unknown, the times are not in order, or the result has nothing that could be drawn.
+            If a state or a key of ``style`` is unknown, the times are not in order, or nothing could be drawn.
         """
         import matplotlib as mpl
 
+        if unknown := set(style or {}) - set(mpl.rcParams):
+            raise ValueError(f"`style` must use matplotlib's rcParams, such as 'font.size', got {min(unknown)!r}.")
         with mpl.rc_context(dict(style or {})):  # type: ignore[arg-type]  # rcParams by any name
             if ax is None:
                 import matplotlib.pyplot as plt

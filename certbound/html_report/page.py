@@ -22,11 +22,11 @@ from certbound.html_report.markup import table, text
 from certbound.html_report.statement import problem_section
 from certbound.html_report.style import LAYOUT, SCRIPT, SMALL, STYLE
 from certbound.plotting.scene import Scene
+from certbound.problem.problem import Problem
 from certbound.safety.answers import SPARED
 from certbound.safety.starts import SafeStarts
 
 if TYPE_CHECKING:
-    from certbound.problem.problem import Problem
     from certbound.safety.verification import Verdict
 
 SENTENCES = {
@@ -41,20 +41,21 @@ PACKAGES = ("numpy", "scipy", "casadi", "cvxpy", "clarabel", "python-flint", "nu
 
 
 def report_page(
-    shown: Scene | SafeStarts, verdict: Verdict, *, command: str = "", probability: str = "", certificate: str = ""
-) -> str:
+    shown: Scene | SafeStarts | Problem, verdict: Verdict, *, command: str = "", probability: str = "",
+    certificate: str = "",
+) -> str:  # fmt: skip
     """The page as one string: what was proved (``verdict``), and pictures of what is ``shown``.
 
-    These are tubes with sample paths (a scene), or a value function with its safe starts.
+    These are tubes with sample paths (a scene), a value function with its safe starts, or nothing but the problem.
 
     ``command`` gives the verdict again; ``probability`` is the certified bound in words, such as ``3.7e-4``; of the
     text of a ``certificate`` that was written the page shows the hash, as ``sha256sum`` prints it.
     """
     from plotly.offline import get_plotlyjs
 
-    pictures = list(pictures_of(shown, safe=verdict.status == "SAFE"))
+    problem = shown if isinstance(shown, Problem) else shown.problem
+    pictures = [] if isinstance(shown, Problem) else list(pictures_of(shown, safe=verdict.status == "SAFE"))
     large = [picture for picture in pictures if not picture.small]
-    problem = shown.problem
     parts = [
         _head(f"{name_text(problem.name)}: {verdict.status}", get_plotlyjs()),
         _verdict_section(problem, verdict, probability),
@@ -183,7 +184,7 @@ def _legend(entries: Sequence[Entry]) -> str:
     return f'<p class="legend">{keys}</p>' if entries else ""
 
 
-def _small_section(shown: Scene | SafeStarts, pictures: Sequence[Picture]) -> str:
+def _small_section(shown: Scene | SafeStarts | Problem, pictures: Sequence[Picture]) -> str:
     """Every constraint over time, side by side under one legend."""
     if not pictures or not isinstance(shown, Scene):
         return ""

@@ -181,7 +181,8 @@ class Problem(Shown):
     @property
     def span(self) -> str:
         """The horizon in words."""
-        return "at any time" if self.endless else f"within {self.horizon:g} {self.time_unit}"
+        unit = f"{'x ' * self.time_unit[:1].isdigit()}{self.time_unit}"
+        return "at any time" if self.endless else f"within {self.horizon:g} {unit}"
 
     @property
     def time_unit(self) -> str:
