@@ -320,6 +320,17 @@ def power_above(log10: float) -> float:
     return value
 
 
+def amount(value: float, unit: str) -> str:
+    """A number of units; of a unit that is a number itself, so many times it.
+
+    Examples
+    --------
+    >>> amount(48, "15 min"), amount(0.5, "s")
+    ('48 x 15 min', '0.5 s')
+    """
+    return f"{value:g} {'x ' * unit[:1].isdigit()}{unit}"
+
+
 def at_least_text(log10: float | None) -> str:
     """A proved lower bound of a probability, rounded down, as words to add; empty where there is none.
 

@@ -84,7 +84,7 @@ def _unit(scene: Scene) -> str:
 
 
 def _plan(scene: Scene, plane: Plane) -> Picture:
-    names = scene.problem.system.states
+    names = [scene.problem.axis(name) for name in scene.problem.system.states]
     traces: list[Trace] = []
     for tube, color in scene.tubes:
         shape = outlines(tube, plane)
@@ -203,7 +203,8 @@ def _small(scene: Scene, panel: Panel) -> Picture:
 def _words(scene: Scene, panel: Panel, nominal: Array) -> str:
     room = room_of(scene, panel)
     limits = ", ".join(f"{limit:.4g}" for limit in panel.limits)
-    low, high = (0.0 if abs(end) < 1e-9 * np.ptp(nominal) else end for end in (nominal.min(), nominal.max()))
+    size = max(float(np.ptp(nominal)), *map(abs, panel.limits))
+    low, high = (0.0 if abs(end) < 1e-9 * size else end for end in (nominal.min(), nominal.max()))
     if not scene.tubes:
         return f"Limit {limits}; no tube was proved."
     certified = "" if room is None or not np.any(np.isfinite(room)) else f"; certified room {_least(room)}"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from certbound._version import __version__
-from certbound.display import at_least_text, log10_text, name_text, rounded
+from certbound.display import amount, at_least_text, log10_text, name_text, rounded
 from certbound.html_report.figures import Entry, Picture, legend_of, pictures_of
 from certbound.html_report.markup import table, text
 from certbound.html_report.statement import problem_section
@@ -84,16 +84,17 @@ def _head(title: str, script: str) -> str:
 
 
 def _verdict_section(problem: Problem, verdict: Verdict, probability: str) -> str:
-    unit = problem.time_unit
+    when = "" if verdict.time is None else f"at {amount(float(f'{verdict.time:.4g}'), problem.time_unit)}"
+    where = [verdict.constraint or "", when]
     bound = probability or f"10^{rounded(verdict.log10_delta, up=True, digits=4)}"
     rows = [
         ("certified bound on the probability of leaving", bound),
         ("proved from below", at_least_text(verdict.log10_lower).removeprefix(", ")),
         ("asked for", f"{problem.delta!r}"),
-        ("horizon", f"{problem.horizon:g} {unit}"),
+        ("horizon", problem.span.removeprefix("within ")),
         ("states", ", ".join(problem.system.states)),
         ("margin at the tightest place", _least(verdict.margin)),
-        ("where", "" if verdict.time is None else f"{verdict.constraint}, at {verdict.time:.4g} {unit}"),
+        ("where", ", ".join(filter(None, where))),
         ("method", verdict.method),
         ("why", verdict.reason),
     ]

@@ -7,7 +7,7 @@ import re
 import shlex
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -100,6 +100,9 @@ def verify(
             executor=executor,
         )  # fmt: skip
     seconds = time.perf_counter() - started
+    if ":" not in problem:  # reasons and cures in the words of files
+        told = {name: replace(answer, reason=for_files(answer.reason)) for name, answer in verdict.answers.items()}
+        verdict = replace(verdict, reason=for_files(verdict.reason), answers=told)
     result = _result(subject, verdict, seconds)
     if explain:
         result["engines"] = _engines(verdict)
@@ -107,9 +110,6 @@ def verify(
         from certbound.problem.files import notes
 
         result["taken"] = list(notes(problem))
-    if ":" not in problem:
-        for told in (result, *result.get("engines", ())):
-            told["reason"] = for_files(told["reason"])
     if not as_json:  # the verdict comes first: it stands, whatever becomes of the rest
         _print(subject, result, verdict.caution)
     if explain and verdict.status == "UNKNOWN":
