@@ -133,7 +133,7 @@ def _step(op: str, given: Sequence[Ends]) -> Ends | None:
 def _replaced(model: Model, values: Mapping[int, Sequence[float]], count: int) -> Model:
     """The model with jumps as constants, or as inputs behind the states."""
     tape, first = model.dynamics, 1 + model.dimension
-    rows = list(dict.fromkeys(tuple(row) for row in values.values() if len(set(row)) > 1))
+    rows = list(dict.fromkeys(tuple(row) for row in values.values() if count == 1 or len(set(row)) > 1))
     if not rows:
         raise Unproved(f"time alone decides no jump of the dynamics at the ends of {count} pieces")
     nodes = []

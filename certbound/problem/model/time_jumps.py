@@ -71,7 +71,8 @@ def cut_at_jumps(tape: Tape, states: int, horizon: float) -> TimeJumps | None:
     wanted = [index for index in _frontier(tape, values) if found[index]]
     middles = [(Fraction(2 * k + 1, 2 * count)) * breaks[-1] for k in range(count)]
     places = [sum(end < middle for end in breaks) - 1 for middle in middles]
-    return _with_inputs(tape, states, {index: [values[index][place] for place in places] for index in wanted})
+    rows = {index: [values[index][place] for place in places] for index in wanted}
+    return _with_inputs(tape, states, rows, every=count == 1 and _touches(tape, own, breaks[-1]))
 
 
 def decimal(value: float) -> Fraction:
@@ -102,6 +103,19 @@ def _jumps_within(tape: Tape, own: Sequence[int], first: Fraction, last: Fractio
         if node.op in JUMPS and all(lines[arg] is not None for arg in node.args):
             yield from _crossings(node.op, _compared(node, lines), first, last)
         lines[index] = _line(node, lines, (first + last) / 2)
+
+
+def _touches(tape: Tape, own: Sequence[int], horizon: Fraction) -> bool:
+    """Whether something jumps at time 0 or at the end: inside of the closed piece nothing decides it there."""
+    lines: dict[int, Line | None] = {}
+    for index in own:
+        node = tape.nodes[index]
+        if node.op in JUMPS and all(lines[arg] is not None for arg in node.args):
+            around = _crossings(node.op, _compared(node, lines), Fraction(-1), horizon + 1)
+            if not {Fraction(0), horizon}.isdisjoint(around):
+                return True
+        lines[index] = _line(node, lines, horizon / 2)
+    return False
 
 
 def _compared(node: Node, lines: Mapping[int, Line | None]) -> Line:
@@ -193,12 +207,14 @@ def _frontier(tape: Tape, values: Mapping[int, Sequence[float]]) -> list[int]:
     return [index for index in values if index in needed]
 
 
-def _with_inputs(tape: Tape, states: int, values: Mapping[int, Sequence[float]]) -> TimeJumps | None:
-    """The tape with inputs for those of the values that change, and constants for the others.
+def _with_inputs(
+    tape: Tape, states: int, values: Mapping[int, Sequence[float]], *, every: bool
+) -> TimeJumps | None:
+    """The tape with inputs for those of the values that change (or ``every`` one), and constants for the others.
 
     What is chosen by 0 or 1 is a product from then on: nothing is left that jumps.
     """
-    changing = {index: tuple(row) for index, row in values.items() if len(set(row)) > 1}
+    changing = {index: tuple(row) for index, row in values.items() if every or len(set(row)) > 1}
     columns = list(dict.fromkeys(changing.values()))
     if not columns:
         return None
