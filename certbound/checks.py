@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import keyword
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ def _floats(name: str, value: Any) -> Array:
         array = np.asarray(raw, dtype=float) if raw.dtype.kind in "biufO" else None
     except (TypeError, ValueError) as error:
         raise TypeError(f"`{name}` must hold numbers, got {value!r}.") from error
-    if array is None:
+    if array is None or value is None:
         raise TypeError(f"`{name}` must hold numbers, got {value!r}.")
     if np.any(np.isnan(array)):
         raise ValueError(f"`{name}` must not contain nan, got {value!r}.")
@@ -130,8 +131,27 @@ def names(name: str, value: Sequence[str], reserved: Iterable[str] = ()) -> tupl
 def nearest(word: str, known: Iterable[str]) -> str:
     """``; did you mean 'x'?`` with the nearest known word, or the list of known words."""
     known = sorted(known)
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
     return f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(dict.fromkeys(known)) or 'none'}."
+
+
+def instance(name: str, value: Any, kind: type) -> None:
+    """Refuse what is no ``cb.Problem`` or whatever else is wanted."""
+    if not isinstance(value, kind):
+        cure = f"; give cb.load({value!r})." if isinstance(value, str) else "."
+        raise TypeError(f"`{name}` must be a cb.{kind.__name__}, got {value!r}{cure}")
+
+
+@contextlib.contextmanager
+def located(where: str, names: Iterable[str]) -> Iterator[None]:
+    """Say of errors about an argument where in a file it stands: ``radius`` becomes ``avoid.0.ball.radius``."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        text = str(error)
+        for name in names:
+            text = text.replace(f"`{name}`", f"`{where}.{name}`", 1)
+        raise type(error)(text) from error
 
 
 def pick(coordinates: Any, dimension: int) -> tuple[int, ...] | None:

@@ -101,10 +101,12 @@ class Shown:
         Raises
         ------
         ValueError
-            If a state is unknown, the times are not in order, or the result has nothing that could be drawn.
+            If a state or a key of ``style`` is unknown, the times are not in order, or nothing could be drawn.
         """
         import matplotlib as mpl
 
+        if unknown := set(style or {}) - set(mpl.rcParams):
+            raise ValueError(f"`style` must use matplotlib's rcParams, such as 'font.size', got {min(unknown)!r}.")
         with mpl.rc_context(dict(style or {})):  # type: ignore[arg-type]  # rcParams by any name
             if ax is None:
                 import matplotlib.pyplot as plt
@@ -316,6 +318,17 @@ def power_above(log10: float) -> float:
     while value < 1 and (value == 0 or _EXACT.log10(Decimal(value)) < Decimal(log10)):
         value = math.nextafter(value, 1.0)
     return value
+
+
+def amount(value: float, unit: str) -> str:
+    """A number of units; of a unit that is a number itself, so many times it.
+
+    Examples
+    --------
+    >>> amount(48, "15 min"), amount(0.5, "s")
+    ('48 x 15 min', '0.5 s')
+    """
+    return f"{value:g} {'x ' * unit[:1].isdigit()}{unit}"
 
 
 def at_least_text(log10: float | None) -> str:

@@ -1,4 +1,4 @@
-"""Jumps of the dynamics that time alone decides: on equal pieces of the horizon they are constants.
+"""Jumps and bends of the dynamics that time alone decides: on equal pieces of the horizon constants, or one side.
 
 A proof names the number of pieces. That no such jump lies inside one is looked at piece by piece, in fractions; what
 jumps at their ends is an input from then on, as the rows of a plan are. The one time of a jump has no weight. A time is
@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
+from typing import Any
 
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model
@@ -23,6 +24,7 @@ _LARGEST, _LONGEST = 2**53, 4096  # a value of floor that is a float itself, and
 _CHOICE = "if_else_zero"
 _OF_TRUTHS = frozenset(["and", "or", "not", _CHOICE])
 _TRUTHS = JUMPS - {_CHOICE, "sign", "floor"}
+_BENDS = frozenset(["min", "max", "abs"])
 
 Ends = tuple[Fraction, Fraction]
 """The values of a straight line at the two ends of a piece."""
@@ -39,13 +41,16 @@ def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
     tape, horizon = model.dynamics, _decimal(model.horizon)
     timed = _timed(tape)
     ends = [horizon * k / count for k in range(count + 1)]
-    found: dict[int, list[float | None]] = {index: [] for index in timed if tape.nodes[index].op in JUMPS}
+    found: dict[int, list[float | None]] = {index: [] for index in timed if tape.nodes[index].op in JUMPS | _BENDS}
     for first, last in pairwise(ends):
         budget.check()
         lines: dict[int, Ends | None] = {}
         for index in timed:
             lines[index] = _short(_line(tape.nodes[index], lines, first, last))
-            if index in found:
+            node = tape.nodes[index]
+            if node.op in _BENDS:
+                found[index].append(_side(node, [lines[arg] for arg in node.args]))
+            elif index in found:
                 value = lines[index]
                 found[index].append(float(value[0]) if value is not None and value[0] == value[1] else None)
     values = {
@@ -80,6 +85,10 @@ def _line(node: Node, lines: Mapping[int, Ends | None], first: Fraction, last: F
         return _chosen(node.op, given)
     if node.op in JUMPS:
         return _step(node.op, given)
+    if node.op in _BENDS:
+        side = _side(node, given)
+        other = given[1] if len(given) == 2 else (-given[0][0], -given[0][1])
+        return None if side is None else given[0] if side else other
     a, b = given[0], given[-1]
     if node.op == "neg":
         return -a[0], -a[1]
@@ -91,6 +100,17 @@ def _line(node: Node, lines: Mapping[int, Ends | None], first: Fraction, last: F
     if node.op == "div" and _flat(b) and b[0] != 0:
         return a[0] / b[0], a[1] / b[0]
     return None
+
+
+def _side(node: Node, given: Sequence[Ends | None]) -> float | None:
+    """1 where a bend is its first side (of ``abs``: not the negative) on the piece, 0 where the other, or None."""
+    known = [line for line in given if line is not None]
+    if len(known) < len(given):
+        return None
+    over = [a - b for a, b in zip(*known)] if len(known) == 2 else list(known[0])
+    if node.op == "min":
+        over = [-value for value in over]
+    return 1.0 if min(over) >= 0 else 0.0 if max(over) <= 0 else None
 
 
 def _short(line: Ends | None) -> Ends | None:
@@ -131,26 +151,42 @@ def _step(op: str, given: Sequence[Ends]) -> Ends | None:
 
 
 def _replaced(model: Model, values: Mapping[int, Sequence[float]], count: int) -> Model:
-    """The model with jumps as constants, or as inputs behind the states."""
+    """The model with jumps as constants, or as inputs behind the states; a bend is one side, or each by its inputs."""
     tape, first = model.dynamics, 1 + model.dimension
-    rows = list(dict.fromkeys(tuple(row) for row in values.values() if len(set(row)) > 1))
+    rows = list(dict.fromkeys(tuple(row) for row in values.values() if count == 1 or len(set(row)) > 1))
     if not rows:
         raise Unproved(f"time alone decides no jump of the dynamics at the ends of {count} pieces")
-    nodes = []
+    nodes: list[Node] = []
+    place: list[int] = []
+
+    def put(*parts: Any) -> int:
+        nodes.append(Node(*parts))
+        return len(nodes) - 1
+
     for index, node in enumerate(tape.nodes):
         row = tuple(values.get(index, ()))
-        if row in rows:
-            nodes.append(Node("input", (first + rows.index(row),)))
+        args = () if node.op == "input" else tuple(place[arg] for arg in node.args)
+        if row and node.op in _BENDS:
+            other = args[1] if len(args) == 2 else put("neg", args)
+            if row in rows:
+                side = put("input", (first + rows.index(row),))
+                rest = put("mul", (put("sub", (put("const", (), 1.0), side)), other))
+                place.append(put("add", (put("mul", (side, args[0])), rest)))
+            else:
+                place.append(args[0] if row[0] else other)
+        elif row in rows:
+            place.append(put("input", (first + rows.index(row),)))
         elif row:
-            nodes.append(Node("const", (), row[0]))
+            place.append(put("const", (), row[0]))
         elif node.op == _CHOICE and node.args[0] in values and tape.nodes[node.args[0]].op in _TRUTHS:
-            nodes.append(Node("mul", node.args))  # by 0 or 1
-        elif node.op == "input" and node.args[0] >= first:
-            nodes.append(Node("input", (node.args[0] + len(rows),)))
+            place.append(put("mul", args))  # by 0 or 1
+        elif node.op == "input":
+            place.append(put("input", (node.args[0] + (len(rows) if node.args[0] >= first else 0),)))
         else:
-            nodes.append(node)
+            place.append(put(node.op, args, node.value, node.part))
     names = (*tape.inputs[:first], *(f"jump {k + 1}" for k in range(len(rows))), *tape.inputs[first:])
-    new = Tape(inputs=names, nodes=tuple(nodes), outputs=tape.outputs, shape=tape.shape)
+    outputs = tuple(place[output] for output in tape.outputs)
+    new = Tape(inputs=names, nodes=tuple(nodes), outputs=outputs, shape=tape.shape)
     plan = [[row[k] for row in rows] for k in range(count)]
     return replace(model, dynamics=new, plan=plan)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import math
 import os
 import re
@@ -122,12 +123,20 @@ def load_problem(
     from certbound.problem.files import load
 
     kind = Path(source).suffix
-    if kind in (".toml", ".yaml", ".yml") and not Path(source).exists():
+    if kind == ".py":
+        words = f"`PROBLEM` must be module:name for a problem in Python, got `{source}`"
+        raise InputError(words, f"write {Path(source).stem}:problem with the name that the problem has in it")
+    if kind and ":" not in source and not Path(source).exists():
         folder = Path(source).parent
-        here = sorted(path.name for path in folder.glob(f"*{kind}"))[:3] if folder.is_dir() else []
+        every = sorted(path.name for path in folder.glob("*.[ty]*ml")) if folder.is_dir() else []
+        here = difflib.get_close_matches(Path(source).name, every, n=3, cutoff=0.4) or every[:3]
         cure = f"there is {', '.join(here)} in that folder" if here else "check the path"
         raise InputError(f"`{source}`: No such file or directory", f"{cure}; `certbound new NAME` writes one")
     parameters: dict[str, Any] = dict(settings_of(pairs))
+    for name in ("horizon", "delta"):
+        if name in parameters and Path(source).is_file():
+            cure = f"write --{name} {parameters[name]:g}"
+            raise InputError(f"`--set` changes parameters, and `{name}` is none", cure)
     changes: dict[str, Any] = {} if delta is None else {"delta": delta}
     with _as_input_error(_cure(source), module=":" in source):
         problem = load(source, **parameters)

@@ -94,8 +94,8 @@ def drawn_reach(problem: Problem, verdict: Verdict) -> ReachTube | None:
         return None
 
 
-def scene_of(problem: Problem, verdict: Verdict, reach: ReachTube, title: str) -> Scene:
-    """What is drawn of a verdict."""
+def scene_of(problem: Problem, verdict: Verdict, reach: ReachTube | None, title: str) -> Scene:
+    """What is drawn of a verdict: limits and sample paths, with the tubes where there are any."""
     import numpy as np
 
     from certbound.plotting import Scene, measured_rooms, noisy_reach

@@ -60,7 +60,7 @@ def pictures_of(shown: Scene | SafeStarts, *, safe: bool) -> Iterator[Picture]:
 
 def legend_of(scene: Scene) -> list[Entry]:
     """The one legend of the small pictures."""
-    entries = [("nominal", INK, "line")]
+    entries = [("nominal", INK, "line")] if scene.tubes else []
     entries += [("with noise" if tube.noise else "noise-free", colour, "area") for tube, colour in scene.tubes]
     entries += [] if scene.tube is None else [("certified bound", BLUE, "line")]
     entries += [] if scene.paths is None else [("sample paths", GREY, "line")]
@@ -69,7 +69,8 @@ def legend_of(scene: Scene) -> list[Entry]:
 
 def _plan_legend(scene: Scene) -> list[Entry]:
     entries = [entry for entry in legend_of(scene) if entry[0] != "certified bound"]
-    entries.insert(-1, ("the tube at the slider's time", BLUE, "line"))
+    if scene.tubes:
+        entries.insert(-1, ("the tube at the slider's time", BLUE, "line"))
     if any(constraint.outside for constraint in scene.problem.safe):
         entries += [("obstacle", VERMILION, "area"), *([] if scene.tube is None else [("eroded", YELLOW, "area")])]
     return entries if scene.problem.reach is None else [*entries, ("target", GREEN, "area")]
@@ -83,7 +84,7 @@ def _unit(scene: Scene) -> str:
 
 
 def _plan(scene: Scene, plane: Plane) -> Picture:
-    names = scene.problem.system.states
+    names = [scene.problem.axis(name) for name in scene.problem.system.states]
     traces: list[Trace] = []
     for tube, color in scene.tubes:
         shape = outlines(tube, plane)
@@ -108,7 +109,8 @@ def _plan(scene: Scene, plane: Plane) -> Picture:
     frames = [
         {"name": label, "data": data, "traces": list(range(first, first + len(data)))} for label, data in now
     ]
-    words = f"The plane of {names[plane[0]]} and {names[plane[1]]}: nominal, reachable sets, sample paths, obstacles."
+    sets = "nominal, reachable sets, " if scene.tubes else ""
+    words = f"The plane of {names[plane[0]]} and {names[plane[1]]}: {sets}sample paths, obstacles."
     return Picture(
         title=f"Seen from above: {names[plane[0]]}, {names[plane[1]]}", words=words, traces=traces, layout=layout,
         frames=frames, legend=_plan_legend(scene),
@@ -117,15 +119,17 @@ def _plan(scene: Scene, plane: Plane) -> Picture:
 
 def _sets(scene: Scene, plane: Plane, layout: Trace) -> Trace:
     """The sets of the plane, and axes on which all of them and the tube can be seen."""
-    hull = (scene.tube or scene.reach).hull
-    low, high = hull.lo.min(axis=0)[list(plane)], hull.hi.max(axis=0)[list(plane)]
+    places = scene.nominal()[1] if scene.paths is None else scene.paths.reshape(-1, scene.paths.shape[-1])
+    wider = scene.tube or scene.reach
+    ends = (places, places) if wider is None else (wider.hull.lo, wider.hull.hi)
+    low, high = ends[0].min(axis=0)[list(plane)], ends[1].max(axis=0)[list(plane)]
     room = 0.04 * (high - low)
     tube = np.stack([low - room, high + room], axis=1).ravel()
     limits = frame_of(scene.problem, plane, tuple(tube.tolist()))
     safe = scene.problem.safe
     shapes = shapes_of(scene.problem, plane, limits, {k: band_of(scene, c, plane) for k, c in enumerate(safe)})
-    ends = [numbers(np.array(limits[:2])), numbers(np.array(limits[2:]))]
-    axes = [layout[name] | {"range": end, "zeroline": False} for name, end in zip(("xaxis", "yaxis"), ends)]
+    ranges = [numbers(np.array(limits[:2])), numbers(np.array(limits[2:]))]
+    axes = [layout[name] | {"range": end, "zeroline": False} for name, end in zip(("xaxis", "yaxis"), ranges)]
     if any(c.region.form.even and set(asked_of(c.region)) == set(plane) for c in safe):
         axes[1] |= {"scaleanchor": "x", "scaleratio": 1}
     return {"shapes": shapes, "xaxis": axes[0], "yaxis": axes[1]}
@@ -134,6 +138,8 @@ def _sets(scene: Scene, plane: Plane, layout: Trace) -> Trace:
 def _moments(scene: Scene, plane: Plane) -> Iterator[tuple[str, list[Trace]]]:
     """At every stop of the slider: the tube's set then, and the places of the sample paths."""
     tube = scene.tube or scene.reach
+    if tube is None:
+        return
     pieces = np.unique(np.linspace(0, tube.curve.pieces - 1, STOPS).astype(int))
     shapes = outlines(tube, plane, pieces)
     for piece, shape in zip(pieces, shapes):
@@ -197,7 +203,10 @@ def _small(scene: Scene, panel: Panel) -> Picture:
 def _words(scene: Scene, panel: Panel, nominal: Array) -> str:
     room = room_of(scene, panel)
     limits = ", ".join(f"{limit:.4g}" for limit in panel.limits)
-    low, high = (0.0 if abs(end) < 1e-9 * np.ptp(nominal) else end for end in (nominal.min(), nominal.max()))
+    size = max(float(np.ptp(nominal)), *map(abs, panel.limits))
+    low, high = (0.0 if abs(end) < 1e-9 * size else end for end in (nominal.min(), nominal.max()))
+    if not scene.tubes:
+        return f"Limit {limits}; no tube was proved."
     certified = "" if room is None or not np.any(np.isfinite(room)) else f"; certified room {_least(room)}"
     return f"Nominal between {low:.4g} and {high:.4g}; limit {limits}{certified}."
 

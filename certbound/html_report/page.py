@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from certbound._version import __version__
-from certbound.display import at_least_text, log10_text, name_text, rounded
+from certbound.display import amount, at_least_text, log10_text, name_text, rounded
 from certbound.html_report.figures import Entry, Picture, legend_of, pictures_of
 from certbound.html_report.markup import table, text
 from certbound.html_report.statement import problem_section
 from certbound.html_report.style import LAYOUT, SCRIPT, SMALL, STYLE
 from certbound.plotting.scene import Scene
+from certbound.problem.problem import Problem
 from certbound.safety.answers import SPARED
 from certbound.safety.starts import SafeStarts
 
 if TYPE_CHECKING:
-    from certbound.problem.problem import Problem
     from certbound.safety.verification import Verdict
 
 SENTENCES = {
@@ -41,20 +41,21 @@ PACKAGES = ("numpy", "scipy", "casadi", "cvxpy", "clarabel", "python-flint", "nu
 
 
 def report_page(
-    shown: Scene | SafeStarts, verdict: Verdict, *, command: str = "", probability: str = "", certificate: str = ""
-) -> str:
+    shown: Scene | SafeStarts | Problem, verdict: Verdict, *, command: str = "", probability: str = "",
+    certificate: str = "",
+) -> str:  # fmt: skip
     """The page as one string: what was proved (``verdict``), and pictures of what is ``shown``.
 
-    These are tubes with sample paths (a scene), or a value function with its safe starts.
+    These are tubes with sample paths (a scene), a value function with its safe starts, or nothing but the problem.
 
     ``command`` gives the verdict again; ``probability`` is the certified bound in words, such as ``3.7e-4``; of the
     text of a ``certificate`` that was written the page shows the hash, as ``sha256sum`` prints it.
     """
     from plotly.offline import get_plotlyjs
 
-    pictures = list(pictures_of(shown, safe=verdict.status == "SAFE"))
+    problem = shown if isinstance(shown, Problem) else shown.problem
+    pictures = [] if isinstance(shown, Problem) else list(pictures_of(shown, safe=verdict.status == "SAFE"))
     large = [picture for picture in pictures if not picture.small]
-    problem = shown.problem
     parts = [
         _head(f"{name_text(problem.name)}: {verdict.status}", get_plotlyjs()),
         _verdict_section(problem, verdict, probability),
@@ -83,16 +84,17 @@ def _head(title: str, script: str) -> str:
 
 
 def _verdict_section(problem: Problem, verdict: Verdict, probability: str) -> str:
-    unit = problem.time_unit
+    when = "" if verdict.time is None else f"at {amount(float(f'{verdict.time:.4g}'), problem.time_unit)}"
+    where = [verdict.constraint or "", when]
     bound = probability or f"10^{rounded(verdict.log10_delta, up=True, digits=4)}"
     rows = [
         ("certified bound on the probability of leaving", bound),
         ("proved from below", at_least_text(verdict.log10_lower).removeprefix(", ")),
         ("asked for", f"{problem.delta!r}"),
-        ("horizon", f"{problem.horizon:g} {unit}"),
+        ("horizon", problem.span.removeprefix("within ")),
         ("states", ", ".join(problem.system.states)),
         ("margin at the tightest place", _least(verdict.margin)),
-        ("where", "" if verdict.time is None else f"{verdict.constraint}, at {verdict.time:.4g} {unit}"),
+        ("where", ", ".join(filter(None, where))),
         ("method", verdict.method),
         ("why", verdict.reason),
     ]
@@ -183,7 +185,7 @@ def _legend(entries: Sequence[Entry]) -> str:
     return f'<p class="legend">{keys}</p>' if entries else ""
 
 
-def _small_section(shown: Scene | SafeStarts, pictures: Sequence[Picture]) -> str:
+def _small_section(shown: Scene | SafeStarts | Problem, pictures: Sequence[Picture]) -> str:
     """Every constraint over time, side by side under one legend."""
     if not pictures or not isinstance(shown, Scene):
         return ""

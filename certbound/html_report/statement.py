@@ -42,7 +42,7 @@ def problem_section(problem: Problem) -> str:
     rows += [] if problem.reach is None else [("has to reach", _asked(problem.reach, unit, states))]
     if problem.domain is not None:
         rows.append(("domain", problem.domain.describe(states, "inside")))
-    rows.append(("horizon", f"{problem.horizon:g} {unit}"))
+    rows.append(("horizon", problem.span.removeprefix("within ")))
     rows.append(("allowed probability", f"delta = {problem.delta!r}"))
     return (
         '<section id="problem"><h2>The problem</h2><div class="halves"><div>'

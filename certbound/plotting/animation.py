@@ -35,7 +35,7 @@ def animate(
     verdict : Verdict
         With a reach tube (the engines linear and constants have one).
     path : str or Path
-        The file, which should end in .gif.
+        The file, which ends in .gif.
     frames : int
         Pictures, at equal steps of time.
     paths : int
@@ -48,10 +48,13 @@ def animate(
     Raises
     ------
     ValueError
-        If ``frames`` is below 2, ``seconds`` is not positive, or nothing was proved that could be drawn.
+        If ``path`` does not end in .gif, ``frames`` is below 2, ``seconds`` is not positive, or nothing was
+        proved that could be drawn.
     """
     if frames < 2 or not seconds > 0:
         raise ValueError(f"`frames` must be at least 2 and `seconds` positive, got {frames} and {seconds}.")
+    if Path(path).suffix.lower() != ".gif":
+        raise ValueError(f"`path` must end in .gif, got {str(path)!r}.")
     from matplotlib.animation import FuncAnimation, PillowWriter
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -61,6 +64,7 @@ def animate(
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     moving = _Plane(axes, scene) if plane_of(scene.problem) is not None else _Trace(axes, scene)
+    assert scene.reach is not None
     times = np.linspace(float(scene.reach.curve.starts[0]), scene.reach.end, frames)
     film = FuncAnimation(figure, lambda k: moving.show(float(times[k])), frames=frames, blit=False)
     film.save(str(path), writer=PillowWriter(fps=max(1, round(frames / seconds))), dpi=80)
@@ -90,6 +94,7 @@ class _Plane:
     def show(self, t: float) -> list[Any]:
         """Move what moves."""
         tube = self.scene.tube or self.scene.reach
+        assert tube is not None
         piece = np.array([tube.curve.piece_of(t)])
         shape: Array = outlines(tube, self.plane, piece)[0]
         self.rim.set_data(*np.concatenate([shape, shape[:1]]).T)

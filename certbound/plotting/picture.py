@@ -110,8 +110,10 @@ def _legend(scene: Scene) -> list[Any]:
     from matplotlib.patches import Patch
 
     obstacles = any(constraint.outside for constraint in scene.problem.safe)
-    handles: list[Any] = [Line2D([], [], color=INK, linewidth=1.2, label="nominal")]
-    handles.append(Patch(facecolor=INNER, label="noise-free"))
+    handles: list[Any] = []
+    if scene.reach is not None:
+        handles.append(Line2D([], [], color=INK, linewidth=1.2, label="nominal"))
+        handles.append(Patch(facecolor=INNER, label="noise-free"))
     if scene.tube is not None:
         handles.append(Patch(facecolor=OUTER, label="with noise"))
         handles.append(Line2D([], [], color=BLUE, linewidth=1.2, label="certified bound"))

@@ -223,6 +223,7 @@ def band_of(scene: Scene, constraint: Inside, plane: Plane) -> float:
     region = constraint.region
     if scene.tube is None or set(asked_of(region)) != set(plane):
         return 0.0
+    assert scene.reach is not None
     rows = [_row(scene.reach, plane, angle) for angle in np.linspace(0, 2 * np.pi, 16, endpoint=False)]
     width = max(float(np.max(supports(scene.tube, row) - supports(scene.reach, row))) for row in rows)
     return max(width, 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,13 +23,13 @@ GREEN, EDGE = "#009E73", "#8a7d00"
 class Scene:
     """What a picture shows: the constraints of ``problem``, the noise-free tube ``reach``, whose curve is the nominal.
 
-    ``tube`` has the stochastic deviation; ``times``, shape (K + 1,), and ``paths``, shape (paths, K + 1, n), are sample
-    paths. ``rooms`` are what an engine measured of single constraints: number in ``problem.safe``, directions (K, n),
-    room (K,).
+    Where no tube was proved there is no ``reach``, and no nominal but the start. ``tube`` has the stochastic deviation;
+    ``times``, shape (K + 1,), and ``paths``, shape (paths, K + 1, n), are sample paths. ``rooms`` are what an engine
+    measured of single constraints: number in ``problem.safe``, directions (K, n), room (K,).
     """
 
     problem: Problem
-    reach: ReachTube
+    reach: ReachTube | None
     tube: ReachTube | None = None
     times: Array | None = None
     paths: Array | None = None
@@ -54,6 +54,7 @@ class Scene:
 
     def between(self, first: float, last: float) -> Scene:
         """The part of the scene from one time to another, by whole pieces."""
+        assert self.reach is not None
         curve = self.reach.curve
         kept = np.flatnonzero((np.asarray(curve.ends) >= first) & (np.asarray(curve.starts) <= last))
         if not len(kept):
@@ -70,11 +71,14 @@ class Scene:
     @property
     def tubes(self) -> list[tuple[ReachTube, str]]:
         """The tubes with their colours, the wider one first."""
-        inner = [(self.reach, INNER)]
+        inner = [] if self.reach is None else [(self.reach, INNER)]
         return inner if self.tube is None else [(self.tube, OUTER), *inner]
 
     def nominal(self, count: int = 400) -> tuple[Array, Array]:
         """Times at which the nominal is drawn, shape (K,), and its states then, shape (K, n)."""
+        if self.reach is None:
+            start: Any = self.problem.starts[0]
+            return np.zeros(1), np.asarray(start.mean if start.random else start.middle)[None]
         curve = self.reach.curve
         times = np.asarray(curve.starts)
         if curve.continuous:

@@ -12,7 +12,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.checks import assign, nearest
-from certbound.display import Shown, ask_later_room, name_text
+from certbound.display import Shown, amount, ask_later_room, name_text
 from certbound.errors import InfeasibleError
 from certbound.problem.ingredients import (
     check_dimension,
@@ -181,7 +181,7 @@ class Problem(Shown):
     @property
     def span(self) -> str:
         """The horizon in words."""
-        return "at any time" if self.endless else f"within {self.horizon:g} {self.time_unit}"
+        return "at any time" if self.endless else f"within {amount(self.horizon, self.time_unit)}"
 
     @property
     def time_unit(self) -> str:

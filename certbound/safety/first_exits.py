@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.checks import vector
+from certbound.checks import instance, vector
 from certbound.display import Shown, rounded
 from certbound.errors import EngineError, InfeasibleError, contained
 from certbound.parallel import alone
@@ -148,6 +148,7 @@ def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> 
 
     Source: Thm K8 of theory, one state.
     """
+    instance("problem", problem, Problem)
     _check(problem)
     try:
         with contained("values"):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from certbound.checks import instance
 from certbound.parallel import alone
 from certbound.problem.problem import Problem
 from certbound.safety.decision import decide
@@ -79,6 +80,7 @@ def verify_safety(
     >>> verify_safety(problem, method="constants").status
     'SAFE'
     """
+    instance("problem", problem, Problem)
     own = time_limit is not None or progress is not None or jobs != 1 or executor is not None
     made = Watch(time_limit, progress=progress, jobs=jobs, executor=executor, patient=patient)
     watch = made if own else current_watch() or made

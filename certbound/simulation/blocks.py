@@ -147,7 +147,8 @@ class Work:
             raise ValueError(
                 "the model gave a state that is not finite in the step after time "
                 f"{notes[1] * self.interval:.6g} on path {block * self.block + int(notes[0])}, from state "
-                f"({state}); use more steps, or set `domain` to where the model is meant."
+                f"({state}); use more steps, or set `domain` to where the model is meant; "
+                "where a step may cross 0 write sqrt(max(.., 0))."
             )
         return int(done)
 

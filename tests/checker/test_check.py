@@ -287,9 +287,9 @@ def test_an_angle_that_is_constant_varies_for_nobody() -> None:
 
 
 def test_a_nominal_curve_may_cross_a_kink_in_time() -> None:
-    """min(t, 0.5) bends inside a piece, where the dynamics has no series; twice the slope there is still refused."""
+    """No hundred pieces end where min(t, 0.4999) bends: the dynamics has no series there; more is still refused."""
     slow = cb.ContinuousSystem(
-        lambda t, x: [-0.5 * x[0] - 0.05 * np.minimum(t / 0.437, 0.5)], states=1, diffusion=[[0.05]]
+        lambda t, x: [-0.5 * x[0] - 0.05 * np.minimum(t / 0.437, 0.4999)], states=1, diffusion=[[0.05]]
     )
     safe = [cb.Inside(cb.Box([-1.0], [1.0]))]
     problem = cb.Problem(slow, initial=[0.2], safe=safe, horizon=0.437, delta=1e-2)
@@ -297,7 +297,7 @@ def test_a_nominal_curve_may_cross_a_kink_in_time() -> None:
     assert data["claim"]["method"] == "constants"
     assert check_data(data, problem_data(problem)).valid
     nodes = data["problem"]["dynamics"]["nodes"]
-    bent = next(i for i, node in enumerate(nodes) if node[0] == "const" and float.fromhex(node[1]) == 0.5)
+    bent = next(i for i, node in enumerate(nodes) if node[0] == "const" and float.fromhex(node[1]) == 0.4999)
     nodes[bent][1] = (0.6).hex()
     report = check_data(data)
     assert not report.valid

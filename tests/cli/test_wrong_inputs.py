@@ -41,6 +41,11 @@ def bare_noise():
 def nothing():
     return 3
 
+def forgetting():
+    build(lambda x: -x)
+
+unasked = build(lambda x: -x).system
+
 def dividing():
     return 1 / 0
 """
@@ -117,6 +122,21 @@ FILES = {
     "a plan that is not there": (
         GOOD + '[inputs]\nu = [-1, 1]\n[plan]\nfile = "none.json"\n', "none.json", ""
     ),
+    "a key in the wrong table": (change("horizon = 5", 'horizon = 5\nleaving = "ends"', STEPS), "leaving", "[domain]"),
+    "a word that is none of two": (
+        STEPS + '[domain]\nbox = { x = [-2, 2] }\nleaving = "end"\n', "'unsafe' or 'ends', got 'end'", "domain.leaving"
+    ),
+    "noise without a law": (change('law = "gaussian"\n', "", STEPS), "noise.law", 'law = "gaussian"'),
+    "a definition of a later one": (
+        change("[dynamics]", '[definitions]\nf = "2*g"\ng = "1"\n[dynamics]', STEPS), "'g', which stands below", "order"
+    ),
+    "no sign to multiply": (change("-sin(angle)", "-2angle"), "'angle'", "2*angle"),
+    "a comma for a point": (change("-sin(angle)", "-0,5*angle"), "','", "point"),
+    "a function of NumPy": (change("-sin(angle)", "-np.sin(angle)"), "'.'", "sin(x)"),
+    "a radius below 0": (STEPS + "[[avoid]]\nball = { center = [3], radius = -1 }\n", "avoid.0.ball.radius", ""),
+    "a window that ends before it begins": (STEPS + "during = [2, 1]\n", "stay.0.during", ""),
+    "a negative standard deviation": (change("std = 0.1", "std = -0.1", STEPS), "noise.std", ""),
+    "a key that stands twice": (change("horizon = 5", "horizon = 5\nhorizon = 6", STEPS), "not TOML", "twice"),
     "inputs without a plan": (GOOD + "[inputs]\nu = [-1, 1]\n", "plan", "plan"),
 }  # fmt: skip
 
@@ -150,6 +170,8 @@ def test_the_files_are_right_but_for_what_is_changed(tmp_path: Path) -> None:
         ("nothing", "must be a cb.Problem"),
         ("dividing", "division by zero"),
         ("missing", "has no 'missing'"),
+        ("forgetting", "returned None"),
+        ("unasked", "the `system` of a cb.Problem"),
     ],
 )
 def test_a_wrong_model_in_python(
@@ -184,6 +206,9 @@ def test_a_module_that_cannot_be_imported(
         (["check", "note.txt"], "", ""),
         (["verify", "note.txt"], "TOML", ""),
         (["verify", "."], "", ""),
+        (["verify", "model.tml"], "No such file", "certbound new"),
+        (["verify", "model.py"], "module:name", "model:problem"),
+        (["verify", "nothing"], "no bundled problem", "known: chain"),
         (["simulate", "ou"], "--paths", "simulate --help"),
         (["simulate", "ou", "--paths", "100", "--time-limit", "5", "--checkpoint", "run.npz"], "--checkpoint", ""),
         (["new", "a/b"], "", ""),
@@ -262,7 +287,9 @@ def test_a_program_that_is_stopped_from_outside(tmp_path: Path) -> None:
             try:
                 time.sleep(patience)
                 process.send_signal(signal.SIGINT)
-                out, err = process.communicate(timeout=60)
+                out, err = process.communicate(timeout=20)
+            except subprocess.TimeoutExpired:  # it came within a weak reference's callback, where Python drops it
+                continue
             finally:
                 process.kill()
             if process.returncode != -signal.SIGINT:

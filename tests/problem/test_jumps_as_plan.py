@@ -48,6 +48,13 @@ def given(field: str, horizon: str = "10") -> cb.Problem:
         ("-x + 0.2*sign(3*(4 - t) - 6)", "10", 5),
         ("where(t < 1 or (t > 2 and not t == 3), -x, -2*x)", "4", 4),
         ("-x + 0.1*where(t < 5, sin(t), where(t < 20, t, 7))", "10", 2),
+        ("-x + where(t < 10, 0.2, -0.2)", "10", 1),
+        ("-x + min(0.1*t, 0.3)", "6", 2),
+        ("-x + min(0.1*t, 0.3)", "3", 1),
+        ("-x + 0.1*max(0, min(1, (t - 2)/3)) + 0.05*abs(t - 4)", "10", 10),
+        ("-x + 0.1*max(-floor(t/5), sin(t), t/10)", "10", 2),
+        ("-x + where(t > 0, 0.2, -0.2)", "10", 1),
+        ("-x + 0.1*floor(t/5 + 0.5)*where(t < 10, 1, 0)", "10", 4),
     ],
 )
 def test_a_jump_at_a_known_time_lies_between_two_pieces(field, horizon, pieces):
@@ -64,6 +71,7 @@ def test_a_jump_at_a_known_time_lies_between_two_pieces(field, horizon, pieces):
 @pytest.mark.parametrize(
     "field",
     [
+        "-x + 0.1*min(t, x)", "-x + 0.1*abs(t - 0.12345)", "-x + 0.1*abs(sin(t))",
         "-x + 0.1*sign(x)", "-x + 0.2*sign(sin(t))", "-x + 0.1*(t < x)", "-x + 0.1*(t < 20)", "-x + 0.1*(t < 0.12345)",
         "-x",
     ],
@@ -103,6 +111,19 @@ def test_the_linear_response_is_near_the_truth_beside_a_jump_and_certificates_sa
         data["proof"]["jumps"] = wrong
         with pytest.raises(CertificateError, match="jumps"):
             check_data(data)
+
+
+@pytest.mark.parametrize("field", ["where(t < 2, 0.1, 7) - x", "min(0.5*t, 0.3) - abs(t - 0.6) - x"])
+def test_a_jump_at_the_very_end_is_none_and_bends_have_certificates(field):
+    problem = given(field, "2").replace(safe=[cb.Inside(cb.Box([-2], [1]))])
+    verdict = cb.verify_safety(problem, method="linear")
+    assert verdict.status == "SAFE"
+    data = parse(certificate_text(problem, verdict))
+    report = check_data(data, json.loads(json.dumps(problem_data(problem))))
+    assert report.valid, report.reason
+    if "min" in field:
+        data["proof"]["jumps"] = 3
+        assert not check_data(data).valid
 
 
 def test_reach_tubes_and_noise_free_violations_see_the_jump():

@@ -7,7 +7,7 @@ import re
 import shlex
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -100,6 +100,9 @@ def verify(
             executor=executor, patient=time_limit is not None,
         )  # fmt: skip
     seconds = time.perf_counter() - started
+    if ":" not in problem:  # reasons and cures in the words of files
+        told = {name: replace(answer, reason=for_files(answer.reason)) for name, answer in verdict.answers.items()}
+        verdict = replace(verdict, reason=for_files(verdict.reason), answers=told)
     result = _result(subject, verdict, seconds)
     if explain:
         result["engines"] = _engines(verdict)
@@ -107,9 +110,6 @@ def verify(
         from certbound.problem.files import notes
 
         result["taken"] = list(notes(problem))
-    if ":" not in problem:
-        for told in (result, *result.get("engines", ())):
-            told["reason"] = for_files(told["reason"])
     if not as_json:  # the verdict comes first: it stands, whatever becomes of the rest
         _print(subject, result, verdict.caution)
     if explain and verdict.status == "UNKNOWN":
@@ -175,22 +175,32 @@ def _write(problem: Problem, verdict: Verdict, proof: str, *, report: Path | Non
     with spinner("looking for what can be drawn"):
         starts = values_of(problem, verdict) if verdict.reach is None else None
         reach = drawn_reach(problem, verdict) if starts is None else None
-        shown = starts if reach is None else scene_of(problem, verdict, reach, title)
-    if shown is None:
-        sys.stderr.write("certbound: nothing was drawn or reported: no set was proved that could be\n")
-        return
+        bare = starts is None and reach is None
+        drawn = starts is None and not (bare and problem.endless)
+        scene = scene_of(problem, verdict, reach, title) if drawn else None
+    if bare:
+        paths = "" if scene is None or scene.paths is None else "sample paths and "
+        what = "nothing is drawn" if scene is None else f"{paths}limits are drawn alone"
+        sys.stderr.write(f"certbound: no set was proved that could be drawn; {what}\n")
     if plot is not None:
-        from certbound.plotting import Scene, draw_scene, draw_values
+        from certbound.plotting import draw_scene, draw_values
 
         with spinner("drawing"):
-            write_picture(plot, draw_scene(shown) if isinstance(shown, Scene) else draw_values(shown, title))
+            if scene is not None:
+                write_picture(plot, draw_scene(scene))
+            elif starts is not None:
+                write_picture(plot, draw_values(starts, title))
     if report is not None:
         from certbound.html_report import report_page
 
         with spinner("writing the report"):
             command = shlex.join(["certbound", *(word for word in sys.argv[1:])])
             probability = log10_text(verdict.log10_delta)
-            write_file(report, report_page(shown, verdict, command=command, probability=probability, certificate=proof))
+            page = report_page(
+                scene or starts or problem, verdict, command=command, probability=probability,
+                certificate=proof,
+            )  # fmt: skip
+            write_file(report, page)
 
 
 def _certify(problem: Problem, verdict: Verdict, path: Path, left: float | None) -> tuple[str, dict[str, Any]]:

@@ -76,7 +76,8 @@ def loads(text: str, *, folder: Path | None = None, **parameters: Any) -> Proble
     try:
         content = tomllib.loads(text.removeprefix("\ufeff"))
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"the problem file is not TOML: {error}.") from error
+        twice = "; a key or a table stands there twice" if "overwrite" in f"{error}" or "twice" in f"{error}" else ""
+        raise ValueError(f"the problem file is not TOML: {error}{twice}.") from error
     except RecursionError as error:
         raise ValueError("the problem file is nested too deeply.") from error
     return _built(content, folder, parameters)
@@ -183,7 +184,9 @@ def _load_module(text: str, parameters: Mapping[str, Any]) -> Problem:
         return value
     problem = value(**parameters) if isinstance(value, Callable) else None  # type: ignore[arg-type]  # Callable is no type to mypy
     if not isinstance(problem, Problem):
-        raise TypeError(f"{text!r} must be a cb.Problem or a function that returns one, got {value!r}.")
+        got = f"a function that returned {problem!r}" if problem is not value and callable(value) else repr(value)
+        cure = "; make it the `system` of a cb.Problem." if hasattr(value, "disturbance") else "."
+        raise TypeError(f"{text!r} must be a cb.Problem or a function that returns one, got {got}{cure}")
     return problem
 
 

@@ -24,7 +24,7 @@ _TOKEN = re.compile(
     r"|(?P<symbol>\*\*|[<>=!]=|[-+*/(),<>]))"
 )
 _CURES = {
-    ".": "attribute access does not exist here",
+    ".": "attribute access does not exist here; write functions without a module's name, as in sin(x)",
     "[": "indexing does not exist here; use the states' names",
     "{": "braces do not exist here",
     "^": "write ** for powers",
@@ -92,8 +92,15 @@ class _Parser:
         node = self.expression(0)
         token = self.peek()
         if token.kind != "end":
-            raise self.fail(f"unexpected {token.text!r}", token.place)
+            raise self.fail(f"unexpected {token.text!r}{self._separator(token)}", token.place)
         return node
+
+    def _separator(self, token: _Token) -> str:
+        """What was meant by two values side by side."""
+        before = self.tokens[self.next - 1]
+        if token.text == ",":
+            return "; write decimals with a point" if before.kind == "number" else ""
+        return f"; write {before.text}*{token.text}" if before.kind == "number" else "; write * to multiply"
 
     def _split(self) -> list[_Token]:
         tokens: list[_Token] = []
@@ -109,7 +116,8 @@ class _Parser:
                     place += blank + 1
                     continue
                 cure = _CURES.get(character, "such a character does not exist here")
-                raise self.fail(f"{cure} ({character!r})", place + blank)
+                what, separator, rest = cure.partition(";")
+                raise self.fail(f"{what} ({character!r}){separator}{rest}", place + blank)
             kind = match.lastgroup or "symbol"
             word = match.group(kind)
             tokens.append(_Token("symbol" if word in _LOGIC else kind, word, match.start(kind)))

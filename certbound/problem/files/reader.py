@@ -76,11 +76,21 @@ class Reader:
             slot = graph.inputs.index(name) if name in graph.inputs else None
             names[name] = _forbidden(name, inputs) if slot is None else graph.input(slot)
         names |= {name: graph.const(_finite(value, f"parameters.{name}")) for name, value in self.parameters.items()}
-        for name, text in self.spec.definitions.items():
+        current = ""
+
+        def later(name: str) -> Callable[[], int]:
+            def use() -> int:
+                which = "itself" if name == current else f"{name!r}, which stands below it"
+                raise ValueError(f"`definitions.{current}` must not use {which}; definitions are read in order.")
+
+            return use
+
+        names |= {name: later(name) for name in self.spec.definitions}
+        for current, text in self.spec.definitions.items():
             try:
-                names[name] = self._node(text, graph, names, f"definitions.{name}")
+                names[current] = self._node(text, graph, names, f"definitions.{current}")
             except _ForbiddenError as error:
-                names[name] = _raise(error)
+                names[current] = _raise(error)
         nodes = [self._node(text, graph, names, place) for text, place in zip(texts, where)]
         return graph.tape(nodes, shape)
 

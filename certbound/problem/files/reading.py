@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.checks import nearest
+from certbound.checks import located, nearest
 from certbound.problem import sets
 from certbound.problem.files.plans import read_plan
 from certbound.problem.files.schema import Cost, Specification
@@ -141,8 +141,9 @@ class _ProblemReader(SetReader):
         if table is None:
             return {}
         if table.diffusion is not None or table.law not in LAWS:
-            continuous = table.diffusion is not None
-            cure = "; `diffusion` is for continuous time." if continuous else nearest(f"{table.law}", LAWS)
+            cure = nearest(f"{table.law}", LAWS) if table.law else '; write for example law = "gaussian" and std = 0.1.'
+            if table.diffusion is not None:
+                cure = "; `diffusion` is for continuous time."
             raise ValueError(
                 f"`noise.law` must be one of {', '.join(LAWS)} in discrete time, with one level and at most `matrix`, "
                 f"got {table.law!r}{cure}"
@@ -160,7 +161,8 @@ class _ProblemReader(SetReader):
         for flag in flags.keys() - set(build.flags):
             raise ValueError(f"`noise.{flag}` must be omitted for law {table.law!r}.")
         level = {key: self.array(value, f"noise.{key}") for key, value in entries.items()}
-        result: dict[str, Any] = {"noise": build(**level, **tables, **flags)}
+        with located("noise", build.levels):
+            result: dict[str, Any] = {"noise": build(**level, **tables, **flags)}
         if table.matrix is not None:
             result["noise_matrix"] = self.gain(table.matrix, "noise.matrix")
         return result

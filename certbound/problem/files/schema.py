@@ -44,8 +44,17 @@ class _Table(BaseModel):
         known = [*cls.model_fields, *cls.more_keys()]
         for key in value:
             if key not in known:
-                raise ValueError(f"unknown key {key!r} in {cls.title}{nearest(str(key), known)}")
+                raise ValueError(f"unknown key {key!r} in {cls.title}{_hint(str(key), known)}")
         return value
+
+
+def _hint(key: str, known: list[str]) -> str:
+    """The nearest key of a table, or the tables in which this one stands."""
+    near, tables = nearest(key, known), [_Table]
+    for table in tables:
+        tables += table.__subclasses__()
+    homes = dict.fromkeys(table.title for table in tables if key in table.model_fields and "[" in table.title)
+    return near if "did you mean" in near or not homes else f"; it belongs into {' or '.join(homes)}."
 
 
 class BallTable(_Table):
@@ -257,6 +266,8 @@ def explain(error: ValidationError) -> str:
             plain = f"must be a list of tables; write [[{key}]]"
         if any(line.startswith((f"`{key}`", f"`{key}.")) for line in lines) and plain:
             continue  # another alternative of what was refused already
+        if fault["type"] == "literal_error":
+            plain += f", got {fault['input']!r}"
         line = f"`{key}` {plain}" if plain else f"`{key}`: {message[:1].lower()}{message[1:]}"
         line = line if keys else line.removeprefix("``: ")
         if line not in lines:
@@ -274,6 +285,7 @@ _PLAIN = {
     "float_parsing": "must be a number",
     "float_type": "must be a number",
     "string_type": "must be a text in quotes",
+    "literal_error": "must be {expected}",
 }
 """What pydantic's kinds of faults are in the words of this program."""
 

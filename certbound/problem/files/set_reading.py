@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from certbound.checks import located
 from certbound.problem import sets
 from certbound.problem.files.reader import Reader
 from certbound.problem.files.schema import Constraint, Part, PolygonTable, Start
@@ -98,23 +99,27 @@ class SetReader(Reader):
                 fields[name] = read(value, place)
             else:
                 fields[name] = self.number(value, place)
-        return _SHAPES[kind](**fields)
+        with located(where, fields):
+            return _SHAPES[kind](**fields)
 
     def stays(self, table: Constraint, where: str) -> list[Any]:
         """Staying in an intersection is staying in each of its parts."""
         _refuse_then(table, where)
         during = None if table.during is None else self.array(table.during, f"{where}.during")
-        return [sets.Inside(part, during=during, label=table.label) for part in self.parts(table, where)]
+        parts = self.parts(table, where)
+        with located(where, ["during"]):
+            return [sets.Inside(part, during=during, label=table.label) for part in parts]
 
     def constraint(self, kind: Callable[..., Any], table: Constraint, where: str) -> Any:
         during = None if table.during is None else self.array(table.during, f"{where}.during")
         whole, outward = table.all is not None, kind is sets.Outside
         parts = self.parts(table, where, outward=outward)
         region = sets.intersection(parts, dimension=len(self.states), outward=outward) if whole else parts[0]
-        if kind is sets.Reach:
-            return kind(region, during=during, label=table.label, then=table.then)
-        _refuse_then(table, where)
-        return kind(region, during=during, label=table.label)
+        options = {"then": table.then} if kind is sets.Reach else {}
+        if not options:
+            _refuse_then(table, where)
+        with located(where, ["during"]):
+            return kind(region, during=during, label=table.label, **options)
 
     def parts(self, table: Constraint, where: str, *, outward: bool = False) -> list[Any]:
         if table.all is None:
@@ -133,7 +138,8 @@ class SetReader(Reader):
         corners = self.matrix(rows, f"{where}.vertices")
         places = [self.states.index(name) for name in names]
         points = corners.T if isinstance(vertices, dict) else corners
-        return sets.polygon(points, places=places, dimension=len(self.states), outward=outward)
+        with located(where, ["vertices"]):
+            return sets.polygon(points, places=places, dimension=len(self.states), outward=outward)
 
     def region(self, table: Part | Constraint, where: str, *, outward: bool = False) -> Any:
         if table.polygon is not None:

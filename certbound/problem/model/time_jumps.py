@@ -1,4 +1,5 @@
-"""Jumps that the clock alone decides: ``where(t < 5, a, b)`` is a constant on either side of t = 5.
+"""Jumps and bends that the clock alone decides: ``where(t < 5, a, b)`` is a constant on either side of t = 5, and
+``min(t, 5)`` one of its arguments.
 
 In continuous time such a jump is no hindrance: what the model says at the one time of the jump has no weight. The
 horizon is cut into equal pieces that have the jumps at their ends, and what jumps becomes an input with a value a
@@ -21,8 +22,11 @@ from certbound.problem.model.tape import JUMPS, Node, Tape
 
 _MOST_JUMPS = 500
 _MOST_PIECES = 1000
+_MOST_BENT = 100  # pieces for the sake of bends, which engines can do without
 _CHOICE = "if_else_zero"
 _TRUTHS = JUMPS - {_CHOICE, "sign", "floor"}  # 0 or 1
+_BENDS = frozenset({"min", "max", "abs"})
+_CUT = JUMPS | _BENDS
 
 Line = tuple[Fraction, Fraction]
 """Slope and offset of a function of t that is a straight line on a piece."""
@@ -45,8 +49,8 @@ class TimeJumps:
 def cut_at_jumps(tape: Tape, states: int, horizon: float) -> TimeJumps | None:
     """The function without the jumps that t alone decides; None where it has none, or they fit into no equal pieces.
 
-    A jump counts where its argument is, piece by piece, a straight line in t: ``t < 5``, ``sign(t - 3)``,
-    ``floor(t/2)``, ``t - 2*floor(t/2) < 1``.
+    So too without its bends, where these fit into a hundred pieces. Each counts where its argument is, piece by piece,
+    a straight line in t: ``t < 5``, ``sign(t - 3)``, ``floor(t/2)``, ``t - 2*floor(t/2) < 1``, ``min(t, 5)``.
 
     Parameters
     ----------
@@ -59,19 +63,31 @@ def cut_at_jumps(tape: Tape, states: int, horizon: float) -> TimeJumps | None:
     """
     found = reads(tape)
     own = [index for index in range(len(tape.nodes)) if found[index] <= {0}]
-    if not any(tape.nodes[index].op in JUMPS and found[index] for index in own):
-        return None
-    breaks = _breaks(tape, own, decimal(horizon))
+    straight = [index for index in own if tape.nodes[index].op not in _BENDS]
+    for kept, ops, most in ((own, _CUT, _MOST_BENT), (straight, JUMPS, _MOST_PIECES)):
+        if any(tape.nodes[index].op in ops and found[index] for index in kept):
+            cut = _cut(tape, states, decimal(horizon), kept, found, most)
+            if cut is not None:
+                return cut
+    return None
+
+
+def _cut(
+    tape: Tape, states: int, horizon: Fraction, own: Sequence[int], found: Sequence[set[int]], most: int
+) -> TimeJumps | None:
+    """The function without what jumps or bends among the nodes ``own``, in at most so many pieces."""
+    breaks = _breaks(tape, own, horizon)
     if breaks is None:
         return None
     count = math.lcm(*((end / breaks[-1]).denominator for end in breaks))
-    if count > _MOST_PIECES:
+    if count > most:
         return None
     values = _values(tape, own, breaks)
     wanted = [index for index in _frontier(tape, values) if found[index]]
     middles = [(Fraction(2 * k + 1, 2 * count)) * breaks[-1] for k in range(count)]
     places = [sum(end < middle for end in breaks) - 1 for middle in middles]
-    return _with_inputs(tape, states, {index: [values[index][place] for place in places] for index in wanted})
+    rows = {index: [values[index][place] for place in places] for index in wanted}
+    return _with_inputs(tape, states, rows, every=count == 1 and _touches(tape, own, breaks[-1]))
 
 
 def decimal(value: float) -> Fraction:
@@ -99,14 +115,27 @@ def _jumps_within(tape: Tape, own: Sequence[int], first: Fraction, last: Fractio
     lines: dict[int, Line | None] = {}
     for index in own:
         node = tape.nodes[index]
-        if node.op in JUMPS and all(lines[arg] is not None for arg in node.args):
+        if node.op in _CUT and all(lines.get(arg) is not None for arg in node.args):
             yield from _crossings(node.op, _compared(node, lines), first, last)
         lines[index] = _line(node, lines, (first + last) / 2)
 
 
+def _touches(tape: Tape, own: Sequence[int], horizon: Fraction) -> bool:
+    """Whether something jumps at time 0 or at the end: inside of the closed piece nothing decides it there."""
+    lines: dict[int, Line | None] = {}
+    for index in own:
+        node = tape.nodes[index]
+        if node.op in _CUT and all(lines.get(arg) is not None for arg in node.args):
+            around = _crossings(node.op, _compared(node, lines), Fraction(-1), horizon + 1)
+            if not {Fraction(0), horizon}.isdisjoint(around):
+                return True
+        lines[index] = _line(node, lines, horizon / 2)
+    return False
+
+
 def _compared(node: Node, lines: Mapping[int, Line | None]) -> Line:
-    """What a jump compares with 0 (``floor``: with whole numbers)."""
-    given = [line for line in (lines[arg] for arg in node.args) if line is not None]
+    """What a jump or a bend compares with 0 (``floor``: with whole numbers)."""
+    given = [line for line in (lines.get(arg) for arg in node.args) if line is not None]
     if len(given) == 1 or node.op in ("and", "or", _CHOICE):
         return given[0]
     return given[0][0] - given[1][0], given[0][1] - given[1][1]
@@ -127,13 +156,13 @@ def _crossings(op: str, line: Line, first: Fraction, last: Fraction) -> Iterator
 def _line(node: Node, lines: Mapping[int, Line | None], middle: Fraction) -> Line | None:
     """A node as a straight line on a piece with this middle, on which no node before it jumps; None where it is none.
 
-    A jump has its value at the middle.
+    A jump has its value at the middle, a bend the argument that it has there.
     """
     if node.op == "const":
         return Fraction(0), decimal(node.value)
     if node.op == "input":
         return Fraction(1), Fraction(0)
-    given = [line for line in (lines[arg] for arg in node.args) if line is not None]
+    given = [line for line in (lines.get(arg) for arg in node.args) if line is not None]
     if len(given) != len(node.args) or node.part is not None:
         return None
     if node.op in ("and", "or", "not"):
@@ -141,10 +170,20 @@ def _line(node: Node, lines: Mapping[int, Line | None], middle: Fraction) -> Lin
         return Fraction(0), Fraction({"and": all(holds), "or": any(holds), "not": not holds[0]}[node.op])
     if node.op == _CHOICE:
         return given[1] if given[0] != _NOTHING else _NOTHING
+    if node.op in _BENDS:
+        other = given[1] if len(given) == 2 else (-given[0][0], -given[0][1])
+        return given[0] if _first(node, lines, middle) else other
     if node.op in JUMPS:
         slope, offset = _compared(node, lines)
         return Fraction(0), _jumped(node.op, slope * middle + offset)
     return _sum(node.op, given)
+
+
+def _first(node: Node, lines: Mapping[int, Line | None], middle: Fraction) -> bool:
+    """Whether a bend is its first argument at a time; of ``abs``: its argument, and not the negative of that."""
+    slope, offset = _compared(node, lines)
+    value = slope * middle + offset
+    return value <= 0 if node.op == "min" else value >= 0
 
 
 def _jumped(op: str, value: Fraction) -> Fraction:
@@ -172,33 +211,39 @@ def _sum(op: str, given: Sequence[Line]) -> Line | None:
 
 
 def _values(tape: Tape, own: Sequence[int], breaks: Sequence[Fraction]) -> dict[int, list[float]]:
-    """The value of every jump of ``own`` on every piece, of those that are known on all of them."""
+    """The value of every jump of ``own`` on every piece, where it is known on all; of a bend 1 for its first side."""
     pieces: list[dict[int, Line | None]] = []
+    sides: dict[int, list[float]] = {index: [] for index in own if tape.nodes[index].op in _BENDS}
     for first, last in itertools.pairwise(breaks):
         lines: dict[int, Line | None] = {}
         for index in own:
             lines[index] = _line(tape.nodes[index], lines, (first + last) / 2)
+            if index in sides and lines[index] is not None:
+                sides[index].append(float(_first(tape.nodes[index], lines, (first + last) / 2)))
         pieces.append(lines)
     jumps = [index for index in own if tape.nodes[index].op in JUMPS - {_CHOICE}]
     known = [index for index in jumps if all(lines[index] is not None for lines in pieces)]
-    return {index: [float((lines[index] or _NOTHING)[1]) for lines in pieces] for index in known}
+    bent = {index: row for index, row in sides.items() if len(row) == len(pieces)}
+    return {index: [float((lines[index] or _NOTHING)[1]) for lines in pieces] for index in known} | bent
 
 
 def _frontier(tape: Tape, values: Mapping[int, Sequence[float]]) -> list[int]:
     """The known jumps that something else than a known jump needs."""
     needed = set(tape.outputs)
     for index, node in enumerate(tape.nodes):
-        if index not in values and node.op != "input":
+        if (index not in values or node.op in _BENDS) and node.op != "input":
             needed |= set(node.args)
     return [index for index in values if index in needed]
 
 
-def _with_inputs(tape: Tape, states: int, values: Mapping[int, Sequence[float]]) -> TimeJumps | None:
-    """The tape with inputs for those of the values that change, and constants for the others.
+def _with_inputs(
+    tape: Tape, states: int, values: Mapping[int, Sequence[float]], *, every: bool
+) -> TimeJumps | None:
+    """The tape with inputs for those of the values that change (or ``every`` one), and constants for the others.
 
     What is chosen by 0 or 1 is a product from then on: nothing is left that jumps.
     """
-    changing = {index: tuple(row) for index, row in values.items() if len(set(row)) > 1}
+    changing = {index: tuple(row) for index, row in values.items() if every or len(set(row)) > 1}
     columns = list(dict.fromkeys(changing.values()))
     if not columns:
         return None
@@ -208,7 +253,16 @@ def _with_inputs(tape: Tape, states: int, values: Mapping[int, Sequence[float]])
     copy = graph.arithmetic()
     made: list[int] = []
     for index, node in enumerate(tape.nodes):
-        if index in changing:
+        if index in values and node.op in _BENDS:
+            one = made[node.args[0]]
+            other = made[node.args[1]] if len(node.args) == 2 else graph.apply("neg", one)
+            if index in changing:
+                side = graph.input(first + columns.index(changing[index]))
+                rest = graph.apply("mul", graph.apply("sub", graph.const(1.0), side), other)
+                made.append(graph.apply("add", graph.apply("mul", side, one), rest))
+            else:
+                made.append(one if values[index][0] else other)
+        elif index in changing:
             made.append(graph.input(first + columns.index(changing[index])))
         elif index in values:
             made.append(graph.const(values[index][0]))

@@ -90,11 +90,12 @@ def _array(entries: Sequence[Any]) -> np.ndarray[Any, np.dtype[Any]]:
     return array
 
 
-def _parameters(function: Callable[..., Any], name: str, arguments: Mapping[str, Sequence[str]]) -> list[str]:
+def _parameters(function: Any, name: str, arguments: Mapping[str, Sequence[str]]) -> list[str]:
     known = list(arguments)
     entries = [entry for names in arguments.values() for entry in names]
     if not callable(function):
-        raise TypeError(f"`{name}` must be a function of {', '.join(known)}, got {function!r}.")
+        cure = "; expressions in text are for problem files." if isinstance(function, str) else "."
+        raise TypeError(f"the model must be a function of {', '.join(known)}, got {function!r}{cure}")
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError) as error:

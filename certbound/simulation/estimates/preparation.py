@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.checks import instance
 from certbound.errors import InfeasibleError
 from certbound.problem.goals import check_end
 from certbound.problem.model import compile_scalar
+from certbound.problem.problem import Problem
 from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
 from certbound.simulation.stepping import Scenario, StepModel, step_model
 from certbound.simulation.stiffness import exponential, jacobians, step_error, steps_needed
@@ -102,6 +104,7 @@ def prepare(problem: Any, steps: int | None = None, scenario: Scenario | None = 
         If ``steps`` is malformed or its tables overflow the memory limit, the start lies elsewhere than said,
         or the noise has no law.
     """
+    instance("problem", problem, Problem)
     scenario = scenario or Scenario()
     if not isinstance(scenario, Scenario):
         raise TypeError(f"`scenario` must be a certbound.simulation.stepping.Scenario, got {scenario!r}.")
