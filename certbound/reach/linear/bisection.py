@@ -134,7 +134,8 @@ def _side_by_side(runs: list[LinearRun], target: Share) -> dict[LinearRun, Linea
 
     answers: dict[LinearRun, LinearAnswer | None] = {}
     tasks = [partial(_work, run, target) for run in runs]
-    for run, (found, run.learnt, run.hoped) in zip(runs, side_by_side(tasks, jobs_allowed(), executor_lent())):
+    for run, (found, learnt, hoped) in zip(runs, side_by_side(tasks, jobs_allowed(), executor_lent())):
+        run.learnt, run.hoped = learnt, hoped
         answers[run] = None if found is None else LinearAnswer(run=run, outcome=found[0], shown=found[1])
     return answers
 
