@@ -236,6 +236,15 @@ def share_of_time(part: float) -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def in_proportion(part: float, least: float) -> Iterator[None]:
+    """Under a limit, end the block quietly after a part of the time that was spent before it, ``least`` at least."""
+    watch = _CURRENT.get()
+    limited = watch is not None and watch.limit is not None
+    with watch.share(1.0, max(part * watch.spent, least)) if watch and limited else contextlib.nullcontext():
+        yield
+
+
 def solver_limit() -> dict[str, float]:
     """The option that keeps a call of Clarabel to the time that is left; none where there is no limit."""
     left = seconds_left()

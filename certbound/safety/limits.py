@@ -26,6 +26,7 @@ from certbound.watch import poll, share_of_time
 
 _HALVINGS = 5
 _WIDENINGS = 4
+_LONGEST = 5000  # times or steps, where the horizon is infinite
 _LEAST_EXPONENT = -300.0  # deltas are floats
 
 
@@ -134,7 +135,13 @@ def smaller_verdicts(verdict: Verdict, *, method: str = "auto", cells: int | Non
 
 
 def _horizon(problem: Problem, safe: Callable[[Callable[[], Problem]], bool]) -> Iterator[float]:
-    """Longer and longer horizons."""
+    """Longer and longer horizons; of an infinite one, each four times the one before."""
+    if problem.endless:
+        length = 1
+        while length < _LONGEST and safe(lambda: problem.replace(horizon=length)):  # noqa: B023  (called at once)
+            yield float(length)
+            length *= 4
+        return
     if problem.system.time == "continuous":
         shares = _largest(lambda factor: safe(lambda: problem.replace(horizon=factor * problem.horizon)), 1 / 64)
         yield from (share * problem.horizon for share in shares)
@@ -142,7 +149,7 @@ def _horizon(problem: Problem, safe: Callable[[Callable[[], Problem]], bool]) ->
     low, high = 0, int(problem.horizon)
     while high - low > 1:
         middle = (low + high) // 2
-        if safe(lambda: problem.replace(horizon=middle)):  # noqa: B023  (called at once)
+        if safe(lambda: problem.replace(horizon=middle)):  # noqa: B023
             low = middle
             yield float(low)
         else:

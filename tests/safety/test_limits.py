@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import log_ndtr
 
 import certbound as cb
+from certbound.safety import limits
 from certbound.safety.limits import Limits, find_limits, smaller_verdicts
+from certbound.safety.verdict import Verdict
 
 
 def walk(bound: float = 4.0, sigma: float = 1.0, steps: int = 16) -> cb.Problem:
@@ -33,6 +38,17 @@ def test_limits_of_a_random_walk() -> None:
     assert status(walk(bound=4.0 + found.widening)) == "SAFE"
     assert status(walk(bound=4.0 + 0.7 * found.widening)) == "UNKNOWN"
     assert "SAFE would be: delta" in found.summary()
+
+
+def test_of_an_infinite_horizon_finite_ones_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = cb.verify_safety(walk(), method="linear")
+    forever = replace(first, problem=walk().replace(horizon=math.inf))
+
+    def decided(problem: cb.Problem, **_: object) -> Verdict:
+        return replace(first, status="SAFE" if problem.horizon <= 100 else "UNKNOWN")
+
+    monkeypatch.setattr(limits, "decide", decided)
+    assert find_limits(forever).horizon == 64
 
 
 def drift(factor: float = 1.0) -> cb.Problem:

@@ -83,8 +83,10 @@ def bisected(problem: Problem, whole: LinearRun, target: Share) -> SplitAnswer |
     while heap:
         poll(f"cells of the initial set: {len(done)} done, {len(heap)} to do")
         worst = [heapq.heappop(heap) for _ in range(min(_BATCH, len(heap)))]
-        learnt = done[-1][1].run.learnt if done else whole.learnt
-        found = _side_by_side([run for _, _, _, run in worst if run is not whole], target, learnt)
+        for _, _, _, run in worst:
+            run.learnt = done[-1][1].run.learnt if done else whole.learnt
+            run.hoped = done[-1][1].shown.nonlinear if done else run.hoped
+        found = _side_by_side([run for _, _, _, run in worst if run is not whole], target)
         for _, _, leaf, run in worst:
             proved = found.get(run)
             if proved is not None:
@@ -97,6 +99,7 @@ def bisected(problem: Problem, whole: LinearRun, target: Share) -> SplitAnswer |
             for half in leaf.halves(_side(run)):
                 count += 1
                 other = run_of(problem, cells=half.cells, pieces=pieces)
+                other.hoped = run.hoped
                 heapq.heappush(heap, (-_urgency(other), count, half, other))
     if not whole.engine.continuous:  # elsewhere events are dear
         work = whole.engine.pieces * whole.engine.n**2
@@ -116,7 +119,7 @@ def _further(
             break
         poll(f"cells of the initial set: {len(done)} done, halving the worst")
         halves = [(half, run_of(problem, cells=half.cells, pieces=pieces)) for half in leaf.halves(_side(answer.run))]
-        proofs = _side_by_side([run for _, run in halves], target, None)
+        proofs = _side_by_side([run for _, run in halves], target)
         found = [(half, proofs[run]) for half, run in halves]
         better = [(half, part) for half, part in found if part is not None and part.outcome.log_probability < level]
         if len(better) < 2:
@@ -126,35 +129,22 @@ def _further(
     return done
 
 
-def _side_by_side(
-    runs: list[LinearRun], target: Share, learnt: tuple[Array, Array] | None
-) -> dict[LinearRun, LinearAnswer | None]:
+def _side_by_side(runs: list[LinearRun], target: Share) -> dict[LinearRun, LinearAnswer | None]:
     """What is proved of cells; each begins with what the proof of another one has learnt."""
 
     answers: dict[LinearRun, LinearAnswer | None] = {}
-    tasks = [partial(_work, run, target, learnt) for run in runs]
-    for run, found in zip(runs, side_by_side(tasks, jobs_allowed(), executor_lent())):
-        answers[run] = None
-        if found is not None:
-            outcome, shown, run.learnt = found
-            answers[run] = LinearAnswer(run=run, outcome=outcome, shown=shown)
+    tasks = [partial(_work, run, target) for run in runs]
+    for run, (found, learnt, hoped) in zip(runs, side_by_side(tasks, jobs_allowed(), executor_lent())):
+        run.learnt, run.hoped = learnt, hoped
+        answers[run] = None if found is None else LinearAnswer(run=run, outcome=found[0], shown=found[1])
     return answers
 
 
-def _work(run: LinearRun, target: Share, learnt: tuple[Array, Array] | None) -> Any:
-    """What is proved of a cell, without the run: outcome, what is shown, what was learnt; None where it falls short."""
-    run.learnt = learnt
-    found = _proved(run, target)
-    return None if found is None else (found.outcome, found.shown, run.learnt)
-
-
-def _proved(run: LinearRun, target: Share) -> LinearAnswer | None:
-    """What is proved of a cell, if it meets the target."""
+def _work(run: LinearRun, target: Share) -> Any:
+    """What is proved of a cell, without the run: outcome and what is shown, if it meets the target; what was learnt."""
     met = meeting(run, target)
-    if met is None:
-        return None
-    shown, effort = met
-    return LinearAnswer(run=run, outcome=refined(run, shown, effort, target), shown=shown)
+    found = None if met is None else (refined(run, *met, target), met[0])
+    return found, run.learnt, run.hoped
 
 
 def _middle_promises(problem: Problem, leaf: _Leaf, pieces: int | None, target: Share) -> bool:

@@ -17,10 +17,14 @@ from certbound.reach.linear.proved import LinearAnswer
 from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share
 from certbound.reach.nominal import Cells
+from certbound.watch import in_proportion
 
 _SEVERAL, _FINE = 4, 300  # states, and pieces of time
 _COARSER = (16.0, 6.0, 2.4)  # times fewer pieces
 _REFINEMENTS = 3
+_SURELY = 0.9  # of what a guess says, in its worst case
+_MOST = 100.0  # of logarithms
+_FURTHER, _BRIEFLY = 0.3, 1.0  # of the time until the target was met, and seconds, for a smaller probability
 _MANY = 20  # nonlinear coordinates beyond which a probability below the target is not refined
 
 
@@ -92,25 +96,37 @@ def hopes_of(run: LinearRun, target: Share) -> Iterator[tuple[float, int]]:
     """The shares of the target with which a guess of the remainder says that it is within reach.
 
     Of all of them the last one has the least levels, and so the least remainder. Where the first has no chance, it is
-    looked at next: if the noise takes more than the target with it as well, the others need no look.
+    looked at next: what the noise takes with it, it takes with the others as well, and those that leave less than that
+    need no look. ``run.hoped`` is the first; then it is the one that promises most. Where a remainder could not be
+    enclosed, only the last share is tried after it.
     """
-    for index, (share, effort) in enumerate(shares.GUESSED):
-        if run.promise(target.part(share), effort, limit=target.log) <= target.log:
+    taken, found = 0.0, np.inf  # of the target: by the noise next to the least remainder, and in all
+
+    def promise(share: float, effort: int, limit: float) -> float:
+        nonlocal found
+        value = float(np.exp(min(run.promise(target.part(share), effort, limit=limit) - target.log, _MOST)))
+        if value < found:
+            found, run.hoped = value, target.part(share)
+        return value
+
+    first, (last, most) = run.hoped, shares.GUESSED[-1]
+    in_order = sorted(shares.GUESSED, key=lambda hope: first is None or target.part(hope[0]) != first)
+    for index, (share, effort) in enumerate(in_order):
+        if share + _SURELY * taken > 1:
+            continue
+        if promise(share, effort, target.log) <= 1:
             yield share, effort
-        elif index == 0 and not _within_reach(run, target):
-            return
-
-
-def _within_reach(run: LinearRun, target: Share) -> bool:
-    """Whether the noise alone, next to the least remainder that is tried, may cost no more than the target."""
-    share, effort = shares.GUESSED[-1]
-    limit = target.log + float(np.log1p(share))
-    return run.promise(target.part(share), effort, limit=limit) <= limit
+            if run.lost >= target.part(share).log:  # the last one has the best chance then, and is the end of it
+                if share < last and promise(last, most, target.log) <= 1:
+                    yield last, most
+                return
+        elif index == 0:
+            taken = promise(last, most, target.log + float(np.log1p(last))) - last
 
 
 def promising(run: LinearRun, target: Share) -> bool:
     """Whether a guess of the remainder says that the target is within reach."""
-    return _within_reach(run, target) and any(True for _ in hopes_of(run, target))
+    return any(True for _ in hopes_of(run, target))
 
 
 def least(first: Outcome, second: Outcome) -> Outcome:
@@ -121,15 +137,19 @@ def least(first: Outcome, second: Outcome) -> Outcome:
 def refined(
     run: LinearRun, best: Outcome, effort: int, target: Share, found: Callable[[Outcome], object] = lambda outcome: None
 ) -> Outcome:
-    """A smaller probability, where the levels cost most of what was proved: with smaller and smaller shares."""
+    """A smaller probability, where the levels cost most of what was proved: with smaller and smaller shares.
+
+    The target is met already, so that a limit of time leaves this a part of what it took.
+    """
     above = best.log_probability - best.nonlinear.log
     if best.log_probability > target.log or above <= -3.0 or (above >= 2.0 and not run.curved):
         return best
     coupled = max((len(group[0]) for group in run.engine.model.blocks), default=1) > 1
-    for _ in range(0 if coupled or len(run.engine.model.active) > _MANY else _REFINEMENTS):
-        outcome = run.probability(Share(2 * best.nonlinear.log), effort)
-        if outcome.log_probability >= best.log_probability:
-            break
-        best = outcome
-        found(best)
+    with in_proportion(_FURTHER, _BRIEFLY):
+        for _ in range(0 if coupled or len(run.engine.model.active) > _MANY else _REFINEMENTS):
+            outcome = run.probability(Share(2 * best.nonlinear.log), effort)
+            if outcome.log_probability >= best.log_probability:
+                break
+            best = outcome
+            found(best)
     return best

@@ -53,11 +53,17 @@ class Outcome:
 
 
 class LinearRun(Inclusion):
-    """One evaluation of the engine: the inclusion for the remainder, the events, and their room."""
+    """One evaluation of the engine: the inclusion for the remainder, the events, and their room.
+
+    ``hoped`` is the delta_N that promised most, here or in a run much like this one, and ``lost`` the logarithm of the
+    largest one at which the remainder could not be enclosed.
+    """
 
     def __init__(self, engine: Linearisation) -> None:
         self.requirements = [requirements(engine.problem, engine.nominal(cell)) for cell in range(engine.cells)]
         super().__init__(engine, [[asked.rows for asked in cell] for cell in self.requirements])
+        self.hoped: Share | None = None
+        self.lost = -np.inf
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
         self.kept: dict[Share, tuple[Array, list[Events]]] = {}
@@ -161,6 +167,7 @@ class LinearRun(Inclusion):
         if not self.hopeless(nonlinear):
             levels, events = self.levels(nonlinear)
             bounds = self.include(levels, effort)
+            self.lost = self.lost if bounds is not None else max(self.lost, nonlinear.log)
         if bounds is None or not events:  # without events the noise-free reachable set alone
             return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=bounds)
         outcomes = [self._cell(cell, bounds, events[cell], nonlinear) for cell in range(len(self.supports))]

@@ -25,6 +25,7 @@ from certbound.problem.model import adds_plainly, selected
 from certbound.reach.remainder.derivatives import Derivatives
 from certbound.reach.remainder.expansion import Expansion, Parts
 from certbound.reach.remainder.frame import Frame
+from certbound.reach.remainder.nominal_defect import NominalDefect
 from certbound.reach.remainder.polytope import Boxes, Polytope, grid
 from certbound.reach.remainder.samples import fitted_slopes, sampled_range
 from certbound.rigor.intervals import Interval
@@ -35,6 +36,8 @@ Target = tuple[Array, Array]
 _GRID = {1: 16, 2: 6, 3: 4}
 _MANY = 4  # coupled coordinates from which on outputs that depend on fewer are bounded by themselves
 _MOST = 300  # boxes per piece that one round may cut
+_CROWD = 1000  # boxes of one piece, beyond which cutting them is no way to what is hoped for
+_CLOSE = 0.02  # of the range that is hoped for: how close bounds come to one that is larger
 _STALLED = 0.995  # cutting a box must make it exceed less
 _EFFORT = ((0, np.inf), (8, 0.5), (12, 0.2), (20, 0.08))  # rounds of bisection, tolerated excess over the range
 
@@ -51,10 +54,20 @@ class _Asked:
     only: Index | None
     outputs: list[int] | None = None  # all when omitted
 
-    def excess(self, lo: Array, hi: Array, inner_lo: Array, inner_hi: Array, items: Index) -> Array:
-        """By how much bounds over boxes exceed what is hoped for, or their own range: in its units, (Q, n)."""
+    def excess(
+        self, lo: Array, hi: Array, inner_lo: Array, inner_hi: Array, items: Index, nominal: NominalDefect | None
+    ) -> Array:
+        """By how much bounds over boxes exceed what is hoped for, or their own range: in its units, (Q, n).
+
+        Where no cutting keeps what is hoped for, because the middle of a box exceeds it, what is there counts instead.
+        """
         low, high = (inner_lo, inner_hi) if self.target is None else self.target
-        found = np.maximum(hi - high[items], low[items] - lo) / np.maximum(high - low, 1e-300)[items]
+        width = np.maximum(high - low, 1e-300)
+        if self.target is not None:
+            if nominal is not None:
+                inner_lo, inner_hi = inner_lo + nominal.defect.lo, inner_hi + nominal.defect.hi
+            low, high = np.minimum(low, inner_lo - _CLOSE * width), np.maximum(high, inner_hi + _CLOSE * width)
+        found = np.maximum(hi - high[items], low[items] - lo) / width[items]
         found = found - self.tolerance if self.target is None else found
         if self.outputs is not None:
             found[:, np.setdiff1d(np.arange(found.shape[1]), self.outputs)] = -np.inf
@@ -217,10 +230,12 @@ class Remainder(Derivatives):
             if step == asked.rounds or not alone or size > 6:
                 excess = np.full((len(items), n), -np.inf)
             else:
-                excess = asked.excess(lo, hi, inner_lo, inner_hi, items)
+                excess = asked.excess(lo, hi, inner_lo, inner_hi, items, expansion.nominal)
             largest = excess.max(axis=1)
             moving = np.isinf(before) | expansion.model.planar  # planes may need cuts on both sides to come closer
             worst = (largest > 0) & ((largest < _STALLED * before) | moving)
+            if alone:
+                worst &= (np.bincount(items[worst], minlength=m) <= _CROWD)[items]
             if worst.sum() > _MOST * m:
                 worst &= largest > np.partition(largest, -_MOST * m)[-_MOST * m]
             done = ~worst

@@ -282,3 +282,28 @@ def test_boxes_of_one_output_that_reach_where_another_is_undefined_are_left_for_
     lower, upper = engine.model.bound(engine.frame, low, high, rows, 3)
     assert np.all(np.isfinite(lower))
     assert np.all(np.isfinite(upper))
+
+
+def test_boxes_are_cut_no_further_than_their_own_middles_allow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bound that the remainder itself exceeds is out of reach, however finely boxes are cut."""
+    system = cb.DiscreteSystem(
+        lambda x: [np.sin(3 * x[0] * x[1] + x[2]), x[1] * np.cos(2 * x[0]), 0.5 * x[2]], states=3,
+        noise=cb.Gaussian(std=0.02),
+    )
+    engine = Linearisation(cb.Problem(system, initial=[0.1] * 3, safe=[], horizon=1, delta=1e-2))
+    seen, original = [0], Expansion.parts
+
+    def counted(self: Expansion, boxes: Boxes) -> object:
+        seen[0] += len(boxes)
+        return original(self, boxes)
+
+    monkeypatch.setattr(Expansion, "parts", counted)
+    high, rows = np.full((1, 3), 0.5), np.zeros((1, 0, 3))
+    s = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 21)] * 3), -1).reshape(-1, 3)
+    beta = remainder(engine, 0, np.zeros(len(s)), s)
+    hoped = 0.5 * beta.min(axis=0)[None] - 1e-9, 0.5 * beta.max(axis=0)[None] + 1e-9
+    lower, upper = engine.model.bound(engine.frame, -high, high, rows, 3, hoped)
+    assert seen[0] < 2000
+    assert np.all(beta.max(axis=0) <= upper[0])
+    assert np.all(upper[0] <= beta.max(axis=0) + 0.01 * np.ptp(beta, axis=0) + 1e-12)
+    assert np.all(beta.min(axis=0) >= lower[0])
