@@ -116,7 +116,7 @@ def answered(name: str, problem: cb.Problem, limit: float, *, explain: bool = Fa
             told.append(progress.seconds)
 
     begun, wall = time.process_time(), time.monotonic()
-    verdict = cb.verify_safety(problem, time_limit=limit, progress=tell)
+    verdict = cb.verify_safety(problem, time_limit=limit, progress=tell, patient=False)
     seconds, wall, explained = time.process_time() - begun, time.monotonic() - wall, 0.0
     if explain and verdict.status == "UNKNOWN":
         begun = time.process_time()
