@@ -1,0 +1,95 @@
+"""Infinite horizons in continuous time, any number of states: noise along a bounded state leads every path out.
+
+**Theorem.** Let the safe set lie where l <= x_i <= h, and let s f_i >= -b and |g_i|^2 >= a > 0 on it for every
+disturbance, f_i and g_i being the drift and the row of the diffusion of that state, s = 1 or -1. Then a path leaves the
+safe set with probability 1, and the mean time until then is at most 2 w (e^{k w} - 1)/(k a), w = h - l, k = 2 b/a + 1/w.
+
+*Proof.* u = e^{k s (x_i - c)}, c the end at which u is least, lies in [1, e^{k w}] on the safe set, and L u =
+u k (s f_i + k |g_i|^2/2) >= k (k a/2 - b) = k a/(2 w). So by Ito's formula k a/(2 w) E[tau and t] <= E u(X) - u(x) <=
+e^{k w} - 1 for every t, tau being the time of leaving. QED
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from certbound.problem.model import sources
+from certbound.problem.problem import Problem
+from certbound.problem.systems import ContinuousSystem
+from certbound.rigor.intervals import Interval
+from certbound.values.continuous.coefficients import enclose, squared_diffusion
+
+_PARTS = 64  # of the bounded state
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SureExit:
+    """Every path leaves: s f_i >= -``drift`` and |g_i|^2 >= ``noise`` > 0 on the safe set, s = -1 where ``mirrored``.
+
+    ``state`` is i; ``mean`` bounds the mean time of leaving, and is infinite where that is beyond all floats.
+    """
+
+    state: int
+    mirrored: bool
+    noise: float
+    drift: float
+    mean: float
+
+
+def leaves_surely(problem: Problem) -> SureExit | None:
+    """Why every path leaves the safe set in the end; None where that is not proved.
+
+    Continuous time, no target, limits that always hold and stand still, and a model without t. An EnclosureError where
+    the model is undefined somewhere in the box around the safe set.
+    """
+    system = problem.system
+    plain = isinstance(system, ContinuousSystem) and problem.reach is None and problem.hold is None
+    if not plain or problem.ending or isinstance(problem.plan, np.ndarray):
+        return None
+    assert isinstance(system, ContinuousSystem)
+    square = squared_diffusion(system.diffusion, system.states)
+    if any(0 in slots for tape in (problem.closed_loop, square) for slots in sources(tape)):
+        return None
+    around, n = _hull(problem), system.dimension
+    box = system.disturbance
+    pushes = [] if box is None else [Interval(a, b) for a, b in zip(box.low, box.high)]
+    found: list[SureExit] = []
+    for state in np.flatnonzero(np.isfinite(around.lo) & np.isfinite(around.hi)).tolist():
+        edges = np.linspace(around.lo[state], around.hi[state], _PARTS + 1)
+        edges[-1] = around.hi[state]
+        whole = [Interval(np.full(_PARTS, side.lo), np.full(_PARTS, side.hi)) for side in (*around, *pushes)]
+        cells = [Interval.point(np.zeros(_PARTS)), *whole]
+        cells[1 + state] = Interval(edges[:-1], edges[1:])
+        with np.errstate(all="ignore"):
+            flow = enclose(problem.closed_loop, cells)[0][state]
+            noise = float(np.min(enclose(square, cells[: n + 1])[0][state * (n + 1)].lo))
+        width = Interval.point(float(around.hi[state])) - Interval.point(float(around.lo[state]))
+        for mirrored, drift in ((False, -float(np.min(flow.lo))), (True, float(np.max(flow.hi)))):
+            if noise > 0 and width.lo > 0 and math.isfinite(drift):
+                drift = max(drift, 0.0)
+                mean = _mean_time(float(width.hi), noise, drift)
+                found.append(SureExit(state=state, mirrored=mirrored, noise=noise, drift=drift, mean=mean))
+    return min(found, key=lambda one: one.mean, default=None)
+
+
+def _hull(problem: Problem) -> Interval:
+    """A box around the safe set, rounded outward; infinite where nothing bounds a state at all times."""
+    n = problem.system.dimension
+    low, high = np.full(n, -np.inf), np.full(n, np.inf)
+    for one in problem.kept:
+        if one.outside or one.during not in (None, (0.0, float(problem.horizon))) or one.region.moving:
+            continue
+        around, places = one.region.hull(), one.region.places(n)
+        low[places], high[places] = np.maximum(low[places], around.lo), np.minimum(high[places], around.hi)
+    return Interval(low, high)
+
+
+def _mean_time(width: float, noise: float, drift: float) -> float:
+    """2 w (e^{k w} - 1)/(k a), rounded up."""
+    slope = 2 * drift / noise + 1 / width
+    if not slope * width < 700:
+        return math.inf
+    return 2 * width * math.expm1(slope * width * (1 + 1e-15)) / (slope * noise) * (1 + 1e-9)
