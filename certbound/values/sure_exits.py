@@ -1,4 +1,4 @@
-"""Infinite horizons in continuous time, any number of states: noise along a bounded state leads every path out.
+"""Infinite horizons, any number of states: noise along a bounded state leads every path out.
 
 **Theorem.** Let the safe set lie where l <= x_i <= h, and let s f_i >= -b and |g_i|^2 >= a > 0 on it for every
 disturbance, f_i and g_i being the drift and the row of the diffusion of that state, s = 1 or -1. Then a path leaves the
@@ -7,18 +7,23 @@ safe set with probability 1, and the mean time until then is at most 2 w (e^{k w
 *Proof.* u = e^{k s (x_i - c)}, c the end at which u is least, lies in [1, e^{k w}] on the safe set, and L u =
 u k (s f_i + k |g_i|^2/2) >= k (k a/2 - b) = k a/(2 w). So by Ito's formula k a/(2 w) E[tau and t] <= E u(X) - u(x) <=
 e^{k w} - 1 for every t, tau being the time of leaving. QED
+
+**In discrete time** with normal noise of variance a > 0 along x_i, s x_i exceeds its bound e at the next step with
+probability at least p = 1 - Phi((e + b)/sqrt(a)) from every safe state: leaving is certain, after 1/p steps at most in
+the mean.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 
-from certbound.problem.model import sources
+from certbound.problem.model import Tape, sources
 from certbound.problem.problem import Problem
-from certbound.problem.systems import ContinuousSystem
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import enclose, squared_diffusion
 
@@ -29,7 +34,8 @@ _PARTS = 64  # of the bounded state
 class SureExit:
     """Every path leaves: s f_i >= -``drift`` and |g_i|^2 >= ``noise`` > 0 on the safe set, s = -1 where ``mirrored``.
 
-    ``state`` is i; ``mean`` bounds the mean time of leaving, and is infinite where that is beyond all floats.
+    ``state`` is i; ``mean`` bounds the mean time of leaving, and is infinite where that is beyond all floats. In
+    discrete time ``noise`` is the variance of a step along x_i.
     """
 
     state: int
@@ -42,16 +48,17 @@ class SureExit:
 def leaves_surely(problem: Problem) -> SureExit | None:
     """Why every path leaves the safe set in the end; None where that is not proved.
 
-    Continuous time, no target, limits that always hold and stand still, and a model without t. An EnclosureError where
-    the model is undefined somewhere in the box around the safe set.
+    No target, limits that always hold and stand still, and a model without t. An EnclosureError where the model is
+    undefined somewhere in the box around the safe set.
     """
     system = problem.system
-    plain = isinstance(system, ContinuousSystem) and problem.reach is None and problem.hold is None
-    if not plain or problem.ending or isinstance(problem.plan, np.ndarray):
+    square = _square(system)
+    if square is None or problem.reach is not None or problem.hold is not None or problem.ending:
         return None
-    assert isinstance(system, ContinuousSystem)
-    square = squared_diffusion(system.diffusion, system.states)
-    if any(0 in slots for tape in (problem.closed_loop, square) for slots in sources(tape)):
+    if isinstance(problem.plan, np.ndarray):
+        return None
+    tapes = (problem.closed_loop, *([square] if isinstance(square, Tape) else []))
+    if any(0 in slots for tape in tapes for slots in sources(tape)):
         return None
     around, n = _hull(problem), system.dimension
     box = system.disturbance
@@ -65,14 +72,29 @@ def leaves_surely(problem: Problem) -> SureExit | None:
         cells[1 + state] = Interval(edges[:-1], edges[1:])
         with np.errstate(all="ignore"):
             flow = enclose(problem.closed_loop, cells)[0][state]
-            noise = float(np.min(enclose(square, cells[: n + 1])[0][state * (n + 1)].lo))
+            moved = isinstance(square, Tape)
+            noise = float(np.min(enclose(square, cells[: n + 1])[0][state * (n + 1)].lo)) if moved else square[state]
         width = Interval.point(float(around.hi[state])) - Interval.point(float(around.lo[state]))
         for mirrored, drift in ((False, -float(np.min(flow.lo))), (True, float(np.max(flow.hi)))):
             if noise > 0 and width.lo > 0 and math.isfinite(drift):
-                drift = max(drift, 0.0)
+                drift = drift if isinstance(system, DiscreteSystem) else max(drift, 0.0)
                 mean = _mean_time(float(width.hi), noise, drift)
+                if isinstance(system, DiscreteSystem):
+                    mean = _mean_steps(float(-around.lo[state] if mirrored else around.hi[state]), noise, drift)
                 found.append(SureExit(state=state, mirrored=mirrored, noise=noise, drift=drift, mean=mean))
     return min(found, key=lambda one: one.mean, default=None)
+
+
+def _square(system: ContinuousSystem | DiscreteSystem) -> Tape | list[float] | None:
+    """The tape of g g'; in discrete time the variances of normal noise that adds to the state, rounded down."""
+    if isinstance(system, ContinuousSystem):
+        return squared_diffusion(system.diffusion, system.states)
+    if not system.noise.gaussian or system.gain is not None:
+        return None
+    rows = [[Fraction(entry) for entry in row] for row in system.noise_matrix.tolist()]
+    law = system.noise.exact_covariance()
+    variances = [sum(a * b * law[i][j] for i, a in enumerate(row) for j, b in enumerate(row)) for row in rows]
+    return [float(np.nextafter(float(value), -np.inf)) for value in variances]
 
 
 def _hull(problem: Problem) -> Interval:
@@ -93,3 +115,10 @@ def _mean_time(width: float, noise: float, drift: float) -> float:
     if not slope * width < 700:
         return math.inf
     return 2 * width * math.expm1(slope * width * (1 + 1e-15)) / (slope * noise) * (1 + 1e-9)
+
+
+def _mean_steps(end: float, noise: float, drift: float) -> float:
+    """1/p, rounded up."""
+    away = (end + drift) / math.sqrt(noise)
+    chance = math.erfc(max(away, 0.0) * (1 + 1e-12) / math.sqrt(2)) / 2
+    return (1 + 1e-9) / chance if chance > 1e-300 else math.inf

@@ -29,6 +29,7 @@ from certbound.safety.certificates.step_values import (
 from certbound.values.chains import Drifting
 from certbound.values.continuous import ExitBounds, Lasting, Payment, Rate, Surface, bound_lasting
 from certbound.values.discrete import FailureBounds
+from certbound.values.sure_exits import SureExit
 
 _COARSE = (0.04, 0.01, 0.0)  # of log P, for a smaller file
 _MORE_ROOM = 3  # in continuous time and two states
@@ -75,6 +76,13 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
         return _lasting(problem, attempt, above=False)
     if isinstance(answer.details, Rate) and answer.details.fast is not None:
         return _leaving(problem, answer.details, above=False)
+    if isinstance(answer.details, SureExit):
+        sure = answer.details
+        data = {
+            "engine": "surely", "state": sure.state, "mirrored": sure.mirrored, "noise": exact(sure.noise * (1 - _OFF)),
+            "drift": exact(sure.drift + _OFF * (1 + abs(sure.drift))), "side": "lower",
+        }
+        return data, 0.0, []
     check_starts(problem)
     found, effort = _exits_of(problem, answer), min(attempt, len(_COARSE) - 1)
     least = claimed_below(answer.log10_lower, problem.delta, _room(problem, effort))

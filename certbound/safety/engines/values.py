@@ -45,7 +45,8 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
             return answer if answer.log10_delta < 0 else _by_rate(problem) or _without_end(problem, limit) or answer
         found = _failure(problem, limit)
     except (InfeasibleError, EnclosureError) as error:
-        lasting = _by_rate(problem) or _without_end(problem, limit)
+        sure = leaves_surely(problem) if problem.endless else None
+        lasting = _surely(problem, sure) if sure is not None else _by_rate(problem) or _without_end(problem, limit)
         return lasting or EngineAnswer(applicable=False, method="values", reason=str(error))
     return _answer(problem, found)
 
