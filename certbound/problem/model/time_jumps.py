@@ -57,6 +57,39 @@ def cut_at_jumps(tape: Tape, states: int, horizon: float) -> TimeJumps | None:
     horizon : float
         The length of time, finite.
     """
+    known = _known(tape, horizon)
+    if known is None:
+        return None
+    breaks, values = known
+    count = math.lcm(*((end / breaks[-1]).denominator for end in breaks))
+    if count > _MOST_PIECES:
+        return None
+    middles = [(Fraction(2 * k + 1, 2 * count)) * breaks[-1] for k in range(count)]
+    places = [sum(end < middle for end in breaks) - 1 for middle in middles]
+    return _with_inputs(tape, states, {index: [row[place] for place in places] for index, row in values.items()})
+
+
+def between_jumps(tape: Tape, states: int, horizon: float) -> list[tuple[float, Tape]]:
+    """The function from one of its jumps that t alone decides to the next: the end of each piece, and its tape.
+
+    One piece where it has none, or too many. The arguments are those of `cut_at_jumps`.
+    """
+    known = _known(tape, horizon)
+    cut = None if known is None else _with_inputs(tape, states, known[1])
+    if known is None or cut is None:
+        return [(float(horizon), tape)]
+    found = []
+    for end, row in zip(known[0][1:], cut.rows):
+        graph, first = Graph(tape.inputs), 1 + states
+        slots = [graph.input(slot) for slot in range(len(tape.inputs))]
+        slots[first:first] = [graph.const(value) for value in row]
+        outputs = cut.tape.evaluate(graph.arithmetic(), slots)
+        found.append((float(end), graph.tape(outputs, tape.shape)))
+    return found
+
+
+def _known(tape: Tape, horizon: float) -> tuple[list[Fraction], dict[int, list[float]]] | None:
+    """0, the times of the jumps and the horizon, and what is known of the jumps in between; None where there is none."""
     found = reads(tape)
     own = [index for index in range(len(tape.nodes)) if found[index] <= {0}]
     if not any(tape.nodes[index].op in JUMPS and found[index] for index in own):
@@ -64,14 +97,8 @@ def cut_at_jumps(tape: Tape, states: int, horizon: float) -> TimeJumps | None:
     breaks = _breaks(tape, own, decimal(horizon))
     if breaks is None:
         return None
-    count = math.lcm(*((end / breaks[-1]).denominator for end in breaks))
-    if count > _MOST_PIECES:
-        return None
     values = _values(tape, own, breaks)
-    wanted = [index for index in _frontier(tape, values) if found[index]]
-    middles = [(Fraction(2 * k + 1, 2 * count)) * breaks[-1] for k in range(count)]
-    places = [sum(end < middle for end in breaks) - 1 for middle in middles]
-    return _with_inputs(tape, states, {index: [values[index][place] for place in places] for index in wanted})
+    return breaks, {index: values[index] for index in _frontier(tape, values) if found[index]}
 
 
 def decimal(value: float) -> Fraction:
