@@ -17,7 +17,10 @@ import certbound as cb
 from certbound.display import log10_text
 from certbound.watch import Watch
 
-__all__ = ["ENDS", "FOLDER", "LIMIT", "LITERATURE", "PATHS", "literature_row", "measured", "path_of", "simulated"]
+__all__ = [
+    "ENDS", "FOLDER", "LIMIT", "LITERATURE", "PATHS", "literature_row", "measured", "path_of", "processor_clock",
+    "simulated",
+]  # fmt: skip
 
 FOLDER = Path(__file__).parent / "literature"
 PATHS = 200_000
@@ -82,7 +85,7 @@ def literature_row(name: str) -> list[str]:
 def measured(problem: cb.Problem) -> list[str]:
     """Answer, proved bounds from both sides, and seconds of processor time."""
     begun = time.process_time()
-    with _processor_clock():
+    with processor_clock():
         verdict = cb.verify_safety(problem, time_limit=LIMIT)
     seconds = time.process_time() - begun
     least = "" if verdict.log10_lower is None else log10_text(verdict.log10_lower)
@@ -96,7 +99,7 @@ def simulated(problem: cb.Problem) -> list[str]:
 
 
 @contextlib.contextmanager
-def _processor_clock() -> Iterator[None]:
+def processor_clock() -> Iterator[None]:
     """Limits of time count seconds of this process in the block, so that answers do not depend on other work."""
     defaults = Watch.__init__.__kwdefaults__
     before = defaults["clock"]

@@ -117,7 +117,7 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
-    "values.continuous": (13, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
+    "values.continuous": (15, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (35, "the one description of functions, which every room reads, differentiates and evaluates"),

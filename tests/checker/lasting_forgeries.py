@@ -251,7 +251,8 @@ def _(data: Data) -> None:
 
 @forges("a bounded set is left surely", "surely", "statement/safe_set.py", "SafeSet", "bounds p")
 def _(data: Data) -> None:
-    data["problem"]["constraints"][0]["region"] = {"kind": "halfspace", "normal": exact([1.0, 0.0]), "bound": exact(1.0)}
+    region = {"kind": "halfspace", "normal": exact([1.0, 0.0]), "bound": exact(1.0)}
+    data["problem"]["constraints"][0]["region"] = region
 
 
 @forges("what leads every path out bounds nothing from above", "surely", _SURELY, "check_surely", "from below only")

@@ -10,7 +10,7 @@ from scipy import stats
 
 import certbound as cb
 from certbound.safety.engines import values_engine
-from certbound.values.sure_exits import leaves_surely
+from certbound.values.continuous import leaves_surely
 
 _BOX = cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))
 

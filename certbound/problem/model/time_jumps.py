@@ -89,7 +89,7 @@ def between_jumps(tape: Tape, states: int, horizon: float) -> list[tuple[float, 
 
 
 def _known(tape: Tape, horizon: float) -> tuple[list[Fraction], dict[int, list[float]]] | None:
-    """0, the times of the jumps and the horizon, and what is known of the jumps in between; None where there is none."""
+    """0, the times of the jumps and the horizon, and what is known of the jumps in between; None if there is none."""
     found = reads(tape)
     own = [index for index in range(len(tape.nodes)) if found[index] <= {0}]
     if not any(tape.nodes[index].op in JUMPS and found[index] for index in own):

@@ -27,9 +27,8 @@ from certbound.safety.certificates.step_values import (
     stretched,
 )
 from certbound.values.chains import Drifting
-from certbound.values.continuous import ExitBounds, Lasting, Payment, Rate, Surface, bound_lasting
+from certbound.values.continuous import ExitBounds, Lasting, Payment, Rate, SureExit, Surface, bound_lasting
 from certbound.values.discrete import FailureBounds
-from certbound.values.sure_exits import SureExit
 
 _COARSE = (0.04, 0.01, 0.0)  # of log P, for a smaller file
 _MORE_ROOM = 3  # in continuous time and two states

@@ -12,10 +12,9 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.values.chains import bound_chain, bound_drifting
-from certbound.values.continuous import ExitBounds, bound_exits, bound_lasting, bound_rate
+from certbound.values.continuous import ExitBounds, SureExit, bound_exits, bound_lasting, bound_rate, leaves_surely
 from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
-from certbound.values.sure_exits import SureExit, leaves_surely
 from certbound.watch import seconds_left
 
 _SECONDS = 20.0  # about what may be spent
@@ -62,8 +61,8 @@ def _lasting(problem: Problem) -> EngineAnswer:
     if problem.system.dimension > 1:
         raise InfeasibleError(
             "a value function in continuous time needs an end, and the horizon is infinite; without one a single state "
-            "is served, with limits and targets that stand still, for a model that does not depend on time, and several "
-            "states where noise leads every path out: along one that is bounded on both sides, everywhere."
+            "is served, with limits and targets that stand still, for a model that does not depend on time, and "
+            "several states where noise leads every path out: along one that is bounded on both sides, everywhere."
         )
     return found or _by_function(problem)
 

@@ -138,7 +138,8 @@ def pieces(
     ``breaks`` are more times at which phases end.
     """
     limits, end = limits_of(problem, inner=inner), last_instant(problem)
-    instants = sorted({0.0, end, *(min(t, end) for _, window in limits for t in window), *(t for t in breaks if t < end)})
+    ends = [t for _, window in limits for t in window]
+    instants = sorted({0.0, end, *(min(t, end) for t in (*ends, *breaks))})
     phases, gates = [], []
     for first, last in itertools.pairwise(instants):
         active = [limit for limit, window in limits if window[0] <= first and last <= window[1]]

@@ -2,7 +2,7 @@
 
 **Theorem.** Let the safe set lie where l <= x_i <= h, and let s f_i >= -b and |g_i|^2 >= a > 0 on it for every
 disturbance, f_i and g_i being the drift and the row of the diffusion of that state, s = 1 or -1. Then a path leaves the
-safe set with probability 1, and the mean time until then is at most 2 w (e^{k w} - 1)/(k a), w = h - l, k = 2 b/a + 1/w.
+safe set with probability 1, after at most 2 w (e^{k w} - 1)/(k a) in the mean, w = h - l and k = 2 b/a + 1/w.
 
 *Proof.* u = e^{k s (x_i - c)}, c the end at which u is least, lies in [1, e^{k w}] on the safe set, and L u =
 u k (s f_i + k |g_i|^2/2) >= k (k a/2 - b) = k a/(2 w). So by Ito's formula k a/(2 w) E[tau and t] <= E u(X) - u(x) <=
@@ -67,13 +67,16 @@ def leaves_surely(problem: Problem) -> SureExit | None:
     for state in np.flatnonzero(np.isfinite(around.lo) & np.isfinite(around.hi)).tolist():
         edges = np.linspace(around.lo[state], around.hi[state], _PARTS + 1)
         edges[-1] = around.hi[state]
-        whole = [Interval(np.full(_PARTS, side.lo), np.full(_PARTS, side.hi)) for side in (*around, *pushes)]
+        sides = [*(around[k] for k in range(n)), *pushes]
+        whole = [Interval(np.full(_PARTS, side.lo), np.full(_PARTS, side.hi)) for side in sides]
         cells = [Interval.point(np.zeros(_PARTS)), *whole]
         cells[1 + state] = Interval(edges[:-1], edges[1:])
         with np.errstate(all="ignore"):
             flow = enclose(problem.closed_loop, cells)[0][state]
-            moved = isinstance(square, Tape)
-            noise = float(np.min(enclose(square, cells[: n + 1])[0][state * (n + 1)].lo)) if moved else square[state]
+            if isinstance(square, Tape):
+                noise = float(np.min(enclose(square, cells[: n + 1])[0][state * (n + 1)].lo))
+            else:
+                noise = square[state]
         width = Interval.point(float(around.hi[state])) - Interval.point(float(around.lo[state]))
         for mirrored, drift in ((False, -float(np.min(flow.lo))), (True, float(np.max(flow.hi)))):
             if noise > 0 and width.lo > 0 and math.isfinite(drift):
