@@ -4,8 +4,8 @@ The safe set lies in a bounded box; on the part of it that no constraint rules o
 > 0 for every disturbance, f_i and g_i being the drift and the row of the diffusion of one state, s = -1 where
 ``mirrored``. With w the width of the box along it, k = 2 drift/noise + 1/w and u = exp(k s x_i), L u is at least
 k noise/(2 w) u: u is bounded on the safe set and its mean grows at no less than a fixed rate until a path leaves, so
-that the mean time of leaving is finite, and leaving certain. In discrete time |g_i|^2 is the variance of normal noise that adds to the
-state: the next step leads out with a probability that has a positive lower bound.
+that the mean time of leaving is finite, and leaving certain. In discrete time |g_i|^2 is the variance of normal noise
+that adds to the state: the next step leads out with a probability that has a positive lower bound.
 """
 
 from __future__ import annotations
