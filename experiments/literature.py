@@ -35,7 +35,8 @@ ENDS = {
 
 LITERATURE = {
     "halfdisc_sde": "moment-SOS, order 6: <= .302",
-    "halfdisc_sde_disc": "moment-SOS, order 6: <= .557",
+    "halfdisc_sde_disc": "moment-SOS, order 6: <= .557; missing: closer bounds beside walls where a velocity alone is "
+    "noisy",
     "halfdisc_steps": "moment-SOS, order 6: <= 6.5e-4",
     "halfdisc_steps_disc": "moment-SOS, order 6: <= .402",
     "santoyo": "sums of squares, degree 14: a curve, no table",
@@ -45,8 +46,8 @@ LITERATURE = {
     "gbm_target": "neural supermartingale: <= .1 in 96 to 429 s; then stayed in: not stated here, a path that has just "
     "entered leaves again",
     "linear_sys": "neural supermartingale: <= 1e-6 in 105 s (GPU), of a network; here a saturated linear policy",
-    "two_link": "neural supermartingale: <= .2 in 5 to 24 h (GPU), of a network, which cannot be stated; the linear "
-    "policy here does not arrive",
+    "two_link": "neural supermartingale: <= .2 in 5 to 24 h (GPU), of a network, which cannot be stated; here a "
+    "saturated linear policy; missing: an engine for four states and kinks from so wide a set of starts",
     "walk": "linear templates: <= 1e-4; that S <= 100 also holds after the arrival is left out",
     "pendulum_rasm": "neural supermartingale: <= 1e-6 in 138 s (GPU), of a network; here a saturated linear policy",
     "collision": "neural supermartingale: <= 1e-6 in 137 s (GPU), of a network; here a saturated linear policy",
