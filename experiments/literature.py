@@ -17,7 +17,10 @@ import certbound as cb
 from certbound.display import log10_text
 from certbound.watch import Watch
 
-__all__ = ["ENDS", "FOLDER", "LIMIT", "LITERATURE", "PATHS", "literature_row", "measured", "path_of", "simulated"]
+__all__ = [
+    "ENDS", "FOLDER", "LIMIT", "LITERATURE", "PATHS", "literature_row", "measured", "path_of", "processor_clock",
+    "simulated",
+]  # fmt: skip
 
 FOLDER = Path(__file__).parent / "literature"
 PATHS = 200_000
@@ -32,7 +35,8 @@ ENDS = {
 
 LITERATURE = {
     "halfdisc_sde": "moment-SOS, order 6: <= .302",
-    "halfdisc_sde_disc": "moment-SOS, order 6: <= .557",
+    "halfdisc_sde_disc": "moment-SOS, order 6: <= .557; missing: closer bounds beside walls where a velocity alone is "
+    "noisy",
     "halfdisc_steps": "moment-SOS, order 6: <= 6.5e-4",
     "halfdisc_steps_disc": "moment-SOS, order 6: <= .402",
     "santoyo": "sums of squares, degree 14: a curve, no table",
@@ -42,8 +46,8 @@ LITERATURE = {
     "gbm_target": "neural supermartingale: <= .1 in 96 to 429 s; then stayed in: not stated here, a path that has just "
     "entered leaves again",
     "linear_sys": "neural supermartingale: <= 1e-6 in 105 s (GPU), of a network; here a saturated linear policy",
-    "two_link": "neural supermartingale: <= .2 in 5 to 24 h (GPU), of a network, which cannot be stated; the linear "
-    "policy here does not arrive",
+    "two_link": "neural supermartingale: <= .2 in 5 to 24 h (GPU), of a network, which cannot be stated; here a "
+    "saturated linear policy; missing: an engine for four states and kinks from so wide a set of starts",
     "walk": "linear templates: <= 1e-4; that S <= 100 also holds after the arrival is left out",
     "pendulum_rasm": "neural supermartingale: <= 1e-6 in 138 s (GPU), of a network; here a saturated linear policy",
     "collision": "neural supermartingale: <= 1e-6 in 137 s (GPU), of a network; here a saturated linear policy",
@@ -82,7 +86,7 @@ def literature_row(name: str) -> list[str]:
 def measured(problem: cb.Problem) -> list[str]:
     """Answer, proved bounds from both sides, and seconds of processor time."""
     begun = time.process_time()
-    with _processor_clock():
+    with processor_clock():
         verdict = cb.verify_safety(problem, time_limit=LIMIT)
     seconds = time.process_time() - begun
     least = "" if verdict.log10_lower is None else log10_text(verdict.log10_lower)
@@ -96,7 +100,7 @@ def simulated(problem: cb.Problem) -> list[str]:
 
 
 @contextlib.contextmanager
-def _processor_clock() -> Iterator[None]:
+def processor_clock() -> Iterator[None]:
     """Limits of time count seconds of this process in the block, so that answers do not depend on other work."""
     defaults = Watch.__init__.__kwdefaults__
     before = defaults["clock"]

@@ -117,10 +117,11 @@ ENTERED = {
 
 MOST_DOORS = 5
 MANY_DOORS = {
-    "values.continuous": (13, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
+    "checker.endless": (7, "a proof from above and one from below of each kind, which the table of engines names"),
+    "values.continuous": (15, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
-    "problem.model": (35, "the one description of functions, which every room reads, differentiates and evaluates"),
+    "problem.model": (36, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (20, "events in both times, for noise that depends on the state and not; units; jumps"),
     "reach.linear": (17, "certificates state the records of the search: linearisations, shares, levels, references"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),

@@ -21,6 +21,8 @@ from certbound.checker.endless import (
     check_lasting_below,
     check_leaving,
     check_leaving_below,
+    check_surely,
+    check_surely_below,
 )
 from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, number, wholes
@@ -46,7 +48,7 @@ COORDINATES = "coordinates"
 LIMITS = "limits"
 """The engine that a proof names whose parts are about some of the constraints each, and add up."""
 
-WHOLE = ("lasting", "drift", "rate")
+WHOLE = ("lasting", "drift", "rate", "surely")
 """The engines that prove targets and infinite horizons themselves, beside value functions in discrete time."""
 
 STATED = "the stated constants hold"
@@ -362,6 +364,7 @@ ENGINES = {
     "values": Engine(words="the value function itself (Thm K8)", prove=_values, below=_values_below),
     "lasting": Engine(words="a function of the state alone", prove=check_lasting, below=check_lasting_below),
     "rate": Engine(words="how fast paths leave", prove=check_leaving, below=check_leaving_below),
+    "surely": Engine(words="noise that leads every path out", prove=check_surely, below=check_surely_below),
     "drift": Engine(words="a drift away from the limit (Lundberg's inequality)", prove=check_drift),
     "quadratic": Engine(words="quadratic value bounds (Thm K9)", prove=_quadratic),
 }

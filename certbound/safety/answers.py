@@ -18,6 +18,8 @@ from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
 
+_NEAR = math.log10(4)  # of two bounds, that an engine which knows both may decide between with more time
+
 Proof = tuple[dict[str, Any], float, list[str]]
 """The proof's data, the claimed log10 of the probability, and what is assumed."""
 
@@ -201,6 +203,13 @@ def is_more_than(log10_lower: float, target: float) -> bool:
     """Whether 10**log10_lower > target is proved, in ball arithmetic."""
     with precision():
         return log10_lower > upper(arb(target).log() / arb(10).log())
+
+
+def may_decide(answer: EngineAnswer, target: float) -> bool:
+    """Whether an engine's bounds are near each other with the target in between, so that more time may decide."""
+    if not answer.applicable or answer.conclusive or answer.log10_lower is None:
+        return False
+    return answer.log10_lower <= math.log10(target) < answer.log10_delta <= answer.log10_lower + _NEAR
 
 
 def settled(log10_delta: float, target: float) -> float:

@@ -19,7 +19,7 @@ from typing import Any
 from certbound.errors import EngineError, contained
 from certbound.problem.goals import met_at
 from certbound.problem.problem import Problem
-from certbound.safety.answers import EngineAnswer, Request, is_more_than
+from certbound.safety.answers import EngineAnswer, Request, is_more_than, may_decide
 from certbound.safety.averages import average_verdict
 from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
@@ -89,7 +89,7 @@ class _Search:
         self.sketches: dict[str, EngineAnswer] = {}
         self.chances: dict[Any, float] = {}
         self.spent: dict[str, float] = {}
-        self.full: set[str] = set()
+        self.full: set[str] = set(ENGINES if request.thorough else ())
         self._inner = 0.0  # seconds of engines that had a turn inside another one's
 
     @property
@@ -189,13 +189,14 @@ class _Search:
         return self.late and self.settled
 
     def _in_full(self, names: tuple[str, ...], share: float) -> bool:
-        """Ask once those that spared themselves for others' sake, which have proved nothing; whether that says SAFE."""
+        """Ask once those that spared themselves where nobody proved anything, or may decide now; whether one did."""
         with self.watch.share(share):
-            for name in (name for name in names if self.problem.system.dimension < ENGINES[name].spares):
-                if not self.bounded and name in self.answers and name not in self.full:
+            for name in (name for name in names if name in self.answers and name not in self.full):
+                few = self.problem.system.dimension < ENGINES[name].spares
+                if (few and not self.bounded) or may_decide(self.answers[name], self.problem.delta):
                     self.full.add(name)
                     self._thoroughly(name, Request())
-        return self.safe
+        return self.safe or self.refuted
 
     def _thoroughly(self, name: str, request: Request) -> None:
         """Ask once more; where nobody set a limit, only as long as that is in proportion to what it all took so far."""

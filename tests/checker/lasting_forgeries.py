@@ -17,6 +17,7 @@ from tests.checker.forgeries import _BASES, Data, _sharp, _stated, forges
 from tests.checker.value_forgeries import _below
 
 _LASTING, _LEAVING = "endless/scale_function.py", "endless/eigenfunction.py"
+_SURELY = "endless/surely.py"
 _HALF = [cb.Inside(cb.HalfSpace([-1.0], 0.0))]
 
 
@@ -42,6 +43,23 @@ def restless(delta: float = 0.5) -> cb.Problem:
     """Brownian motion between two limits, for ever."""
     system = cb.ContinuousSystem(lambda x: 0 * x, states=["x"], diffusion=1.0)
     return drifting(initial=[0.1], safe=[cb.Inside(cb.Box([-1.0], [1.0]))], delta=delta).replace(system=system)
+
+
+def shaken_for_ever(delta: float = 0.5) -> cb.Problem:
+    """A velocity with noise, for ever."""
+    system = cb.ContinuousSystem(
+        lambda x, d: [x[1], d[0] - x[1] - x[0] ** 3], states=["p", "v"], disturbance=cb.Box([-0.1], [0.1]),
+        diffusion=lambda x: [[0.0], [0.5 + 0.2 * x[1]]],
+    )
+    safe = [cb.Inside(cb.Ball([0.0, 0.0], 1.0))]
+    return cb.Problem(system, initial=[0.1, 0.0], safe=safe, horizon=math.inf, delta=delta, name="for ever")
+
+
+def shaken_steps(delta: float = 0.5) -> cb.Problem:
+    """Four states that normal noise shakes at every step, for ever."""
+    system = cb.DiscreteSystem(lambda x: 0.8 * x, states=4, noise=cb.Gaussian(std=0.2))
+    safe = [cb.Inside(cb.Box([-1.0] * 4, [1.0] * 4))]
+    return cb.Problem(system, initial=[0.0] * 4, safe=safe, horizon=math.inf, delta=delta, name="steps for ever")
 
 
 def lasting_steps() -> cb.Problem:
@@ -82,6 +100,8 @@ _BASES |= {
     "lasting below": _sharp(_below(lambda: met(delta=0.01))),
     "rate": _sharp(_by_rate),
     "rate below": _sharp(_rate_below),
+    "surely": _sharp(_below(shaken_for_ever)),
+    "surely steps": _sharp(_below(shaken_steps)),
     "drift": _sharp(_stated(lasting_steps, "values")),
 }
 
@@ -202,6 +222,43 @@ def _(data: Data) -> None:
 @forges("the interval of v holds the safe set from below", "rate below", _LEAVING, "_Leaving._check_interval", "lie in")
 def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["high"] = exact([1.2])
+
+
+@forges("noise shakes a state everywhere", "surely", _SURELY, "check_surely_below", "the noise of the state")
+def _(data: Data) -> None:
+    data["proof"]["noise"] = exact(0.0901)
+
+
+@forges("normal noise shakes a state at every step", "surely steps", _SURELY, "check_surely_below", "to be at least")
+def _(data: Data) -> None:
+    data["problem"]["noise"]["values"] = exact([0.199] * 4)
+
+
+@forges("noise within bounds leads nowhere surely", "surely steps", _SURELY, "check_surely_below", "normal noise")
+def _(data: Data) -> None:
+    data["problem"]["noise"] |= {"law": "uniform", "level": "halfwidth"}
+
+
+@forges("the drift against the way out is bounded", "surely", _SURELY, "check_surely_below", "the drift of the state")
+def _(data: Data) -> None:
+    data["proof"]["drift"] = exact(float.fromhex(data["proof"]["drift"]) * 0.6)
+
+
+@forges("only who may go on for ever leaves surely", "surely", _SURELY, "check_surely_below", "infinite horizon")
+def _(data: Data) -> None:
+    data["problem"]["horizon"] = exact(5.0)
+
+
+@forges("a bounded set is left surely", "surely", "statement/safe_set.py", "SafeSet", "bounds p")
+def _(data: Data) -> None:
+    region = {"kind": "halfspace", "normal": exact([1.0, 0.0]), "bound": exact(1.0)}
+    data["problem"]["constraints"][0]["region"] = region
+
+
+@forges("what leads every path out bounds nothing from above", "surely", _SURELY, "check_surely", "from below only")
+def _(data: Data) -> None:
+    del data["claim"]["log10_lower"], data["proof"]["side"]
+    data["claim"]["log10_delta"] = exact(-1.0)
 
 
 @forges("the drift outweighs the noise", "drift", _LASTING, "check_drift", "outweigh the noise")

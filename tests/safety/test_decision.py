@@ -230,6 +230,22 @@ def test_once_unsafe_is_proved_nobody_is_asked_in_full(monkeypatch: pytest.Monke
     assert [asked.count(name) for name in ("linear", "quadratic")] == [1, 1]
 
 
+@pytest.mark.parametrize(("lower", "count"), [(-3.2, 2), (-3.5, 1)])
+def test_bounds_that_are_near_what_is_asked_are_made_better(
+    monkeypatch: pytest.MonkeyPatch, clock: Time, lower: float, count: int
+) -> None:
+    asked = scripted(monkeypatch, clock, {})
+
+    def near(problem: cb.Problem, request: Request) -> EngineAnswer:
+        asked.append("near")
+        return EngineAnswer(method="values", log10_delta=-2.8, log10_lower=-2.9 if request.thorough else lower)
+
+    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=near))
+    verdict, _ = run(clock, 60)
+    assert asked.count("near") == count
+    assert verdict.status == ("UNSAFE" if count == 2 else "UNKNOWN")
+
+
 def test_without_a_limit_a_second_asking_is_in_proportion_to_the_first(
     monkeypatch: pytest.MonkeyPatch, clock: Time
 ) -> None:

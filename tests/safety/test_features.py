@@ -1,4 +1,4 @@
-"""All that can be asked, a row each: saved and loaded, bounded, simulated, certified, and a forged twin refused.
+"""All that can be asked, a row each: saved and loaded, drawn, bounded, simulated, certified, a forged twin refused.
 
 The rows are examples of ``certbound new --example`` and some more. Simulations here are NumPy's own, by what the words
 say; the kernels are held against these bounds elsewhere.
@@ -157,6 +157,37 @@ def failing(problem: cb.Problem, start: np.ndarray, rng: np.random.Generator) ->
     return int((gone | (~there & ~over) if target is not None else gone).sum())
 
 
+# ---- moments of what is drawn --------------------------------------------------------------------------------
+
+
+def _variance(law: Any) -> np.ndarray:
+    """Of the entries of a law whose mean is 0, by hand."""
+    size = np.asarray(getattr(law, law.level), dtype=float)
+    if law.name == "gaussian":
+        return size**2 if law.level == "std" else np.diag(law.proxy)
+    if law.name in ("discrete", "histogram"):
+        weights = np.asarray(law.probabilities)
+        edges = np.asarray(law.edges if law.name == "histogram" else [*law.values, 0])
+        a, b = (edges[:-1], edges[1:]) if law.name == "histogram" else (edges[:-1], edges[:-1])
+        assert abs(weights @ (a + b)) < 1e-12
+        return size**2 * (weights @ (a * a + a * b + b * b)) / 3
+    return size**2 * {"uniform": 1 / 3, "triangular": 1 / 6, "laplace": 2.0, "rademacher": 1.0}[law.name]
+
+
+def hold_moments(problem: cb.Problem, rng: np.random.Generator, count: int = 20_000) -> None:
+    """Means and variances of noise, random starts and drawn constants, as simulations draw them."""
+    drawn = [(one.sample(rng, count), np.array([one.mean]), _variance(one.law)) for one in problem.random.values()]
+    if problem.system.time == "discrete":
+        law = problem.system.noise
+        drawn.append((law.sample(rng, count), np.zeros(1), _variance(law)))
+    if problem.initial.random:
+        drawn.append((problem.initial.sample(rng, count), problem.initial.middle, np.diag(problem.initial.covariance)))
+    for found, mean, variance in drawn:
+        rows = np.asarray(found).reshape(count, -1)
+        np.testing.assert_array_less(np.abs(rows.mean(axis=0) - mean), 5 * np.sqrt(variance / count) + 1e-12)
+        np.testing.assert_array_less(np.abs(rows.var(axis=0) - variance), 15 * variance / np.sqrt(count) + 1e-12)
+
+
 # ---- the table -----------------------------------------------------------------------------------------------
 
 
@@ -168,6 +199,7 @@ def test_a_feature_is_saved_bounded_simulated_and_certified(name: str, tmp_path:
     cb.save(problem, tmp_path / "again.toml")
     data = problem_data(problem)
     assert problem_data(cb.load(tmp_path / "again.toml")) == data
+    hold_moments(problem, np.random.default_rng(11))
     verdict = cb.verify_safety(problem, method=METHODS.get(name, OWN[problem.system.time]))
     assert verdict.status == "SAFE"
     rng, first = np.random.default_rng(7), problem.starts[0]

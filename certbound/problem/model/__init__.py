@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     )
     from certbound.problem.model.recombined import turned_tape
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
-    from certbound.problem.model.time_jumps import cut_at_jumps
+    from certbound.problem.model.time_jumps import between_jumps, cut_at_jumps
     from certbound.problem.model.tracing import trace
 
 _HOME = {
@@ -51,13 +51,14 @@ _HOME = {
     "recombined": "turned_tape",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
-    "time_jumps": "cut_at_jumps",
+    "time_jumps": "between_jumps cut_at_jumps",
     "tracing": "trace",
 }
 
 __all__ = [
     "adds_plainly",
     "arithmetic",
+    "between_jumps",
     "ARITY",
     "call_network",
     "compile_numpy",

@@ -61,33 +61,67 @@ def cut_at_jumps(tape: Tape, states: int, horizon: float) -> TimeJumps | None:
     horizon : float
         The length of time, finite.
     """
-    found = reads(tape)
-    own = [index for index in range(len(tape.nodes)) if found[index] <= {0}]
+    found, own = reads(tape), _timed(tape)
     straight = [index for index in own if tape.nodes[index].op not in _BENDS]
     for kept, ops, most in ((own, _CUT, _MOST_BENT), (straight, JUMPS, _MOST_PIECES)):
         if any(tape.nodes[index].op in ops and found[index] for index in kept):
-            cut = _cut(tape, states, decimal(horizon), kept, found, most)
+            cut = _cut(tape, states, decimal(horizon), kept, most)
             if cut is not None:
                 return cut
     return None
 
 
-def _cut(
-    tape: Tape, states: int, horizon: Fraction, own: Sequence[int], found: Sequence[set[int]], most: int
-) -> TimeJumps | None:
+def between_jumps(tape: Tape, states: int, horizon: float) -> list[tuple[float, Tape]]:
+    """The function from one of its jumps that t alone decides to the next: the end of each piece, and its tape.
+
+    One piece where it has none, or too many. The arguments are those of `cut_at_jumps`.
+    """
+    straight = [index for index in _timed(tape) if tape.nodes[index].op not in _BENDS]
+    if not any(tape.nodes[index].op in JUMPS for index in straight) or math.isinf(horizon):
+        return [(float(horizon), tape)]
+    known = _known(tape, straight, decimal(horizon))
+    cut = None if known is None else _with_inputs(tape, states, known[1], every=True)
+    if known is None or cut is None:
+        return [(float(horizon), tape)]
+    found = []
+    for end, row in zip(known[0][1:], cut.rows):
+        graph, first = Graph(tape.inputs), 1 + states
+        slots = [graph.input(slot) for slot in range(len(tape.inputs))]
+        slots[first:first] = [graph.const(value) for value in row]
+        outputs = cut.tape.evaluate(graph.arithmetic(), slots)
+        found.append((float(end), graph.tape(outputs, tape.shape)))
+    return found
+
+
+def _timed(tape: Tape) -> list[int]:
+    """The nodes that see nothing but the clock."""
+    return [index for index, seen in enumerate(reads(tape)) if seen <= {0}]
+
+
+def _cut(tape: Tape, states: int, horizon: Fraction, own: Sequence[int], most: int) -> TimeJumps | None:
     """The function without what jumps or bends among the nodes ``own``, in at most so many pieces."""
-    breaks = _breaks(tape, own, horizon)
-    if breaks is None:
+    known = _known(tape, own, horizon)
+    if known is None:
         return None
+    breaks, values = known
     count = math.lcm(*((end / breaks[-1]).denominator for end in breaks))
     if count > most:
         return None
-    values = _values(tape, own, breaks)
-    wanted = [index for index in _frontier(tape, values) if found[index]]
     middles = [(Fraction(2 * k + 1, 2 * count)) * breaks[-1] for k in range(count)]
     places = [sum(end < middle for end in breaks) - 1 for middle in middles]
-    rows = {index: [values[index][place] for place in places] for index in wanted}
+    rows = {index: [row[place] for place in places] for index, row in values.items()}
     return _with_inputs(tape, states, rows, every=count == 1 and _touches(tape, own, breaks[-1]))
+
+
+def _known(
+    tape: Tape, own: Sequence[int], horizon: Fraction
+) -> tuple[list[Fraction], dict[int, list[float]]] | None:
+    """0, the times at which ``own`` jumps or bends and the horizon, and its values in between; None of too many."""
+    breaks, found = _breaks(tape, own, horizon), reads(tape)
+    if breaks is None:
+        return None
+    values = _values(tape, own, breaks)
+    return breaks, {index: values[index] for index in _frontier(tape, values) if found[index]}
 
 
 def decimal(value: float) -> Fraction:

@@ -27,7 +27,7 @@ from certbound.safety.certificates.step_values import (
     stretched,
 )
 from certbound.values.chains import Drifting
-from certbound.values.continuous import ExitBounds, Lasting, Payment, Rate, Surface, bound_lasting
+from certbound.values.continuous import ExitBounds, Lasting, Payment, Rate, SureExit, Surface, bound_lasting
 from certbound.values.discrete import FailureBounds
 
 _COARSE = (0.04, 0.01, 0.0)  # of log P, for a smaller file
@@ -75,6 +75,13 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
         return _lasting(problem, attempt, above=False)
     if isinstance(answer.details, Rate) and answer.details.fast is not None:
         return _leaving(problem, answer.details, above=False)
+    if isinstance(answer.details, SureExit):
+        sure = answer.details
+        data = {
+            "engine": "surely", "state": sure.state, "mirrored": sure.mirrored, "noise": exact(sure.noise * (1 - _OFF)),
+            "drift": exact(sure.drift + _OFF * (1 + abs(sure.drift))), "side": "lower",
+        }
+        return data, 0.0, []
     check_starts(problem)
     found, effort = _exits_of(problem, answer), min(attempt, len(_COARSE) - 1)
     least = claimed_below(answer.log10_lower, problem.delta, _room(problem, effort))
@@ -135,8 +142,8 @@ def _passage(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]
         )
     if not found.proposed:
         raise CertificateError(
-            "no value function was found that a certificate can state: in two states it states bounded boxes, no "
-            "obstacles and no oblique or curved limits."
+            "no value function was found that a certificate can state: in one state it states limits and noise that do "
+            "not come, go or jump, in two states bounded boxes, no obstacles and no oblique or curved limits."
         )
     best = min(payment.log for _, payment in found.proposed)
     share = _COARSE[effort] * max(1.0, -0.1 * best)

@@ -12,7 +12,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.values.chains import bound_chain, bound_drifting
-from certbound.values.continuous import ExitBounds, bound_exits, bound_lasting, bound_rate
+from certbound.values.continuous import ExitBounds, SureExit, bound_exits, bound_lasting, bound_rate, leaves_surely
 from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
@@ -46,19 +46,36 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
             return answer if answer.log10_delta < 0 else _by_rate(problem) or _without_end(problem, limit) or answer
         found = _failure(problem, limit)
     except (InfeasibleError, EnclosureError) as error:
-        lasting = _by_rate(problem) or _without_end(problem, limit)
+        sure = leaves_surely(problem) if problem.endless else None
+        lasting = _surely(problem, sure) if sure is not None else _by_rate(problem) or _without_end(problem, limit)
         return lasting or EngineAnswer(applicable=False, method="values", reason=str(error))
     return _answer(problem, found)
 
 
 def _lasting(problem: Problem) -> EngineAnswer:
     """An infinite horizon in continuous time."""
+    found = _by_rate(problem)
+    if found is not None and found.log10_lower is not None:
+        return found
+    sure = leaves_surely(problem)
+    if sure is not None:
+        return _surely(problem, sure)
     if problem.system.dimension > 1:
         raise InfeasibleError(
             "a value function in continuous time needs an end, and the horizon is infinite; without one a single state "
-            "is served, with limits and targets that stand still, for a model that does not depend on time."
+            "is served, with limits and targets that stand still, for a model that does not depend on time, and "
+            "several states where noise leads every path out: along one that is bounded on both sides, everywhere."
         )
-    return _by_rate(problem) or _by_function(problem)
+    return found or _by_function(problem)
+
+
+def _surely(problem: Problem, sure: SureExit) -> EngineAnswer:
+    """Noise along a bounded state leads every path out."""
+    name, unit = problem.system.states[sure.state], problem.time_unit
+    mean = f", after at most {rounded(sure.mean, up=True, digits=3)} {unit} in the mean" if sure.mean < math.inf else ""
+    words = f"every path leaves in the end{mean}: the limits bound {name} on both sides, and its noise vanishes nowhere"
+    return EngineAnswer(log10_delta=0.0, log10_lower=0.0, reason=f"{words}.", method="values", details=sure,
+                        conclusive=True)  # fmt: skip
 
 
 def _by_function(problem: Problem) -> EngineAnswer:

@@ -4,12 +4,20 @@
 """
 
 from certbound.values.continuous.exits import ExitBounds, bound_exits, chart_exits, chart_slabs_of
-from certbound.values.continuous.line import Lasting, Rate, bound_lasting, bound_mean_time, bound_rate
+from certbound.values.continuous.line import (
+    Lasting,
+    Rate,
+    SureExit,
+    bound_lasting,
+    bound_mean_time,
+    bound_rate,
+    leaves_surely,
+)  # fmt: skip
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.room import faces_of, starts_of
 from certbound.values.continuous.surface import Surface
 
 __all__ = [
-    "ExitBounds", "Lasting", "Payment", "Rate", "Surface", "bound_exits", "bound_lasting", "bound_mean_time",
-    "bound_rate", "chart_exits", "chart_slabs_of", "faces_of", "starts_of",
+    "ExitBounds", "Lasting", "Payment", "Rate", "SureExit", "Surface", "bound_exits", "bound_lasting",
+    "bound_mean_time", "bound_rate", "chart_exits", "chart_slabs_of", "faces_of", "leaves_surely", "starts_of",
 ]

@@ -17,7 +17,7 @@ from certbound.values.continuous.held_faces import check_noise, held_face, resol
 from certbound.values.continuous.hypotheses import Model, raised_above
 from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import Link, prove_above, prove_below, spans
-from certbound.values.continuous.line.moved_model import model_on
+from certbound.values.continuous.line.moved_model import model_on, parts_of
 from certbound.values.continuous.line.phases import (
     Gate,
     Phase,
@@ -137,10 +137,11 @@ def held_in(problem: Problem, model: Model, start: Start) -> Held:
 def room_of(
     problem: Problem, model: Model, cuts: tuple[float, float], start: Start, held: Held = (None, None), *, inner: bool
 ) -> Room:
-    phases, gates = pieces(problem, cuts, inner=inner)
+    parts = parts_of(model, float(problem.horizon))
+    phases, gates = pieces(problem, cuts, inner=inner, breaks=[end for end, _ in parts])
     phases = [held_at(phase, held) for phase in phases]
     check_room(phases)
-    models = [model_on(phase, model) for phase in phases]
+    models = [model_on(phase, next(one for end, one in parts if phase.end <= end)) for phase in phases]
     if held != (None, None):
         models = [resolved(one, (phase.start, phase.end), [(phase.low, phase.high)])
                   for phase, one in zip(phases, models)]  # fmt: skip

@@ -6,10 +6,29 @@ a(t, x) / w^2; o and w are Lipschitz, which is all that Ito's formula needs of t
 
 from __future__ import annotations
 
-from certbound.problem.model import Graph, Tape, jacobian
+from dataclasses import replace
+
+from certbound.problem.model import Graph, Tape, between_jumps, jacobian
 from certbound.values.continuous.coefficients import Reader
 from certbound.values.continuous.hypotheses import Model
 from certbound.values.continuous.line.phases import Phase
+
+
+def parts_of(model: Model, horizon: float) -> list[tuple[float, Model]]:
+    """The model from one jump of its noise that t alone decides to the next: the end of each part, and its model.
+
+    Such a noise has no full rank over the time of a jump, of which nothing but the values on either side is known; on
+    either side it is continuous, and a path does not see a single time. Jumps of the drift are jumps of the parts too.
+    """
+    squares = between_jumps(model.square.tape, 1, horizon)
+    if len(squares) == 1:
+        return [(horizon, model)]
+    drifts = between_jumps(model.drift.tape, 1, horizon)
+    found = []
+    for end in sorted({end for end, _ in (*squares, *drifts)}):
+        drift, square = (next(tape for last, tape in parts if end <= last) for parts in (drifts, squares))
+        found.append((end, replace(model, drift=Reader(drift, 2), square=Reader(square, 2))))
+    return found
 
 
 def model_on(phase: Phase, model: Model) -> Model:

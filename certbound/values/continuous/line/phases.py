@@ -131,11 +131,15 @@ def _beside(constraint: Inside, ends: dict[int, float], problem: Problem) -> dic
 
 
 def pieces(
-    problem: Problem, cuts: tuple[float, float], *, inner: bool
+    problem: Problem, cuts: tuple[float, float], *, inner: bool, breaks: Sequence[float] = ()
 ) -> tuple[list[Phase], list[Gate]]:
-    """Phases in order, and the gate at the end of each; at ``cuts`` the line is cut where nothing bounds it."""
+    """Phases in order, and the gate at the end of each; at ``cuts`` the line is cut where nothing bounds it.
+
+    ``breaks`` are more times at which phases end.
+    """
     limits, end = limits_of(problem, inner=inner), last_instant(problem)
-    instants = sorted({0.0, end, *(min(t, end) for _, window in limits for t in window)})
+    ends = [t for _, window in limits for t in window]
+    instants = sorted({0.0, end, *(min(t, end) for t in (*ends, *breaks))})
     phases, gates = [], []
     for first, last in itertools.pairwise(instants):
         active = [limit for limit, window in limits if window[0] <= first and last <= window[1]]
