@@ -9,9 +9,7 @@ closest call: P(at least as many exits | exit probability delta).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,6 +27,7 @@ __all__ = ["CASES", "Case", "binomial_level", "draw_case", "exits", "tubes_of"]
 
 CASES = 60
 LAWS = ("gaussian", "rademacher", "uniform")
+_BATCH = 20_000  # paths at a time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,65 +141,34 @@ def tubes_of(case: Case, *, slow: bool) -> list[Tube]:
 def exits(case: Case, radii: np.ndarray, paths: int, seed: int) -> np.ndarray:
     """Numbers of paths that leave each of the tubes, whose radii at the grid times are (tube, time)."""
     rng = np.random.Generator(np.random.SFC64(seed))
-    return np.asarray(
-        _kernel()(case.steps, case.noises, case.start, radii, paths, case.law, case.bend, case.follows, rng)
-    )
+    lost = np.zeros(len(radii), dtype=np.int64)
+    for first in range(0, paths, _BATCH):
+        lost += _exits(case, radii, min(_BATCH, paths - first), rng)
+    return lost
 
 
-@cache
-def _kernel() -> Callable[..., np.ndarray]:
-    import numba
+def _exits(case: Case, radii: np.ndarray, paths: int, rng: np.random.Generator) -> np.ndarray:
+    nominal, x = case.start[None], np.tile(case.start, (paths, 1))
+    out = np.zeros((len(radii), paths), dtype=bool)
+    for step, noise, radius in zip(case.steps, case.noises, radii.T[1:]):
+        match case.law:
+            case 0:
+                w = rng.standard_normal(x.shape)
+            case 1:
+                w = np.where(rng.random(x.shape) < 0.5, 1.0, -1.0)
+            case _:
+                w = math.sqrt(3.0) * (2.0 * rng.random(x.shape) - 1.0)
+        size = 0.3 + 0.7 / (1.0 + x[:, :1] ** 2) if case.follows else 1.0
+        x = _bent(x, case.bend) @ step.T + (size * w) @ noise.T
+        nominal = _bent(nominal, case.bend) @ step.T
+        out |= np.linalg.norm(x - nominal, axis=1) > radius[:, None]
+    return out.sum(axis=1)
 
-    @numba.njit(nogil=True)
-    def bent(x: float, bend: int) -> float:
-        if bend == 1:
-            return math.sin(x)
-        if bend == 2:
-            return abs((x + 1.0) % 4.0 - 2.0) - 1.0
-        return x
 
-    @numba.njit(nogil=True)
-    def run(steps, noises, start, radii, paths, law, bend, follows, rng):  # type: ignore[no-untyped-def]
-        count, n = steps.shape[0], steps.shape[1]
-        tubes = radii.shape[0]
-        lost = np.zeros(tubes, dtype=np.int64)
-        nominal = np.empty((count + 1, n))
-        nominal[0] = start
-        for k in range(count):
-            for i in range(n):
-                nominal[k + 1, i] = 0.0
-                for j in range(n):
-                    nominal[k + 1, i] += steps[k, i, j] * bent(nominal[k, j], bend)
-        x, y, w = np.empty(n), np.empty(n), np.empty(n)
-        for _ in range(paths):
-            out = np.zeros(tubes, dtype=np.bool_)
-            x[:] = start
-            for k in range(count):
-                size = 1.0
-                if follows:
-                    size = 0.3 + 0.7 / (1.0 + x[0] * x[0])
-                for j in range(n):
-                    if law == 0:
-                        w[j] = size * rng.standard_normal()
-                    elif law == 1:
-                        w[j] = size if rng.random() < 0.5 else -size
-                    else:
-                        w[j] = size * math.sqrt(3.0) * (2.0 * rng.random() - 1.0)
-                square = 0.0
-                for i in range(n):
-                    y[i] = 0.0
-                    for j in range(n):
-                        y[i] += steps[k, i, j] * bent(x[j], bend) + noises[k, i, j] * w[j]
-                    square += (y[i] - nominal[k + 1, i]) ** 2
-                x[:] = y
-                size = math.sqrt(square)
-                for j in range(tubes):
-                    if size > radii[j, k + 1]:
-                        out[j] = True
-            lost += out
-        return lost
-
-    return run  # type: ignore[no-any-return]
+def _bent(x: np.ndarray, bend: int) -> np.ndarray:
+    if bend == 1:
+        return np.sin(x)
+    return np.abs((x + 1.0) % 4.0 - 2.0) - 1.0 if bend == 2 else x
 
 
 def binomial_level(lost: int, paths: int, delta: float) -> float:
