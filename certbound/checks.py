@@ -119,7 +119,9 @@ def names(name: str, value: Sequence[str], reserved: Iterable[str] = ()) -> tupl
     """Distinct identifiers."""
     result = tuple(value)
     for entry in result:
-        if not isinstance(entry, str) or not entry.isidentifier() or keyword.iskeyword(entry):
+        if isinstance(entry, str) and keyword.iskeyword(entry):
+            raise ValueError(f"`{name}` must not use {entry!r}, a word of Python's own; {entry}_ would do.")
+        if not isinstance(entry, str) or not entry.isidentifier():
             raise ValueError(f"`{name}` must be identifiers (letters, digits, _), got {entry!r}.")
         if entry in set(reserved) | {"t"}:
             raise ValueError(f"`{name}` must not use the name {entry!r}, which is taken; choose another.")

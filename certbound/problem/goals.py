@@ -37,7 +37,7 @@ def until(problem: Problem, t: float) -> Problem:
 def check_end(problem: Problem, what: str) -> None:
     """Refuse an infinite horizon, with an InfeasibleError, where ``what`` needs an end."""
     if problem.endless:
-        raise InfeasibleError(f"{what} needs an end, and the horizon is infinite: give a finite `horizon`.")
+        raise InfeasibleError(f"{what} needs an end, and the horizon is infinite; give a finite `horizon`.")
 
 
 def met_at(problem: Problem, t: float) -> Problem:

@@ -49,7 +49,10 @@ class _Table(BaseModel):
 
 
 def _hint(key: str, known: list[str]) -> str:
-    """The nearest key of a table, or the tables in which this one stands."""
+    """The nearest key of a table, or how a law is named, or the tables in which this one stands."""
+    if key in LAWS and "law" in known:
+        levels = [f"{level} = 0.1" for level in LAWS[key].levels][:1]
+        return "; write " + " and ".join([f'law = "{key}"', *levels]) + "."
     near, tables = nearest(key, known), [_Table]
     for table in tables:
         tables += table.__subclasses__()

@@ -78,6 +78,7 @@ def test_a_thousand_chained_definitions_are_read():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
+        ('states = ["px", "py", "th"]', 'states = ["px", "del", "th"]', "must not use 'del', a word of Python's own; del_ would do"),
         ("horizon = 5.0", "horizn = 5.0", "unknown key 'horizn' in the problem file; did you mean 'horizon'"),
         ("horizon = 5.0", "", "`horizon` is missing"),
         ("horizon = 5.0", "horizon = -5", "`horizon` must be positive, got -5"),
@@ -110,6 +111,7 @@ def test_a_thousand_chained_definitions_are_read():
         ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', "[[1, 2], [1], [1, 2]]", "rows of equal length"),
         ('["sigma", 0, 0]', '["d", 0, 0]', r"`noise\.diffusion\.0\.0`: 'd' must not be used here, only t, px, py, th"),
         ('["sigma", 0, 0]', '["turn", 0, 0]', r"`noise\.diffusion\.0\.0`: .* 'd' must not be used here"),
+        ("[noise]\ndiffusion = ", "[noise]\nuniform = ", 'write law = "uniform" and halfwidth = 0.1'),
         ("[noise]\ndiffusion = ", "[noise]\nlaw = 'gaussian'\nstd = 1\nq = ", "unknown key 'q' in \\[noise\\]"),
         ("[noise]\n", "[noise]\nlaw = 'gaussian'\n", "`noise` must hold `diffusion` alone in continuous time"),
         ("[-0.1, 0.1], [-0.1, 0.1], [-0.1, 0.1]]", "[-0.1, 0.1]]", r"`initial\.box` must have 3 entries, got 1"),
