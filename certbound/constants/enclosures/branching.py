@@ -85,7 +85,7 @@ def bound_supremum(
         done |= ~np.any(boxes.lo < boxes.hi, axis=1)
         if done.any():
             first = int(np.argmax(np.where(done, uppers, -np.inf)))
-            if uppers[first] > retired:
+            if done[first] and uppers[first] > retired:  # boxes that are ruled out have -inf, and count for nothing
                 retired, retired_box = float(uppers[first]), boxes[first]
             keep = ~done
             boxes, uppers, weights = boxes[keep], uppers[keep], weights[keep]
