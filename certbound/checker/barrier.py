@@ -7,7 +7,8 @@ With D the set on which no constraint is broken, proved here by branch and bound
 - V >= boundary on the points of D where some constraint is about to be broken.
 
 Then P(leaving within T) <= exp(start - boundary + max(growth, 0) T) for every disturbance that does not see coming
-noise. Source: docs/theory.md, Section 10.
+noise. With an inflow the first inequality is that the same expression, times exp(V - boundary), is at most the inflow,
+and P(leaving within T) <= exp(start - boundary) + inflow T. Source: docs/theory.md, Section 10.
 """
 
 from __future__ import annotations
@@ -37,9 +38,12 @@ def check_barrier(model: Model, value: object, budget: Budget) -> arb:
     It holds for every start and every disturbance that does not see coming noise (it makes exp(V) a supermartingale).
     CertificateError where the proof's data are malformed, Unproved where an inequality could not be proved.
     """
-    record = Record(value, "proof", _PROOF)
+    record = Record(value, "proof", _PROOF, ("inflow",))
     _refuse(model)
     growth, start, boundary = (arb(record.number(name)) for name in ("growth", "start", "boundary"))
+    inflow = None if record["inflow"] is None else arb(record.number("inflow", least=0.0))
+    if inflow is not None and not growth.is_zero():
+        raise CertificateError("`proof.growth` must be 0 beside an inflow.")
     expressions = _Expressions(model, record, budget)
     safe = SafeSet(model)
     initial = [(low.lower(), high.upper()) for low, high in zip(model.initial.low, model.initial.high)]
@@ -57,11 +61,17 @@ def check_barrier(model: Model, value: object, budget: Budget) -> arb:
         member = held if part.exact else lambda *_: False
         if not negative.prove([nothing, *part.box, *rest], -boundary, _on_states(part.skip, n), member):
             raise Unproved("the barrier was not shown to reach its level where a constraint breaks")
-    drift = Ceiling(graph, expressions.generator, expressions.defined, count=count, budget=budget)
+    generator = expressions.generator
+    if inflow is not None:  # of exp(V - boundary)
+        above = graph.sub(expressions.value, graph.const(record.number("boundary")))
+        generator = graph.mul(graph.apply("exp", above), generator)
+    drift = Ceiling(graph, generator, expressions.defined, count=count, budget=budget)
     box: list[Side] = [(arb(0), arb(model.horizon)), *safe.hull]
     box += [(arb(low), arb(high)) for low, high in model.disturbance]
-    if not drift.prove(box, growth, excluded, held):
+    if not drift.prove(box, growth if inflow is None else inflow, excluded, held):
         raise Unproved("the barrier was not shown to grow as slowly as stated")
+    if inflow is not None:
+        return upper((start - boundary).exp() + inflow * arb(model.horizon))
     return upper((start - boundary + arb.max(growth, arb(0)) * arb(model.horizon)).exp())
 
 

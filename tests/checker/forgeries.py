@@ -213,6 +213,7 @@ _BASES: dict[str, Callable[[], str]] = {
     "valued plane": _sharp(_stated(conftest.valued_plane, "values")),
     "leaving": _sharp(lambda: conftest.exit_certificate(conftest.leaving)),
     "barrier": lambda: json.dumps(by_hand(kinked(), 8.0, 0.7201, 0.0801, 7.999)),
+    "steady": lambda: json.dumps(by_hand(kinked(horizon=30.0), 8.0, 0.0, 0.0801, 7.999, 2.4215e-4)),
 }
 
 
@@ -818,6 +819,11 @@ def _(data: Data) -> None:
 @forges("the barrier grows no faster than stated", "barrier", "barrier.py", "check_barrier", "grow as slowly")
 def _(data: Data) -> None:
     _scale(data["proof"], "growth", 1.0, -0.0005)
+
+
+@forges("no more than the inflow comes to the barrier", "steady", "barrier.py", "check_barrier", "grow as slowly")
+def _(data: Data) -> None:
+    _scale(data["proof"], "inflow", 0.999)
 
 
 @forges("the barrier is below its level at the start", "barrier", "barrier.py", "check_barrier", "on the initial set")

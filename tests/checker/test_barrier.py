@@ -17,10 +17,14 @@ from certbound.safety.answers import exact
 from certbound.safety.certificate import problem_data
 
 
-def by_hand(problem: cb.Problem, theta: float, growth: float, start: float, boundary: float) -> dict[str, Any]:
+def by_hand(
+    problem: cb.Problem, theta: float, growth: float, start: float, boundary: float, inflow: float | None = None
+) -> dict[str, Any]:
     """A certificate with V = theta |x|^2."""
     n = problem.system.dimension
     claimed = (start - boundary + max(growth, 0.0) * problem.horizon) / math.log(10)
+    if inflow is not None:
+        claimed = math.log10(math.exp(start - boundary) + inflow * problem.horizon)
     return json.loads(json.dumps({
         "format": "certbound certificate", "version": 1,
         "claim": {"log10_delta": exact(min(claimed, 0.0) * (1 - 1e-9)), "method": "barrier", "assumptions": []},
@@ -29,6 +33,7 @@ def by_hand(problem: cb.Problem, theta: float, growth: float, start: float, boun
             "engine": "barrier", "center": exact(np.zeros(n)), "scale": exact(np.ones(n)),
             "exponents": (2 * np.eye(n, dtype=int)).tolist(), "coefficients": exact(np.full(n, theta)),
             "growth": exact(growth), "start": exact(start), "boundary": exact(boundary),
+            **({} if inflow is None else {"inflow": exact(inflow)}),
         },
     }))  # fmt: skip
 
@@ -52,6 +57,17 @@ def test_a_barrier_made_by_hand_is_proved_and_its_numbers_are_sharp() -> None:
         refused = check_data(by_hand(problem, 8.0, growth, start, boundary))
         assert not refused.valid
         assert why in refused.reason
+
+
+def test_an_inflow_made_by_hand_is_proved_and_sharp() -> None:
+    """exp(8 x^2 - 8) changes at most at the rate 2.419e-4, at |x| = .0491."""
+    problem = kinked(horizon=30.0)
+    report = check_data(by_hand(problem, 8.0, 0.0, 0.08 + 1e-9, 8.0 - 1e-9, 2.4196e-4))
+    assert report.valid, report.reason
+    assert 10**report.log10_proved == pytest.approx(math.exp(-7.92) + 30 * 2.4196e-4, rel=1e-6)
+    refused = check_data(by_hand(problem, 8.0, 0.0, 0.08 + 1e-9, 8.0 - 1e-9, 2.4180e-4))
+    assert not refused.valid
+    assert "grow as slowly" in refused.reason
 
 
 def test_three_states_a_ball_an_obstacle_and_noise_that_depends_on_the_state() -> None:
@@ -137,6 +153,7 @@ def test_dynamics_that_is_undefined_or_jumps_in_the_safe_set_is_not_proved_over(
         ({"scale": exact([0.0])}, "scale"), ({"scale": exact([-1.0])}, "scale"), ({"exponents": [[2], [2]]}, "differ"),
         ({"exponents": [[2, 0]]}, "one a state"), ({"exponents": [[-1]]}, "0..12"), ({"exponents": [[99]]}, "0..12"),
         ({"coefficients": exact([1.0, 2.0])}, "1 entries"), ({"growth": None}, "hexadecimal"), ({"x": 1}, "unknown"),
+        ({"inflow": exact(0.1)}, "must be 0 beside"), ({"inflow": exact(-0.1)}, "at least 0"),
     ],
 )  # fmt: skip
 def test_malformed_barriers_are_refused(change: dict[str, Any], why: str) -> None:

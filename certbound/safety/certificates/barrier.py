@@ -30,7 +30,8 @@ def barrier_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> P
     stated = Barrier(
         exponents=barrier.exponents, coefficients=barrier.coefficients, center=barrier.center, scale=barrier.scale,
         start=_above(barrier.start, room), boundary=-_above(-barrier.boundary, room),
-        growth=_above(max(barrier.growth, 0.0), room / horizon),
+        growth=0.0 if barrier.inflow > 0 else _above(max(barrier.growth, 0.0), room / horizon),
+        inflow=barrier.inflow * math.exp(2 * room),
     )  # fmt: skip
     log10 = stated.log10_probability(horizon)
     log10 += 1e-12 * (1 + abs(log10))
@@ -46,6 +47,8 @@ def barrier_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> P
         "start": exact(stated.start),
         "boundary": exact(stated.boundary),
     }
+    if stated.inflow > 0:
+        data["inflow"] = exact(stated.inflow)
     return data, log10, []
 
 

@@ -10,13 +10,17 @@ The disturbance may react to the state and the past, but must not see coming noi
 The condition is convex in V: for a polynomial each point of a grid gives a second-order cone, and the exponent is
 linear, so that the best polynomial is one conic program. What it proposes is then bounded over all of D, from above
 and below, by branch and bound with centred forms.
+
+Where noise keeps a system moving about what attracts it, kappa T is large whatever V is. There L w <= c is asked of
+w = exp(V - u), L the generator; w is at least 1 where a path leaves, w(X) - c t, stopped, is a supermartingale, and
+    P(leaving within T) <= exp(max over X_0 of V - u) + c T.
+Near the attractor w is small, so that c is.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -30,10 +34,11 @@ from certbound.problem.model import Tape, compile_numpy, jacobian, substitute, t
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.nominal import initial_cells
-from certbound.rigor.intervals import Interval
+from certbound.rigor.intervals import Interval, exp, log
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
+from certbound.safety.engines.barrier_programs import Polynomials
 from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
-from certbound.watch import poll, solver_limit
+from certbound.watch import poll
 
 _MOST_STATES = 3
 _DEGREES = {1: (4, 6), 2: (4, 6), 3: (4,)}
@@ -44,6 +49,7 @@ _FAR = 1 / 3  # share of the exponent asked for, from which on the next degree i
 _CLOSE = 0.1  # of log10: what is proved may be that far from what the program hoped for
 _BUDGET = 20_000
 _TOLERANCE = 0.02  # of kappa T, of V at the start and of V at the boundary: a loss of 0.03 in log10
+_HIGHEST = 40.0
 _LOG10 = math.log(10.0)
 
 
@@ -54,6 +60,7 @@ class Barrier:
     V(x) = sum_k coefficients[k] prod_i ((x_i - center_i)/scale_i)**exponents[k, i]; shapes: exponents (K, n),
     coefficients (K,), center and scale (n,). ``start`` is an upper bound of V over the initial set, ``boundary`` a
     lower one where a constraint is about to be broken, ``growth`` an upper bound kappa of the generator's expression.
+    With an ``inflow`` c, which bounds the generator of exp(V - boundary) itself, the growth is 0.
     """
 
     exponents: Integers
@@ -63,10 +70,13 @@ class Barrier:
     start: float
     boundary: float
     growth: float
+    inflow: float = 0.0
 
     def log10_probability(self, horizon: float) -> float:
         """log10 of the bound on the probability of leaving within ``horizon``, rounded up."""
         exponent = Interval.point(self.start) - self.boundary + Interval.point(max(self.growth, 0.0)) * horizon
+        if self.inflow > 0:
+            exponent = log(exp(exponent) + Interval.point(self.inflow) * horizon)
         value = float(exponent.hi) / _LOG10
         return value + 4e-16 * abs(value)
 
@@ -99,17 +109,22 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
             best, level = found, found.log10_probability(problem.horizon)
         if level <= math.log10(problem.delta) or 0 > level > _FAR * math.log10(problem.delta):
             break
+    if level > math.log10(problem.delta):
+        found = work.steady(_DEGREES[work.n][0], lambda barrier: asked.found(_answer(problem, barrier)), level)
+        best = found if found is not None else best
     if best is None:
         return EngineAnswer(reason="no polynomial barrier was found.", method="barrier")
     return _answer(problem, best)
 
 
 def _answer(problem: Problem, best: Barrier) -> EngineAnswer:
+    words = f"grows by at most {max(best.growth, 0.0) * problem.horizon:.3g} in logarithm within the horizon"
+    if best.inflow > 0:
+        words = f"over that at the boundary grows by at most {best.inflow * problem.horizon:.3g} within the horizon"
     return EngineAnswer(
         log10_delta=min(best.log10_probability(problem.horizon), 0.0),
-        reason=f"exp(V) - V a polynomial of degree {int(best.exponents.sum(axis=1).max())} - grows by at most "
-        f"{max(best.growth, 0.0) * problem.horizon:.3g} in logarithm within the horizon, from {best.start:.3g} to "
-        f"{best.boundary:.3g} at the boundary.",
+        reason=f"exp(V) - V a polynomial of degree {int(best.exponents.sum(axis=1).max())} - {words}, from "
+        f"{best.start:.3g} to {best.boundary:.3g} at the boundary.",
         method="barrier",
         details=best,
     )
@@ -152,6 +167,7 @@ class _Work:
             free += list(zip(np.asarray(disturbance.low).tolist(), np.asarray(disturbance.high).tolist()))
         self.ranges = Interval(*(np.array(ends) for ends in zip(*free)))
         self.noises = int(system.diffusion.shape[1])
+        self.programs = Polynomials(problem, system, self.center, self.scale)
 
     # ---- the search ------------------------------------------------------------------------------------------
 
@@ -161,14 +177,14 @@ class _Work:
         Few points first: what they hope for says whether more, which take long, are worth it. Where a bound is
         ``known`` already, only the target is.
         """
-        exponents = np.array([e for e in itertools.product(range(degree + 1), repeat=self.n) if 0 < sum(e) <= degree])
+        exponents = self._exponents(degree)
         horizon, target = self.problem.horizon, math.log10(self.problem.delta)
         points = self._points(_COARSE[self.n])
         fine: tuple[Array, Array, Array] | None = None
         best: Barrier | None = None
         for number in range(1 + _ROUNDS):
             poll(f"a polynomial of degree {degree}, round {number + 1}")
-            coefficients, hoped = self._program(exponents, *points)
+            coefficients, hoped = self.programs.slowest(exponents, points)
             if coefficients is None:
                 return best
             proved, worst = self._certified(exponents, coefficients)
@@ -186,12 +202,41 @@ class _Work:
                 fine = self._points(_FINE[self.n])
                 points = points[0], fine[1], fine[2]
             if fine is not None and len(fine[0]):  # of many points, those that bind: each takes its time in the program
-                height = self._generated(exponents, coefficients, fine[0])
+                height = self.programs.generated(exponents, coefficients, fine[0])
                 binding = height >= np.quantile(height, 1 - _BINDING)
                 points = np.concatenate([points[0], fine[0][binding]]), *points[1:]
                 fine = fine[0][~binding], *fine[1:]
             points = tuple(np.concatenate([have, tight]) for have, tight in zip(points, worst))  # type: ignore[assignment]  # as many as before
         return best
+
+    def steady(self, degree: int, found: Callable[[Barrier], object], level: float) -> Barrier | None:
+        """The best barrier with an inflow that proves less than ``level``, a log10; ``found`` takes what it finds."""
+        exponents, horizon, best = self._exponents(degree), float(self.problem.horizon), None
+        points, fine = self._points(_COARSE[self.n]), self._points(_FINE[self.n])[0]
+        points, begun = (points[0], points[1], self._points(_FINE[self.n])[2]), None
+        for number in range(1 + _ROUNDS):
+            poll(f"a steady polynomial of degree {degree}, round {number + 1}")
+            coefficients, hoped = self.programs.steadiest(exponents, points, begun)
+            if coefficients is None or hoped > -math.log(2):
+                break
+            proved, worst = self._certified(exponents, coefficients, steady=True)
+            if proved is not None and proved.log10_probability(horizon) < level:
+                best, level = proved, proved.log10_probability(horizon)
+                found(best)
+            if level <= math.log10(self.problem.delta):
+                break
+            height = self.programs.generated(exponents, coefficients, fine)
+            value = self.programs.monomials(exponents, fine[:, 1 : self.n + 1], ()) @ coefficients[:-1]
+            height -= np.exp(np.clip(hoped - value - coefficients[-1], -_HIGHEST, _HIGHEST)) / horizon
+            binding = height >= np.quantile(height, 1 - _BINDING / 2)
+            points = np.concatenate([points[0], fine[binding]]), *points[1:]
+            points = tuple(np.concatenate([have, tight]) for have, tight in zip(points, worst))  # type: ignore[assignment]  # as many as before
+            fine, begun = fine[~binding], (coefficients, hoped)
+        return best
+
+    def _exponents(self, degree: int) -> Integers:
+        powers = itertools.product(range(degree + 1), repeat=self.n)
+        return np.array([power for power in powers if 0 < sum(power) <= degree])
 
     def _points(self, count: int) -> tuple[Array, Array, Array]:
         """Points (t, x, d) of the safe set, points x of the initial set, points x of the boundary."""
@@ -231,68 +276,12 @@ class _Work:
         """The largest phi at points."""
         return np.asarray(np.max([gap.over(Interval.point(states)).mid for gap in self.gaps], axis=0))
 
-    def _program(
-        self, exponents: Integers, inner: Array, initial: Array, boundary: Array
-    ) -> tuple[Array | None, float]:
-        """Coefficients (the constant last) that minimise the exponent on the points, and log10 of that bound."""
-        import cvxpy
-
-        cp: Any = cvxpy
-        linear, roots = self._terms(exponents, inner)
-        c, constant, top, growth = cp.Variable(len(exponents)), cp.Variable(), cp.Variable(), cp.Variable(nonneg=True)
-        quadratic = sum(cp.square(root @ c) for root in roots)
-        rows = [
-            linear @ c + 0.5 * quadratic <= growth,
-            self._monomials(exponents, initial, ()) @ c + constant <= top,
-            self._monomials(exponents, boundary, ()) @ c + constant >= 0,
-        ]
-        program = cp.Problem(cp.Minimize(top + growth * self.problem.horizon), rows)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # an inaccurate proposal is a proposal
-                program.solve(solver=cp.CLARABEL, **solver_limit())
-        except cp.SolverError:
-            return None, 0.0
-        if c.value is None or not np.isfinite(program.value) or program.value >= 0:
-            return None, 0.0
-        return np.append(np.asarray(c.value, dtype=float), float(constant.value)), float(program.value) / _LOG10
-
-    def _terms(self, exponents: Integers, inner: Array) -> tuple[Array, list[Array]]:
-        """The generator's expression at points, linear @ c + 1/2 sum_j (roots[j] @ c)^2: matrices (points, K)."""
-        states = inner[:, 1 : self.n + 1]
-        drift = compile_numpy(self.problem.closed_loop)(*inner.T)
-        diffusion = self.system.diffusion
-        given = compile_numpy(diffusion)(*inner[:, : self.n + 1].T) if isinstance(diffusion, Tape) else diffusion
-        spread = np.broadcast_to(given, (len(inner), self.n, self.noises))
-        slopes = np.stack([self._monomials(exponents, states, (i,)) for i in range(self.n)])
-        linear = np.einsum("pi,ipk->pk", drift, slopes)
-        square = np.einsum("pij,pkj->pik", spread, spread)
-        for i, j in itertools.product(range(self.n), repeat=2):
-            linear = linear + 0.5 * square[:, i, j, None] * self._monomials(exponents, states, (i, j))
-        return linear, [np.einsum("pi,ipk->pk", spread[:, :, j], slopes) for j in range(self.noises)]
-
-    def _generated(self, exponents: Integers, coefficients: Array, inner: Array) -> Array:
-        """The generator's expression of a polynomial (the constant last) at points."""
-        linear, roots = self._terms(exponents, inner)
-        c = coefficients[:-1]
-        return np.asarray(linear @ c + 0.5 * sum((root @ c) ** 2 for root in roots))
-
-    def _monomials(self, exponents: Integers, states: Array, along: tuple[int, ...]) -> Array:
-        """Monomials in the scaled states, differentiated along the given states: (points, K)."""
-        y = (states - self.center) / self.scale
-        powers, factor = exponents.copy(), np.ones(len(exponents))
-        for i in along:
-            factor = factor * powers[:, i] / self.scale[i]
-            powers[:, i] -= 1
-        powers = np.maximum(powers, 0)
-        return np.asarray(factor * np.prod(y[:, None, :] ** powers, axis=-1))
-
     # ---- the proof -------------------------------------------------------------------------------------------
 
     def _certified(
-        self, exponents: Integers, coefficients: Array
+        self, exponents: Integers, coefficients: Array, *, steady: bool = False
     ) -> tuple[Barrier | None, tuple[Array, Array, Array]]:
-        """What holds for the polynomial, and the points where its three bounds are tight."""
+        """What holds for the polynomial (``steady``: with an inflow), and where its three bounds are tight."""
         names = list(self.system.states)
         powers = np.vstack([exponents, np.zeros((1, self.n), dtype=np.int64)])
 
@@ -307,25 +296,31 @@ class _Work:
             return total
 
         value = trace(polynomial, {"x": names})
-        tolerance = _TOLERANCE
-        growth = self._supremum(
-            self._generator(value), self.ranges, 1, self._safe, tolerance / float(self.problem.horizon)
-        )
-        if not np.isfinite(growth.upper):  # V is finite everywhere: no other one would help
+        generator, horizon = self._generator(value), float(self.problem.horizon)
+        start = self._supremum(value, self.start, 0, _anywhere, _TOLERANCE)
+        negative = substitute(trace(lambda v: -v[0], {"v": ["v"]}), names, {"v": value})
+        exit_ = self._supremum(negative, self.hull, 0, self._leaving, _TOLERANCE)
+        share = _TOLERANCE / horizon
+        if steady:
+            share *= math.exp(min(start.upper, 0.0))
+            whole = trace(lambda v, g: np.exp(v[0]) * g[0], {"v": ["v"], "g": ["g"]})
+            generator = substitute(whole, generator.inputs, {"v": value, "g": generator})
+        growth = self._supremum(generator, self.ranges, 1, self._safe, share)
+        if not (np.isfinite(growth.upper) or steady):  # V is finite everywhere: no other one would help
             raise EngineError(
                 "the dynamics have no finite enclosure near ("
                 + ", ".join(f"{x:.4g}" for x in growth.worst.mid[1 : self.n + 1])
                 + "), a part of the safe set: they are undefined there, or jump."
             )
-        start = self._supremum(value, self.start, 0, _anywhere, tolerance)
-        negative = substitute(trace(lambda v: -v[0], {"v": ["v"]}), names, {"v": value})
-        exit_ = self._supremum(negative, self.hull, 0, self._leaving, tolerance)
         points = growth.point[None], start.point[None], exit_.point[None]
         if not all(np.isfinite([growth.upper, start.upper, exit_.upper])):
             return None, points
+        inflow = 0.0
+        if steady:  # of exp(V - boundary)
+            inflow = float((Interval.point(max(growth.upper, 0.0)) * exp(Interval.point(exit_.upper))).hi)
         return Barrier(
             exponents=powers, coefficients=coefficients, center=self.center, scale=self.scale,
-            start=start.upper, boundary=-exit_.upper, growth=growth.upper,
+            start=start.upper, boundary=-exit_.upper, growth=0.0 if steady else growth.upper, inflow=inflow,
         ), points  # fmt: skip
 
     def _generator(self, value: Tape) -> Tape:

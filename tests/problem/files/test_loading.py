@@ -78,7 +78,7 @@ def test_a_thousand_chained_definitions_are_read():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('states = ["px", "py", "th"]', 'states = ["px", "del", "th"]', "not use 'del', a word of Python's own; del_ would"),
+        ('states = ["px", "py", "th"]', 'states = ["px", "del", "th"]', "'del', a word of Python's own; del_ would"),
         ("horizon = 5.0", "horizn = 5.0", "unknown key 'horizn' in the problem file; did you mean 'horizon'"),
         ("horizon = 5.0", "", "`horizon` is missing"),
         ("horizon = 5.0", "horizon = -5", "`horizon` must be positive, got -5"),

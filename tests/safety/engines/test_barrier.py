@@ -17,7 +17,9 @@ from certbound.safety.certificate import problem_data
 from certbound.safety.certificates.barrier import barrier_proof
 from certbound.safety.engines import barrier as engine
 from certbound.safety.engines.barrier import Barrier, barrier_engine
+from certbound.safety.engines.barrier_programs import Polynomials
 from certbound.safety.engines.gaps import gaps_of, lies_inside
+from certbound.values.continuous.exits import bound_exits
 
 
 def scalar(**changes: object) -> cb.Problem:
@@ -90,6 +92,18 @@ def test_noise_that_depends_on_the_state_a_disturbance_and_an_obstacle(monkeypat
     exits = cb.simulate_exits(problem, paths=20_000, rng=1, steps=200)
     assert found.log10_delta < -1.5
     assert 10**found.log10_delta >= exits.lower
+
+
+def test_an_inflow_stays_near_the_truth_where_noise_keeps_moving() -> None:
+    """Every exp(V) grows by a factor e^(kappa T) that leaves nothing over 8 units of time."""
+    system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=[[0.45]])
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.2], [1.2]))], horizon=8, delta=1e-9)
+    found = engine._Work(problem, system).steady(4, lambda _: None, 0.0)
+    assert found is not None
+    truth = bound_exits(problem, seconds=1.0)
+    assert truth.lower <= found.log10_probability(8.0) <= truth.upper + np.log10(2)
+    answer = barrier_engine(problem)
+    assert answer.log10_delta == pytest.approx(found.log10_probability(8.0), abs=0.3)
 
 
 @pytest.mark.parametrize(
@@ -169,11 +183,12 @@ def test_an_initial_set_that_was_not_proved_safe_gets_no_bound(monkeypatch: pyte
 def test_a_target_far_out_of_reach_is_not_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
     hopes, asked = list[float](), [0.0]
 
-    def program(_: object, exponents: np.ndarray, *points: np.ndarray) -> tuple[np.ndarray, float]:
+    def program(_: object, exponents: np.ndarray, points: object) -> tuple[np.ndarray, float]:
         hopes.append(asked[0])
         return np.zeros(len(exponents) + 1), asked[0]
 
-    monkeypatch.setattr(engine._Work, "_program", program)
+    monkeypatch.setattr(Polynomials, "slowest", program)
+    monkeypatch.setattr(engine._Work, "steady", lambda *_: None)
     nothing = np.zeros((0, 4)), np.zeros((0, 3)), np.zeros((0, 3))
     monkeypatch.setattr(engine._Work, "_certified", lambda *_: (None, nothing))
     system = cb.ContinuousSystem(lambda x: -x, states=3, diffusion=0.3 * np.eye(3))
@@ -197,13 +212,13 @@ def test_points_are_taken_at_several_times_only_where_the_model_depends_on_it(dr
 
 def test_of_many_points_only_those_that_bind_enter_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
-    program = engine._Work._program
+    program = Polynomials.slowest
 
-    def counted(self: engine._Work, exponents: np.ndarray, inner: np.ndarray, *others: np.ndarray) -> object:
-        asked.append(len(inner))
-        return program(self, exponents, inner, *others)
+    def counted(self: Polynomials, exponents: np.ndarray, points: Any) -> object:
+        asked.append(len(points[0]))
+        return program(self, exponents, points)
 
-    monkeypatch.setattr(engine._Work, "_program", counted)
+    monkeypatch.setattr(Polynomials, "slowest", counted)
     found = barrier_engine(oscillator(0.4))
     assert found.log10_delta < -2
     assert max(asked) < 0.8 * engine._FINE[2] ** 2
@@ -211,14 +226,15 @@ def test_of_many_points_only_those_that_bind_enter_the_program(monkeypatch: pyte
 
 def test_a_further_degree_that_cannot_reach_the_target_is_given_up_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     hopes: list[tuple[int, float]] = []
-    program = engine._Work._program
+    program = Polynomials.slowest
 
-    def noted(self: Any, exponents: Any, *points: Any) -> Any:
-        found = program(self, exponents, *points)
+    def noted(self: Any, exponents: Any, points: Any) -> Any:
+        found = program(self, exponents, points)
         hopes.append((int(exponents.sum(axis=1).max()), found[1]))
         return found
 
-    monkeypatch.setattr(engine._Work, "_program", noted)
+    monkeypatch.setattr(Polynomials, "slowest", noted)
+    monkeypatch.setattr(engine._Work, "steady", lambda *_: None)
     system = cb.ContinuousSystem(lambda x: [x[0] - x[0] ** 3, -x[1]], states=2, diffusion=0.3 * np.eye(2))
     room = cb.Inside(cb.Box([-0.4, -1.5], [2, 1.5]))
     problem = cb.Problem(system, initial=cb.Box([0.9, -0.1], [1.0, 0.1]), safe=[room], horizon=3)
