@@ -109,7 +109,7 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
             best, level = found, found.log10_probability(problem.horizon)
         if level <= math.log10(problem.delta) or 0 > level > _FAR * math.log10(problem.delta):
             break
-    if level > math.log10(problem.delta):
+    if level > math.log10(problem.delta) and work.n < _MOST_STATES:  # in three states that takes a quarter of a minute
         found = work.steady(_DEGREES[work.n][0], lambda barrier: asked.found(_answer(problem, barrier)), level)
         best = found if found is not None else best
     if best is None:
