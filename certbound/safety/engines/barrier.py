@@ -217,7 +217,7 @@ class _Work:
         for number in range(1 + _ROUNDS):
             poll(f"a steady polynomial of degree {degree}, round {number + 1}")
             coefficients, hoped = self.programs.steadiest(exponents, points, begun)
-            if coefficients is None or hoped > -math.log(2):
+            if coefficients is None or hoped > level * _LOG10 - math.log(2):
                 break
             proved, worst = self._certified(exponents, coefficients, steady=True)
             if proved is not None and proved.log10_probability(horizon) < level:

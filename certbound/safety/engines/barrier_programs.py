@@ -68,7 +68,7 @@ class Polynomials:
             if begun is None:
                 return None, 0.0
         coefficients, level = begun
-        for _ in range(_STEPS):
+        for left in reversed(range(_STEPS)):
             poll()
             depth = np.clip(level - rows @ coefficients[:-1] - coefficients[-1], _DEEP, _HIGH)
             c, constant, m = cp.Variable(len(exponents)), cp.Variable(), cp.Variable()
@@ -83,8 +83,8 @@ class Polynomials:
                 break
             before, level = level, float(m.value)
             coefficients = np.append(np.asarray(c.value, dtype=float), float(constant.value))
-            if abs(before - level) < _SETTLED * abs(level):
-                break
+            if abs(before - level) < _SETTLED * abs(level) or level > max(left * (before - level), 0.0) > 0:
+                break  # or it will not fall below 0 at that rate
         return coefficients, level
 
     def _first(self, exponents: Integers, points: Points) -> tuple[Array, float] | None:
