@@ -24,7 +24,7 @@ from certbound.safety.averages import average_verdict
 from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
-from certbound.safety.misses import best_time, find_miss, window_of
+from certbound.safety.misses import arrival, best_time, find_miss, window_of
 from certbound.safety.portfolio import ENGINES, Engine, check_request, engines_of
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
@@ -347,7 +347,7 @@ class _Search:
         """What an engine answers about meeting the target by a time; not to meet it by then says nothing from below."""
         found = row.prove(self.problem, request) if row.endless else None
         if found is None or not found.applicable:
-            found = row.prove(self.problem.replace(horizon=self.meeting[0]), request)
+            found = row.prove(self.problem.replace(horizon=arrival(self.problem)[0]), request)
             return replace(found, log10_lower=None, conclusive=False)
         return found
 

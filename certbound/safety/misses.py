@@ -24,10 +24,12 @@ def window_of(problem: Problem) -> tuple[float, float]:
 def best_time(problem: Problem) -> float:
     """The time of the target's window at which the worst of a few noise-free trajectories is deepest in it.
 
-    In floating point: whatever it is, to meet the target then is one way of not failing.
+    In floating point: whatever it is, to meet the target then is one way of not failing. Without an end the time of
+    `arrival`, where there is one.
     """
     if problem.endless:
-        return _arrival(problem)
+        last, stay = arrival(problem)
+        return last if stay else best_time(_until(problem, last))
     first, last = window_of(problem)
     if first == last or (isinstance(problem.plan, np.ndarray) and problem.system.time == "continuous"):
         return last
@@ -37,17 +39,20 @@ def best_time(problem: Problem) -> float:
     return float(times[np.argmax(depth)]) if np.any(depth > -np.inf) else last
 
 
-def _arrival(problem: Problem) -> float:
-    """A time by which noise-free trajectories are well inside the target, where they ever are."""
+def arrival(problem: Problem) -> tuple[float, bool]:
+    """A time by which noise-free trajectories are well inside the target, and whether they ever stay there."""
     last, inside = 1.0, 0
     for _ in range(_DOUBLINGS):
         last *= 2
-        shorter = problem.replace(horizon=int(last) if problem.system.time == "discrete" else last)
-        times, _, _, paths, flow = _followed(shorter)
+        times, _, _, paths, flow = _followed(_until(problem, last))
         inside += bool(rooms(Inside(problem.reach.region), flow, times, paths)[:, -1].min() > 0)
         if inside == _SETTLED:
             break
-    return last
+    return last, inside == _SETTLED
+
+
+def _until(problem: Problem, last: float) -> Problem:
+    return problem.replace(horizon=int(last) if problem.system.time == "discrete" else last)
 
 
 def find_miss(problem: Problem) -> Violation | None:
