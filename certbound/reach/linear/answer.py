@@ -22,7 +22,8 @@ from certbound.watch import share_of_time
 _NOTHING = -0.1  # log of a probability that says nothing
 _PARTS = (2, 4, 8)  # cells along each side, tried one after the other
 _MOST_PIECES = 4000  # pieces of time times cells
-_FEW = 3  # states up to which cells of the start come before engines that are dear
+_FEW = 3  # states up to which cells of the start are looked at without being asked thoroughly
+_AT_ONCE = 3  # states from which on that is at once: with fewer, polynomials and metrics are quick, and may say more
 _EARLY = 0.2  # of the time that is left, for them
 
 
@@ -44,9 +45,10 @@ def linear_answer(
     cells : int, optional
         Cells along each side of the initial set; as few as serve when omitted.
     thorough : bool
-        False: one cell when omitted, but for a while in few states, and no larger shares where nothing was proved.
+        False: one cell when omitted, but for a while in three states, or in fewer with ``before``; and no larger shares
+        where nothing was proved.
     quick : bool
-        Not for a while either.
+        One cell whatever the states.
     before : LinearAnswer, optional
         What was found for the same problem without ``thorough`` and ``cells``; it is not looked for again.
     found : callable
@@ -63,7 +65,8 @@ def linear_answer(
     alone = cells is None and unproved
     if alone and run.curved and plain:
         assert isinstance(problem, Problem)
-        if not run.parted and (thorough or (not quick and run.engine.n <= _FEW)):
+        early = not quick and run.engine.n <= _FEW and (before is not None or run.engine.n >= _AT_ONCE)
+        if not run.parted and (thorough or early):
             with nullcontext() if thorough else share_of_time(_EARLY):
                 split = bisected(problem, run, target)
                 if split is not None:
