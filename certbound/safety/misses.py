@@ -14,6 +14,7 @@ from certbound.rigor.norms import Norm
 from certbound.safety.falsification import ATTEMPTS, Violation, candidates, follow, proved, rooms
 
 _DOUBLINGS, _SETTLED = 12, 3
+_NEARLY = 0.1  # of the depth that an earlier time, with less noise until then, is worth
 
 
 def window_of(problem: Problem) -> tuple[float, float]:
@@ -29,14 +30,21 @@ def best_time(problem: Problem) -> float:
     """
     if problem.endless:
         last, stay = arrival(problem)
-        return last if stay else best_time(_until(problem, last))
+        return last if stay else _deepest(_until(problem, last), _NEARLY)
     first, last = window_of(problem)
     if first == last or (isinstance(problem.plan, np.ndarray) and problem.system.time == "continuous"):
         return last
+    return _deepest(problem, 0.0)
+
+
+def _deepest(problem: Problem, less: float) -> float:
+    """The first time at which the worst trajectory is deepest, or by such a part less deep."""
+    first, last = window_of(problem)
     times, _, _, paths, flow = _followed(problem)
     depth = rooms(Inside(problem.reach.region, (first, last)), flow, times, paths).min(axis=0)
     depth = np.where(np.isfinite(depth) & (times > 0), depth, -np.inf)
-    return float(times[np.argmax(depth)]) if np.any(depth > -np.inf) else last
+    most = depth.max()
+    return float(times[np.argmax(depth >= most - less * abs(most))]) if np.isfinite(most) else last
 
 
 def arrival(problem: Problem) -> tuple[float, bool]:
